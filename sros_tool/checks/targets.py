@@ -89,7 +89,8 @@ def _findings_unless_policy(path: Path, circumstances: Circumstances) -> list[Fi
 def policy_findings(paths: Iterable[Path], circumstances: Circumstances) -> list[Finding]:
     """Return the findings about policy files and the policies in folders, checked together.
 
-    Raises: DocumentError: there is no file at a path, or no policy in a folder.
+    Raises:
+        DocumentError: there is no file at a path, or no policy in a folder.
     """
     from sros_tool.checks.policies import policy_file_findings
 

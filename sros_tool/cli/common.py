@@ -330,8 +330,9 @@ def chosen_enclaves(
 ) -> tuple[str, ...]:
     """Return the enclaves that the arguments and the options of `several_enclaves` name.
 
-    Raises: UsageError: no enclave is named. KeystoreError: a pattern matches no enclave, or a robot
-    has none.
+    Raises:
+        UsageError: no enclave is named.
+        KeystoreError: a pattern matches no enclave, or a robot has none.
     """
     check_chosen(names, patterns, robots)
     if not (patterns or robots):

@@ -591,7 +591,8 @@ def _propose(
 ) -> int:
     """Show the rights that logs report as denied, and the lines; write the rights if accepted.
 
-    Raises: SrosError: rights were proposed, and not accepted.
+    Raises:
+        SrosError: rights were proposed, and not accepted.
     """
     from sros_tool.explain.denials import lines_asking_for
     from sros_tool.files import policies_dir

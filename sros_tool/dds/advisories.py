@@ -2,14 +2,14 @@
 
 The advisories that ship with sros are in ``advisories.json`` next to this module: for each release
 line of Fast DDS, they repeat the git history of eProsima/Fast-DDS (as of 2026-08-20).  An event
-``fixed`` names the first release with the fix.  A release line that was never fixed has no such
-event, so all its later releases count as affected until newer advisories name a fix.
+``fixed`` names the first release with the fix.  A release line without a fix has no such event, so
+all later releases of the line count as affected until newer advisories name a fix.
 
-``database_specific`` has three members.  ``needs`` is what an attack needs: ``security`` (DDS
-Security is on), ``identity`` (a certificate of the keystore's CA), ``document`` (a document that
-the permissions CA signed) or nothing but the network.  ``gives`` is its effect: ``denial``,
-``memory``, ``access`` or ``unclear``.  ``unclear_lines`` are release lines about which the history
-says nothing; they may be affected.
+``database_specific`` has three members.  ``needs`` is the precondition of an attack: ``security``
+(DDS Security is on), ``identity`` (a certificate of the keystore's CA), ``document`` (a document
+that the permissions CA signed) or nothing but the network.  ``gives`` is the effect of the attack:
+``denial``, ``memory``, ``access`` or ``unclear``.  ``unclear_lines`` are release lines that may be
+affected, because the history says nothing about them.
 
 Source: https://ossf.github.io/osv-schema.
 """
@@ -33,7 +33,7 @@ _REPOSITORIES = {
     "github.com/eclipse-zenoh/zenoh": "Zenoh",
 }
 PRODUCTS = tuple(_REPOSITORIES.values())
-"""The products that advisories can be about."""
+"""The products that sros knows from advisories."""
 _MOST_BYTES = 4 * 1024 * 1024
 _MOST_ADVISORIES = 10_000
 _ID = re.compile(r"[A-Za-z][A-Za-z0-9]*(?:-[A-Za-z0-9]+){1,6}", re.ASCII)
@@ -80,7 +80,7 @@ class Advisory(NamedTuple):
         return version in self.versions or any(part.has(version) for part in self.ranges)
 
     def fixed_in(self, version: Version) -> str:
-        """Return the first release with the fix, of the same major version; "" if there is none."""
+        """Return the first release of the same major version with the fix; "" without a fix."""
         ends = {None if part.inclusive else part.end for part in self.ranges if part.has(version)}
         last = max((end for end in ends if end), default=None)
         if last is None or None in ends or last[0] != version[0] or self.affects(last):
@@ -88,7 +88,7 @@ class Advisory(NamedTuple):
         return ".".join(map(str, last))
 
     def with_releases_of(self, other: Advisory) -> Advisory:
-        """Return this advisory with the releases of ``other``, which has the same id, added."""
+        """Return this advisory with the releases of ``other`` added; both have the same id."""
         return self._replace(
             ranges=self.ranges + other.ranges,
             versions=self.versions | other.versions,
@@ -112,8 +112,8 @@ def known_vulnerabilities(
 ) -> KnownVulnerabilities | None:
     """Return the advisories about a release, such as "2.14.5" of "Fast DDS".
 
-    If ``advisories`` is None, those that ship with sros are used.  Returns None if the version
-    cannot be read, or if no advisory is about the product.
+    If ``advisories`` is None, the advisories that ship with sros are used.  Returns None if the
+    version cannot be read, or if no advisory is about the product.
     """
     numbers = version_numbers(version)
     advisories_of_library = [
@@ -147,7 +147,7 @@ def shipped_advisories() -> tuple[Advisory, ...]:
 
 
 def read_advisories(path: Path) -> tuple[Advisory, ...]:
-    """Return the advisories that ship with sros together with those in a file.
+    """Return the advisories in a file, and the advisories that ship with sros.
 
     An advisory in the file replaces the shipped advisory with the same id, for the products that
     the file names.
@@ -173,7 +173,7 @@ def read_advisories(path: Path) -> tuple[Advisory, ...]:
 def parse_advisories(data: bytes, label: str) -> tuple[Advisory, ...]:
     """Return the advisories in OSV records; ``label`` is the name of ``data`` in errors.
 
-    Records with the same id become one advisory, which has the releases of all of them.  Withdrawn
+    Records with the same id become one advisory, with the releases of all these records.  Withdrawn
     records count as affecting no release.  Products that sros does not know are left out.
 
     Raises:
@@ -301,7 +301,7 @@ def _text(value: object) -> str:
 
 
 def _line(product: str, version: Version) -> str:
-    """Return the release line of a version; releases 2.7 to 2.14 of Fast DDS are line 2.14."""
+    """Return the release line of a version; Fast DDS 2.7 to 2.14 belong to the line 2.14."""
     if product != "Fast DDS":
         return f"{version[0]}.{version[1]}"
     for first, line in ((3, 3), "3.6"), ((3, 0), "3.2"), ((2, 7), "2.14"):

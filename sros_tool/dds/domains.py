@@ -10,7 +10,7 @@ from itertools import pairwise
 from sros_tool.errors import UsageError
 
 MAX_DOMAIN = 230
-"""Largest domain id that every vendor accepts: Cyclone DDS 0.10 refuses documents above it."""
+"""Largest domain id that every vendor accepts: Cyclone DDS 0.10 refuses larger ids."""
 
 _ONE = re.compile(r"(\d{1,9})(?:-(\d{1,9}))?\Z", re.ASCII)
 
@@ -19,8 +19,8 @@ _ONE = re.compile(r"(\d{1,9})(?:-(\d{1,9}))?\Z", re.ASCII)
 class DomainRange:
     """The domains from ``first`` to ``last``, both included.
 
-    In documents that sros did not write, ``first`` or ``last`` may be missing (None); vendors
-    differ in how they read such a range.
+    In documents that sros did not write, ``first`` or ``last`` may be missing (None); vendors read
+    such a range differently.
     """
 
     first: int | None
@@ -49,7 +49,7 @@ class DomainSet:
     def parse(cls, text: str, source: str = "") -> DomainSet:
         """Return the domains in a text such as ``0``, ``0,7`` or ``3-5,9``, as sorted ranges.
 
-        ``source`` is where the text comes from, for errors.
+        ``source`` names the origin of the text in errors.
 
         Raises:
             UsageError: the text is not a list of whole numbers from 0 to 230.
@@ -112,10 +112,10 @@ class DomainSet:
     def one_of_each_kind(
         cls, listed: Collection[DomainSet], other_sets: Iterable[DomainSet]
     ) -> tuple[int, ...]:
-        """Return one domain for each group of domains that are in the same sets, sorted.
+        """Return an example domain for each group of domains that are in the same sets, sorted.
 
-        Only groups within the ``listed`` sets count.  But if a range lacks one of its ends, all
-        groups count, because vendors read such a range differently.
+        Only groups within the ``listed`` sets count.  But if a range lacks an end, all groups
+        count, because vendors read such a range differently.
         """
         sets = dict.fromkeys((*listed, *other_sets))
         borders = {0}
@@ -137,9 +137,9 @@ class DomainSet:
 
     @classmethod
     def parts(cls, sets: Iterable[DomainSet]) -> tuple[DomainSet, ...]:
-        """Return the groups of domains that are in the same of the ``sets``, which must be closed.
+        """Return groups of domains that belong to the same ``sets``, which must be closed.
 
-        So a set has either all domains of a group or none.
+        So a set contains either all domains of a group or no domain of it.
         """
         ranges: dict[tuple[bool, ...], list[tuple[int, int]]] = {}
         known = tuple(dict.fromkeys(sets))
@@ -163,10 +163,10 @@ class DomainSet:
         return DomainSet.of(*(pair for pair in common if pair[0] <= pair[1]))
 
     def preferred(self) -> int:
-        """Return domain 0, the default of ROS, if it is in the set, else the set's first domain."""
+        """Return domain 0, the default of ROS, if it is in the set, or else the first domain."""
         return 0 if 0 in self else next(iter(self))
 
     def only(self) -> int | None:
-        """Return the domain of a set that has only one, else None."""
+        """Return the only domain of the set, or None if it has several."""
         domains = list(self)
         return domains[0] if len(domains) == 1 else None

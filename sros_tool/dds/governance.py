@@ -45,9 +45,9 @@ class Attribute(NamedTuple):
 
     ``name`` is the name of the XML element and of the rule's field; ``term`` is the field of
     `sros_tool.policy.model` that is translated into the attribute.  ``values`` are the allowed
-    values.  ``open`` is the value that protects nothing; ``portable`` is a value that protects and
-    that all vendors enforce alike.  ``default`` is the value if a document lacks the element; None
-    if the schema requires the element.
+    values.  ``open`` is the value without protection; ``portable`` is a protecting value that all
+    vendors enforce alike. ``default`` is the value if a document lacks the element; None if the
+    schema requires the element.
     """
 
     name: str
@@ -63,7 +63,7 @@ class Attribute(NamedTuple):
         return isinstance(self.open, bool)
 
     def is_open(self, rule: DomainRule | TopicRule) -> bool:
-        """Return whether ``rule`` has the attribute's open value, the one that protects nothing."""
+        """Return whether ``rule`` has the attribute's open value, which protects nothing."""
         return bool(getattr(rule, self.name) == self.open)
 
 
@@ -113,7 +113,7 @@ class TopicRule:
 )
 @dataclass(frozen=True, slots=True)
 class DomainRule:
-    """The protection of some domains; the first topic rule that matches a topic applies to it."""
+    """The protection of some domains; for a topic, the first matching topic rule applies."""
 
     domains: DomainSet
     allow_unauthenticated_participants: bool = field(
@@ -154,7 +154,7 @@ def attributes(rule: type[DomainRule | TopicRule]) -> tuple[Attribute, ...]:
 
 
 def settings(rule: type[DomainRule | TopicRule], *, protect: bool) -> dict[str, Any]:
-    """Map attribute names to values that protect, which are portable, or else to open values."""
+    """Map attribute names to portable values that protect, or else to open values."""
     return {
         attribute.name: attribute.portable if protect else attribute.open
         for attribute in attributes(rule)
@@ -162,7 +162,7 @@ def settings(rule: type[DomainRule | TopicRule], *, protect: bool) -> dict[str, 
 
 
 class Governance(NamedTuple):
-    """A governance document; the first domain rule that lists a domain applies to it."""
+    """A governance document; for a domain, the first domain rule that lists it applies."""
 
     domain_access_rules: tuple[DomainRule, ...]
 

@@ -27,7 +27,8 @@ MAX_SIGNED_BYTES = 60 * 1024
 A message of the handshake must fit into one UDP datagram of 64 KB, with the certificate, the
 signature and the participant's data.  Tested with Fast DDS 2.9.1 on one network interface: with an
 EC certificate of 0.6 KB, 63,129 bytes work and 63,189 do not; with an RSA certificate of 0.9 KB,
-62,579 work and 62,854 do not.  The rest is room for longer certificates and more interfaces.
+62,579 work and 62,854 do not.  The remaining bytes are room for longer certificates and more
+interfaces.
 """
 LARGE_BYTES = MAX_SIGNED_BYTES - 6 * 1024
 """Size in bytes from which an unsigned document is written as short as possible.
@@ -41,7 +42,7 @@ TOPIC_LINE_BYTES = len("            <topic></topic>\r\n")
 class Criteria(NamedTuple):
     """The topics and partitions of a ``<publish>`` or ``<subscribe>`` in a rule.
 
-    No partitions means the default partition.
+    Without partitions, the default partition is meant.
     """
 
     topics: tuple[str, ...]
@@ -58,10 +59,10 @@ class Rule(NamedTuple):
     subscribe: tuple[Criteria, ...] = ()
     relay: tuple[Criteria, ...] = ()
     order: tuple[str, ...] = ()
-    """The direction of each criteria in document order; () means that publish comes first."""
+    """The directions of the rule's criteria in document order; () for publish first."""
 
     def criteria_of(self, directions: Sequence[str]) -> Iterator[tuple[str, Criteria]]:
-        """Yield the criteria of ``directions`` in document order, each with its direction."""
+        """Yield pairs of direction and criteria of ``directions``, in document order."""
         criteria = {each: iter(getattr(self, each)) for each in directions}
         order = self.order or [each for each in directions for _ in getattr(self, each)]
         for direction in order:
@@ -70,7 +71,7 @@ class Rule(NamedTuple):
 
 
 class Grant(NamedTuple):
-    """The rights and the validity of one subject; dates are kept as written in the document."""
+    """The rights and the validity of a subject; dates have the form in the document."""
 
     name: str
     subject: str
@@ -81,7 +82,7 @@ class Grant(NamedTuple):
     default_empty: bool = False
     """Whether ``<default>`` is empty, which crashes Cyclone DDS."""
     default_first: bool = False
-    """Whether ``<default>`` stands before a rule; Fast DDS ignores rules after it."""
+    """Whether ``<default>`` stands before a rule; Fast DDS then ignores the rules after it."""
 
     @property
     def validity(self) -> Window:
@@ -371,13 +372,13 @@ _CONSEQUENCES = {
 
 
 OverlapTest = Callable[[str], bool]
-"""A function that tells whether an expression and some other expressions share a name."""
+"""A function that returns whether an expression and some other expressions share a name."""
 
 
 def _overlap_by_text(names: Sequence[str]) -> OverlapTest:
-    """Return a function that tells whether an expression and one of ``names`` match each other.
+    """Return a function that returns whether an expression and any of ``names`` match.
 
-    Both are taken as text: one of them matches the other as a pattern.
+    The match is textual: an expression has to match the text of the other one as a pattern.
     """
     return lambda name: any(
         fnmatchcase(other_name, name) or fnmatchcase(name, other_name) for other_name in names
@@ -389,10 +390,10 @@ def portability_problems(
     signed_bytes: int,
     overlap_test_of: Callable[[Sequence[str]], OverlapTest] = _overlap_by_text,
 ) -> Iterator[tuple[str, str]]:
-    """Yield (id, clause) for each part of a document that vendors read differently.
+    """Yield id and clause for each part of a document that vendors read differently.
 
-    ``overlap_test_of(expressions)`` returns a test whether an expression and one of ``expressions``
-    match a common name.
+    ``overlap_test_of(expressions)`` returns a function that returns whether an expression and any
+    of ``expressions`` match a common name.
     """
     if signed_bytes >= MAX_SIGNED_BYTES:
         yield "portable.document-size", f"the signed permissions have {signed_bytes} bytes"
@@ -436,7 +437,7 @@ def _topics(criteria: Iterable[Criteria]) -> tuple[str, ...]:
 def _blocked_by_denials(
     denied: list[str], denied_too: set[str], is_allowed: OverlapTest
 ) -> list[str]:
-    """Return the denied expressions that share a name with an expression allowed the other way."""
+    """Return the denied expressions that share a name with an expression allowed otherwise."""
     return [
         expression
         for expression in denied
@@ -447,7 +448,7 @@ def _blocked_by_denials(
 _FEW_PARTS = 20
 """Number of distinct name parts up to which searching all names for the parts is faster.
 
-With more parts, comparing all names with each other is faster.
+With more parts, comparing all pairs of names is faster.
 """
 
 
@@ -473,7 +474,7 @@ def name_notes(names: Iterable[str], new: Iterable[str]) -> Iterator[Note]:
 
 
 def mistaken_names(names: Iterable[str]) -> list[tuple[str, str]]:
-    """Return the sorted pairs (a, b) of enclaves for which Cyclone DDS takes a for b.
+    """Return the sorted pairs (a, b) of enclaves where Cyclone DDS gives enclave a the rights of b.
 
     Cyclone DDS only checks that the subject of the permissions has every part of the certificate's
     subject.  So the permissions of ``/robot/admin`` fit the certificate of ``/robot``.

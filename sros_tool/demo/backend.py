@@ -350,7 +350,8 @@ class HandNode:
 def security_of(node: HandNode, environment: Mapping[str, str]) -> str:
     """Return a line that names the library on which the node runs, and says whether it is secured.
 
-    Raises: SrosError: The environment demands security, and the enclave cannot be loaded.
+    Raises:
+        SrosError: The environment demands security, and the enclave cannot be loaded.
     """
     if node.backend == ZENOH:
         kind = "ROUTER" if node.role is Role.ROUTER else "SESSION"

@@ -67,14 +67,14 @@ _RIGHTS = {
     ("reply", "service"): "reply",
 }
 WORDS = (*dict.fromkeys(word for word, _ in _RIGHTS), _JOIN)
-"""The words of questions; request and reply are the policy's words for call and serve."""
+"""The words of questions; in policies, request and reply stand for call and serve of services."""
 
 _ROLES = {"rq": "requests", "rr": "replies"}
 
 
 @shows("verb", "topic", "role", null_if_empty=("role",))
 class Part(NamedTuple):
-    """One DDS endpoint that a right needs; ``role`` names it in ROS terms, "" for a topic."""
+    """A DDS endpoint that a right needs; ``role`` names it in ROS terms, "" for a topic."""
 
     verb: AccessVerb
     """Whether the endpoint publishes or subscribes."""
@@ -92,15 +92,16 @@ _OWN_PARTS = (
     Part(AccessVerb.PUBLISH, ROS_DISCOVERY_TOPIC, "node names"),
     Part(AccessVerb.SUBSCRIBE, ROS_DISCOVERY_TOPIC, "node names"),
 )
-"""The endpoints that every process of ROS 2 needs to start."""
+"""The endpoints that every ROS 2 process needs to start."""
 
 
 @shows("word", "type", "right", "name", null_if_empty=("type", "right", "name"))
 class Question(NamedTuple):
     """A question about an enclave, such as ``publish topic /chatter``.
 
-    It asks whether the enclave may do ``word`` with ``name``, an absolute ROS name.  If ``name`` is
-    "", it asks whether the enclave may join.  ``only`` replaces the endpoints that the right needs.
+    The question is whether the enclave may do ``word`` with ``name``, an absolute ROS name; if
+    ``name`` is "", whether the enclave may join.  ``only`` replaces the endpoints that the right
+    needs.
     """
 
     word: str
@@ -145,7 +146,7 @@ def ask(word: str, name: str = "", kind: str | None = None) -> Question:
         kind: The type of the name: topic, service or action. By default, call means a service.
 
     Raises:
-        UsageError: No node can do that, or no node could use the name.
+        UsageError: No node can do ``word`` with this kind of name, or no node could use the name.
     """
     if word not in WORDS:
         raise UsageError(
@@ -177,7 +178,7 @@ _OF_ACTIONS = {"call": "call", "serve": "execute"}
 
 
 def about_action(question: Question, rights: Iterable[Right]) -> Question | None:
-    """Return the question about the action with this name, if rights show that it is one.
+    """Return the question about an action with the same name, if rights show such an action.
 
     "call" and "serve" are for services and actions, whose names look the same.  Returns None if
     ``rights`` do not show an action, or if the question is about something else.
@@ -191,11 +192,11 @@ def about_action(question: Question, rights: Iterable[Right]) -> Question | None
 
 
 _COMMANDS = ("send_goal", "cancel_goal")
-"""The services of an action that command its server; get_result only asks."""
+"""The services of an action that command its server; get_result only reads."""
 
 
 def acting_parts(question: Question) -> dict[str, Question]:
-    """Map the parts of an action that act on the other side to questions about each part alone.
+    """Map the parts of an action that act on the other side to questions about these parts.
 
     Whoever may send goals commands the server, without the right to call the whole action; whoever
     may reply or publish for the server informs the clients.  Empty if the question is not about an
@@ -215,7 +216,7 @@ def acting_parts(question: Question) -> dict[str, Question]:
 
 
 def text_of_parts(question: Question, parts: Iterable[str]) -> str:
-    """Return a sentence on what an enclave can do by these parts of an action."""
+    """Return a sentence on what an enclave can do by ``parts`` of an action."""
     does = "command the server" if question.right == "call" else "inform the clients"
     return f"it may do a part of the action, which is enough to {does}: {', '.join(parts)}."
 
@@ -273,7 +274,7 @@ class Provenance(StrEnum):
     CHANGED = "changed"
     """The policy file states other rights than the permissions have."""
     UNKNOWN = "unknown"
-    """The ledger does not say from which policy file the permissions were made."""
+    """The permissions were made from another version or another file with the same rights."""
     PLANNED = "planned"
     """The answer is about the policy; nothing is signed yet."""
 
@@ -282,7 +283,8 @@ class Provenance(StrEnum):
 class PolicyLine(NamedTuple):
     """A line of a policy that states a right or a denial.
 
-    ``group`` and ``profile`` contain the name; ``right`` is the word of the policy language.
+    ``group`` and ``profile`` are the parts of the policy with the line; ``right`` is the word of
+    the policy language.
     """
 
     source: Source
@@ -297,7 +299,7 @@ class PolicyLine(NamedTuple):
 
     @property
     def protection(self) -> Annotated[str, Words(("sign", "encrypt"))] | None:
-        """The protection that the line demands at least, or null."""
+        """The minimum protection that the line demands, or null."""
         return self.group.protect.lower() if self.group.protect else None
 
     def __str__(self) -> str:
@@ -405,7 +407,7 @@ class DecidedPart(NamedTuple):
 class Answer(NamedTuple):
     """The decision of a DDS vendor on a question.
 
-    ``decision`` has the outcome; ``part`` is the endpoint that it is about, or None for joining.
+    ``decision`` has the outcome; ``part`` is the endpoint that was decided on, or None for joining.
     ``grant`` and ``domain_rule`` are the parts of the documents that apply.
 
     `sros_tool.explain.explanation` fills in the other fields.  ``lines`` are the lines of the
@@ -438,12 +440,12 @@ class Answer(NamedTuple):
     change: PolicyChange | None = None
     """The smallest change of the policy that would allow the access, or null."""
     remedy: str = ""
-    """What to do if no change of the policy can help, or null."""
+    """What to do if no change of the policy helps, or null."""
     sign: bool = False
 
     @property
     def counts_key(self) -> bool:
-        """Whether the answer assumes the enclave's key, which is not here."""
+        """Whether the answer assumes that the enclave has its key, which is not here."""
         return self.enclave.key_elsewhere
 
     @property
@@ -478,7 +480,7 @@ class Answer(NamedTuple):
 
     @property
     def denied_by(self) -> str:
-        """Who denies the access, or null."""
+        """The vendor, peer or rule that denies the access, or null."""
         match self.outcome:
             case Outcome.ALLOWED:
                 return ""
@@ -591,9 +593,9 @@ _CREATED = {
 
 
 def recorded_policy(keystore: OpenedKeystore, signed: bytes) -> str:
-    """Return the SHA-256 (hexadecimal) of the policy from which permissions were made.
+    """Return the SHA-256 (hexadecimal) of the policy from which permissions were made, or "".
 
-    The ledger of the keystore has it; without a ledger or an entry, the result is "".
+    The SHA-256 is in the ledger of the keystore; without a ledger or an entry, the result is "".
     """
     digest = hashlib.sha256(signed).hexdigest()
     ledger = keystore.ledger_with("sha256", digest)
@@ -602,7 +604,7 @@ def recorded_policy(keystore: OpenedKeystore, signed: bytes) -> str:
 
 
 def template_default(digest: str) -> str:
-    """Return which default policy of keystore templates has this digest, or "".
+    """Return the default policy of keystore templates that has this digest, or "".
 
     ``digest`` is from `recorded_policy`.  The result is "everything" or "node_basics", as in
     ``permissions.default`` of a template.
@@ -675,7 +677,7 @@ class Evaluator:
 
     @property
     def access(self) -> Access | None:
-        """Access of a process on this vendor; None if it cannot start, or no peer accepts it."""
+        """Access of a process on this vendor; None if it cannot start or every peer refuses it."""
         return self._participant.access
 
     @property
@@ -684,9 +686,9 @@ class Evaluator:
         return _CERTIFICATE_FILES.isdisjoint(problem.file for problem in self._participant.problems)
 
     def for_other_certificates(self) -> Evaluator:
-        """Return the evaluator for whoever has another certificate that the permissions fit.
+        """Return an evaluator for other certificates that the permissions fit.
 
-        Faults of the enclave's own certificate and key do not count for it.
+        Faults of the enclave's own certificate and key do not count for this evaluator.
         """
         faulty = {problem.file for problem in self._participant.problems}
         if not faulty or faulty - {*_CERTIFICATE_FILES, KEY_FILE, KEY_URI_FILE}:

@@ -1,4 +1,4 @@
-"""Open the enclave that a question is about, and find out what the question's name means.
+"""Open the enclave of a question, and find out whether its name means a service or an action.
 
 The enclave is in a keystore, a folder or a policy.  The command line and the Python API both use
 this module.
@@ -93,14 +93,14 @@ def fleet_of(file: Path | None, keystore: OpenedKeystore | None) -> Fleet | None
 
 
 class AskedEnclave(NamedTuple):
-    """An enclave to ask about, and the whole policy that was given, if any."""
+    """An enclave to ask about, and the whole policy that the user named, if any."""
 
     enclave: LoadedEnclave
     policy: Policy | None = None
 
     @property
     def has_peers(self) -> bool:
-        """Whether the enclave's peers are in the policy or the keystore: an export lacks some."""
+        """Whether the policy or keystore has all peers of the enclave; an export lacks some."""
         keystore = self.enclave.keystore
         return self.policy is not None or bool(keystore and keystore.has_all_enclaves)
 
@@ -130,7 +130,7 @@ def rights_naming(keystore: OpenedKeystore, name: str) -> Iterator[Right]:
 
 
 def _may_have(document: bytes, name: str) -> bool:
-    """Return whether a document can contain a topic of a ROS name, perhaps with escapes."""
+    """Return whether a document can contain a topic of a ROS name, including escaped characters."""
     text = name.encode()
     return text in document and (
         b"rt" + text in document or b"rq" + text in document or b"rr" + text in document
@@ -138,7 +138,7 @@ def _may_have(document: bytes, name: str) -> bool:
 
 
 def _rights_in(enclave: str, data: bytes) -> Iterator[Right]:
-    """Yield the rights in a permissions document; of each subject, only the first grant counts."""
+    """Yield the rights in a permissions document, by the first grant for each subject."""
     from sros_tool.pki import smime
     from sros_tool.translate import grant_rights
 
@@ -196,7 +196,7 @@ def is_policy(path: Path) -> bool:
 
 
 def policy_to_ask(file: Path, fleet: Fleet | None) -> tuple[Policy, Policy]:
-    """Return a policy as its file states it, and with its placeholders filled in for a fleet."""
+    """Return a policy as in its file, and with its placeholders filled in for a fleet."""
     from sros_tool.fleet.expansion import FleetPolicy
     from sros_tool.policy.document import read_policy
 
@@ -264,7 +264,7 @@ def signed_enclave(
 
 
 def _load_enclave(folder: Path, moment: datetime) -> LoadedEnclave:
-    """Load the enclave in a folder; its name is the common name of its certificate, or ""."""
+    """Load the enclave in a folder, under the common name of its certificate, or ""."""
     from sros_tool.pki.certificates import common_name_of
 
     state = open_enclave(folder, now=moment)
@@ -277,8 +277,8 @@ def planned_enclave(
 ) -> LoadedEnclave:
     """Return the enclave as the policy would create it, with the keystore's governance.
 
-    Without a keystore, the governance is the default template's, with the protection that the
-    policy demands.
+    Without a keystore, the governance is the one of the default template, with the protection that
+    the policy demands.
     """
     from sros_tool.keystore.participant import plan_enclave
     from sros_tool.keystore.protection import governance_with_stated
@@ -300,7 +300,7 @@ def planned_enclave(
 def _action_meant(
     evaluator: Evaluator, question: Question, read_other_rights: Callable[[], Iterable[Right]]
 ) -> Question | None:
-    """Return the same question about an action if rights show an action of this name; else None.
+    """Return the question about an action, if rights show an action of this name; else None.
 
     The rights of the enclave are read first.  If they deny the service, ``read_other_rights``
     returns more rights, such as those in its policy and keystore.
@@ -319,7 +319,7 @@ def _action_meant(
 def taken_for_action(question: Question, action: Question) -> tuple[Note, ...]:
     """Return a note that a question about a service is answered for an action.
 
-    Empty for ``call``, because a policy uses this word for actions.
+    Empty for ``call``, because policies use this word for actions only.
     """
     if action.word == question.word:
         return ()
@@ -354,7 +354,7 @@ def note_on_action(
 def question_meant(
     evaluator: Evaluator, asked_enclave: AskedEnclave, question: Question, kind: str | None
 ) -> tuple[Question, tuple[Note, ...]]:
-    """Return the question to answer, and a note if it differs from the question that was asked."""
+    """Return the question to answer, with a note if the user asked a different question."""
     if not kind:
         action = _action_meant(
             evaluator, question, lambda: asked_enclave.other_rights(question.name)

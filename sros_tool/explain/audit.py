@@ -1,12 +1,13 @@
 """Find the rights that observed ROS nodes use and that a policy or keystore denies.
 
-DDS Security cannot only log denials: either its rules are enforced, or there is no security.  So
-nothing is enforced here.  The decision engine decides on each endpoint in the ROS graph, in the
-enclave in which its process would run; the denials are those that a secured robot would log.
+DDS Security has no mode that only logs denials: either its rules are enforced, or there is no
+security. So an audit enforces nothing: the decision engine decides on each endpoint in the ROS
+graph, in the enclave in which its process would run, and the audit reports the denials that a
+secured robot would log.
 
-On a robot without security, the graph shows the enclave / for most processes.  Then the name of the
-node tells the enclave: by the profiles of the policy, or by the services of nodes that permissions
-of a keystore name.
+On a robot without security, the graph shows the enclave / for most processes.  Then the enclave
+follows from the name of the node: by the profiles of the policy, or by the services of nodes that
+permissions of a keystore name.
 
 Nodes that were not observed are not judged: the result names the nodes of the policy or keystore
 that did not appear, and everything in the graph that belongs to no enclave.
@@ -83,7 +84,7 @@ class EnclaveNodes:
     def enclaves_for(self, node: str) -> frozenset[str]:
         """Return the enclaves for the node with this full name.
 
-        Enclaves with exactly this name are preferred to those with wildcards.
+        Enclaves with exactly this name are preferred to enclaves with a matching wildcard.
         """
         exact = frozenset(name for name, nodes in self.by_enclave.items() if node in nodes)
         return exact or frozenset(
@@ -94,7 +95,7 @@ class EnclaveNodes:
 
     @property
     def expected(self) -> frozenset[EnclaveNode]:
-        """The nodes that should run on the robot; tools that observe it are left out."""
+        """The nodes that should run on the robot, without tools that observe the robot."""
         return frozenset(
             EnclaveNode(enclave, node)
             for enclave, nodes in self.by_enclave.items()
@@ -111,7 +112,8 @@ class EnclaveNode:
     """The enclave of the node."""
     node: str
     """Full name of the node, perhaps with wildcards; empty if the nodes of the enclave are not
-    known, and no node was seen in it."""
+    known, and no node of the enclave was seen.
+    """
 
     def __str__(self) -> str:
         """Return text like ``node /talker of enclave /robot/talker``."""
@@ -125,7 +127,7 @@ def _is_of(node: str, name: str) -> bool:
 
 @dataclass(frozen=True)
 class AuditedEnclaves:
-    """The enclaves of a policy or keystore (``what``), with an evaluator for each."""
+    """The enclaves of a policy or keystore (``what``), and a function that returns an evaluator."""
 
     what: str
     nodes: EnclaveNodes
@@ -135,7 +137,7 @@ class AuditedEnclaves:
     _evaluators: dict[str, Evaluator] = field(default_factory=dict)
 
     def evaluator(self, enclave: str) -> Evaluator:
-        """Return the evaluator for an enclave; loads the enclave only once."""
+        """Return the evaluator for an enclave; an enclave is loaded only once."""
         if enclave not in self._evaluators:
             loaded = self.load(enclave)
             self._evaluators[enclave] = Evaluator(self.vendor, loaded, self.context)
@@ -148,7 +150,7 @@ def audited_enclaves(
     """Return the enclaves of a keystore, or of the policies of a robot, with a vendor's decisions.
 
     A policy counts as signed, with the governance of the default template; ``fleet`` has the robots
-    that fill in its placeholders.
+    that fill in the policy's placeholders.
 
     Raises:
         UsageError: a path is neither a policy nor a keystore, a keystore is one of several paths,
@@ -186,7 +188,7 @@ def audited_enclaves(
 def policy_enclaves(
     policy: Policy, governance: Governance, vendor: Vendor, context: JoinContext
 ) -> AuditedEnclaves:
-    """Return the enclaves of a policy, as if it were signed now with this governance."""
+    """Return the enclaves of a policy, as if the policy were signed now with ``governance``."""
     nodes = {
         enclave.path: tuple(expand("~", p.ns, p.node) for p in enclave.all_profiles())
         for enclave in policy.enclaves
@@ -229,10 +231,10 @@ def keystore_enclaves(
 class DeniedRight:
     """A right that nodes of an enclave use, and that DDS would deny.
 
-    ``nodes`` are the full names of the nodes.  ``right.name`` is a DDS topic if it has no ROS name.
-    ``endpoints`` are the endpoints that the nodes need.  With ``by_rule``, a deny rule denies the
-    right, so that a new allow rule would not help.  With ``new_enclave``, the node has no enclave
-    yet, and the enclave of ``right`` is a proposal.
+    ``nodes`` are the full names of the nodes.  ``right.name`` is a DDS topic if the topic has no
+    ROS name. ``endpoints`` are the endpoints that the nodes need.  With ``by_rule``, a deny rule
+    denies the right, so that a new allow rule would not help.  With ``new_enclave``, the node has
+    no enclave yet, and the enclave of ``right`` is a proposal.
     """
 
     right: Right
@@ -310,9 +312,9 @@ class Audit:
     """The result of an audit of observed nodes.
 
     ``refused`` maps enclaves to the reason why no process could start there, or find peers.
-    ``observation`` has the judged nodes, each with the enclaves in which it was judged. ``unseen``
-    are the ``expected`` nodes of the policy or keystore that did not appear.  ``unjudged`` says in
-    words what was observed but not judged.
+    ``observation`` has the judged nodes, with the enclaves in which they were judged. ``unseen``
+    are the ``expected`` nodes of the policy or keystore that did not appear.  ``unjudged`` are
+    clauses on what was observed but not judged.
     """
 
     denied: tuple[DeniedRight, ...]
@@ -329,9 +331,9 @@ class Audit:
         return not (self.denied or self.refused)
 
     def lines(self) -> dict[str, str]:
-        """Return a line for each refused enclave, denied right and node without an enclave.
+        """Return lines on refused enclaves, denied rights and nodes without enclave, by key.
 
-        The key of a line stays the same while more rights of a node without an enclave are seen.
+        The key of a line does not change when more rights of a node without an enclave are seen.
         """
         lines = {name: f"{name}: every process: {why}" for name, why in self.refused.items()}
         lines = dict(sorted(lines.items()))
@@ -368,9 +370,9 @@ def _base_name(node: str) -> str:
 def audit(observation: Observation, enclaves: AuditedEnclaves, observer: str = "") -> Audit:
     """Return the rights that observed nodes use and that their enclaves would be denied.
 
-    If the nodes of a process match several enclaves, each is judged, with a note. ``observer`` is
-    the enclave of the process that observed, or "": an enclave without named nodes counts as seen
-    if that process runs in it.
+    If the nodes of a process match several enclaves, all these enclaves are judged, with a note.
+    ``observer`` is the enclave of the process that observed, or ""; this enclave counts as seen if
+    it names no nodes.
     """
     unjudged = _unjudged_notes(observation)
     notes = [note for note, _ in unjudged]
@@ -459,9 +461,9 @@ _STRAYS = "not judged, because the writers or readers of these topics belong to 
 
 
 def _unjudged_notes(observation: Observation) -> list[tuple[Note, str]]:
-    """Return notes on observed things that were not judged, each with their number and names.
+    """Return notes on what was not judged, paired with a text of number and names.
 
-    The text of number and names is "" for tools that only observe.
+    The text is "" for tools that only observe.
     """
     tools = {node.fqn for node in observation.nodes if is_tool(node)}
     active = {node.fqn for node in observation.nodes if is_tool(node) and not _only_observes(node)}
@@ -516,7 +518,7 @@ def _only_observes(node: ObservedNode) -> bool:
 def _enclaves_of(
     process: Sequence[ObservedNode], known: EnclaveNodes
 ) -> tuple[frozenset[str], bool]:
-    """Return the enclaves in which a process may run, and whether they match all of its nodes.
+    """Return the enclaves in which a process may run, and whether all nodes of the process fit.
 
     The enclave that the graph shows counts even if it is meant for other nodes.
     """
@@ -581,7 +583,7 @@ def _denied_rights(
 
 
 def _rights_of(node: ObservedNode, enclave: str) -> Iterator[tuple[Right, tuple[Endpoint, ...]]]:
-    """Yield the rights that a node uses, each with the endpoints that it needs."""
+    """Yield the rights that a node uses, with the endpoints that need the right."""
     folded = rights_of_endpoints(node.endpoints)
     for right in folded.rights:
         yield Right(enclave, ALLOW, right.right, right.name), _endpoints(right.right, right.name)
@@ -605,7 +607,7 @@ def _without_enclave(node: ObservedNode, source: str) -> Iterator[DeniedRight]:
 
 
 def _group_by_right(denied: Iterable[DeniedRight]) -> tuple[DeniedRight, ...]:
-    """Return the denied rights without duplicates, sorted, with all nodes that use each right."""
+    """Return the denied rights sorted and without duplicates, with all nodes that use the right."""
     by_right: dict[Right, DeniedRight] = {}
     for right in denied:
         other = by_right.get(right.right, right)
@@ -615,7 +617,7 @@ def _group_by_right(denied: Iterable[DeniedRight]) -> tuple[DeniedRight, ...]:
 
 
 def _nodes_using_denied(denied: Iterable[DeniedRight], observation: Observation) -> Observation:
-    """Return the nodes with the endpoints of denied rights, without rights that a rule denies."""
+    """Return the nodes with the endpoints of denied rights that no deny rule denies."""
     wanted: dict[tuple[str, str], set[Endpoint]] = {}
     for right in denied:
         if right.by_rule:

@@ -1,13 +1,13 @@
 """Read denied topics in the logs of secured nodes, and propose the missing rights.
 
-The texts of the logs are in `sros_tool.runtime.log_texts`.  Fast DDS names the topic and, in a
-line nearby, whether it is for a writer or a reader.  Cyclone DDS first checks whether a topic may
-be used at all; only the next message of rcl has the direction.  Cyclone DDS logs nothing if the
+The texts of the logs are in `sros_tool.runtime.log_texts`.  Fast DDS names the topic and, in a line
+nearby, the kind of endpoint: writer or reader. Cyclone DDS first checks whether a topic may be used
+at all; only the next message, of rcl, has the direction.  Cyclone DDS logs nothing if the
 governance protects the discovery of the topic.
 
-A log is no proof: a process can print any line, even one that looks like a denial, and so ask for
-rights that it should not have.  So each denial names the process that printed it, and a person
-decides.
+A log is no proof: a process can print any line, even a line that looks like a denial, and so ask
+for rights that the process should not have.  So each denial names the process that printed it, and
+a person decides.
 """
 
 from __future__ import annotations
@@ -64,9 +64,9 @@ class Denial:
 
     ``by_rule`` says whether a deny rule denies the topic, so that an allow rule would not help
     (None: unknown), ``remote`` whether the permissions of a peer deny it.  ``enclave`` is "" if the
-    log does not name it.  ``process`` is the label of the process that printed the denial, or "",
-    and ``lines`` the numbers of its lines, from 1.  ``folder`` is the folder from which the process
-    loaded its enclave, or "".
+    log does not name the enclave.  ``process`` is the label of the process that printed the denial,
+    or "", and ``lines`` the numbers of its lines, from 1.  ``folder`` is the folder from which the
+    process loaded its enclave, or "".
     """
 
     topic: str
@@ -82,9 +82,9 @@ class Denial:
 
 @dataclass(frozen=True, slots=True)
 class MissingRights:
-    """The rights that nodes lack according to denials in logs, by enclave ("" if not named).
+    """The rights that nodes lack according to denials in logs, by enclave ("" if unknown).
 
-    No rights are proposed for other denials: those without a direction (``unclear``), by a deny
+    No rights are proposed for other denials: denials without a direction (``unclear``), by a deny
     rule (``by_rule``), by the permissions of a peer (``remote``), and of topics without a ROS name
     (``foreign``).
     """
@@ -97,10 +97,10 @@ class MissingRights:
 
 
 def read_denials(text: str) -> tuple[Denial, ...]:
-    """Return the denied topics in a log without colors, each topic once for each process.
+    """Return the denied topics in a log without colors; every topic once for each process.
 
     The labels that ros2 launch, journald or Docker Compose put before lines distinguish the
-    processes in a log; the enclave named by one process is not used for another one.
+    processes in a log; the enclave that one process names is not used for other processes.
     """
     processes: dict[str, list[tuple[int, str]]] = {}
     for number, line in enumerate(log_lines(text), 1):
@@ -140,7 +140,7 @@ def _denials_of(process: str, numbered: list[tuple[int, str]]) -> Iterator[Denia
 
 
 def _direction(lines: list[str], topic: str) -> tuple[bool, str]:
-    """Return, from a denial and the lines after it, whether a peer is denied, and the direction."""
+    """Return, from a denial and the lines after it, whether a peer denies, and the direction."""
     for line in lines:
         other = denied_topic(line)
         if other and other[1]["topic"] != topic:
@@ -159,9 +159,9 @@ def _direction(lines: list[str], topic: str) -> tuple[bool, str]:
 
 
 def propose(denials: Iterable[Denial]) -> MissingRights:
-    """Return the rights without which the denials happened, as far as the log shows them.
+    """Return the rights whose lack caused the denials, as far as the log shows this.
 
-    A node stops at the first refusal.  So a denied topic of a service leads to a right to the
+    A node stops at the first refusal. So a denied topic of a service leads to a right to the
     service, and a denied service of an action to a right to the action.
     """
     rights: dict[str, set[NodeRight]] = {}
@@ -216,7 +216,7 @@ def _without_parts(rights: set[NodeRight]) -> frozenset[NodeRight]:
 
 
 _ANY_NODE = ("/", "*")
-"""The namespace and name of a profile for any node, in an enclave that has nodes with names."""
+"""Namespace and name of a profile for any node, in an enclave that also has named nodes."""
 
 _OTHER = (
     "not proposed, because the policy has no profile for nodes with these names; start them with "
@@ -240,7 +240,7 @@ _SEVERAL = Note(
 )
 
 _NODE_PARTS = ("common/node.xml", "common/node/parameters.xml")
-"""Files to include, the largest first; a node that lacks a right of a file lacks the include."""
+"""Files to include, the largest first; a node without a right of a file lacks this include."""
 
 
 def learned_from_logs(
@@ -251,7 +251,7 @@ def learned_from_logs(
     node: tuple[str, str] | None,
     present: Policy | None,
 ) -> tuple[Learned, list[AskingLine], bool]:
-    """Return the rights missing by logs, the lines that ask for them, and whether any was denied.
+    """Return rights that logs report missing, the log lines, and whether a right was denied.
 
     Args:
         logs: the texts of the logs by their paths.
@@ -284,7 +284,7 @@ def learned_from_logs(
 def lines_asking_for(added: Iterable[Right], lines: Iterable[AskingLine]) -> list[AskingLine]:
     """Return the log lines that ask for any of the rights ``added``.
 
-    A policy may state the right of a line already, and deny it.
+    Leaves out lines whose right the policy already states or denies.
     """
     rules = Rules(added)
 
@@ -310,14 +310,14 @@ def as_learned(
 ) -> Learned:
     """Return the proposed rights as profiles.
 
-    With ``enclave``, only that enclave gets rights: from denials that name it or no enclave.
-    ``node`` (namespace and name) names the profile.  Without it, the rights go to
-    the node whose standard services were denied, else to the only profile of the enclave in
-    ``policy``, else to a profile for any node: DDS checks only the enclave.  If ``policy`` does not
-    have the enclave, the node is assumed to have the last part of its name, with a note.  A node
-    that is not in the policy gets a note instead of rights.  With ``common``, a node that has none
-    of the rights that every node needs gets all of them, if it was denied one of them, or if the
-    profile is new in a policy that is ``written``.
+    With ``enclave``, only that enclave gets rights: from denials that name this enclave or none.
+    ``node`` (namespace and name) names the profile. Without ``node``, the rights go to the node
+    whose standard services were denied, else to the only profile of the enclave in ``policy``, else
+    to a profile for any node: DDS checks only the enclave.  If ``policy`` does not have the
+    enclave, the node is assumed to have the last part of the enclave's name, with a note. A node
+    that is not in the policy gets a note instead of rights. With ``common``, a node that has none
+    of the rights that every node needs gets all these rights, if such a right was denied to the
+    node, or if the profile is new in a policy that is ``written``.
 
     Raises:
         UsageError: The log does not name the enclave of a denial, and ``enclave`` is "".
@@ -367,7 +367,7 @@ def as_learned(
 def _rights_by_enclave(
     missing_rights: MissingRights, enclave: str
 ) -> dict[str, frozenset[NodeRight]]:
-    """Return the rights by enclave; only of ``enclave`` if it is not ""."""
+    """Return the rights by enclave; with ``enclave``, only the rights of that enclave."""
     rights_by_enclave: dict[str, frozenset[NodeRight]] = {}
     for named, rights in missing_rights.rights.items():
         if enclave and named not in ("", enclave):
@@ -388,7 +388,7 @@ def _rights_by_profile(
     node: tuple[str, str] | None,
     present: Mapping[tuple[str, str], frozenset[NodeRight]],
 ) -> dict[tuple[str, str], frozenset[NodeRight]]:
-    """Return the rights by the profile to which they are added: its namespace and node name."""
+    """Return the rights by the profile that gets them: namespace and node name."""
     if node is not None:
         return {node: rights}
     nodes = nodes_served((right.right, right.name) for right in rights)
@@ -421,10 +421,10 @@ def _missing_common_part(
     node_rights: frozenset[NodeRight],
     common: CommonParts,
 ) -> tuple[str, ...]:
-    """Return, as a tuple, the common part that a profile needs and does not include; or ().
+    """Return a tuple with the common part that a profile needs and does not include; or ().
 
-    The profile needs a part if one of its rights was denied (None: any), and lacks the part if it
-    has none of its rights.
+    A profile needs a part if a right of the part was denied (None: any right), and lacks the part
+    if the profile has no right of the part.
     """
     if is_expression(profile[1]):
         return ()

@@ -1,4 +1,4 @@
-"""Whether earlier permissions, or revoked certificates, may allow what is denied now."""
+"""Notes on earlier permissions and revoked certificates that may still give a denied right."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ from sros_tool.wording import first_few
 def note_on_earlier_permissions(
     keystore: OpenedKeystore, denied: Collection[str], now: datetime
 ) -> Iterator[Note]:
-    """Yield a note on enclaves that are ``denied`` now, if earlier permissions may allow it.
+    """Yield a note on enclaves that are ``denied`` now, but perhaps allowed by earlier permissions.
 
-    Permissions cannot be revoked: earlier permissions work with every certificate that they fit,
-    until either expires or the certificate is revoked.  The ledger does not have the rights of
-    earlier permissions; those that were signed from the same policy as the present ones do not
-    count.  If the ledger or a revocation list cannot be read, or lines are missing, the note says
-    so.
+    Permissions cannot be revoked: earlier permissions work with every fitting certificate, until
+    the permissions or the certificate expire, or the certificate is revoked. The ledger does not
+    have the rights of earlier permissions; permissions from the same policy as the present
+    permissions do not count. The note also reports a ledger or revocation list that is unreadable
+    or lacks lines.
     """
     if not denied or not keystore.has(LEDGER):  # an export, or a keystore of ros2/sros2
         return
@@ -72,8 +72,8 @@ def note_on_revoked_enclaves(
 ) -> Iterator[Note]:
     """Yield notes on enclaves whose revoked certificates are still accepted and give the right.
 
-    DDS accepts them in processes without the current revocation list; Zenoh (``vendor`` None) has
-    no revocation list.  ``named`` are the enclaves that have the right now.
+    DDS processes without the current revocation list accept revoked certificates; Zenoh (``vendor``
+    None) has no revocation list.  ``named`` are the enclaves that have the right now.
     """
     kind = "explain.revoked-enclaves"
     try:
@@ -224,6 +224,6 @@ _UNKNOWN = {
 
 
 def _unknown(keystore: OpenedKeystore, kind: str, reason: str, remedy: str = "") -> Note:
-    """Return a note of a kind that says why the answer is not known, and what to do."""
+    """Return a note which says that the answer is not known, for what reason, and what to do."""
     remedy = remedy or f"`sros check {quote(str(keystore.root))}` says what to do."
     return Note(kind, f"{_UNKNOWN[kind]} is not known: {reason}. {remedy}")

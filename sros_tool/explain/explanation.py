@@ -55,7 +55,7 @@ from sros_tool.terminal import log_step
 
 
 def explain(evaluator: Evaluator, question: Question) -> Answer:
-    """Return the answer to a question with its policy lines and, for a denial, change or remedy."""
+    """Return the answer with policy lines and, for a denial, a change of the policy or a remedy."""
     answer, enclave = evaluator.answer(question), evaluator.enclave
     log_step(
         "INFO",
@@ -84,7 +84,7 @@ def explain(evaluator: Evaluator, question: Question) -> Answer:
 
 
 def _provenance(enclave: LoadedEnclave, recorded: str) -> Provenance | None:
-    """Return whether the permissions were made from the policy, according to the ledger."""
+    """Return whether permissions were made from the policy, according to the ledger."""
     if enclave.policy is None:
         return None
     if not enclave.signed:
@@ -97,7 +97,7 @@ def _provenance(enclave: LoadedEnclave, recorded: str) -> Provenance | None:
 
 
 def _has_rules_of_policy(enclave: LoadedEnclave) -> bool:
-    """Return whether the grant that DDS reads has the rules that the policy states."""
+    """Return whether the grant that DDS reads has exactly the rules that the policy states."""
     from sros_tool.translate import permissions_for
 
     assert enclave.policy
@@ -242,7 +242,7 @@ _NO_RULE = frozenset({"no-rule", "default"})
 def _smallest_change(evaluator: Evaluator, answer: Answer) -> PolicyChange | None:
     """Return the smallest change of the policy that makes the vendor allow a denied question.
 
-    The change is for the enclave's policy or, if there is none, for the rights in its permissions.
+    The change is for the enclave's policy or, without a policy, for the rights in the permissions.
     Returns None if no policy could allow the question.
     """
     enclave, question = evaluator.enclave, answer.question
@@ -301,7 +301,7 @@ def _present_rights(policy: Enclave | None, name: str, answer: Answer) -> set[Ri
 def _blocking_denials(rights: Iterable[Right], answer: Answer) -> list[Right]:
     """Return the denials from which the deciding expression of an answer comes.
 
-    Denials of the other direction count only if there are no others: Cyclone DDS denies a whole
+    Denials of the other direction count only if no other denials exist: Cyclone DDS denies a whole
     topic because of a denial in either direction.
     """
     expression = answer.decision.expression or ""
@@ -325,8 +325,8 @@ _ANY_NODE = ("/", "*")
 def _added_xml(right: Right, places: Iterable[tuple[str, str]]) -> str:
     """Return the XML of a policy with one right, in the profile of the closest node.
 
-    The closest of the ``places`` (namespace and name of nodes) is the one with the longest
-    namespace that contains the right's name.  Without places, the profile is for any node.
+    ``places`` are namespaces and names of nodes; the closest node has the longest namespace that
+    contains the right's name.  Without places, the profile is for any node.
     """
     known = list(places)
     fitting = [place for place in known if right.name.startswith(place[0].rstrip("/") + "/")]
@@ -366,8 +366,8 @@ _ALIKE = 0.9
 def likely_names(answer: Answer) -> tuple[str, ...]:
     """Return at most three allowed names that may be meant instead of the denied name.
 
-    For a service that every node offers, they are the same services of the enclave's nodes.  For
-    any other name, they are names with the same last part (a forgotten remapping), or else names
+    For a service that every node offers, these are the same services of the enclave's nodes. For
+    any other name, these are names with the same last part (a forgotten remapping), or else names
     with a similar spelling.
     """
     question = answer.question
@@ -376,10 +376,10 @@ def likely_names(answer: Answer) -> tuple[str, ...]:
 
 
 def likely_meaning(right: Right, used: Collection[Right], named: Iterable[Right]) -> str:
-    """Return what a policy may mean instead of a denied right, as a clause; "" for nothing.
+    """Return a clause on the name that a policy may mean instead of a denied right, or "".
 
-    ``used`` are the rights that the node uses, so they are no mistakes; ``named`` are the
-    `named_rights` of its enclave.
+    ``used`` are rights that the node uses, and that are therefore no mistakes; ``named`` are the
+    `named_rights` of the node's enclave.
     """
     if right.kind == "dds":
         return ""
@@ -402,7 +402,7 @@ def remapping_clause(name: str, meant: str) -> str:
 
 
 def meaning_of_other_kind(right: Right, named: Iterable[Right]) -> str:
-    """Return a clause if ``named`` have the name as an action, not as a service, or the reverse."""
+    """Return a clause if ``named`` have the name as an action, not a service, or the reverse."""
     for other in named:
         if other.name == right.name and {other.kind, right.kind} == {"services", "actions"}:
             kind = "an action" if other.kind == "actions" else "a service"
@@ -430,7 +430,7 @@ def _similar_names(name: str, names: AbstractSet[str], is_service: bool) -> tupl
 
 
 _SHOWN = 3
-"""Highest number of names that are proposed."""
+"""Maximum number of names that are proposed."""
 
 
 def _group_edits(lifted_rights: list[Right], policy: Enclave) -> Iterator[GroupEdit]:

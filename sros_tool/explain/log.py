@@ -100,11 +100,10 @@ from sros_tool.values import shows
 from sros_tool.wording import first_few
 
 _WORDS = (re.compile(r"[\w/]+"), re.compile(r"[^\s(]+"), re.compile(r"\S+"))
-"""Patterns that split a log line into words: without punctuation, or with the punctuation of
-topics."""
+"""Patterns that split a log line into words: without punctuation, or with that of topics."""
 _NUMBERS = re.compile(r"\b[0-9a-f]{2}(?:\.[0-9a-f]{2}){5,}\S*|\d+")
 _LONGEST = 8000
-"""Number of characters of a line that are read, because a line may have many megabytes."""
+"""Maximum number of characters read from a line, because a line may have many megabytes."""
 
 
 @shows(
@@ -126,7 +125,7 @@ class LogFinding:
     line: int
     """First line of the log with the message, from 1."""
     count: int
-    """How often the message occurs in the log."""
+    """Number of log lines with the message."""
     text: str
     """Text of the first line."""
     process: str
@@ -138,7 +137,7 @@ class LogFinding:
     remedy: str
     """What to do about the cause."""
     found: tuple[str, ...] = ()
-    """Causes that sros saw in the enclave itself."""
+    """Causes that sros found in the enclave."""
     checked: bool = False
     """Whether the enclave was examined."""
     zenoh: bool = False
@@ -157,7 +156,7 @@ class ExplainedLog(NamedTuple):
     log: str
     """Path of the log."""
     findings: Sequence[LogFinding]
-    """The security messages, each once."""
+    """The different security messages."""
     notes: Sequence[Note]
     """Notes, which text output prints on standard error."""
 
@@ -185,10 +184,11 @@ class SearchedKeystore:
         return self._by_node.get(node, ())
 
     def has_other_side(self, right: Right) -> bool | None:
-        """Return whether an enclave has the right that the peers of a right need, by its name.
+        """Return whether an enclave states, by exact name, the right that peers of ``right`` need.
 
-        None if that is not known, as with unreadable permissions, or if an enclave has the right
-        only by a wildcard. In an export, the enclave with the right may be missing (see `place`).
+        Returns None if that is not known, as with unreadable permissions, or if an enclave has the
+        right only by a wildcard. In an export, the enclave with the right may be missing (see
+        `place`).
         """
         exact, expressions = self._allowed_names[PEER_RIGHT[right.right]]
         if right.name in exact:
@@ -200,7 +200,7 @@ class SearchedKeystore:
 
     @cached_property
     def zenoh_routers(self) -> frozenset[str]:
-        """The enclaves of Zenoh routers, by the settings (or their default) and by router files."""
+        """The enclaves of Zenoh routers, by the settings or defaults, and by router files."""
         from sros_tool.zenoh.configuration import ZenohNetwork  # most logs do not come from Zenoh
 
         network = None
@@ -214,7 +214,7 @@ class SearchedKeystore:
 
     @cached_property
     def rotates(self) -> bool:
-        """Whether a CA rotation is in the stage in which the new CAs have issued all files."""
+        """Whether a CA rotation is in the stage after which all files are from the new CAs."""
         try:
             return read_rotation(self._keystore).stage is RotationStage.REISSUE
         except SrosError:
@@ -232,13 +232,13 @@ class SearchedKeystore:
 
     @property
     def place(self) -> str:
-        """The source of the enclaves: the keystore, or an export, which may lack enclaves."""
+        """A word for the source of the enclaves: keystore or export."""
         is_whole = self._rights is not None and self._rights.scope is None
         return "keystore" if is_whole else "export"
 
     @cached_property
     def _allowed_names(self) -> Mapping[str, tuple[frozenset[str], Names]]:
-        """Map each right to the exact names, and to the wildcards, that enclaves have."""
+        """Map each right to the exact names, and the wildcards, for which enclaves have it."""
         names: dict[str, set[str]] = {right: set() for right in PEER_RIGHT}
         for right in self._rights.rights if self._rights else ():
             if right.qualifier is ALLOW and right.right in names:
@@ -262,7 +262,7 @@ class SearchedKeystore:
 class AskedPolicy:
     """The policy that explains a log, perhaps of a robot that uses the policy in a namespace.
 
-    ``file`` is its path, and ``name`` the enclave that the user named, or "".
+    ``file`` is the path of the policy, and ``name`` the enclave that the user named, or "".
     """
 
     file: str
@@ -282,7 +282,7 @@ class AskedPolicy:
         return enclave.removesuffix(path) if path else "", path
 
     def enclave(self, enclave: str) -> Enclave | None:
-        """Return an enclave as the robot has it, or None if no enclave of the policy fits."""
+        """Return the enclave with its path on the robot, or None if no enclave fits."""
         ns, path = self.place(enclave)
         stated = self.policy.enclave(path) if path else None
         if stated is None:
@@ -292,7 +292,7 @@ class AskedPolicy:
 
 
 FindEnclave = Callable[[str], LoadedEnclave | None]
-"""Function that loads an enclave by name ("": the one that the user named), or returns None."""
+"""Function that returns an enclave by name ("": the enclave that the user named), or None."""
 
 
 def explain_log_of(
@@ -303,11 +303,11 @@ def explain_log_of(
     asking: AskingContext,
     policy_file: Path | None = None,
 ) -> ExplainedLog:
-    """Explain the security messages of a log, and examine the enclaves that it names.
+    """Return the explained messages of a log; examines the enclaves that the log names.
 
     ``name`` is the enclave, or its folder, whose processes wrote the log; "" if the log names the
-    enclave itself, or ``keystore`` is the folder of the enclave alone.  With ``policy_file``, there
-    is no keystore, and only denials are examined: by the rights in the policy.
+    enclave, or if ``keystore`` is the folder of a single enclave.  With ``policy_file``, there is
+    no keystore, and only denials are examined: by the rights in the policy.
 
     Raises:
         UsageError: ``name`` is an enclave, and there is no keystore.
@@ -383,13 +383,14 @@ def explain_log(
     keystore: SearchedKeystore | None = None,
     policy: AskedPolicy | None = None,
 ) -> tuple[LogFinding, ...]:
-    """Return the security messages of a log, each once, in the order of the log.
+    """Return the different security messages of a log, in the order of the log.
 
     Lines that are not understood follow at the end, with one finding for each process.
 
-    ``find`` loads an enclave; ``context`` returns domain and time for it.  ``root`` is the path of
-    the keystore as suggested commands name it.  The enclaves of peers and nodes in the log are
-    looked up in ``keystore``.  ``policy`` is the policy if enclaves are from one.
+    ``find`` loads an enclave; ``context`` returns the domain and time for a loaded enclave.
+    ``root`` is the path of the keystore as suggested commands name it.  The enclaves of peers and
+    nodes in the log are looked up in ``keystore``.  ``policy`` is set if the enclaves are from a
+    policy.
     """
     plain = plain_text(text)
     examiner = _Examiner(find, context, root, keystore, policy)
@@ -418,7 +419,7 @@ def explain_log(
 
 @dataclass(frozen=True, slots=True)
 class _Hit:
-    """A log line with a known text; ``fields`` are the groups of the text's pattern."""
+    """A log line with a known text; ``fields`` are the groups that the text's pattern matched."""
 
     line: int
     text: str
@@ -510,7 +511,7 @@ def _meaning_of(line: str, rest: str) -> tuple[LogText, re.Match[str] | None]:
 
 
 def _strongest_hits(hits: Iterable[_Hit], reported: set[str]) -> Iterator[_Hit]:
-    """Yield the hits, without weak hits if the same process has a stronger one.
+    """Yield the hits, without weak hits of processes that also have a stronger hit.
 
     ``reported`` are the processes whose denied topics are reported separately.
     """
@@ -534,7 +535,7 @@ def _grouped_hits(hits: Iterable[_Hit]) -> Iterator[list[_Hit]]:
 def _lines_naming(
     lines: list[str], denials: Sequence[Denial]
 ) -> Mapping[Denial, list[tuple[int, str]]]:
-    """Map denials to the numbers and texts of lines that name their topic.
+    """Map denials to the numbers and texts of lines that name the denied topic.
 
     If a process was denied a topic for several causes, a line that reports no denial belongs to the
     last denial before it.
@@ -574,9 +575,7 @@ _DROPPED: Mapping[tuple[str, bool], str] = {
     ("Reply", False): "call",
     ("Declare Queryable", False): "call",
 }
-"""Maps a kind of message, and whether it was an incoming message, to the right that the remote
-process lacks.
-"""
+"""Kind of message and whether the message was incoming → right that the remote process lacks."""
 _GRAPH: Mapping[tuple[str, bool], str] = {
     ("Liveliness Token", True): "announce this node, topic or service in the graph",
     ("Liveliness Token", False): "see this node, topic or service in the graph",
@@ -588,11 +587,11 @@ _GRAPH: Mapping[tuple[str, bool], str] = {
 def _dropped_message_findings(
     lines: Iterable[str], root: str, own_name: str, keystore: SearchedKeystore | None
 ) -> Iterator[LogFinding]:
-    """Yield a finding for each right whose lack made Zenoh drop messages.
+    """Yield a finding for each missing right for which Zenoh dropped messages.
 
-    ``own_name`` is the enclave of the process that wrote the log, "" if unknown.  If the process
-    drops a message to or from its router, the process itself lacks the right: its rules for the
-    router are its own rights.
+    ``own_name`` is the enclave of the process that wrote the log, "" if unknown. If the process
+    drops a message to or from its router, the process itself lacks the right, because its rules for
+    the router are its own rights.
     """
     numbered = ((n, *labeled_line(line[:_LONGEST])) for n, line in enumerate(lines, 1))
     groups: dict[tuple[str, str, bool, str], list[DroppedMessage]] = {}
@@ -634,7 +633,7 @@ def _dropped_message_findings(
 def _remedy_for_dropped(
     dropped: DroppedMessage, enclave: str, dropped_right: str, root: str
 ) -> str:
-    """Return the remedy if ``enclave``, "" if unknown, may not do ``dropped_right``."""
+    """Return the remedy for a dropped message if ``enclave`` ("": unknown) lacks the right."""
     if not dropped.name:
         return (
             "The log line with `on Interface(...)+CertCommonName(...)` and this zid has the name "
@@ -659,7 +658,7 @@ def _remedy_for_dropped(
 
 
 class _Examiner:
-    """Searches the enclaves that a log names for the causes of its messages."""
+    """The search for causes of log messages in the enclaves that the log names."""
 
     def __init__(
         self,
@@ -677,7 +676,7 @@ class _Examiner:
         self._evaluators: dict[tuple[Vendor, str], Evaluator] = {}
 
     def _meaning(self, hit: _Hit, enclave: LoadedEnclave | None) -> LogText | None:
-        """Return the meaning of a hit in its enclave; None if it is no security message."""
+        """Return the meaning of a hit in its enclave; None if the hit is no security message."""
         unnamed = hit.enclave == "/" and enclave is None
         if hit.meaning is not RUNS_OPEN:
             return NO_ENCLAVE if unnamed and hit.meaning.id == "files-missing" else hit.meaning
@@ -689,7 +688,7 @@ class _Examiner:
         return UNNOTICED_FAULT if problems else None
 
     def message(self, hits: list[_Hit]) -> LogFinding | None:
-        """Return the finding for one group of equal messages; None if they are no trouble."""
+        """Return the finding for a group of equal messages; None if the messages are no trouble."""
         named = self._find(hits[0].enclave)
         meaning = self._meaning(hits[0], named)
         if meaning is None:
@@ -742,7 +741,7 @@ class _Examiner:
         )
 
     def _other_folder_remedy(self, path: str, remedy: str) -> str:
-        """Return the remedy if this keystore lacks a folder that a log reports missing."""
+        """Return the remedy for a folder that a log reports missing and this keystore lacks."""
         place, inside, name = path.rpartition("/enclaves/")
         if not inside or self._keystore is None:
             return ""
@@ -757,7 +756,7 @@ class _Examiner:
         )
 
     def _with_names(self, text: str, enclave: LoadedEnclave | None, hit: _Hit) -> str:
-        """Return a remedy with keystore, enclave and the hit's fields for its placeholders."""
+        """Return a remedy with keystore, enclave and the hit's fields in place of placeholders."""
         own_name = enclave.name if enclave else hit.enclave.rstrip("/")
         own_name = "" if hit.meaning in (NO_ENCLAVE, RUNS_OPEN) else own_name
         if self._is_export and NEEDS_CA_KEYS.search(text):
@@ -823,7 +822,7 @@ class _Examiner:
         return replace(finding, found=tuple(known), checked=bool(known), remedy=text)
 
     def missing_namespaces(self, denials: Iterable[Denial]) -> dict[tuple[str, str], str]:
-        """Map pairs of process and enclave to the namespace that all denied names lack.
+        """Map pairs of process and enclave to the namespace that is missing in all denied names.
 
         Empty unless a service that every node offers is among the names: otherwise a remapping may
         be missing, not the namespace of the process.
@@ -858,7 +857,7 @@ class _Examiner:
     def denial(self, denial: Denial, named: list[tuple[int, str]], ns: str = "") -> LogFinding:
         """Return the finding for a denied topic; ``named`` are the lines that name the topic.
 
-        ``ns`` is the namespace that the whole process lacks, or "".
+        ``ns`` is the namespace that is missing in all names of the process, or "".
         """
         line, text = named[0][0], " ".join(named[0][1].split())
         right, name, kind = _in_ros_terms(denial)
@@ -928,7 +927,7 @@ class _Examiner:
         return replace(finding, found=tuple(facts), checked=True, remedy=remedy)
 
     def _other_folder_cause(self, denial: Denial, enclave: LoadedEnclave) -> tuple[list[str], str]:
-        """Return cause and remedy if the process runs from another folder than the enclave's."""
+        """Return cause and remedy if the process loaded its files from another folder."""
         folder, loaded = Path(denial.folder), None
         with suppress(SrosError, OSError):  # the path comes from the log, so it may be anything
             if folder.is_absolute() and enclave.folder and not folder.samefile(enclave.folder):
@@ -972,7 +971,7 @@ class _Examiner:
     def _similar_name_cause(
         self, denial: Denial, name: str, enclave: LoadedEnclave, remedy: str
     ) -> tuple[list[str], str]:
-        """Return causes and a remedy if the enclave has rights to similar names."""
+        """Return causes and a remedy if the enclave has rights to similarly spelled names."""
         questions = _questions_to_ask(denial)
         if len(questions) != 1 or denial.by_rule:
             return [], ""
@@ -1008,7 +1007,7 @@ class _Examiner:
         return [], f"{renamed}Otherwise, {remedy}" if renamed else ""
 
     def _how_to_ask(self, denial: Denial, name: str) -> str:
-        """Return the commands that show which rights a policy lacks for the topic of a denial."""
+        """Return the commands that show which rights a policy lacks for a denied topic."""
         root, enclave = self._root or "KEYSTORE", denial.enclave or "ENCLAVE"
         asked, advice = self._policy.file if self._policy else root, ""
         if self._policy:
@@ -1049,7 +1048,7 @@ class _Examiner:
     def _causes(
         self, enclave: LoadedEnclave, answer: Answer, faults: tuple[Fault, ...]
     ) -> Iterator[tuple[str, str]]:
-        """Yield faults of the enclave with remedies: those in ``faults``, or else all of them."""
+        """Yield faults of the enclave with remedies: those in ``faults``, or else all faults."""
         fitting = [problem for problem in answer.problems if problem.fault in faults]
         for problem in fitting or answer.problems:
             yield str(problem), remedy(problem.fault, self._root, enclave.name, problem.file)
@@ -1084,7 +1083,7 @@ class _Examiner:
 
 
 def _keystore_with(path: str) -> Path | None:
-    """Return the keystore that has the enclave folder named in a log; None if there is none.
+    """Return the keystore that has the enclave folder ``path`` of a log, or None.
 
     The check is strict, because the log chooses the path, and the remedy changes the owner of the
     keystore.
@@ -1098,7 +1097,7 @@ def _keystore_with(path: str) -> Path | None:
 
 
 def _unknown_cause(hits: Iterable[_Hit]) -> str:
-    """Return the cause for lines that are not understood: their texts, without repetitions."""
+    """Return the cause for lines with unknown meaning: the different texts of these lines."""
     lines: dict[str, int] = {}
     for hit in hits:
         lines.setdefault(_NUMBERS.sub("", plain_refusal(hit.text)), hit.line)
@@ -1109,7 +1108,7 @@ def _unknown_cause(hits: Iterable[_Hit]) -> str:
 
 
 def _with_name(text: str, word: str, name: str) -> str:
-    """Return a remedy with the quoted ``name`` in place of ``word``; unchanged for "".
+    """Return a remedy with the quoted ``name`` in place of ``word``; unchanged if ``name`` is "".
 
     Braces are doubled, because the remedy is a format string.
     """
@@ -1123,7 +1122,7 @@ def _with_name(text: str, word: str, name: str) -> str:
 _COMMAND = re.compile(r"(`sros\b[^`]*`)")
 _MOST_LINES = 20
 _MOST_PEERS = 5
-"""Highest number of peers that are examined for one message."""
+"""Maximum number of peers that are examined for one message."""
 _OF_ROTATION = ("peer-signature", "peer-permissions-ca")
 _NOT_RESTARTED = {
     Vendor.FAST: "Restart this process{of}: it was not restarted since stage 1, and so does not "
@@ -1141,7 +1140,7 @@ _TOPICS_OF_EVERY_NODE = ("rt/rosout", "rt/parameter_events")
 
 
 def _nodes(answer: Answer) -> tuple[str, ...]:
-    """Return a clause on the nodes that an enclave's permissions name, in a tuple; or ()."""
+    """Return a tuple with a clause on the nodes that an enclave's permissions name; or ()."""
     nodes = _served_names(answer)
     if nodes:
         return (f"its permissions are for {_listed_nodes(nodes)}",)
@@ -1154,7 +1153,7 @@ def _served_names(answer: Answer) -> tuple[str, ...]:
 
 
 def _renaming_advice(nodes: Sequence[str], wrong: str, enclave: str) -> str:
-    """Return the remedy for a node named ``wrong`` in ``enclave``, which is for other ``nodes``.
+    """Return the remedy for a node named ``wrong`` in an enclave that is for other ``nodes``.
 
     A rule without the name of a node renames all nodes of a process.
     """
@@ -1212,8 +1211,8 @@ def _nothing_found(enclave: LoadedEnclave) -> str:
 def _in_ros_terms(denial: Denial) -> tuple[str, str, str]:
     """Return the denied operation (one of `answer.WORDS`, or "use"), the ROS name, and its type.
 
-    A topic or a service of an action counts as the action.  For a topic that belongs to no ROS
-    name, the name is the topic, and the type is "".
+    A topic or a service of an action counts as the action. For a topic without a ROS name, the name
+    is the topic, and the type is "".
     """
     right, name = right_to_use(denial.topic, writes=denial.direction == PUBLISH)
     if not right:
@@ -1253,6 +1252,6 @@ def _questions_to_ask(denial: Denial) -> tuple[Question, ...]:
 
 
 def _question(denial: Denial) -> Question:
-    """Return a question about the denied topic alone."""
+    """Return a question about the denied topic only."""
     part = Part(AccessVerb(denial.direction), denial.topic)
     return Question(denial.direction, "topic", denial.direction, denial.topic, (part,))

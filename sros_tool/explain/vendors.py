@@ -66,7 +66,7 @@ from sros_tool.wording import first_few
 class ZenohNextToDds(NamedTuple):
     """The decision of Zenoh, shown next to the decision of DDS.
 
-    ``problem`` says why the decision is not known, or is "".
+    ``problem`` is the reason that the decision is not known, or "".
     """
 
     zenoh: ZenohInBrief | None
@@ -82,7 +82,7 @@ class VendorExplanation(NamedTuple):
     asked: Asked
     answer: Answer
     vendor_why: str
-    """Why this vendor was chosen."""
+    """Reason for the choice of this vendor."""
     beside: ZenohNextToDds | None
     notes: tuple[Note, ...]
 
@@ -111,7 +111,7 @@ class DistributionAnswer(NamedTuple):
 
     @property
     def measured(self) -> bool:
-        """Whether the rules that decide were tested with this release of the DDS."""
+        """Whether the deciding rules were tested with this release of the DDS."""
         return self.shipped.tested
 
     @property
@@ -163,7 +163,7 @@ class Comparison(NamedTuple):
 
     @property
     def sentence(self) -> str:
-        """Who decides differently than the first vendor or distribution, as a sentence."""
+        """A sentence on the vendors or distributions that decide differently than the first."""
         if self.vendors:
             return _vendor_differences(self.vendors)
         decided = [(answer.shipped.title, answer.outcome) for answer in self.distributions or ()]
@@ -174,7 +174,7 @@ DdsExplanation = VendorExplanation | Comparison
 
 
 class Compared(Enum):
-    """The compared decisions: of all vendors, or of all distributions."""
+    """The decisions to compare: of all vendors, or of all distributions."""
 
     VENDORS = auto()
     DISTRIBUTIONS = auto()
@@ -192,7 +192,7 @@ def explain_on_dds(
     """Return the decision of the chosen vendor, or of all vendors or distributions.
 
     ``chosen_vendor`` is the vendor and the reason to choose it; ``kind`` is the kind of the name
-    (topic, service or action) if the user gave it; ``compared`` says what is compared.
+    (topic, service or action) if the user gave it; ``compared`` selects the decisions to compare.
     """
     vendor, why = chosen_vendor
     enclave = asked_enclave.enclave
@@ -299,7 +299,7 @@ def _earlier_permissions_notes(answer: Answer, now: datetime) -> Iterator[Note]:
 
 
 def _note_on_action(evaluator: Evaluator, answer: Answer, kind: str | None) -> Iterator[Note]:
-    """Yield a note if the enclave may not call the service, but an action with this name."""
+    """Yield a note if the enclave may not call the service, but an action with the same name."""
 
     def decide(action: Question) -> tuple[bool, Sequence[str]]:
         decided = evaluator.answer(action)
@@ -336,9 +336,9 @@ def _not_a_topic_notes(answer: Answer, asked_enclave: AskedEnclave) -> Iterator[
 
 
 def _other_name_notes(answer: Answer, asked_enclave: AskedEnclave) -> Iterator[Note]:
-    """Yield a note if another name may be meant: a similar name, or a name that somebody offers.
+    """Yield a note if another name may be meant: a similar name, or a name with an offering peer.
 
-    A name that a peer has a right to is no mistake.
+    A name to which a peer has a right is no mistake.
     """
     question = answer.question
     if answer.allowed or answer.problems or not question.right:
@@ -394,7 +394,7 @@ def _note_on_fitting_permissions(evaluator: Evaluator, answer: Answer) -> Iterat
 def _fitting_holders(evaluator: Evaluator) -> Iterator[Evaluator]:
     """Yield evaluators of enclaves whose permissions also fit the certificate of another enclave.
 
-    Only enclaves are read whose paths have all parts of the enclave's path.
+    Reads only enclaves whose paths have all parts of the enclave's path.
     """
     enclave, keystore = evaluator.enclave, evaluator.enclave.keystore
     own_parts, certified = {*enclave.name.split("/")}, {enclave.name: enclave.subject}
@@ -416,7 +416,7 @@ def _fitting_holders(evaluator: Evaluator) -> Iterator[Evaluator]:
 def _zenoh_decision(
     enclave: LoadedEnclave, question: Question, context: JoinContext
 ) -> ZenohNextToDds | None:
-    """Return Zenoh's decision, or why it is unknown; None if the keystore has no Zenoh files."""
+    """Return Zenoh's decision, or the reason that it is unknown; None without Zenoh files."""
     keystore = enclave.keystore
     if keystore is None or enclave.state is None or not is_keystore(keystore.root):
         return None
@@ -435,7 +435,8 @@ def _zenoh_decision(
 def _runs_on_zenoh(keystore: OpenedKeystore, name: str) -> bool:
     """Return whether an enclave has Zenoh files, or the keystore is set up for Zenoh.
 
-    If the settings have no [zenoh] part, other enclaves are not examined: there may be thousands.
+    If the settings have no [zenoh] part, other enclaves are not examined, because there may be
+    thousands.
     """
     if any((keystore.folder(name) / file).is_file() for file in ZENOH_SIGNED):
         return True
@@ -450,14 +451,14 @@ def _runs_on_zenoh(keystore: OpenedKeystore, name: str) -> bool:
 
 
 class OpenedParts(NamedTuple):
-    """Whether processes without an identity have a right, or else which of its `acting_parts`."""
+    """Whether processes without an identity have a right, or else its `acting_parts`."""
 
     whole: bool = False
     parts: tuple[str, ...] = ()
 
     @staticmethod
     def joined(opened: Iterable[OpenedParts]) -> OpenedParts:
-        """Return what is open in at least one of several enclaves or domains."""
+        """Return the open parts of several enclaves or domains together."""
         known = tuple(opened)
         if any(opened_parts.whole for opened_parts in known):
             return OpenedParts(whole=True)
@@ -484,19 +485,21 @@ class VendorOutcome(NamedTuple):
     domains: str = ""
     """The ROS domains in which the enclave has the right, such as ``10`` or ``10,20``, or null."""
     opened: OpenedParts = OpenedParts()
-    """What the enclave's governance gives to processes without an identity."""
+    """The rights that the enclave's governance gives to processes without an identity."""
     in_part: Sequence[str] = ()
     """The parts of an action, such as ``send_goal``, by which the enclave can command the server
-    (with call) or inform the clients (with execute), although it does not have the whole right."""
+    (with call) or inform the clients (with execute), without the whole right.
+    """
     by_permissions_of: Sequence[str] = ()
-    """The other enclaves whose permissions fit the certificate of this enclave and allow it, so
-    that whoever has the key of this enclave may do it, too."""
+    """The other enclaves whose permissions fit the certificate of this enclave and allow the
+    access, so that a process with the key of this enclave has the right, too.
+    """
     subject: str = ""
     granted: str = ""
 
     @property
     def allowed(self) -> bool:
-        """Whether the enclave has the right that was asked for."""
+        """Whether the enclave has the right in question."""
         return self.outcome.ok
 
     @property
@@ -511,7 +514,7 @@ class VendorOutcome(NamedTuple):
 
     @property
     def stopped(self) -> str:
-        """Why no process can run in the enclave with its current files, or ""."""
+        """The reason that no process can run in the enclave with its current files, or ""."""
         runs = self.outcome not in (Outcome.REFUSED, Outcome.CRASHES)
         return "" if runs else self.text.partition(": ")[2]
 
@@ -528,17 +531,17 @@ class WhoByVendor(NamedTuple):
     vendor: Vendor
     """The DDS vendor, as `--vendor` takes it."""
     vendor_why: str
-    """Why this vendor was chosen."""
+    """Reason for the choice of this vendor."""
     domain: int | None
     """The ROS domain of ``--domain``; null for every domain."""
     enclaves: Sequence[VendorOutcome]
-    """All enclaves, with the decision for each."""
+    """All enclaves, with the vendor's decision on the enclave."""
     export: bool = False
     """Whether the question was about an export, which may lack enclaves of its keystore."""
 
     @property
     def anybody(self) -> bool:
-        """Whether processes without an identity have the right, too, by the governance."""
+        """Whether the governance also gives the right to processes without an identity."""
         return any(outcome.anybody for outcome in self.enclaves)
 
     @property
@@ -577,7 +580,7 @@ def _outcome(evaluator: Evaluator, name: str, question: Question) -> VendorOutco
 
 
 def _opened_parts(evaluator: Evaluator, question: Question) -> OpenedParts:
-    """Return what processes without an identity may do, by the enclave's governance."""
+    """Return the access that the enclave's governance gives to processes without an identity."""
     access = evaluator.access
     opened = access.topics_of_unauthenticated() if access else None
     if opened is None or not question.parts:
@@ -610,9 +613,9 @@ def _note_on_anybody(opened_parts: Iterable[OpenedParts], remedy: str) -> Iterat
 
 
 class VendorOfPolicy(NamedTuple):
-    """The decisions of a vendor on the enclaves of a policy, by the permissions that it would give.
+    """The decisions of a vendor on the enclaves of a policy, by the permissions to be signed.
 
-    Only enclaves that match one of the ``patterns`` are asked about; without patterns, all are.
+    With ``patterns``, only enclaves that match a pattern are decided on.
     """
 
     policy: Policy
@@ -652,12 +655,14 @@ class VendorOfPolicy(NamedTuple):
 
 
 _MOST_NARROWED = 100
-"""If more enclaves than this are asked about, sros decides on all: other permissions may fit, too.
+"""Maximum number of enclaves that are decided on alone; for more, sros decides on all enclaves.
+
+Other enclaves matter because their permissions may also fit.
 """
 
 
 class VendorOfKeystore(NamedTuple):
-    """The decisions of a vendor on the enclaves ``names`` of a keystore; without names, on all."""
+    """The decisions of a vendor on the enclaves ``names`` of a keystore, or on all enclaves."""
 
     keystore: OpenedKeystore
     vendor: Vendor
@@ -723,7 +728,7 @@ class VendorOfKeystore(NamedTuple):
         return tuple(o for o in self._with_holders(outcomes) if o.enclave in asked)
 
     def _with_holders(self, outcomes: Sequence[VendorOutcome]) -> tuple[VendorOutcome, ...]:
-        """Return the outcomes; denials name allowed enclaves whose permissions also fit."""
+        """Return the outcomes; denials name allowed enclaves whose permissions fit."""
         certified = {o.enclave: o.subject for o in outcomes if o.subject and not o.allowed}
         granted = {o.enclave: [o.granted] for o in outcomes if o.granted}
         vendors = {self.vendor, *(self.stated(o.enclave) or self.vendor for o in outcomes)}
@@ -744,7 +749,7 @@ class VendorOfKeystore(NamedTuple):
         )
 
     def notes(self, question: Question, outcomes: Sequence[VendorOutcome]) -> Iterator[Note]:
-        """Yield notes on an export, which may lack enclaves, and on whoever else may do it."""
+        """Yield notes on enclaves that an export lacks, and on other holders of the right."""
         # As in `outcomes`.
         from sros_tool.explain.earlier import note_on_earlier_permissions, note_on_revoked_enclaves
         from sros_tool.explain.who import note_on_export

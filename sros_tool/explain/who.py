@@ -1,4 +1,4 @@
-"""Decide a question for all enclaves of a keystore, and find whom an enclave can influence."""
+"""Decide a question for all enclaves of a keystore, and find the enclaves that one influences."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class EnclaveOutcome(Protocol):
 
     @property
     def allowed(self) -> bool:
-        """Whether the enclave has the right that was asked for."""
+        """Whether the enclave has the right in question."""
 
     @property
     def anybody(self) -> bool:
@@ -66,7 +66,7 @@ class EnclaveOutcome(Protocol):
 
     @property
     def stopped(self) -> str:
-        """Why no process can run in the enclave with its current files, or ""."""
+        """The reason that no process can run in the enclave with its current files, or ""."""
 
     @property
     def domains(self) -> str:
@@ -85,7 +85,7 @@ _Outcome = TypeVar("_Outcome", bound=EnclaveOutcome)
 
 
 class Decider(Protocol):
-    """A DDS vendor, or Zenoh, and the keystore or policy on whose enclaves it decides."""
+    """A DDS vendor, or Zenoh, with the keystore or policy that has the enclaves to decide on."""
 
     @property
     def title(self) -> str:
@@ -95,7 +95,7 @@ class Decider(Protocol):
         """Return the decision for each enclave, sorted by name."""
 
     def rights_naming(self, name: str) -> Iterable[Right]:
-        """Return at least all rights to a ROS name."""
+        """Return all rights to a ROS name, and perhaps further rights."""
 
     def printed(self, question: Question, outcomes: Sequence[Any], /) -> NamedTuple:
         """Return the outcomes in the form that ``--json`` prints."""
@@ -109,12 +109,12 @@ class AnswerForAll(NamedTuple):
 
     question: Question
     outcomes: Sequence[Any]
-    """One `EnclaveOutcome` for each enclave."""
+    """An `EnclaveOutcome` for each enclave."""
     notes: tuple[Note, ...]
 
     @property
     def allowed(self) -> bool:
-        """Whether any enclave can do it, or processes without an identity can."""
+        """Whether any enclave, or any process without an identity, has the right."""
         return any(
             outcome.allowed or outcome.anybody or outcome.by_permissions_of
             for outcome in self.outcomes
@@ -132,7 +132,7 @@ def note_on_export(keystore: OpenedKeystore) -> Iterator[Note]:
 
 
 def answer_for_all(decider: Decider, question: Question, kind: str | None) -> AnswerForAll:
-    """Return the decisions on all enclaves; the name of an action is taken for the action.
+    """Return the decisions on all enclaves, about an action if ``question`` names an action.
 
     ``kind`` is the kind of the name (topic, service or action) if the user gave it.
     """
@@ -163,7 +163,7 @@ def callable_action(decider: Decider, question: Question) -> Note | None:
 
 
 def names_meant(decider: Decider, question: Question, enclaves: Container[str]) -> Note | None:
-    """Return a note on similar names in the rights of ``enclaves``, in case of a typing error."""
+    """Return a note on similar names in the rights of ``enclaves``, for a mistyped name."""
     names = sorted(
         {
             right.name
@@ -186,8 +186,8 @@ def first_allowing_domain(
 ) -> tuple[_Outcome, str, tuple[str, ...]]:
     """Return the decision of the first domains that give the right, else of the first domains.
 
-    Also returns the domains that give the right, as text; or, if none does, the parts of an action
-    that some domain gives.
+    Also returns text with the domains that give the right; or, if no domain gives the right, the
+    parts of an action that at least one domain gives.
     """
     allowing = [domains for domains, outcome in outcomes.items() if outcome.allowed]
     shown = DomainSet.of(*((d, d) for domains in allowing for d in domains)) if allowing else ""
@@ -196,7 +196,7 @@ def first_allowing_domain(
 
 
 def decide_each(names: Sequence[str], decide: Callable[[str], _Outcome]) -> tuple[_Outcome, ...]:
-    """Return the decision on each of the enclaves, sorted by name; uses all cores."""
+    """Return the decisions on the enclaves, sorted by name; uses all cores."""
     from sros_tool.parallel import map_slices, tick  # not needed for one enclave
 
     def work(part: Sequence[str]) -> list[_Outcome]:
@@ -214,7 +214,7 @@ def decide_each(names: Sequence[str], decide: Callable[[str], _Outcome]) -> tupl
 
 
 class ReachedStep(NamedTuple):
-    """A step of a path: one enclave sends, another receives."""
+    """A step of a path: an enclave sends, and another enclave receives."""
 
     from_: str
     """The enclave that sends."""
@@ -243,13 +243,14 @@ class ReachedEnclave(NamedTuple):
 
 @shows("path", "left_out", "domain", "enclave", "influences", "learns_from")
 class FollowedReach(NamedTuple):
-    """The enclaves that one enclave can influence and learn from."""
+    """The enclaves that an enclave can influence, and the enclaves from which it can learn."""
 
     path: Path
     """Path of the keystore or policy."""
     left_out: Sequence[str]
-    """Topics that do not count, and services (as */NAME) whose requests do not count, because they
-    change nothing."""
+    """Topics that do not count, and services (as */NAME) whose requests change nothing, and
+    therefore do not count.
+    """
     domain: int | None
     """The ROS domain in which information flows; null for every domain."""
     reach: Reach
@@ -283,8 +284,7 @@ def follow_reach(
     """Return the enclaves that an enclave can influence and learn from, by the rights of a source.
 
     ``infrastructure`` says whether topics of all nodes, and requests that only read, count too.
-    Information goes from enclave to enclave in any ROS domain that both have, or in ``domain``
-    alone.
+    Information goes from enclave to enclave in any common ROS domain, or only in ``domain``.
 
     Raises:
         KeystoreError: the keystore does not have the enclave, or the enclave has no rights.
@@ -350,9 +350,9 @@ def follow_reach(
 
 
 def _fitting_holders(source: RightsSource, enclave: str) -> list[str]:
-    """Return the enclaves of a keystore whose permissions also fit the certificate of another one.
+    """Return the other enclaves of a keystore whose permissions fit an enclave's certificate.
 
-    Only enclaves are compared whose paths have all parts of the enclave's path.
+    Compares only enclaves whose paths have all parts of the enclave's path.
     """
     parts = {*enclave.split("/")}
     granted = {
@@ -383,7 +383,7 @@ def _admits_strangers(governance: Governance) -> bool:
 
 
 def _access_in_domain(unguarded_access: Iterable[Unguarded], domain: int) -> Iterator[Unguarded]:
-    """Yield, as rights in one domain, the access that the domain's governance leaves open."""
+    """Yield the access that the governance of a domain leaves open, as rights in this domain."""
     only = DomainSet.of((domain, domain))
     for topics in unguarded_access:
         if topics.domains is None or domain in topics.domains:
@@ -393,10 +393,10 @@ def _access_in_domain(unguarded_access: Iterable[Unguarded], domain: int) -> Ite
 def _rights_of_router(
     source: RightsSource, rights: Iterable[Right], router: str
 ) -> Iterator[Right]:
-    """Yield what a router may send and receive, as rights; nothing for any other enclave.
+    """Yield rights to all that a router may send and receive; nothing for any other enclave.
 
-    By ``rights``, it may receive what its enclaves may send, and send what they may receive. It
-    also has the rights that other routers give it.
+    By ``rights``, a router may receive what its enclaves may send, and send what its enclaves may
+    receive. The router also has the rights that other routers give.
     """
     if router not in source.routers:
         return

@@ -1,4 +1,4 @@
-"""Decide on rights as Zenoh does: by the configurations in a keystore, for each link of processes.
+"""Decide on rights as Zenoh does: by the configurations in a keystore, link by link.
 
 Zenoh reports no denial as an error: a process that denies a message drops it.  In client mode, the
 router and the session itself decide on a right; in peer mode, the sessions of all other enclaves
@@ -93,7 +93,7 @@ _OF_TLS = (CERTIFICATE_FILE, KEY_FILE, IDENTITY_CA_FILE)
 
 
 class _Outcome(StrEnum):
-    """What happens to the messages of an enclave."""
+    """The fate of an enclave's messages."""
 
     ALLOWED = "allowed"
     DROPPED = "dropped"
@@ -110,8 +110,8 @@ class _Outcome(StrEnum):
 class ZenohFile(NamedTuple):
     """The configuration of an enclave's process, as read from the keystore.
 
-    ``process`` is None if the process opens no session, and ``problem`` says why.  ``until`` is the
-    time at which the certificate expires.  ``endpoints`` are the addresses to which a session
+    ``process`` is None if the process opens no session, for the reason ``problem``.  ``until`` is
+    the time at which the certificate expires.  ``endpoints`` are the addresses to which a session
     connects, or at which a router listens.
     """
 
@@ -131,7 +131,7 @@ class Reached(NamedTuple):
     """The enclave."""
     deliveries: tuple[Delivery, ...]
     problem: str
-    """Why its process opens no session, or null."""
+    """Reason that the process of the enclave opens no session, or null."""
 
 
 class DecidingWildcard(NamedTuple):
@@ -140,7 +140,7 @@ class DecidingWildcard(NamedTuple):
     expression: str
     """The key expression."""
     reaches: tuple[str, ...]
-    """The enclaves that a put or a query on the whole wildcard reaches."""
+    """The enclaves that receive a put or a query on the whole wildcard."""
 
 
 class CheckedLink(NamedTuple):
@@ -169,8 +169,8 @@ class ZenohAnswer:
     """The decision of Zenoh on a question about an enclave.
 
     ``text`` is the reason, as a clause.  ``checks`` are the decisions on the messages of the right
-    itself.  ``domains`` are the ROS domains in which the right is allowed, if several were asked
-    about.
+    itself.  ``domains`` are the ROS domains in which the right is allowed, if several domains were
+    decided.
     """
 
     enclave: str
@@ -180,31 +180,32 @@ class ZenohAnswer:
     text: str
     checks: tuple[Check, ...] = ()
     reached: tuple[Reached, ...] = ()
-    """The enclaves with the matching right, such as to subscribe to what this enclave publishes."""
+    """The enclaves with the matching right, such as to subscribe to a published topic."""
     wildcards: tuple[DecidingWildcard, ...] = ()
     """Key expressions with wildcards on which the decision depends."""
     until: datetime | None = None
-    """When the certificate expires, or null."""
+    """The expiry of the certificate, or null."""
     unsigned: tuple[str, ...] = ()
-    """The files that decide and that the permissions CA has not signed."""
+    """The deciding files that the permissions CA has not signed."""
     domains: str = ""
     in_part: tuple[str, ...] = ()
     """The parts of an action, such as ``send_goal``, by which the enclave can command the server
-    (with call) or inform the clients (with execute), although it does not have the whole right."""
+    (with call) or inform the clients (with execute), without the whole right.
+    """
 
     @property
     def anybody(self) -> bool:
-        """Whether processes without an identity have the right, too, by the rules."""
+        """Whether the rules also give the right to processes without an identity."""
         return False
 
     @property
     def by_permissions_of(self) -> tuple[str, ...]:
-        """None: Zenoh reads no permissions."""
+        """Always empty: Zenoh reads no permissions."""
         return ()
 
     @property
     def in_brief(self) -> ZenohInBrief:
-        """Whether Zenoh allows the access, and why."""
+        """The decision of Zenoh, with its reason as a clause."""
         mode = self.mode.value if self.mode else None
         return ZenohInBrief(self.allowed, mode, self.text, self.outcome)
 
@@ -220,22 +221,22 @@ class ZenohAnswer:
 
     @property
     def stopped(self) -> str:
-        """Why the enclave's process opens no session, or ""."""
+        """The reason that the enclave's process opens no session, or ""."""
         return self.text if self.outcome is _Outcome.REFUSED else ""
 
     @property
     def of_router(self) -> bool:
-        """Whether the enclave is a router's."""
+        """Whether the enclave is the enclave of a router."""
         return self.mode is Mode.ROUTER
 
     @property
     def dropped(self) -> Check | None:
-        """The check that drops a message, or None; a check on data if several drop messages."""
+        """The check that drops a message, preferably a check on data, or None."""
         return _check_to_report((check for check in self.checks if not check.allowed), self.enclave)
 
     @property
     def deciding(self) -> Check | None:
-        """The check whose rule decides the answer; None if nothing was checked."""
+        """The check whose rule decides the answer; None without checks."""
         return self.dropped or _check_to_report(self.checks, self.enclave)
 
     @property
@@ -269,7 +270,8 @@ class ZenohEnclaveOutcome(NamedTuple):
     """The ROS domains in which the enclave has the right, such as ``10`` or ``10,20``, or null."""
     in_part: Sequence[str] = ()
     """The parts of an action, such as ``send_goal``, by which the enclave can command the server
-    (with call) or inform the clients (with execute), although it does not have the whole right."""
+    (with call) or inform the clients (with execute), without the whole right.
+    """
 
 
 class WhoOnZenoh(NamedTuple):
@@ -280,7 +282,7 @@ class WhoOnZenoh(NamedTuple):
     vendor: Literal["zenoh"]
     """Always ``"zenoh"``."""
     vendor_why: str
-    """Why Zenoh was chosen."""
+    """Reason for the choice of Zenoh."""
     domain: int | None
     """The ROS domain of ``--domain``; null for every domain."""
     enclaves: Sequence[ZenohEnclaveOutcome]
@@ -290,10 +292,10 @@ class WhoOnZenoh(NamedTuple):
 
 
 class ZenohEvaluator:
-    """An evaluator of questions about the enclaves of one keystore, reusable for many questions.
+    """An evaluator of questions about the enclaves of a keystore, reusable for many questions.
 
     Raises `KeystoreError` if the keystore has no Zenoh configurations, no configuration of a
-    router, or routers that are not connected to each other: what they enforce is then unknown.
+    router, or routers without connection: the enforced rules are then unknown.
     """
 
     def __init__(
@@ -301,7 +303,7 @@ class ZenohEvaluator:
     ) -> None:
         """Read the routers.
 
-        In a copy of a keystore without any keys, all keys count as present, except the key of
+        In a copy of a keystore without keys, all keys count as present, except the key of
         ``joining``.
         """
         keystore.check()
@@ -319,10 +321,10 @@ class ZenohEvaluator:
     def _routers(self) -> dict[str, ZenohFile]:
         """Map the enclaves of routers to their files.
 
-        There is one router, or there are several that are connected to each other.
+        There is a single router, or there are several routers with connections to each other.
 
         Raises:
-            KeystoreError: there is no router, or its rules do not tell what passes.
+            KeystoreError: there is no router, or it is not clear which messages its rules let pass.
         """
         routers = {
             name: self._file(name, ROUTER_FILE)
@@ -350,7 +352,7 @@ class ZenohEvaluator:
         )
 
     def _router_of(self, enclave: str) -> ZenohFile:
-        """Return the file of the router whose rules name an enclave; else of the first router."""
+        """Return the file of the router whose rules name an enclave, or of the first router."""
         for file in self.routers.values():
             if file.process and file.process.access.rules_for(enclave):
                 return file
@@ -363,8 +365,8 @@ class ZenohEvaluator:
 
         Args:
             enclave: the enclave.
-            question: the right that is asked for.
-            reach: also list the enclaves at the other end of the right.
+            question: the question on a right.
+            reach: also list the enclaves that have the matching right.
             brief: do not list unsigned files, and read the router's file in place of the files of
                 peers, which have the same rights.
         """
@@ -411,7 +413,7 @@ class ZenohEvaluator:
     def with_parts(self, answer: ZenohAnswer, *, brief: bool) -> ZenohAnswer:
         """Return an answer with the parts of a denied action that the enclave may do.
 
-        ``brief`` is as in `answer`.
+        For ``brief``, see `answer`.
         """
         if answer.outcome is not _Outcome.DROPPED:
             return answer
@@ -426,7 +428,7 @@ class ZenohEvaluator:
         return bool(needed) and all(check.allowed for check in needed)
 
     def _reason_text(self, check: Check | None) -> str:
-        """Return a clause that names the deciding check, its reason, and the file with its rule."""
+        """Return a clause that names the deciding check, its reason, and the file with the rule."""
         assert check
         file = self._file_of(check.enforcer)
         return f"{check}: {check.decision.why}, in {file} of {check.enforcer}"
@@ -434,7 +436,7 @@ class ZenohEvaluator:
     def outdated_enclaves(self, answer: ZenohAnswer) -> tuple[str, ...] | None:
         """Return the deciding files of an answer that do not match the permissions.
 
-        Only the rules that concern the question are compared.  None if the files cannot be
+        Only the rules that concern the question are compared.  Returns None if the files cannot be
         compared, as in an export.
         """
         try:
@@ -542,12 +544,12 @@ class ZenohEvaluator:
         return ZenohFile(enclave, file, ZenohProcess(name, mode, access), "", until, endpoints)
 
     def _is_left_out(self, problem: Problem) -> bool:
-        """Return whether a copy of the keystore for others lacks the file of a problem, a key."""
+        """Return whether the problem is a missing key, in a copy of the keystore without keys."""
         lacks_key = (problem.file, problem.fault) == (KEY_FILE, Fault.FILE_MISSING)
         return lacks_key and self._counts_keys
 
     def _configuration(self, path: Path) -> tuple[Mode, MessageFilter, tuple[ZenohEndpoint, ...]]:
-        """Return the mode of a process, what it enforces, and where it connects or listens."""
+        """Return a process's mode, its access control, and its endpoints."""
         data = self.keystore.read(path, "Zenoh configuration")
         rendered = self._rendered.read(data)
         # In this form of the file, each rule is written once, with the id from the file.
@@ -571,7 +573,7 @@ class ZenohEvaluator:
             return False
 
     def unsigned_files(self, *zenoh_files: ZenohFile) -> tuple[str, ...]:
-        """Return the files, and the files of the routers, that no permissions CA has signed."""
+        """Return the files of processes and of routers that no permissions CA has signed."""
         return tuple(
             f"{file.enclave}/{file.file}"
             for file in dict.fromkeys((*zenoh_files, *self.routers.values()))
@@ -584,7 +586,7 @@ class ZenohEvaluator:
     def _answer_for_router(
         self, answer: ZenohAnswer, process: ZenohProcess, *, brief: bool
     ) -> ZenohAnswer:
-        """Return the answer for a router's enclave, which may do what passes through the router.
+        """Return the answer for a router's enclave, which may use all that passes the router.
 
         Every session that may receive a message accepts it from the router, and also from a second
         process that has the router's key.
@@ -642,8 +644,9 @@ class ZenohEvaluator:
     ) -> tuple[Check, ...]:
         """Return the checks that decide on the rights of an enclave.
 
-        These are the checks on its link with the router.  If the router denies a right in peer
-        mode, they are the checks on its link with the first peer that allows the right.
+        These are the checks on the enclave's link with the router.  If the router denies a right in
+        peer mode, these are the checks on the enclave's link with the first peer that allows the
+        right.
         """
         checks = tuple(self._link_checks(process, router, wanted_rights))
         if process.mode is not Mode.PEER or brief or all(check.allowed for check in checks):
@@ -664,7 +667,7 @@ class ZenohEvaluator:
         return checks
 
     def _rights(self, enclave: str, question: Question) -> tuple[Right, ...]:
-        """Return the rights that a question needs; () if it asks whether the enclave may join."""
+        """Return the rights that a question needs; () if it asks about joining."""
         return parts(Right(enclave, ALLOW, question.right, question.name)) if question.right else ()
 
     def _link_checks(
@@ -694,7 +697,7 @@ class ZenohEvaluator:
     def _graph_deliveries(
         self, process: ZenohProcess, other: ZenohProcess
     ) -> tuple[Delivery, Delivery]:
-        """Return the deliveries that announce a node of ``process`` and show it other nodes."""
+        """Return the deliveries that announce a node of ``process``, or show other nodes to it."""
         whole_domain = f"@ros2_lv/{self.domain}/**"
         router = self._router_of(process.name).process
         assert router
@@ -712,7 +715,7 @@ class ZenohEvaluator:
     def _reached_enclaves(
         self, zenoh_file: ZenohFile, wanted_rights: Sequence[Right]
     ) -> Iterator[Reached]:
-        """Yield the enclaves that have the right at the other end."""
+        """Yield the enclaves that have the matching right."""
         for name in self.names if wanted_rights else ():
             if name == zenoh_file.enclave or name in self.routers:
                 continue
@@ -755,8 +758,8 @@ class ZenohEvaluator:
     ) -> Iterator[DecidingWildcard]:
         """Yield the deciding wildcards, with the enclaves that a message on the wildcard reaches.
 
-        Only a put or a query can have a wildcard as its key.  It passes only where a rule includes
-        the whole wildcard.
+        Only a put or a query can have a wildcard as its key, and passes only if a rule includes the
+        whole wildcard.
         """
         asked = [right for right in wanted_rights if right.right in ("publish", "request")]
         for wide in dict.fromkeys(filter(None, map(self._wildcard, checks))):
@@ -788,11 +791,11 @@ def _unrestricted_process(name: str, mode: Mode) -> ZenohProcess:
 
 
 _DATA = (Message.PUT, Message.QUERY, Message.LIVELINESS_TOKEN)
-"""The messages that transport data or announce a node; other messages only prepare for them."""
+"""The messages that transport data or announce a node; other messages only prepare these."""
 
 
 def _check_to_report(checks: Iterable[Check], enclave: str) -> Check | None:
-    """Return the check that an answer reports; None if there is none.
+    """Return the check that an answer reports; None without checks.
 
     Checks of data come before other checks; then checks by other enclaves come before checks by
     ``enclave`` itself.
@@ -878,7 +881,7 @@ def _rules(access: MessageFilter) -> Iterator[tuple[object, tuple[str, ...]]]:
 
 
 class ZenohOfKeystore:
-    """The decisions of Zenoh for enclaves of a keystore: ``names``, or all with the router."""
+    """The decisions of Zenoh for enclaves of a keystore: ``names``, or all and the router."""
 
     def __init__(
         self,
@@ -948,7 +951,7 @@ class ZenohOfKeystore:
         return WhoOnZenoh(str(question), "zenoh", self._reason_text, self._domain, shown, is_export)
 
     def notes(self, question: Question, outcomes: Sequence[ZenohAnswer]) -> Iterator[Note]:
-        """Yield notes on an export, files, the router's key, and whoever else may do it."""
+        """Yield notes on an export, files, the router's key, and other holders of the right."""
         from sros_tool.explain.earlier import note_on_revoked_enclaves  # as in `outcomes`
         from sros_tool.explain.who import note_on_export
 
@@ -988,10 +991,10 @@ class ZenohExplanation(NamedTuple):
 
     asked: Asked
     vendor_why: str
-    """Why Zenoh was chosen."""
+    """Reason for the choice of Zenoh."""
     answer: ZenohAnswer
     out_of_date: tuple[str, ...] | None
-    """The deciding files that do not match the permissions for the question; null if not known."""
+    """The deciding files that do not match the permissions for the question; null if unknown."""
     stated: Answer
     keystore: OpenedKeystore
     notes: tuple[Note, ...]
@@ -1013,7 +1016,7 @@ class ZenohExplanation(NamedTuple):
 
     @property
     def policy(self) -> StatedInPolicy | None:
-        """What `--policy` says, or null without it."""
+        """The part of the policy that `--policy` names, or null without `--policy`."""
         return self.stated.policy
 
     @property
@@ -1023,12 +1026,12 @@ class ZenohExplanation(NamedTuple):
 
     @property
     def wants_rights(self) -> bool:
-        """Whether more rights would help; never for a router, because its enclave has no rights."""
+        """Whether more rights would help; never for a router, whose enclave has no rights."""
         return not self.allowed and not self.permitted and not self.answer.of_router
 
     @property
     def remedy(self) -> str:
-        """What to do if no policy can help, or null."""
+        """What to do if no change of the policy helps, or null."""
         return self.written or (self.stated.remedy if self.wants_rights else "")
 
     @property
@@ -1056,7 +1059,7 @@ class ZenohExplanation(NamedTuple):
 
     @property
     def counts_key(self) -> bool:
-        """Whether the answer assumes the enclave's key, which is not here."""
+        """Whether the answer assumes that the enclave has its key, which is not here."""
         return self.asked.question.word != "join" and self.stated.counts_key
 
 
@@ -1070,8 +1073,8 @@ def explain_on_zenoh(
 ) -> ZenohExplanation:
     """Return Zenoh's decision by the files, and the decision by the signed permissions.
 
-    ``why`` is the reason why Zenoh is asked; ``kind`` is the kind of the name (topic, service or
-    action) if the user gave it.
+    ``why`` is the reason to ask Zenoh; ``kind`` is the kind of the name (topic, service or action)
+    if the user gave it.
 
     Raises:
         UsageError: the user named no keystore with the enclave.

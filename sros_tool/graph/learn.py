@@ -1,11 +1,11 @@
 """Learn a policy from an observation of the ROS graph, and write it, or add it to a policy.
 
-Names come over the network; on an unsecured robot, anybody can send them.  So every name that is
-not a plain ROS name is left out, above all a topic that is *named* like a wildcard.  The policy
+Names come over the network, and anybody can send names to an unsecured robot.  So every name that
+is not a plain ROS name is left out, above all a topic that is *named* like a wildcard.  The policy
 uses relative names where they are shorter, and ``*`` for the part of a node's name that changes
-with every start.  A common part is included only if the node has every right in it, so that an
-include never grants more than was observed.  Learned names need no escaping: plain ROS names
-contain no markup.
+with every start.  A common part is included only if the node has every right in this part, so that
+an include never grants more rights than were observed.  Learned names need no escaping: plain ROS
+names contain no markup.
 
 The graph shows the enclave / for a process that was started without ``--ros-args --enclave``, which
 is usual on a robot that is not secured yet: `enclave_per_node` gives such processes enclaves.
@@ -88,10 +88,10 @@ class NodeRight(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class LearnedProfile:
-    """The rights of a node, and how its profile states them.
+    """The rights of a node, and the form in which a profile states them.
 
-    ``rights`` are all its rights, with absolute names.  ``includes`` are the common parts that the
-    profile includes, ``groups`` state the rights that those parts do not contain.
+    ``rights`` are all rights of the node, with absolute names. ``includes`` are the common parts
+    that the profile includes, ``groups`` state the rights that these parts do not contain.
     """
 
     enclave: str
@@ -105,8 +105,8 @@ class LearnedProfile:
 class RightsFound(StrEnum):
     """The source of learned rights.
 
-    ``graph``: the ROS graph was observed; ``log``: the lines of a log deny them; ``audit``: they
-    were observed, and the policy or keystore denies them.
+    ``graph`` stands for rights in the observed ROS graph, ``log`` for rights that a log reports as
+    denied, ``audit`` for observed rights that the policy or keystore denies.
     """
 
     GRAPH = "graph"
@@ -118,7 +118,7 @@ class RightsFound(StrEnum):
 class Learned:
     """The result of learning: profiles sorted by enclave and node, and notes.
 
-    ``source`` says where the rights come from.
+    ``source`` is the source of the rights.
     """
 
     profiles: tuple[LearnedProfile, ...]
@@ -165,7 +165,8 @@ _Place = tuple[str, str, str]
 def learn(observation: Observation, common: CommonParts | None = None) -> Learned:
     """Return the rights that the observed nodes use; profiles may include the parts in ``common``.
 
-    If the enclave of a node is ambiguous, every possible enclave gets its rights, with a note.
+    If the enclave of a node is ambiguous, every possible enclave gets the node's rights, with a
+    note.
     """
     notes = _Notes()
     seen: dict[_Place, set[NodeRight]] = {}
@@ -198,7 +199,7 @@ def learn(observation: Observation, common: CommonParts | None = None) -> Learne
 
 
 def _rights_of(node: ObservedNode, notes: _Notes) -> list[tuple[_Place, frozenset[NodeRight]]]:
-    """Return pairs of place (enclave, namespace, name) and rights: one for each possible enclave.
+    """Return pairs of place (enclave, namespace, name) and rights, for all possible enclaves.
 
     Names that a policy cannot express are left out, with a note.
     """
@@ -266,8 +267,8 @@ def _is_place(ns: str, name: str) -> bool:
 class Folded(NamedTuple):
     """The ROS rights that a node needs for a set of DDS endpoints.
 
-    ``halves`` are service endpoints without the matching request or reply endpoint; ``foreign``
-    are topics that have no ROS name.  A policy can express neither.
+    ``halves`` are service endpoints without the matching request or reply endpoint; ``foreign`` are
+    topics without a ROS name. A policy can express neither ``halves`` nor ``foreign``.
     """
 
     rights: frozenset[NodeRight]
@@ -281,7 +282,7 @@ _ANY_DOMAIN = DomainSet.of((0, 0))
 def rights_of_endpoints(endpoints: Iterable[Endpoint]) -> Folded:
     """Return the ROS rights that a node needs for these DDS endpoints.
 
-    The topics of a service or an action become one right if all of them are there.
+    The topics of a service or an action become a single right if none of them is missing.
     """
     endpoints = tuple(endpoints)
     rule = Rule(True, _ANY_DOMAIN, _criteria(endpoints, PUBLISH), _criteria(endpoints, SUBSCRIBE))
@@ -333,8 +334,10 @@ _CHANGING = (
 )
 _TOOLS = re.compile(r"_ros2cli(_.*)?\Z|(?P<observer>_sros_observer)(_.*)?\Z")
 _OF_OBSERVER = frozenset({Endpoint("rt/parameter_events", PUBLISH)})
-"""The endpoints of an observer of sros. A node with its name but other endpoints is no
-observer."""
+"""The endpoints of an observer of sros.
+
+A node with an observer's name and other endpoints is no observer.
+"""
 
 
 def is_tool(node: ObservedNode) -> bool:
@@ -357,11 +360,11 @@ def stable_name(name: str) -> str:
 
 
 def name_as_written(fqn: str, ns: str, node: str) -> str:
-    """Return an absolute name as the profile of ``node`` in ``ns`` writes it.
+    """Return an absolute name in the form of the profile of ``node`` in ``ns``.
 
-    Private names of the node become ``~/x``, names in its namespace ``x``; others stay absolute.
-    In the root namespace only names without a further slash become relative: deeper ones belong to
-    other namespaces.  The inverse is `expand`.
+    Private names of the node become ``~/x``, names in its namespace ``x``; other names stay
+    absolute. In the root namespace, only names without a further slash become relative, because
+    deeper names belong to other namespaces.  The inverse is `expand`.
     """
     own = expand("~/", ns, node)
     if fqn.startswith(own):
@@ -400,9 +403,9 @@ Parts with more rights come first.
 class CommonParts:
     """The common parts that a policy can include.
 
-    ``rights`` maps the path of a part to its rights, with names as the part writes them.
-    ``missing`` maps the path of a part to the files that have to be copied for it: their content
-    by path, relative to the folder of the policy.
+    ``rights`` maps the path of a part to its rights, with names in the form of the part.
+    ``missing`` maps the path of a part to the files to copy for this part: a map from path,
+    relative to the folder of the policy, to content.
     """
 
     rights: Mapping[str, frozenset[NodeRight]] = field(default_factory=dict)
@@ -433,7 +436,7 @@ class CommonParts:
 
 
 def common_parts(folder: Path, shipped: Path) -> CommonParts:
-    """Return the parts that a policy in ``folder`` can include, read there or from ``shipped``.
+    """Return the parts that a policy in ``folder`` can include, from ``folder`` or ``shipped``.
 
     A part in ``folder`` has priority.  A part of ``shipped`` is left out if ``folder`` has another
     version of a file that the part needs, so that versions never mix.
@@ -467,7 +470,7 @@ def _differs_from_shipped(folder: Path, path: str, needed: Mapping[str, bytes]) 
 
 
 def _part_rights(root: Path, part: str) -> frozenset[NodeRight] | None:
-    """Return the rights that a common part allows; None if it denies any or cannot be read."""
+    """Return the rights that a common part allows; None if it denies a right or is unreadable."""
     includer = Includer(root.resolve())
     file = (root / part).resolve()
     rights = set()
@@ -491,7 +494,7 @@ def _shipped_parts(
 
 
 def _needed_files(root: Path, part: str) -> dict[str, bytes]:
-    """Map the paths of a part and all its includes, relative to ``root``, to their content."""
+    """Map the paths of a part and all its includes, relative to ``root``, to file contents."""
     files: dict[str, bytes] = {}
     waiting = [(root / part).resolve()]
     includer = Includer(root.resolve())
@@ -546,7 +549,7 @@ _TEXTS = {
 
 
 class _Notes:
-    """A collector of the subjects (nodes, topics) of notes; one note lists all of the same kind."""
+    """A collector of the subjects (nodes, topics) of notes; a note lists all subjects of a kind."""
 
     def __init__(self) -> None:
         self._found: dict[str, set[str]] = {}
@@ -564,7 +567,7 @@ class _Notes:
 
 
 def first_subjects(subjects: Sequence[str], separator: str = ", ") -> str:
-    """Return the first five subjects, and how many more there are: "a, b, c, d, e and 2 more"."""
+    """Return the first five subjects, and the number of others: "a, b, c, d, e and 2 more"."""
     return first_few(subjects, _SHOWN, separator)
 
 
@@ -572,7 +575,7 @@ _EVERY_NODE = "common/node.xml"
 
 
 class News:
-    """The nodes and rights that were reported so far; rights that every node needs do not count."""
+    """The nodes and rights that were reported so far, except rights that every node needs."""
 
     def __init__(self, common: CommonParts) -> None:
         self._ordinary = common.rights.get(_EVERY_NODE, frozenset[NodeRight]())
@@ -616,8 +619,8 @@ def enclave_per_node(observation: Observation) -> NamedEnclaves:
 
     The enclave has the namespace and name of the process's node.  If a process has several nodes,
     its enclave is named after the component container, or else after the node with the shortest
-    name.  Notes say which processes have several nodes, which enclaves several processes share, and
-    which names Cyclone DDS mistakes for each other.
+    name.  Notes name processes with several nodes, enclaves of several processes, and names that
+    Cyclone DDS mistakes for each other.
     """
     processes: dict[str, list[ObservedNode]] = {}
     for node in observation.nodes:
@@ -637,14 +640,14 @@ def enclave_per_node(observation: Observation) -> NamedEnclaves:
 def _enclave_name(nodes: Sequence[ObservedNode]) -> str:
     """Return the enclave name for a process with these nodes.
 
-    It is the full name of the main node, without the part that changes with every start.
+    The name is the full name of the main node, without the part that changes with every start.
     """
     main = min(nodes, key=_enclave_rank)
     return replace(main, name=stable_name(main.name).rstrip("_*") or main.name).fqn
 
 
 def _enclave_rank(node: ObservedNode) -> tuple[bool, bool, int, str]:
-    """Return the sort key of a node: a process's enclave is named after the lowest node."""
+    """Return the sort key of a node; the lowest node gives its name to a process's enclave."""
     (reply,) = dds_names("reply", expand(_CONTAINER, node.ns, node.name)).publish
     is_container = Endpoint(reply, PUBLISH) in node.endpoints
     return not is_container, stable_name(node.name) != node.name, len(node.fqn), node.fqn
@@ -707,7 +710,7 @@ _HEADERS = {
      unwanted. -->
 """,
 }
-"""The comment at the head of a learned policy."""
+"""Source of rights → comment at the head of a learned policy."""
 
 
 class AskingLine(NamedTuple):
@@ -718,9 +721,9 @@ class AskingLine(NamedTuple):
     line: int
     """Number of the line, from 1."""
     process: str | None
-    """The process that printed the line; null if the line does not say."""
+    """The process that printed the line; null if it is unknown."""
     enclave: str | None
-    """The enclave that the line names; null if the line names none."""
+    """The enclave that the line names, or null."""
     direction: Annotated[str, Words((PUBLISH, SUBSCRIBE))]
     """The denied direction."""
     topic: str
@@ -729,12 +732,12 @@ class AskingLine(NamedTuple):
 
 @shows(optional=("accepted", "denials"), spread=("observation",))
 class LearnedPolicy(NamedTuple):
-    """The learned rights, and how the policy file changes."""
+    """The learned rights, and the changes of the policy file."""
 
     file: Path | None
     """Path of the policy file; null without FILE."""
     source: RightsFound
-    """Where the rights come from."""
+    """The source of the rights."""
     created: bool
     """Whether the policy file is new, or would be with `--accept`."""
     changed: bool
@@ -743,7 +746,7 @@ class LearnedPolicy(NamedTuple):
     observation: Observation
     """The nodes that were observed; empty for a log."""
     ended: Sequence[str]
-    """The participants of these nodes that ended while they were observed (`--watch`)."""
+    """The nodes whose participants ended while they were observed (`--watch`)."""
     added: Sequence[Right]
     """The rights that are added to the policy."""
     copied: Sequence[str]
@@ -759,9 +762,10 @@ class LearnedPolicy(NamedTuple):
 class Draft(NamedTuple):
     """A change of the policy file at ``path`` that is not written yet.
 
-    ``before`` is the current content of the file, None if there is no file; ``document`` is the
-    new content.  ``copies`` maps the paths of files to create, relative to the policy's folder, to
-    their content.  ``document`` must give all rights in ``least`` and no right outside of ``most``.
+    ``before`` is the current content of the file, None if there is no file; ``document`` is the new
+    content.  ``copies`` maps the paths of files to create, relative to the policy's folder, to
+    their content.  ``document`` must give all rights in ``least``, and no right that is not in
+    ``most``.
     """
 
     path: Path
@@ -782,11 +786,11 @@ class Draft(NamedTuple):
 def draft(path: Path, learned: Learned, common: CommonParts | None) -> Draft:
     """Return the change that adds the ``learned`` rights to the policy file at ``path``.
 
-    Nothing is written.  ``common`` are the parts that ``learned`` may include; None writes one file
-    without includes.
+    Nothing is written. ``common`` are the parts that ``learned`` may include; None stands for a
+    single file without includes.
 
     Raises:
-        PolicyError, DocumentError: the file is not a policy, or no rights can be added to it.
+        PolicyError, DocumentError: the file is not a policy, or rights cannot be added to the file.
     """
     additions = learned.policy()
     rights = policy_rights(additions)
@@ -848,7 +852,7 @@ def _rights_and_profiles(
 
 
 def write(plan: Draft) -> None:
-    """Write a draft to disk; after a failure, no file is changed.
+    """Write a draft to disk, or change nothing after a failure.
 
     Raises:
         PolicyError: the new policy, read again, would not give the expected rights.
@@ -879,7 +883,7 @@ def _check(plan: Draft) -> None:
 
 
 def render(learned: Learned) -> bytes:
-    """Return the learned profiles as a policy file (XML); same profiles, same bytes."""
+    """Return the learned profiles as a policy file (XML); equal profiles give equal bytes."""
     declared = f' xmlns:xi="{_XINCLUDE}"' if learned.includes else ""
     lines = [f'<policy version="{VERSION}"{declared}>', "  <enclaves>"]
     for path, profiles in groupby(learned.profiles, key=lambda profile: profile.enclave):
@@ -916,8 +920,8 @@ def _with_includes(
     """Return the policy file ``merged`` with includes added, and the included parts.
 
     ``merged`` is ``before`` with the learned rights.  A profile that ``before`` already had gets
-    its includes in front of its content.  A new profile gets no includes if the policy denies one
-    of its rights.
+    includes in front of its content. A new profile gets no includes if the policy denies a right of
+    the profile.
     """
     name = f"the policy file '{path}'"
     known = _profiles(EditedText(before, name))
@@ -957,13 +961,13 @@ def merge_policies(
 ) -> Merged:
     """Merge policies into the policy file at ``path``; write nothing.
 
-    Only the ``nodes`` of ``others`` (() for all) are merged.  They are moved to the ``namespace``,
-    remapped by the texts ``remaps``, and put into the ``enclave``.  With ``may_include``, new
-    profiles include common parts in the folder of ``path``.
+    Only the ``nodes`` of ``others`` (() for all) are merged.  These nodes are moved to the
+    ``namespace``, remapped by the rules in ``remaps``, and put into the ``enclave``.  With
+    ``may_include``, new profiles include common parts in the folder of ``path``.
 
     Raises:
-        SrosError: as `merge_all` and `remapped_policies`; or a name is not valid, or no policy has
-            one of the nodes.
+        SrosError: as `merge_all` and `remapped_policies`; or a name is not valid, or a node is in
+            no policy.
     """
     additions = list(others)
     if nodes:
@@ -996,11 +1000,11 @@ def merge_policies(
 
 
 def _with_common_parts(path: Path, merged: bytes, others: Sequence[Policy]) -> bytes:
-    """Return the policy file ``merged``, whose new profiles include the common parts in its folder.
+    """Return the policy file ``merged`` with includes of common parts in its new profiles.
 
-    A profile is new if the file at ``path`` lacks it.  Without includes in ``others``, which were
-    merged into the file, ``merged`` is returned.  Rights never change.  A profile does not change
-    if it states a protection, or if its enclave denies a right in the parts.
+    A profile is new if the file at ``path`` lacks it. Without includes in ``others``, the merged
+    policies, ``merged`` is returned unchanged.  Rights never change.  A profile does not change if
+    it states a protection, or if its enclave denies a right in the parts.
     """
     if not any(
         group.source.file != merged_policy.file
@@ -1044,7 +1048,7 @@ def _allowed_rights(rights: Iterable[Right]) -> frozenset[NodeRight]:
 
 
 def _groups_not_given(given_rights: frozenset[NodeRight], profile: Profile) -> tuple[Group, ...]:
-    """Return the groups of a profile, except names whose rights are all in ``given_rights``."""
+    """Return the groups of a profile, without names whose rights are all in ``given_rights``."""
     groups = []
     for group in profile.groups:
         names = tuple(
@@ -1072,7 +1076,7 @@ def _profiles(text: EditedText) -> dict[tuple[str, str, str], PlacedElement]:
 
 
 def _profiles_of(path: Path, document: bytes) -> frozenset[tuple[str, str, str]]:
-    """Return (enclave, namespace, node) of the profiles in the file itself, not in its includes."""
+    """Return (enclave, namespace, node) of the profiles in the file, but not in its includes."""
     return frozenset(_profiles(EditedText(document, f"the policy file '{path}'")))
 
 
@@ -1095,5 +1099,5 @@ def _put_inside(profile: LearnedProfile, element: PlacedElement, text: EditedTex
 
 
 def _prefix(text: EditedText) -> str | None:
-    """Return the prefix of the XInclude namespace; None if the document declares none."""
+    """Return the prefix of the XInclude namespace; None for a document without a prefix."""
     return next((p for p, uri in text.root.xml.nsmap.items() if p and uri == _XINCLUDE), None)

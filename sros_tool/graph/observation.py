@@ -1,14 +1,14 @@
 """Observations of a ROS graph: nodes with their DDS endpoints, and the union of observations.
 
-Topics have their raw DDS names here (``rt/chatter``, ``rq/addRequest``), because only those are
+Topics have raw DDS names (``rt/chatter``, ``rq/addRequest``), because only raw names are
 unambiguous; `sros_tool.graph.learn` translates them to ROS names.
 
 ``python -P -m sros_tool.graph.observation FD PERIOD`` is the observer process: it reads the ROS
 graph through rclpy, so that a DDS that logs to standard output, refuses or crashes does no harm to
-its parent.  It writes JSON, one object per line, to the file descriptor FD: first
-``{"ready": RMW}`` or ``{"failed": STAGE, "reason": TEXT}``, then the graph after each change.  It
-reads the graph every PERIOD seconds, after a change at once, and exits when its standard input is
-closed.
+its parent.  The observer process writes JSON, one object per line, to the file descriptor FD: first
+``{"ready": RMW}`` or ``{"failed": STAGE, "reason": TEXT}``, then the graph after each change. The
+process reads the graph every PERIOD seconds, after a change at once, and exits when its standard
+input is closed.
 """
 
 from __future__ import annotations
@@ -46,14 +46,14 @@ FAST_DDS = "010f"
 class ObservedNode:
     """A node of a process.
 
-    ``enclaves`` holds the enclave of the process; all candidates, sorted, if the graph does not
-    show which enclave it is.  ``participant`` is the first 12 bytes of the identifiers of the
-    node's endpoints, in hexadecimal (RTPS 2.3, 8.2.4.1): nodes of the same process have the same.
-    On Zenoh it is ``zenoh-`` and the id of the session.
+    ``enclaves`` has the enclave of the process, or all candidates, sorted, if the graph does not
+    show the enclave. ``participant`` is the first 12 bytes of the identifiers of the node's
+    endpoints, in hexadecimal (RTPS 2.3, 8.2.4.1), which nodes of the same process share. On Zenoh,
+    ``participant`` is ``zenoh-`` and the id of the session.
     """
 
     enclaves: tuple[str, ...]
-    """Enclave of the node; several candidates if the graph does not show which."""
+    """Enclave of the node, or several candidates if the graph does not show the enclave."""
     ns: str
     name: str
     """Name of the node, without its namespace."""
@@ -81,9 +81,9 @@ class ObservedNode:
     def process(self) -> str:
         """The part of ``participant`` that all participants of the node's process share.
 
-        A process has a participant for each context of rclpy or rclcpp.  Fast DDS (2.6 to 3.6,
-        ``GuidUtils.hpp``) gives them a host, process id and random number in common; the
-        participants of other middleware show nothing in common.
+        A process has a participant for each context of rclpy or rclcpp.  With Fast DDS (2.6 to 3.6,
+        ``GuidUtils.hpp``), all these participants have the host, process id and a random number in
+        common; with other middleware, they have nothing in common.
         """
         return self.participant[:16] if self.participant.startswith(FAST_DDS) else self.participant
 
@@ -95,11 +95,11 @@ class ObservedNode:
 
 @shows("nodes")
 class Observation(NamedTuple):
-    """The nodes of a ROS graph, sorted, and the endpoints that belong to no node.
+    """The nodes of a ROS graph, sorted, and the endpoints without a node.
 
     ``silent`` are nodes (enclave, namespace, name) that were announced but had no endpoint.
-    ``strays`` are endpoints (participant, endpoint) without a node: of a program that does not use
-    ROS, or of a node that was not discovered completely.
+    ``strays`` are endpoints (participant, endpoint) without a node: endpoints of a program that
+    does not use ROS, or of a node that was not discovered completely.
     """
 
     nodes: tuple[ObservedNode, ...] = ()
@@ -109,11 +109,11 @@ class Observation(NamedTuple):
 
     @property
     def endpoint_count(self) -> int:
-        """The number of endpoints of all nodes together."""
+        """The number of endpoints of all nodes."""
         return sum(len(node.endpoints) for node in self.nodes)
 
     def union(self, other: Observation) -> Observation:
-        """Return the nodes and endpoints of both observations together.
+        """Return the nodes and endpoints of both observations.
 
         A process never changes its enclave, so a node keeps only the candidate enclaves that both
         observations have.
@@ -177,17 +177,17 @@ def _topics(node: ObservedNode, direction: str) -> list[str]:
 
 
 _NODE_NAME = "_sros_observer_" + secrets.token_hex(8)
-"""Name of the observer's node; random, so that no other program knows it before the node starts."""
+"""Name of the observer's node: random, so that no other program knows it in advance."""
 
 _PREFIX_BYTES = 12  # length of the participant's part of an endpoint's identifier (RTPS 2.3, 9.3.1)
 _DISCOVERY = "ros_discovery_info"
 # These RMWs keep their participants sorted by identifier, and list nodes in that order.
 _ORDERED = ("rmw_fastrtps_cpp", "rmw_fastrtps_dynamic_cpp", "rmw_cyclonedds_cpp", "rmw_connextdds")
 _LOG_FLUSH_SECONDS = 0.3
-"""Time to wait before exit, so that the logging thread of Fast DDS prints why the node failed."""
+"""Seconds to wait before exit, so that the logging thread of Fast DDS can print its errors."""
 _ATTEMPTS = 5
 _AGAIN_SECONDS = 0.01
-"""Time until a graph that changes is read again."""
+"""Seconds until a changing graph is read again."""
 
 
 def main() -> int:
@@ -253,7 +253,7 @@ def report_graph(observer: GraphObserver, report: Any, period: float, *, ordered
 
 
 class _Observer:
-    """The observer's node, which reads the graph and leaves itself out of it.
+    """The observer's node, which reads the graph and leaves itself out of the result.
 
     Another node that takes the same name later is not left out.
     """
@@ -283,7 +283,7 @@ class _Observer:
         return listed
 
     def _endpoints(self) -> list[tuple[str, str, str, str, str]]:
-        """Return all endpoints but the observer's, sorted.
+        """Return all endpoints except the observer's, sorted.
 
         An endpoint is (participant, namespace of its node, name of its node, topic, direction).
         """

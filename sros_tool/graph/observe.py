@@ -1,16 +1,16 @@
 """Observe the live ROS graph through rclpy, and find the enclave of each node.
 
 `RosGraph` runs rclpy in a separate process (`observation.main`); `settle`, `look_for` and `watch`
-decide how long the graph is observed.  Times are in seconds; clock and source are passed in.
+end the observation.  Times are in seconds; clock and source are passed in.
 
 rclpy lists nodes with their enclaves, but without their processes; it lists endpoints with the
 names of their nodes and with their participants (processes), but without enclaves.  `resolve`
 combines the two lists, even if nodes of the same name run in several enclaves.
 
 The graph shows the enclave of ``--ros-args --enclave``, but "/" for a process whose enclave comes
-from ROS_SECURITY_ENCLAVE_OVERRIDE.  The identifier of a secured participant, however, begins with
-a digest of its certificate's subject (DDS-Security 1.1, 9.3.3), which its peers check;
-`with_certified_enclaves` uses that digest.
+from ROS_SECURITY_ENCLAVE_OVERRIDE.  But the identifier of a secured participant begins with a
+digest of the certificate's subject (DDS-Security 1.1, 9.3.3), which peers check;
+`with_certified_enclaves` uses this digest.
 """
 
 from __future__ import annotations
@@ -43,9 +43,9 @@ from sros_tool.pki.certificates import IDENTITY_DIGITS
 
 _LOG = logging.getLogger(__name__)
 _NO_SHARED_MEMORY = {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}
-"""Fast DDS cannot write to the shared memory of another user, and nodes would have no names."""
+"""Variables against shared memory: Fast DDS cannot write to another user's shared memory."""
 _PERIOD_SECONDS = 0.1
-"""Time between two readings of the graph; a node that runs for a second is read several times."""
+"""Seconds between two readings of the graph; short, to see a node that runs for a second."""
 _START_SECONDS = 30.0
 _END_SECONDS = 3.0
 
@@ -140,7 +140,8 @@ class RosGraph:
     def close(self) -> None:
         """Stop the observer process.
 
-        Closing its input lets it leave the graph properly; a process that does not end is killed.
+        A process whose input is closed leaves the graph properly; a process that does not end is
+        killed.
         """
         if self._process.stdin:
             self._process.stdin.close()
@@ -153,7 +154,7 @@ class RosGraph:
         self._output.close()
 
     def _line(self, seconds: float) -> dict[str, Any] | None:
-        """Return the next JSON object of the observer; None if none comes within ``seconds``."""
+        """Return the next JSON object of the observer, or None after ``seconds`` without one."""
         deadline = time.monotonic() + seconds
         with selectors.DefaultSelector() as selector:
             selector.register(self._report, selectors.EVENT_READ)
@@ -223,10 +224,10 @@ _TICK = 0.2
 class Settling(NamedTuple):
     """The times, in seconds, after which an observed graph counts as complete.
 
-    The graph is complete once ``least`` seconds have passed and it has not changed for ``still``
-    seconds, but at the latest after ``most`` seconds.  Fast DDS announces its participants in a
-    first burst, and then every 3 s.  With many participants, parts of the burst get lost: a graph
-    of half a robot did not change from 0.4 to 3.4 s.
+    The graph is complete after ``least`` seconds, if it has not changed for ``still`` seconds, and
+    at the latest after ``most`` seconds.  Fast DDS announces its participants in a first burst, and
+    then every 3 s.  With many participants, parts of the burst get lost: a graph of half a robot
+    did not change from 0.4 to 3.4 s.
     """
 
     least: float = 4.0
@@ -235,7 +236,7 @@ class Settling(NamedTuple):
 
 
 SECURED = Settling(least=6.0, still=5.0, most=45.0)
-"""Secured participants authenticate each other first, which takes up to 2.5 s."""
+"""Times for secured participants, which first authenticate each other, in up to 2.5 s."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -263,7 +264,7 @@ class Snapshot:
 def settle(source: GraphSource, settling: Settling, clock: Clock) -> Snapshot:
     """Return the graph once it stops changing, at the latest after ``settling.most`` seconds.
 
-    Time counts from the observer's first report, which takes long on a slow machine.
+    Time counts from the observer's first report, which comes late on a slow machine.
     """
     begin = clock()
     changed: float | None = None
@@ -340,12 +341,12 @@ NOBODY = "_NODE_NAME_UNKNOWN_"
 
 
 class Sighting(NamedTuple):
-    """One reading of the graph.
+    """A reading of the graph.
 
     ``listed`` are the announced nodes, in the order of the RMW.  ``endpoints`` are tuples of
     participant, namespace and name of the node, and endpoint.  ``ordered`` says that the RMW lists
-    nodes by ascending participant, as rmw_dds_common does (graph_cache keeps its participants in a
-    map by identifier).
+    nodes by ascending participant, as rmw_dds_common does (graph_cache has a map of participants by
+    identifier).
     """
 
     listed: tuple[Listed, ...]
@@ -354,7 +355,7 @@ class Sighting(NamedTuple):
 
 
 def resolve(sighting: Sighting) -> Observation:
-    """Return the nodes of a sighting, with their process and their possible enclaves."""
+    """Return the nodes of a sighting, with their processes and possible enclaves."""
     by_participant: dict[str, dict[_Name, set[Endpoint]]] = {}
     strays = set()
     for participant, ns, name, endpoint in sighting.endpoints:
@@ -429,7 +430,7 @@ def _with_enclaves_by_order(
     """Return ``candidates`` with the enclaves that the order of ``listed_nodes`` decides.
 
     The nth listed node of a name belongs to the nth participant with a node of that name, if there
-    are as many nodes as participants.  ``candidates`` stay unchanged if this contradicts them.
+    are as many nodes as participants. ``candidates`` do not change if the order contradicts them.
     """
     enclaves: dict[_Name, list[str]] = {}
     for enclave, ns, name in listed_nodes:
@@ -454,9 +455,10 @@ def _with_enclaves_by_order(
 def with_owners_of_strays(observation: Observation) -> Observation:
     """Return the observation with the strays of each process as endpoints of its only node.
 
-    A process that leaves soon may never announce its node: the standard services of every node
-    name it.  Its possible enclaves are those of nodes with the same name, or else "/".  Strays of a
-    process without a known node, or with several nodes, stay strays.
+    A process that leaves soon may never announce its node; then the names of the node's standard
+    services show the node. The possible enclaves of such a node are the enclaves of nodes with the
+    same name, or else "/". Strays of a process without a known node, or with several nodes, stay
+    strays.
     """
     by_process: dict[str, set[Endpoint]] = {}
     for participant, endpoint in observation.strays:
@@ -494,7 +496,7 @@ def _serving_nodes(endpoints: Iterable[Endpoint]) -> Iterator[_Name]:
 
 
 _SECURED = tuple("89abcdef")
-"""First hexadecimal digits of the identifiers of secured participants: their first bit is set."""
+"""First hexadecimal digits of identifiers of secured participants, whose first bit is set."""
 _DEFAULT_ENCLAVE = ("/",)
 
 

@@ -1,8 +1,8 @@
 """The observer process on Zenoh, which reads the ROS graph from the tokens of rmw_zenoh.
 
-``python -P -m sros_tool.graph.zenoh_tokens FD PERIOD`` writes what the observer on DDS writes
-(`sros_tool.graph.observation`), with the DDS topics of the same ROS names.  It needs no RMW: it
-takes the configuration from the variables of rmw_zenoh, and announces nothing of itself.
+``python -P -m sros_tool.graph.zenoh_tokens FD PERIOD`` writes the same output as the observer on
+DDS (`sros_tool.graph.observation`), with the DDS topics of the same ROS names. The process needs no
+RMW: it takes the configuration from the variables of rmw_zenoh, and announces nothing.
 
 A token is ``@ros2_lv/DOMAIN/SESSION/NODE/ENTITY/KIND/ENCLAVE/NAMESPACE/NAME``, with
 ``/TOPIC/TYPE/HASH/QOS`` at its end for a publisher, subscription, service or client; "/" in a name
@@ -35,7 +35,7 @@ _DEFAULTS: Mapping[bool, Mapping[str, Any]] = {
         "connect": {"endpoints": ["tcp/localhost:7447"]},
     },
 }
-"""The defaults of rmw_zenoh that matter here, for a router (True) and a session (False)."""
+"""Defaults of rmw_zenoh that matter for observers, for a router (True) and a session (False)."""
 
 
 def configuration(variables: Mapping[str, str], *, router: bool = False) -> zenoh.Config:
@@ -57,7 +57,7 @@ def configuration(variables: Mapping[str, str], *, router: bool = False) -> zeno
 
 
 class _TokenObserver:
-    """The tokens of a domain that are alive."""
+    """The live tokens of a domain."""
 
     def __init__(self, session: zenoh.Session, domain: str) -> None:
         self._tokens: set[str] = set()
@@ -70,7 +70,7 @@ class _TokenObserver:
         (self._tokens.add if alive else self._tokens.discard)(str(sample.key_expr))
 
     def snapshot(self) -> tuple[list[Any], list[Any]]:
-        """Return nodes and endpoints, as the observer on DDS does."""
+        """Return nodes and endpoints in the form of the observer on DDS."""
         nodes, endpoints = set(), set()
         for token in tuple(self._tokens):
             chunks = token.split("/")

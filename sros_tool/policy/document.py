@@ -1,10 +1,10 @@
 """Policy files (SROS2 policy XML 0.2.0): reading them with their includes, and writing them.
 
-Policies of version 0.1.0 (ROS 2 Crystal to Eloquent) are converted: they have one profile for each
-node and no enclaves.
+Policies of version 0.1.0 (ROS 2 Crystal to Eloquent) are converted: such policies have a profile
+for each node and no enclaves.
 
 The grammar follows the schema of ros2/sros2.  In addition, every name is checked: a name that ROS
-does not allow is an error, because its author relies on the right or the denial of the name.
+does not allow is an error, because the author of the policy relies on the right or the denial.
 
 Includes (``xi:include``) are read only from the folder of the policy and the folders below.  An
 include is resolved as by libxml2 (XInclude), or refused.  Nodes of included documents are never
@@ -107,7 +107,8 @@ class MissingFileError(DocumentError):
 PolicyFiles = Callable[[Path], bytes]
 """A function that returns the content of a policy file, given the file's path.
 
-It raises `MissingFileError` if there is no such file, and `DocumentError` if this is not known.
+The function raises `MissingFileError` if there is no such file, and `DocumentError` if its
+existence is not known.
 """
 
 
@@ -115,22 +116,19 @@ It raises `MissingFileError` if there is no such file, and `DocumentError` if th
 class Includer:
     """A reader of policy files in the folder ``root`` and below.
 
-    Each file is read once, but counted each time it is included, because a few small files could
-    expand to gigabytes.
+    A file is read once, but counts for the size limit at every include, because a few small files
+    could expand to gigabytes.
     """
 
     root: Path
     read: PolicyFiles | None = None
     """A function that returns a file's content; None stands for the file system."""
     fallbacks: list[tuple[Source, str]] = field(default_factory=list)
-    """The includes that used their fallback, each with the path of the missing file."""
+    """The includes that used their fallback, with the path of the missing file."""
     _documents: dict[Path, etree._Element] = field(default_factory=dict)
     _sizes: dict[Path, int] = field(default_factory=dict)
     _real_paths: dict[tuple[Path, str], Path] = field(default_factory=dict)
-    """Maps a folder and the path in an include to the real path of the file.
-
-    Many profiles include the same file.
-    """
+    """Folder and path in an include → real path of the file; many profiles repeat includes."""
     _includes: int = 0
     _elements: int = 0
     _bytes: int = 0
@@ -151,7 +149,7 @@ class Includer:
         return self._documents[file]
 
     def use_content(self, file: Path, content: bytes) -> None:
-        """Use ``content`` for the file with this real path, even where it is included."""
+        """Use ``content`` for the file with this real path, also in includes."""
         root = parse(content, f"the policy file '{file}'", instructions=True)
         _check_instructions(root, file)
         self._documents[file] = root
@@ -165,11 +163,11 @@ class Includer:
         return self._expanded(parent, place)
 
     def target(self, element: etree._Element, place: IncludedFile) -> Path:
-        """Return the real path of the file that an include names, which may be missing.
+        """Return the real path of the file that an include names; the file may be missing.
 
         Raises:
             PolicyError: the file is outside of the policy's folder, or other XInclude processors
-                would search for it in another place.
+                would search for the file in another place.
         """
         where = _line(element, place)
         href = element.get("href", "")
@@ -287,7 +285,7 @@ class Includer:
     def _selected(
         self, roots: Iterator[tuple[etree._Element, IncludedFile]], pointer: str, where: str
     ) -> list[tuple[etree._Element, IncludedFile]]:
-        """Return the elements of a document, with resolved includes, that an xpointer selects."""
+        """Return the elements that an xpointer selects in a document with resolved includes."""
         path = pointer.removeprefix("xpointer(").removesuffix(")")
         steps = list(_STEP.finditer(path[:_MAX_LENGTH]))
         if f"xpointer({''.join(step[0] for step in steps)})" != pointer or not steps:
@@ -317,12 +315,12 @@ COMMON = "common"
 
 
 def _is_there(file: Path) -> bool:
-    """Return whether a file exists; False if its name is too long for the file system."""
+    """Return whether a file exists; False for a name that is too long for the file system."""
     return os.path.exists(file)  # noqa: PTH110 - Path.exists raises for such a name
 
 
 def _missing_remedy(file: Path) -> str:
-    """Return a sentence on how to get an included file that ships with sros; "" for other files."""
+    """Return a sentence on how to get an included file that ships with sros, or ""."""
     # Reading policies must not import modules that write files.
     from sros_tool.files import policies_dir
 
@@ -390,7 +388,7 @@ _REQUIRED = {
     "ns": 'ns="/", or the namespace of the node',
     "node": 'node="NAME", with the name of the node',
 }
-"""Maps a required attribute to the text that says what to write if it is missing."""
+"""Required attribute → remedy text that shows what to write."""
 _QUALIFIERS = {qualifier.value: qualifier for qualifier in Qualifier}
 
 
@@ -412,7 +410,7 @@ def read_policy(
         placeholders: accept placeholders (`sros_tool.policy.placeholders`) in names; they are not
             filled in, so only `sros_tool.fleet.expansion` can use the policy.
         policy_files: returns the content of included files that are not in the file system.
-        may_be_empty: accept a file without enclaves, to which the caller adds some.
+        may_be_empty: accept a file without enclaves, to which the caller adds enclaves.
 
     Raises:
         PolicyError: (or another `DocumentError`, with file and line) the file violates the format,
@@ -432,7 +430,7 @@ def read_policy(
 
 
 def refuse_fallbacks(policy: Policy) -> None:
-    """Raise `PolicyError` if an include of a policy used its fallback, as a file is missing."""
+    """Raise `PolicyError` if an include of a policy used its fallback because a file is missing."""
     for source, file in policy.fallbacks:
         raise PolicyError(
             f"{source}: the fallback of the include is used, because '{file}' is absent",
@@ -516,7 +514,7 @@ class _Reader:
     def _read_policy(
         self, element: etree._Element, place: IncludedFile, version: str, tag: str = "enclave"
     ) -> Policy:
-        """Return the policy whose enclaves are the children of ``element``, named ``tag``."""
+        """Return the policy whose enclaves are the children of ``element`` with the tag ``tag``."""
         enclaves: dict[str, Enclave] = {}
         for child, at in self._read_children(element, place):
             enclave = self._read_enclave(*self._expect(child, at, tag))
@@ -563,7 +561,7 @@ class _Reader:
         element: etree._Element,
         place: IncludedFile,
     ) -> PolicyError:
-        """Return the error for a name that is not valid, whatever the values of placeholders are.
+        """Return the error for a name that is invalid with any values of placeholders.
 
         ``written`` is the name as in the file.  ``label`` is "enclave name" or "namespace".
         """
@@ -618,7 +616,7 @@ class _Reader:
     def _read_groups(
         self, element: etree._Element, place: IncludedFile, node: str
     ) -> Iterator[Group]:
-        """Yield the groups for an XML group: one for each protection level of its names."""
+        """Yield the groups for an XML group: a group for each protection level of its names."""
         kind = tag_of(element)
         if kind not in RIGHTS:
             raise PolicyError(
@@ -844,8 +842,8 @@ def _meant_attribute(right: str, value: str) -> str:
 def _absolute(profile: Profile) -> tuple[Profile, ...]:
     """Return equivalent profiles whose namespaces begin with "/".
 
-    Every ROS name begins with "/".  So the first ``*`` of a namespace matches nothing before a "/",
-    or a text that begins with "/".
+    Every ROS name begins with "/". So a ``*`` at the beginning of a namespace matches either
+    nothing before a "/", or a text that begins with "/".
     """
     below = profile.ns.lstrip("*")
     if below == profile.ns:
@@ -861,8 +859,8 @@ def _absolute(profile: Profile) -> tuple[Profile, ...]:
 class ConvertedPolicy(NamedTuple):
     """A policy converted from an earlier format, with the same rights.
 
-    ``left_out`` are profiles for which no enclave is possible, each with the reason.  Because they
-    are left out, the converted policy permits less than the original.
+    ``left_out`` are profiles for which no enclave is possible, with reasons. Without these
+    profiles, the converted policy permits less than the original.
     """
 
     policy: Policy
@@ -879,7 +877,7 @@ class PrintedConversion(NamedTuple):
     enclaves: Sequence[str]
     """Paths of the enclaves in the converted policy."""
     left_out: Sequence[str]
-    """Profiles that cannot be converted, with reasons; if there are any, the exit status is 1."""
+    """Profiles that cannot be converted, with reasons; the exit status is then 1."""
     output: Path | None
     """Path of the file that was written, or null."""
     dry_run: DryRun
@@ -916,7 +914,7 @@ class CopiedPolicies(NamedTuple):
 
 
 def copy_policies(source: Path, target: Path, *, dry_run: bool = False) -> list[FileChange]:
-    """Copy a folder of policies, or of common fragments alone, and return the changed files.
+    """Copy a folder of policies, or only of common fragments, and return the changed files.
 
     Existing files stay unchanged.
 
@@ -955,7 +953,7 @@ def copy_policies(source: Path, target: Path, *, dry_run: bool = False) -> list[
 
 
 def convert_policy(path: Path) -> ConvertedPolicy:
-    """Convert a policy file of version 0.1.0, with one enclave for each node.
+    """Convert a policy file of version 0.1.0 to a policy with an enclave for each node.
 
     The path of an enclave is the node's namespace and name, like the folder of the node's keys in
     ros2/sros2 0.6 to 0.8.  A private name is ``~/name`` since ROS 2 Eloquent, and ``~name`` in
@@ -1138,7 +1136,7 @@ def checked_text(
     Args:
         policy: the policy.
         output: the file that the caller will write, or None.
-        label: how the policy was made, such as "narrowed", for errors.
+        label: the origin of the policy for errors, such as "narrowed".
         placeholders: whether names may have the placeholders of a fleet.
 
     Raises:
@@ -1180,7 +1178,7 @@ _MOST_SEARCHED = 256 * 1024
 
 
 def join_policies(policies: Sequence[Policy]) -> Policy:
-    """Return one policy with the enclaves of all ``policies``, of which there is at least one.
+    """Return a policy with the enclaves of all ``policies`` (at least one policy).
 
     Policies may share enclaves by including them from the same place.
 
@@ -1205,7 +1203,7 @@ def join_policies(policies: Sequence[Policy]) -> Policy:
 def files_of_policies(folder: Path) -> Iterator[Path]:
     """Yield the paths of the policies in a folder and below it, sorted; for a file, its own path.
 
-    Fragments, which are only included by policies, are left out.
+    Fragments that policies only include are left out.
 
     Raises:
         DocumentError: a file that may be a policy cannot be read, is not XML, or has a name without

@@ -1,11 +1,11 @@
-"""Merging policies into a policy file: which rights are missing, and the edits that add them.
+"""Merge policies into a policy file: find the missing rights, and the edits that add them.
 
 A merge never weakens a denial, and adds a right only in the requested direction.  All other text of
 the file, including comments and line ends, stays unchanged byte for byte.
 
 A name is added to a group with exactly the name's rights, in the profile of the name's namespace
-and node.  If the file lacks the group or the profile, it is added; included files do not change.
-The result is read again, to prove that it states exactly the old and the added rights.
+and node.  A missing group or profile is added; included files do not change. The result is read
+again, to prove that the file then states exactly the old and the added rights.
 """
 
 from __future__ import annotations
@@ -62,8 +62,8 @@ _SHOWN = 3
 class Contradiction:
     """A right that the policy file allows and a merged policy denies, or the reverse.
 
-    Another case is a merged policy that allows the right to one node, and denies it to another node
-    of the same enclave.  The denial may concern only a part of the right.  The denial always
+    Another case is a merged policy that allows the right to a node, and denies the right to another
+    node of the same enclave.  The denial may concern only a part of the right.  The denial always
     decides.
     """
 
@@ -72,12 +72,12 @@ class Contradiction:
     allowed: Right
     """The rule that allows the right."""
     new: bool
-    """Whether the merge adds the denial to the policy file; if not, the file already had it."""
+    """Whether the merge adds the denial to the policy file, which did not have it before."""
 
 
 @dataclass(frozen=True, slots=True)
 class AddedName:
-    """A name to add to a profile, as written there, with its rights and its protection level."""
+    """A name to add to a profile, in its form there, with its rights and its protection level."""
 
     kind: str
     name: str
@@ -164,10 +164,10 @@ class _Planner:
         return not (self._file.cover(right) or self._file.cover(denial))
 
     def _between_nodes(self, enclave: Enclave) -> Iterator[Contradiction]:
-        """Yield contradictions between nodes of an enclave, as a denial applies to all of them.
+        """Yield contradictions between nodes of an enclave, because a denial applies to all nodes.
 
-        It is no contradiction if each node with the right states the same denial, as an exception
-        from its own right.
+        There is no contradiction if every node with the right states the same denial, as an
+        exception from its own right.
         """
         of_nodes = defaultdict[tuple[str, str], set[Right]](set)
         for profile in enclave.all_profiles():
@@ -193,7 +193,7 @@ class _Planner:
 
 @dataclass(slots=True)
 class _NewName:
-    """A name to add, as first written, with the rights to add and the protection level."""
+    """A name to add, in the form of its first occurrence, with rights and protection level."""
 
     written: str
     rights: dict[tuple[str, Qualifier], None]
@@ -238,10 +238,10 @@ def merge_notes(contradictions: Sequence[Contradiction]) -> tuple[Note, ...]:
 
 
 def counterpart_notes(policies: Iterable[Policy], merged: Collection[Right]) -> Iterator[Note]:
-    """Yield a note on ``merged`` rights whose counterpart in one of ``policies`` is gone.
+    """Yield a note on ``merged`` rights that lost their counterpart in one of ``policies``.
 
     The counterpart of a right to subscribe is a right to publish, for instance.  A DENY of another
-    policy, or another name there, took it away.
+    policy denies the counterpart, or the other policy uses another name.
     """
     lost: set[Right] = set()
     for rights in map(policy_rights, policies):
@@ -276,7 +276,7 @@ class PlacedElement:
 
     @property
     def tag(self) -> str:
-        """The tag, with its namespace in braces if it has one."""
+        """The tag, with a namespace in braces."""
         return tag_of(self.xml)
 
     def get(self, attribute: str) -> str:
@@ -317,7 +317,7 @@ class EditedText:
         )
 
     def _elements(self, root: etree._Element) -> PlacedElement:
-        """Return the tree of elements with their positions, which lxml does not provide."""
+        """Return the tree of elements with their positions, which lxml does not know."""
         nodes = root.iter()
         top: PlacedElement | None = None
         stack: list[PlacedElement] = []
@@ -345,7 +345,7 @@ class EditedText:
     # ── layout of the text ────────────────────────────────────────────────────────────────
 
     def indent_of(self, element: PlacedElement) -> str | None:
-        """Return the white space before an element that begins a line; None for other elements."""
+        """Return the white space before an element at the start of a line; else None."""
         line = max(self.text.rfind("\n", 0, element.start), self.text.rfind("\r", 0, element.start))
         before = self.text[line + 1 : element.start].removeprefix("\ufeff")
         if before.strip(" \t") or (line < 0 and element is not self.root):
@@ -375,7 +375,7 @@ class EditedText:
     # ── edits ───────────────────────────────────────────────────────────────────────────
 
     def insert(self, place: int, text: str, until: int | None = None) -> None:
-        """Insert ``text`` at the offset ``place``; with ``until``, replace the text up to there."""
+        """Insert ``text`` at the offset ``place``; with ``until``, replace the text up to it."""
         self._edits.append((place, place if until is None else until, text))
 
     def document(self) -> bytes:
@@ -388,7 +388,7 @@ class EditedText:
 
 
 def _encoding(data: bytes, root: etree._Element) -> str:
-    """Return the encoding for decoding a document so that a byte order mark stays a character."""
+    """Return an encoding that decodes a document with its byte order mark as a character."""
     declared = root.getroottree().docinfo.encoding or "utf-8"
     if data.startswith(codecs.BOM_UTF16_LE):
         return "utf-16-le"
@@ -402,8 +402,8 @@ class Merged:
     """A policy file after a merge: its new content, the added rights, and the contradictions.
 
     If no right is added, ``document`` is the unchanged content of the file.  ``rights`` are all
-    rights after the merge.  ``notes`` are about denials that win, and about enclaves that several
-    nodes, or one node in several namespaces, share since the merge.
+    rights after the merge.  ``notes`` are about denials that win, and about enclaves that, since
+    the merge, have several nodes, or a node in several namespaces.
     """
 
     document: bytes
@@ -420,7 +420,7 @@ class MergedPolicy(NamedTuple):
     policy: Path
     """Path of the policy file, as given on the command line."""
     added: Sequence[Right]
-    """Rights that were added to the policy."""
+    """Rights that one policy allows and another one denies; the DENY wins."""
     contradictions: Sequence[Contradiction]
     """Rights that one of the policies allows and another denies; the DENY wins."""
     output: Path | None
@@ -438,7 +438,7 @@ def merge_into(path: Path, additions: Policy) -> Merged:
     Raises:
         PolicyError: (or another `DocumentError`) the file is not a policy, or a right cannot be
             added: its enclave is in an included file, or the part to change is also included
-            elsewhere, and would there add rights that nobody requested.
+                elsewhere, where it would add rights that nobody requested.
     """
     return merge_all(path, (additions,))
 
@@ -475,7 +475,7 @@ def merge_all(path: Path, policies: Iterable[Policy]) -> Merged:
 
 
 def _shared_enclaves(before: Policy, policies: Iterable[Policy], after: Policy) -> Iterator[str]:
-    """Yield a text on each enclave that gets new nodes from policies that lack its present nodes.
+    """Yield a text on each enclave that gets nodes from policies without its present nodes.
 
     Nodes that have the same name in other namespaces are instances of a node, for which there is
     another note.
@@ -507,7 +507,7 @@ def _checked_policy(path: Path, document: bytes, before: Policy, added: Sequence
     """Return the policy in ``document``.
 
     Raises:
-        PolicyError: its rights are not exactly those of ``before`` and the ``added`` ones.
+        PolicyError: the rights are not exactly the rights of ``before`` and ``added``.
     """
     try:
         after = read_policy(path, document)
@@ -533,7 +533,7 @@ def _check_protection(path: Path, merged: Policy, additions: Policy) -> None:
     """Raise `PolicyError` unless ``merged`` protects names as ``additions`` require.
 
     A name that the file already has may lack the protection, because a merge does not change such a
-    name: the author decides at which occurrence of the name to state the protection.
+    name: the author has to choose the occurrence of the name that states the protection.
     """
     present = {(e.kind, e.name): e for e in stated_protections(merged.enclaves)}
     for protection in stated_protections(additions.enclaves):
@@ -570,7 +570,7 @@ def _group(kind: str, rights: GroupRights, entries: Iterable[AddedName]) -> _New
 
 
 def _groups(entries: Sequence[AddedName]) -> list[_NewElement]:
-    """Return groups for names, which must be sorted by kind and rights."""
+    """Return groups for names that are sorted by kind and rights."""
     return [
         _group(kind, rights, names)
         for (kind, rights), names in groupby(entries, key=lambda entry: (entry.kind, entry.rights))
@@ -653,7 +653,7 @@ class _Editor:
                 self._add_names(group, kind, list(names))
 
     def _add_names(self, group: PlacedElement, kind: str, entries: Sequence[AddedName]) -> None:
-        """Insert names into a group: in order if the group is sorted, otherwise at its end."""
+        """Insert names into a group: in order if the group is sorted, or else at the end."""
         present = [child.xml.text or "" for child in group.named(kind.removesuffix("s"))]
         is_sorted = len(present) == len(group.children) and present == sorted(present)
         for entry in entries:
@@ -682,7 +682,7 @@ class _Editor:
         self._text.insert(self._text.position_after(sibling), self._rendered(new, indent))
 
     def _put_first(self, parent: PlacedElement, new: _NewElement) -> None:
-        """Insert an element as the first child, but after text or a comment at the beginning."""
+        """Insert an element as the first child, after text or a comment at the beginning."""
         text, first = self._text, parent.children[0]
         if text.text[parent.inner : first.start].strip():
             self._put_after(first, new)
@@ -706,7 +706,7 @@ class _Editor:
         text.insert(place, rendered)
 
     def _rendered(self, new: _NewElement, indent: str | None) -> str:
-        """Return the XML of an element, with a line for each child if ``indent`` is given."""
+        """Return the XML of an element; with ``indent``, every child is on its own line."""
         tag = new.start.split(" ", 1)[0]
         before = "" if indent is None else self._text.newline + indent
         if not new.children:

@@ -1,4 +1,4 @@
-"""Minimizing a policy to the observed rights, and wildcards that make a large policy smaller.
+"""Reduce a policy to observed rights, and propose wildcards that make a large policy smaller.
 
 The over-privilege of an enclave is the number of allowed pairs (right, name), divided by the number
 of observed pairs.  The right of a pair is publish, subscribe, request, reply, call or execute, and
@@ -58,8 +58,8 @@ def enclaves_of_nodes(
 
     Args:
         observed: the enclaves that were observed.
-        nodes: the full names of the nodes in each enclave of the policy.  The result has no nodes
-            that are in several enclaves, and no observed enclave that is in the policy itself.
+        nodes: the full names of the nodes in each enclave of the policy. The result leaves out
+            nodes in several enclaves, and observed enclaves that are in the policy.
     """
     homes = defaultdict(list)
     for enclave, names in nodes.items():
@@ -94,7 +94,7 @@ class EnclaveUse:
     enclave: str
     """Path of the enclave."""
     observed_at_all: bool
-    """Whether the enclave was observed; otherwise it is not changed."""
+    """Whether the enclave was observed; an enclave that was not observed does not change."""
     never_observed: tuple[Right, ...]
     """Rights that were never observed and are therefore removed."""
     kept_for_every_node: tuple[Right, ...]
@@ -112,7 +112,7 @@ class EnclaveUse:
 
     @property
     def ratio(self) -> float | None:
-        """Over-privilege: allowed pairs divided by observed pairs; null if none was observed."""
+        """Over-privilege: allowed pairs divided by observed pairs; null without observed pairs."""
         return self.allowed / self.observed if self.observed else None
 
 
@@ -129,8 +129,8 @@ def minimize(
 ) -> MinimizedPolicy:
     """Return ``policy``, narrowed to the ALLOW rights in ``observed``.
 
-    Every DENY stays.  ``common`` are the rights that every node needs.  If the policy allows them
-    to a node with a profile, they stay even if they were not observed.
+    Every DENY stays.  ``common`` are the rights that every node needs.  If the policy allows these
+    rights to a node with a profile, they stay even if they were not observed.
     """
     used = join_actions(right for right in observed if right.qualifier is ALLOW)
     by_enclave: dict[str, set[Right]] = defaultdict(set)
@@ -152,10 +152,10 @@ def minimize(
 
 
 def _protected_as_before(before: Policy, after: Policy) -> Policy:
-    """Return ``after`` with the protection levels that were only stated for removed names.
+    """Return ``after`` with the protection levels that only removed names stated.
 
     A level that one enclave states applies to all enclaves.  So other enclaves that keep a right to
-    the name now have to state it.
+    the name now have to state this level.
     """
     known = {(e.kind, e.name, e.level) for e in stated_protections(after.enclaves)}
     gone = {(e.kind, e.name, e.level) for e in stated_protections(before.enclaves)} - known
@@ -240,7 +240,7 @@ class _Narrowing:
         return self._rules.cover(part) and not self._rules.cover(part._replace(qualifier=DENY))
 
     def _is_usable(self, part: Right) -> bool:
-        """Return whether the enclave allows a right, or a part of a right with a wildcard."""
+        """Return whether the enclave allows a right at all, or a part of it by a wildcard."""
         if self._is_allowed(part):
             return True
         return is_expression(part.name) and self._rules.overlaps(part)
@@ -279,7 +279,7 @@ class _Narrowing:
     # ── rules that stay, and replacements of wildcards ─────────────────────────────────────
 
     def _is_unchanged(self, rule: Right) -> bool:
-        """Return whether a rule stays: every node needs it, or it was observed as written."""
+        """Return whether a rule stays: every node needs it, or it was observed in this form."""
         if rule in self._common:
             return True
         if not is_expression(rule.name):
@@ -292,7 +292,7 @@ class _Narrowing:
         )
 
     def _narrowed(self, kept_rights: set[Right]) -> tuple[WideRule, ...]:
-        """Return the wildcards to replace, each with the rights that replace it."""
+        """Return the wildcards to replace, with the rights that replace them."""
         wide = [
             rule for rule in self._stated if is_expression(rule.name) and rule not in kept_rights
         ]
@@ -366,7 +366,7 @@ class _Narrowing:
         }
 
     def _with_actions(self, found_pairs: set[_Pair], rules: Rules) -> set[_Pair]:
-        """Return the pairs, with one pair for each action that ``rules`` allow completely."""
+        """Return the pairs, with a pair for each action that ``rules`` allow completely."""
         pairs = set(found_pairs)
         for action in ("call", "execute"):
             for name in self._names.of(KIND_OF[action]):
@@ -395,8 +395,8 @@ def _narrowed_enclave(
 ) -> Enclave:
     """Return ``enclave`` with its denials, ``kept_rights``, and exact names in place of wildcards.
 
-    The names that replace a wildcard are written once, where the wildcard occurs first, and in its
-    form: relative, private or absolute.  Profiles that have no rule left stay.
+    The names that replace a wildcard are written once, at the first occurrence of the wildcard and
+    in its form: relative, private or absolute. Profiles without rules stay.
     """
     pending = dict(replacements)
     return enclave.with_profiles(
@@ -409,8 +409,8 @@ def _profile(
 ) -> Profile:
     """Return the profile with its denials, ``kept_rights`` and the replacements of other rights.
 
-    ``pending`` maps rights to their replacements.  The replacements that this profile gets are
-    removed from ``pending``.
+    ``pending`` maps rights to their replacements; replacements that this profile gets are removed
+    from ``pending``.
     """
     statements: dict[tuple[str, str, Level | None], dict[tuple[str, Qualifier], None]] = {}
     for group in profile.groups:
@@ -477,9 +477,9 @@ def propose_wildcards(
 ) -> tuple[WildcardProposal, ...]:
     """Return wildcards that make an enclave's permissions ``needed`` bytes smaller.
 
-    ``rights`` are the rights of this enclave, ``known_rights`` the rights of all enclaves.
-    ``size`` returns the size of a right in bytes.  Wildcards that newly allow a known name come
-    last, and are used only if the others do not suffice; otherwise the largest savings come first.
+    ``rights`` are the rights of this enclave, ``known_rights`` the rights of all enclaves. ``size``
+    returns the size of a right in bytes.  Wildcards that newly allow a known name come last, and
+    are used only if other wildcards do not suffice. Larger savings come before smaller ones.
     """
     allowed = [right for right in rights if right.enclave == enclave and right.qualifier is ALLOW]
     rules = Rules(allowed)
@@ -517,7 +517,7 @@ def propose_wildcards(
 
 
 def _candidates(rights: Iterable[Right]) -> dict[Right, list[Right]]:
-    """Map possible wildcards to the rights that they replace, at least `_FEWEST` for each one."""
+    """Map possible wildcards to the rights that they replace: at least `_FEWEST` rights."""
     rights_by_wildcard: dict[Right, list[Right]] = defaultdict(list)
     for right in rights:
         if right.name.startswith("/") and not is_expression(right.name):
@@ -541,7 +541,7 @@ def _wider_names(name: str) -> Iterator[str]:
 def _names_without_right(
     enclave: str, own_rules: Rules, known_rights: Iterable[Right]
 ) -> dict[str, list[str]]:
-    """Map rights to the known names for which the enclave lacks them; actions count as parts."""
+    """Map rights to known names for which the enclave lacks the right; actions count as parts."""
     by_service: dict[bool, set[str]] = {True: set(), False: set()}
     for part in split_actions(known_rights):
         if not is_expression(part.name):

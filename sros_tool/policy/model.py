@@ -1,6 +1,6 @@
 """The policy language of ROS: who may publish, subscribe, request, reply, call and execute.
 
-Names follow SROS2 policy XML 0.2.0.  Values are equal if they state the same, even if they were
+Names follow SROS2 policy XML 0.2.0.  Values with the same statements are equal, even if they were
 read from different files and lines (`Source`).
 """
 
@@ -21,11 +21,11 @@ RIGHTS: dict[str, tuple[str, str]] = {
     "services": ("request", "reply"),
     "actions": ("call", "execute"),
 }
-"""Maps a kind of names (topics, services, actions) to its two rights."""
+"""Kind of names (topics, services, actions) → its two rights."""
 PEER_RIGHT = {one: other for pair in RIGHTS.values() for one, other in (pair, pair[::-1])}
-"""Maps a right to the right that the peer needs, such as publish to subscribe."""
+"""Right → the right that the peer needs, such as publish for subscribe."""
 OFFERING_RIGHT = {"subscribe": "publish", "request": "reply", "call": "execute"}
-"""Maps a right to use a name to the right to offer the name."""
+"""Right to use a name → right to offer the name."""
 
 
 class Qualifier(StrEnum):
@@ -58,10 +58,10 @@ _NOWHERE = Source("", 0)
 class Group:
     """Names of one kind (topics, services or actions) that share the same rights and protection.
 
-    ``rights`` are pairs of a right and its qualifier, in the order of `RIGHTS`.  ``names`` are as
-    written: relative, private or absolute, perhaps with wildcards.  ``protect`` is the least
-    protection of messages with these names, or None if the policy states none.  ``lines`` are the
-    lines of the names in the file of ``source``; () if the names were not read from one file.
+    ``rights`` are pairs of a right and its qualifier, in the order of `RIGHTS`.  ``names`` have the
+    form in the policy: relative, private or absolute, perhaps with wildcards. ``protect`` is the
+    minimum protection of messages with these names, or None. ``lines`` are the lines of the names
+    in the file of ``source``; () if the names were not read from a single file.
     """
 
     kind: str
@@ -80,7 +80,7 @@ class Group:
 
 @dataclass(frozen=True, slots=True)
 class Profile:
-    """The rights of one node in its namespace."""
+    """The rights of a node in its namespace."""
 
     ns: str
     node: str
@@ -98,7 +98,7 @@ class Profiles(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Enclave:
-    """The rights of the processes of one enclave.
+    """The rights of the processes of an enclave.
 
     ``digest`` is the SHA-256 of the policy file with its includes, from which the enclave was read.
     """
@@ -139,19 +139,19 @@ def policy_in_namespace(policy: Policy, namespace: str) -> Policy:
 
 
 def below_namespace(path: str, namespace: str) -> str:
-    """Return the path of an enclave, or a namespace, with another namespace before it."""
+    """Return the path of an enclave, or a namespace, with another namespace in front."""
     return f"{namespace.rstrip('/')}/{path.lstrip('/')}".rstrip("/") or "/"
 
 
 def policy_in_enclave(policy: Policy, path: str) -> Policy:
-    """Return a policy with all profiles in the enclave ``path`` of a process with all nodes."""
+    """Return a policy with all profiles in the enclave ``path``, for a process with all nodes."""
     blocks = tuple(block for enclave in policy.enclaves for block in enclave.profiles)
     enclaves = [replace(enclave, path=path, profiles=blocks) for enclave in policy.enclaves[:1]]
     return replace(policy, enclaves=tuple(enclaves))
 
 
 def policy_of_nodes(policy: Policy, nodes: Collection[str]) -> Policy:
-    """Return a policy with only the rights of the named nodes, in the enclaves that have one.
+    """Return a policy with only the rights of the named nodes, and the enclaves of these nodes.
 
     Denials for other nodes stay, because a denial applies to all nodes of an enclave.
     """
@@ -180,7 +180,7 @@ def policy_of_nodes(policy: Policy, nodes: Collection[str]) -> Policy:
 def nodes_in_several_namespaces(
     enclaves: Iterable[Enclave],
 ) -> dict[tuple[str, str], tuple[Profile, ...]]:
-    """Map each enclave and node with several namespaces to profiles, one for each namespace.
+    """Map each enclave and node with several namespaces to a profile for each namespace.
 
     Nodes whose names have wildcards are left out.  ``enclaves`` may have an enclave several times.
     """
@@ -196,7 +196,7 @@ def nodes_in_several_namespaces(
 class Policy:
     """A policy with its includes resolved; each enclave path occurs once.
 
-    ``fallbacks`` are the includes that used their fallback, each with the path of the missing file.
+    ``fallbacks`` are the includes that used their fallback, with the path of the missing file.
     """
 
     enclaves: tuple[Enclave, ...]
@@ -251,7 +251,7 @@ def with_groups(policy: Policy, change: Callable[[Group, Profile], Iterable[Grou
 
 
 class Level(StrEnum):
-    """The protection level of messages; with ``..._WITH_ORIGIN_AUTHENTICATION`` also of writers."""
+    """Protection level of messages; ``..._WITH_ORIGIN_AUTHENTICATION`` also proves the writer."""
 
     NONE = "NONE"
     SIGN = "SIGN"
@@ -261,7 +261,7 @@ class Level(StrEnum):
 
 
 PROTECT: dict[str, Level] = {"sign": Level.SIGN, "encrypt": Level.ENCRYPT}
-"""Maps the words for protection levels in a policy to the levels."""
+"""Word in a policy → protection level."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -290,7 +290,7 @@ class NamedProtection(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class DomainProtection:
-    """The protection of a domain and of the names in it; ``default`` applies to other names."""
+    """The protection of a domain and of its names; ``default`` applies to unlisted names."""
 
     rtps: Level = Level.SIGN
     discovery: Level = Level.ENCRYPT
@@ -307,7 +307,7 @@ class DomainProtection:
 @shows("enclave", "kind", "name", "level")
 @dataclass(frozen=True, slots=True)
 class StatedProtection:
-    """The least protection that a policy requires for the matching names of one ``kind``.
+    """The minimum protection that a policy requires for the matching names of one ``kind``.
 
     ``name`` is absolute; ``enclave`` and ``source`` are the place in a policy that states the
     protection.
@@ -320,7 +320,7 @@ class StatedProtection:
     name: str
     """The absolute ROS name, perhaps with wildcards."""
     level: Level
-    """The least protection level of messages."""
+    """The minimum protection level of messages."""
     source: Source = field(compare=False)
 
     def __str__(self) -> str:
@@ -336,7 +336,7 @@ class StatedProtection:
 def stated_protections(enclaves: Iterable[Enclave]) -> tuple[StatedProtection, ...]:
     """Return the protection levels that enclaves require for names, in order, without duplicates.
 
-    A level that an enclave states repeatedly for a name is returned once, with its first place.
+    A level that an enclave states repeatedly for a name is returned once, with the first place.
     """
     protections: dict[StatedProtection, None] = {}
     for enclave in enclaves:

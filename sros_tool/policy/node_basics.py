@@ -14,9 +14,9 @@ from sros_tool.policy.patterns import Names
 from sros_tool.policy.rights import Right, Rules, policy_rights, split_actions
 
 _ANY_NODE = "/*"
-"""The name, in the rights of an enclave without a policy, that stands for every node."""
+"""The name that stands for every node, in the rights of an enclave without a policy."""
 _WITHOUT_PARAMETERS = {"get_type_description"}
-"""The service of a node without parameters."""
+"""The services of a node without parameters."""
 
 
 @cache
@@ -33,8 +33,8 @@ def _basics() -> Rules:
 class NodeRights:
     """The rights of some enclaves that their own nodes need to start.
 
-    The services of a node are among these rights only if the enclave may serve all of them and no
-    other enclave may serve any of them, because with such a right, a process can pose as another
+    The services of a node count only if the enclave may serve all these services and no other
+    enclave may serve any of them, because with such a right, a process can pose as another
     enclave's node.  The comparison leaves out a right to serve the services of nodes with any name,
     which enclaves without a policy have.
     """
@@ -80,5 +80,5 @@ class NodeRights:
 
 
 def are_basic(rights: Iterable[Right]) -> bool:
-    """Return whether all ``rights`` are among those of an enclave without a policy."""
+    """Return whether an enclave without a policy has all ``rights``."""
     return all(_basics().cover(right._replace(enclave="/")) for right in rights)

@@ -1,12 +1,13 @@
 """Name expressions with wildcards: matching, covering and overlapping.
 
-``*`` matches any characters, also "/"; ``?`` matches one character; ``[abc]`` and ``[a-c]`` match
-one character of a set, and ``[!a-c]`` one character outside of it.  This is fnmatch of glibc
+``*`` matches any characters, including "/"; ``?`` matches one character; ``[abc]`` and ``[a-c]``
+match one character of a set, and ``[!a-c]`` one character outside of it.  This is fnmatch of glibc
 without escapes, as in the DDS vendors.
 
-`overlap` and `covers` compare two expressions, `Names` searches many.  `common_name` compares any
-number, also with exceptions, and returns an example; it considers only valid absolute ROS names.
-`listed_expressions` replaces an expression by several without ``?`` and sets of characters.
+`overlap` and `covers` compare two expressions, `Names` searches many expressions. `common_name`
+compares any number of expressions, also with exceptions, and returns an example, which is a valid
+absolute ROS name. `listed_expressions` replaces an expression by several expressions without ``?``
+and sets of characters.
 """
 
 from __future__ import annotations
@@ -40,7 +41,8 @@ _ANY = frozenset([""])
 OTHER_NAMESPACE = "/[\ue000]"
 """Any namespace except ``/``, as an expression.
 
-The letter in it does not occur in files, so of their expressions only ``*`` matches it.
+The letter U+E000 does not occur in files, so only ``*`` in the expressions of files matches this
+name.
 """
 _ROS_LETTERS = f"_{digits}{ascii_letters}/"
 _CHOICE = re.compile(r"\[(!?)([^\]]+)\]|(\?)|([^?\[]+)")
@@ -83,7 +85,7 @@ def covers(wide: str, narrow: str) -> bool:
 
 
 def overlap(first: str, second: str) -> bool:
-    """Return whether some name matches both expressions."""
+    """Return whether any name matches both expressions."""
     if not is_expression(first):
         return matches(second, first) if is_expression(second) else first == second
     if not is_expression(second):
@@ -128,7 +130,7 @@ class _Pattern:
         return bool(reached >> len(self.pieces))
 
     def overlaps(self, other: _Pattern) -> bool:
-        """Return whether some name matches both expressions."""
+        """Return whether any name matches both expressions."""
         if not (all(self.pieces) and all(other.pieces)):
             return False  # an empty set of characters matches nothing
         if self.starred and other.starred:
@@ -144,7 +146,7 @@ class _Pattern:
         return self._overlaps_fixed(other) if self.starred else other._overlaps_fixed(self)
 
     def _overlaps_fixed(self, fixed_form: _Pattern) -> bool:
-        """Return whether some name matches both expressions; ``fixed_form`` has no ``*``."""
+        """Return whether any name matches both expressions; ``fixed_form`` has no ``*``."""
         reached = self._begin()
         for piece in fixed_form.pieces:
             kept = reached & self.stars | (reached & self._overlapping_positions(piece)) << 1
@@ -223,7 +225,7 @@ def _members(text: str) -> frozenset[str]:
 
 
 class ComparisonLimit:
-    """A limit on comparisons, so that searching many expressions ends in time."""
+    """A limit on comparisons, so that a search in many expressions ends in time."""
 
     def __init__(self, maximum: int = 60_000_000) -> None:
         """Set the limit to ``maximum`` characters; the default takes about ten seconds."""
@@ -246,7 +248,7 @@ class ComparisonLimit:
 
 
 _FEW = 16
-"""Number of expressions up to which they are compared one by one, without an index."""
+"""Maximum number of expressions that are compared one by one, without an index."""
 _LAST = "\U0010ffff"
 _END = re.compile(r".*[*?\]]", re.DOTALL)
 _BETWEEN = "\0"
@@ -255,10 +257,10 @@ _GRAM = 4
 
 
 class Names:
-    """An ordered set of names and expressions that finds those that cover or overlap a name.
+    """An ordered set of names and expressions, with searches by covered or overlapping name.
 
     Only expressions with the same beginning, end or letters are compared.  ``limit`` limits the
-    number of comparisons; sets that are used for one purpose share a limit.
+    number of comparisons; sets for the same purpose share a limit.
     """
 
     def __init__(self, names: Iterable[str], limit: ComparisonLimit | None = None) -> None:
@@ -318,7 +320,7 @@ class Names:
     def _by_letters(self) -> dict[str, list[int]]:
         """Map parts of names to the positions of expressions whose names all have this part.
 
-        Each expression is listed once, by the part that the fewest expressions have in common.
+        Each expression is listed once, under its part that the fewest other expressions have.
         """
         grams = [
             {gram for run in _RUN.findall(_letters_of(expression)) for gram in _grams(run)}
@@ -363,7 +365,7 @@ class Names:
 
 
 class _Beginnings:
-    """An index of texts by their beginnings; open texts can go on with anything.
+    """An index of texts by their beginnings; an open text stands for all texts that begin with it.
 
     A text is identified by its number, the position in the list.
     """
@@ -379,7 +381,7 @@ class _Beginnings:
         self._sizes = sorted({len(text) for text in self._open})
 
     def numbers_of_texts(self, begin: str) -> list[int]:
-        """Return the numbers of the texts that begin with ``begin``, or can if they are open."""
+        """Return the numbers of the texts that begin with ``begin``; open texts may be shorter."""
         first = bisect_left(self._texts, begin)
         numbers = self._numbers[first : bisect_left(self._texts, begin + _LAST, lo=first)]
         for size in self._sizes:
@@ -448,7 +450,8 @@ def common_name(
     """Return the shortest name that matches all ``wanted_names`` and no ``unwanted_names``.
 
     Without ``absolute``, the name has no leading "/", like a DDS topic.  If the ``wanted_names``
-    begin with `OTHER_NAMESPACE`, so does the name.  The result is None if there is no such name.
+    begin with `OTHER_NAMESPACE`, the name also begins with it.  Returns None if there is no such
+    name.
 
     Raises:
         DocumentError: the expressions have too many ``?`` after ``*`` for a decision.
@@ -479,7 +482,7 @@ def _search(wanted: tuple[str, ...], unwanted_names: tuple[str, ...], absolute: 
 
 
 class TooManyNames(Exception):  # noqa: N818 - the caller makes an error of it
-    """An expression stands for too many names to list."""
+    """Raised if an expression stands for too many names to list."""
 
 
 def listed_expressions(expression: str, maximum: int) -> list[str]:
@@ -502,7 +505,7 @@ def listed_expressions(expression: str, maximum: int) -> list[str]:
 
 
 def _letters_or_text(negated: str, listed: str, any_letter: str, text: str) -> Sequence[str]:
-    """Return the alternatives for one match of `_CHOICE`: several letters, or only its text."""
+    """Return the alternatives for a match of `_CHOICE`: several letters, or only its own text."""
     if text:
         return [text]
     if any_letter:

@@ -1,11 +1,11 @@
 """Placeholders in policy names, which stand for names that differ between robots of a fleet.
 
-``{robot}`` and ``{namespace}`` stand for the name and the ROS namespace of one robot.  With
-``{robots}`` and ``{namespaces}``, a name stands for several names, one for each robot.
+``{robot}`` and ``{namespace}`` stand for the name and the ROS namespace of a robot. A name with
+``{robots}`` or ``{namespaces}`` stands for several names: a name for each robot.
 ``{robot:carriers}`` means the robots of the group carriers.
 
-A placeholder must not stand where its value could widen a name: a part of a name with a placeholder
-must have no wildcard, because ``/r1*`` would also match the names of a robot r10.
+A placeholder must not be at a place where its value could widen a name: a part of a name with a
+placeholder must have no wildcard, because ``/r1*`` would also match the names of a robot r10.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ Parts = tuple[str | Placeholder, ...]
 
 
 def has_placeholder(text: str) -> bool:
-    """Return whether ``text`` contains a brace, which is only allowed in placeholders."""
+    """Return whether ``text`` contains a brace, which names have only in placeholders."""
     return "{" in text or "}" in text
 
 
@@ -73,7 +73,7 @@ def parts_of(text: str) -> Parts:
 
 
 def _place_problem(placeholder: Placeholder, before: str, after: str) -> str:
-    """Return why a placeholder is not allowed between two texts, as a sentence, or ""."""
+    """Return a sentence on why a placeholder is not allowed between two texts, or ""."""
     around = before.rpartition("/")[2] + after.partition("/")[0]
     in_set = before.rfind("[") > before.rfind("]")
     if in_set or not _WILDCARDS.isdisjoint(around):
@@ -95,12 +95,12 @@ def placeholders_of(parts: Parts) -> tuple[Placeholder, ...]:
 
 
 def sample(parts: Parts) -> str:
-    """Return the name with the shortest possible values for placeholders, to check its grammar."""
+    """Return the name with the shortest possible values for placeholders, to check the grammar."""
     return "".join(part if isinstance(part, str) else _SAMPLES[part.value] for part in parts)
 
 
 def check_path(path: Parts) -> None:
-    """Check that an enclave path stands for one enclave, or one for each robot of a group.
+    """Check that an enclave path stands for one enclave, or for one enclave of each robot.
 
     Raises:
         ValueError: the path stands for something else; the message is a sentence.
@@ -118,7 +118,7 @@ def check_name(name: Parts, path: Parts, *, several: bool) -> None:
 
     Args:
         name: the name.
-        path: the path of the enclave that states it, which `check_path` accepts.
+        path: the path of the enclave that states the name; `check_path` has accepted this path.
         several: whether the name may stand for several names, one for each robot.
 
     Raises:
@@ -147,7 +147,7 @@ def check_name(name: Parts, path: Parts, *, several: bool) -> None:
 
 
 def fill(parts: Parts, robot: str, namespace: str, *, plural: bool = False) -> Parts:
-    """Fill in the singular placeholders of a name, or with ``plural``, the plural ones."""
+    """Fill in the singular placeholders of a name, or with ``plural``, the plural placeholders."""
     values = {"robot": robot, "namespace": namespace}
     if namespace == "/" and len(parts) > 1:
         values["namespace"] = ""  # in the root namespace, {namespace}/scan is /scan

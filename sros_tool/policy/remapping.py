@@ -48,7 +48,7 @@ class Remapping(NamedTuple):
 
     @property
     def is_of_node(self) -> bool:
-        """Whether the names of the rule differ from node to node."""
+        """Whether the rule has names that differ from node to node."""
         return self.old == _NODE or "~" in (self.old[0], self.new[0])
 
     def __str__(self) -> str:
@@ -56,7 +56,7 @@ class Remapping(NamedTuple):
 
 
 class UsedRule(NamedTuple):
-    """A use of a rule: it changed a node (``kind`` is ""), or a name in one of the node's groups.
+    """A use of a rule, which changed a node (``kind`` is ""), or a name in a group of the node.
 
     ``kind`` is the kind of the group; ``old`` and ``new`` are the full name, of the node or in the
     group, before and after the change.
@@ -97,7 +97,7 @@ def parse_remapping(text: str) -> Remapping:
 
 
 def parse_remapping_of_names(text: str) -> Remapping:
-    """Return the rule in a text, for names that do not belong to a single node, as in requirements.
+    """Return the rule in a text, for names without a node, as in requirements.
 
     Raises:
         UsageError: (or another error of `parse_remapping`) the text is not such a rule.
@@ -120,7 +120,7 @@ def parse_remapping_of_names(text: str) -> Remapping:
 def remapped_name(name: str, ns: str, rules: Iterable[Remapping]) -> list[str]:
     """Return the full names that replace a full name of any node in a namespace.
 
-    The ``rules`` are those of `parse_remapping_of_names`.  A wildcard that matches an old name
+    The ``rules`` are results of `parse_remapping_of_names`.  A wildcard that matches an old name
     stays, and the new name is added.
     """
     rules = tuple(rules)
@@ -138,9 +138,9 @@ def remapped_name(name: str, ns: str, rules: Iterable[Remapping]) -> list[str]:
 
 
 def has_new_name(rule: Remapping, names: Iterable[str], namespaces: Iterable[str]) -> bool:
-    """Return whether ``names``, in full, have what a rule remaps to in one of some namespaces.
+    """Return whether full ``names`` contain the new name of a rule, in any of ``namespaces``.
 
-    A node counts if a name is below that of the node.
+    The name of a node counts as contained if a name is below it.
     """
     of_node = rule.old == _NODE
     new = {
@@ -155,7 +155,7 @@ def has_new_name(rule: Remapping, names: Iterable[str], namespaces: Iterable[str
 
 
 def renamed_action_text(rule: Remapping) -> str:
-    """Return a sentence on which nodes rename an action by a rule, and how the others do."""
+    """Return a sentence on nodes for which a rule renames an action, and on a way for others."""
     parts = (
         f"-r {quote(str(rule._replace(old=rule.old + part, new=rule.new + part)))}"
         for _, part in ACTION_PARTS["call"]
@@ -169,7 +169,7 @@ def renamed_action_text(rule: Remapping) -> str:
 def remapped_policies(
     policies: Iterable[Policy], texts: Iterable[str], file: Policy = _EMPTY
 ) -> tuple[list[Policy], list[Note]]:
-    """Return remapped policies, and notes on what the nodes may do differently afterwards.
+    """Return remapped policies, and notes on changes of the nodes' rights.
 
     ``texts`` are rules.  There is also a note for each DENY in ``file``, the policy to merge into,
     that denies an old name but not its new name.
@@ -210,10 +210,10 @@ def remapped_policies(
 def _notes_on_requirements(
     policies: Iterable[Policy], rules: Iterable[Remapping]
 ) -> Iterator[Note]:
-    """Yield a note on names that no node has any more, except for the services of every node.
+    """Yield a note on names that no node has any more, except services of every node.
 
-    A requirement for such a name would hold, whoever may use the new name.  Rules for namespaces
-    are ignored, because `sros check` puts requirements into a namespace, too.
+    A requirement for such a name would hold, regardless of who may use the new name.  Rules for
+    namespaces are ignored, because `sros check` puts requirements into a namespace, too.
     """
     of_names = [rule for rule in rules if rule.old != _NAMESPACE]
     policies = tuple(policies)
@@ -282,9 +282,9 @@ def remapped_policy(
     """Return a policy with remapped names, and the uses of the rules.
 
     A wildcard that matches an old name stays, and the new name is added to its group.  The new
-    names in ``moved_names``, of any node, are also added to each DENY that matches the old name.
-    An old name stays denied if a wildcard of its enclave, among the rights ``stated`` by all
-    policies, would allow it.
+    names in ``moved_names``, of any node, are also added to each DENY that matches the old name. An
+    old name stays denied if a wildcard of its enclave, among the rights ``stated`` by all policies,
+    would allow the name.
     """
     used: set[UsedRule] = set()
     wildcards = Rules(right for right in stated if is_expression(right.name))
@@ -353,7 +353,7 @@ def _more_denials(
     ns: str,
     node: str,
 ) -> Iterator[Group]:
-    """Yield a group with names that a DENY of ``group`` must deny in addition, if there are any.
+    """Yield a group with the additional names that a DENY of ``group`` must deny, if any.
 
     These are the new names in ``moved_names``, and the names in ``by_wildcards`` that no node has
     as its new name.

@@ -41,22 +41,22 @@ from sros_tool.values import Words, shows
 from sros_tool.wording import first_few
 
 KIND_OF = {right: kind for kind, pair in RIGHTS.items() for right in pair}
-"""Maps a right to the kind of its names, such as publish to topics."""
+"""Right → the kind of its names, such as topics for publish."""
 
 KindOfName = Annotated[str, Words((*RIGHTS, "dds"))]
 
 RIGHT_ORDER = {right: number for number, right in enumerate(KIND_OF)}
-"""The order in which rights are listed: publish, subscribe, request, reply, call, execute."""
+"""Right → position in lists: publish, subscribe, request, reply, call, execute."""
 
 ACTION_RIGHT = {"request": "call", "reply": "execute"}
-"""Maps a right to use or offer a service to the same right for a whole action."""
+"""Right to use or offer a service → the same right to a whole action."""
 
 
 @shows("enclave", "qualifier", "kind", "right", "name")
 class Right(NamedTuple):
     """A right or a denial of one enclave for one name.
 
-    A name without a leading "/" is a DDS topic that is not a ROS name; it occurs only in
+    A name without a leading "/" is a DDS topic that is not a ROS name, which occurs only in
     permissions that sros did not write.
     """
 
@@ -106,7 +106,7 @@ GroupRights = tuple[tuple[str, Qualifier], ...]
 
 
 def group_rights(rights: Iterable[tuple[str, Qualifier]]) -> Iterator[GroupRights]:
-    """Yield the rights of groups for one name: two groups if a right is allowed and denied."""
+    """Yield the rights of groups for a name: two groups if a right is allowed and denied."""
     ordered = sorted(rights, key=lambda right: (RIGHT_ORDER[right[0]], right[1]))
     if len({right for right, _ in ordered}) == len(ordered):
         yield tuple(ordered)
@@ -126,7 +126,7 @@ def policy_rights(policy: Policy) -> frozenset[Right]:
 
 
 class PlacedRight(NamedTuple):
-    """A right with its place in a policy; ``written`` is the name as in the policy."""
+    """A right with its place in a policy; ``written`` is the name in the form of the policy."""
 
     right: Right
     written: str
@@ -147,7 +147,7 @@ def placed_rights(enclave: Enclave) -> Iterator[PlacedRight]:
 
 
 def profile_rights(enclave: str, profile: Profile) -> Iterator[Right]:
-    """Yield the rights in one profile of an enclave, with absolute names."""
+    """Yield the rights in a profile of an enclave, with absolute names."""
     ns, node = profile.ns, profile.node
     for group in profile.groups:
         for name in group.names:
@@ -160,7 +160,7 @@ def profile_rights(enclave: str, profile: Profile) -> Iterator[Right]:
 
 
 def parts(right: Right) -> tuple[Right, ...]:
-    """Return the rights to an action's five topics and services; any other right stays itself."""
+    """Return the rights to an action's five topics and services; of another right, itself."""
     part_rights = ACTION_PARTS.get(right.right)
     if part_rights is None:
         return (right,)
@@ -172,8 +172,8 @@ def parts(right: Right) -> tuple[Right, ...]:
 def action_right(right: str, name: str) -> tuple[str, str]:
     """Return the right to the action of which ``right`` to ``name`` is a part, with its name.
 
-    Other pairs are returned unchanged.  So are subscriptions, because watching an action does not
-    need the right to command it.
+    Other pairs are returned unchanged. Subscriptions are also returned unchanged, because watching
+    an action does not need the right to command it.
     """
     action, part = action_part(name)
     for whole, of in ACTION_PARTS.items():
@@ -222,7 +222,7 @@ class Rules:
         return all(self._covering_right(part) for part in parts(right))
 
     def covering_rights(self, right: Right) -> tuple[Right, ...]:
-        """Return the rights that together cover ``right``; () if they cover only a part of it."""
+        """Return the rights that together cover ``right``; () if part of it is not covered."""
         covering = [self._covering_right(part) for part in parts(right)]
         return tuple(dict.fromkeys(filter(None, covering))) if all(covering) else ()
 
@@ -266,8 +266,8 @@ _Place = tuple[str, Qualifier, str]
 class RightsDifference(NamedTuple):
     """The rights that only one of two sides has, in normal form and sorted.
 
-    ``covered`` maps a right to the wildcards of the other side that cover it, unless the other side
-    denies a part of it.
+    ``covered`` maps a right to the wildcards of the other side that cover this right, unless the
+    other side denies a part of it.
     """
 
     only_first: tuple[Right, ...]
@@ -278,7 +278,7 @@ class RightsDifference(NamedTuple):
         return bool(self.only_first or self.only_second)
 
     def lines(self) -> list[tuple[str, Right]]:
-        """Return the different rights, with "-" for the first side only and "+" for the second."""
+        """Return the different rights, with "-" for the first side and "+" for the second side."""
         lines = [("-", right) for right in self.only_first] + [("+", e) for e in self.only_second]
         return sorted(lines, key=lambda line: (*order(line[1]), line[0] == "+"))
 
@@ -294,7 +294,7 @@ class RightsDifference(NamedTuple):
 def renamed_enclaves(
     first_rights: Iterable[Right], second_rights: Iterable[Right]
 ) -> dict[str, str]:
-    """Map enclaves that only the first rights have to enclaves with equal rights among the second.
+    """Map enclaves that are only in ``first_rights`` to enclaves of ``second_rights`` alike.
 
     An enclave is left out if several other enclaves have the same rights.
     """
@@ -329,7 +329,7 @@ def compare(
 
     An action counts as its services and topics.  A right that only one side states is no difference
     if it is covered by wildcards that both sides state, because large permissions leave such rights
-    out.  But a part of an action is a difference if the other side has it only with the whole
+    out.  But a part of an action is a difference if the other side has the part only with the whole
     action, and the whole action is a difference.
     """
     first, second = (
@@ -369,7 +369,7 @@ CHANGING_NODES = (
     "_ros2cli_",
     "_sros_observer_",
 )
-"""Beginnings of node names that end with an address or process id, which changes every time."""
+"""Beginnings of node names that end with an address or process id, which changes at every start."""
 _SERVED_BY_EVERY_NODE = frozenset(f"~/{service}" for service in NODE_SERVICES)
 
 
@@ -385,7 +385,7 @@ class NodeName(NamedTuple):
         return covers(wider.ns, self.ns) and covers(wider.name, self.name) and not in_root
 
     def overlaps(self, other: NodeName) -> bool:
-        """Return whether some node matches both names."""
+        """Return whether any node matches both names."""
         return overlap(self.ns, other.ns) and overlap(self.name, other.name)
 
 
@@ -426,7 +426,7 @@ def _offers_node_services(group: Group) -> bool:
 def nodes_of_rights(rights: Iterable[Right]) -> tuple[NodeName, ...]:
     """Return the nodes whose standard services an enclave may offer by its rights.
 
-    Denials are ignored here; `denied_nodes` returns the nodes that they take away.
+    Denials are ignored; `denied_nodes` returns the nodes that denials take away.
     """
     nodes = (
         node
@@ -441,8 +441,8 @@ def nodes_of_rights(rights: Iterable[Right]) -> tuple[NodeName, ...]:
 def denied_nodes(rights: Iterable[Right]) -> tuple[NodeName, ...]:
     """Return the nodes whose standard services are allowed but then all denied.
 
-    Nodes that may offer any of their standard services are left out.  If a denial matches a part of
-    what a wildcard allows, the result has all nodes that the denial matches.
+    Nodes that may offer any of their standard services are left out.  If a denial matches some of
+    the nodes that a wildcard allows, the result has all nodes that the denial matches.
     """
     allowed: dict[str, None] = {}
     denied: dict[str, None] = {}
@@ -489,7 +489,7 @@ def _full_names(name: str, service: str = "") -> Iterator[str]:
 
 
 def _texts_before(name: str, end: str) -> Iterator[str]:
-    """Yield expressions for the texts that match ``name`` when ``end`` is added."""
+    """Yield expressions for the texts that match ``name`` after ``end`` is added."""
     if not is_expression(name):
         if name.endswith(end):
             yield name.removesuffix(end)
@@ -514,7 +514,7 @@ def _nodes(name: str) -> Iterator[NodeName]:
 
 
 def nodes_as_text(nodes: Iterable[NodeName]) -> str:
-    """Return nodes as text for the ledger: "NAMESPACE NAME" of each, separated by commas."""
+    """Return nodes as text for the ledger: "NAMESPACE NAME", separated by commas."""
     return ", ".join(f"{node.ns} {node.name}" for node in nodes)
 
 
@@ -527,12 +527,12 @@ def nodes_from_text(text: str) -> tuple[NodeName, ...]:
 def rights_without_counterpart(
     first_rights: Collection[Right], second_rights: Collection[Right], difference: RightsDifference
 ) -> list[Right]:
-    """Return the ``second_rights`` that have lost their counterpart since ``first_rights``.
+    """Return the ``second_rights`` whose counterpart was in ``first_rights``, and is gone.
 
     An example is a right to subscribe to a topic that no enclave may publish any more, because the
     right to publish it is gone or denied; another is a right to publish a topic to which no enclave
-    may subscribe any more.  A right with a wildcard counts if no counterpart has a name that it
-    matches.  What every node offers, such as its parameters, needs no counterpart.
+    may subscribe any more.  A right with a wildcard counts if no counterpart has a matching name.
+    Names that every node offers, such as its parameter services, need no counterpart.
     """
     reduced = [right for right in difference.only_first if right.qualifier is not DENY]
     reduced += (right for right in difference.only_second if right.qualifier is DENY)
@@ -592,19 +592,19 @@ def _allowed_pairs(
 
 
 def _name_or_wildcard(name: str) -> str:
-    """Return a name, of a part of an action the action's name, and "*" for any wildcard."""
+    """Return a name: of a part of an action the action's name, and of a wildcard "*"."""
     return "*" if is_expression(name) else name.partition(ACTION_SEPARATOR)[0]
 
 
 def lost_counterpart_text(right: Right) -> str:
-    """Return a clause on one of the `rights_without_counterpart`."""
+    """Return a clause on a right that lost its counterpart."""
     other = PEER_RIGHT[right.right]
     other = {"reply": "serve", "subscribe": "subscribe to"}.get(other, other)
     return f"{right.enclave} may {right.right} {right.name}, but no enclave may {other} it any more"
 
 
 def lost_counterparts_text(rights: Iterable[Right]) -> str:
-    """Return a sentence on some of the `rights_without_counterpart`."""
+    """Return a sentence on some rights that lost their counterpart."""
     clauses = list(map(lost_counterpart_text, sorted(rights)))
     return f"{first_few(clauses, _SHOWN, '; ', ', and ')}."
 

@@ -641,7 +641,8 @@ def _digest(kind: str, content: bytes, digits: int) -> str:
 def _header(content: bytes, key: bytes) -> str:
     """Return the object id that follows ``key`` in the first line of a commit or tag.
 
-    Raises: DocumentError: the object is malformed.
+    Raises:
+        DocumentError: the object is malformed.
     """
     first, _, digits = content.partition(b"\n")[0].partition(b" ")
     object_hash = digits.decode(errors="replace")

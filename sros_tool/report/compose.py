@@ -1,10 +1,10 @@
 """Compose the picture of one source, or the overlay of two, from rights and governance.
 
 A wildcard is replaced by the known names that it matches, and denials override permissions.  Known
-names are the exact names in the rights of all sources.  A wildcard that would be invisible then,
-such as one whose known names are all denied, is drawn as a name.  An action is shown as one name,
-also for a right to only some of its parts, such as the right of a recorder that subscribes to
-``/*``.
+names are the exact names in the rights of all sources.  A wildcard that would then be invisible,
+such as a wildcard whose known names are all denied, is drawn as a name.  An action is shown as one
+name, even if a right is for only some parts of the action, such as the right of a recorder that
+subscribes to ``/*``.
 """
 
 from __future__ import annotations
@@ -74,9 +74,9 @@ class PictureSource:
     ``rights`` are the rights and denials in the source.  ``nodes`` maps paths of enclaves to names
     of nodes; ``enclaves`` has the enclaves with data of their certificates; ``scope`` has the paths
     of the enclaves that the source describes, None for all.  ``protections`` are the protection
-    levels that a policy states, and ``policy`` is that policy.  ``keystore`` is the keystore from
-    which the source was read; ``unread`` are its units that were only compared with others.
-    ``in_domains`` has the rights by their ROS domains; empty if the source does not say them.
+    levels that a policy states, and ``policy`` is that policy. ``keystore`` is the keystore from
+    which the source was read; ``unread`` are units of the keystore that were only compared with
+    other units. ``in_domains`` has the rights by ROS domain; empty if the source states no domains.
     """
 
     origin: SourceTitle
@@ -117,7 +117,7 @@ class PictureSource:
         )
 
     def moved_to_homes(self, homes: Mapping[str, str]) -> PictureSource:
-        """Return a copy with rights and nodes moved from enclaves to others, as ``homes`` says."""
+        """Return a copy in which rights and nodes of an enclave are moved to ``homes[enclave]``."""
         nodes: dict[str, set[str]] = defaultdict(set)
         for path, names in self.nodes.items():
             nodes[homes.get(path, path)].update(names)
@@ -185,8 +185,7 @@ def overlay(
 def with_requirements(picture: Picture, requirements: Requirements) -> Picture:
     """Return a picture in which the rights that break requirements are marked.
 
-    A right to a name that the picture does not have is added, such as a name that only wildcards
-    match.
+    Adds such rights to names that the picture lacks, such as names that only wildcards match.
     """
     broken = {
         (use.enclave, use.kind, use.name, use.right): use
@@ -281,7 +280,7 @@ def _picture(
 
 
 def _senders_and_receivers(edges: Iterable[Edge]) -> Mapping[tuple[str, str], list[bool]]:
-    """Map kind and name to two flags: some enclave may send, some enclave may receive."""
+    """Map kind and name to two flags: whether any enclave may send, and any may receive."""
     allowed: dict[tuple[str, str], list[bool]] = defaultdict(lambda: [False, False])
     for edge in edges:
         if edge.qualifier is ALLOW:
@@ -400,7 +399,7 @@ def _marked_rights(
 
 
 def _neutral_edge(edge: Edge, unseen: frozenset[str], observed: NamesOfRights) -> Edge:
-    """Return ``edge``, marked BOTH if nothing shows whether it was used.
+    """Return ``edge``, marked BOTH if it is unknown whether the right was used.
 
     This is the case for a denial, for an enclave in ``unseen``, and for a wildcard drawn as a name
     that matches a name in ``observed``.
@@ -434,8 +433,8 @@ def _overlay_differences(
 def _unused_rights(edges: Iterable[Edge]) -> tuple[OverlayDifference, ...]:
     """Return rights that were allowed but never observed, or observed but not allowed.
 
-    Rights that every node needs are left out.  The names that a wildcard matches are only counted:
-    there are too many for a recorder of all topics.
+    Rights that every node needs are left out.  The names that a wildcard matches are only counted,
+    because a recorder of all topics has too many.
     """
     differences: dict[tuple[OverlaySide, Right], tuple[str, ...]] = {}
     reached: dict[Right, list[bool]] = defaultdict(list)
@@ -477,10 +476,10 @@ class NamesOfRights:
 def _with_all_wildcards(
     rights: Collection[Right], edges_of: Callable[[Known], list[Edge]]
 ) -> tuple[Known, list[Edge]]:
-    """Return the names to draw and the edges to them, so that every wildcard is visible.
+    """Return the names to draw, and edges to these names that show every wildcard.
 
-    Edges to known names do not show a wildcard if all names that it matches are denied, or if the
-    enclave also has rights to these names themselves.  Such a wildcard is drawn as a name.
+    Edges to known names do not show a wildcard if all matched names are denied, or if the enclave
+    also has rights to these exact names.  Such a wildcard is drawn as a name.
     """
     known = Known(rights)
     edges = edges_of(known)
@@ -507,7 +506,7 @@ def _with_all_wildcards(
 class Known:
     """The exact names of topics, services and actions that appear in rights.
 
-    ``wildcards`` are rights whose wildcards are drawn as names, although they match known names.
+    ``wildcards`` are rights whose wildcards are drawn as names, even if known names match.
     """
 
     def __init__(self, rights: Iterable[Right], wildcards: Iterable[Right] = ()) -> None:
@@ -544,8 +543,7 @@ class Known:
     def names_to_draw(self, right: Right) -> tuple[str, ...]:
         """Return the names to draw for a right: exact names, and wildcards that are drawn as names.
 
-        Such a wildcard is drawn for each ALLOW that overlaps it, and for each
-        DENY that covers it.
+        A wildcard is drawn for each ALLOW that overlaps it, and for each DENY that covers it.
         """
         if not is_expression(right.name):
             return (right.name,)
@@ -598,9 +596,9 @@ _Found = dict[Qualifier, set[str]]
 
 
 def _edges_of(rights: Collection[Right], known_names: Known) -> list[Edge]:
-    """Return one edge for each right or denial and each name that it matches, unsorted.
+    """Return an edge from each right or denial to each matching name, unsorted.
 
-    A wildcard that matches no known name, or would not be seen, is drawn as a name.
+    A wildcard that matches no known name, or would be invisible, is drawn as a name.
     """
     nodes = NodeRights(rights)
     topics: dict[tuple[str, str, str, str], _Found] = defaultdict(lambda: defaultdict(set))
@@ -634,7 +632,7 @@ def _action_edges(
     qualifier: Qualifier,
     members: dict[tuple[str, str], set[str]],
 ) -> Iterable[Edge]:
-    """Yield one edge for a right to the whole action, or one for each right to parts of it."""
+    """Yield an edge for a right to the whole action, or edges for rights to parts of the action."""
     remaining = dict(members)
     for right, needed in _WHOLE.items():
         if needed <= members.keys():
@@ -669,7 +667,7 @@ def protection_of(governance: Governance | None, kind: str, name: str) -> Protec
 
     The protection of whole RTPS messages protects every topic in them.  A topic without a rule
     counts as not protected: vendors refuse it.  Access counts as controlled if all domain rules
-    control it for all of these topics, as in `sros_tool.reach`.  Topics that are open to
+    control access to all these topics, as in `sros_tool.reach`.  Topics that are open to
     participants without an identity on any tested vendor count as not controlled.
     """
     if governance is None or not governance.domain_access_rules:
@@ -708,7 +706,7 @@ _ORDER = list(WireLevel)
 
 
 class _Demanded:
-    """The protection that a policy demands for names; used if there is no governance."""
+    """The protection that a policy demands for names, for pictures without a governance."""
 
     def __init__(self, stated_protections: Iterable[StatedProtection]) -> None:
         topics_of: dict[WireLevel, list[str]] = defaultdict(list)
@@ -718,7 +716,7 @@ class _Demanded:
         self._names = {level: Names(topics) for level, topics in topics_of.items()}
 
     def protection(self, kind: str, name: str) -> Protection | None:
-        """Return the weakest protection demanded for the topics of a name; None without any."""
+        """Return the weakest protection demanded for the topics of a name, or None."""
         levels = [self._level(topic) for topic in _topics(kind, name)] if self._names else []
         least = min(levels, key=_ORDER.index, default=WireLevel.UNKNOWN)
         return None if least is WireLevel.UNKNOWN else Protection(least)

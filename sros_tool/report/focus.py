@@ -1,13 +1,13 @@
-"""The part of a picture about one name or enclave: who influences it, and whom it influences.
+"""The part of a picture around a name or enclave: who influences it, and whom it influences.
 
 Who may use a name, and who influences whom, is decided by `sros_tool.reach` for all names that
 rights and governance allow, known or not.  Between two enclaves, the picture has the known names by
 which information goes from the first enclave to the second; without a known name, it has one
 example.
 
-The layout has a column for each hop, and names between two columns.  Information goes from left to
-right: names in the focus have the enclaves that may send to the left of them, and those that may
-receive to the right.  Enclaves further away than the hops that are drawn share one card.
+The layout has a column for each hop, and names between two columns. Information goes from left to
+right: senders are to the left of a name in the focus, and receivers to the right. Enclaves further
+away than the drawn hops share a card.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ _VERBS = {
     "actions": ("call action", "caller", "execute"),
     "dds": ("publish DDS topic", "publisher", "subscribe to"),
 }
-"""Words by kind of name: verb of senders, noun for senders, verb of receivers."""
+"""Kind of name → verb of senders, noun for senders, verb of receivers."""
 _ONE_WAY = ("publish", "subscribe")
 _COMMANDS = ("send_goal", "cancel_goal")
 _NAMED = 3  # maximum number of enclaves that a sentence names; more are counted
@@ -76,10 +76,10 @@ def focused_picture(
     """Return the part of a picture connected to the names or enclaves in ``words``.
 
     Args:
-        picture: a picture of ``sources``, one or two.
+        picture: a picture of ``sources``.
         words: absolute ROS names, perhaps with wildcards; DDS topics; paths of enclaves.
-        routers: number of Zenoh routers.  If there are several, the answers say that they do not
-            consider what passes between routers.
+        routers: number of Zenoh routers. With several routers, the answers say that they ignore the
+            limits on what passes between routers.
 
     Raises:
         UsageError: nothing in the sources has such a name.
@@ -115,14 +115,14 @@ def focused_picture(
 class FocusFlow:
     """The flow of information to and from the names in a focus, in stages.
 
-    ``own`` are the enclaves in the focus, and ``targets`` its names (kind and name).  ``before``
-    maps an enclave to its number of hops to the focus: 1 if it is in the focus, or may send to a
-    target.  ``after`` maps an enclave to the number of hops from the focus: 1 if it may receive
-    from a target.
+    ``own`` are the enclaves in the focus, and ``targets`` the names in the focus (kind and name).
+    ``before`` maps an enclave to the number of hops to the focus: 1 for an enclave in the focus, or
+    that may send to a target. ``after`` maps an enclave to the number of hops from the focus: 1 for
+    an enclave that may receive from a target.
 
-    ``stages`` maps a name to its columns.  A target has column 0, and so has a name that an enclave
-    in the focus writes.  Columns to the left count the hops of the reading enclaves; columns to the
-    right count the hops of the writing enclaves, as negative numbers.
+    ``stages`` maps a name to its columns.  Targets, and names that an enclave in the focus writes,
+    have column 0.  Columns to the left count the hops of the reading enclaves; columns to the right
+    count the hops of the writing enclaves, as negative numbers.
     """
 
     own: frozenset[str]
@@ -261,7 +261,7 @@ class _System:
         An exact name counts if a right states it, or if the wildcard of a right matches it.
 
         Raises:
-            UsageError: there is none.
+            UsageError: there is no such name or enclave.
         """
         enclaves = [enclave.path for enclave in self._picture.enclaves]
         kinds = [_ENCLAVE] * (word in enclaves)
@@ -284,7 +284,7 @@ class _System:
             yield kind, word
 
     def focus(self, kind: str, name: str) -> Focus:
-        """Return who may use a name and influence its users, or the influences of an enclave."""
+        """Return the users of a name and who influences them, or the influences of an enclave."""
         if kind == _ENCLAVE:
             influencing = self._influences(self._network.influencers_of({name}))
             influenced = self._influences(self._network.influenced_by({name}), 0)
@@ -360,7 +360,7 @@ class _System:
         )
 
     def _edges_by_wildcard(self, kind: str, name: str) -> Iterator[Edge]:
-        """Yield the rights to a name that is matched only by wildcards."""
+        """Yield the rights to a name that only wildcards match."""
         if (kind, name) in self._known:
             return
         by_right: dict[tuple[str, str], list[Right]] = defaultdict(list)
@@ -384,7 +384,7 @@ def _overlaps_word(right: Right, kind: str, word: str) -> bool:
 def _commands(kind: str, name: str) -> Iterator[str]:
     """Yield the DDS topics of a name by which a sender can command its receivers.
 
-    Requests of services that only answer questions are left out.
+    Leaves out requests of services that only answer questions.
     """
     if kind == "dds":
         yield name
@@ -407,7 +407,7 @@ def _sentence(
 ) -> str:
     """Return a sentence on who may use a name, and how many enclaves influence its senders.
 
-    ``partial``: there may be other enclaves, so no enclave is said to be the only one.
+    With ``partial``, there may be other enclaves, so no enclave is said to be the only one.
     """
     sends, sender, receives = _VERBS[kind]
     who = "every enclave" if open_to_all else _enclaves_text(senders, partial=partial)
@@ -426,7 +426,7 @@ def _sentence(
 
 
 def _counted_influences(influences: Sequence[Influence], direct: int) -> str:
-    """Return the number of enclaves in words, and how many of them are ``direct`` hops away."""
+    """Return the number of enclaves in words, and how many of them are direct."""
     near = sum(influence.hops == direct for influence in influences)
     text = counted(len(influences), "enclave") if influences else "no enclave"
     return text if near == len(influences) else f"{text} ({near} directly)"
@@ -448,7 +448,7 @@ _MOST_ENCLAVES = 24  # if a column has more, groups are drawn; with more groups,
 _MOST_BUNDLES = 40  # if a stage has more, names with the same senders are joined
 _GUTTER, _LETTER, _SMALL_LETTER = 76, 7.4, 6.2
 _ROOM = {"names": 66, "enclave": 24, "group": 24}
-"""Width on a card that its text does not use, in pixels."""
+"""Width on a card besides its text, in pixels."""
 
 
 def flow_scene(picture: Picture, hops: int = HOPS, *, with_places: bool = True) -> Scene:
@@ -456,9 +456,9 @@ def flow_scene(picture: Picture, hops: int = HOPS, *, with_places: bool = True) 
 
     Args:
         picture: a picture with a focus.
-        hops: how many hops to the left and to the right are drawn, at least 1.
-        with_places: whether cards get a y and groups get frames; formats that place cards
-            themselves need neither.
+        hops: number of hops to draw to the left and to the right, at least 1.
+        with_places: whether cards get a y and groups get frames; formats with a layout engine need
+            neither.
     """
     draft = _Draft(picture, FocusFlow.of(picture), hops)
     cards = draft.cards_in_columns()
@@ -476,7 +476,7 @@ def flow_scene(picture: Picture, hops: int = HOPS, *, with_places: bool = True) 
 
 
 class _Stage(NamedTuple):
-    """Bundles of names in one ``column``, with the rights of enclaves on both sides of it."""
+    """Bundles of names in a ``column``, and the rights of enclaves on both sides of the column."""
 
     column: int
     bundles: tuple[tuple[Bundle, tuple[Tie, ...], tuple[Tie, ...]], ...]
@@ -505,7 +505,7 @@ class _Draft:
         return middle + (1 - 2 * hop if is_before_focus else 2 * hop - 1)
 
     def _folded(self) -> Mapping[tuple[bool, str], str]:
-        """Map side of the focus and enclave to the id of the card that stands for the enclave."""
+        """Map side of the focus and enclave to the id of the card for the enclave."""
         nodes = {}
         for before, side in ((True, self._flow.before), (False, self._flow.after)):
             columns: dict[int, list[str]] = defaultdict(list)
@@ -621,7 +621,7 @@ class _Draft:
         return [*links_of(cards, ties), *self._further_links(cards)]
 
     def _further_links(self, cards: Mapping[str, Card]) -> Iterator[Link]:
-        """Yield links of the outermost drawn cards to the card of the enclaves further away."""
+        """Yield links between the outermost drawn cards and the card of enclaves further away."""
         for before, paths in zip((True, False), self._further, strict=True):
             if not paths:
                 continue
@@ -668,7 +668,7 @@ _BOTH = OverlaySide.BOTH
 
 
 def _width(card: Card) -> int:
-    """Return the width of a card for its text, in pixels."""
+    """Return the width that a card needs for its text, in pixels."""
     widest = max((len(line) for line in card.lines), default=0) * _LETTER
     small = max((len(note) for note in card.notes), default=0) * _SMALL_LETTER
     return max(96, round(max(widest, small) + _ROOM[card.role]))

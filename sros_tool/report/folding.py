@@ -1,11 +1,11 @@
-"""Draw robots, namespaces or enclaves that differ only in their names as one.
+"""Draw robots, namespaces or enclaves that differ only in their names once, with a label.
 
 A unit is a robot of a fleet.  Without a fleet, units are sibling namespaces or enclaves that
 contain nearly the same enclaves.  Two units are equal if their drawings differ only in the names of
-the units.  The drawing of a unit has the rights and denials of its enclaves, also by wildcards that
-the picture shows at known names only, and the rights and denials of other enclaves to its names.
-If a unit has rights to names of other units, such as the robots whose poses a robot reads, only the
-number of these units has to be equal.
+the units.  The drawing of a unit has the rights and denials of the unit's enclaves, also wildcards
+that the picture shows at known names only, and the rights and denials of other enclaves to the
+unit's names. If a unit has rights to names of other units, such as the robots whose poses a robot
+reads, only the number of these units has to be equal.
 
 A label such as ``{r01…r50}`` stands for each equal unit: ``/{r01…r50}/base`` may publish
 ``/{r01…r50}/odom`` means that each robot may publish its own topic.
@@ -48,7 +48,7 @@ from sros_tool.report.picture import (
 from sros_tool.wording import counted
 
 _MARKS = "{}…"
-"""Characters of labels, which ROS names cannot have; a picture with one is not folded."""
+"""Characters of labels, which ROS names cannot have; pictures with these are not folded."""
 _WORD = re.compile(r"[A-Za-z0-9_]+")
 _MOST_PIECES = 16
 """Maximum number of pieces of a word (split at underscores) that are compared with unit names."""
@@ -57,11 +57,11 @@ _TITLE_LETTERS = 30
 """Maximum length of the title of a frame, in characters; a frame is as wide as a card."""
 _ENCLAVE = "enclave"
 _Part = tuple[int, tuple[int, ...]]
-"""A part of the picture about a unit: a number for its kind, and the units that it names."""
+"""A part of the picture about a unit: a number for its kind, and the units in it."""
 
 
 class Folding(NamedTuple):
-    """A picture in which equal units are drawn as one, and the real names for its labels."""
+    """A picture in which equal units are drawn once, and the real names behind the labels."""
 
     picture: Picture
     equal: tuple[EqualUnits, ...]
@@ -71,7 +71,7 @@ class Folding(NamedTuple):
 
     @classmethod
     def of(cls, picture: Picture, robots: Mapping[str, Robot] | None = None) -> Folding:
-        """Return a picture with equal units drawn as one.
+        """Return a picture with equal units drawn once, with a label.
 
         Args:
             picture: any picture, even one with a focus or of two sources.
@@ -83,8 +83,9 @@ class Folding(NamedTuple):
         """Return the scenes, whose cards list the real enclaves and names.
 
         Args:
-            with_places: for formats that place cards themselves, False: without y and frames.
-            hops: with a focus, how far enclaves are drawn; 0 for the default.
+            with_places: whether cards get a y and groups get frames; formats with a layout engine
+                need neither.
+            hops: with a focus, the number of hops to draw; 0 for the default.
         """
         scenes = scenes_of(self.picture, with_places=with_places, drawn_as=self.names)
         if self.picture.focus:
@@ -115,11 +116,11 @@ class Folding(NamedTuple):
 
 
 class DrawnUnit(NamedTuple):
-    """A robot, a namespace or an enclave that can be equal to others of its ``family``.
+    """A robot, namespace or enclave that can be equal to other units of its ``family``.
 
-    ``values`` are the words by which names name it: its name, and its namespace if that differs.
-    ``group`` are the groups and the domain of a robot: only robots with the same groups and domain
-    are expected to be alike.
+    ``values`` are the words that stand for the unit in names: its name, and its namespace if that
+    differs. ``group`` are the groups and the domain of a robot: only robots with the same groups
+    and domain are expected to be alike.
     """
 
     name: str
@@ -137,9 +138,9 @@ class DrawnUnit(NamedTuple):
 
 @dataclass(frozen=True)
 class UnitText:
-    """A text, split where it has the name of a unit.
+    """A text that is split at names of units.
 
-    A unit is stored as its number, and the number of the word in its ``values``.
+    A unit is stored as two numbers: of the unit, and of the word in the unit's ``values``.
     """
 
     parts: tuple[str, ...]
@@ -152,7 +153,7 @@ class UnitText:
 
     @cached_property
     def form(self) -> tuple[object, ...]:
-        """The text without the units: equal for texts that differ in units alone."""
+        """The text without the names of units; equal for texts that differ only in units."""
         return self.parts, tuple(number for _, number in self.named)
 
     def fill(self, word: Callable[[int, int], str]) -> str:
@@ -162,7 +163,7 @@ class UnitText:
         return first + "".join(value + part for value, part in zip(named, rest, strict=True))
 
     def with_only_unit(self, unit: int | None, word: Callable[[int, int], str]) -> UnitText:
-        """Return the text split only at the name of ``unit``; other units become plain text."""
+        """Return the text split only at names of ``unit``; other names become plain text."""
         parts, named = [self.parts[0]], []
         for named_unit, part in zip(self.named, self.parts[1:], strict=True):
             if named_unit[0] == unit:
@@ -177,13 +178,13 @@ class UnitNames:
     """The names of units in texts, and the unit of each enclave.
 
     ``of`` maps enclaves to the numbers of their units.  An enclave belongs to the unit whose name
-    is in its path, even if it is outside of the unit's namespace; it belongs to none if its path
-    has the names of several units.  A unit can be folded only if the path of each of its enclaves
-    has the unit's name.
+    is in its path, even outside of the unit's namespace, and to no unit if its path has the names
+    of several units. A unit can be folded only if the paths of all its enclaves have the unit's
+    name.
     """
 
     def __init__(self, units: Sequence[DrawnUnit], paths: Iterable[str]) -> None:
-        """Find the words that stand for units, in the paths of all enclaves."""
+        """Find the words for units in the paths of all enclaves."""
         number = Counter(value for unit in units for value in unit.values)
         dropped: set[int] = set()
         while True:
@@ -242,8 +243,8 @@ class UnitNames:
     ) -> tuple[tuple[int, int] | None, int]:
         """Return the unit with the longest name that begins at piece ``at``, and the name's length.
 
-        The unit is its number and the number of the word in its ``values``, or None; the length is
-        a number of pieces.
+        The unit is a pair of numbers, of the unit and of the word in its ``values``, or None; the
+        length is a number of pieces.
         """
         for size in range(min(len(pieces) - at, _MOST_PIECES), 0, -1):
             unit = self.words.get("_".join(pieces[at : at + size]))
@@ -302,8 +303,8 @@ class _Draft:
     def _sightings(self) -> Iterator[tuple[int, tuple[int, ...], Edge | str]]:
         """Yield each enclave and drawn right whose texts have names of units.
 
-        Yields a number, the units, and the enclave or right; items with the same number differ only
-        in their units.
+        Yields triples: a number, the units, and the enclave or right. Triples with the same number
+        differ only in their units.
         """
         alarming = {
             finding.enclave for finding in self._picture.findings if finding.severity == "error"
@@ -342,7 +343,7 @@ class _Draft:
             yield kind, units, edge
 
     def _stated_edges(self) -> Iterator[Edge]:
-        """Yield, as they are stated, the rights that the picture changes or does not show.
+        """Yield, in their original form, rights that the picture changes or does not show.
 
         These are wildcards; in a picture with a focus, all rights.
         """
@@ -358,9 +359,9 @@ class _Draft:
     def _find_classes(self) -> dict[int, list[int]]:
         """Return the classes of equal units, sorted by name.
 
-        First, units of a family are compared with the names of all other units ignored.  Some units
-        are then distinguished wherever they are named: those unlike the rest of their family, and
-        those that most of the family names, such as a leader.
+        First, units of a family are compared without regard to the names of other units. Then the
+        names of some units count: of units unlike the rest of their family, and of units that have
+        rights from most of the family, such as a leader.
         """
         self._symbols = [unit.family for unit in self._units]
         parts = self._parts_by_unit()
@@ -391,13 +392,13 @@ class _Draft:
         return name_order(self._units[unit].name)
 
     def _unit_names(self, units: Iterable[int]) -> tuple[str, ...]:
-        """Return the names of equal units, also of units that were not read in full."""
+        """Return the names of equal units, including units that were not read in full."""
         names = [self._units[unit].name for unit in units]
         unread = (self._unread.get(name, ()) for name in names)
         return tuple(sorted([*names, *chain.from_iterable(unread)], key=name_order))
 
     def _parts_by_unit(self) -> list[Counter[_Part]]:
-        """Return for each unit the parts of the picture that name it, with symbols for units."""
+        """Return, for each unit, the parts of the picture with its name, as symbols."""
         parts: list[Counter[_Part]] = [Counter() for _ in self._units]
         for kind, units, _what in self._seen:
             for unit in set(units):
@@ -412,7 +413,7 @@ class _Draft:
     def _are_alike(self, view: Iterable[_Part], other: Iterable[_Part]) -> bool:
         """Return whether two drawings of units have at least half of their content in common.
 
-        Rights that every node needs do not count: they would make any two enclaves alike.
+        Rights that every node needs do not count, because they would make any two enclaves alike.
         """
         own, others = (
             {part for part in parts if part[0] not in self._common_kinds} for parts in (view, other)
@@ -420,7 +421,7 @@ class _Draft:
         return 2 * len(own & others) >= max(len(own), len(others))
 
     def _named_by(self, families: Container[int]) -> Counter[int]:
-        """Return how many other units of its family have rights to names of each unit."""
+        """Map each unit to the number of other units of its family with rights to its names."""
         pairs = {
             (unit, owner)
             for _kind, units, part in self._seen
@@ -467,7 +468,7 @@ class _Draft:
         return domains.pop() if len(domains) == 1 else ""
 
     def _is_kept_apart(self, unit: int) -> bool:
-        """Return whether a unit may not be drawn together with others."""
+        """Return whether a unit has to be drawn separately from equal units."""
         symbol = self._symbols[unit]
         return not any(
             len({other_unit for other_unit in units if self._symbols[other_unit] == symbol}) > 1
@@ -475,14 +476,14 @@ class _Draft:
         )
 
     def _label(self, unit: int, position: int = 0) -> str:
-        """Return the label for a unit's class; for a unit equal to no other, its own word."""
+        """Return the label for a unit's class; for a unit without equal units, its own word."""
         if unit not in self._inside:
             return self._word(unit, position)
         first, *_, last = self._classes[self._inside[unit]]
         return f"{{{self._word(first, position)}…{self._word(last, position)}}}"
 
     def _is_drawn(self, unit: int) -> bool:
-        """Return whether a unit is drawn: only the first of a class of equal units is."""
+        """Return whether a unit is drawn: true for the first of a class of equal units only."""
         return unit not in self._inside or self._classes[self._inside[unit]][0] == unit
 
     def _path(self, enclave: str) -> str:
@@ -494,7 +495,7 @@ class _Draft:
         return path
 
     def _per_unit(self, text: UnitText, number: int) -> Iterator[str]:
-        """Yield the text once for each unit of a class, with that unit's name."""
+        """Yield the text once for each unit of a class, with the name of this unit."""
         for unit in self._classes[number]:
             yield text.fill(partial(self._plain_word, unit))
 
@@ -502,7 +503,7 @@ class _Draft:
         return self._word(unit, position)
 
     def _edges(self, differing_parts: Set[Edge | str]) -> Iterator[Edge]:
-        """Yield the rights to draw: of drawn units, and of enclaves that belong to no unit."""
+        """Yield the rights to draw: rights of drawn units, and of enclaves without a unit."""
         count_text = self._other_units_text()
         for edge in self._picture.edges:
             unit = self._of.get(edge.enclave)
@@ -529,7 +530,7 @@ class _Draft:
         return other in self._inside or unit in self._inside
 
     def _other_units_text(self) -> Callable[[Edge, int, int, int], str]:
-        """Return a function that tells how many other units a right is for, as text."""
+        """Return a function that returns the number of other units for a right, as text."""
         units_by_key: dict[object, set[int]] = defaultdict(set)
         families: dict[int, list[int]] = defaultdict(list)
         for n in sorted(set(self._of.values()), key=self._unit_name_order):
@@ -566,7 +567,7 @@ class _Draft:
         return several
 
     def _real_names(self, kind: str, name: UnitText) -> Iterable[str]:
-        """Yield the real names that a drawn name with labels stands for."""
+        """Yield the real names for which a drawn name with labels stands."""
         if len(name.named) == 1 and name.units[0] in self._inside:
             return self._per_unit(name, self._inside[name.units[0]])
         if self._names_of_form is None:
@@ -659,14 +660,14 @@ class _Draft:
         return tuple(different), differing_parts
 
     def _units_in_focus(self) -> set[int]:
-        """Return the units in the focus, which differ from all others by that."""
+        """Return the units in the focus, which are not equal to units outside of the focus."""
         names = (focus.name for focus in self._picture.focus)
         return {unit for name in names for unit in self._text(name).units}
 
     def _in_words(
         self, drawn: Sequence[Edge | str], unit: int, replaced: int | None = None
     ) -> Iterator[str]:
-        """Yield enclaves and rights in words, with ``unit`` named instead of ``replaced``."""
+        """Yield enclaves and rights in words, with the name of ``unit`` for ``replaced``."""
 
         def word(named: int, position: int) -> str:
             return self._label(unit if named == replaced else named, position)
@@ -682,7 +683,7 @@ class _Draft:
 
 
 def _classes(views: Sequence[Counter[_Part]], before: Sequence[int]) -> dict[int, list[int]]:
-    """Divide classes of units, so that only units with equal views stay in the same class."""
+    """Divide classes of units into classes of units with equal views."""
     numbers: dict[object, int] = {}
     classes: dict[int, list[int]] = defaultdict(list)
     for unit, view in enumerate(views):
@@ -700,7 +701,7 @@ def _unfolded(picture: Picture) -> Folding:
 
 
 def units_of(paths: Sequence[str], robots: Mapping[str, Robot]) -> list[DrawnUnit]:
-    """Return the units of enclaves: their ``robots``, else units with similar paths."""
+    """Return the units of enclaves: ``robots``, or else units with similar paths."""
     return list(_robots(paths, robots) if robots else _guessed_units(paths))
 
 
@@ -713,7 +714,7 @@ def name_order(name: str) -> tuple[object, ...]:
 
 
 def _robots(paths: Iterable[str], robots: Mapping[str, Robot]) -> Iterator[DrawnUnit]:
-    """Yield the robots of a fleet, each with its enclaves that are in ``paths``."""
+    """Yield the robots of a fleet that have enclaves in ``paths``."""
     enclaves: dict[str, list[str]] = defaultdict(list)
     named = {}
     for path in paths:
@@ -752,7 +753,7 @@ def _guessed_units(paths: Iterable[str]) -> Iterator[DrawnUnit]:
 
 
 def _group_by_first_part(paths: Iterable[tuple[str, str]]) -> dict[str, dict[str, str]]:
-    """Group paths by their first part: map it to the rest of the path and to the enclave."""
+    """Map the first part of paths to the rest of these paths, and the rest to the enclave."""
     groups: dict[str, dict[str, str]] = defaultdict(dict)
     for path, enclave in paths:
         first, _, rest = path.partition("/")

@@ -175,8 +175,8 @@ def render_svg(picture: Picture, scene: Scene) -> str:
 def _style(palette: Mapping[str, tuple[str, str]]) -> str:
     """Return the style of a drawing: light, and dark where the viewer asks for it.
 
-    Viewers that know neither variables nor media queries (CairoSVG, Qt, printing) draw in the
-    light colors, so the style has each color itself.
+    Viewers without variables and media queries (CairoSVG, Qt, printing) draw in the light colors,
+    so the style also has every color as a value.
     """
     light = {word: colors[0] for word, colors in palette.items()}
     dark = {word: colors[1] for word, colors in palette.items()}
@@ -194,7 +194,7 @@ def _style(palette: Mapping[str, tuple[str, str]]) -> str:
 
 
 def _summary(picture: Picture, scene: Scene) -> str:
-    """Return how many enclaves and names a scene shows, and how many names it leaves out."""
+    """Return the numbers of enclaves and names in a scene, and of left out names, in words."""
     text = f"{counted(len(picture.enclaves), 'enclave')}, {counted(scene.shown, 'name')}"
     return text + (f", {scene.hidden} that every node needs are left out" if scene.hidden else "")
 
@@ -427,9 +427,10 @@ def render_mermaid(picture: Picture, scene: Scene) -> str:
 
 
 def _render_markdown(picture: Picture, *, everything: bool = False) -> str:
-    """Return a table of who may send to, and receive from, each name, in Markdown.
+    """Return a Markdown table with the senders and receivers of each name.
 
-    Without ``everything``, it lacks names to which enclaves have only the rights of every node.
+    Without ``everything``, names are left out if the only rights to them are rights that every node
+    needs.
     """
     rows: dict[tuple[str, str], tuple[list[str], list[str]]] = {
         (edge.kind, edge.name): ([], [])
@@ -463,7 +464,7 @@ def _render_markdown(picture: Picture, *, everything: bool = False) -> str:
 
 
 def _who_for_single_names(picture: Picture, name: Name, *, sends: bool) -> str:
-    """Return a remark on a wildcard of which, on one side, enclaves may use only known names."""
+    """Return a remark on a wildcard if, on one side, enclaves may use only its known names."""
     single = (
         edge
         for edge in picture.edges
@@ -502,7 +503,7 @@ def _title(picture: Picture) -> str:
 
 
 def _node_cards(scene: Scene) -> Mapping[str, Card]:
-    """Map node ids to cards; the two cards of an enclave become one node."""
+    """Map node ids to cards; both cards of an enclave become one node."""
     cards: dict[str, Card] = {}
     for card in sorted(scene.cards, key=lambda card: (card.role, card.members, card.column)):
         cards.setdefault(_key(card.id), card)
@@ -510,7 +511,7 @@ def _node_cards(scene: Scene) -> Mapping[str, Card]:
 
 
 def _clusters(cards: Mapping[str, Card]) -> dict[str, list[str]]:
-    """Map groups to the node ids of their enclaves; empty if there is only one group."""
+    """Map groups to the node ids of their enclaves; empty for a single group."""
     groups: dict[str, list[str]] = defaultdict(list)
     for key, card in cards.items():
         if card.role == "enclave":
@@ -632,12 +633,11 @@ def render(
 
     Args:
         picture: the picture.
-        folding: the same picture with equal units as one.
-        form: the form.
+        folding: the same picture with equal units drawn once. form: the format.
         moment: the time that a page shows.
         everything: also draw rights that every node needs; a page has both.
         graphviz: let Graphviz lay out an SVG.
-        hops: how many hops from its focus are drawn.
+        hops: number of hops to draw from the focus.
 
     Raises:
         UnavailableError: Graphviz is not installed.

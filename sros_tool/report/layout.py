@@ -1,11 +1,11 @@
 """The layout of a picture in three columns: senders left, names in the middle, listeners right.
 
-SVG and the page use the same scene; Graphviz and Mermaid use its cards, but place them themselves.
-Lengths are in pixels at normal text size; x grows to the right and y downwards.
+SVG and the page use the same scene; Graphviz and Mermaid use the cards of the scene, but place the
+cards themselves. Lengths are in pixels at normal text size; x grows to the right and y downwards.
 
-It is a layered layout with three layers, after Sugiyama: each column is ordered by the barycenters
-of the neighbors, and each card is placed as near to its neighbors as the other cards allow (with
-the pool-adjacent-violators algorithm).  The same input always gives the same layout.
+The layout has three layers, after Sugiyama: each column is ordered by the barycenters of the
+neighbors, and each card is placed as near to its neighbors as the other cards allow (with the
+pool-adjacent-violators algorithm).  The same input always gives the same layout.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ _NAMES = "topics, services, actions"
 
 
 class Head(NamedTuple):
-    """The heading of a column; ``anchor`` says which part of the text is at ``x``."""
+    """The heading of a column; ``x`` is the position of the part of the text named ``anchor``."""
 
     x: int
     anchor: str
@@ -93,8 +93,8 @@ class Scene:
     """Cards and the links between them.
 
     ``shown`` is the number of names that are drawn, or counted on the card of their only enclave;
-    ``hidden`` is the number of names that this scene leaves out, because the only rights for them
-    are rights that every node needs.
+    ``hidden`` is the number of names that are left out, because only rights that every node needs
+    are for these names.
     """
 
     id: str
@@ -115,11 +115,10 @@ class Card:
     """A rectangle with text: an enclave, a group of enclaves, or a bundle of names.
 
     ``column`` counts from 0, names are in odd columns; an enclave that sends and listens has a card
-    on both sides.  A card in the focus of the picture is ``chosen``.  ``lines``
-    is the text, ``notes`` smaller text below it.  ``members`` are all enclaves or names of the
-    card.  Only cards of names have ``kind``, ``level``, ``lacks`` and ``tags``:
-    the letters of onlookers, which are nodes with rights to many of the names.  Only cards of
-    enclaves have ``group``.
+    on both sides.  A card in the focus of the picture is ``chosen``.  ``lines`` is the text,
+    ``notes`` smaller text below.  ``members`` are all enclaves or names of the card.  Only cards of
+    names have ``kind``, ``level``, ``lacks`` and ``tags``: the letters of onlookers, which are
+    nodes with rights to many of the names.  Only cards of enclaves have ``group``.
     """
 
     id: str
@@ -144,8 +143,8 @@ class Card:
 class Link:
     """An arrow from the right edge of one card to the left edge of another card.
 
-    ``rights`` is its label, such as publish; ``wildcard`` says that only wildcards give the right,
-    ``violates`` that it breaks a requirement, ``differs`` that units like this one do not have it.
+    ``rights`` is the label, such as publish; ``wildcard`` says that only wildcards give the right,
+    ``violates`` that the right breaks a requirement, ``differs`` that similar units lack the right.
     """
 
     source: str
@@ -162,7 +161,7 @@ class Link:
 
 
 class Onlooker(NamedTuple):
-    """An enclave with lines to very many names: their cards show its letter (``tag``) instead."""
+    """An enclave with lines to very many names, whose cards show its letter (``tag``) instead."""
 
     tag: str
     enclave: str
@@ -181,7 +180,7 @@ class Frame:
 
 
 DrawnAs = Mapping[tuple[str, str], Sequence[str]]
-"""Maps kind and text of a drawn name to the real names behind it."""
+"""Kind and text of a drawn name → the real names behind the drawn name."""
 
 
 def scenes_of(
@@ -190,14 +189,14 @@ def scenes_of(
     """Return the scenes of a picture, the overview first.
 
     With few enclaves, the first scene leaves out the rights that every node needs, and the second
-    one has everything.  With many enclaves, the first scene has the groups and the links between
+    scene has everything.  With many enclaves, the first scene has the groups and the links between
     them, and each group has another scene with its neighbors.
 
     Args:
         picture: the picture.
-        with_places: whether cards get a y and groups get frames; formats that place cards
-            themselves need neither.
-        drawn_as: for drawn names, the real names behind them; only real names are counted.
+        with_places: whether cards get a y and groups get frames; formats with a layout engine need
+            neither.
+        drawn_as: the real names behind drawn names; only real names are counted.
     """
     groups = {enclave.path: enclave.group for enclave in picture.enclaves}
     titles = sorted(set(groups.values()))
@@ -265,7 +264,7 @@ def _scene(
 
 
 def _count_real_names(names: Iterable[tuple[str, str]], drawn_as: DrawnAs) -> int:
-    """Return the number of distinct real names that drawn names stand for."""
+    """Return the number of different real names behind drawn names."""
     return len(
         {(kind, real) for kind, name in names for real in drawn_as.get((kind, name), (name,))}
     )
@@ -275,7 +274,7 @@ class _Draft:
     """The builder of a scene before placement, with its cards and links.
 
     ``members`` maps each node of the scene to its enclaves; ``everybody`` maps each name to the
-    nodes with any right to it, drawn or not.
+    nodes with any right to the name, drawn or not.
     """
 
     def __init__(
@@ -401,8 +400,8 @@ class _Draft:
 def _onlookers(bundles: Sequence[Bundle]) -> dict[tuple[str, str], int]:
     """Map onlookers (node and right) to the number of their names.
 
-    An onlooker, such as ("/recorder", "subscribe"), has wildcards that match so many names that its
-    lines would hide all other lines.
+    An onlooker, such as ("/recorder", "subscribe"), has wildcards for so many names that the lines
+    of the onlooker would hide all other lines.
     """
     reached: dict[tuple[str, str], list[Bundle]] = defaultdict(list)
     wild: dict[tuple[str, str], int] = defaultdict(int)
@@ -468,9 +467,10 @@ def side_card(
     members: Iterable[str],
     group: str = "",
 ) -> Card:
-    """Return the card of an enclave in ``group``, or of several enclaves, without x, y and width.
+    """Return the card of an enclave, or of several enclaves, without x, y and width.
 
-    ``card`` is its id, and ``label`` the text that names the enclave or the enclaves.
+    ``card`` is the id of the card, ``label`` names the enclave or enclaves, and ``group`` is its
+    group.
     """
     lines = _wrapped_name(label, _SIDE_LETTERS)
     return Card(
@@ -547,7 +547,7 @@ LinkedTie = tuple[str, str, Tie]
 
 
 def links_of(cards: Mapping[str, Card], ties: Iterable[LinkedTie]) -> list[Link]:
-    """Return links for rights, without positions; rights that are drawn alike share a link."""
+    """Return links for rights, without positions; equally drawn rights share a link."""
     groups: dict[tuple[str, str, Qualifier, bool, OverlaySide, bool, bool], set[str]]
     groups = defaultdict(set)
     for source, target, tie in ties:
@@ -586,7 +586,7 @@ def placed(scene: Scene, columns: int) -> Scene:
 def _stacked_cards(
     cards: Iterable[Card], lines: Sequence[tuple[str, str]], columns: int
 ) -> dict[str, Card]:
-    """Return the cards with their y, by id, ordered by column and y.
+    """Return the cards with their y, by id, in the order of column and y.
 
     Cards of names are in odd columns; ``lines`` are pairs of ids in neighboring columns.
     """
@@ -628,7 +628,7 @@ def _linked_cards(cards: Mapping[str, Card], links: Sequence[Link]) -> tuple[Lin
 def _tops(
     columns: Sequence[Sequence[ColumnItem]], lines: Sequence[tuple[str, str]]
 ) -> dict[str, float]:
-    """Map cards to their y: the tallest column has no gaps, other columns are aligned with it."""
+    """Map cards to their y; the tallest column has no gaps, and other columns follow it."""
     extent = [_extent(column) for column in columns]
     tallest = max(range(len(columns)), key=lambda number: (extent[number], number % 2 == 1))
     tops: dict[str, float] = {}
@@ -677,8 +677,8 @@ def order_columns(
 ) -> list[list[ColumnItem]]:
     """Return the items of all columns in an order with few crossings of lines.
 
-    ``lines`` are pairs of ids of items in neighboring columns.  The result is the order with the
-    fewest crossings of all sweeps.
+    ``lines`` are pairs of ids of items in neighboring columns.  The order is the one with the
+    fewest crossings among several sweeps.
     """
     near: dict[str, list[str]] = {item.id: [] for column in columns for item in column}
     for first_id, second_id in lines:
@@ -767,8 +767,8 @@ def place_column(
 ) -> dict[str, float]:
     """Map items to y positions near their ``wanted_positions``, without overlaps.
 
-    Items keep their order, with ``gap`` between them, and none is above ``top``.  The first item of
-    each group has ``lead`` more space above it.  All lengths are in pixels.
+    Items keep their order, with ``gap`` between items, and no item is above ``top``.  The first
+    item of each group has ``lead`` more space above it.  All lengths are in pixels.
     """
     offsets, at, group = [], 0.0, None
     for item in column:

@@ -1,9 +1,9 @@
 """HTML pages of a picture, of a demo's result and of a fleet's status, each in a single file.
 
 The pages load no other files: the content security policy allows only the script and style in the
-file, by their digests.  The data is JSON in which every character that could end its element is
-escaped, and the script inserts it only as text.  The pages of a demo and of a fleet have no script;
-their input is what ``sros demo --json`` and ``sros fleet status --json`` print.
+file, by their digests.  The data is JSON in which every character that could end the script element
+is escaped, and the script inserts data only as text. The pages of a demo and of a fleet have no
+script; their input is the output of ``sros demo --json`` and ``sros fleet status --json``.
 """
 
 from __future__ import annotations
@@ -52,8 +52,8 @@ def render_page(
         picture: the picture, with all its enclaves.
         scenes: the drawings that the page offers.
         now: the time for which the findings were decided.
-        drawn: the picture in which equal robots, namespaces and enclaves are drawn as one; None if
-            there are none.
+        drawn: the picture in which equal robots, namespaces and enclaves are drawn once; None if no
+            units are equal.
     """
     script, style = _asset("view.js"), _asset("view.css")
     origins = ", ".join(f"{origin.kind} {origin.title}" for origin in picture.origins)
@@ -72,8 +72,8 @@ def render_page(
 def escape(text: str) -> str:
     """Escape ``text`` for the content of an HTML element or an attribute value.
 
-    A character that XML forbids, a control character or a line break becomes a visible escape: it
-    could control a terminal that shows the file.
+    A character that XML forbids, a control character or a line break becomes a visible escape,
+    because it could control a terminal that shows the file.
     """
     return html.escape(visible_line(text))
 
@@ -126,8 +126,8 @@ def _digest(text: str) -> str:
 def _page_data(picture: Picture, scenes: tuple[Scene, ...], drawn: Picture) -> dict[str, Any]:
     """Return the data of the page's script, as values for JSON.
 
-    Rights are grouped by names with equal rights (bundles), which takes less space than one entry
-    for each right.
+    Names with equal rights are grouped into bundles, which take less space than an entry for each
+    right.
     """
     bundles = fold(picture.names, picture.edges, separate_questions=True)
     return {
@@ -150,7 +150,10 @@ def _page_data(picture: Picture, scenes: tuple[Scene, ...], drawn: Picture) -> d
 
 
 def _requirements_json(requirements: Requirements | None) -> dict[str, Any] | None:
-    """Return how many requirements hold, and what breaks the others; findings say the rest."""
+    """Return the number of requirements that hold, and the violations of the others.
+
+    Findings have further details.
+    """
     return requirements and {
         "hold": requirements.hold,
         "assumed": len(requirements.assumed),
@@ -174,10 +177,10 @@ def _with_denial_flag(value: dict[str, Any]) -> dict[str, Any]:
 
 
 def _bundles_json(bundles: Iterable[Bundle], enclaves: Sequence[str]) -> dict[str, Any]:
-    """Return bundles as JSON, in which common parts of bundles and of ties are listed once.
+    """Return bundles as JSON, in which common parts of bundles and ties are listed once.
 
-    A bundle is its names, the number of its traits, and its ties: each list is the number of a
-    common part of ties, followed by the numbers of their enclaves.
+    A bundle is a list of names, the number of its traits, and lists of ties. A list of ties is the
+    number of their common part, followed by the numbers of their enclaves.
     """
     numbers = {path: number for number, path in enumerate(enclaves)}
     traits: dict[Bundle, int] = {}
@@ -217,7 +220,7 @@ def _tie_json(tie: Tie) -> dict[str, Any]:
 
 
 def _row_json(bundle: Bundle) -> dict[str, Any]:
-    """Return a row of the table of names: who may send, who may receive, who is denied."""
+    """Return a row of the table of names: its senders, receivers and denied enclaves."""
     ties = [tie for tie in bundle.ties if tie.qualifier is ALLOW]
     return {
         "kind": bundle.kind,
@@ -242,7 +245,7 @@ def _scene_json(scene: Scene) -> dict[str, Any]:
 
 
 def _table(rows: list[dict[str, Any]]) -> list[list[Any]]:
-    """Return ``rows``, which have the same keys, as a list of keys and then lists of values."""
+    """Return ``rows`` with equal keys as a list: the list of keys, then lists of values."""
     if not rows:
         return []
     keys = list(rows[0])
@@ -258,7 +261,7 @@ _MOST_OPEN_ROWS = 20
 
 
 def render_demo_page(result: Json, made: str) -> str:
-    """Return the HTML page of a demo's result; ``made`` says by which release of sros, and when."""
+    """Return the HTML page of a demo's result; ``made`` names the release of sros and the time."""
     is_only = len(result["scenarios"]) == 1
     scenarios = (_demo_scenario(scenario, is_only=is_only) for scenario in result["scenarios"])
     why = _sentence(f"why {result['backend']}: {result['why']}" if result["why"] else "")
@@ -367,7 +370,7 @@ def _demo_open(rows: Sequence[Json]) -> str:
 
 
 def _demo_vulnerabilities(result: Json) -> str:
-    """Return a section on the DDS under test, and on others that the processes had loaded."""
+    """Return a section on the DDS under test, and on other DDS libraries of the processes."""
     lines = []
     libraries = result.get("libraries") or ()
     for used in sorted(libraries, key=lambda used: not result["dds"].startswith(used["product"])):
@@ -389,7 +392,7 @@ def _demo_vulnerabilities(result: Json) -> str:
 
 
 def _fold(title: str, text: str) -> str:
-    """Return HTML of a text below a title that unfolds it."""
+    """Return an HTML element with a title that unfolds ``text``."""
     return (
         f"<details><summary>{escape(title)}</summary>{_with_marks(text)}</details>"
         if text
@@ -398,12 +401,12 @@ def _fold(title: str, text: str) -> str:
 
 
 def _number_as_expected(rows: Sequence[Json]) -> int:
-    """Return the number of rows that were run and had the expected result."""
+    """Return the number of rows that ran with the expected result."""
     return sum(bool(row["as_expected"]) and row["observed"] != _SKIPPED for row in rows)
 
 
 def _untried_attempts(scenario: Json) -> Sequence[str]:
-    """Return the attempts that a proof of a user's keystore needs, but that were not made."""
+    """Return the missing attempts that a proof of a user's keystore needs."""
     keystore = scenario.get("keystore")
     return keystore["not_tried"] if keystore else ()
 
@@ -507,14 +510,14 @@ def render_fleet_page(
     """Return the HTML page of a fleet's status.
 
     Args:
-        status: what ``sros fleet status --json`` prints.
-        words: state → its words, where they differ from its name.
+        status: the output of ``sros fleet status --json``. words: state → its words, if they differ
+            from the name of the state.
         facts: sentences about the fleet as a whole.
-        rows: of robots with the same state: this state, their names, when they confirmed, their
-            first expiry, what to do, and why.
-        remedies: what to do → how it is done.
-        list_lacking: where the revocation list is in force, unless that is on all robots that have
-            to have it.
+        rows: a row for each group of robots with the same state: state, names, time of
+            confirmation, first expiry, what to do, and why.
+        remedies: what to do → how to do it.
+        list_lacking: a sentence on how many robots have the revocation list in force; "" if all
+            do that have to.
     """
     order = {state: (_urgency(state), place) for place, state in enumerate(status["counts"])}
     tiles = "".join(
@@ -557,7 +560,7 @@ def render_fleet_page(
 
 
 def _dds_finding(finding: Json) -> str:
-    """Return a finding on the DDS of robots; its path and numbers are in a part that unfolds."""
+    """Return a finding on the DDS of robots; path and numbers are in a part that unfolds."""
     text, comma, rest = finding["text"].partition("; in '")
     folded = f"In '{rest}. {finding['remedy']}" if comma else ""
     return _fold(f"{finding['subject']}: {text}", folded)

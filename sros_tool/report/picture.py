@@ -21,7 +21,7 @@ from sros_tool.wording import counted, first_few
 SENDS = {"publish": True, "request": True, "call": True} | dict.fromkeys(
     ("subscribe", "reply", "execute"), False
 )
-"""Whether an enclave with the right is a sender, so that its arrow points to the name."""
+"""Right → whether its holder sends, so that the arrow points to the name."""
 
 _ASKED = tuple(f"/{name}" for name in READING_SERVICES)
 _KINDS = (*RIGHTS, "dds")
@@ -29,7 +29,7 @@ _KINDS = (*RIGHTS, "dds")
 
 
 class OverlaySide(StrEnum):
-    """The side of an overlay that has a right; BOTH for a picture without overlay."""
+    """The side of an overlay with the right; BOTH also for a picture without overlay."""
 
     BOTH = "both"
     FIRST = "first"
@@ -47,12 +47,12 @@ class WireLevel(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Protection:
-    """Protection of a name by governance: the weakest among its DDS topics.
+    """Protection of a name by governance: the weakest protection among its DDS topics.
 
     ``data``, ``metadata`` and ``rtps`` are protection kinds of DDS-Security 1.1.  Without
     ``read_control``, every authenticated participant may read, whatever its permissions; without
-    ``write_control``, every authenticated participant may write.  With ``strangers``, participants
-    without an identity may do so as well.
+    ``write_control``, every authenticated participant may write.  With ``strangers``, this also
+    applies to participants without an identity.
     """
 
     level: WireLevel
@@ -72,7 +72,7 @@ class Protection:
 
     @property
     def everybody(self) -> str:
-        """Who may do what permissions do not control, in words."""
+        """The participants that need no permissions for open access to the name, in words."""
         return (
             "everybody, even without an identity"
             if self.strangers
@@ -80,7 +80,7 @@ class Protection:
         )
 
     def open_text(self, kind: str) -> str:
-        """Return what permissions do not control, such as "everybody may publish", or ""."""
+        """Return a clause on open access, such as "everybody may publish", or ""."""
         sends, receives = _VERBS[kind]
         sides = [sends] * (not self.write_control) + [receives] * (not self.read_control)
         even = ", even without an identity" if self.strangers else ""
@@ -101,8 +101,8 @@ class Edge:
 
     ``by`` are the wildcards that match the name; empty if the right has the exact name.  ``parts``
     are the parts of an action, such as feedback, if the right is not for the whole action.
-    ``common``: every node needs the right to start.  ``violates``: the right breaks a requirement.
-    ``differs``: similar robots, namespaces or enclaves do not have the right.
+    ``common`` says that every node needs the right to start, ``violates`` that the right breaks a
+    requirement, ``differs`` that similar robots, namespaces or enclaves lack the right.
     """
 
     enclave: str
@@ -118,7 +118,7 @@ class Edge:
     by: tuple[str, ...] = ()
     """Wildcards that give the right; empty if the rule has the exact name."""
     parts: tuple[str, ...] = ()
-    """Parts of the action that the right is for; empty for the whole action."""
+    """Parts of the action for which the right is; empty for the whole action."""
     mark: OverlaySide = OverlaySide.BOTH
     """The side of the comparison that has the right."""
     common: bool = False
@@ -150,7 +150,8 @@ class Lack(StrEnum):
 class Name:
     """A topic, service or action; or a ``wildcard`` that is drawn as a name.
 
-    ``lacks`` is the side that nobody may take.  The server of a service is its receiver.
+    ``lacks`` is the side (senders or receivers) without an allowed enclave. The server of a service
+    is its receiver.
     """
 
     kind: str
@@ -162,7 +163,7 @@ class Name:
     protection: Protection
     """Protection of the name by the governance."""
     wildcard: bool = False
-    """Whether it is a wildcard, drawn as a name because no right to a known name shows it."""
+    """Whether the name is a wildcard, drawn as a name because no right to a known name shows it."""
     lacks: Lack = Lack.NOTHING
     """The side that is missing because no enclave has the right; the server of a service is its
     receiver.
@@ -178,7 +179,7 @@ _VERBS = {
 
 
 def lack_text(kind: str, lacks: Lack) -> str:
-    """Return what no enclave may do with a name, such as ``nobody may publish``."""
+    """Return a clause on the use that no enclave is allowed, such as ``nobody may publish``."""
     sends, receives = _VERBS[kind]
     return f"nobody may {sends if lacks is Lack.SENDER else receives}"
 
@@ -213,9 +214,10 @@ class Statement(NamedTuple):
 class PicturedEnclave:
     """An enclave in a picture; ``group`` is its host or its namespace.
 
-    ``subject``, ``issuer``, ``serial`` and ``key`` describe its certificate; "" without one.
-    ``problems`` keep a process from using it.  If the picture also shows which rights were used, an
-    enclave that was not ``observed`` counts as neither.  ``note`` stands on its card.
+    ``subject``, ``issuer``, ``serial`` and ``key`` describe the certificate; "" without a
+    certificate. ``problems`` keep a process from using the enclave. In a picture of used rights,
+    the rights of an enclave that was not ``observed`` count as neither used nor unused. ``note`` is
+    text on the card.
     """
 
     path: str
@@ -282,7 +284,7 @@ class SourceTitle(NamedTuple):
     """Title of a source in the picture: its file name, and its kind."""
 
     title: str
-    """File name of the source; folders only as far as they tell two sources apart."""
+    """File name of the source; with folders only if two sources have the same file name."""
     kind: str
     """Kind of the source, such as ``policy``."""
 
@@ -307,7 +309,7 @@ class OverlayDifference(NamedTuple):
     """A right that only one side has, with ``notes``.
 
     For a change, the notes are the wildcards of the other side that cover the right; for use, the
-    number of names that a wildcard matches and that were never observed.
+    number of never observed names that a wildcard matches.
     """
 
     mark: OverlaySide
@@ -323,7 +325,7 @@ class Influence:
     """An enclave that influences, or is influenced, with the number of hops and a shortest path."""
 
     enclave: str
-    """Path of the influencing or influenced enclave."""
+    """Path of the enclave."""
     hops: int
     """Number of hops: the names on the path."""
     path: str
@@ -332,7 +334,7 @@ class Influence:
 
 @dataclass(frozen=True, slots=True)
 class Focus:
-    """The answer to a question about one name or enclave.
+    """The answer to a question about a name or an enclave.
 
     The answer holds for all names that rights allow, even for names that the picture does not have.
     """
@@ -372,9 +374,9 @@ class PicturedViolation(NamedTuple):
     """A requirement that does not hold, with the uses of names that break it."""
 
     text: str
-    """What breaks the requirement, and what the requirement demands."""
+    """The violation, and the demand of the requirement."""
     short: str
-    """What breaks the requirement, such as `/teleop may publish /cmd_vel`."""
+    """The violation in short, such as `/teleop may publish /cmd_vel`."""
     uses: tuple[PicturedUse, ...]
     """Uses of names that break the requirement."""
 
@@ -384,7 +386,7 @@ _SHOWN = 2  # rights of one unit in the headlines
 
 
 class Requirements(NamedTuple):
-    """The results of requirements: how many hold, and which do not.
+    """The results of requirements: the number that hold, and the violations.
 
     ``assumed`` are the requirements that hold only under an assumption, in words.
     """
@@ -412,7 +414,7 @@ class Requirements(NamedTuple):
 class EqualUnits(NamedTuple):
     """Robots, namespaces or enclaves (``what``) that are equal except for their names.
 
-    ``label`` stands for each of them in the paths and names that are drawn, like ``{r01…r50}``.
+    ``label`` stands for these units in drawn paths and names, like ``{r01…r50}``.
     """
 
     label: str
@@ -435,8 +437,8 @@ class EqualUnits(NamedTuple):
 class UnreadUnits(NamedTuple):
     """Units of a large keystore whose permissions were compared as text, but not parsed.
 
-    The text equals that of the unit ``like``, except for the names.  ``enclaves`` is the
-    number of enclaves of the ``members``.
+    The text equals the text of the unit ``like``, except for the names. ``enclaves`` is the number
+    of enclaves of the ``members``.
     """
 
     what: str
@@ -448,8 +450,8 @@ class UnreadUnits(NamedTuple):
 class DifferentUnit(NamedTuple):
     """A unit that differs slightly from several equal units, whose label is ``usual``.
 
-    ``unit`` may be the label of several units.  ``more`` and ``fewer`` are the enclaves and rights
-    that only this unit has, and that it lacks, in words.
+    ``unit`` may be the label of several units.  ``more`` and ``fewer`` are, in words, the enclaves
+    and rights that only this unit has, and that this unit lacks.
     """
 
     unit: str
@@ -478,8 +480,8 @@ class DifferentUnit(NamedTuple):
 class Picture:
     """The rights in a system, with protection, validity and findings.
 
-    With a ``focus``, the picture has only the names and enclaves that lead to it or from it.  It
-    lacks the enclaves of the units in ``unread``.
+    With a ``focus``, the picture has only the names and enclaves that lead to the focus or from the
+    focus. The picture lacks the enclaves of the units in ``unread``.
     """
 
     title: str
@@ -503,16 +505,16 @@ class Picture:
     focus: tuple[Focus, ...] = ()
     """With ``--focus``: an answer for each chosen name and enclave."""
     requirements: Requirements | None = None
-    """With ``--requirements``: which requirements hold; else null."""
+    """With ``--requirements``: the requirements that hold and that do not; else null."""
     equal: tuple[EqualUnits, ...] = ()
-    """Robots, namespaces or enclaves that are equal except for their names, drawn as one."""
+    """Robots, namespaces or enclaves that are equal except for their names, drawn once."""
     different: tuple[DifferentUnit, ...] = ()
-    """Units that differ slightly from equal ones."""
+    """Units that differ slightly from equal units."""
     exports: tuple[str, ...] = ()
     """The sources that are exports, which may lack enclaves of their keystore."""
     unread: tuple[UnreadUnits, ...] = ()
     join_needs_right: bool = False
-    """Whether an enclave can join only ROS domains in which it has a right."""
+    """Whether an enclave can join only the ROS domains in which it has a right."""
 
     @property
     def headlines(self) -> tuple[str, ...]:
@@ -534,7 +536,7 @@ class Picture:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Sentences without a full stop: which units are drawn as one, and which differ."""
+        """Sentences without a full stop: on units that are drawn once, and on units that differ."""
         equal = (f"{units.title} are drawn as one" for units in self.equal)
         more = len(self.different) - _SAID
         different = [unit.sentence() for unit in self.different[:_SAID]]
@@ -594,8 +596,9 @@ def is_plain(tie: Tie) -> bool:
 class Bundle:
     """Sorted names of the same kind and protection, with the same ties.
 
-    In a ``partial`` bundle, each tie is for only some of the names.  ``asks``: the names are
-    services whose requests change nothing.  ``lacks`` is the side that nobody may take.
+    In a ``partial`` bundle, every tie is for only some of the names. ``asks`` says that the names
+    are services whose requests change nothing. ``lacks`` is the side (senders or receivers) without
+    an allowed enclave.
     """
 
     kind: str
@@ -620,7 +623,7 @@ def fold(
         names: the names.
         edges: the rights and denials for the names.
         owner: returns the node that stands for an enclave: the enclave, or its group.
-        separate_questions: give services whose requests change nothing bundles of their own.
+        separate_questions: put services whose requests change nothing into separate bundles.
     """
     ties: dict[tuple[str, str], set[Tie]] = defaultdict(set)
     for edge in edges:
@@ -660,7 +663,7 @@ def fold(
 
 
 def joined_by_senders(bundles: Iterable[Bundle]) -> tuple[Bundle, ...]:
-    """Return bundles joined if they have the same senders, whoever receives their names.
+    """Return bundles, merged if they have the same senders, even with other receivers.
 
     Denials and differences stay separate, because users look for them.
     """

@@ -1,9 +1,9 @@
 """Choose the enclaves of a large keystore that a picture reads in full.
 
 Reading an enclave as vendors do takes milliseconds, and equal units (robots, or namespaces and
-enclaves that look alike) are drawn as one anyway.  So if the signed permissions of units have the
+enclaves that look alike) are drawn once anyway.  So if the signed permissions of units have the
 same text except for the units' names, only the first and the last of these units are read in full.
-Of the others, only this text is compared, and nothing else is in the picture.
+For the units in between, the picture relies on this comparison of texts.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from sros_tool.report.picture import UnreadUnits
 from sros_tool.xml import read_bytes
 
 _LARGE = 1000
-"""Number of enclaves up to which a picture reads all of them."""
+"""Maximum number of enclaves for which a picture reads all enclaves."""
 _BOUNDARY = re.compile(rb'(?i)multipart/signed[^\r\n]*boundary="([^"\r\n]+)"')
 _VALIDITY = re.compile(r"<not_(before|after)>[^<]*</not_\1>")
 _MARKS = "\x01\x02"
@@ -57,11 +57,11 @@ def sample_of(
 
     Args:
         keystore: the keystore.
-        robots: the robots of its fleet, by enclave.
+        robots: the robots of the keystore's fleet, by enclave.
         wanted_names: names of units that are read in any case.
 
-    All units that use names of other units are read.  Everything is read if names of units cannot
-    be told apart, or if too few units are alike.
+    All units that use names of other units are read. Everything is read if names of units are
+    ambiguous, or if too few units are alike.
     """
     paths = keystore.names
     whole_keystore = SampledKeystore(keystore, paths)
@@ -121,7 +121,7 @@ def _is_ambiguous(word: str, words: Collection[str]) -> bool:
 
 
 _UNIQUE = re.compile(",OU=[0-9a-f]{16}(?=</subject_name>)")
-"""What makes the subject of a certificate unique; it says nothing about rights."""
+"""The part that makes a certificate's subject unique, and that says nothing about rights."""
 
 
 def _digest_of(
@@ -129,7 +129,7 @@ def _digest_of(
 ) -> str:
     """Return a digest of a unit's permissions with the unit's name masked.
 
-    It is "" if permissions of the unit cannot be read, or are not in the usual form.
+    Returns "" if permissions of the unit cannot be read, or are not in the usual form.
     """
     texts = {path: _signed_text(keystore, path) for path in enclaves}
     hidden = [
@@ -156,7 +156,7 @@ def _without_unit_names(text: str, unit: DrawnUnit, names: UnitNames) -> str:
 def _with_mark(text: str, word: str, mark: str) -> str:
     """Return a text with ``mark`` in place of each whole word ``word``.
 
-    It is faster than a regular expression, which would be compiled for each of many robots.
+    This is faster than a regular expression, which would be compiled for each robot.
     """
     first, *later_parts = f"{text}\n".split(word)
     parts, before = [first], first[-1:]
@@ -175,7 +175,7 @@ def _named_units(keystore: OpenedKeystore, enclaves: Iterable[str], names: UnitN
 
 
 def _signed_text(keystore: OpenedKeystore, path: str) -> str | None:
-    """Return the signed text of an enclave's permissions without dates; None for another form."""
+    """Return the signed text of an enclave's permissions without dates, or None."""
     try:
         data = read_bytes(keystore.folder(path) / PERMISSIONS_FILE, "permissions document")
         boundary = _BOUNDARY.search(data[:1000])

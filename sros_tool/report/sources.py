@@ -1,4 +1,4 @@
-"""Read what pictures show: policies, permissions, keystores and observations.
+"""Read the sources of pictures: policies, permissions, keystores and observations.
 
 A picture shows only the base name of a source, because paths of this machine are private. Keys of
 enclaves are read only to report faults, such as a key that does not fit its certificate.
@@ -90,9 +90,9 @@ class Drawing:
     ``HOST=ENCLAVE``; ``fleets`` has, for each source, the fleet whose robots fill in the
     placeholders; ``focus`` are names or paths of enclaves.  With ``checked``, the picture has the
     findings of ``sros check``; with a file of ``requirements``, also the rights that break a
-    requirement.  Dates in permissions are read in the time zone ``zone``.  With ``sampled``, of
-    equal robots, namespaces or enclaves in a large keystore only some are read in full, above all
-    those named in ``robots``.
+    requirement.  Dates in permissions are read in the time zone ``zone``.  With ``sampled``, only
+    some of many equal robots, namespaces or enclaves in a large keystore are read in full, and all
+    robots in ``robots``.
     """
 
     sources: Sequence[Path]
@@ -110,7 +110,7 @@ class Drawing:
 
 
 def draw(drawing: Drawing) -> tuple[Picture, Folding]:
-    """Return a picture, and the same picture with equal units drawn as one.
+    """Return a picture, and the same picture with equal units drawn once.
 
     Equal units are robots, namespaces or enclaves that differ only in their names.
 
@@ -196,7 +196,7 @@ def _compared_picture(
     """Return the picture of one source, or the comparison of two sources.
 
     The comparison is "use" if the second source was observed, "change" for two sources of the same
-    kind, "worlds" if one is for Zenoh, and else "drift" (of a keystore from its policy).
+    kind, "worlds" if a source is for Zenoh, and else "drift" (of a keystore from its policy).
     """
     if len(sources_read) == 1:
         return compose(sources_read[0], hosts)
@@ -215,7 +215,7 @@ def _compared_picture(
 
 
 def _read(path: Path, fleet: Fleet | None, drawing: Drawing, title: str) -> PictureSource:
-    """Read a source; if ``drawing`` asks for it, with findings of ``sros check``.
+    """Read a source, with findings of ``sros check`` if ``drawing`` asks for them.
 
     A source that ``sros check`` does not read has the finding ``view.not-checked`` instead.
     Findings name files with the folders that ``title`` has.
@@ -259,10 +259,10 @@ def _not_checked(text: str) -> PicturedFinding:
 
 
 def _sample(path: Path, drawing: Drawing) -> SampledKeystore | None:
-    """Return the enclaves of a keystore to read in full; None for another source.
+    """Return the enclaves of a keystore to read in full; None for sources of other kinds.
 
     Raises:
-        UsageError: ``drawing`` wants a robot that is not there.
+        UsageError: ``drawing`` names a robot that the keystore lacks.
     """
     if not (path.is_dir() and is_keystore(path)):
         if drawing.robots:
@@ -331,7 +331,7 @@ def drawn_difference(
 
 
 def _check_no_governance(sources: Sequence[Path], sources_read: Sequence[PictureSource]) -> None:
-    """Raise `UsageError` if --template is used with a source that has a governance of its own."""
+    """Raise `UsageError` if --template is used with a source that has a governance."""
     for path, source in zip(sources, sources_read, strict=True):
         kind = source.origin.kind
         if kind in ("keystore", "enclave"):
@@ -363,7 +363,7 @@ def _hosts(words: Iterable[str]) -> dict[str, str]:
 
 
 def _robots(path: Path, fleet: Fleet | None, source: PictureSource) -> dict[str, Robot]:
-    """Map the paths of a source's enclaves to the robots that they belong to.
+    """Map the paths of a source's enclaves to the robots of these enclaves.
 
     Enclaves of no robot are left out; without a fleet, the result is empty.
     """
@@ -444,7 +444,7 @@ def _file_name(path: str) -> str:
 def _pictured_finding(
     finding: Finding, enclaves: Container[str], shown: Callable[[str], str] = _file_name
 ) -> PicturedFinding:
-    """Return a finding for the picture; if its subject is not an enclave, the text names it.
+    """Return a finding for the picture; its text names a subject that is not an enclave.
 
     ``shown`` returns the name of a file.
     """
@@ -471,10 +471,10 @@ def read_source(
 
     An observation is a learned policy, or the output of ``sros generate_policy --json``.  Faults of
     a keystore become findings.  ``fleet`` has the robots that fill in placeholders of a policy,
-    ``sample`` the enclaves of a keystore that are read; None for all.
+    ``sample`` the enclaves of a keystore to read (None: all).
 
     Raises:
-        DocumentError: ``path`` is nothing of this kind.
+        DocumentError: ``path`` is none of these.
     """
     data = read_bytes(path, "file") if path.is_file() else b""
     if data.lstrip()[:1] == b"{" and not is_zenoh(data, path):
@@ -532,7 +532,7 @@ def _with_findings(
 
 
 def _titles(paths: Sequence[Path]) -> list[str]:
-    """Return the file names of sources, with as many of their folders as tell them apart."""
+    """Return the file names of sources, with folders as far as needed to distinguish them."""
     parts = [path.absolute().parts[1:] for path in paths]
     titles = []
     for path, own in zip(paths, parts, strict=True):
@@ -613,7 +613,7 @@ def _with_keystore(source: PictureSource, sample: SampledKeystore, now: datetime
 
 
 def _joint_governance(governances: Iterable[Governance | None]) -> Governance | None:
-    """Return the rules of all governance documents: access that one of them opens is open."""
+    """Return the union of all governance documents: access that any document opens is open."""
     distinct = [governance for governance in dict.fromkeys(governances) if governance is not None]
     if len(distinct) < 2:
         return distinct[0] if distinct else None
@@ -701,8 +701,8 @@ def _without_paths(finding: PicturedFinding, places: Mapping[str, str]) -> Pictu
 def _file_names(path: Path) -> Mapping[str, str]:
     """Map the paths of a source, as given, absolute and resolved, to its file name.
 
-    Its folder in quotes is mapped, too: without quotes, the same text may begin a ROS name.  Longer
-    paths come first, so that they are replaced before paths that they contain.
+    The folder of the source is mapped only in quotes: without quotes, the same text may begin a ROS
+    name. Longer paths come first, so that they are replaced before paths that they contain.
     """
     places = {
         f"{quotes}{place}{quotes}": f"{quotes}{_base_name(shown)}{quotes}"

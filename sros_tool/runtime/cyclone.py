@@ -2,14 +2,15 @@
 
 A refusal by DDS Security raises a `SecurityRefusedError`, every other failure a `DdsError`, so that
 a crash is never mistaken for a refusal.  A process must not have two participants with different
-enclaves in one domain: in Cyclone DDS 0.10 the second one gets the permissions of the first.
+enclaves in one domain: in Cyclone DDS 0.10, the second participant gets the permissions of the
+first.
 
 libddsc is not loaded at import: `load_cyclone` finds and loads it on the first call.  The functions
 that sros calls are declared here as in ``dds/dds.h`` of Cyclone DDS 0.10 and 11.0, which agree.
 
 ``python -P -m sros_tool.runtime.cyclone DOMAIN PID...`` prints a JSON object that maps participants
-of Cyclone DDS on this machine to the ids of their processes, as they say themselves; it looks for
-these processes for three seconds at most.
+of Cyclone DDS on this machine to the ids of their processes, as the participants themselves state;
+the search takes three seconds at most.
 """
 
 from __future__ import annotations
@@ -37,13 +38,13 @@ _Value = TypeVar("_Value")
 FOLDER_VARIABLE = "SROS_CYCLONEDDS_DIR"
 """Environment variable with the only folder to search for libddsc.
 
-The folder may also be one into which Debian's packages were unpacked.
+The folder may also contain unpacked Debian packages.
 """
 
 _SYSTEM_NAMES = ("libddsc.so.0debian", "libddsc.so.0t64", "libddsc.so.0", "libddsc.so.11")
 """The shared object names of Debian 12, of Debian 13, and of an installation from source or ROS.
 
-ROS 2 Lyrical has the last name.
+ROS 2 Lyrical uses the last name.
 """
 
 INSTALL_ADVICE = (
@@ -56,7 +57,7 @@ _SUPPORTED = ("0.10", "11.0")
 _NEEDED_FIRST = ("_platform", "_hoofs", "_posh.", "_posh_roudi", "_posh", "_binding_c")
 _KEPT_LOG_MESSAGES = 200
 _LOG_HEADER = re.compile(r"^ *\d+\.\d{6} \[\d*\] .*?: ", re.MULTILINE)
-"""Time, domain and thread, which libddsc writes before a message."""
+"""Matches the time, domain and thread that libddsc writes before a message."""
 
 STRING_TYPE = "std_msgs::msg::dds_::String_"
 
@@ -67,7 +68,7 @@ _BUILTIN_SUBSCRIPTIONS = 0x7FFF0000 + 4
 _KEEP_LAST, _BEST_EFFORT, _RELIABLE, _XCDR1, _XCDR2 = 0, 0, 1, 0, 2
 _STRING_OPS = (ctypes.c_uint32 * 3)(0x01 << 24 | 0x05 << 16, 0, 0)
 _OCTET_OPS = (ctypes.c_uint32 * 3)(0x01 << 24 | 0x01 << 16, 0, 0)
-"""Reads only the first byte of a message."""
+"""Serialization operations that read only the first byte of a message."""
 _NO_OPTIMIZE = 1
 
 _FILE_PROPERTIES = {
@@ -97,7 +98,7 @@ class DdsError(SrosError):
 
 
 class SecurityRefusedError(DdsError):
-    """A refusal by DDS Security of a participant, a topic, a writer or a reader."""
+    """A refusal of a participant, topic, writer or reader by DDS Security."""
 
 
 class Publication(NamedTuple):
@@ -112,7 +113,7 @@ class Participant:
 
     Raises:
         SecurityRefusedError: DDS Security refuses the participant.
-        DdsError: creating it failed for another reason.
+        DdsError: DDS cannot create the participant for another reason.
         UnavailableError: Cyclone DDS or its security plugins are missing.
     """
 
@@ -135,8 +136,8 @@ class Participant:
         """Return a reliable DataWriter of strings on the DDS topic ``topic`` ("rt/chatter").
 
         Raises:
-            SecurityRefusedError: the permissions deny it.
-            DdsError: creating it failed for another reason.
+            SecurityRefusedError: the permissions deny the writer.
+            DdsError: DDS cannot create the writer for another reason.
         """
         return Writer(self._library, self._endpoint("writer", topic))
 
@@ -146,8 +147,8 @@ class Participant:
         Only a reader that is not reliable receives from best-effort writers.
 
         Raises:
-            SecurityRefusedError: the permissions deny it.
-            DdsError: creating it failed for another reason.
+            SecurityRefusedError: the permissions deny the reader.
+            DdsError: DDS cannot create the reader for another reason.
         """
         handle = self._endpoint("reader", topic, reliable=reliable)
         return Reader(self._library, handle, self.handle)
@@ -156,22 +157,22 @@ class Participant:
         """Return a best-effort DataReader of any DDS type, which can only count messages.
 
         Raises:
-            SecurityRefusedError: the permissions deny it.
-            DdsError: creating it failed for another reason.
+            SecurityRefusedError: the permissions deny the reader.
+            DdsError: DDS cannot create the reader for another reason.
         """
         handle = self._endpoint("reader", topic, type_name, reliable=False)
         return Reader(self._library, handle, self.handle)
 
     def publications(self) -> tuple[Publication, ...]:
-        """Return this participant's writers and the discovered writers, sorted by topic."""
+        """Return the writers of this participant and all discovered writers, sorted by topic."""
         return tuple(sorted(self._discovered(_BUILTIN_PUBLICATIONS, _publication_of)))
 
     def subscriptions(self) -> tuple[Publication, ...]:
-        """Return this participant's readers and the discovered readers, sorted by topic."""
+        """Return the readers of this participant and all discovered readers, sorted by topic."""
         return tuple(sorted(self._discovered(_BUILTIN_SUBSCRIPTIONS, _publication_of)))
 
     def process_ids(self) -> dict[str, int]:
-        """Map discovered participants on this machine to the process ids that they state.
+        """Map discovered participants on this machine to their stated process ids.
 
         A participant is the first 12 bytes of its identifier, in hexadecimal.
         """
@@ -209,7 +210,7 @@ class Participant:
         return self._library.log.messages()
 
     def close(self) -> None:
-        """Leave the domain; writers and readers of this participant are closed with it."""
+        """Leave the domain, and close the writers and readers of this participant."""
         self._library.api.dds_delete(self.handle)
 
     def __enter__(self) -> Participant:
@@ -322,15 +323,15 @@ class Reader:
         return tuple(_take_samples(self._library, self.handle, 64, _string_of))
 
     def count(self) -> int:
-        """Return how many messages were received since the last call."""
+        """Return the number of messages received since the last call."""
         return len(_take_samples(self._library, self.handle, 64, lambda _: None))
 
 
 def security_properties(enclave: Path, plugins: Path | None) -> dict[str, str]:
-    """Return the properties that make Cyclone DDS load ``enclave``, as rmw_cyclonedds sets them.
+    """Return the properties with which rmw_cyclonedds makes Cyclone DDS load ``enclave``.
 
-    ``plugins`` is the folder of libdds_security_*.so; without it, the dynamic loader searches for
-    them.
+    ``plugins`` is the folder of libdds_security_*.so; without this folder, the dynamic loader
+    searches for the plugins.
 
     Raises:
         DdsError: a file of the enclave is missing.
@@ -376,7 +377,7 @@ def _qos(library: CycloneLibrary) -> Iterator[Any]:
 def _take_samples(
     library: CycloneLibrary, handle: int, limit: int, copy: Callable[[int], _Value]
 ) -> list[_Value]:
-    """Take up to ``limit`` samples; ``copy`` converts each before DDS gets its memory back."""
+    """Return up to ``limit`` samples; ``copy`` converts a sample before DDS frees its memory."""
     samples = (ctypes.c_void_p * limit)()
     infos = (SampleInfo * limit)()
     count = library.api.dds_take(handle, samples, infos, limit, limit)
@@ -412,8 +413,8 @@ def _text(raw: bytes | None) -> str:
 class CycloneLibrary(NamedTuple):
     """A loaded libddsc: its functions, its file, and its log.
 
-    ``version`` is as in its file name ("0.10.2"); ``plugins`` is the folder of its security
-    plugins, None if they are missing.
+    ``version`` is the version in the file name ("0.10.2"); ``plugins`` is the folder of the
+    security plugins, or None.
     """
 
     api: Any
@@ -424,17 +425,17 @@ class CycloneLibrary(NamedTuple):
 
 
 class CycloneLog:
-    """The warnings and errors of all participants of this process.
+    """The warnings and errors that Cyclone DDS logs for all participants of this process.
 
-    libddsc writes them to ``stderr`` of the C library; Cyclone DDS 11 exports no function with
-    which to receive them.  So that stream becomes a file in memory, for all C libraries of this
+    libddsc writes these messages to ``stderr`` of the C library; Cyclone DDS 11 exports no function
+    that receives messages. So this C stream becomes a file in memory, for all C libraries of this
     process; Python's ``sys.stderr`` and the file descriptor 2 stay as they are.
     """
 
     def __init__(self) -> None:
         """Redirect the stream ``stderr`` of the C library to a file in memory.
 
-        libddsc keeps the stream that exists when it creates its first participant.
+        libddsc keeps the stream that exists when the first participant is created.
         """
         self._file = _memory_file()
         self._made = os.fstat(self._file)
@@ -446,8 +447,8 @@ class CycloneLog:
     def _leave_parent(self) -> None:
         """Write to a new file if this process was forked from the process that opened the log.
 
-        The parent's descriptor is not closed: if the parent closed the file, the descriptor may
-        belong to another file.
+        The parent's descriptor stays open, because it may belong to another file if the parent
+        closed the log.
         """
         with suppress(OSError):
             if os.path.samestat(os.fstat(self._file), self._made):
@@ -457,7 +458,7 @@ class CycloneLog:
                 self._made = os.fstat(self._file)
 
     def clear(self) -> None:
-        """Forget the messages."""
+        """Discard the messages."""
         os.ftruncate(self._file, 0)
 
     def messages(self) -> tuple[str, ...]:
@@ -475,7 +476,7 @@ def _memory_file() -> int:
 
 
 def _describe_return(library: CycloneLibrary, code: int) -> str:
-    """Return the name that the library gives to a (negative) return code."""
+    """Return the name of a (negative) return code, as the library gives it."""
     return str(library.api.dds_strretcode(code).decode("ascii", "replace"))
 
 
@@ -484,7 +485,7 @@ def load_cyclone() -> CycloneLibrary:
     """Load libddsc 0.10 or 11.0, once per process.
 
     Raises:
-        UnavailableError: there is no libddsc, or only one with another C interface.
+        UnavailableError: there is no libddsc, or its C interface is another one.
     """
     api, path = _load_first()
     version = version_of(path)
@@ -553,10 +554,10 @@ def _library_files(folder: Path) -> list[Path]:
 
 
 def _load_all(files: Iterable[Path]) -> None:
-    """Load libraries that depend on each other; ignore those that cannot be loaded.
+    """Load libraries that depend on each other; ignore libraries that cannot be loaded.
 
-    After that, libddsc finds them by name, without LD_LIBRARY_PATH.  Dependencies are loaded first,
-    otherwise the dynamic loader might load the system's copies of them.
+    After that, libddsc finds the libraries by name, without LD_LIBRARY_PATH. Dependencies are
+    loaded first, because the dynamic loader might otherwise load the system's copies.
     """
     waiting = sorted(files, key=_load_order)
     while waiting:
@@ -586,8 +587,8 @@ def loaded_libraries(prefix: str) -> tuple[Path, ...]:
 def version_of(path: Path) -> str:
     """Return the version in a shared library's name: "0.10.2" of libddsc.so.0.10.2.
 
-    Wheels contain copies instead of links, so the loaded file may have the shortest name: then the
-    names next to it count.
+    Wheels contain copies instead of links, so the loaded file may have the shortest name; then the
+    names of its copies count.
     """
     copies = [copy for copy in path.parent.glob(f"{path.name}.*") if _same_size(copy, path)]
     name = max([path.name, *(copy.name for copy in copies)], key=len)
@@ -652,7 +653,7 @@ class SampleInfo(ctypes.Structure):
 
 
 class StringSample(ctypes.Structure):
-    """The C form of ``std_msgs/msg/String``: one pointer to characters."""
+    """The C form of ``std_msgs/msg/String``: a pointer to characters."""
 
     _fields_ = [("data", ctypes.c_char_p)]
 

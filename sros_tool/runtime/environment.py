@@ -1,13 +1,13 @@
 """The environment that makes a process run secured: variables, arguments and containers.
 
 ROS_SECURITY_ENCLAVE_OVERRIDE decides which enclave secures a process.  The ROS graph shows the
-enclave of ``--ros-args --enclave`` instead, even if it is a different one.
+enclave of ``--ros-args --enclave`` instead, which can be different.
 
 rmw_zenoh_cpp also reads ZENOH_SESSION_CONFIG_URI, the configuration of nodes, and
-ZENOH_ROUTER_CONFIG_URI, the configuration of the router; without a value it uses its default, which
-is open.  ZENOH_CONFIG_OVERRIDE has the form ``KEY=VALUE;KEY=VALUE``, with values in JSON5, and is
-applied after either file.  Earlier versions do not read it; there, a session with the configuration
-of an enclave does not open.
+ZENOH_ROUTER_CONFIG_URI, the configuration of the router; without a value, it uses a default
+configuration, which is open. ZENOH_CONFIG_OVERRIDE has the form ``KEY=VALUE;KEY=VALUE``, with
+values in JSON5, and is applied after either file. Earlier versions of rmw_zenoh_cpp do not read
+ZENOH_CONFIG_OVERRIDE, so that a session with the configuration of an enclave does not open.
 
 A service of Docker Compose and the objects of Kubernetes add the enclave to a container, and take
 away what a ROS node does not need.  ROS writes its logs to /tmp, the only place that stays
@@ -44,11 +44,11 @@ OVERRIDE = "ZENOH_CONFIG_OVERRIDE"
 _VARIABLES = (SESSION_URI, ROUTER_URI, OVERRIDE)
 
 NO_CONFIGURATION = "/dev/null/refused-by-sros.json5"
-"""A path that can never exist: a process that has to read its configuration there exits."""
+"""A path that can never exist: a process that has to read a configuration from it exits."""
 
 _TLS = "transport/link/tls"
 _LINE_ENDS = {point: f"\\u{point:04x}" for point in (0x2028, 0x2029)}
-"""Characters that JSON allows in a string, and JSON5 does not."""
+"""Escapes for characters that JSON allows in a string, and JSON5 does not."""
 _MOST_KEYS = 5
 _MOST_CHARACTERS = 60
 
@@ -57,8 +57,10 @@ REFUSING_ZENOH: Mapping[str, str] = {SESSION_URI: NO_CONFIGURATION, ROUTER_URI: 
 
 
 class PrintedEnvironment(NamedTuple):
-    """The environment of an enclave. ``--format json`` prints the object in ``variables`` alone.
-    After an error, the variables let no node start.
+    """The environment of an enclave.
+
+    ``--format json`` prints only the object in ``variables``. After an error, the variables let no
+    node start.
     """
 
     keystore: Path | None
@@ -87,13 +89,11 @@ REFUSING: Mapping[str, str] = {
     STRATEGY: "Enforce",
     **REFUSING_ZENOH,
 }
-"""Variables that keep rcl from starting a node with any RMW, and rmw_zenoh_cpp from starting a
-router.
-"""
+"""Variables that keep rcl from starting nodes, and rmw_zenoh_cpp from starting a router."""
 
 
 def render_refusal(form: str) -> str:
-    """Return text in the format ``form`` that keeps nodes from starting, after an error.
+    """Return text in the format ``form`` that keeps nodes from starting, for output after an error.
 
     Empty output would let nodes start unsecured, for example through a shell or jq: see `REFUSING`.
     In a shell, the text also fails as a command, even if ``eval $(...)`` without quotes makes it a
@@ -170,7 +170,7 @@ _UNREADABLE: dict[str, Callable[[str], bool]] = {
     "systemd": _is_not_printable,
     "docker": _is_interpreted,
 }
-"""Format → function that tells if the format cannot express a value; sh and fish express all."""
+"""Format → function that returns whether the format cannot express a value; absent: it can."""
 
 # ── the command line of a node ─────────────────────────────────────────────────────────────
 
@@ -183,9 +183,9 @@ _PYTHON = re.compile(r"python[\d.]*\Z")
 def with_enclave(command: Sequence[str], enclave: str) -> tuple[str, ...]:
     """Return a command with ``--ros-args --enclave``, if it certainly starts a ROS node.
 
-    It does if it is ``ros2 run``, runs an executable or Python script of a ROS package
-    (``lib/PACKAGE/NAME``), or has ``--ros-args``.  Other commands, the router of rmw_zenoh_cpp, and
-    commands that already name an enclave, are returned unchanged.
+    A command certainly starts a ROS node if it is ``ros2 run``, runs an executable or Python script
+    of a ROS package (``lib/PACKAGE/NAME``), or has ``--ros-args``.  Other commands, the router of
+    rmw_zenoh_cpp, and commands that already name an enclave, are returned unchanged.
     """
     command = tuple(command)
     ros_args = command[command.index(ROS_ARGS) :] if ROS_ARGS in command else ()
@@ -195,7 +195,7 @@ def with_enclave(command: Sequence[str], enclave: str) -> tuple[str, ...]:
 
 
 def starts_nodes(command: Sequence[str]) -> bool:
-    """Return whether a command certainly starts ROS nodes, as `with_enclave` says."""
+    """Return whether a command certainly starts ROS nodes; see `with_enclave`."""
     if any(Path(word).name == _ZENOH_ROUTER for word in command):
         return False
     if Path(command[0]).name == "ros2":
@@ -209,9 +209,9 @@ def enclave_argument(command: Sequence[str]) -> str:
 
 
 def named_enclave(command: Sequence[str]) -> str:
-    """Return the enclave that ``--ros-args --enclave`` names in a command; "" if it names none.
+    """Return the enclave that ``--ros-args --enclave`` names in a command, or "".
 
-    The last occurrence counts.  ``--`` ends the arguments for ROS until the next ``--ros-args``
+    The last occurrence counts. ``--`` ends the arguments for ROS until the next ``--ros-args``
     (rcl/src/rcl/arguments.c).
     """
     enclave, of_ros = "", False
@@ -232,7 +232,7 @@ _NODE_RULES, _NAMESPACE_RULE = ("__node", "__name"), "__ns"
 def node_argument(command: Sequence[str]) -> tuple[str, str] | None:
     """Return namespace and name that a command certainly gives its node, or None.
 
-    Without a rule for the namespace it is "/".
+    Without a rule for the namespace, the namespace is "/".
     """
     nodes = possible_nodes(command)
     return nodes[""] if "" in nodes and len({*nodes.values()}) == 1 else None
@@ -241,7 +241,8 @@ def node_argument(command: Sequence[str]) -> tuple[str, str] | None:
 def possible_nodes(command: Sequence[str]) -> dict[str, tuple[str, str]]:
     """Map a node's own name to the namespace and the name that a command gives it.
 
-    "" stands for every name that is not listed; if it is missing, such a node keeps its own name.
+    The key "" stands for every name that is not listed; without this key, such nodes keep their own
+    name.
     """
     names, namespaces = _node_rules(command)
     nodes = {}
@@ -257,7 +258,7 @@ def possible_nodes(command: Sequence[str]) -> dict[str, tuple[str, str]]:
 def started_nodes(command: Sequence[str]) -> Iterator[tuple[str, str]]:
     """Yield namespace and name that a command may give a node; "" if the command does not set one.
 
-    The last pair is that of a node whose own name no rule names (``-r talker:__node:=NAME``).
+    The last pair is for nodes whose own name no rule names (``-r talker:__node:=NAME``).
     """
     names, namespaces = _node_rules(command)
     for own in (*filter(None, dict.fromkeys((*names, *namespaces))), ""):
@@ -271,11 +272,11 @@ def nodes_with_rules(command: Sequence[str]) -> list[str]:
 
 
 def _node_rules(command: Sequence[str]) -> tuple[dict[str, str], dict[str, str]]:
-    """Return the rules for node names and for node namespaces, each by the node that it applies to.
+    """Return the remapping rules for node names and for namespaces, by the node that they apply to.
 
-    "" stands for every node.  The rules are ``-r __node:=NAME`` and ``-r __ns:=NAMESPACE`` behind
-    ``--ros-args``.  The order is that of the command: rcl takes the first rule that matches a node
-    (``remap.c``).
+    The key "" stands for every node.  The rules are ``-r __node:=NAME`` and ``-r __ns:=NAMESPACE``
+    behind ``--ros-args``.  The order is the order in the command: rcl takes the first rule that
+    matches a node (``remap.c``).
     """
     names: dict[str, str] = {}
     namespaces: dict[str, str] = {}
@@ -288,7 +289,7 @@ def _node_rules(command: Sequence[str]) -> tuple[dict[str, str], dict[str, str]]
 
 
 def _rules(command: Sequence[str]) -> Iterator[tuple[str, str, str]]:
-    """Yield the node ("": all), the left and the right side of each remapping rule."""
+    """Yield the node ("": all nodes), the left and the right side of each remapping rule."""
     of_ros = False
     for before, word in pairwise(("", *command)):
         if word == ROS_ARGS:
@@ -329,7 +330,7 @@ def _is_of_package(command: Sequence[str]) -> bool:
 def zenoh_environment(
     configurations: Mapping[str, str], authority: Path, certificate: Path, key: Path
 ) -> dict[str, str]:
-    """Return variables with which rmw_zenoh_cpp runs in an enclave; if it cannot, it exits.
+    """Return variables with which rmw_zenoh_cpp runs in an enclave, or exits if that is impossible.
 
     Args:
         configurations: maps `SESSION_URI` and `ROUTER_URI` to absolute paths of files; processes of
@@ -356,7 +357,7 @@ def zenoh_environment(
 def _text(path: Path) -> str:
     """Return a path as a JSON string.
 
-    Zenoh puts paths behind "#" into the text of an endpoint, in which ";" and "?" also have a
+    Zenoh appends paths to the text of an endpoint, behind "#"; there, ";" and "?" also have a
     meaning (tested with 1.10.2).
     """
     text = str(path)
@@ -370,7 +371,7 @@ def _text(path: Path) -> str:
 
 
 def override_pairs(text: str) -> Iterator[tuple[str, str]]:
-    """Yield key and value of each entry of ZENOH_CONFIG_OVERRIDE, as rmw_zenoh_cpp splits it.
+    """Yield key and value of each entry of ZENOH_CONFIG_OVERRIDE, as rmw_zenoh_cpp splits the text.
 
     A value ends at a line end; an entry without key or value is skipped.
     """
@@ -384,8 +385,8 @@ def override_pairs(text: str) -> Iterator[tuple[str, str]]:
 def replaced_notes(environment: Mapping[str, str], variables: Mapping[str, str]) -> Iterator[Note]:
     """Yield a note for each Zenoh variable of ``environment`` that ``variables`` replaces.
 
-    For ZENOH_CONFIG_OVERRIDE the note names the keys, because its old value could switch access
-    control off.
+    For ZENOH_CONFIG_OVERRIDE, the note names the keys, because the replaced value could switch
+    access control off.
     """
     for name in _VARIABLES:
         before = environment.get(name)
@@ -418,7 +419,7 @@ MAX_SECRET = 1024 * 1024
 """Largest size of the files in a Secret, in bytes (MaxSecretSize of core/v1)."""
 
 _USER = 1000
-"""User id and group id of the process, which most ROS images use."""
+"""User id and group id of the process in a container, as in most ROS images."""
 _OWNER_READS = 0o400
 _LOGS = {"ROS_LOG_DIR": "/tmp"}  # noqa: S108 (a path in the container, which has it alone)
 _ENCLAVE_VOLUME, _LOG_VOLUME = "sros-enclave", "tmp"
@@ -434,9 +435,9 @@ _LONGEST_PLAIN = 40
 class Container:
     """A container whose process runs in an enclave.
 
-    ``folder`` is the absolute path of the enclave's files, in the container and, for Compose, also
-    on the machine that runs it.  Without ``image``, the result has to be merged with a definition
-    that has an image.
+    ``folder`` is the absolute path of the enclave's files in the container and, for Compose, also
+    on the machine that runs the container.  Without ``image``, the result has to be merged with a
+    definition that has an image.
     """
 
     enclave: str
@@ -449,8 +450,8 @@ class Container:
 def object_name(enclave: str) -> str:
     """Return a name of at most 58 characters (RFC 1123) that only this enclave has.
 
-    Names of enclaves may have capitals, "_" and "/". A name that loses one of these ends with "--"
-    and the first 64 bits of the enclave's SHA-256, so that it is unique.
+    Names of enclaves may have capitals, "_" and "/". A name that loses such a character ends with
+    "--" and the first 64 bits of the enclave's SHA-256, so that the name is unique.
     """
     words = "-".join(re.findall(r"[a-z0-9]+", enclave.lower()))
     if _PLAIN.match(enclave) and len(words) <= _LONGEST_PLAIN:

@@ -21,7 +21,7 @@ from sros_tool.errors import DocumentError
 
 
 class EventKind(StrEnum):
-    """What a process reports with an event, such as that it is ready or heard a message."""
+    """The kind of an event, such as that a process is ready, or that it heard a message."""
 
     READY = "ready"
     REFUSED = "refused"
@@ -33,7 +33,7 @@ class EventKind(StrEnum):
 
 
 class ProcessStage(StrEnum):
-    """How far a process got before it was refused or failed."""
+    """The stage of a process before it was refused or failed."""
 
     IMPORT = "import"
     PARTICIPANT = "participant"
@@ -59,7 +59,7 @@ class Event:
 
 
 class EventWriter:
-    """A writer that appends events to a file, or drops them if ``path`` is None."""
+    """A writer that appends events to a file; without ``path``, events are discarded."""
 
     def __init__(self, path: Path | None) -> None:
         self._file = None
@@ -98,7 +98,7 @@ class EventWriter:
 
 
 class EventReader:
-    """A reader of the events appended since its last read; a missing file counts as empty."""
+    """A reader of the events since the last read; a missing file counts as empty."""
 
     def __init__(self, path: Path) -> None:
         self._path = path

@@ -2,9 +2,9 @@
 
 Each text was seen in a real log of Fast DDS 2.9.1, 2.14.5 or 3.6.2 (Permissions.cpp,
 SecurityManager.cpp, PKIDH.cpp), Cyclone DDS 0.10.2 (access_control.c, authentication.c,
-q_omg_security.c), or rcl of Jazzy, and those of rmw_cyclonedds with Cyclone DDS 0.10.5.
+q_omg_security.c), or rcl of Jazzy; texts of rmw_cyclonedds were seen with Cyclone DDS 0.10.5.
 
-To add a vendor, add its rows to `LOG_TEXTS`; `sros_tool.runtime.vendor_log` reads the lines.
+To add a vendor, add rows to `LOG_TEXTS`; `sros_tool.runtime.vendor_log` reads the lines.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ class RefusedObject(Enum):
     """The object that DDS Security refused, according to a log message."""
 
     ALL_SECURITY = auto()
-    """Every secured participant: DDS Security is not built in."""
+    """Every secured participant, because DDS Security is not built in."""
     PARTICIPANT = auto()
-    """The participant of the process: its files or its domain are not accepted."""
+    """The participant of the process, because of its files or its domain."""
     TOPIC = auto()
     """A topic, a DataWriter or a DataReader."""
 
 
 _ROS = None
-"""The vendor of texts that rcl or an RMW prints, whichever DDS is used."""
+"""The vendor of texts that rcl or an RMW prints with any DDS."""
 
 
 class LogText(NamedTuple):
@@ -42,7 +42,7 @@ class LogText(NamedTuple):
     cause the text; ``remedy_without_fault`` is the remedy if the enclave has none of these faults.
 
     ``vagueness`` is 0 for a text that names a cause, and higher for less specific texts: of all
-    texts of a process, only those with the lowest value count.  ``refuses`` is None if the text
+    texts of a process, only the texts with the lowest value count.  ``refuses`` is None if the text
     alone does not prove that DDS Security refused something.
     """
 
@@ -136,19 +136,19 @@ LET_ENTER_EXPORT = (
     f"{_SHOW_MODES} Give the export to the user of the node: `sudo chown -R USER KEYSTORE`. If the "
     "folder was made after the node started, restart the node."
 )
-"""The remedy if a folder that rcl did not find is there, in an export."""
+"""The remedy if an export has a folder that rcl did not find."""
 LET_ENTER_ORIGINAL = (
     f"{_SHOW_MODES} It is next to the CA keys, which no node should be able to read: export the "
     "enclave into a folder of the user of the node. If the folder was made after the node started, "
     "restart the node."
 )
-"""The same remedy, in a keystore with its CA keys."""
+"""The remedy if a keystore with CA keys has a folder that rcl did not find."""
 _SET_DOMAIN = (
     "Set ROS_DOMAIN_ID to a domain of the keystore: `sros env KEYSTORE ENCLAVE --domain ID` prints "
     "the variables."
 )
 _FAST_PARTICIPANT = r"(?P<participant>[0-9a-f]{2}(?:\.[0-9a-f]{2}){11})\|\S*"
-"""A remote participant in a line of Fast DDS; its GUID begins with a digest of its subject name."""
+"""A remote participant in a line of Fast DDS; the GUID begins with a digest of the subject name."""
 _CYCLONE_PARTICIPANT = r"remote participant (?P<participant>[0-9a-f]{1,8}(?::[0-9a-f]{1,8}){2}):\S+"
 _REFUSED_PARTICIPANT = rf"(?:permissions for {_FAST_PARTICIPANT} \()?"
 _RENEW_PARTICIPANT = (
@@ -661,7 +661,7 @@ _CONSEQUENCE_TEXTS = (
         _DENIED_ENDPOINT, _FIND_TOPIC, vagueness=3,
     ),
 )  # fmt: skip
-"""Messages that follow the message with the reason."""
+"""Messages that follow from an earlier message, which has the reason."""
 
 _DENIED_TOPIC_TEXTS = (
     _log_text(
@@ -688,7 +688,7 @@ _DENIED_TOPIC_TEXTS = (
         refuses=RefusedObject.TOPIC,
     ),
 )  # fmt: skip
-"""Denied topics: nearby lines show the denied right and the node."""
+"""Messages about denied topics; nearby lines show the denied right and the node."""
 
 _CAUSELESS_TEXTS = (
     _log_text("refusal", _FAST, r"validate_local_identity|verifying CA certificate",
@@ -700,7 +700,7 @@ _CAUSELESS_TEXTS = (
     _log_text("refusal", _CYCLONE, r"denied by default rule|found in deny_rule",
           refuses=RefusedObject.TOPIC),
 )  # fmt: skip
-"""Refusals without a cause."""
+"""Messages about refusals, without a cause."""
 
 LOG_TEXTS: tuple[LogText, ...] = (
     *_ROS_TEXTS,
@@ -725,7 +725,7 @@ _AMBIGUOUS_WORDS = (
     r"|\bPEM\b|handshake|certificate|private key|authenticated\b|crypto|decrypt"
     r"|access[ _]?control|\benclave|keystore|\bCRL\b"
 )
-"""Words about DDS Security, or about the security or packages of something else."""
+"""Words about DDS Security, or about the security or packages of other programs."""
 _MIDDLEWARE_ORIGINS = (
     r"\b(?:rcl|rmw)\w{0,40}\b|fast.?(?:dds|rtps)|cyclone|\bdds|openssl|\bwhat\(\): "
     r"|\[\w{1,40} (?:Error|Warning)\]"
@@ -806,4 +806,4 @@ UNNOTICED_FAULT = _log_text(
 )  # fmt: skip
 """The meaning of rcl's line about an enclave with another fault, without an error after it."""
 STARTS = (RUNS_OPEN, RAN_OPEN, UNNOTICED_FAULT)
-"""The meanings of rcl's line about the enclave, by the state in which sros finds the enclave."""
+"""The meanings of rcl's line about the enclave, by the state of the enclave."""

@@ -1,12 +1,12 @@
-"""Networks for the demo, separate from the host's: one for the process, and one for each row.
+"""Networks for the demo, separate from the host's network: for the process, and for each row.
 
 The network namespace has only a loopback interface, and disappears with the last process in it.
-Creating it needs CAP_SYS_ADMIN or a user namespace, which also grants the right to capture packets
-in the new network (capabilities(7), user_namespaces(7)).
+Creating a network namespace needs CAP_SYS_ADMIN or a user namespace, which also grants the right to
+capture packets in the new network (capabilities(7), user_namespaces(7)).
 
 A row's network is a namespace that exists as long as the processes and sockets in it.  To create
-one, a process must be in a separate network and have only one thread (`run_isolated`): setns(2)
-changes only the calling thread.
+the network of a row, a process must be in a separate network and have only one thread
+(`run_isolated`): setns(2) changes only the calling thread.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _RTF_UP = 0x1
 
 _LOCAL_PORTS = Path("/proc/sys/net/ipv4/ip_local_port_range")
 _BELOW_DDS = "1024 7399"
-"""A port range that no domain uses: their ports begin at 7400 (RTPS 2.5 §9.6.2.3)."""
+"""A port range that no domain uses: DDS ports begin at 7400 (RTPS 2.5 §9.6.2.3)."""
 
 _TRIAL_SECONDS = 60
 
@@ -67,14 +67,14 @@ class _RouteEntry(ctypes.Structure):
 
 
 class Isolation(NamedTuple):
-    """Whether a process can get a network of its own, and the reason if it cannot."""
+    """Whether a process can get a separate network, and the reason if it cannot."""
 
     isolated: bool
     reason: str = ""
 
 
 def try_isolation() -> Isolation:
-    """Return whether `enter_isolation` would work, by trying it in a child process."""
+    """Return whether `enter_isolation` would work, after trying it in a child process."""
     read_end, write_end = os.pipe()
     child = os.fork()
     if child == 0:
@@ -131,7 +131,8 @@ def _unshare(flags: int) -> None:
 def _bring_up_loopback() -> None:
     """Switch on the loopback interface, with multicast, without the program ip.
 
-    This is what ``ip link set lo up multicast on; ip route add 224.0.0.0/4 dev lo`` does.
+    The effect is the same as of ``ip link set lo up multicast on; ip route add 224.0.0.0/4 dev
+    lo``.
     """
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as control:
         request = struct.pack("16sH14x", b"lo", 0)
@@ -155,7 +156,7 @@ def _add_multicast_route(control: socket.socket) -> None:
 
 
 def _keep_off_ports_of_dds() -> None:
-    """Stop the kernel from assigning ports of DDS domains to sockets that bind to any free port.
+    """Keep the kernel from assigning ports of DDS domains to sockets that bind to any free port.
 
     From domain 102 on, the DDS ports are in the range from which Linux assigns free ports: a
     participant could not join if its port was assigned to another socket.
@@ -175,7 +176,7 @@ _HERE = "/proc/thread-self/ns/net"
 class RowNetwork:
     """The network of a demo row's processes and capture.
 
-    With ``own`` False it is the network of the machine.
+    With ``own`` False, the network is the one of the machine.
     """
 
     def __init__(self, *, own: bool) -> None:
@@ -219,7 +220,7 @@ def _enter(descriptor: int) -> None:
 _Value = TypeVar("_Value")
 
 Progress = Callable[[str], None]
-"""A function that is called with each line about the progress."""
+"""A function that is called with lines about the progress."""
 
 ENDING_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 

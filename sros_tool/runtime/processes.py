@@ -1,17 +1,18 @@
 """The running processes that use ROS 2, DDS or Zenoh, as /proc shows them, and their files.
 
-A process is recognized by the libraries that it has mapped, by ``--ros-args``, or by its program.
-A process itself chooses the texts that /proc shows of it (command, environment, mapped files), also
-after its start: so every text is bounded, and read through a handle of the process's folder, which
-never becomes that of another process.  A process that links its DDS statically and has no arguments
-of ROS is not recognized; a process that cannot be examined is reported.
+A process is recognized by the libraries that it has mapped, by ``--ros-args``, or by its program. A
+process itself chooses the texts that /proc shows (its command, environment, and mapped files), even
+after its start. So the length of every text is limited, and texts are read through a handle of the
+process's folder, which never becomes a handle of another process's folder.  A process that links
+its DDS statically and has no arguments of ROS is not recognized; a process that cannot be examined
+is reported.
 
-The paths that a process names can mean other files to this process, if it has its own root
-directory or mounts, as in a container.  So paths are resolved below the root directory of the
-process, part by part: no link can lead out of it.  Only regular files are opened for reading, never
+If a process has its own root directory or mounts, as in a container, the paths that it names can
+mean other files for sros. So paths are resolved below the root directory of the process, part by
+part, and no link can lead out of this directory.  Only regular files are opened for reading, never
 pipes or devices.  The time of a file's last status change (st_ctime) shows that it was replaced:
-the kernel sets it by its own clock, and copying programs can preserve other times, but not this
-one.
+the kernel sets this time by its own clock, and copying programs can preserve other times, but not
+this time.
 """
 
 from __future__ import annotations
@@ -52,30 +53,28 @@ _DDS_LIBRARIES = re.compile(
     rb"(?:\.abi3|\.cpython-[\w-]+)?\.so[^/\n]*?)( \(deleted\))?$",
     re.MULTILINE,
 )
-"""Matches a mapped DDS library, only at a line's start: a process may map thousands of files."""
+"""Matches a mapped DDS library at a line's start: a process may map thousands of files."""
 _PRODUCTS = {b"fastrtps": "Fast DDS", b"fastdds": "Fast DDS", b"ddsc": "Cyclone DDS"}
 _THREE_NUMBERS = re.compile(r"\.so\.(\d+\.\d+\.\d+)(?:\.\d+)?\Z", re.ASCII)
 _MOST_ENTRIES = 10_000
 _MOST_COPIES_SOUGHT = 20
-"""Maximum number of libraries of a process whose copies are searched; the version of others is
-unknown.
-"""
+"""Maximum number of libraries of a process for which copies are searched to find the version."""
 _DAEMON = ("_ros2_daemon", "ros2cli.daemon", "ros2-daemon")
 _ZENOHD = "zenohd"
-"""The Zenoh router without rmw_zenoh, whose variables it does not read."""
+"""The Zenoh router without rmw_zenoh, which does not read the variables of rmw_zenoh."""
 _ROUTERS = ("rmw_zenohd", _ZENOHD)
 _BRIDGES = ("zenoh-bridge-ros2dds", "zenoh-bridge-dds")
 _INTERPRETER = re.compile(r"(?:python[\d.]*|sh|bash|dash|perl|ruby|node)\Z")
 _FLAGS = re.compile(r"-[BEIOPbdiqsuvx]+\Z")
-"""Options without a value of Python (such as -u), some of which shells have, too."""
+"""Python options without a value (such as -u); some of them are also options of shells."""
 _SCRIPTS_OF_SROS = ("sros", "sros_tool")
 
 _LOADING = timedelta(milliseconds=20)
 """Shortest time from a process's start (known in steps of 10 ms) to loading its enclave."""
 _CLOCK_TOLERANCE = timedelta(seconds=1)
-"""Longest time by which a process's folder can look older than the process if no clock was set."""
+"""Maximum time by which a process's folder can seem older than the process, if no clock was set."""
 _FIRST_LOOK = timedelta(minutes=1)
-"""Longest time from a start to a first look, for the process that was seen soonest."""
+"""Maximum time from the start to the first look, for the process that was seen soonest."""
 _MOST_BYTES = 4 * 1024 * 1024
 _MOST_MAPS = 32 * 1024 * 1024
 _MOST_TRIES = 3
@@ -90,7 +89,7 @@ class MappedLibrary(NamedTuple):
     """A DDS library that a process has mapped.
 
     ``version`` has three numbers, or is "" if the file's name does not show it.  ``path`` is the
-    path as the process sees it.  ``replaced`` says that the path now has another file or none.
+    path as the process sees it.  ``replaced`` says that the path now has another file or no file.
     """
 
     product: str
@@ -100,7 +99,7 @@ class MappedLibrary(NamedTuple):
 
     @property
     def packaged(self) -> bool:
-        """Whether it is from a Debian or Ubuntu package, which can have later fixes."""
+        """Whether the library is from a Debian or Ubuntu package, which can have later fixes."""
         return self.path.startswith(("/usr/lib/", "/lib/"))
 
 
@@ -109,16 +108,16 @@ class Process:
     """A running process that uses ROS 2, DDS or Zenoh.
 
     ``started`` is the earliest moment at which it can have loaded its files, by the clock of that
-    moment; ``clock_advanced`` is how far the clock was set forward since: then ``started`` is a
-    minute too early or more.  ``libraries`` are the names of the libraries of ROS 2, DDS and
-    Zenoh that it has mapped, such as "libddsc", and ``dds`` the DDS libraries with their
-    versions.  ``network`` names its network namespace; "" is the namespace of this process.
-    ``enclave`` is the enclave that it names, if it asks for security, and ``configuration`` the
-    file that it names for Zenoh.  ``forked_by`` are the id and command of the first process of
-    its program, if another one started it.  ``own_pid`` is the id that the process itself sees;
-    in a container, it differs from ``pid``.  ``user`` is the id of the user who runs it, for a
-    set-user-ID program of the user who started it; it is `SEVERAL_USERS` if both, or others, have
-    a say in it.
+    moment; ``clock_advanced`` is the time by which the clock was set forward since then, which
+    makes ``started`` too early by a minute or more. ``libraries`` are the names of mapped libraries
+    of ROS 2, DDS and Zenoh, such as "libddsc", and ``dds`` the DDS libraries with their versions.
+    ``network`` names the network namespace; "" is the namespace of sros. ``enclave`` is the enclave
+    that the process names, if it asks for security, and ``configuration`` the Zenoh configuration
+    that the process names. ``forked_by`` are the id and command of the first process of the same
+    program, if that process started this one. ``own_pid`` is the id that the process itself sees;
+    in a container, this id differs from ``pid``. ``user`` is the id of the user who runs the
+    process; for a set-user-ID program, of the user who started it; `SEVERAL_USERS` if several users
+    can control the process.
     """
 
     pid: int
@@ -137,7 +136,7 @@ class Process:
 
     @property
     def program(self) -> tuple[int, tuple[str, ...]]:
-        """The id and the command of the process that has to be started for this one to run."""
+        """The id and the command of the process that has to be started to start this process."""
         return self.forked_by if self.forked_by[0] else (self.pid, self.command)
 
     @property
@@ -154,8 +153,8 @@ class Process:
     def domain(self) -> str:
         """The ROS domain that the process names, as a number.
 
-        rcl reads it as strtoul(3) does, such as 0x0.  Text that is no number of 64 bits is returned
-        in quotes, safe to print.
+        rcl reads the variable with strtoul(3), which also accepts 0x0. Text that is no 64-bit
+        number is returned in quotes, safe to print.
         """
         named = self.environment.get(DOMAIN) or "0"
         number = _DOMAIN_NUMBER.fullmatch(named)
@@ -167,7 +166,7 @@ class Process:
 
     @property
     def rmw(self) -> str:
-        """The RMW of the middleware that the process has mapped, or else the RMW that it names."""
+        """The RMW of the mapped middleware, or else the RMW that the process names."""
         named = self.environment.get(RMW, "")
         mapped = {rmw for library, rmw in _RMW_OF.items() if library in self.libraries}
         if len(mapped) == 1 and not any(named.startswith(path) for path in mapped):
@@ -220,7 +219,7 @@ _RMW_OF = {
 class UnseenProcess(NamedTuple):
     """A process that could not be examined; ``why`` is a clause.
 
-    ``speaks`` is true if its command shows that it uses ROS 2; false means unknown.
+    ``speaks`` is true if the command shows that the process uses ROS 2; false means unknown.
     """
 
     pid: int
@@ -240,7 +239,7 @@ class RunningProcesses:
 
     Processes that only wait for another process are left out.  ``hidden`` is a clause on the
     processes that /proc does not show, or "".  ``container`` says whether only the processes of a
-    container can be seen, ``by_root`` whether root looked.
+    container can be seen, ``by_root`` whether sros ran as root.
     """
 
     processes: tuple[Process, ...] = ()
@@ -251,7 +250,7 @@ class RunningProcesses:
 
 
 def boot_id(proc: Path = Path("/proc")) -> str:
-    """Return the random name of this start of the machine; "" if the system does not tell it."""
+    """Return the random id of this boot of the machine; "" if the kernel shows no id."""
     try:
         return (proc / "sys/kernel/random/boot_id").read_text(errors="replace").strip()[:_LONGEST]
     except OSError:
@@ -259,12 +258,12 @@ def boot_id(proc: Path = Path("/proc")) -> str:
 
 
 def plain(text: str, longest: int = _LONGEST) -> str:
-    """Return a text, which a process chose, in a short and escaped form for messages."""
+    """Return a text that a process chose, shortened and escaped for messages."""
     return re.sub(r"[^\w.+/ -]", "?", text[:longest])
 
 
 def program_of(command: tuple[str, ...]) -> str:
-    """Return the name of a command's program, or of the script or module that it interprets."""
+    """Return the name of a command's program, or of the script or module that the program runs."""
     name, *words = (Path(command[0]).name, *command[1:]) if command else ("",)
     if _INTERPRETER.match(name):
         while words and _FLAGS.match(words[0]):
@@ -287,7 +286,7 @@ class _Stat(NamedTuple):
 
 
 class _ProcessData(NamedTuple):
-    """The data that was read of a process; it is valid as long as ``stat`` does not change."""
+    """The data read of a process, which is valid as long as ``stat`` does not change."""
 
     stat: _Stat
     process: Process | None
@@ -295,7 +294,7 @@ class _ProcessData(NamedTuple):
 
 
 class ProcessTable:
-    """A reader of the processes in /proc; it reads a process again only if it changed."""
+    """A reader of the processes in /proc, which reads a process again only after a change."""
 
     def __init__(self, proc: Path = Path("/proc")) -> None:
         self._proc = proc
@@ -360,8 +359,9 @@ class ProcessTable:
     ) -> _ProcessData | None:
         """Return the data of a process; None if it has ended or runs no program.
 
-        ``begin`` is when the machine started, from which the kernel counts the start times of
-        processes; ``longest_advance`` returns how far the clock was set forward since.
+        ``begin`` is the moment when the machine started, from which the kernel counts the start
+        times of processes; ``longest_advance`` returns the time by which the clock was set forward
+        since then.
         """
         for _ in range(_MOST_TRIES):
             stat = _stat(folder)
@@ -393,10 +393,10 @@ class ProcessTable:
         return _ProcessData(stat, None, UnseenProcess(pid, command, why, _may_speak(command)))
 
     def _longest_clock_advance(self, begin: datetime) -> timedelta:
-        """Return how far the clock was set forward since a process started, as /proc shows at most.
+        """Return the longest time by which /proc shows that the clock was set forward.
 
-        ``begin`` is when the machine started, by the present clock.  The later somebody first
-        looked at a process, the less it shows.
+        ``begin`` is the moment when the machine started, by the present clock. A process shows only
+        changes of the clock before somebody first looked at the process in /proc.
         """
         longest = timedelta()
         for pid in filter(str.isdigit, os.listdir(self._proc)):
@@ -420,10 +420,10 @@ class ProcessTable:
             os.close(root)
 
     def _waiting_processes(self, processes: list[Process]) -> set[int]:
-        """Return the ids of processes that only wait for another, which uses ROS 2 or DDS.
+        """Return the ids of processes that only wait for a process which uses ROS 2 or DDS.
 
-        An example is ``timeout 60 sros run KEYSTORE ENCLAVE -- talker --ros-args``: it has mapped
-        no library of ROS 2 or DDS, but its child process has.
+        An example is ``timeout 60 sros run KEYSTORE ENCLAVE -- talker --ros-args``, which has
+        mapped no library of ROS 2 or DDS, unlike its child process.
         """
         parents = {pid: looked_at.stat.parent for pid, looked_at in self._looked.items()}
         above: set[int] = set()
@@ -453,7 +453,7 @@ def with_files(process: Process, root: ProcessRoot, folder: str) -> Process:
 
 
 def dds_of(pid: int) -> tuple[MappedLibrary, ...]:
-    """Return the DDS libraries that a process has mapped; empty if they cannot be seen."""
+    """Return the DDS libraries that a process has mapped; empty if these cannot be seen."""
     try:
         folder = os.open(f"/proc/{pid}", os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
         try:
@@ -472,7 +472,7 @@ def dds_of(pid: int) -> tuple[MappedLibrary, ...]:
 def _with_versions(
     libraries: tuple[MappedLibrary, ...], root: ProcessRoot
 ) -> tuple[MappedLibrary, ...]:
-    """Return the libraries with versions that copies next to them show."""
+    """Return the libraries; versions come from the names of copies in the same folder."""
     unknown = [library for library in libraries if not library.version and not library.replaced]
     named = {library: _with_version(library, root) for library in unknown[:_MOST_COPIES_SOUGHT]}
     return tuple(named.get(library, library) for library in libraries)
@@ -485,7 +485,7 @@ def _with_version(library: MappedLibrary, root: ProcessRoot) -> MappedLibrary:
 
 
 class _TooLongError(OSError):
-    """A file of /proc is longer than sros reads."""
+    """Raised for a file of /proc that is longer than sros reads."""
 
 
 def _examine(pid: int, folder: int, command: tuple[str, ...], started: datetime) -> Process | None:
@@ -519,7 +519,7 @@ def _examine(pid: int, folder: int, command: tuple[str, ...], started: datetime)
 
 
 def _forked_by(folder: int, command: tuple[str, ...]) -> tuple[int, tuple[str, ...]]:
-    """Return the id and command of the first process of a program; (0, ()) if it is this one.
+    """Return the id and command of the first process of a program; (0, ()) if it is this process.
 
     A fork has the command of its parent.  A child of Python's ``multiprocessing`` has a command
     that only its parent can start (CPython, ``multiprocessing/spawn.py`` and ``forkserver.py``).
@@ -559,7 +559,8 @@ def _mapped_dds(maps: bytes) -> tuple[MappedLibrary, ...]:
 def installed_dds() -> tuple[MappedLibrary, ...]:
     """Return the DDS libraries in the folders of ROS and of packages.
 
-    Environment variables are not used: in a login by ssh they do not name the folder of ROS.
+    Environment variables are not used, because they do not name the folder of ROS in a login by
+    ssh.
     """
     libraries = (
         (folder / name, _PRODUCTS[match[1].encode()])
@@ -575,7 +576,7 @@ def installed_dds() -> tuple[MappedLibrary, ...]:
 
 
 def _names_in(folder: Path) -> list[str]:
-    """Return the names of the files of a folder; none if it cannot be read, or is a file."""
+    """Return the names of the files in a folder; empty for an unreadable folder or a file."""
     try:
         return os.listdir(folder)
     except OSError:
@@ -590,11 +591,11 @@ _LIBRARY_FILE = re.compile(rf"lib({'|'.join(map(re.escape, map(bytes.decode, _PR
 
 
 class ProcessOrigin(NamedTuple):
-    """How a process was started; a part is empty if it does not exist or cannot be seen.
+    """The way in which a process was started; unknown parts are empty.
 
-    ``unit`` is its systemd system service, ``folder`` its working directory, ``launch`` the
-    command of the ``ros2 launch`` that started it (its own, for a launch), and ``container`` the
-    id of its container of Docker or Podman.
+    ``unit`` is the systemd system service, ``folder`` the working directory, ``launch`` the command
+    of the ``ros2 launch`` that started the process (or that is the process), and ``container`` the
+    id of its Docker or Podman container.
     """
 
     unit: str = ""
@@ -604,7 +605,7 @@ class ProcessOrigin(NamedTuple):
 
 
 def process_origin(pid: int, proc: Path = Path("/proc")) -> ProcessOrigin:
-    """Return how a process was started."""
+    """Return the unit, folder, launch and container in which a process was started."""
     unit = folder = container = ""
     with suppress(OSError):
         text = (proc / str(pid) / "cgroup").read_text(errors="surrogateescape")
@@ -636,10 +637,9 @@ SERVICE_NAME = r"\w[\w:.@\\-]*\.service"
 _SERVICE = re.compile(
     r"^(?:0:|\d+:name=systemd):/system\.slice/(?:.*/)?(" + SERVICE_NAME + r")$", re.M | re.A
 )
-"""A line of /proc/PID/cgroup, of version 2 or 1 (cgroups(7)); not for users' own services."""
+"""A line of /proc/PID/cgroup, version 2 or 1 (cgroups(7)), for a system service (not of a user)."""
 _CONTAINER = re.compile(r"/(?:docker|libpod)[-/]([0-9a-f]{64})(?:\.scope)?(?:/|$)", re.M | re.A)
-"""A line of /proc/PID/cgroup for a container, as both cgroup drivers of Docker and Podman write it.
-"""
+"""A line of /proc/PID/cgroup for a Docker or Podman container, by either cgroup driver."""
 
 
 def _version(name: str) -> str:
@@ -649,31 +649,31 @@ def _version(name: str) -> str:
 
 
 _FIRST_PID_NAMESPACE = "pid:[4026531836]"
-"""The name of the namespace that has all processes (PROC_PID_INIT_INO of <linux/proc_ns.h>)."""
+"""Name of the PID namespace with all processes (PROC_PID_INIT_INO of <linux/proc_ns.h>)."""
 
 
 def _programs_in(command: tuple[str, ...]) -> set[str]:
-    """Return the names that may be those of the program, or of the script that it interprets."""
+    """Return the possible names of a command's program, or of the script that the program runs."""
     return {Path(word).name for word in command[:3]}
 
 
 def _may_speak(command: tuple[str, ...]) -> bool:
-    """Return whether a command shows that its process uses ROS 2 or Zenoh."""
+    """Return whether a command shows that the process uses ROS 2 or Zenoh."""
     is_of_zenoh = not _programs_in(command).isdisjoint((*_ROUTERS, *_BRIDGES))
     is_daemon = any(mark in word for word in command[:3] for mark in _DAEMON)
     return ROS_ARGS in command or is_of_zenoh or is_daemon
 
 
 def _is_sros_run(command: tuple[str, ...]) -> bool:
-    """Return whether a command is ``sros run``, which later becomes the command of the node."""
+    """Return whether a command is ``sros run``, which later becomes the node itself."""
     names = [Path(word).name for word in command[:4]]
     return "run" in names and any(script in names for script in _SCRIPTS_OF_SROS)
 
 
 def _configuration_of(process: Process) -> LoadedFile | None:
-    """Return the configuration file of a Zenoh process, not read yet; None for others.
+    """Return the configuration file of a Zenoh process, without its content; None for others.
 
-    If the file is unknown, the ``problem`` of the result says why.
+    If the file is unknown, the result has the reason as ``problem``.
     """
     if not process.is_zenoh:
         return None
@@ -695,7 +695,7 @@ def _stat(folder: int) -> _Stat:
     """Return the numbers of a process.
 
     Raises:
-        OSError: It has ended.
+        OSError: The process has ended.
     """
     text = _read(folder, "stat", _MOST_BYTES).decode("utf-8", "surrogateescape")
     # The name may hold spaces and parentheses; numbers follow the last parenthesis.
@@ -709,19 +709,18 @@ def _stat(folder: int) -> _Stat:
 
 
 _USERS = re.compile(rb"^Uid:\s+(\d+)\s+(\d+)\s+(\d+)\s+(\d+)", re.MULTILINE)
-"""The real, effective, saved and file system user id in /proc/PID/status."""
+"""Matches the real, effective, saved and file system user id in /proc/PID/status."""
 SEVERAL_USERS = 0xFFFFFFFF
-"""Stands for several users who may have a say in a process; no process has this id (setresuid(2)).
-"""
+"""A user id for several users who can control a process; no process has it (setresuid(2))."""
 
 
 def user_text(user: int) -> str:
-    """Return the user who has a say in a process as text, such as ``user 1000``."""
+    """Return text that names the user who can control a process, such as ``user 1000``."""
     return "several users at once" if user == SEVERAL_USERS else f"user {user}"
 
 
 _OWN_PID = re.compile(rb"^NSpid:(?:\s+\d+)*\s+(\d+)$", re.MULTILINE)
-"""The process id in the innermost PID namespace, in /proc/PID/status."""
+"""Matches the process id in the innermost PID namespace, in /proc/PID/status."""
 
 
 _STARTED_BY, _STARTED_AS = 11, 12
@@ -729,11 +728,11 @@ _STARTED_BY, _STARTED_AS = 11, 12
 
 
 def _clock_advanced(folder: int, started: datetime) -> timedelta:
-    """Return how far the clock was set forward since somebody first looked at a process; 0 if not.
+    """Return by how much the clock was set forward since somebody first looked at a process.
 
-    ``started`` is its start by the present clock.  The kernel gives /proc/PID the time at which
-    somebody (systemd, ps, sros) first looks there (Linux, ``fs/proc/base.c``), which is after the
-    start, unless another clock told it.
+    ``started`` is the start of the process by the present clock. The kernel gives /proc/PID the
+    time at which somebody (systemd, ps, sros) first looks at it (Linux, ``fs/proc/base.c``). This
+    time is after the start, unless the clock was changed in between. The result is 0 if it was not.
     """
     first_look = _moment(os.fstat(folder).st_ctime_ns)
     advanced = started - first_look
@@ -741,14 +740,14 @@ def _clock_advanced(folder: int, started: datetime) -> timedelta:
 
 
 def _user(folder: int, status: bytes) -> int:
-    """Return the only user but root who has a say in a process, or 0, or `SEVERAL_USERS`.
+    """Return the only user other than root who can control a process, or 0, or `SEVERAL_USERS`.
 
-    Whoever starts a set-user-ID program chose its words and environment, whatever user ids it gives
-    itself later.  A process can replace its auxiliary vector, but not its ids in ``status``
-    (PR_SET_MM in prctl(2)), so that the vector can only add a user.
+    The user who starts a set-user-ID program chooses its command and environment, whatever user ids
+    the program takes later.  A process can replace its auxiliary vector, but not its ids in
+    ``status`` (PR_SET_MM in prctl(2)), so that the vector can only add a user.
 
     Raises:
-        OSError: It has ended, or may not be examined.
+        OSError: The process has ended, or may not be examined.
     """
     auxiliary = _read(folder, "auxv", _MOST_BYTES)
     length = len(auxiliary) - len(auxiliary) % 16
@@ -776,10 +775,10 @@ def _words(folder: int, name: str) -> list[str]:
 
 
 def _read(folder: int, name: str, max_bytes: int) -> bytes:
-    """Return a file of /proc/PID.
+    """Return the content of a file of /proc/PID.
 
     Raises:
-        OSError: It cannot be read, or is longer than ``max_bytes``.
+        OSError: The file cannot be read, or is longer than ``max_bytes``.
     """
     handle = os.open(name, os.O_RDONLY | os.O_CLOEXEC, dir_fd=folder)
     try:
@@ -804,7 +803,7 @@ def _namespace(path: Path) -> str:
 _CRL = "crl.pem"
 _KEY, _KEY_ON_TOKEN = "key.pem", "key.p11"
 _UNREAD = (_KEY, _KEY_ON_TOKEN, "governance.p7s")
-"""Files that are not read: private keys, and files whose content says nothing about a process."""
+"""Files that are not read: private keys, and files whose content shows nothing about a process."""
 _MOST_FILE_BYTES = 16 * 1024 * 1024
 _MOST_BYTES_OF_FILES = 64 * 1024 * 1024
 _LAST_SECOND = 253402300799
@@ -816,9 +815,9 @@ _MOST_FOLDERS = 200
 class LoadedFile:
     """The current state of a file that a process loads at its start.
 
-    ``changed`` is when the file, or a link to it, was last written, replaced or given another mode
-    or owner; None if the file does not exist.  ``problem`` is a clause on why it could not be
-    examined.  ``mode`` are its permission bits.
+    ``changed`` is the time of the last change of the file or of a link to it: of content, mode or
+    owner, or a replacement; None if the file does not exist. ``problem`` is a clause on why the
+    file could not be examined. ``mode`` are the permission bits of the file.
     """
 
     name: str
@@ -833,11 +832,11 @@ class ProcessEnclave:
     """The enclave that a process names, and the current state of its files.
 
     ``keystore`` is the path that the process names.  ``moved`` maps folders of the keystore whose
-    last change added or removed no file (they were moved, or got another mode) to the time of that
+    last change was a move or a new mode, without added or removed files, to the time of that
     change.  ``writable`` is a clause on a folder that users other than the keystore's owner can
-    change. ``here`` is the path of the keystore for this process; None if that path is another
-    folder here. ``folders`` are the device and inode of the keystore and of the enclave, as far as
-    they are there.  ``problem`` is a clause on why the enclave could not be examined.
+    change. ``here`` is the path of the keystore for sros; None if this path is another folder for
+    sros. ``folders`` are the device and inode of the keystore and of the enclave, as far as these
+    exist.  ``problem`` is a clause on why the enclave could not be examined.
     """
 
     keystore: str
@@ -851,11 +850,11 @@ class ProcessEnclave:
     problem: str = ""
 
     def file(self, name: str) -> LoadedFile:
-        """Return a file of the enclave by its name."""
+        """Return the file of the enclave with this name."""
         return next((file for file in self.files if file.name == name), LoadedFile(name))
 
     def is_of(self, keystore: Path) -> bool:
-        """Return whether this is an enclave of a keystore on this machine, whatever path names it.
+        """Return whether this is an enclave of a keystore on this machine, also by another path.
 
         The folder of the enclave decides, or the folder of the keystore: links, ``..`` and the
         mounts of a container give a folder other paths.  For a folder that does not exist, the path
@@ -879,7 +878,7 @@ class ProcessEnclave:
 
 
 class FileReader:
-    """Reader of the files of processes, which reads at most 64 MiB, and the same file only once."""
+    """A reader of files of processes: at most 64 MiB, and the same file only once."""
 
     def __init__(self) -> None:
         self._left = _MOST_BYTES_OF_FILES
@@ -915,9 +914,9 @@ class FileReader:
 
 
 class ProcessRoot:
-    """The root directory of a process, below which its paths are resolved.
+    """The root directory of a process, below which paths of the process are resolved.
 
-    ``handle`` is a folder that is open with O_PATH; it stays with the caller.
+    ``handle`` is a folder that is open with O_PATH; the caller has to close it.
     """
 
     def __init__(self, handle: int, reader: FileReader) -> None:
@@ -936,7 +935,7 @@ class ProcessRoot:
         return LoadedFile(name, _moment(changed), data, mode=stat.S_IMODE(way[-1][1].st_mode))
 
     def copies(self, path: str) -> list[str]:
-        """Return files next to a library that have its size, and a name that begins with its name.
+        """Return files next to a library with the same size, and a name that begins with its name.
 
         The result is empty if the folder cannot be examined, or has too many entries.
         """
@@ -965,7 +964,7 @@ class ProcessRoot:
             return []
 
     def folders(self, path: str) -> list[tuple[str, os.stat_result]]:
-        """Return the folders on the way to a folder, and last the folder itself, with their states.
+        """Return the parents of a folder, and last the folder itself, with their states.
 
         Raises:
             OSError: The folder does not exist, or cannot be examined.
@@ -979,9 +978,9 @@ class ProcessRoot:
     def _opened(self, path: str) -> Iterator[tuple[int, list[tuple[str, os.stat_result]]]]:
         """Open the file or folder at a path with O_PATH, in a context.
 
-        Yields the handle, and the path and state of each folder and link on the way, and of the
-        file or folder itself.  Each part is opened in the folder before it, and the system follows
-        no link, so nothing outside of the root directory is reached.
+        Yields the handle, and the paths and states of all folders and links on the way and of the
+        file or folder itself. Every part is opened in its parent folder, and the system follows no
+        link, so nothing outside of the root directory is reached.
         """
         parts_left = [part for part in path.split("/")[::-1] if part]
         way = [("/", os.fstat(self._handle))]
@@ -1085,14 +1084,14 @@ def _loaded_enclave(
 
 
 def _reason(error: OSError) -> str:
-    """Return why a folder could not be examined, as a clause; "" if it does not exist."""
+    """Return a clause on why a folder could not be examined; "" if the folder does not exist."""
     if error.errno in (errno.ENOENT, errno.ENOTDIR):
         return ""
     return error.strerror or str(error)
 
 
 def _writable_folder_clause(folders: list[tuple[str, os.stat_result]], user: int) -> str:
-    """Return a clause on a folder that users other than root, ``user`` and its owner can change."""
+    """Return a clause on a folder that users besides root, ``user`` and its owner can change."""
     trusted = frozenset({0, user, folders[0][1].st_uid})
     for path, state in folders:
         if why := other_writers(state, trusted):
@@ -1101,7 +1100,7 @@ def _writable_folder_clause(folders: list[tuple[str, os.stat_result]], user: int
 
 
 def _identity(folders: Sequence[tuple[str, os.stat_result]]) -> tuple[int, int]:
-    """Return the device and inode of the last folder."""
+    """Return the device and inode of the last of ``folders``."""
     state = folders[-1][1]
     return state.st_dev, state.st_ino
 

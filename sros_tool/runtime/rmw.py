@@ -26,7 +26,7 @@ DEFAULT_RMW = "rmw_fastrtps_cpp"
 
 
 def denial_trace_variables(stream: str) -> dict[str, str]:
-    """Return variables that make Cyclone DDS trace, to stderr or stdout, why it denies a topic."""
+    """Return variables that make Cyclone DDS log, to stderr or stdout, why it denies a topic."""
     return {
         "CYCLONEDDS_URI": "<CycloneDDS><Domain><Tracing>"
         "<Category>fatal,error,warning,trace</Category>"
@@ -37,10 +37,11 @@ def denial_trace_variables(stream: str) -> dict[str, str]:
 class Middleware(NamedTuple):
     """A middleware that ROS 2 can use, and how to recognize it.
 
-    ``rmw`` is a part of the names of its RMWs, and the names of its shared libraries begin with one
-    of ``libraries``.  ``vendor`` is its DDS vendor, or None if it is not a DDS; ``trace_variables``
-    are environment variables with which it logs why it denies a topic.  The library
-    ``rmw_library`` has the text ``open_build`` only if it was built without DDS Security.
+    ``rmw`` is a part of the names of the RMWs, and ``libraries`` are the beginnings of names of
+    shared libraries. ``vendor`` is the DDS vendor, or None for another middleware;
+    ``trace_variables`` are environment variables that make the middleware log why it denies a
+    topic.  The library ``rmw_library`` has the text ``open_build`` only if it was built without DDS
+    Security.
     """
 
     name: str
@@ -85,13 +86,13 @@ def middleware_of(rmw: str) -> Middleware | None:
 
 
 def vendor_of(rmw: str) -> Vendor | None:
-    """Return the DDS vendor of an RMW, or None if it is unknown or does not use DDS."""
+    """Return the DDS vendor of an RMW, or None if the RMW is unknown or does not use DDS."""
     middleware = middleware_of(rmw)
     return middleware.vendor if middleware else None
 
 
 def rmw_implementations(environment: Mapping[str, str]) -> tuple[str, ...]:
-    """Return the RMWs in the ament index, starting with the one that rclpy would use.
+    """Return the RMWs in the ament index, starting with the RMW that rclpy would use.
 
     Searches the prefixes in AMENT_PREFIX_PATH, and the prefix of this Python, which wheels use.
     """
@@ -111,7 +112,7 @@ def _prefixes(environment: Mapping[str, str]) -> list[str]:
 
 
 def package_version(rmw: str, environment: Mapping[str, str]) -> tuple[int, int, int] | None:
-    """Return the version of an installed RMW by its package.xml; None if that cannot be told."""
+    """Return the version of an installed RMW by its package.xml; None if it is unknown."""
     from sros_tool.xml import parse, read_bytes
 
     for prefix in _prefixes(environment):
@@ -130,7 +131,7 @@ _VERSION = re.compile(r"(\d{1,9})\.(\d{1,9})\.(\d{1,9})", re.ASCII)
 
 
 def chosen_rmw(named: str | None, environment: Mapping[str, str]) -> str:
-    """Return the RMW that a process will use; "" if that is uncertain.
+    """Return the RMW that a process will use; "" if several are possible.
 
     ``named`` is the RMW that the user chose.  Without it, the result is $RMW_IMPLEMENTATION, or the
     only installed RMW, which rmw_implementation then loads.
@@ -144,9 +145,9 @@ def chosen_rmw(named: str | None, environment: Mapping[str, str]) -> str:
 def built_without_security(rmw: str, environment: Mapping[str, str]) -> bool:
     """Return whether an installed RMW surely has no DDS Security, without starting it.
 
-    Its library has the message of a node that asks for security in vain only if it was built
-    without DDS Security (rmw_fastrtps of Jazzy, participant.cpp; rmw_cyclonedds of Jazzy,
-    rmw_node.cpp). False says nothing: only `sros doctor` tries what an RMW enforces.
+    Only a library that was built without DDS Security has the error message for nodes that ask for
+    security (rmw_fastrtps of Jazzy, participant.cpp; rmw_cyclonedds of Jazzy, rmw_node.cpp). False
+    proves nothing: only `sros doctor` tests whether an RMW enforces security.
     """
     middleware = middleware_of(rmw)
     if not (middleware and middleware.open_build):
@@ -169,10 +170,10 @@ def vendor_here(
 ) -> tuple[Vendor, str]:
     """Return the DDS vendor of this machine, and the reason as a short text.
 
-    The vendor is that of $RMW_IMPLEMENTATION, else of an installed RMW, else Fast DDS, in the
-    release that $ROS_DISTRO ships.  With ``distribution``, its release counts instead, and
-    installed RMWs do not.  The text also warns if the RMW was built without DDS Security, or if the
-    release was not tested.
+    The vendor is the vendor of $RMW_IMPLEMENTATION, else of an installed RMW, else Fast DDS, in the
+    release that $ROS_DISTRO ships. With ``distribution``, the release is the one that this
+    distribution ships, and installed RMWs do not count.  The text also warns if the RMW was built
+    without DDS Security, or if the release was not tested.
     """
     named = environment.get(RMW, "")
     rmw, why = "", ""
@@ -193,7 +194,7 @@ def vendor_here(
 def chosen_vendor(
     named: str | None, distribution: Distribution | None, environment: Mapping[str, str]
 ) -> tuple[Vendor, str]:
-    """Return the vendor of a name such as ``cyclonedds``, or else `vendor_here`, and the reason.
+    """Return the vendor of a name such as ``cyclonedds``, or else `vendor_here`, with the reason.
 
     With a distribution, the vendor has the rules of the release that the distribution ships.
 

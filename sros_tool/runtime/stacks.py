@@ -1,13 +1,13 @@
-"""Find out which installed DDS stacks enforce security, by trying each with an enclave.
+"""Find out which installed DDS stacks enforce security, by trying them with an enclave.
 
 The name or version of a library does not show how it was built, so each stack is tried in a
 separate process.  Only two results mean "does not enforce": the stack reports that security is not
 built in, or creates an endpoint that the permissions deny.  Any other failure means "could not be
 tried".
 
-That process is this module: it joins with the enclave that the environment names, then creates
-endpoints that the enclave's permissions allow and some that they deny, and reports each result.
-The parent judges the results, so that a crash of the process does not count as a refusal.
+The separate process runs this module: it joins with the enclave that the environment names, creates
+endpoints that the enclave's permissions allow and endpoints that they deny, and reports the
+results. The parent judges the results, so that a crash of the process does not count as a refusal.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ _EXIT_SECONDS = 5.0
 
 
 class ProbeEnclave(NamedTuple):
-    """The secured environment of a probe, with one allowed and one denied ROS topic.
+    """The secured environment of a probe, with an allowed and a denied ROS topic.
 
     ``environment`` has the ROS_SECURITY_* variables and ROS_DOMAIN_ID of an enclave that may
     publish ``allowed``, and neither publish nor subscribe to ``denied``.
@@ -111,7 +111,7 @@ class Stack(NamedTuple):
     evidence: str = ""
     """Description of the attempt and the observed result."""
     advice: str = ""
-    """Advice on what to do; empty if there is none."""
+    """What to do, or an empty string."""
     rmw: str = ""
     """Name of the RMW; empty if the stack is not an RMW."""
 
@@ -120,12 +120,12 @@ class Stack(NamedTuple):
 
 
 def survey(probe: ProbeEnclave) -> tuple[Stack, ...]:
-    """Try every stack that sros knows; the result includes stacks that are not installed."""
+    """Return all stacks that sros knows, after trying them; also stacks that are not installed."""
     return (*rclpy_stacks(probe), cyclone_stack(probe), _cyclonedds_package_stack(probe))
 
 
 def rclpy_stacks(probe: ProbeEnclave) -> Iterator[Stack]:
-    """Try each installed RMW of rclpy in turn, the default first, and yield the result."""
+    """Try all installed RMWs of rclpy in turn, the default first, and yield the results."""
     if importlib.util.find_spec("rclpy") is None:
         yield _without_rclpy()
         return
@@ -179,7 +179,7 @@ def _probe_rmw(probe: ProbeEnclave, rmw: str) -> Stack:
 
 
 def _with_release(stack: Stack) -> Stack:
-    """Return an RMW on Zenoh with its installed release, and a note on what enforces security."""
+    """Return an RMW on Zenoh with its installed release, and a note on its security."""
     version = package_version(stack.rmw, os.environ)
     if version is None:
         return stack._replace(advice=_ZENOH_ADVICE)
@@ -289,7 +289,7 @@ def _wait(process: subprocess.Popen[bytes]) -> int | None:
 
 
 class ProbeVerdict(NamedTuple):
-    """Whether a DDS enforces security (None: could not be tried), with the evidence."""
+    """The result of a probe: whether a DDS enforces security (None: not tried), with evidence."""
 
     enforces: bool | None
     evidence: str
@@ -451,8 +451,8 @@ _JOINS: dict[str, Callable[[], tuple[Ask, Close]]] = {
 def main(arguments: Sequence[str] | None = None) -> int:
     """Join, then create endpoints on two topics; arguments are ``KIND REPORT ALLOWED DENIED``.
 
-    KIND is a key of `_JOINS`, REPORT the file for the events, the others are ROS topics.  Returns
-    the exit status.
+    KIND is a key of `_JOINS`, REPORT the file for the events, ALLOWED and DENIED are ROS topics.
+    Returns the exit status.
     """
     kind, report, allowed, denied = sys.argv[1:] if arguments is None else arguments
     if try_isolation().isolated:
@@ -495,7 +495,7 @@ def _report_failure(
 
 
 def _dds_in_memory() -> str:
-    """Return name, version and file of the DDS in this process, one per line; "" if none."""
+    """Return name, version and file of the DDS in this process, as lines; "" without a DDS."""
     for middleware in MIDDLEWARE:
         for prefix in middleware.libraries:
             for file in loaded_libraries(prefix):

@@ -1,4 +1,4 @@
-"""systemd units: nodes that run in their enclaves, and the regular work on a keystore.
+"""systemd units for nodes that run in their enclaves, and for regular work on a keystore.
 
 A node gets only what a ROS node over DDS or Zenoh needs: sockets of IP, the list of network
 interfaces (netlink), shared memory, devices, and its own enclave, but no other enclaves.
@@ -38,10 +38,10 @@ class WrittenUnits(NamedTuple):
 
 
 TEMPLATE = "sros@.service"
-"""The unit of all nodes; its instance name is the enclave, as `unit_instance` writes it."""
+"""The unit of all nodes; its instance name is an enclave, in the form of `unit_instance`."""
 
 _NODES = "/etc/sros/nodes"
-"""Folder with a program for each enclave, used if no command is named."""
+"""Folder with a program for each enclave, which runs if no command is named."""
 
 METRICS_FILE = "/var/lib/sros-metrics/sros.prom"
 FLEET_FILE = "/var/lib/sros-metrics/fleet.prom"
@@ -106,7 +106,7 @@ SIGNING_JOBS = frozenset({Job.RENEW, Job.COLLECT})
 def unit_instance(enclave: str) -> str:
     """Return the instance name of an enclave, as `systemd-escape --path` does.
 
-    The name of an enclave has only letters, digits, "_" and "/", of which "/" alone is escaped.
+    Of the characters in enclave names (letters, digits, "_" and "/"), only "/" has to be escaped.
     """
     return enclave.strip("/").replace("/", "-") or "-"
 
@@ -114,7 +114,7 @@ def unit_instance(enclave: str) -> str:
 def _check_path(path: str, kind: str, option: str = "") -> str:
     """Return ``path`` if all directives of a unit read it in the same way.
 
-    ``option`` is the command-line option with which the user can name another path.
+    ``option`` is the command-line option that sets the path.
 
     Raises:
         UsageError: the path is not absolute, or has characters with a meaning in some directives.
@@ -137,7 +137,7 @@ def _check_user(name: str) -> str:
     """Return ``name`` if it is a valid user name.
 
     Raises:
-        UsageError: it is not a valid user name.
+        UsageError: ``name`` is not a valid user name.
     """
     if not _USER.match(name):
         raise UsageError(f"{name!r} is not the name of a user", "", "Name a user such as ros.")
@@ -147,7 +147,7 @@ def _check_user(name: str) -> str:
 def node_template(user: str) -> str:
     """Return the text of `TEMPLATE`, the unit of all nodes.
 
-    For an enclave without `node_settings`, which contain its command, the unit starts nothing.
+    Without `node_settings`, which contain the command, the unit starts nothing for an enclave.
     """
     return f"""\
 # Runs a node in the enclave of its instance name, which sros@NAME.service.d/enclave.conf adds.
@@ -191,12 +191,13 @@ def node_settings(
 
     Args:
         enclave: the name of the enclave.
-        variables: its environment variables.
+        variables: the environment variables of the enclave.
         keystore: the path of the keystore.
         command: the command with its arguments; if empty, the program in `_NODES` with the path of
             the enclave.
         below: the enclaves in subfolders of this enclave's folder.
-        sros: the path of the program sros, which then verifies the enclave first, or "".
+        sros: the path of the program sros, which verifies the enclave before the start; "" for no
+            verification.
 
     Raises:
         UsageError: a path, a word of the command or a variable cannot be written in a unit.
@@ -254,7 +255,7 @@ def job_units(
     Args:
         job: the job.
         keystore: the path of the keystore.
-        user: its owner.
+        user: the owner of the keystore.
         sros: the path of the program sros.
         passphrase: the path of the file with the passphrase of the CA keys, or "".
         domain: the ROS domain in which the guard takes open nodes for mistakes.
@@ -262,7 +263,7 @@ def job_units(
         inbox: the path of the folder with the messages of robots, for `Job.COLLECT`.
         publishing: the path of the folder in which `Job.COLLECT` publishes releases.
         max_age: the age of a confirmation from which a robot is offline for `Job.FLEET`; None for
-            that of `sros fleet status`.
+            the default of `sros fleet status`.
 
     Raises:
         UsageError: a path cannot be written in a unit.
@@ -352,7 +353,7 @@ WantedBy=timers.target
 
 
 def _guard(keystore: str, sros: str, domain: int) -> str:
-    """Return the service that watches the processes of a machine as long as it runs."""
+    """Return the service that watches the processes of a machine while the machine runs."""
     root = _check_path(keystore, "the keystore")
     variables = {KEYSTORE: root, ENABLE: "true", STRATEGY: "Enforce", DOMAIN: str(domain)}
     # Only the two capabilities of root that are needed to look at all processes.

@@ -1,7 +1,7 @@
 """The environment variables of ROS 2 that choose security and the domain, as rcl reads them.
 
-Any other ROS_SECURITY_ENABLE than ``true`` switches security off.  With any other
-ROS_SECURITY_STRATEGY than ``Enforce``, a process without an enclave runs unsecured.  Source:
+Any value of ROS_SECURITY_ENABLE other than ``true`` switches security off. With any value of
+ROS_SECURITY_STRATEGY other than ``Enforce``, a process without an enclave runs unsecured.  Source:
 rcl/src/rcl/security.c.
 
 This module is imported by every node of the demo, and imports little.
@@ -27,7 +27,7 @@ _DOMAIN_ID = re.compile(r"(?:0|[1-9]\d*)\Z", re.ASCII)
 
 
 def domain_from(environment: Mapping[str, str]) -> int | None:
-    """Return ROS_DOMAIN_ID as a number, or None if it is unset or empty.
+    """Return ROS_DOMAIN_ID as a number, or None if the variable is unset or empty.
 
     Raises:
         UsageError: The value is not a domain id; rcl would not start either.
@@ -86,7 +86,8 @@ def choose_loadable(environment: Mapping[str, str], enclave: str = "/") -> Secur
     Source: rmw_dds_common ``security.cpp``, whose message does not name the file.
 
     Raises:
-        SrosError: The process would not start (Enforce); contains the message of the RMWs.
+        SrosError: The process would not start (Enforce); the error contains the message of the
+            RMWs.
     """
     from sros_tool.runtime.cyclone import ENCLAVE_FILES
 
@@ -102,7 +103,7 @@ def choose_loadable(environment: Mapping[str, str], enclave: str = "/") -> Secur
 
 
 def domain_of(environment: Mapping[str, str]) -> int:
-    """Return the domain that ROS_DOMAIN_ID names, or 0 if it is not set.
+    """Return the domain in ROS_DOMAIN_ID, or 0 if the variable is not set.
 
     Raises:
         UsageError: The value is not a domain id.

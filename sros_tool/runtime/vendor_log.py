@@ -4,8 +4,8 @@ Fast DDS writes colored text to standard output, Cyclone DDS writes to its log s
 error.  With ROS_SECURITY_LOG_FILE, Fast DDS writes the reasons of refusals to that file instead, in
 another format.
 
-To add a vendor, add the text that it puts around a reason to `_REASON_CONTEXT`, its words for
-writers and readers to `ENDPOINT_KINDS`, and its messages to `sros_tool.runtime.log_texts`.
+To add a vendor, add the vendor's text around a reason to `_REASON_CONTEXT`, the words for writers
+and readers to `ENDPOINT_KINDS`, and the messages to `sros_tool.runtime.log_texts`.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _LINE_FORMATS = (
 def vendor_of_line(line: str) -> Vendor | None:
     """Return the vendor whose log has lines of this form, or None.
 
-    The label of the process has to be removed from ``line`` before.
+    Callers have to remove the label of the process from ``line``.
     """
     return next((vendor for vendor, form in _LINE_FORMATS if form.search(line)), None)
 
@@ -38,23 +38,23 @@ def vendor_of_line(line: str) -> Vendor | None:
 SECURITY_DIRECTORY = re.compile(
     r"\b(?:Found )?security directory: (?P<folder>\S*?/enclaves(?P<enclave>/\S*)?)(?:\s|\Z)"
 )
-"""The line in which rcl, or a node of `sros demo`, names its enclave and its folder (groups)."""
+"""The line in which rcl, or a node of `sros demo`, names its enclave and folder (groups)."""
 
 _PROCESS_LABEL = re.compile(
     r"\[(?P<launch>[\w.-]+-\d+)\] "  # ros2 launch: [talker-1]
     r"|(?:\S+ +){2,4}?(?P<journald>[\w.@-]+\[\d+\]): "  # Nov 21 06:00:00 robot talker[12]:
     r"|(?P<compose>[\w.-]+) +\| "  # Docker Compose: talker-1  |
 )
-"""The label at the start of a line that distinguishes the processes in one log."""
+"""Matches the label at the start of a line, which distinguishes the processes in a log."""
 
 LINE_DOMAIN = re.compile(r"\] \S+\|\S+ (\d{1,9}) \w+::\w+ :")
-"""The domain in a line of ROS_SECURITY_LOG_FILE, after the participant's identifier."""
+"""Matches the domain in a line of ROS_SECURITY_LOG_FILE, after the participant's identifier."""
 
 CONTINUATION = re.compile(r"^(?:[0-9A-F]{8,}:error:|\(code: )")
-"""The start of a line that belongs to the line before it: OpenSSL's error stack."""
+"""Matches the start of a continuation line: OpenSSL's error stack."""
 
 REMOTE_ENDPOINT = re.compile(r"check_remote_data|remote (?:writer|reader)")
-"""The words that show that the permissions of a remote participant deny a topic."""
+"""Matches words which show that permissions of a remote participant deny a topic."""
 
 ENDPOINT_KINDS: Mapping[str, re.Pattern[str]] = {
     "writer": re.compile(
@@ -70,20 +70,20 @@ ENDPOINT_KINDS: Mapping[str, re.Pattern[str]] = {
     "client": re.compile(r"create(?:_c| c|C)lient|/rcl/client\.c:"),
     "server": re.compile(r"create(?:_s| s|S)ervice|/rcl/service\.c:"),
 }
-"""The words in lines near a denied topic that show the kind of the denied endpoint."""
+"""Kind of endpoint → words in lines near a denied topic that show this kind."""
 
 
 def log_lines(text: str) -> list[str]:
     r"""Return the lines of a log, which end only with ``\n``.
 
-    A process can print any other line separator, such as ``\r``, in the middle of a line, and
-    behind it a label that makes the text look like that of another process.
+    A process can print another line separator, such as ``\r``, in the middle of a line, and then a
+    label of another process, to make the text look like the text of that process.
     """
     return [line.removesuffix("\r") for line in text.split("\n")]
 
 
 def labeled_line(line: str) -> tuple[str, str]:
-    """Return the process that the label of a line names, and the text after it.
+    """Return the process that the label of a line names, and the text after the label.
 
     A line without a label gives ("", line).
     """
@@ -92,7 +92,7 @@ def labeled_line(line: str) -> tuple[str, str]:
 
 
 def missing_security(text: str) -> str:
-    """Return the message of a DDS that it was built without DDS Security, or ""."""
+    """Return the message of a DDS which says that it was built without DDS Security, or ""."""
     return _first_refusal(RefusedObject.ALL_SECURITY, text)
 
 
@@ -117,7 +117,7 @@ def _first_refusal(refused: RefusedObject, text: str) -> str:
 def denied_topic(line: str) -> tuple[Vendor, re.Match[str]] | None:
     """Return the vendor that denies a topic, and the match with group ``topic``.
 
-    Group ``rule`` is the rule that denies the topic, if the line names the rule.
+    Group ``rule`` is the denying rule, if the line names the rule.
     """
     for vendor, pattern in _TOPIC_DENIED:
         if match := pattern.search(line):
@@ -170,8 +170,8 @@ _REASON_CONTEXT = re.compile(
     r"|Remote secure participant \S+ not allowed\. ?|[0-9A-F]{16}:error:[0-9A-F]+:[\w ]+:"
     r"|:\.\./\S+\.c:\d+|\[\w+\] failed: |validate_local_identity: |Error\. (?=Error|validate)"
 )
-"""The text that vendors put around the reason of a refusal, such as times and positions."""
+"""Matches the text that vendors put around the reason of a refusal, such as times and positions."""
 
 _NO_REASON = "{}, and Fast DDS gives no reason"
 _FAILED_FUNCTION = re.compile(r"(?:-> Function |::)(\w+)(?: :)?\s*\Z")
-"""The failed function, in a line of Fast DDS without a message."""
+"""Matches the failed function in a line of Fast DDS without a message."""

@@ -1,8 +1,8 @@
 """The security messages that Zenoh logs, their meanings, and the messages that it drops.
 
-rmw_zenoh prints warnings and errors of nodes, and also informative messages of its router;
-RUST_LOG=zenoh=debug makes a process say why a connection failed, and RUST_LOG=zenoh=trace which
-messages access control drops.  Each text was seen in a log of Zenoh 1.10.2; texts of
+rmw_zenoh prints warnings and errors of nodes, and also informative messages of its router; with
+RUST_LOG=zenoh=debug, a process logs why a connection failed, and with RUST_LOG=zenoh=trace, it logs
+the messages that access control drops.  Each text was seen in a log of Zenoh 1.10.2; texts of
 rmw_zenoh_cpp are from its source code.
 """
 
@@ -209,7 +209,7 @@ class DroppedMessage(NamedTuple):
     """A message that access control dropped, as the log of the enforcing process reports it.
 
     ``line`` counts from 1; ``name`` is the common name of the remote process, "" if the log does
-    not show it; ``message`` is as Zenoh writes it, such as "Declare Subscriber".
+    not show a name; ``message`` is Zenoh's name for the message, such as "Declare Subscriber".
     """
 
     line: int
@@ -233,9 +233,9 @@ _DECLARED_OR_UNDECLARED = "Declare/Undeclare"
 def dropped_messages(lines: Iterable[tuple[int, str, str]]) -> Iterator[DroppedMessage]:
     """Yield the dropped messages in lines (number, process, text) of a log.
 
-    When a key is declared, Zenoh tries all kinds of messages for it and logs each result.  These
-    lines, which contain "Declare/Undeclare", report no message; the lines "Using cached result",
-    and lines for keys that were not declared, do.
+    When a key is declared, Zenoh tests all kinds of messages for this key and logs every result.
+    These lines, which contain "Declare/Undeclare", are about no message. The lines "Using cached
+    result", and lines for keys that were not declared, are about messages.
     """
     declarations = []
     names: dict[tuple[str, str], str] = {}

@@ -1,1 +1,1 @@
-"""Translation between ROS and Zenoh: `rights` as access control, and the tokens of its `graph`."""
+"""Translation between ROS and Zenoh: `rights` as access control, and the tokens of the `graph`."""

@@ -1,4 +1,4 @@
-"""Graph tokens of rmw_zenoh: what a node may announce by its rights, and under which names.
+"""Graph tokens of rmw_zenoh: the entities that a node may announce by its rights, and their names.
 
 A node, publisher, subscription, server or client is announced by a liveliness token
 ``@ros2_lv/DOMAIN/SESSION/NODE/ENTITY/KIND/ENCLAVE/NAMESPACE/NAME[/TOPIC/TYPE/HASH/QOS]``, in which
@@ -7,8 +7,8 @@ from its graph by session, node, namespace and name, and ignores the enclave (gr
 a rule has to check all names in a token.
 
 A name is one chunk of a token, so in a token ``$*`` means the same as ``*`` in ROS.  A denial is
-exact, too, because processes do not read wildcards in a token as such, but as a name that no node
-or topic has.
+exact, too, because processes read a wildcard in a token as plain text, which is no name of a node
+or topic.
 """
 
 from __future__ import annotations
@@ -43,9 +43,9 @@ from sros_tool.zenoh.key_expressions import (
 GRAPH = "@ros2_lv"
 _NODE, _NAME = "NN", 9
 _KINDS = {"publish": "MP", "subscribe": "MS", "reply": "SS", "request": "SC"}
-"""Maps a right to the kind of entity that it lets a node announce, as written in tokens."""
+"""Right → kind of entity, as in tokens, that a node with this right may announce."""
 _MOST_TOKENS = 4096
-"""Maximum number of key expressions for the tokens of one right of an enclave."""
+"""Maximum number of key expressions for the tokens of a right of an enclave."""
 _EVERY_KIND = "*"
 _ANNOUNCING = (Message.LIVELINESS_TOKEN,)
 _ASKING = (Message.LIVELINESS_QUERY, Message.DECLARE_LIVELINESS_SUBSCRIBER)
@@ -57,7 +57,7 @@ _LETTER = "[a-zA-Z0-9_]"
 class AnnouncedNodes(NamedTuple):
     """The nodes that an enclave may announce: ``allowed`` without ``denied``.
 
-    A node is written as in a token: ``DOMAIN/NAMESPACE/NAME``, with ``%`` for ``/`` in names.
+    Nodes have the form of tokens: ``DOMAIN/NAMESPACE/NAME``, with ``%`` for ``/`` in names.
     """
 
     allowed: tuple[str, ...]
@@ -65,7 +65,7 @@ class AnnouncedNodes(NamedTuple):
 
 
 def announced_nodes(rules: Iterable[AccessRule], enclave: str) -> AnnouncedNodes:
-    """Return the nodes that an enclave may announce by the rules that `graph_rules` returned."""
+    """Return the nodes that an enclave may announce by the rules from `graph_rules`."""
     nodes: dict[bool, list[str]] = {True: [], False: []}
     for rule in rules:
         if rule.messages == _ANNOUNCING:
@@ -82,7 +82,7 @@ def announced_names(
 ) -> dict[bool, tuple[str, ...]]:
     """Return the names that rules of `graph_rules` allow (True) and deny (False) to an enclave.
 
-    These are the names of the topics or services to which the enclave has the ``right`` in a
+    The names are names of topics or services to which the enclave has the ``right`` in a
     ``domain``.
     """
     names: dict[bool, dict[str, None]] = {True: {}, False: {}}
@@ -107,7 +107,7 @@ def nodes_in_rules(rules: Iterable[AccessRule], enclave: str) -> tuple[NodeName,
 
 
 def _node_of(place: str) -> NodeName:
-    """Return the node that tokens write as ``DOMAIN/NAMESPACE/NAME``."""
+    """Return the node for the form ``DOMAIN/NAMESPACE/NAME`` of tokens."""
     _, ns, name = map(_named, place.split("/"))
     return NodeName(ns, name)
 
@@ -117,11 +117,11 @@ def graph_rules(
 ) -> Iterator[AccessRule]:
     """Yield the rules for the graph tokens of an enclave's processes.
 
-    The processes may see all tokens.  With their own enclave, they may announce the topics and
-    services in ``rights``, the nodes in ``nodes``, and the nodes whose own services (such as
-    set_parameters) they may offer.  Such a node does not count if all its own services are denied.
-    Without any such node, they may announce any node.  The expression for seeing tokens is exactly
-    the one that rmw_zenoh asks for.
+    The processes may see all tokens.  Under the name of their own enclave, the processes may
+    announce the topics and services in ``rights``, the nodes in ``nodes``, and the nodes whose own
+    services (such as set_parameters) they may offer. Such a node does not count if all its own
+    services are denied. Without such nodes, the processes may announce any node. The expression for
+    seeing tokens is exactly the expression in the requests of rmw_zenoh.
     """
     rights, nodes = tuple(rights), tuple(nodes)
     offering, without = nodes_of_rights(rights), denied_nodes(rights)
@@ -161,7 +161,7 @@ class _Tokens:
         }
 
     def of(self, rights: Iterable[Right]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """Return two tuples of key expressions: allowed tokens, and denied ones among them."""
+        """Return two tuples of key expressions: allowed tokens, and denied tokens among these."""
         sides: dict[bool, dict[str, dict[str, None]]] = {True: {}, False: {}}
         for _, qualifier, right, name in rights:
             sides[qualifier is ALLOW].setdefault(right, {})[name] = None
@@ -221,7 +221,7 @@ class _Tokens:
 
 
 def _listed_expressions(name: str) -> list[str]:
-    """Return expressions in which ``*`` is the only wildcard; one wider expression if too many."""
+    """Return expressions with ``*`` as the only wildcard, or one wider expression for too many."""
     try:
         return listed_expressions(name, _MOST_TOKENS)
     # The keys of such a name cannot be listed either, so the right is refused elsewhere.
@@ -241,7 +241,7 @@ def _parts(name: str) -> tuple[str, ...]:
 
 
 def _token_names(nodes: Iterable[NodeName]) -> tuple[str, ...]:
-    """Return the namespaces and names of nodes as written in tokens."""
+    """Return the namespaces and names of nodes in the form of tokens."""
     places = (
         f"{_part(ns)}/{_part(name)}"
         for node in nodes
@@ -253,7 +253,7 @@ def _token_names(nodes: Iterable[NodeName]) -> tuple[str, ...]:
 
 
 def _part(name: str) -> str:
-    """Return a name as written in tokens, with ``%`` for ``/``."""
+    """Return a name in the form of tokens, with ``%`` for ``/``."""
     return canonical((name.replace("/", "%").replace("*", ANY_PART) or "%",))
 
 
@@ -261,7 +261,7 @@ def _part(name: str) -> str:
 
 
 class SharedNodes(NamedTuple):
-    """Nodes that several enclaves may announce; each enclave can remove the others' nodes."""
+    """Nodes that several enclaves may announce; these enclaves can remove each other's nodes."""
 
     enclaves: tuple[str, ...]
     """The enclaves that may announce all nodes in `nodes`."""
@@ -362,7 +362,7 @@ def _with_the_same_beginning(groups: Sequence[AnnouncedNodes]) -> Mapping[int, s
 
 
 def _have_common(first: AnnouncedNodes, second: AnnouncedNodes) -> bool:
-    """Return whether some node is in both groups."""
+    """Return whether any node is in both groups."""
     left, right = (names_of(nodes.allowed) - names_of(nodes.denied) for nodes in (first, second))
     return not (left & right).is_empty()
 
@@ -373,7 +373,7 @@ def _begin(node: str) -> str:
 
 
 def _full_names(nodes: Iterable[str]) -> tuple[str, ...]:
-    """Return the full names of nodes, without nodes that another one's wildcards include."""
+    """Return the full names of nodes, without nodes that another node's wildcards include."""
     parts = map(_node_of, nodes)
     names = dict.fromkeys("/".join((ns.rstrip("/").removeprefix("*"), name)) for ns, name in parts)
     return tuple(
@@ -390,9 +390,9 @@ def example_token(
     key_expressions: Iterable[str],
     passes: Callable[[str], bool] = lambda _: True,
 ) -> str:
-    """Return an example of an enclave's node token, if possible one that may pass.
+    """Return an example of an enclave's node token, preferably a token that may pass.
 
-    A token may pass if ``key_expressions`` include it and ``passes`` returns True for it.
+    A token may pass if ``key_expressions`` include the token and ``passes`` returns True for it.
     """
     begin = f"{GRAPH}/{domain}/"
     places = [
@@ -417,7 +417,7 @@ def example_token(
 
 
 def _wildcard_like(name: str, part: str) -> str:
-    """Return an example that matches a chunk of the key expression of a token.
+    """Return an example for a chunk of a token's key expression.
 
     The example is ``name`` if the chunk ``part`` is only a wildcard; otherwise it is the chunk
     without its wildcards.

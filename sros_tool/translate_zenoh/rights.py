@@ -1,10 +1,10 @@
 """Translation between ROS policies and Zenoh access control, without adding or losing rights.
 
-`translate` does the same for DDS.  Key expressions, messages and tokens are those of rmw_zenoh
-(ros2/rmw_zenoh, docs/design.md).  `rights_in_rules` reads back the rules that sros writes.  For
-rules that sros did not write, its result can be too wide, because a ROS ``*`` also matches slashes,
-but it is never too narrow.  `rights_of_subjects` reads rules that sros did not write: a name is in
-its result only if the rules allow every key of this name.
+`translate` does the same for DDS. Key expressions, messages and tokens are as in rmw_zenoh
+(ros2/rmw_zenoh, docs/design.md). `rights_in_rules` reads the rules that sros writes. For other
+rules, the result can be too wide, because a ROS ``*`` also matches slashes, but is never too
+narrow. `rights_of_subjects` reads rules that sros did not write: a name is in the result only if
+the rules allow every key of this name.
 """
 
 from __future__ import annotations
@@ -73,10 +73,10 @@ from sros_tool.zenoh.subtraction import (
 )
 
 _TYPE = ("$*::$*", "*")
-"""The type and its hash at the end of the keys of topics and services; rules do not check them.
+"""The type and its hash at the end of the keys of topics and services, which rules do not check.
 
 Every type contains "::", which no part of a ROS name contains.  So a wildcard in a name never
-matches a part of the type, and keys below the key of one name are never keys of another name.
+matches a part of the type, and keys below the key of a name are never keys of another name.
 """
 _IN_TYPES = "::"
 _UNTYPED = ("*", "*")
@@ -85,7 +85,7 @@ ANY_TYPE = "any::type/hash"
 """An example of a type and its hash; the rules of sros decide alike for all types."""
 _BELOW_TOPICS = (ANY_CHUNKS,) if any(release.below_topics for release in RELEASES) else ()
 _BELOW = {"publish": _BELOW_TOPICS, "subscribe": _BELOW_TOPICS}
-"""Maps a right to the chunks that some release of rmw_zenoh adds to its keys."""
+"""Right → chunks that a release of rmw_zenoh adds to the keys of the right."""
 _ADVANCED = f"@adv/{ANY_CHUNKS}"
 """The end of the keys for the history of a topic (TRANSIENT_LOCAL), below the topic's key."""
 _M = Message
@@ -122,14 +122,14 @@ The messages are on the key of the name, or with `_HISTORY`, on the keys of its 
 
 
 class StatedRight(NamedTuple):
-    """A right to one topic or service, or a denial of it, with the place that states it."""
+    """A right to a topic or service, or a denial, with the place that states it."""
 
     right: Right
     source: Source
 
 
 def stated_rights(enclave: Enclave) -> tuple[StatedRight, ...]:
-    """Return the rights of an enclave with absolute names, with actions as their parts.
+    """Return the rights of an enclave with absolute names, and with actions split into their parts.
 
     The parts of an action are its topics and services.
     """
@@ -180,7 +180,7 @@ def remote_of(
 
 
 def domains_of(control: AccessControl) -> set[int]:
-    """Return the ROS domains in which processes may ask for graph tokens, which all nodes do."""
+    """Return the ROS domains in which processes may ask for graph tokens, as all nodes do."""
     asked = {
         tuple(key.split("/"))
         for remote in control.remotes
@@ -194,7 +194,7 @@ def domains_of(control: AccessControl) -> set[int]:
 def stated_names(rules: Iterable[AccessRule]) -> list[tuple[str, str]]:
     """Return the pairs of a right and a name that rules of `remote_of` state, sorted.
 
-    Names with wildcards are written as in Zenoh.
+    Names with wildcards have the form of Zenoh.
     """
     marks = {of[0][:2]: right for right, of in _MESSAGES.items()}
     return sorted(
@@ -217,7 +217,7 @@ def _name_in(key: str) -> str:
 
 
 def untyped(key: str) -> str:
-    """Return the key expression of a right as other tools write it, with wildcards for the type.
+    """Return the key expression of a right in the form of other tools, with wildcards for the type.
 
     A part below the key of the topic is left out.
     """
@@ -253,15 +253,15 @@ def crossing_rules(names: Iterable[str], domains: Iterable[int]) -> tuple[Access
 
 
 _EXACT_NAMES = re.compile(r"(?:/[^/#$*?\[]+)+")
-"""Matches absolute names without wildcards, one or several joined, that are valid as Zenoh keys."""
+"""Matches absolute names without wildcards, single or joined, that are valid as Zenoh keys."""
 _NO_KEY = re.compile(r"[#$]|//|/\Z")
-"""Matches text that no Zenoh key may have."""
+"""Matches text that Zenoh keys must not contain."""
 
 
 def _allowed_keys(
     domain: int, stated_rights: Iterable[StatedRight]
 ) -> Iterator[tuple[str, tuple[str, ...], Difference | None]]:
-    """Yield each right with its allowed key expressions, and the `Difference` that they express.
+    """Yield each right with its allowed key expressions, and the same keys as a `Difference`.
 
     The key expressions leave out denied names.  The difference is None if no name has wildcards.
 
@@ -298,7 +298,7 @@ def _allowed_keys(
 
 
 def _forms(places: Mapping[str, Source]) -> frozenset[Chunks]:
-    """Return the chunks of the key expressions that match some names."""
+    """Return the chunks of the key expressions that match the names in ``places``."""
     return frozenset(
         chunks
         for name, place in places.items()
@@ -349,7 +349,7 @@ def _untranslatable_denial_error(
 
 
 def _with_keys_below(names: frozenset[Chunks] | set[Chunks]) -> set[Chunks] | frozenset[Chunks]:
-    """Return the same names, with one expression for a name together with all names below it."""
+    """Return the same names, with a single expression for a name and all names below it."""
     below = ("*", ANY_CHUNKS)
     if not any(name[-1] == ANY_CHUNKS for name in names):
         return names
@@ -360,7 +360,7 @@ def _with_keys_below(names: frozenset[Chunks] | set[Chunks]) -> set[Chunks] | fr
 
 
 def _names_of_expression(name: str, place: Source) -> list[str]:
-    """Return the names of an expression, one for each choice of its ``?`` and character sets.
+    """Return the names of an expression: a name for each choice of its ``?`` and character sets.
 
     Raises:
         PolicyError: the names take more than `MOST_EXPRESSIONS`.
@@ -400,9 +400,9 @@ def _number_of_chunks(name: str) -> int:
 def chunks_of(name: str) -> list[Chunks]:
     """Return the chunks of the key expressions that together match the ROS names of ``name``.
 
-    ``name`` is absolute, with ``*`` as its only wildcard.  A ``*`` of a policy also matches "/".
-    So a star next to a slash becomes ``**``, and a star within a part of a name takes two
-    expressions.  `_number_of_chunks` tells beforehand whether the result would be too large.
+    ``name`` is absolute, with ``*`` as its only wildcard.  A ``*`` of a policy also matches "/". So
+    a star next to a slash becomes ``**``, and a star within a part of a name needs two expressions.
+    `_number_of_chunks` shows in advance whether the result would be too large.
     """
     if "*" not in name:
         return [tuple(name[1:].split("/"))]
@@ -422,7 +422,7 @@ def chunks_of(name: str) -> list[Chunks]:
 
 
 def _chunks_of_part(texts: list[str]) -> list[list[str]]:
-    """Return chunks for one part of a name; ``texts`` are the texts between its stars."""
+    """Return chunks for a part of a name; ``texts`` are the texts between the part's stars."""
     if texts == ["", ""]:
         return [["*", ANY_CHUNKS]]
     first, *later_texts = texts
@@ -452,11 +452,11 @@ _USE = {
     (Flow.INGRESS, Message.QUERY): "request",
     (Flow.EGRESS, Message.QUERY): "reply",
 }
-"""Maps the direction and kind of a message to the right that it uses."""
+"""Direction and kind of a message → right that the message uses."""
 _WILD = ("*", ANY_CHUNKS)
 _TYPE_AND_HASH = 2
 _MOST_ANY_CHUNKS = 6
-"""Maximum number of ``**`` in a key expression; each of them doubles the number of names."""
+"""Maximum number of ``**`` in a key expression; every ``**`` doubles the number of names."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -476,8 +476,8 @@ class RightsInRules:
 class RouterLinks(NamedTuple):
     """The links between the routers of a Zenoh network, and the rights that may pass over them.
 
-    ``router_of`` maps each enclave to the router that it connects to, and each router to itself.
-    ``passing`` maps each router to the rights that it gives to the other routers.
+    ``router_of`` maps an enclave to the router that it connects to, and a router to itself.
+    ``passing`` maps a router to the rights that it gives to other routers.
     """
 
     router_of: Mapping[str, str]
@@ -528,10 +528,10 @@ def _differences_in(
 ) -> Mapping[tuple[str, int], Sequence[Right]]:
     """Return the rights and denials behind rules that list only allowed names, by right and domain.
 
-    The names are in the rules for graph tokens.  They count only if sros would list exactly the key
-    expressions of the rules for them.  Without this step, each key expression would be read as a
-    ROS name by itself, which matches more: ``$*b$*/**`` has the b in the first part, but ``/*b*``
-    in any part.
+    The names are in the rules for graph tokens.  These names count only if sros would list exactly
+    the key expressions of the rules for these names. Without this step, each key expression would
+    be read as a separate ROS name, which matches more names: ``$*b$*/**`` has the b in the first
+    part, but ``/*b*`` in any part.
     """
     keys: dict[tuple[str, int], set[str]] = {}
     denied = set()
@@ -559,7 +559,7 @@ def _differences_in(
 
 
 def _right_keys(rule: AclRule) -> Iterator[tuple[str, str]]:
-    """Yield pairs of a right and a key expression to which a rule applies."""
+    """Yield pairs of a right and a key expression of the right to which a rule applies."""
     for (flow, message), right in _USE.items():
         if flow in rule.flows and message in rule.messages:
             # Keys with @adv are for the history of a topic, and belong to the same right.
@@ -590,7 +590,7 @@ def ros_names(key: str) -> tuple[str, ...]:
 
 
 def _without_type(chunks: list[str]) -> list[str]:
-    """Return the chunks of the name without type and hash, which can be wildcards.
+    """Return the chunks of the name, without type and hash, which can be wildcards.
 
     The expression is in canonical form, in which ``*`` stands before ``**``.
     """
@@ -632,7 +632,7 @@ def name_of_key(key: str) -> tuple[str, str]:
 
 @dataclass(frozen=True, slots=True)
 class _DecidingMessage:
-    """The message that decides whether a remote process has a right, and others it needs."""
+    """The message that decides whether a remote process has a right, and other needed messages."""
 
     flow: Flow
     message: Message
@@ -645,14 +645,14 @@ _DECIDING_MESSAGES = {
     "request": _DecidingMessage(_IN, _M.QUERY, ((_OUT, _M.REPLY),)),
     "reply": _DecidingMessage(_OUT, _M.QUERY, ((_IN, _M.DECLARE_QUERYABLE), (_IN, _M.REPLY))),
 }
-"""Maps a right to its deciding message, from the view of the process that has the rules."""
+"""Right → deciding message, from the view of the process that has the rules."""
 
 
 @dataclass(frozen=True, slots=True)
 class StatedName:
     """A right to a ROS name, perhaps with wildcards.
 
-    ``lacks`` are messages that the right needs as well, but that the rules do not allow.
+    ``lacks`` are messages that the right also needs, but that the rules do not allow.
     """
 
     right: str
@@ -666,9 +666,9 @@ class RightsOfSubject:
     """The rights that rules give to the processes that match a subject.
 
     ``names`` are the common names of the processes' certificates; None stands for any name.  With
-    ``self_limiting``, the rights belong to the process that has the rules, and which can ignore the
-    rules.  ``unsaid`` are pairs of a right and a key that no ROS name expresses exactly; ``denied``
-    are pairs of a right and a denied key.
+    ``self_limiting``, the rights belong to the process that has the rules, and this process can
+    ignore the rules.  ``unsaid`` are pairs of a right and a key that no ROS name expresses exactly;
+    ``denied`` are pairs of a right and a denied key.
     """
 
     subject: str
@@ -700,7 +700,7 @@ def rights_of_subjects(document: ConfigurationDocument) -> tuple[RightsOfSubject
 
 
 def is_self_limiting(document: ConfigurationDocument) -> bool:
-    """Return whether the rules of a session identify no process, so that they limit only itself."""
+    """Return whether the rules of a session name no process, so that they limit only itself."""
     access = document.access
     used = [subject for subject in access.subjects if access.rules_of(subject.id)]
     return (
@@ -787,7 +787,7 @@ class _PrefixIndex:
             )
 
     def any(self, text: str, holds: Callable[[str, str], bool]) -> bool:
-        """Return whether ``holds(expression, text)`` for an expression that may match the text."""
+        """Return whether ``holds(expression, text)`` for any expression that may match the text."""
         for end in range(len(text) + 1):
             for expression in self._by_begin.get(text[:end], ()):
                 if holds(expression, text):
@@ -809,7 +809,7 @@ class _AllowedNames:
         self._stated_keys: list[str] = []
 
     def stated(self) -> list[tuple[str, str]]:
-        """Return pairs of domain and name, without names that others of the domain cover."""
+        """Return pairs of domain and name, without names that another name of the domain covers."""
         sound = dict.fromkeys(
             (domain, name)
             for key in self._allowed
@@ -847,7 +847,7 @@ class _AllowedNames:
 
 
 def _candidates(key: str) -> Iterator[tuple[str, str]]:
-    """Yield pairs of domain and name that may express a key expression or a part of it."""
+    """Yield pairs of domain and name that may express a key expression, or a part of it."""
     domain, *chunks = key.split("/")
     if domain == ANY_CHUNKS:
         domain, chunks = "*", [ANY_CHUNKS, *chunks]
@@ -866,7 +866,7 @@ def _candidates(key: str) -> Iterator[tuple[str, str]]:
 
 
 def _ros_names_in(chunks: Sequence[str]) -> list[str]:
-    """Return the ROS names for chunks; several, because a ROS ``*`` also matches "/"."""
+    """Return the ROS names for chunks; there are several, because a ROS ``*`` also matches "/"."""
     if not chunks:
         return []
     text = "/".join(chunks)
@@ -896,8 +896,8 @@ def _topic_keys(key: str) -> list[str]:
 def enclave_of(rights: RightsOfSubject) -> tuple[str, ...]:
     """Return the enclaves for which a subject stands, or ().
 
-    If a session limits itself, the enclave has the id of the subject as its name:
-    zenoh_security_tools writes the node's name there, and uses the enclave of the same name.
+    If a session limits itself, the enclave has the id of the subject as its name, because
+    zenoh_security_tools uses the node's name for both.
     """
     named = rights.names or ((f"/{rights.subject}",) if rights.self_limiting else ())
     return tuple(name for name in named if _is_enclave(name))
@@ -913,8 +913,8 @@ def _is_enclave(name: str) -> bool:
 def policy_of(subjects: Iterable[RightsOfSubject]) -> Policy:
     """Return a policy that gives the enclaves of subjects their rights, and never more.
 
-    Rules name no nodes, so the node of each profile is the last part of the enclave's name.  All
-    names are absolute.
+    Rules name no nodes, so the node of a profile is the last part of the enclave's name.  All names
+    are absolute.
     """
     rights: dict[str, set[Right]] = {}
     for subject in subjects:

@@ -1,10 +1,11 @@
-"""Zenoh access control: rules for remote processes, and what they decide.
+"""Zenoh access control: rules for remote processes, and the decisions by these rules.
 
-`AccessControl` is what sros writes: its subjects are certificates, and by default messages are
-denied.  A deny rule for a part of the keys that another rule allows does not stop queries and puts
-with a wildcard key (tested with 1.10.2).  It does stop graph tokens, because no process reads their
-keys as wildcards.  `Enforcement` is the access control in any configuration.  Sources: zenoh.io
-"Access Control"; zenoh 1.9, access_control.rs and authorization.rs; compared with the wheel 1.10.2.
+`AccessControl` is the access control that sros writes: subjects are certificates, and messages are
+denied by default.  A deny rule for a part of the keys that another rule allows does not stop
+queries and puts with a wildcard key (tested with 1.10.2). Such a rule does stop graph tokens,
+because no process reads the keys of tokens as wildcards.  `Enforcement` is the access control in
+any configuration. Sources: zenoh.io "Access Control"; zenoh 1.9, access_control.rs and
+authorization.rs; compared with the wheel 1.10.2.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ class Flow(StrEnum):
     """To the remote process."""
 
     def opposite(self) -> Flow:
-        """Return the direction as the remote process sees it."""
+        """Return the direction from the view of the remote process."""
         return Flow.EGRESS if self is Flow.INGRESS else Flow.INGRESS
 
 
@@ -54,7 +55,7 @@ class AccessRule(NamedTuple):
 
     Only rules for graph tokens deny.  No process reads the key of a token as a wildcard, so a rule
     for tokens can deny some of the keys that another rule allows.  For other messages, Zenoh would
-    not enforce this.
+    not enforce such a denial.
     """
 
     flow: Flow
@@ -80,7 +81,7 @@ class RemoteRights:
     differences: Mapping[_Use, tuple[Difference, ...]] = field(default_factory=dict, compare=False)
 
     def mirrored(self, common_name: str) -> RemoteRights:
-        """Return the rights for the same messages that the remote process must give to this one.
+        """Return the rights that the remote process must give to this one for the same messages.
 
         ``common_name`` is the common name of this process.
         """
@@ -104,8 +105,8 @@ _Use = tuple[Flow, tuple[Message, ...]]
 class AccessControl:
     """The access control of a process: rules by common name; other processes are denied.
 
-    Each common name occurs only once.  If a second subject had the same name, its rights would be
-    added to those of the first, and in Zenoh up to 1.5.1, a random one of the two subjects would
+    Each common name occurs only once. The rights of a second subject with the same name would be
+    added to the rights of the first, and in Zenoh up to 1.5.1, a random one of both subjects would
     decide.
     """
 
@@ -126,7 +127,7 @@ class AccessControl:
         return bool(rules) and all(rules)
 
     def passing(self, common_name: str, flow: Flow, message: Message) -> KeyExpressions:
-        """Return the key expressions of the rules that allow a message, for searching many keys."""
+        """Return the key expressions of the rules that allow a message, to search many keys."""
         return self._expressions(common_name, flow, message, allows=True)
 
     def denied(self, common_name: str, flow: Flow, message: Message) -> KeyExpressions:
@@ -150,7 +151,7 @@ class AccessControl:
         )
 
     def decide(self, remote: Remote, flow: Flow, message: Message, key: str) -> AccessDecision:
-        """Return the decision that `Enforcement.decide` makes for the file with these rules."""
+        """Return the decision of `Enforcement.decide` for a file with these rules."""
         rights = None if remote.common_name is None else self._by_name.get(remote.common_name)
         if rights is None:
             stated = any(of_remote.rules for of_remote in self.remotes)
@@ -165,7 +166,7 @@ class AccessControl:
         return _decide_by_rules(applying, (rights.common_name,))
 
     def allowed_keys(self, common_name: str, flow: Flow, message: Message) -> tuple[str, ...]:
-        """Return the key expressions that rules allow, without subtracting denied ones."""
+        """Return the key expressions that rules allow, including denied ones."""
         rules = self._rules(common_name, flow, message)
         return tuple(key for rule in rules if rule.allows for key in rule.key_expressions)
 
@@ -207,10 +208,10 @@ class AccessControl:
 def rule_ids(
     rules: Sequence[Sequence[Hashable]], names: Sequence[str], *, once: bool = True
 ) -> list[list[str]]:
-    """Return the ids of rules in a file: one list per remote process, in the order of ``names``.
+    """Return the ids of rules in a file: a list per remote process, in the order of ``names``.
 
-    With ``once``, a rule that several processes have has one shared id.  In older files, it has an
-    id for each process.
+    With ``once``, a rule that several processes have has one shared id.  In older files, such a
+    rule has an id for each process.
     """
     uses = Counter(rule for of in rules for rule in of if once)
     number = count()
@@ -229,7 +230,7 @@ _NO_RULE_AT_ALL = "no rule is in force, and the default is DENY"
 def _decide_by_rules(
     applicable_rules: Sequence[tuple[bool, str]], subjects: tuple[str, ...]
 ) -> AccessDecision:
-    """Return the decision on a message by the rules that apply to it; a denial wins.
+    """Return the decision on a message by the applicable rules; a denial wins.
 
     ``applicable_rules`` are pairs: whether the rule allows, and the rule's id.
     """
@@ -241,7 +242,7 @@ def _decide_by_rules(
 
 
 _FEW = 16
-"""Number of key expressions up to which they are compared one by one, without an index."""
+"""Maximum number of key expressions that are compared one by one, without an index."""
 
 
 def _include(expressions: tuple[str, ...], key: str) -> bool:
@@ -258,7 +259,7 @@ def _search(expressions: tuple[str, ...]) -> KeyExpressions:
 def joined(rules: Iterable[AccessRule]) -> tuple[AccessRule, ...]:
     """Return equivalent rules, sorted, with a single rule for each direction and list of messages.
 
-    Key expressions are left out if another one of the same rule includes them.
+    Leaves out key expressions that another key expression of the same rule includes.
     """
     keys_of_use: dict[tuple[Flow, tuple[Message, ...], bool], list[tuple[str, ...]]] = {}
     for flow, messages, keys, allows in rules:
@@ -281,14 +282,14 @@ def _needed_keys(keys: frozenset[str]) -> tuple[str, ...]:
 
 
 def sorted_rules(rules: Iterable[AccessRule]) -> tuple[AccessRule, ...]:
-    """Return rules in the order that `joined` uses, without joining them."""
+    """Return rules in the order of `joined`, without joining rules."""
     return tuple(
         sorted(rules, key=lambda rule: (*_rule_order(rule.flow, rule.messages), not rule.allows))
     )
 
 
 def joined_rights(name: str, rights: Iterable[RemoteRights]) -> RemoteRights:
-    """Return the rights of all processes together, as those of a process named ``name``."""
+    """Return the joint rights of all processes, as the rights of a process named ``name``."""
     of_all = list(rights)
     differences: dict[_Use, dict[Difference, None]] = {}
     for use, of in (item for rights in of_all for item in rights.differences.items()):
@@ -303,8 +304,8 @@ def joined_rights(name: str, rights: Iterable[RemoteRights]) -> RemoteRights:
 class RightsBetween:
     """The messages that processes of two enclaves may exchange directly, by the rights of both.
 
-    Therefore a process that enforces its rules sends and receives nothing that its rights deny,
-    whatever the other process does.
+    So a process that enforces its rules sends and receives nothing that its rights deny, whatever
+    the other process does.
     """
 
     def __init__(self, rights: Iterable[RemoteRights]) -> None:
@@ -386,7 +387,7 @@ def _added_keys(first_keys: tuple[str, ...], second_keys: tuple[str, ...]) -> tu
 
 
 def narrowed_rights(rights: RemoteRights, most: Iterable[AccessRule], kept: str) -> RemoteRights:
-    """Return the part of ``rights`` that the rules in ``most`` allow, too.
+    """Return the part of ``rights`` that the rules in ``most`` also allow.
 
     Rules for keys that begin with ``kept`` are not narrowed.  These are keys of graph tokens, in
     which the names of nodes and topics are only parts of a key.
@@ -430,7 +431,7 @@ def _rule_order(flow: Flow, messages: tuple[Message, ...]) -> tuple[bool, list[i
 
 @dataclass(frozen=True, slots=True)
 class Remote:
-    """A remote process as access control sees it; None stands for a property that it lacks.
+    """The properties of a remote process for access control; None for a missing property.
 
     ``common_name`` is the first common name in the process's certificate.  ``link_protocol`` is a
     protocol such as "tls".  ``interfaces`` are the network interfaces of this host that the
@@ -476,14 +477,14 @@ class AclSubject:
     line: int = field(default=0, compare=False)
 
     def is_named(self) -> bool:
-        """Return whether the subject restricts who a process is, not only how it connects."""
+        """Return whether the subject restricts who a process is, and not only its connection."""
         return self.cert_common_names is not None or self.usernames is not None
 
     def overlaps(self, other: AclSubject) -> bool:
-        """Return whether one process can match both subjects, and so has the rights of both.
+        """Return whether a process can match both subjects, and then has the rights of both.
 
         The result is False for subjects that restrict the same properties, because Zenoh joins such
-        subjects for the values that they share.
+        subjects for common values.
         """
         pairs = [(getattr(self, name), getattr(other, name)) for name in PROPERTIES]
         return any((first is None) is not (second is None) for first, second in pairs) and all(
@@ -500,7 +501,7 @@ PROPERTIES = tuple(
 
 @dataclass(frozen=True, slots=True)
 class AclPolicy:
-    """An entry of Zenoh's ``policies``: the ids of rules and of the subjects they apply to."""
+    """An entry of Zenoh's ``policies``: ids of rules, and ids of the subjects with these rules."""
 
     rules: tuple[str, ...]
     subjects: tuple[str, ...]
@@ -508,11 +509,10 @@ class AclPolicy:
 
 @dataclass(frozen=True, slots=True)
 class AccessDecision:
-    """Whether a message passes, and why.
+    """Whether a message passes, and the reason.
 
-    ``rules`` are the ids of the deciding rules; there are none if the default decides.
-    ``subjects`` are the ids of all subjects that match the remote process.  ``why`` is the reason,
-    as a clause.
+    ``rules`` are the ids of the deciding rules; () if the default decides. ``subjects`` are the ids
+    of all subjects that match the remote process.  ``why`` is the reason, as a clause.
     """
 
     allowed: bool
@@ -531,7 +531,7 @@ class MessageFilter(Protocol):
         """Return the key expressions of a rule, by its id."""
 
     def allowed_keys(self, common_name: str, flow: Flow, message: Message) -> tuple[str, ...]:
-        """Return the key expressions that rules allow, without subtracting denied ones."""
+        """Return the key expressions that rules allow, including denied ones."""
 
     def rules_for(self, common_name: str) -> int:
         """Return the number of rules for the remote process with this common name."""
@@ -543,12 +543,12 @@ class MessageFilter(Protocol):
 _OF_HISTORY = (Message.PUT, Message.QUERY)
 
 _Combination = tuple[str | None, ...]
-"""One value for each of `PROPERTIES`; None stands for any value."""
+"""A value for each of `PROPERTIES`; None stands for any value."""
 
 
 @dataclass(frozen=True)
 class Enforcement:
-    """The access control of a process, as any configuration can state it."""
+    """The access control of a process, in the form that any configuration can have."""
 
     enabled: bool = False
     allows_by_default: bool = False
@@ -576,7 +576,7 @@ class Enforcement:
         )
 
     def unclear_reason(self) -> str:
-        """Return why the common name alone does not decide what passes, as a clause, or ""."""
+        """Return a clause on why the common name alone does not decide, or ""."""
         for subject in self.subjects:
             stated = {name for name in PROPERTIES if getattr(subject, name) is not None}
             if subject.cert_common_names is not None and len(stated) > 1:
@@ -595,7 +595,7 @@ class Enforcement:
         return ""
 
     def _history_only_key(self, subject: str) -> str:
-        """Return a key on which a subject gets only the history (``@adv``), or ""."""
+        """Return a key on which only the history (``@adv``) passes for a subject, or ""."""
         keys: dict[Flow, list[str]] = {flow: [] for flow in Flow}
         history: dict[Flow, set[str]] = {flow: set() for flow in Flow}
         for rule in self.rules_of(subject):
@@ -622,9 +622,9 @@ class Enforcement:
 
         ``key`` is the key or key expression of the message: a rule applies if one of its key
         expressions includes the whole ``key``.  Subjects with the same values count as one subject,
-        in which DENY wins.  If different subjects match, it is enough that one of them allows the
-        message.  With the default ALLOW, a subject allows the message unless one of its rules
-        denies it.
+        in which DENY wins.  If several subjects match, it is enough that one subject allows the
+        message. With the default ALLOW, a subject allows the message unless a rule of the subject
+        denies the message.
         """
         if not self.enabled:
             return AccessDecision(True, (), (), "access control is off")
@@ -684,8 +684,8 @@ class Enforcement:
     ) -> NameSet:
         """Return the keys, without wildcards, on which `decide` lets a message pass.
 
-        ``of`` maps key expressions to the set of names that they include: the keys themselves, or
-        names that stand for keys.
+        ``of`` maps key expressions to a set of names: the included keys, or names that stand for
+        these keys.
         """
         all_names = ~NameSet()
         if not self.enabled:
@@ -706,7 +706,7 @@ class Enforcement:
 
     @cached_property
     def _combinations(self) -> Mapping[_Combination, tuple[str, ...]]:
-        """Maps combinations of property values to the ids of the subjects that list them."""
+        """Map combinations of property values to the ids of the subjects that list the values."""
         ids_of: dict[_Combination, list[str]] = {}
         for subject in self.subjects:
             values = (getattr(subject, name) or (None,) for name in PROPERTIES)

@@ -1,9 +1,9 @@
-"""Zenoh configurations of single processes, as rmw_zenoh reads them, without paths and keys.
+"""Zenoh configurations of single processes in the form for rmw_zenoh, without paths and keys.
 
 `ZenohNetwork` has the settings for all processes of a keystore.
 
-A configuration file replaces the whole default configuration of rmw_zenoh.  So the file repeats the
-values that ROS needs and that differ from Zenoh's defaults
+A configuration file replaces the whole default configuration of rmw_zenoh.  So the file repeats
+values that ROS needs, if they differ from Zenoh's defaults
 (rmw_zenoh_cpp/config/DEFAULT_RMW_ZENOH_*_CONFIG.json5).
 """
 
@@ -33,7 +33,7 @@ from sros_tool.zenoh.access import (
 
 
 class Mode(StrEnum):
-    """How a process takes part in the Zenoh network."""
+    """The part that a process takes in the Zenoh network."""
 
     ROUTER = "router"
     PEER = "peer"
@@ -44,12 +44,12 @@ class Mode(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class ZenohRouter:
-    """A router, and the enclaves whose sessions connect to it.
+    """A router, and the enclaves whose sessions connect to this router.
 
     ``name`` is the router's enclave.  Sessions and other routers connect to ``endpoints``
-    (``HOST:PORT``).  The router listens at ``listen``, or at the ports of ``endpoints`` on all its
+    (``HOST:PORT``).  The router listens at ``listen``, or at the ports of ``endpoints`` on all
     addresses.  ``enclaves`` are names of enclaves, in which ``*`` stands for any characters.
-    ``crossing`` are the topics and services that may pass between this router and others.  If it is
+    ``crossing`` are the topics and services that may pass between this router and other routers; if
     empty, the ``crossing`` of the network applies.
     """
 
@@ -99,7 +99,7 @@ class ZenohNetwork:
         return self.listen or self.endpoints
 
     def every_router(self) -> tuple[ZenohRouter, ...]:
-        """Return all routers; the first one has the enclaves that no other router names."""
+        """Return all routers; the first router has the enclaves that no other router names."""
         return (ZenohRouter(self.router, self.endpoints, self.listening(), ("*",)), *self.routers)
 
     def router_names(self) -> tuple[str, ...]:
@@ -116,7 +116,7 @@ class ZenohNetwork:
     def connects(self) -> Mapping[str, tuple[str, ...]]:
         """Map each router to the endpoints of the routers to which it connects.
 
-        In each pair of routers, only one connects to the other.
+        In each pair of routers, only one router connects to the other.
 
         Raises:
             UsageError: in a pair of routers, neither can reach the other.
@@ -141,19 +141,19 @@ class ZenohNetwork:
 
 _REVOKED = "last_revocation"
 _QUERY_MILLISECONDS = 600_000
-"""How long rmw_zenoh waits for a reply; Zenoh's default of 10 s would end long calls."""
+"""Time that rmw_zenoh waits for a reply; Zenoh's default of 10 s would end long calls."""
 _MICROSECONDS_UNTIL_CLOSED = 60_000_000
-"""How long a session of rmw_zenoh waits for a stuck receiver before it closes the connection."""
+"""Time that a session of rmw_zenoh waits for a stuck receiver before closing the connection."""
 
 
 class SettingsEdition(Enum):
     """The edition of a configuration file that sros wrote.
 
-    Editions differ in settings that do not affect security, and in how often a rule is written.
+    Editions differ in settings that do not affect security, and in the repetition of equal rules.
     """
 
     FEW = "few"
-    """Few settings, as in the first files; a session ends if its router is not there."""
+    """Few settings, as in the first files; a session ends if its router is missing."""
     OF_RMW_ZENOH = "of rmw_zenoh"
     """All settings of rmw_zenoh that differ from Zenoh's defaults; a session waits for its router.
 
@@ -165,12 +165,12 @@ class SettingsEdition(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Configuration:
-    """The configuration of one Zenoh process: its endpoints and its access control.
+    """The configuration of a Zenoh process: its endpoints and its access control.
 
     The process listens at ``listen`` and connects to ``connect``, in the form ``tls/HOST:PORT``.
-    ``revoked`` is the time of the last revocation in UTC, which shows that a file is older; "" if
-    no enclave was revoked, or if the age of the file does not matter.  ``settings`` is the edition
-    of a file that was read.
+    ``revoked`` is the time of the last revocation in UTC, which identifies older files; "" if no
+    enclave was revoked, or if the age of the file does not matter.  ``settings`` is the edition of
+    a file that was read.
     """
 
     mode: Mode
@@ -183,7 +183,7 @@ class Configuration:
     def render(self, settings: SettingsEdition = SettingsEdition.RULES_ONCE) -> bytes:
         """Return the file as JSON; equal configurations have equal files.
 
-        The file does not name the files of TLS; $ZENOH_CONFIG_OVERRIDE has to name them.
+        The file does not name the TLS files, which $ZENOH_CONFIG_OVERRIDE has to name.
         """
         rights = [render_rights(remote) for remote in self.access_control.remotes]
         return render_configuration(
@@ -192,7 +192,7 @@ class Configuration:
 
 
 class RenderedRights(NamedTuple):
-    """The rules for one remote enclave as written to a file, without their ids."""
+    """The rules for one remote enclave in the form of the file, without ids."""
 
     name: str
     rules: tuple[str, ...]
@@ -206,7 +206,7 @@ def render_configuration(
     revoked: str = "",
     settings: SettingsEdition = SettingsEdition.RULES_ONCE,
 ) -> bytes:
-    """Return the file of `Configuration.render`, from the rendered rights of remote enclaves."""
+    """Return the file of `Configuration.render`, from rendered rights of remote enclaves."""
     control = _control([*rights], once=settings is SettingsEdition.RULES_ONCE)
     without_control = _text_without_control(mode, listen, connect, revoked, settings)
     return f"{without_control}{_CONTROL}{control}".encode()
@@ -218,8 +218,8 @@ _CONTROL = ',\n "access_control": {\n'
 def _control(rendered_rights: Sequence[RenderedRights], *, once: bool) -> str:
     """Return the text of a file's access control.
 
-    With ``once``, a rule that several enclaves have is written once; otherwise it is written for
-    each of them.
+    With ``once``, a rule that several enclaves have is written once; otherwise, it is repeated for
+    every enclave.
     """
     rules: dict[str, str] = {}
     lines: dict[str, list[str]] = {"rules": [], "subjects": [], "policies": []}
@@ -321,7 +321,7 @@ _PERMISSIONS = {True: "allow", False: "deny"}
 
 
 def render_rights(remote: RemoteRights) -> RenderedRights:
-    """Return the rules of a remote enclave as they are written to files."""
+    """Return the rules of a remote enclave in the form of the file."""
     return RenderedRights(
         remote.common_name, tuple([_rendered_rule(rule) for rule in remote.rules])
     )
@@ -350,7 +350,8 @@ def parse_rendered(data: bytes, name: str) -> Configuration:
     ``name`` names the file in errors.
 
     Raises:
-        DocumentError: the file is not exactly as sros writes it, so its meaning is uncertain.
+        DocumentError: the file is not exactly in the form that sros writes, so that its meaning is
+            uncertain.
     """
     configuration = RenderedReader().read(data)
     if configuration is None:
@@ -371,7 +372,7 @@ _SECTIONS = re.compile(
 class RenderedReader:
     """A reader of many configurations that `Configuration.render` wrote.
 
-    Equal files are read only once, as are equal rules in several files.
+    Equal files, and equal rules in several files, are read only once.
     """
 
     def __init__(self) -> None:
@@ -381,7 +382,7 @@ class RenderedReader:
         self._rules: dict[str, AccessRule] = {}
 
     def read(self, data: bytes) -> Configuration | None:
-        """Return a configuration, or None if the file is not exactly as sros writes it."""
+        """Return a configuration, or None if sros would not write exactly this file."""
         digest = sha256(data).digest()
         if digest not in self._read:
             self._read[digest] = self._read_in_full(data)
@@ -482,8 +483,8 @@ def is_endpoint(text: str) -> bool:
 def check_network(network: ZenohNetwork) -> None:
     """Raise `UsageError` for a network in which processes cannot communicate.
 
-    Hosts are compared by name, and only names such as localhost count as this host, although
-    another name may mean the same host.
+    Hosts are compared by name. Only names such as localhost count as this host, although other
+    names may mean the same host.
     """
     if network.routers:
         _check_routers(network)
@@ -526,7 +527,7 @@ def check_network(network: ZenohNetwork) -> None:
 
 
 def _check_routers(network: ZenohNetwork) -> None:
-    """Raise `UsageError` if the routers of a network cannot work together."""
+    """Raise `UsageError` for a network whose routers cannot work together."""
     if network.mode is Mode.PEER:
         raise UsageError(
             "several routers need client mode",

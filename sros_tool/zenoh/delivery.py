@@ -1,9 +1,9 @@
-"""Deliveries between Zenoh processes: which messages must pass on each link.
+"""Deliveries between Zenoh processes: the messages that must pass on each link.
 
 On a link, both processes enforce their rules: the sender with egress rules, the receiver with
 ingress rules.  A process drops a denied message without an error.  Tests with zenoh 1.10.2, which
-denied one message after another, showed which messages a delivery needs on which links.  A test
-compares the result on random rules (``tests/integration/test_zenoh_deliveries.py``).
+denied one message after another, showed the messages that a delivery needs on each link. A test
+compares the results for random rules (``tests/integration/test_zenoh_deliveries.py``).
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class ZenohProcess:
 @shows("enforcer", "remote", "flow", "message", "key", "allowed", "rules", "why")
 @dataclass(frozen=True, slots=True)
 class Check:
-    """A decision of the process ``enforcer`` on one message on its link with ``remote``."""
+    """A decision of the process ``enforcer`` on a message on its link with ``remote``."""
 
     enforcer: str
     """The enclave whose process decides."""
@@ -52,7 +52,7 @@ class Check:
     def rules(self) -> tuple[str, ...]:
         """The ids of the rules that decide whether the message passes.
 
-        There are none if the default decides.
+        Empty if the default decides.
         """
         return self.decision.rules
 
@@ -69,7 +69,7 @@ class Check:
 
 @dataclass(frozen=True, slots=True)
 class Delivery:
-    """The checks that a message must pass on its way, in order.
+    """The checks that a message must pass on its route, in order.
 
     ``replies`` are the checks on the reply to a call; the call is executed even if the reply is
     denied.
@@ -85,7 +85,7 @@ class Delivery:
 
     @property
     def answered(self) -> bool:
-        """Whether the message and the reply to it arrive."""
+        """Whether the message and its reply arrive."""
         return self.arrives and all(check.allowed for check in self.replies)
 
 
@@ -101,8 +101,8 @@ def route(
 ) -> Route:
     """Return the route from ``source`` to ``target``.
 
-    Peers send to each other directly.  Messages from or to a client go through ``router`` and then,
-    if the target has another router, through ``to``.
+    Peers send directly to each other. Messages from or to a client pass through ``router`` and
+    then, if the target has another router, through ``to``.
     """
     if source.mode is Mode.PEER and target.mode is Mode.PEER:
         return source, target
@@ -152,8 +152,8 @@ def token_delivery(
 ) -> Delivery:
     """Return the delivery of a liveliness token along ``route`` to a process that watches tokens.
 
-    ``asked_key`` is the key of the ``message`` by which this process asks for tokens.  A router
-    sends tokens only when asked; peers send each other all tokens without being asked.
+    ``asked_key`` is the key of the ``message`` with which the watching process asks for tokens.  A
+    router sends tokens only when asked; peers send each other all tokens without being asked.
     """
     asking = route[:-3:-1] if route[-2].mode is Mode.ROUTER else ()
     return Delivery(

@@ -1,4 +1,4 @@
-"""A reader of Zenoh configurations by any author: JSON5, or YAML in JSON syntax.
+"""A reader of Zenoh configurations that sros did not write: JSON5, or YAML in JSON syntax.
 
 Zenoh chooses the language by the ending of the file name, and reads no files with other endings.
 
@@ -57,7 +57,7 @@ _LISTEN: Mapping[Mode, tuple[str, ...]] = {
     Mode.PEER: ("tcp/[::]:0",),
     Mode.CLIENT: (),
 }
-"""Where a process listens, by mode, if its configuration names no endpoint."""
+"""Mode → endpoints at which a process listens if its configuration names none."""
 ENCRYPTED = frozenset({"tls", "quic"})
 """The protocols that encrypt messages, and authenticate processes by certificates."""
 _LINK_PROTOCOLS = frozenset(
@@ -68,7 +68,7 @@ _AS_TOML = (".toml",)
 ENDINGS = (".json5", ".json", *_AS_YAML, *_AS_TOML)
 """Endings of file names that Zenoh reads (tested with 1.10.2)."""
 _OTHER_IN_YAML = re.compile(r"\\u|[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\u2028\u2029\ufeff]")
-"""Characters and escapes that YAML reads differently from JSON, or refuses."""
+"""Characters and escapes that YAML refuses, or reads differently from JSON."""
 _MOST_MEANT = 1_000_000
 _MOST_PARTS = 10
 _ZID = re.compile(r"[1-9a-f][0-9a-f]{0,31}", re.ASCII)
@@ -109,12 +109,12 @@ class ZenohEndpoint:
 
 @dataclass(frozen=True, slots=True)
 class TlsOptions:
-    """The options of TLS that decide whom a process accepts, with Zenoh's defaults.
+    """The TLS options that decide which processes are accepted, with Zenoh's defaults.
 
-    ``mutual``: a connecting process must show a certificate.  ``verifies_name``: the certificate of
-    a listening process must have the host of the endpoint.  ``closes_on_expiration``: a connection
-    ends when the certificate of the other side expires.  ``named`` are the names of the settings
-    for certificates and keys in the file, such as "root_ca_certificate".
+    ``mutual`` says that a connecting process must show a certificate, ``verifies_name`` that the
+    certificate of a listening process must have the host of the endpoint, ``closes_on_expiration``
+    that a connection ends when the certificate of the other side expires.  ``named`` are the names
+    of the settings for certificates and keys in the file, such as "root_ca_certificate".
     """
 
     mutual: bool = False
@@ -129,7 +129,7 @@ class ConfigurationDocument:
 
     ``protocols`` are the protocols that endpoints may have; None allows all.  ``namespace`` is put
     before every key of the process.  ``lines`` maps paths of settings, such as "transport/link", to
-    their lines; ``unknown`` are paths that no version of Zenoh up to 1.10 knows.  ``settings`` are
+    line numbers; ``unknown`` are paths that no version of Zenoh up to 1.10 knows.  ``settings`` are
     all settings of the file, as JSON, except access control.
     """
 
@@ -152,7 +152,7 @@ class ConfigurationDocument:
     lines: Mapping[str, int] = field(default_factory=dict, compare=False, repr=False)
 
     def open_link(self) -> str:
-        """Return where a process without a certificate can connect, as a clause; "" if nowhere."""
+        """Return a clause on how a process without a certificate can connect, or ""."""
         for endpoint in (*self.listen, *self.connect):
             if self.protocols is not None and endpoint.protocol not in self.protocols:
                 continue  # Zenoh refuses this endpoint
@@ -164,20 +164,20 @@ class ConfigurationDocument:
         return ""
 
     def line_of(self, path: str) -> int:
-        """Return the line of a setting, or else of the smallest section around it, or else 1."""
+        """Return the line of a setting, or of the smallest section that contains it, or 1."""
         while path and path not in self.lines:
             path = path.rpartition("/")[0]
         return self.lines.get(path, 1)
 
 
 class UnreadConfigurationError(DocumentError):
-    """A configuration that sros cannot read but Zenoh may, so that its rules are unknown."""
+    """Raised for a configuration that sros cannot read but Zenoh may; its rules are unknown."""
 
 
 def parse_configuration(
     data: bytes, name: str, overrides: Iterable[tuple[str, str]] = (), *, lines: bool = True
 ) -> ConfigurationDocument:
-    """Return the configuration that a file states; ``name`` is the file's name in errors.
+    """Return the configuration in a file; ``name`` is the file's name in errors.
 
     ``overrides`` are pairs of a path of a setting and a JSON5 value that replaces the value in the
     file, as in ZENOH_CONFIG_OVERRIDE.  Without ``lines``, every line number is 1, and large files
@@ -185,8 +185,8 @@ def parse_configuration(
 
     Raises:
         UnreadConfigurationError: sros cannot read the file, but Zenoh may: the file has more than
-            16 MiB, is TOML, is YAML that is not also JSON, or has lists in place of objects, whose
-            meaning depends on the version.
+            16 MiB, is TOML, is YAML that is not also JSON, or has lists in place of objects, with a
+            meaning that depends on the version.
         DocumentError: the file is not JSON5, or Zenoh would not accept it.
     """
     root = _root(data, name, lines=lines)
@@ -291,7 +291,7 @@ def _object_error_class(value: object) -> type[DocumentError]:
 
 @dataclass(frozen=True, slots=True)
 class _Section:
-    """An object in the file ``name``, at a path of settings; "" is the path of the whole file."""
+    """An object at a path of settings in the file ``name``; "" is the path of the whole file."""
 
     name: str
     path: str
@@ -527,7 +527,7 @@ def _read_policy(section: _Section) -> AclPolicy:
 
 
 def _check_ids(section: _Section, enforcement: Enforcement) -> None:
-    """Refuse duplicate ids, and policies that name a missing rule or subject."""
+    """Raise for duplicate ids, and for policies that name a missing rule or subject."""
     for member, elements in (("rules", enforcement.rules), ("subjects", enforcement.subjects)):
         ids = [element.id for element in elements]
         if twice := next(_repeated(ids), None):
@@ -540,7 +540,7 @@ def _check_ids(section: _Section, enforcement: Enforcement) -> None:
 
 
 def _check_size(section: _Section, enforcement: Enforcement) -> None:
-    """Raise an error if access control would need many millions of decisions.
+    """Raise if access control would need many millions of decisions.
 
     Even a small file can state that many rules.
     """

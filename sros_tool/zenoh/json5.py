@@ -1,8 +1,8 @@
 """Reading JSON5, the language of Zenoh's configurations, with the line of each member.
 
 Size and depth are limited, and the time is linear in the size: no recursion, no backtracking.  As
-in Zenoh, an object with a repeated member is refused, because readers differ in which value counts.
-Source: spec.json5.org 1.0; compared with what the wheel 1.10.2 accepts.
+in Zenoh, an object with a repeated member is refused, because readers choose different values.
+Source: spec.json5.org 1.0; compared with the texts that the wheel 1.10.2 accepts.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ _MOST_DIGITS = 400
 _MOST_TOKENS = 2_000_000
 """Maximum number of tokens in a text; more tokens would take many seconds.
 
-The configuration of the router of a thousand enclaves has less than half as many.
+The configuration of a router for a thousand enclaves has less than half as many tokens.
 """
 _MOST_WITHOUT_LINES = 200_000
 """Maximum number of tokens in JSON5 that is not plain JSON, if lines are not needed.
 
-The default Zenoh configuration has a fiftieth as many.
+The default Zenoh configuration has a fiftieth of this number.
 """
 
 
 class Json5Error(ValueError):
-    """Text that is not JSON5; ``line`` counts from 1."""
+    """Raised for text that is not JSON5; ``line`` counts from 1."""
 
     def __init__(self, problem: str, line: int) -> None:
         super().__init__(problem)
@@ -60,7 +60,7 @@ _TOKEN = re.compile(
     re.VERBOSE | re.DOTALL,
 )
 _NOT_IN_JSON5 = re.compile(r"\\u|[\u2028\u2029]")
-"""Matches what strings can have in JSON but not in JSON5: Unicode escapes, U+2028, U+2029."""
+"""Matches string contents that JSON allows and JSON5 does not: Unicode escapes, U+2028, U+2029."""
 _LINE = re.compile(r"\r\n|[\n\r\u2028\u2029]")
 _ESCAPE = re.compile(r"\\(?:u([0-9a-fA-F]{4})|x([0-9a-fA-F]{2})|(\r\n|.))", re.DOTALL)
 _ESCAPED = {"b": "\b", "f": "\f", "n": "\n", "r": "\r", "t": "\t", "v": "\v", "0": "\0"}
@@ -75,7 +75,7 @@ class _Token(NamedTuple):
 
 
 def parse_json5(text: str, *, lines: bool = True) -> Any:
-    """Return the value of a JSON5 text; each object is a `Json5Object`.
+    """Return the value of a JSON5 text; all objects are `Json5Object` values.
 
     Without ``lines``, every line number is 1; plain JSON is then read about twenty times as fast,
     and other JSON5 has to be small.
@@ -91,7 +91,7 @@ def parse_json5(text: str, *, lines: bool = True) -> Any:
 
 
 def parse_json(text: str) -> Any:
-    """Return the value of a JSON text; each object is a `Json5Object` with line 1.
+    """Return the value of a JSON text; all objects are `Json5Object` values with line 1.
 
     Raises:
         Json5Error: the text is not JSON, or has more than 100 levels.

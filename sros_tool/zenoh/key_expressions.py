@@ -1,8 +1,8 @@
 """Key expressions of Zenoh: their canonical form, inclusion and intersection.
 
-A key expression consists of chunks with "/" between them.  ``*`` stands for one chunk, ``**`` for
-any number of chunks, ``$*`` for any part of a chunk.  No wildcard matches a chunk that begins with
-``@``.  Source: zenoh.io "Key Expressions"; tested with the wheel 1.10.2.
+A key expression consists of chunks with "/" between them.  ``*`` stands for a single chunk, ``**``
+for any number of chunks, ``$*`` for any part of a chunk.  No wildcard matches a chunk that begins
+with ``@``.  Source: zenoh.io "Key Expressions"; tested with the wheel 1.10.2.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def canonical(chunks: Iterable[str]) -> str:
     """Return the key expression of some chunks in canonical form, the only form that Zenoh accepts.
 
     A chunk that is only ``$*`` becomes ``*``.  In a run of wildcards, each ``*`` comes before the
-    single ``**``.  If a rule has a key in another form, the session does not open.
+    single ``**``.  With a key in another form in a rule, the session does not open.
     """
     chunks = tuple(chunks)
     text = "/".join(chunks)
@@ -50,7 +50,7 @@ def canonical(chunks: Iterable[str]) -> str:
 
 
 def includes(wide: str, narrow: str) -> bool:
-    """Return whether ``wide`` includes every key that ``narrow`` includes, as Zenoh decides."""
+    """Return whether ``wide`` includes every key that ``narrow`` includes, by Zenoh's rules."""
     if wide == narrow:
         return True
     begin = _fixed_begin(wide)
@@ -58,7 +58,7 @@ def includes(wide: str, narrow: str) -> bool:
 
 
 class KeyExpressions:
-    """A set of key expressions, with a fast search for those that include another expression."""
+    """A set of key expressions, with a fast search for those that include a given expression."""
 
     def __init__(self, expressions: Iterable[str]) -> None:
         self.all = frozenset(expressions)
@@ -78,7 +78,7 @@ class KeyExpressions:
         return sorted({len(begin) for begin in self._by_begin})
 
     def include(self, narrow: str) -> bool:
-        """Return whether one of the expressions includes all of ``narrow``."""
+        """Return whether an expression of the set includes all of ``narrow``."""
         if narrow in self.all:
             return True
         return any(
@@ -89,7 +89,7 @@ class KeyExpressions:
         )
 
     def needed(self) -> list[str]:
-        """Return the expressions that no other one includes, sorted.
+        """Return the expressions that no other expression includes, sorted.
 
         If there are too many to compare, all expressions are returned.
         """
@@ -120,7 +120,8 @@ class KeyExpressions:
     def _candidates(self, narrow: str) -> list[Mapping[str, list[str]]]:
         """Return the expressions with wildcards that may include ``narrow``, as groups by form.
 
-        They begin like ``narrow``, and their landmark is "" or a chunk of ``narrow``.
+        These expressions begin like ``narrow``, and have the `_landmark` "" or a chunk of
+        ``narrow``.
         """
         by_begin, candidates = self._by_begin, []
         chunks = {*_chunks(narrow), ""}
@@ -202,7 +203,7 @@ def sequence_includes(wide: Sequence[str], narrow: Sequence[str]) -> bool:
 
 
 def _with_skipped_wildcards(positions: set[int], wide: Sequence[str]) -> set[int]:
-    """Return the positions in ``wide``, and those after a ``**``, which can match nothing."""
+    """Return the positions in ``wide``, and positions after a ``**``, which can match nothing."""
     places = set(positions)
     for at in sorted(positions):
         while at < len(wide) and wide[at] == ANY_CHUNKS:
@@ -225,24 +226,24 @@ def _chunk_includes(wide: str, narrow: str) -> bool:
 
 
 def widest_expression(expression: str) -> str:
-    """Return an expression with ``**`` for all chunks, except those that begin with ``@``."""
+    """Return an expression with ``**`` for all chunks, except chunks that begin with ``@``."""
     chunks = expression.split("/")
     return canonical(chunk if chunk.startswith("@") else ANY_CHUNKS for chunk in chunks)
 
 
 def intersects(first: str, second: str) -> bool:
-    """Return whether some key matches both expressions, as Zenoh decides."""
+    """Return whether any key matches both expressions, by Zenoh's rules."""
     return sequences_intersect(_chunks(first), _chunks(second))
 
 
 @lru_cache(maxsize=_MANY)
 def sequences_intersect(first: tuple[str, ...], second: tuple[str, ...]) -> bool:
-    """Return whether some key matches both expressions, given as chunks."""
+    """Return whether any key matches both expressions, given as chunks."""
     return _sequences_intersect(first, second, ANY_CHUNKS, chunks_intersect)
 
 
 def chunks_intersect(first: str, second: str) -> bool:
-    """Return whether some chunk of a key matches both chunks."""
+    """Return whether any chunk of a key matches both chunks."""
     if first == second:
         return True
     if ANY_CHUNKS in (first, second):
@@ -261,9 +262,9 @@ def chunks_intersect(first: str, second: str) -> bool:
 def _sequences_intersect(
     first: Sequence[str], second: Sequence[str], many: str, meet: Callable[[str, str], bool]
 ) -> bool:
-    """Return whether two sequences can match the same; ``many`` matches any number of members.
+    """Return whether two sequences have a common match; ``many`` matches any number of members.
 
-    ``meet`` returns whether two members can match the same.
+    ``meet`` returns whether two members have a common match.
     """
     reached = {0}
     for left in (*first, None):
@@ -289,11 +290,11 @@ def _sequences_intersect(
 # ── intersections of expressions ───────────────────────────────────────────────────────────
 
 _MOST_COMMON = 4096
-"""Maximum number of key expressions that describe the intersection of two key expressions."""
+"""Maximum number of key expressions for the intersection of two key expressions."""
 
 
 class TooManyExpressions(Exception):  # noqa: N818 - the caller makes an error of it
-    """The intersection of key expressions needs too many key expressions."""
+    """Raised if an intersection needs too many key expressions."""
 
 
 def common(first: str, second: str) -> list[str]:
@@ -313,7 +314,7 @@ def common(first: str, second: str) -> list[str]:
 
 
 _ANY_LETTERS = "\0"
-"""Stands for ``$*``, and cannot occur in a key."""
+"""Stands for ``$*``; a key cannot contain this character."""
 
 
 @lru_cache(maxsize=_MANY)
@@ -428,7 +429,7 @@ def _automaton(expression: str) -> Automaton | None:
 def _chunk(
     chunk: str, begin: int, number: Iterator[int], edges: list[tuple[int, Letters, int]]
 ) -> int:
-    """Add edges for a chunk to ``edges``, and return the position after the chunk.
+    """Append edges for a chunk to ``edges``, and return the position after the chunk.
 
     A chunk that begins with a wildcard does not match a chunk that begins with "@".
     """
@@ -456,7 +457,7 @@ def _chunk(
 
 
 def names_of(expressions: Iterable[str]) -> NameSet:
-    """Return the keys that at least one of the expressions includes."""
+    """Return the set of keys that at least one of the expressions includes."""
     automata = {expression: _automaton(expression) for expression in expressions}
     return NameSet(
         (expression for expression, automaton in automata.items() if automaton is None),
@@ -466,9 +467,9 @@ def names_of(expressions: Iterable[str]) -> NameSet:
 
 @lru_cache(maxsize=_MANY)
 def expression_problem(text: str) -> str:
-    """Return why Zenoh does not accept a key expression, as a clause; "" if it does.
+    """Return a clause on why Zenoh does not accept a key expression; "" for an accepted one.
 
-    A wildcard must be a chunk of its own or ``$*``, and the expression must be in canonical form.
+    A wildcard must be a whole chunk or ``$*``, and the expression must be in canonical form.
     """
     chunks = text.split("/")
     if "" in chunks:

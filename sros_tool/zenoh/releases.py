@@ -9,20 +9,20 @@ from __future__ import annotations
 from typing import NamedTuple
 
 _LEAST_ZENOH = "1.3"
-"""The first version of Zenoh that accepts all settings of the files.
+"""First version of Zenoh that accepts all settings of the files.
 
-rmw_zenoh 0.2.3 has a version from shortly before.
+rmw_zenoh 0.2.3 has a slightly earlier version.
 """
 
 Version = tuple[int, int, int]
 
 
 class RmwZenohRelease(NamedTuple):
-    """The versions of rmw_zenoh_cpp in one ROS 2 distribution, from ``begin`` on.
+    """The versions of rmw_zenoh_cpp in a ROS 2 distribution, from ``begin`` on.
 
     ``least`` is the first version that has `_LEAST_ZENOH` and reads ZENOH_CONFIG_OVERRIDE.
-    ``below_topics`` are key expressions below the key of a topic.  To subscriptions whose graph
-    tokens a publisher sees, it also sends on these keys, or on these keys alone.
+    ``below_topics`` are key expressions below the key of a topic.  A publisher sends to
+    subscriptions whose graph tokens it sees on these keys, too, or only on these keys.
     """
 
     distribution: str
@@ -34,8 +34,8 @@ class RmwZenohRelease(NamedTuple):
 _BUFFERS = ("_buf_cpu", "_buf/*")
 """Keys for messages with an array of bytes (images, point clouds) between C++ nodes.
 
-All subscriptions in main memory share ``_buf_cpu``; each subscription on an accelerator has its own
-key.
+All subscriptions in main memory share ``_buf_cpu``; every subscription on an accelerator has a
+separate key.
 """
 
 RELEASES = (
@@ -44,7 +44,7 @@ RELEASES = (
     RmwZenohRelease("Kilted", (0, 3, 0), (0, 6, 0)),
     RmwZenohRelease("Lyrical", (0, 7, 0), (0, 7, 0), _BUFFERS),
 )
-"""All supported releases, earliest first; Rolling's versions count as the next distribution's."""
+"""All supported releases, earliest first; Rolling's versions count for the next distribution."""
 
 
 def release_of(version: Version) -> RmwZenohRelease:
@@ -54,7 +54,7 @@ def release_of(version: Version) -> RmwZenohRelease:
 
 
 def too_old_because(version: Version) -> str:
-    """Return why the files of sros do not work with a version of rmw_zenoh, as a clause, or ""."""
+    """Return a clause on why the files of sros do not work with a version of rmw_zenoh, or ""."""
     release = release_of(version)
     if version >= release.least:
         return ""

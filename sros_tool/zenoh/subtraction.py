@@ -1,4 +1,4 @@
-"""The keys of access-control rules: allowed key expressions without the denied ones.
+"""The keys of access-control rules: allowed key expressions without denied key expressions.
 
 Zenoh does not enforce a denial of a part of the allowed keys, so rules for topics and services only
 allow.  All expressions are tuples of chunks.  A subtraction is exact for keys whose chunks are ROS
@@ -41,17 +41,17 @@ In a process with Zenoh 1.10.2, a right to publish with 16,384 key expressions t
 _LETTERS = "_" + digits + ascii_letters
 _MANY, _FEW = 65536, 1024
 _MOST_CHARACTERS = 1_000_000
-"""Maximum number of characters that are compared for one chunk, which takes about one second."""
+"""Maximum number of characters that are compared for a chunk, which takes about one second."""
 
 
 class CannotSubtract(Exception):  # noqa: N818 - the caller makes an error of it
-    """The difference cannot be expressed as key expressions, or takes too many of them.
+    """Raised if key expressions cannot express a difference, or if it takes too many.
 
     ``denied`` is the expression that cannot be subtracted; () if the result is too large.
     """
 
     def __init__(self, denied: Chunks = ()) -> None:
-        """Keep the expression that cannot be subtracted, or () for too large a result."""
+        """Keep the expression that cannot be subtracted; () for a result that is too large."""
         super().__init__(denied)
         self.denied = denied
 
@@ -73,7 +73,7 @@ def subtract_all(allowed: frozenset[Chunks], denied: frozenset[Chunks]) -> froze
 
 
 def _uncovered(expressions: frozenset[Chunks]) -> list[Chunks]:
-    """Return the expressions that no other one covers, and perhaps some more if there are many."""
+    """Return the expressions that no other expression covers, and some more if there are many."""
     wide: list[Chunks] = []
     left: list[Chunks] = []
     for expression in sorted(
@@ -116,11 +116,11 @@ def _have_common_key(first: Chunks, second: Chunks) -> bool:
 
 
 _MOST_STEPS = 2 * MOST_EXPRESSIONS
-"""Maximum number of expressions in a step, before some of them are joined."""
+"""Maximum number of expressions in a step, before some expressions are joined."""
 _MOST_COMPARED = 64
-"""Maximum number of wildcard expressions that are compared with all others.
+"""Maximum number of wildcard expressions that are compared with all other expressions.
 
-The comparison finds expressions that others cover.
+The comparison finds expressions that another expression covers.
 """
 _MOST_WILD = 32
 """Maximum number of denied chunks with wildcards at one position of an expression."""
@@ -163,7 +163,7 @@ def _around_wildcards(chunks: Chunks) -> tuple[Chunks, Chunks]:
 def _parts(wide: Chunks, denied: Iterable[Chunks]) -> Iterator[Chunks]:
     """Split ``wide`` so that its ``**`` overlaps no fixed start or end of a denied expression.
 
-    So each part can be compared with a denied expression chunk by chunk, first from the start, then
+    So a part can be compared with a denied expression chunk by chunk, first from the start, then
     from the end.
     """
     if ANY_CHUNKS not in wide:
@@ -208,7 +208,7 @@ def _any_chunks(number: int) -> Chunks:
 
 
 def _to_last_named(chunks: Chunks) -> int:
-    """Return the number of chunks up to and including the last that is not ``*``."""
+    """Return the number of chunks up to and including the last chunk that is not ``*``."""
     return max((at + 1 for at, chunk in enumerate(chunks) if chunk != ANY_CHUNK), default=0)
 
 
@@ -216,7 +216,7 @@ def _to_last_named(chunks: Chunks) -> int:
 def _remaining_keys(wide: Chunks, denied: frozenset[Chunks]) -> frozenset[Chunks]:
     """Return expressions for the keys of ``wide`` without ``denied``.
 
-    Each denied expression has a key in common with ``wide``.
+    All denied expressions have a key in common with ``wide``.
     """
     if not denied:
         return frozenset((wide,))
@@ -235,8 +235,8 @@ def _remaining_keys(wide: Chunks, denied: frozenset[Chunks]) -> frozenset[Chunks
 def _shorter_keys(wide: Chunks, denied: Iterable[Chunks]) -> frozenset[Chunks]:
     """Return expressions for the keys of ``wide``, which must be ``**``, without ``denied``.
 
-    The denied expressions must consist only of wildcards.  With ``**`` they deny all keys from some
-    length on, so the keys that remain are the shorter ones.
+    The denied expressions must consist only of wildcards.  Because of their ``**``, they deny all
+    keys from some length on, so that shorter keys remain.
 
     Raises:
         CannotSubtract: ``wide`` or a denied expression has another form.
@@ -276,7 +276,7 @@ def _split_by_first_chunk(wide: Chunks, denied: Iterable[Chunks]) -> frozenset[C
 
 
 def _first_chunks(expression: Chunks) -> Iterator[tuple[str, Chunks]]:
-    """Yield each possible first chunk of an expression's keys, with the chunks after it."""
+    """Yield each possible first chunk of an expression's keys, with the rest of the expression."""
     if expression and expression[0] == ANY_CHUNKS:
         yield from _first_chunks(expression[1:])
         yield ANY_CHUNK, expression
@@ -288,7 +288,7 @@ def _first_chunks(expression: Chunks) -> Iterator[tuple[str, Chunks]]:
 def _kinds(first: str, first_chunks: tuple[str, ...]) -> Mapping[frozenset[str], Chunks]:
     """Map the kinds of chunks that ``first`` matches to expressions for the chunks of this kind.
 
-    The kind of a chunk is the set of chunks in ``first_chunks`` that match it, too.
+    The kind of a chunk is the set of matching chunks in ``first_chunks``.
     """
     wild = [chunk for chunk in first_chunks if "*" in chunk]
     _check_number(len(wild), _MOST_WILD)
@@ -313,7 +313,7 @@ def _kinds(first: str, first_chunks: tuple[str, ...]) -> Mapping[frozenset[str],
 
 
 def _matches_any(chunk: str, wild: Iterable[str], excluded: frozenset[str]) -> bool:
-    """Return whether a chunk in ``wild``, except for those in ``excluded``, includes ``chunk``."""
+    """Return whether any chunk in ``wild``, except ``excluded`` chunks, includes ``chunk``."""
     return any(_matches(wide, chunk) for wide in wild if wide not in excluded)
 
 
@@ -324,10 +324,10 @@ def _matches(wide: str, narrow: str) -> bool:
 
 @lru_cache(maxsize=_MANY)
 def _chunks(first: str, first_chunks: tuple[str, ...], kinds: frozenset[frozenset[str]]) -> Chunks:
-    """Return few chunks that together match exactly the names of some kinds that ``first`` matches.
+    """Return few chunks that together match the names of ``first`` that are of some ``kinds``.
 
-    The kind of a name is the set of chunks in ``first_chunks`` that match it.  If ``kinds`` has a
-    kind, it must also have each kind that is a subset of it.
+    The kind of a name is the set of matching chunks in ``first_chunks``. For each kind in
+    ``kinds``, all kinds that are subsets must be in ``kinds``, too.
     """
     kinds_of_first = _kinds(first, first_chunks)
 
@@ -362,7 +362,7 @@ def _chunks(first: str, first_chunks: tuple[str, ...], kinds: frozenset[frozense
 
 @lru_cache(maxsize=_MANY)
 def _chunks_less(wide: str, denied: frozenset[str]) -> Chunks:
-    """Return chunks for the names that ``wide`` matches but no chunk of ``denied``."""
+    """Return chunks for the names that ``wide`` matches and no chunk of ``denied`` matches."""
     if not denied:
         return (wide,)
     search = _LetterSearch()
@@ -379,8 +379,8 @@ def _chunks_less(wide: str, denied: frozenset[str]) -> Chunks:
 class _SearchState(NamedTuple):
     """A state of the search: names that begin with ``read``, then text that ``wide`` matches.
 
-    ``denied`` are the denied chunks for the continuation.  ``letters`` are the letters that the
-    continuation may have; names with other letters are already kept.
+    ``denied`` are the denied chunks for the text after ``read``. ``letters`` are the letters that
+    this text may have; names with other letters are already kept.
     """
 
     read: str
@@ -391,7 +391,7 @@ class _SearchState(NamedTuple):
 
 @dataclass
 class _LetterSearch:
-    """The search for chunks that match a chunk's names without the denied names.
+    """The search for chunks that match the names of a chunk, without denied names.
 
     The search reads names from the start until no denied chunk can match any more.  If all
     wildcards in denied chunks are stars at the start, a second search reads backwards from the end.
@@ -412,7 +412,7 @@ class _LetterSearch:
                 states += self._following(state)
 
     def _following(self, state: _SearchState) -> Iterable[_SearchState]:
-        """Return the states that follow a state; none if all its names are now kept or denied."""
+        """Return the next states of a state; () if all its names are kept or denied by now."""
         read, wide, denied, _ = state
         self.effort -= sum(map(len, denied)) + len(denied) * len(wide) + len(read)
         if self.effort < 0:
@@ -436,7 +436,7 @@ class _LetterSearch:
         return self._split_by_next_letter(state._replace(denied=denied))
 
     def _split_by_next_letter(self, state: _SearchState) -> Iterator[_SearchState]:
-        """Yield the states that follow, one for each next letter; ``wide`` must begin with "*"."""
+        """Yield the next states, one for each next letter; ``wide`` must begin with "*"."""
         read, wide, denied, letters = state
         if wide == "*" and not any("*" in chunk for chunk in denied):
             # A chunk with a letter that no denied chunk has is allowed, whatever its other letters
@@ -475,7 +475,7 @@ def _overlap(first: str, second: str) -> bool:
 
 
 def _rest_after_letter(letter: str, chunks: Iterable[str]) -> tuple[str, ...]:
-    """Return the rest of each chunk after reading a letter, without chunks that do not match."""
+    """Return the rest of each chunk after a letter, without chunks that do not match it."""
     rests = []
     for chunk in chunks:
         if chunk.startswith("*"):
@@ -493,7 +493,7 @@ def _rest_after_letter(letter: str, chunks: Iterable[str]) -> tuple[str, ...]:
 def _joined_expressions(expressions: set[Chunks]) -> set[Chunks]:
     """Return fewer expressions for the same keys.
 
-    An expression with ``**`` replaces those that differ from it only in the number of chunks.
+    An expression with ``**`` replaces expressions that differ only in the number of chunks.
     """
     joined = {
         tuple(canonical(expression).split("/")) if expression else expression
@@ -522,7 +522,7 @@ def _joined_expressions(expressions: set[Chunks]) -> set[Chunks]:
 
 
 class _Beginnings:
-    """An index of beginnings, to find those that match the beginning of an expression."""
+    """An index of beginnings, with a search by the beginning of an expression."""
 
     def __init__(self, beginnings: Iterable[Chunks]) -> None:
         self._by_first: dict[Chunks, list[Chunks]] = {}
@@ -541,7 +541,7 @@ class _Beginnings:
 
 
 def _one_shorter(chunks: Chunks) -> Chunks | None:
-    """Return ``a/b`` for ``a/*/**/b``, the keys with one chunk less; None for other expressions."""
+    """Return ``a/b`` for ``a/*/**/b``, for keys with a chunk less; None for other expressions."""
     at = chunks.index(ANY_CHUNKS) if chunks.count(ANY_CHUNKS) == 1 else 0
     return (*chunks[: at - 1], *chunks[at + 1 :]) if at and chunks[at - 1] == ANY_CHUNK else None
 
@@ -567,7 +567,7 @@ class Difference(NamedTuple):
     denied: frozenset[Chunks]
 
     def names(self) -> frozenset[Chunks]:
-        """Return key expressions for the names that remain.
+        """Return key expressions for the remaining names.
 
         Raises:
             CannotSubtract: as in `subtract_all`.
@@ -575,7 +575,7 @@ class Difference(NamedTuple):
         return subtract_all(self.allowed, self.denied)
 
     def keys_below(self, end: str) -> Difference:
-        """Return the keys of this difference, with ``end`` added as further chunks."""
+        """Return the difference with the same names and with ``end`` added as further chunks."""
         return self._replace(end=f"{self.end}/{end}")
 
     def include(self, name: str) -> bool:
@@ -598,7 +598,7 @@ class Difference(NamedTuple):
 
         Raises:
             CannotSubtract: as in `subtract_all`.
-            TooManyExpressions: the names that both allow take too many key expressions.
+            TooManyExpressions: the common names take too many key expressions.
         """
         end = _common_end(self.end, other.end)
         if self.begin != other.begin or end is None:
@@ -610,7 +610,7 @@ class Difference(NamedTuple):
 
 
 def _common_end(first: str, second: str) -> str | None:
-    """Return the intersection of two endings, or None; one with "/**" includes one without."""
+    """Return the intersection of two endings, or None; endings with "/**" include others."""
     end, longer = sorted((first, second), key=len)
     return end if longer in (end, f"{end}/{ANY_CHUNKS}") else None
 
@@ -624,7 +624,7 @@ def _search_index(expressions: frozenset[Chunks]) -> KeyExpressions:
 def _common_expressions(
     expressions: frozenset[Chunks], other_expressions: frozenset[Chunks]
 ) -> frozenset[Chunks]:
-    """Return expressions for the keys that match both some expressions and some others."""
+    """Return expressions for the keys that both sets of expressions match."""
     if expressions == other_expressions:
         return expressions
     return frozenset(
@@ -659,7 +659,7 @@ class RuleKeys:
         self._has_plain_tokens = any(expression.startswith("@") for expression in self.plain)
 
     def include(self, key: str) -> bool:
-        """Return whether the differences of the rule have all keys of an expression.
+        """Return whether the rule's differences have all keys of an expression.
 
         False may be wrong.
         """
@@ -668,7 +668,7 @@ class RuleKeys:
         return any(difference.include_all(begin, chunks, end) for difference in self.differences)
 
     def common(self, other: RuleKeys) -> tuple[str, ...]:
-        """Return expressions for exactly the keys that both rules have, sorted.
+        """Return expressions for exactly the common keys of both rules, sorted.
 
         Raises:
             TooManyExpressions: the result would have too many key expressions.
@@ -709,14 +709,14 @@ _ENDS = re.compile(rf"{re.escape(_TYPE)}(?:/\*\*)?(?:/@adv/\*\*)?\Z")
 
 
 def _expression_parts(expression: str) -> tuple[str, str, str]:
-    """Return three parts of a key expression: before the name, the name, and after it."""
+    """Return the parts of a key expression before the name, of the name, and after the name."""
     begin, _, rest = expression.partition("/")
     name, of_type, below = rest.partition(_TYPE)
     return begin, name, of_type + below
 
 
 def _differences(expressions: Iterable[str]) -> tuple[Difference, ...]:
-    """Return key expressions, except graph tokens, as differences that subtract nothing."""
+    """Return key expressions, except graph tokens, as differences without denied names."""
     names: dict[tuple[str, str], set[Chunks]] = {}
     for expression in expressions:
         if not expression.startswith("@"):

@@ -1,9 +1,9 @@
 """The access control of one vendor: who may join, publish and subscribe, and why.
 
 The governance and the permissions of a participant decide.  A decision chooses the grant of the
-subject (`choose_grant`), takes its rules for the domain (`_rules_for`), applies them to a topic
-(`_GrantRules`), and combines the result with the access control that the governance requires
-(`GovernedDomain`, `_decide_join`, `Access`).
+subject (`choose_grant`), takes the grant's rules for the domain (`_rules_for`), applies these rules
+to a topic (`_GrantRules`), and combines the result with the access control that the governance
+requires (`GovernedDomain`, `_decide_join`, `Access`).
 """
 
 from __future__ import annotations
@@ -74,11 +74,11 @@ ReasonWord = Annotated[str, "Why, as a stable word such as `no-rule`."]
 
 @shows("outcome", "reason", "expression")
 class Decision(NamedTuple):
-    """The outcome of a question to access control, and what decided it.
+    """The outcome of a question to access control, with the deciding rule.
 
     ``reason`` is a fixed word for programs (one of `_REASONS`), ``text`` a sentence for people.
-    ``grant`` is an index in the permissions, and ``rule`` an index in the grant.  ``expression`` is
-    the ``<topic>`` that matched, and ``topic_rule`` the governance rule for the topic.  With
+    ``grant`` is an index in the permissions, and ``rule`` an index in the grant. ``expression`` is
+    the ``<topic>`` that matched, and ``topic_rule`` the governance rule for the topic. With
     ``hits_peers``, the processes of peers crash, but not the participant's own process.
     """
 
@@ -93,7 +93,7 @@ class Decision(NamedTuple):
 
     @property
     def clause(self) -> str:
-        """The text without the vendor's name at the beginning and the full stop at the end."""
+        """The text without the vendor's name at the beginning, and without full stop."""
         _, colon, text = self.text.partition(": ")
         return (text if colon else self.text).removesuffix(".")
 
@@ -126,21 +126,21 @@ _REASONS = {
 
 
 class Refusal(NamedTuple):
-    """Why a vendor does not accept a document; ``outcome`` is REFUSED or CRASHES."""
+    """The reason that a vendor does not accept a document; ``outcome`` is REFUSED or CRASHES."""
 
     reason: str
     text: str
     outcome: Outcome = Outcome.REFUSED
 
     def decision(self) -> Decision:
-        """Return this refusal as the decision on any access."""
+        """Return this refusal as a decision, which applies to any access."""
         return Decision(self.outcome, self.reason, self.text)
 
 
 def choose_grant(
     traits: VendorTraits, permissions: Permissions, subject: str, *, moment: datetime, zone: tzinfo
 ) -> int | Refusal:
-    """Return the index of the grant that decides for ``subject``, or the reason why none does."""
+    """Return the index of the grant that decides for ``subject``, or a refusal without a grant."""
     if not subject and traits.crashes_on_empty_subject:
         text = f"{traits.title} fails with an error on a certificate with an empty subject."
         return Refusal("empty-subject", text, Outcome.CRASHES)
@@ -180,7 +180,7 @@ def choose_grant(
 def _state(
     traits: VendorTraits, index: int, grant: Grant, now: float, zone: tzinfo
 ) -> Refusal | None:
-    """Return why a grant is not valid at the moment ``now``, or None if it is valid."""
+    """Return the refusal of a grant that is not valid at the moment ``now``, or None."""
     begin = read_date(traits.date_rule, grant.not_before, zone)
     end = read_date(traits.date_rule, grant.not_after, zone)
     name = f"grant {grant.name!r}" if grant.name else f"grant {index + 1}"
@@ -243,7 +243,7 @@ class RuleVerdict(NamedTuple):
 
 
 class _Entry(NamedTuple):
-    """One ``<topic>`` of a rule, with the ``partitions`` that the vendor compares for it."""
+    """A ``<topic>`` of a rule, with the ``partitions`` that the vendor compares for the topic."""
 
     criteria: int
     rule: int
@@ -264,7 +264,7 @@ class _Entry(NamedTuple):
 def _rules_for(
     traits: VendorTraits, grant: Grant, domain: int
 ) -> tuple[list[NumberedRule], RuleVerdict]:
-    """Return the grant's rules for ``domain``, and the verdict if none of them matches a topic."""
+    """Return the grant's rules for ``domain``, and the verdict if no rule matches a topic."""
     rules: list[NumberedRule] = []
     for index, rule in enumerate(grant.rules):
         holds = includes_domain(traits.open_range, rule.domains, domain)
@@ -278,7 +278,7 @@ def _rules_for(
 
 
 def _default_verdict(traits: VendorTraits, grant: Grant) -> RuleVerdict:
-    """Return the verdict that the grant's ``<default>`` gives where no rule matches."""
+    """Return the verdict by the grant's ``<default>``, which counts if no rule matches."""
     if not traits.honors_default:
         return RuleVerdict(Outcome.DENIED, "no-rule")
     if traits.crashes_on_empty_texts and grant.default_empty:
@@ -287,7 +287,7 @@ def _default_verdict(traits: VendorTraits, grant: Grant) -> RuleVerdict:
 
 
 class _GrantRules:
-    """The rules of a grant in order, for publishing, for subscribing, or for both at once."""
+    """The rules of a grant in order: for publishing, for subscribing, or for both."""
 
     def __init__(
         self,
@@ -351,7 +351,7 @@ class _GrantRules:
     def crash_verdict(self, topic: str) -> RuleVerdict | None:
         """Return the crash of a process that reads all criteria of the rules for a topic.
 
-        The result is None if no process crashes.
+        Returns None if no process crashes.
         """
         passed = 0
         for position in self._index.matching(topic):
@@ -555,7 +555,7 @@ def _verdict_text(
 ) -> str:
     """Return ``verdict`` on ``asked_access``, such as ``publish rt/a``, as a clause.
 
-    ``by_peers``: the participant itself allows the access, but its peers deny it.
+    ``by_peers`` says that the participant itself allows the access, and its peers deny it.
     """
     rule = "" if verdict.rule is None else f"rule {verdict.rule + 1}"
     peers = f" for domain {domain}, and peers deny the access" if by_peers else ""
@@ -581,7 +581,7 @@ def _verdict_text(
 
 
 class _Joining(NamedTuple):
-    """The outcome of joining a domain, with a word for programs and a clause for people."""
+    """The outcome of joining a domain, with a reason word for programs and a clause for people."""
 
     outcome: Outcome
     reason: str
@@ -598,7 +598,7 @@ def _decide_join(
 ) -> _Joining:
     """Return the outcome of joining a domain, by the governance and the rules of a grant.
 
-    If none of the ``rules`` matches, ``otherwise`` decides.
+    If no rule in ``rules`` matches, ``otherwise`` decides.
     """
     where = f"domain {governed.domain}"
     if traits.always_needs_allow_rule and not any(rule.allow for rule in grant.rules):
@@ -639,7 +639,7 @@ def _decide_join(
 
 
 class _Basis(Enum):
-    """What decides on access to the topics of a governance topic rule."""
+    """The basis of decisions on access to the topics of a governance topic rule."""
 
     NOTHING = auto()
     """All access is denied."""
@@ -662,7 +662,7 @@ _TOPIC_NAMES = {
     TopicNames.WORDS: (f"{ascii_letters}_/", f"{ascii_letters}{digits}_/"),
     TopicNames.PRINTABLE: ("".join(sorted({*map(chr, range(33, 127))} - {*"*?[]\"'#$"})),) * 2,
 }
-"""Maps a rule to the allowed first characters of a topic name and the allowed later ones."""
+"""Rule → characters that may begin a topic name, and characters that may follow."""
 
 
 def _is_topic_name(rule: TopicNames, text: str) -> bool:
@@ -687,9 +687,10 @@ _ENDPOINTS = (AccessVerb.PUBLISH, AccessVerb.SUBSCRIBE)
 
 
 class GrantedAccess:
-    """What the rules of a grant allow in a domain, regardless of governance, validity and joining.
+    """The access that a grant's rules allow in a domain, regardless of governance and validity.
 
-    The participant itself and its peers each apply the rules, and both have to allow the access.
+    The rules are applied by the participant itself and by its peers, and both have to allow the
+    access.
     """
 
     def __init__(self, traits: VendorTraits, grant: Grant, domain: int) -> None:
@@ -706,7 +707,7 @@ class GrantedAccess:
         return allowed if self.peers is self.own else allowed & self.peers[verb].names()
 
     def reason(self, verb: AccessVerb, topic: str) -> str:
-        """Return which rule allows or denies ``verb`` on a topic, as a clause.
+        """Return a clause that names the rule which allows or denies ``verb`` on a topic.
 
         The topic is in the default partition.
         """
@@ -717,12 +718,12 @@ class GrantedAccess:
 
     @cached_property
     def own(self) -> dict[AccessVerb, _GrantRules]:
-        """The rules as the participant itself applies them."""
+        """The rules in the form in which the participant itself applies them."""
         return {verb: self.deciding_rules(self._own_rules, verb) for verb in _ENDPOINTS}
 
     @cached_property
     def peers(self) -> dict[AccessVerb, _GrantRules]:
-        """The rules as peers apply them; the same object as `own` if these are equal."""
+        """The rules in the form in which peers apply them; `own` itself if both are equal."""
         relays = ("relay",) if self._traits.relays_count_for_readers else ()
         if self._own_rules is self.rules and not relays:
             return self.own
@@ -732,7 +733,7 @@ class GrantedAccess:
         }
 
     def deciding_rules(self, rules: Sequence[NumberedRule], *verbs: str) -> _GrantRules:
-        """Return the rules that decide on the verbs, in order."""
+        """Return the rules that decide on ``verbs``, in order."""
         return _GrantRules(self._traits, rules, self.otherwise, *verbs)
 
 
@@ -804,8 +805,8 @@ class Access:
     def ruled_topics(self, verb: AccessVerb) -> NameSet:
         """Return the topics that the rules allow, including names that are not valid in DDS.
 
-        `topics` leaves those names out, and ROS 2 never uses them.  Here they are kept, because the
-        sets of two vendors that read documents alike are then mostly equal.
+        `topics` leaves these names out, and ROS 2 never uses them. `ruled_topics` includes them, so
+        that the sets of two vendors that read documents alike are mostly equal.
         """
         from sros_tool.automata import NameSet
 
@@ -824,7 +825,7 @@ class Access:
         return NameSet.union(topics)
 
     def protection(self) -> tuple[tuple[NameSet, DomainRule, TopicRule], ...]:
-        """Return the topic rules of the domain, each with the topics to which it applies."""
+        """Return the topic rules of the domain, with the topics to which a rule applies."""
         domain = self._governed.rule
         if domain is None:
             return ()
@@ -838,7 +839,7 @@ class Access:
         return self._governed.topics_of_unauthenticated()
 
     def _basis_of(self, verb: AccessVerb, rule: TopicRule) -> _Basis:
-        """Return what decides on the topics of a topic rule, in the way of `_decision_by_rules`."""
+        """Return the basis of decisions on a topic rule's topics, as in `_decision_by_rules`."""
         if self._traits.crashes_on_empty_texts and not rule.topic_expression.strip():
             return _Basis.NOTHING
         writes, reads = rule.enable_write_access_control, rule.enable_read_access_control
@@ -876,12 +877,12 @@ class Access:
 
     @cached_property
     def _own(self) -> dict[AccessVerb, _GrantRules]:
-        """The grant's rules as the participant itself applies them."""
+        """The grant's rules in the form in which the participant itself applies them."""
         return self._granted.own
 
     @cached_property
     def _peers(self) -> dict[AccessVerb, _GrantRules]:
-        """The grant's rules as peers apply them; the same object as `_own` if these are equal."""
+        """The grant's rules in the form in which peers apply them; `_own` if both are equal."""
         return self._granted.peers
 
     @cached_property
@@ -890,7 +891,7 @@ class Access:
         return self._granted.deciding_rules(self._granted.rules, *_ENDPOINTS)
 
     def _creation(self, verb: AccessVerb, topic: str) -> RuleVerdict:
-        """Return the verdict on creating a topic, which comes before an endpoint for ``verb``."""
+        """Return the verdict on creating a topic, the step before an endpoint for ``verb``."""
         if not self._traits.asks_both_directions:
             return self._either.ask_topic(topic)
         directions = sorted(_ENDPOINTS, key=lambda endpoint: endpoint is not verb)
@@ -974,8 +975,8 @@ class Access:
         Peers check only the direction of the refused participant: read access for its readers,
         write access for its writers.  If the other direction is access-controlled, the refused
         participant itself checks the rights of its peers, which it knows only after the handshake.
-        So it matches endpoints that either side opens later (Cyclone DDS 0.10.2,
-        `q_omg_security_check_remote_writer_permissions` and `.._reader_permissions`).
+        So the refused participant matches endpoints that either side opens later (Cyclone DDS
+        0.10.2, `q_omg_security_check_remote_writer_permissions` and `.._reader_permissions`).
         """
         domain = self._governed.rule
         return (

@@ -5,7 +5,7 @@ Comments, processing instructions and ``<!...>`` are skipped between any two tok
 contains either elements or a single text.
 
 The case of tags, the order of elements, and blanks around texts do not matter.  If an element is
-repeated, the last one counts.  An unknown element or attribute makes the document malformed.
+repeated, its last occurrence counts.  An unknown element or attribute makes the document malformed.
 """
 
 from __future__ import annotations
@@ -47,8 +47,7 @@ _ENTITIES = {"lt": "<", "gt": ">", "amp": "&", "apos": "'", "quot": '"'}
 def read(xml: bytes) -> XmlElement:
     """Return the root of a document; raise `UnreadableError` if Cyclone DDS refuses it.
 
-    Texts are stripped of surrounding blanks and decoded as UTF-8, invalid bytes as
-    surrogates.
+    Texts are stripped of surrounding blanks and decoded as UTF-8; invalid bytes become surrogates.
     """
     return _Reader(xml).root()
 
@@ -243,8 +242,8 @@ def read_governance(xml: bytes) -> Governance:
 def read_permissions(xml: bytes) -> Permissions:
     """Return the permissions in ``xml``; raise `UnreadableError` if Cyclone DDS refuses them.
 
-    Three kinds of content are accepted here, although Cyclone DDS crashes in decisions that use
-    them.  A ``<topic>`` without text is read as "".  A rule without domains is read with a range
+    Three kinds of content are accepted, although Cyclone DDS crashes in decisions that use such
+    content.  A ``<topic>`` without text is read as "".  A rule without domains is read with a range
     that is open at both ends.  A ``<default>`` may be empty.
     """
     dds = _Node.root(xml, _PERMISSIONS, _IGNORED)

@@ -1,4 +1,4 @@
-"""How each vendor reads governance and permissions, and which documents it refuses."""
+"""Governance and permissions as each vendor reads them, and the documents that vendors refuse."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def _read(
 
 @lru_cache(maxsize=8)  # all enclaves of a keystore have the same governance
 def canonical_governance(document: bytes) -> Governance | None:
-    """Return the governance in a document that is byte for byte as sros writes it; otherwise None.
+    """Return the governance in a document that has exactly the bytes that sros writes; else None.
 
     All vendors read such a document alike.
     """
@@ -82,7 +82,7 @@ def canonical_governance(document: bytes) -> Governance | None:
 
 
 def canonical_permissions(permissions: Permissions, document: bytes) -> bool:
-    """Return whether ``document`` is byte for byte what sros writes for ``permissions``.
+    """Return whether ``document`` has exactly the bytes that sros writes for ``permissions``.
 
     All vendors read such a document alike.
     """

@@ -1,4 +1,4 @@
-"""XML elements as vendors' parsers return them, and parsers by the schemas of the standard.
+"""XML elements in the form that vendors' parsers return, and parsers by the standard's schemas.
 
 Source: DDS-Security 1.1, the schemas omg_shared_ca_permissions and omg_shared_ca_governance of
 20170901.
@@ -34,7 +34,7 @@ def decoded(text: str) -> str:
 
 
 class UnreadableError(Exception):
-    """The reason why a vendor does not accept a document.
+    """Raised with the reason that a vendor does not accept a document.
 
     ``missing`` says that content is missing from the document, which makes some releases crash
     (`VendorTraits.crashes_on_missing_content`).
@@ -136,13 +136,13 @@ _EVERYWHERE = "{http://www.w3.org/2001/XMLSchema-instance}"
 
 
 def read_permissions(xml: bytes) -> Permissions:
-    """Return the permissions in ``xml``; raise `UnreadableError` if they do not fit the schema."""
+    """Return the permissions in ``xml``; raise `UnreadableError` for an invalid document."""
     _check(_root(xml), "dds", _PERMISSIONS)
     return parse_permissions(xml, "permissions")
 
 
 def read_governance(xml: bytes) -> Governance:
-    """Return the governance in ``xml``; raise `UnreadableError` if it does not fit the schema."""
+    """Return the governance in ``xml``; raise `UnreadableError` for an invalid document."""
     _check(_root(xml), "dds", _GOVERNANCE)
     return parse_governance(xml, "governance")
 

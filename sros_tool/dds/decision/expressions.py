@@ -1,4 +1,4 @@
-"""The topic expressions of vendors: which names they match, as sets and one by one.
+"""The topic expressions of vendors: the set of names that match, and tests of single names.
 
 Vendors read ``[...]`` in an expression either like fnmatch of glibc, or like Cyclone DDS.
 """
@@ -95,8 +95,8 @@ class _FnmatchSets:
         """Return the characters of the set after ``[``, and the index after the set.
 
         After an unknown class or symbol, or a range without an end, the set matches no further
-        character.  An unclosed set is a plain ``[``, but matches nothing if it has such an error
-        before any further ``[``.
+        character.  An unclosed set is a plain ``[``, but the set matches nothing if such an error
+        comes before any further ``[``.
         """
         index = start
         negated = text[index : index + 1] in ("!", "^")
@@ -117,7 +117,7 @@ class _FnmatchSets:
         return _set_of(members, negated), index + 1
 
     def _end_of(self, index: int, *, is_first: bool) -> tuple[bool, bool]:
-        """Return whether a set is closed after ``index``; if not, whether its ``[`` is a plain one.
+        """Return whether a set is closed after ``index``, and if not, whether its ``[`` is plain.
 
         Results are cached, because many unclosed sets would otherwise take quadratic time.
         """
@@ -152,7 +152,7 @@ def _set_of(members: list[Letters], negated: bool) -> Letters:
 
 
 def _token(text: str, index: int) -> tuple[Letters | None, bool, int]:
-    """Return the characters that a token of a set stands for.
+    """Return the characters for which a token of a set stands.
 
     Also returns whether the token is a range, and the index after the token.  The characters are
     None if glibc does not know the token.
@@ -171,9 +171,9 @@ def _token(text: str, index: int) -> tuple[Letters | None, bool, int]:
 
 
 def _member(text: str, index: int) -> tuple[str | None, int]:
-    """Return one character of a set, also one written as ``[.a.]``, and the index after it.
+    """Return a character of a set, written as itself or as ``[.a.]``, and the index after it.
 
-    The character is None if the text has ended or ``[.`` does not enclose one character.
+    The character is None if the text has ended or ``[.`` does not enclose a single character.
     """
     if text[index : index + 2] != "[.":
         return (text[index] if index < len(text) else None), index + 1
@@ -184,7 +184,7 @@ def _member(text: str, index: int) -> tuple[str | None, int]:
 
 
 def _cyclone_set(text: str, start: int) -> tuple[Letters, int]:
-    """Return the characters of the set after ``[``, and the index after it (Cyclone DDS 0.10).
+    """Return the characters of the set after ``[``, and the index after the set (Cyclone DDS 0.10).
 
     The loop of Cyclone DDS ends only after it has read the closing bracket as a member, which can
     also begin a range: ``[ab]`` also matches ``]``, and ``[ab]-x`` is one set with the range from
@@ -213,14 +213,14 @@ def _cyclone_set(text: str, start: int) -> tuple[Letters, int]:
 
 
 _Matcher = Callable[[str], object]
-"""A function of a name, with a truthy result if the name matches."""
+"""A function that returns a truthy value if a name matches."""
 
 _BEFORE_SPECIAL = re.compile(r"[^*?\[]*")
 
 
 @lru_cache(maxsize=65536)
 def _matcher(style: Style, expression: str) -> _Matcher | None:
-    """Return a function that tells whether a name matches ``expression``.
+    """Return a function that returns whether a name matches ``expression``.
 
     The result is None for an expression without wildcards, which matches only its own text.
     """
@@ -238,7 +238,7 @@ def _matcher(style: Style, expression: str) -> _Matcher | None:
 def _patterns(style: Style, expression: str) -> Iterable[str]:
     """Return a regular expression for each character of an expression, and "" for ``*``.
 
-    Vendors differ only in how they read sets of characters.
+    Vendors differ only in sets of characters.
     """
     if "[" in expression:
         pieces = _pieces_of(style, expression)
@@ -247,10 +247,10 @@ def _patterns(style: Style, expression: str) -> Iterable[str]:
 
 
 def _joined_regex(segments: list[str]) -> str:
-    """Return one regular expression for parts of an expression that ``*`` separates.
+    """Return a single regular expression for the parts of an expression between ``*``.
 
-    Each part matches a fixed number of characters, so its first match is as good as a later one.
-    The atomic groups try only the first match; otherwise many stars would take exponential time.
+    A part matches a fixed number of characters, so its first match is as good as a later match. The
+    atomic groups try only the first match; otherwise many stars would take exponential time.
     """
     first, *rest = segments
     if not rest:
@@ -268,8 +268,8 @@ def matches(style: Style, expression: str, name: str) -> bool:
 class ExpressionIndex:
     """An index of a list of expressions that finds the expressions matching a name.
 
-    An expression without wildcards is found by the whole name, any other by the text before its
-    first wildcard.  So a search in thousands of expressions takes little longer than one
+    An expression without wildcards is found by the whole name, another expression by the text
+    before its first wildcard.  So a search in thousands of expressions takes little longer than one
     comparison.
     """
 

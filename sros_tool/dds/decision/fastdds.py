@@ -4,8 +4,8 @@ The parser accepts much that XML forbids: ``--`` in a comment, a lone ``&``, con
 ``]]>`` in a text, a second root.  The parser works on bytes, and ignores declared encodings,
 namespaces and entities.
 
-Fast DDS demands the elements in order, keeps blanks in texts, and accepts one spelling of a
-keyword.  It ignores content after the last expected element.
+Fast DDS demands the elements in order, keeps blanks in texts, accepts only one spelling of a
+keyword, and ignores content after the last expected element.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _REFERENCE = re.compile("&(?:#x?([^;]*)|(quot|amp|apos|lt|gt));")
 def read(xml: bytes) -> XmlElement:
     """Return the first element of a document; raise `UnreadableError` if TinyXML-2 refuses it.
 
-    A text is decoded as UTF-8, invalid bytes as surrogates.
+    A text is decoded as UTF-8; invalid bytes become surrogates.
     """
     return _Reader(xml).root()
 
@@ -234,7 +234,7 @@ def _children_named(parent: XmlElement, name: str) -> list[XmlElement]:
 
 
 class _Sequence:
-    """The child elements of an element, for reading them one after another."""
+    """The child elements of an element, to be read in order."""
 
     def __init__(self, element: XmlElement) -> None:
         self._name = element.name
@@ -295,7 +295,7 @@ def _read_first_text(element: XmlElement) -> str:
     """Return the text of a number or flag, which must be the first node of the element.
 
     Raises:
-        UnreadableError: the first node is not text; even a comment is refused.
+        UnreadableError: the first node is not text, but for instance a comment.
     """
     first = element.children[0] if element.children else None
     if not isinstance(first, str):
@@ -311,7 +311,7 @@ def _read_number(element: XmlElement) -> int:
 
 
 def _integer(match: re.Match[str]) -> int:
-    """Return a number as sscanf reads it: larger ones become the largest 64-bit number."""
+    """Return a number as sscanf reads it: too large numbers become the largest 64-bit number."""
     if match[1]:
         return min(int(match[1], 16), 2**64 - 1)
     digits = match[2].lstrip("+-").lstrip("0")

@@ -1,4 +1,4 @@
-"""Whether a grant applies to the subject of a certificate, and when it is valid, by vendor.
+"""The subjects of certificates to which a grant applies, and the dates of a grant, by vendor.
 
 The subject of a certificate is given as the RFC 2253 text that OpenSSL and
 `sros_tool.pki.certificates.subject_text` print, with the most specific attribute first.
@@ -21,7 +21,7 @@ _MOST_PARTS = 20  # Cyclone DDS refuses a grant whose subject has more parts
 
 
 class ComparisonCrash(Exception):  # noqa: N818
-    """The vendor's process crashes when it compares these two subjects."""
+    """Raised if the vendor's process crashes when it compares two subjects."""
 
 
 def same_subject(rule: Subjects, granted_subject: str, certified_subject: str) -> bool:
@@ -39,7 +39,7 @@ def other_fitting_enclaves(
     """Map an enclave to the other enclaves whose permissions also fit the enclave's certificate.
 
     ``certified`` maps enclaves to the subjects of their certificates, ``granted`` to the subjects
-    of their grants.  Enclaves without such others are left out.
+    of their grants. Enclaves for which no other permissions fit are left out.
     """
     plain = _PLAIN_PARTS.get(traits.subjects)
     if plain is None:  # the other rules compare the whole subject
@@ -87,11 +87,10 @@ def _same_attributes(granted_subject: str, certified_subject: str) -> bool:
 
 
 def _same_parts(granted_subject: str, certified_subject: str) -> bool:
-    """Return whether two subjects have the same parts between commas, without blanks around parts.
+    """Return whether two subjects have equal parts between commas, ignoring blanks around parts.
 
-    Escaped commas split as well.  A part of less than three bytes keeps some of its blanks.  Text
-    after an empty part is ignored.  Source: Fast DDS 2.9.1, Permissions.cpp
-    (rfc2253_string_compare).
+    Escaped commas split as well.  A part of less than three bytes keeps some blanks.  Text after an
+    empty part is ignored.  Source: Fast DDS 2.9.1, Permissions.cpp (rfc2253_string_compare).
     """
     ours, theirs = granted_subject.encode(), certified_subject.encode(errors="surrogateescape")
     our_start = their_start = 0
@@ -105,10 +104,10 @@ def _same_parts(granted_subject: str, certified_subject: str) -> bool:
 
 
 def _trimmed(text: bytes, start: int, end: int) -> bytes:
-    """Return ``text[start:end]`` without blanks, as far as Fast DDS 2.9.1 removes them.
+    """Return ``text[start:end]`` with blanks at both ends removed as by Fast DDS 2.9.1.
 
-    Removal on one side stops before only one byte is left.  In a shorter part, it runs over the end
-    of the part.
+    Removal on one side stops before only one byte is left; in a shorter part, removal continues
+    after the end of the part.
     """
     last = end - 1
     try:
@@ -133,7 +132,7 @@ _BEFORE = {
     wanted: re.compile(rf'(?:\\.|"(?:\\.|[^"\\])*(?:"|\\?\Z)|[^"\\{wanted}])*', re.DOTALL)
     for wanted in "=,"
 }
-"""Maps a character to a pattern for the text before its first occurrence.
+"""Character → pattern for the text before the character's first occurrence.
 
 Occurrences in escapes and quotes do not count.
 """
@@ -235,7 +234,7 @@ _PLAIN_PARTS: dict[Subjects, Callable[[str], str]] = {
     Subjects.SUBSET: str,
     Subjects.TRIMMED_SUBSET: _without_blanks,
 }
-"""Maps a rule that splits subjects to the function that normalizes a part."""
+"""Rule that splits subjects → function that normalizes a part."""
 
 _COMPARE: dict[Subjects, Callable[[str, str], bool]] = {
     Subjects.EXACT: _same_attributes,
@@ -263,10 +262,10 @@ _FARTHEST = timedelta(hours=12)
 
 @lru_cache(maxsize=64)  # the enclaves of a keystore share most of their dates
 def read_date(rule: DateRule, text: str, zone: tzinfo) -> float | None:
-    """Return the time that a date means, in seconds since 1970; None if it is malformed.
+    """Return the time of a date, in seconds since 1970; None for a malformed date.
 
     ``zone`` is the host's time zone.  A date that Cyclone DDS cannot read becomes minus infinity,
-    as a time that has always passed.
+    so that it has always passed.
     """
     match rule:
         case DateRule.LOCAL:

@@ -1,4 +1,4 @@
-"""The vendors of DDS Security, and how their decisions differ, as data.
+"""The vendors of DDS Security, and the differences of their decisions, as data.
 
 The decisions of Fast DDS 2.6.12, 2.9.1, 2.14.5, 2.14.6, 3.2.5 and 3.6.2 and Cyclone DDS 0.10.2,
 0.10.5 and 11.0.1 were tested with the real libraries; Fast DDS 2.14.5 and 2.14.6 decide alike, and
@@ -26,7 +26,7 @@ class Subjects(Enum):
     """The rule by which a grant's subject matches the subject of a certificate."""
 
     EXACT = auto()
-    """The same attributes in the same order; spaces around them do not count."""
+    """The same attributes in the same order; spaces around attributes do not count."""
     WHOLE_ATTRIBUTES = auto()
     """The same texts between commas, even escaped ones; spaces are ignored (Fast DDS 2.6, 2.9)."""
     ANY_ORDER = auto()
@@ -41,7 +41,7 @@ class Subjects(Enum):
 
 
 class DateRule(Enum):
-    """How a vendor reads the dates in a grant."""
+    """The rule by which a vendor reads the dates in a grant."""
 
     STANDARD = auto()
     """A date has the offset that it states, or is in UTC."""
@@ -73,7 +73,7 @@ class TopicNames(Enum):
 
 
 class DenyPartitions(Enum):
-    """Which partitions a deny rule must name to apply to an endpoint."""
+    """The partitions that a deny rule must name to apply to an endpoint."""
 
     ANY_OR_ALL = auto()
     """One of the endpoint's partitions; a rule without partitions applies to all endpoints."""
@@ -84,7 +84,7 @@ class DenyPartitions(Enum):
 
 
 class Signers(Enum):
-    """Who may sign governance and permissions."""
+    """The signers of governance and permissions that a vendor accepts."""
 
     AUTHORITY = auto()
     """The permissions CA itself, whose certificate is in the message."""
@@ -127,7 +127,7 @@ class DocumentReader(Enum):
 class VendorTraits:
     """The names of one vendor, and its decisions where vendors differ.
 
-    The default of a field is what the standard demands.
+    The default of a field is the behavior that the standard demands.
     """
 
     title: str
@@ -150,14 +150,14 @@ class VendorTraits:
     drops_expired: bool = False
     """Running participants lose each other when the certificate of one of them expires.
 
-    Since Fast DDS 2.6.12 and 3.2.5 (CVE-2025-67108); with 2.14.6 and 3.6.2, they stay connected
-    (all tested).
+    This is so since Fast DDS 2.6.12 and 3.2.5 (CVE-2025-67108); with 2.14.6 and 3.6.2, participants
+    stay connected (all tested).
     """
     expiry_overflows: bool = False
     """A certificate that expires more than 292 years from now counts as expired.
 
-    The expiry time in nanoseconds overflows 64 bits.  It wraps around: from 584 years on, the
-    certificate is valid again, and so on.
+    The expiry time in nanoseconds overflows 64 bits and wraps around, so that the certificate is
+    valid again from 584 years on, and so on.
     """
     crashes_on_empty_subject: bool = False
     """A certificate with an empty subject crashes its own process and the processes of peers."""
@@ -166,7 +166,7 @@ class VendorTraits:
     """If the first grant for a subject is not valid now, a later grant is used."""
     open_range: OpenRange = OpenRange.OPEN
     filters_own_domain: bool = True
-    """The participant itself ignores its rules for other domains, as all peers do."""
+    """The participant itself ignores its rules for other domains; peers always do."""
     relays_count_for_readers: bool = False
     """For peers, the ``<relay>`` of a rule also applies to a reader, after the ``<subscribe>``."""
     topic_decides: bool = False
@@ -205,8 +205,9 @@ class VendorTraits:
     controls_unauthenticated: bool = True
     """Access control applies to participants without an identity.
 
-    If False, access control does not apply to them, but topics with enable_discovery_protection are
-    hidden from them, even if discovery_protection_kind is NONE (Cyclone DDS 0.10.2).
+    If False, access control does not apply to these participants, but topics with
+    enable_discovery_protection are hidden from them, even if discovery_protection_kind is NONE
+    (Cyclone DDS 0.10.2).
     """
     refuses_open_rtps: bool = False
     """RTPS protection is refused in a governance that allows unauthenticated participants."""
@@ -294,8 +295,8 @@ class Vendor(StrEnum):
     """A DDS implementation, or the specification itself.
 
     To add a vendor that decides by the standard, add an entry here: options, texts and comparisons
-    use all entries.  `sros_tool.runtime.rmw` maps RMWs to vendors.  An option that names a product
-    without a version means the first entry of this product.
+    use all entries.  `sros_tool.runtime.rmw` maps RMWs to vendors.  In options, a product without a
+    version means the first entry of this product.
     """
 
     traits: VendorTraits
@@ -378,7 +379,7 @@ class Vendor(StrEnum):
 
     @property
     def documented_only(self) -> bool:
-        """Whether the vendor was never tested, and is assumed to follow the standard."""
+        """Whether the vendor was never tested, so that the standard's rules are assumed."""
         return not self.traits.tested and self is not Vendor.STANDARD
 
 
@@ -391,7 +392,7 @@ ZENOH = "zenoh"
 DEFAULT_RELEASES = tuple({vendor.traits.product: vendor for vendor in reversed(TESTED)}.values())[
     ::-1
 ]
-"""The release of each tested product that an option without a version means."""
+"""The release of each tested product that options without a version mean."""
 
 
 def _releases(product: str) -> tuple[Vendor, ...]:
@@ -411,7 +412,7 @@ WHOLE_PRODUCTS = {
     )
     for vendor in DEFAULT_RELEASES
 }
-"""Maps a word for all tested releases of a product, such as ``all-fastdds``, to these releases."""
+"""Word for all tested releases of a product, such as ``all-fastdds`` → these releases."""
 
 
 def words_of(vendors: Iterable[Vendor]) -> list[str]:
@@ -428,8 +429,9 @@ def words_of(vendors: Iterable[Vendor]) -> list[str]:
 def joined_titles(titles: Iterable[str]) -> list[str]:
     """Return titles of vendors, with the releases of a product joined into one title.
 
-    If all tested releases are there, the title is the name of the product; otherwise it names them,
-    such as ``Fast DDS 2.14/3.6``.  Other texts, such as ``Zenoh``, stay as they are.
+    If all tested releases are present, the title is the name of the product; otherwise the title
+    names the releases, such as ``Fast DDS 2.14/3.6``.  Other texts, such as ``Zenoh``, stay as they
+    are.
     """
     of_title = {vendor.title: vendor for vendor in TESTED}
     releases: dict[str, list[Vendor]] = {}
