@@ -20,6 +20,7 @@ from sros_tool.checks.keystores.opened import Circumstances
 from sros_tool.cli.common import chosen_enclaves
 from sros_tool.dds.domains import DomainSet
 from sros_tool.errors import DocumentError, KeystoreError, SrosError
+from sros_tool.files import policies_dir
 from sros_tool.keystore.delivery.archive import unpack
 from sros_tool.keystore.delivery.export import (
     ExportSelection,
@@ -335,6 +336,22 @@ def test_several_enclaves_are_exported_completely_or_not_at_all(
     with pytest.raises(KeystoreError, match="would not run"):
         distribute(OpenedKeystore(fleet), ["/arm/camera", "/base"], tmp_path / "out", now=NOW)
     assert set(snapshot(tmp_path)) == set(before) - {"ks/enclaves/base/permissions.p7s"}
+
+
+def test_an_archive_of_another_kind_is_refused(fleet: Path, tmp_path: Path) -> None:
+    """A folder robot.tar would be no archive, and a folder "-" is not standard output."""
+    policy = policies_dir() / "talker_listener.xml"
+    (robots := tmp_path / "fleet.toml").write_text("[robots]\nr1 = {}\n")
+    sros("generate_artifacts", "-k", fleet, "-p", policy, "--fleet", robots).ok()
+    before = snapshot(tmp_path)
+    for words, said in (
+        (("distribute_key", fleet, "--all", "robot.tar"), "Name an archive FILE.tar.gz, or a fol"),
+        (("fleet", "publish", fleet, "pub.tgz"), "'pub.tgz' would become a folder, not an archive"),
+        (("fleet", "publish", fleet, "-"), "Releases are published in a folder"),
+    ):
+        ended = sros(*words, cwd=tmp_path)
+        assert ended.status == 2 and said in ended.err, ended
+    assert snapshot(tmp_path) == before
 
 
 def test_folder_archive_and_pipe_hold_the_same(fleet: Path, tmp_path: Path) -> None:

@@ -8,18 +8,27 @@ import io
 import tarfile
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
 from typing import NamedTuple, Self
 
-from sros_tool.errors import DocumentError
+from sros_tool.errors import DocumentError, UsageError
 from sros_tool.keystore.layout import folder_mode
 
 SUFFIXES = (".tar.gz", ".tgz")
+_OTHER_SUFFIXES = (".tar", ".tar.xz", ".txz", ".tar.bz2", ".tbz2", ".tar.zst", ".zip", ".7z")
 MAX_UNPACKED = 40 * 1024 * 1024
 MAX_MEMBER = 17 * 1024 * 1024
 """Maximum size in bytes of the unpacked content of an answer, and of a file in any archive.
 
 This leaves room for the largest Zenoh configuration that sros reads, with its signed document.
 """
+
+
+def refuse_archive_name(folder: Path, remedy: str) -> None:
+    """Raise `UsageError` if a new folder would have the name of an archive, or `-`."""
+    name = folder.name
+    if not folder.is_dir() and (name == "-" or name.endswith((*SUFFIXES, *_OTHER_SUFFIXES))):
+        raise UsageError(f"'{folder}' would become a folder, not an archive", "", remedy)
 
 
 class ArchiveLimits(NamedTuple):

@@ -21,7 +21,14 @@ from sros_tool.files import staged_file
 from sros_tool.fleet.robots import robot_of
 from sros_tool.folders import Folder
 from sros_tool.keystore.confirmation import enclave_of
-from sros_tool.keystore.delivery.archive import OF_ONE_ROBOT, SUFFIXES, file_mode, pack, unpack
+from sros_tool.keystore.delivery.archive import (
+    OF_ONE_ROBOT,
+    SUFFIXES,
+    file_mode,
+    pack,
+    refuse_archive_name,
+    unpack,
+)
 from sros_tool.keystore.delivery.robot import check_same_authority
 from sros_tool.keystore.delivery.rollback import (
     ANSWER_AGAIN,
@@ -153,6 +160,7 @@ def distribute(
     if target.name.endswith(SUFFIXES):
         changes = _write_archive(keystore, target, files, now=now, force=force, dry_run=dry_run)
         return Export(target, tuple(names), changes, notes)
+    refuse_archive_name(target, "Name an archive FILE.tar.gz, or a folder without such an ending.")
     changes = _write_folder(keystore, target, files, now=now, force=force, dry_run=dry_run)
     notes += (*_readable_key_notes(target, names), *_notes(keystore, target, names))
     return Export(target, tuple(names), changes, notes)

@@ -30,7 +30,7 @@ from sros_tool.files import remove_file, staged_file
 from sros_tool.fleet.robots import Fleet
 from sros_tool.folders import Folder, make_folders, remove_folders
 from sros_tool.keystore.confirmation import OF_SAME_NUMBER, last_confirmation
-from sros_tool.keystore.delivery.archive import listed_digests
+from sros_tool.keystore.delivery.archive import listed_digests, refuse_archive_name
 from sros_tool.keystore.delivery.export import released_enclave, released_files
 from sros_tool.keystore.delivery.published import (
     BEGIN_AGAIN,
@@ -226,6 +226,7 @@ def publish(
     keystore = OpenedKeystore(root)
     recorded_fleet(keystore)
     checked_fleet(keystore)
+    refuse_archive_name(folder, "Releases are published in a folder: name one, such as pub.")
     _check_apart(root, folder)
     if behind := keystore.ledger_file.clock_behind(now):
         raise KeystoreError(
