@@ -66,6 +66,7 @@ from sros_tool.keystore.confirmation import (
 )
 from sros_tool.keystore.delivery.archive import listed_digests
 from sros_tool.keystore.delivery.release import Release, sealed_robot
+from sros_tool.keystore.expiry import Lifetime, Threshold, read_credentials
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     CRL_FILE,
@@ -79,7 +80,7 @@ from sros_tool.keystore.layout import (
     enclave_path,
     search_enclaves,
 )
-from sros_tool.keystore.reader import read_certificate
+from sros_tool.keystore.reader import OpenedKeystore, read_certificate
 from sros_tool.keystore.transaction import recover_keystore
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import (
@@ -1054,18 +1055,32 @@ def _write_message(inbox: Path, robot: str, message: bytes) -> None:
 _NEW_KEYS = "new-keys"
 
 
-def _is_due(file: Path, now: datetime) -> bool:
-    """Return whether at most a third of the life of the certificate in ``file`` is left.
+_NEW_KEY_AFTER = 0.6
+"""The elapsed fraction of a validity after which a robot asks for a new key.
+
+`sros renew --all-expiring soon` renews with the present key after two thirds at the earliest, and
+`sros fleet collect` signs requests after half.
+"""
+
+
+def _is_due(keystore: OpenedKeystore, name: str, now: datetime, *, new_key: bool) -> bool:
+    """Return whether the robot asks for the renewal of an enclave.
 
     A file is written only when it changes, so its modification time is when the robot got the
-    certificate.
+    certificate.  With ``new_key``, permissions count, too: with them, the keystore machine would
+    renew the certificate of the present key.
 
     Raises:
         SrosError: the certificate cannot be read.
     """
-    validity = validity_of(read_certificate(file))
-    here_since = time_of_file(file.stat().st_mtime)
-    return now >= validity.not_after - validity.lifetime(here_since) / 3
+    file = keystore.folder(name) / CERTIFICATE_FILE
+    validity, here_since = validity_of(read_certificate(file)), time_of_file(file.stat().st_mtime)
+    if not new_key:
+        return now >= validity.not_after - validity.lifetime(here_since) / 3
+    lifetime = Lifetime(name, validity, validity, here_since)
+    with suppress(SrosError):  # what is wrong with permissions is reported elsewhere
+        lifetime = read_credentials(keystore, name).lifetime()
+    return lifetime.due(Threshold(elapsed=_NEW_KEY_AFTER), now)
 
 
 def _enclave_key(folder: Path, name: str, secrets: Secrets) -> PrivateKey:
@@ -1097,7 +1112,7 @@ class Renewals(NamedTuple):
 def _renewals(
     folder: Path, names: Iterable[str], *, now: datetime, new_key: bool, secrets: Secrets
 ) -> Renewals:
-    """Return requests for the enclaves ``names`` whose certificates expire.
+    """Return requests for the enclaves ``names`` that are due for renewal.
 
     With ``new_key``, the requests are for new keys, which wait next to the current keys until their
     certificates are installed; a key on a token stays.  ``secrets`` is asked for the PIN of a
@@ -1106,12 +1121,14 @@ def _renewals(
     requests: list[str] = []
     problems: list[str] = []
     with_new_keys: list[str] = []
+    keystore = OpenedKeystore(folder)
     for name in names:
-        place = enclave_path(folder, name)
+        is_new = new_key and (enclave_path(folder, name) / KEY_FILE).exists()
         try:
-            if not _is_due(place / CERTIFICATE_FILE, now) or len(requests) == MOST_REQUESTS - 1:
+            is_due = _is_due(keystore, name, now, new_key=is_new)
+            if not is_due or len(requests) == MOST_REQUESTS - 1:
                 continue
-            if new_key and (place / KEY_FILE).exists():
+            if is_new:
                 with_new_keys.append(name)
                 continue
             requests.append(make_request(_enclave_key(folder, name, secrets), name).decode())

@@ -85,7 +85,10 @@ def agent() -> None:
     help="CA certificates of the servers. [default: the system's]",
 )  # fmt: skip
 @click.option(
-    "--new-key", is_flag=True, help="Make a new key for each renewal. [default: the key stays]"
+    "--new-key", is_flag=True,
+    help=(
+        "Make a new key for each renewal, which the robot asks for before `sros renew "
+        "--all-expiring soon` renews the present one. [default: the key stays]"),
 )
 @click.option(
     "--restart", is_flag=True,
@@ -247,8 +250,8 @@ def _run(folder: Path, once: bool, interval: str, restarted: bool, as_json: bool
 
     A round fetches the robot's release, verifies it, and installs it whole or not at all. It
     restarts units, or reports the restarts that are due, and checks the running processes. It asks
-    for renewal in the last third of a certificate's validity, and sends a signed report to the
-    keystore machine.
+    for renewal in the last third of a certificate's validity (with `new_key`, after 60 % of the
+    validity of certificate or permissions), and sends a signed report to the keystore machine.
     If one step fails, the others still run, and the next round tries the failed step again.
 
     Example:

@@ -33,9 +33,10 @@ from sros_tool.keystore.confirmation import (
     parse_confirmation,
 )
 from sros_tool.keystore.delivery.release import Release
+from sros_tool.keystore.expiry import read_credentials
 from sros_tool.keystore.issuing.keyring import no_secrets
 from sros_tool.keystore.layout import CRL_FILE, KEY_FILE, REQUIRED_FILES
-from sros_tool.keystore.reader import read_certificate
+from sros_tool.keystore.reader import OpenedKeystore, read_certificate
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import load_certificates, load_request, validity_of
 from sros_tool.pki.crl import load_crl, load_crls, sign_crl
@@ -52,6 +53,7 @@ from tests.agent.releases import NAMES, Home, files_of, moment, release_of
 from tests.agent.test_install import content, has
 from tests.keystore.test_transaction import DIED, in_child, run_out_of_space
 from tests.support.children import LONG
+from tests.agent import published
 from tests.support.harness import copy_of, sros
 from tests.support.long_form import few_steps
 
@@ -1006,6 +1008,21 @@ def test_a_new_key_waits_beside_the_present_one(r1: Robot) -> None:
     assert keys == {name: (r1.folder / f"enclaves{name}/key.pem").read_bytes() for name in NAMES}
     waiting = list((r1.folder / ".agent/new-keys").iterdir())
     assert len(waiting) == 3 and all(path.stat().st_mode & 0o777 == 0o600 for path in waiting)
+
+
+def test_a_new_key_is_asked_for_before_the_keystore_machine_renews_the_present_one(
+    made_publisher: published.Home, tmp_path: Path
+) -> None:
+    """With the template production, its timer issues certificates again after 150 of 365 days."""
+    folder = tmp_path / "robot"
+    sros("distribute_key", made_publisher.root, "--robot", "r1", folder).ok()
+    robot = Robot(folder, tmp_path / "inbox")
+    permissions = read_credentials(OpenedKeystore(folder), "/r1/base").lifetime().permissions
+    made, day = permissions.not_before + BACKDATE, timedelta(days=1)
+    assert permissions.expires_soon_from() == made + 150 * day
+    for new_key, expected in ((True, [0, 1, 1]), (False, [0, 0, 0])):
+        robot.settings = replace(robot.settings, new_key=new_key)
+        assert [robot.round(made + days * day).requests for days in (107, 109, 150)] == expected
 
 
 # ── death and full disks ───────────────────────────────────────────────────────────────────

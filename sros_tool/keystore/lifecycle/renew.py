@@ -229,8 +229,8 @@ class _Renewer:
             raise KeystoreError(
                 f"the key of enclave {name} is not in this keystore",
                 "It was generated on the robot and stays there, so no new key is generated here.",
-                "Create a new request on the robot with `sros create_request`, and sign it here "
-                "with `sros sign_request --renew`.",
+                "Remove the enclave's folder on the robot, create a new request there with "
+                "`sros create_request`, and sign it here with `sros sign_request --renew`.",
             )
 
 
