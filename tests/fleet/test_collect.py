@@ -353,7 +353,7 @@ def test_two_computers_that_are_alike_are_seen_by_their_starts(home: Home) -> No
         assert home.of("r1").outcome == "kept"
         status = fleet_status(OpenedKeystore(home.root), ["r1"])
         (r1,) = status.robots
-        assert any("two computers" in text for text in r1.problems or ()) == is_seen, boot
+        assert any("Two computers" in text for text in r1.problems or ()) == is_seen, boot
         assert (status.unconfirmed == ("r1",)) == is_seen, "no stage of a rotation"
         assert not (is_seen and r1.settled)
     later = NOW + timedelta(days=2)
