@@ -85,10 +85,12 @@ def agent() -> None:
     help="CA certificates of the servers. [default: the system's]",
 )  # fmt: skip
 @click.option(
-    "--new-key", is_flag=True,
+    "--new-key",
+    is_flag=True,
     help=(
         "Make a new key for each renewal, which the robot asks for before `sros renew "
-        "--all-expiring soon` renews the present one. [default: the key stays]"),
+        "--all-expiring soon` renews the present one. [default: the key stays]"
+    ),
 )
 @click.option(
     "--restart", is_flag=True,

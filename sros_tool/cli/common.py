@@ -802,6 +802,21 @@ def change_options(*, dry_run: bool, allow_refusal: Sequence[Vendor] = ()) -> Ch
     }
 
 
+def try_given_passphrase(root: Path, keyring: Keyring) -> None:
+    """Open the CA keys of a keystore if a passphrase is given, although nothing is to be signed.
+
+    So a timer with a wrong passphrase fails today, and not when files are about to expire.
+
+    Raises:
+        SrosError: a key cannot be opened.
+    """
+    from sros_tool.keystore.reader import OpenedKeystore
+
+    if any(map(_taken.get, (_PASSPHRASE, _PASSPHRASE_FILE))):
+        keystore = OpenedKeystore(root)
+        keyring.try_files(keystore, keystore.template)
+
+
 def secrets() -> Callable[[str], str]:
     """Return a secrets handler for PINs of tokens: environment or prompt."""
     return _Secrets(new=False)

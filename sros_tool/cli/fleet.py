@@ -43,6 +43,7 @@ from sros_tool.cli.common import (
     robot_option,
     root_and_file,
     save,
+    try_given_passphrase,
 )
 from sros_tool.cli.program import VerbGroup
 from sros_tool.errors import NOT_DONE, Note, SrosError, UsageError
@@ -312,7 +313,7 @@ def _collect(
     """
     from sros_tool.keystore.delivery.collect import PublishedAnswers, collect
 
-    moment = now()
+    moment, keys = now(), keyring()
     root, inbox = root_and_file(arguments, "fleet collect takes a keystore and one folder")
     with progress("collecting"):
         collected = collect(
@@ -321,7 +322,7 @@ def _collect(
             now=moment,
             restored=restored,
             allow_refusal=allow_refusal,
-            keyring=keyring(),
+            keyring=keys,
             dry_run=dry_run,
         )
     published = None
@@ -332,7 +333,7 @@ def _collect(
         try:
             with progress("publishing"):
                 moment = now()
-                published = publish(root, folder, now=moment, keyring=keyring(), dry_run=dry_run)
+                published = publish(root, folder, now=moment, keyring=keys, dry_run=dry_run)
             new, refused = published.names("published"), published.names("refused")
             collected = collected._replace(published=PublishedAnswers(folder, new, refused))
         except (SrosError, OSError) as error:
@@ -363,6 +364,7 @@ def _collect(
         if not any(robot.requests for robot in collected.robots):  # their lines name the reason
             echo(f"not signed: {collected.not_signed}", err=True)
         return NOT_DONE
+    try_given_passphrase(root, keys)
     is_published = published is None or published.is_complete(moment)
     return 0 if collected.complete and is_published else 1
 

@@ -18,7 +18,7 @@ from sros_tool.keystore.layout import list_enclaves
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.template import load_template
-from tests.support.harness import sros
+from tests.support.harness import policy_text, publish, sros
 
 NOW = datetime.now(UTC)
 RIGHT = "the right passphrase"
@@ -169,6 +169,28 @@ def test_the_program_takes_secrets_from_the_environment_or_a_file(tmp_path: Path
     assert "(mode 0644)" in sros("units", root, tmp_path / "units", *words).ok().err
     file.chmod(0o600)
     assert "mode" not in sros("create_enclave", root, "/b", env=by_file).ok().err
+
+
+def test_a_timer_finds_a_wrong_passphrase_before_something_is_to_sign(tmp_path: Path) -> None:
+    root, file = tmp_path / "ks", tmp_path / "passphrase"
+    file.write_text(RIGHT)
+    file.chmod(0o600)
+    env = {"SROS_CA_PASSPHRASE": None, "SROS_CA_PASSPHRASE_FILE": str(file)}
+    (tmp_path / "policy.xml").write_text(policy_text({"/{robot}": publish("x")}))
+    (tmp_path / "fleet.toml").write_text("[robots]\na = {}\n")
+    (tmp_path / "inbox").mkdir()
+    sros("create_keystore", root, "--template", "production", "--encrypt-ca-keys", env=env).ok()
+    words = ("-p", tmp_path / "policy.xml", "--fleet", tmp_path / "fleet.toml")
+    sros("generate_artifacts", "-k", root, *words, env=env).ok()
+    timers = (("renew", root, "--all-expiring", "soon"), ("fleet", "collect", root, "inbox"))
+    for timer in timers:
+        sros(*timer, env=env, cwd=tmp_path).ok()
+    file.write_text("another passphrase")
+    for timer in timers:
+        ended = sros(*timer, env=env, cwd=tmp_path)
+        assert (ended.status, "The passphrase is wrong." in ended.err) == (2, True), ended
+        # Without a passphrase, keys may be elsewhere until something is to sign.
+        sros(*timer, env=env | {"SROS_CA_PASSPHRASE_FILE": None}, cwd=tmp_path).ok()
 
 
 @pytest.mark.parametrize(

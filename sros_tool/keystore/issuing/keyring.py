@@ -132,6 +132,17 @@ class Keyring:
         except (KeystoreError, PkiError) as error:
             raise KeystoreError(error.what, error.why, error.remedy) from error
 
+    def try_files(self, keystore: OpenedKeystore, template: Template) -> None:
+        """Open the key files of the CAs, to find a wrong passphrase before something is to sign.
+
+        Raises:
+            KeystoreError: a key file is missing, or cannot be opened.
+        """
+        for role in ROLES if template.separate_authorities else (IDENTITY,):
+            place = self.place(role, template)
+            if not (is_token_uri(place) or is_ca_service(place)):
+                self.open(keystore, role, template)
+
     def make(
         self,
         transaction: Transaction,
