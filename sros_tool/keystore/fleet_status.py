@@ -386,6 +386,8 @@ class RobotStatus:
             return "publish"
         if self.lacks_ca and self.state not in (State.BROKEN, *_SUSPICIOUS):
             return "deliver"
+        if self.state is State.RESTART and self.reads_copy:
+            return "look at its `from`"  # the state says the restart
         if self.state in _TO_DO and not self.is_ahead:
             return _TO_DO[self.state]
         if self.state is State.UNUSABLE:

@@ -49,11 +49,11 @@ from sros_tool.runtime.processes import (
     UnseenProcess,
 )
 from sros_tool.validity import BACKDATE, Window
+from tests.agent import published
 from tests.agent.releases import NAMES, Home, files_of, moment, release_of
 from tests.agent.test_install import content, has
 from tests.keystore.test_transaction import DIED, in_child, run_out_of_space
 from tests.support.children import LONG
-from tests.agent import published
 from tests.support.harness import copy_of, sros
 from tests.support.long_form import few_steps
 

@@ -1127,6 +1127,17 @@ def test_links_and_pipes_in_a_publishing_folder_lead_nowhere(publisher: Home, at
     publisher.publish()
 
 
+def test_metadata_that_cannot_be_read_is_not_called_that_of_another(
+    publisher: Home, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(_folder: Folder, path: str, **_: object) -> bytes:
+        raise PermissionError(errno.EACCES, "Permission denied", path)
+
+    monkeypatch.setattr(Folder, "read", refuse)
+    with pytest.raises(KeystoreError, match=r"the metadata in '.*' cannot be read. .* denied"):
+        read_present(publisher.pub, Roots())
+
+
 def test_the_folder_of_another_keystore(publisher: Home) -> None:
     forget_publishing(publisher.root)
     before = snapshot(publisher.folder)

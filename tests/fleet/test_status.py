@@ -296,6 +296,10 @@ def test_a_robot_whose_server_has_an_old_copy(problem: str, field: Field) -> Non
     found = field.status()["robots"]["r1"]
     assert (found["state"], found["to_do"]) == ("earlier", "look at its `from`")
     assert found["problems"] == [problem] and field.status()["older"] is None
+    field.deliver("r1")
+    field.send("r1", problems=[problem], release=2, restart=["/r1/base"])
+    found = field.status()["robots"]["r1"]
+    assert (found["state"], found["to_do"]) == ("restart", "look at its `from`")
     assert "was restored" in field.run("fleet", "publish", "ks", "pub", "--restored", status=2).err
 
 

@@ -266,7 +266,12 @@ def read_present(folder: Path, roots: Roots) -> PresentMetadata:
             f"docs/howto/keystore_is_lost.md. If the file is lost, {_without_metadata(folder)}.",
         ) from error
     except OSError as error:
-        raise _foreign_folder_error(folder, f"'{error.filename}': {error.strerror}") from error
+        raise KeystoreError(
+            f"the metadata in '{folder}' cannot be read",
+            f"'{error.filename}': {error.strerror}.",
+            "Give the user who publishes access to the folder and its files. If a file is damaged, "
+            f"{_without_metadata(folder)}.",
+        ) from error
     except (RepositoryError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise _foreign_folder_error(folder, str(error)) from error
 
