@@ -158,7 +158,9 @@ _NEW_AUTHORITY = Fault.CA_EXPIRED.remedy_in_export("").format(root="KEYSTORE")
 """Remedy for an expired CA, which can no longer renew anything."""
 _MOST_LEDGER = 64 * 1024 * 1024
 _MOST_LEDGERS = 2 * _MOST_LEDGER
-"""Maximum number of ledger bytes to read: of one process, and of all processes together."""
+"""Maximum number of ledger bytes to read: of one process, and of all processes of a user."""
+_FIRST_OF_RANGES = 2**16
+"""The first user id that may be one of many of the same person, who has a range (subuid(5))."""
 _LOADED_BY_ZENOH = (IDENTITY_CA_FILE, CERTIFICATE_FILE, KEY_FILE)
 
 
@@ -177,7 +179,7 @@ def _file_findings(
     newer = list(newer_files(process, enclave))
     # If the order is unknown, the process most likely loaded the newer files.
     changed = () if order_unknown(process) else newer
-    loaded = _loaded_files(enclave, changed, process.started, ledgers)
+    loaded = _loaded_files(enclave, changed, process, ledgers)
     if revoked := loaded.revoked:
         yield PROCESS_REVOKED.found(process.label, f"the certificate of {name} was {revoked}")
     elif not enclave.is_there or len(enclave.lacking) == len(_required_files(enclave)):
@@ -288,14 +290,14 @@ class _Loaded:
 
 
 def _loaded_files(
-    enclave: ProcessEnclave, newer_files: Sequence[str], started: datetime, ledgers: _Ledgers
+    enclave: ProcessEnclave, newer_files: Sequence[str], process: Process, ledgers: _Ledgers
 ) -> _Loaded:
     """Return the files that a process loaded; the ledger has files that changed since."""
     windows: dict[str, Window] = {}
     changed = {file.split()[0] for file in newer_files}
     certificate = next(iter(_certificates_in(enclave, CERTIFICATE_FILE)), None)
-    entries, unknown = ledgers.entries(enclave)
-    before = [entry for entry in entries if entry.time <= iso(started)]
+    entries, unknown = ledgers.entries(enclave, process.user)
+    before = [entry for entry in entries if entry.time <= iso(process.started)]
     serial = 0
     if certificate and CERTIFICATE_FILE not in changed:
         serial = certificate.serial_number
@@ -358,14 +360,14 @@ def _revocation_clause(enclave: ProcessEnclave, entries: Sequence[Entry], serial
 class _Ledgers:
     """The ledgers of the keystores that processes name, as far as they are read.
 
-    Any user can start processes that name a ledger of his own, so the bytes of all ledgers together
-    are limited.
+    Any user can start processes that name a ledger of his own, so the bytes of all ledgers of a
+    user's processes are limited.
     """
 
     def __init__(self) -> None:
-        self._left = _MOST_LEDGERS
+        self._read: dict[int, int] = defaultdict(int)
 
-    def entries(self, enclave: ProcessEnclave) -> tuple[Sequence[Entry], str]:
+    def entries(self, enclave: ProcessEnclave, user: int) -> tuple[Sequence[Entry], str]:
         """Return an enclave's entries, and a clause that says why they cannot be read, or ""."""
         if enclave.here is None:
             return (), "its keystore is not at this path here"
@@ -375,10 +377,11 @@ class _Ledgers:
             return (), "its keystore has no ledger"
         if size > _MOST_LEDGER:
             return (), f"the ledger of its keystore has more than {_MOST_LEDGER // 1024**2} MiB"
-        if size > self._left:
+        user = min(user, _FIRST_OF_RANGES)
+        if self._read[user] + size > _MOST_LEDGERS:
             most = _MOST_LEDGERS // 1024**2
-            return (), f"the ledgers that processes name have more than {most} MiB together"
-        self._left -= size
+            return (), f"the ledgers that processes of a user name have more than {most} MiB"
+        self._read[user] += size
         try:
             entries = OpenedKeystore(enclave.here).ledger_with("enclave", enclave.name).entries
         except SrosError as error:

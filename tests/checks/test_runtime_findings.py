@@ -270,19 +270,21 @@ def test_a_process_of_a_revoked_enclave_whose_files_are_gone(bench: Bench) -> No
     assert "runtime.process-revoked" in ids(state)
 
 
-def test_the_ledgers_of_all_processes_together_are_bounded(
+def test_the_ledgers_of_all_processes_of_a_user_are_bounded(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Any user can start a thousand processes that name a large ledger of his own."""
+    """Any user can start a thousand processes that name a large ledger, and hide no one else's."""
     enclave = ProcessEnclave(str(bench.root), "/base", here=bench.root)
     size = (bench.root / "ledger.jsonl").stat().st_size
     monkeypatch.setattr(processes, "_MOST_LEDGERS", 2 * size + 1)
     ledgers = processes._Ledgers()
-    for _ in range(2):
-        entries, unknown = ledgers.entries(enclave)
-        assert entries and not unknown
-    entries, unknown = ledgers.entries(enclave)
-    assert not entries and "the ledgers that processes name have more than" in unknown
+    for user, are_read in (
+        *((1000, True), (1000, True), (1000, False), (1001, True)),
+        *((100_000, True), (100_001, True), (100_002, False)),  # ids of one user's containers
+    ):
+        entries, unknown = ledgers.entries(enclave, user)
+        assert bool(entries) == are_read, user
+        assert ("the ledgers that processes of a user name" in unknown) != are_read
 
 
 @pytest.mark.parametrize(
