@@ -349,7 +349,8 @@ def _other_name_notes(answer: Answer, asked_enclave: AskedEnclave) -> Iterator[N
         return
     if names := likely_names(answer):
         text = f"the enclave may {question.word} {' and '.join(names)}: perhaps that is meant"
-        if len(names) == 1 and question.type != "action":
+        is_moved = {name.rpartition("/")[2] for name in names} == {question.name.rpartition("/")[2]}
+        if len(names) == 1 and is_moved and question.type != "action":
             text += f" ({remapping_clause(question.name, names[0])})"
         yield Note("explain.likely-name", f"{text}.")
     elif asked_enclave.has_peers and not is_of_every_node(question.name):

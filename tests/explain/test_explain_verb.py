@@ -725,9 +725,9 @@ def test_a_change_is_for_the_node_that_the_permissions_are_for(whole: Path) -> N
     own = f"{node.ns.rstrip('/')}/{node.node}/get_parameters"
     meant = explain(whole, ENCLAVE, "serve", "/elsewhere/get_parameters")
     assert f"note [explain.likely-name]: the enclave may serve {own}" in meant.err
-    near = explain(whole, ENCLAVE, "publish", "/chater").err
-    rules = "-r /chater:=/chatter, or the policy, --remap /chatter:=/chater)."
-    assert "may publish /chatter: " in near and rules in near
+    assert "may publish /chatter: " in explain(whole, ENCLAVE, "publish", "/chater").err
+    rules = "-r /front/chatter:=/chatter, or the policy, --remap /chatter:=/front/chatter)."
+    assert rules in explain(whole, ENCLAVE, "publish", "/front/chatter").err
     assert "may publish /chatter: " in explain(whole, "--who", "publish", "/chater").err
     assert "likely-name" not in found.err
     unused = "[explain.not-used]: no enclave that was read may subscribe /nothing by its name"
