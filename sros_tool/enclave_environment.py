@@ -180,7 +180,7 @@ def loadable_environment(
     if wanted is None and any(other_domain != domain for other_domain in domains or ()):
         text = (
             f"a process in enclave {name} may run in any of the domains {domains}, and runs in "
-            f"{domain}: for another one, add --domain ID."
+            f"{domain}: for another domain, add --domain ID."
         )
         notes += (Note("env.several-domains", text),)
     if not state.token:
@@ -769,7 +769,7 @@ def _unnamed_node_error(policy: Policy, command: Sequence[str]) -> UsageError:
     *_, (ns, _) = started_nodes(command)
     remedy = (
         "Start a launch file with `ros2 launch --secured KEYSTORE POLICY ...`, which finds the "
-        "enclave of each of its nodes, and this command in an enclave of its own: `sros run "
+        "enclave of each of its nodes. Start any other command in an enclave of its own: `sros run "
         "KEYSTORE ENCLAVE -- COMMAND`."
     )
     for name in nodes_with_rules(command):

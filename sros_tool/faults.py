@@ -291,7 +291,7 @@ class Fault(Enum):
         "CVE-2023-24011; Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; tested.",
         "Unless you signed the document on purpose, treat the signer's key as stolen: `sros revoke "
         "{root} {enclave}`. If one CA is for identities and documents, use separate CAs, as "
-        "keystore.one-authority says.",
+        "the remedy of keystore.one-authority says.",
         {"governance.p7s": f"Find out who signed the governance. {_GOVERNANCE}"},
     )
     GOVERNANCE_MALFORMED = (

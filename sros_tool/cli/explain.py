@@ -1125,9 +1125,9 @@ def _text_without_findings(log: str) -> str:
         )
     return (
         f"the log shows nothing that was refused to a node in '{match['folder']}'. If a file was "
-        "missing and the strategy was not Enforce, it runs open: `sros check runtime` on its "
+        "missing and the strategy was not Enforce, the node runs open: `sros check runtime` on its "
         "machine shows this, and the clock. If it hears nothing, peers may refuse it "
-        "silently: explain their logs, and run `sros check FOLDER OTHER` (CAs, revocation list, "
+        "silently: explain their logs, run `sros check FOLDER OTHER` (CAs, revocation list, "
         "governance, domains); on Zenoh, only logs with RUST_LOG=zenoh=trace have denials"
     )
 

@@ -887,8 +887,8 @@ def _remedies(status: FleetStatus, to_dos: Collection[str]) -> Mapping[str, str]
         "find out why": "check whether the robot is on, and which machine reports as this robot: "
         "that machine "
         "may have a wrong name, or a copied disk. If it has files of another robot, it can act "
-        f"as that robot until `sros renew {where} --robot OTHER --new-key --revoke-old`; then "
-        "deliver to both",
+        f"as that robot until you run `sros renew {where} --robot OTHER --new-key --revoke-old`; "
+        "then deliver to both robots",
         "deliver": by_hand,
         "publish": publish_command(root),
         "renew": f"`{renewal_command(root)}`, then {_bringing(root, to_renew)}",

@@ -563,7 +563,7 @@ def rotate_ca(
     cannot = "could not" if dry_run else "cannot"
     cut_off = (
         f"cut off: {', '.join(step.cut_off)} {cannot} talk to robots with the files of this stage "
-        "before getting these files, too"
+        "until they get these files, too"
     )
     is_published = bool(publish_command(root))
     if is_published and step.stage == "retire" and step.replaces_identity:

@@ -342,9 +342,10 @@ def _keystore_problems(robot: LocalRobot) -> Iterator[str]:
             revoke = f"sros revoke {shlex.quote(str(robot.keystore))} {name}"
             yield (
                 f"the keystore has {name}, and the policy does not. If nothing needs it any more: "
-                f"{revoke} (then restart all closed processes: each knows only what was revoked "
-                f"before its start). If it belongs to another machine, such as a laptop: "
-                f"{robot.close_command} --elsewhere {name}. If it belongs to this machine: sros "
+                f"{revoke} (then restart all closed processes, because a process reads "
+                "revocations only when it starts). If it belongs to another machine, such as a "
+                f"laptop: {robot.close_command} --elsewhere {name}. If it belongs to this "
+                "machine: sros "
                 f"merge_policy {shlex.quote(str(robot.policy))} ITS_POLICY --in-place"
             )
 

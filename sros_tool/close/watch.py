@@ -61,7 +61,7 @@ def check_watchable(robot: LocalRobot) -> None:
             "Only an open robot can be watched.",
             f"Leave the robot closed, and add what is missing to '{robot.policy}': `sros explain "
             f"{shlex.quote(str(robot.export))} --log FILE` names the rights that a process lacked. "
-            f"Only to watch all of it again: `{robot.close_command} --undo`.",
+            f"To watch the whole robot again, open it first: `{robot.close_command} --undo`.",
         )
     nodes = [process for process in running.in_domain if not process.is_daemon]
     on_zenoh = [process for process in nodes if process.is_zenoh]
@@ -168,7 +168,7 @@ def _remember(robot: LocalRobot, document: str, observed: ObservedProcesses) -> 
 def _without_enclave_text(robot: LocalRobot, names: Sequence[str]) -> str:
     """Return, as a sentence, which nodes the graph shows without an enclave."""
     return (
-        f"{first_few(names, MOST_NAMES)}: the identifier of the participant is that of a secured "
+        f"{first_few(names, MOST_NAMES)}: the participant has the identifier of a secured "
         f"process, so '{robot.policy}' has no rights for this node. If the node is of the robot, "
         f"start it open, and watch again: {robot.close_command} --for 1m"
     )
@@ -211,8 +211,8 @@ def _say_variables(running: RunningRobot, observed: ObservedProcesses) -> None:
     for names, labels in by_variables.items():
         robot.shell.say(
             "variables that this shell does not have, and that the start commands in "
-            f"{robot.commands_file} do not set: {first_few(names, MOST_NAMES)}; "
-            f"of {enumerated(labels)}"
+            f"{robot.commands_file} do not set: {first_few(names, MOST_NAMES)}; they are set for "
+            f"{enumerated(labels)}"
         )
 
 

@@ -298,8 +298,9 @@ def how_to_learn_beside(robot: Path, domain: int = 0) -> str:
     option = f" --domain {domain}" * bool(domain)
     return (
         f"let it run open next to the closed robot, and run `sros generate_policy "
-        f"{quote(str(robot / CLOSED_POLICY))} --enclave-per-node{option}`; read the rights that "
-        f"this adds, run `sros close {quote(str(robot))}`, and restart the process as that says"
+        f"{quote(str(robot / CLOSED_POLICY))} --enclave-per-node{option}`; read the added "
+        f"rights, run `sros close {quote(str(robot))}`, and restart the process as `sros close` "
+        "says"
     )
 
 

@@ -179,8 +179,9 @@ def _unrecorded_notes(
     if left:
         yield Note(
             "fleet.unrecorded-enclaves",
-            f"Still valid, because the fleet does not record whose it is: {_names_text(left)}, "
-            "with the name of a robot that you revoke in the path. If the key was on that robot, "
+            f"Still valid: {_names_text(left)}, with the name of a robot that you revoke in the "
+            "path. The fleet does not record which robot has such a key. If the key was on that "
+            "robot, "
             f"run `sros revoke {quote(str(keystore.root))} {arguments_for(keystore, left)}`.",
         )
 

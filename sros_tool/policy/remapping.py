@@ -266,9 +266,9 @@ def _notes_on_old_names(
             is_old = right.kind == use.kind and matches(right.name, use.old)
             if is_old and not rules.cover(right._replace(name=use.new)):
                 text = (
-                    f"{right} at {denied.source} stays as it is, and does not apply to {use.new}, "
-                    f"which {use.node} has in place of {use.old}. Add the new name there if it is "
-                    "meant, too."
+                    f"{right} at {denied.source} does not change, and does not apply to {use.new}, "
+                    f"the new name of {use.old} in {use.node}. If the new name is meant, too, add "
+                    "it there."
                 )
                 yield Note("merge.old-name-denied", text)
 

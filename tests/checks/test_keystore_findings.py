@@ -113,7 +113,7 @@ def test_dates_that_are_not_valid_in_every_time_zone_have_a_remedy_that_helps(
     permissions = open_enclave(bench.path("enclaves/base"), now=bench.now).permissions
     assert permissions
     validity = permissions.grants[0].validity
-    wait = f"Wait: from {iso(validity.not_before + timedelta(hours=12))} on, they have begun"
+    wait = f"Wait until {iso(validity.not_before + timedelta(hours=12))}: then they are valid"
     for now, said in (
         (validity.not_before + timedelta(hours=11), wait),
         (validity.not_after - timedelta(hours=13), "--set permissions.validity=2d --allow-looser`"),

@@ -134,7 +134,7 @@ def test_a_keystore_from_before_a_revocation(keystore: Path, tmp_path: Path) -> 
     assert len([text for text in strangers(robot, late) if "accept" in text]) == 1, "by the later"
     said = sros("check", restored, robot).out
     assert "before its next export, revoke the certificates on the other list" in said
-    assert "first revoke them there again" in said and "distribute_key" in said
+    assert "first revoke them again in that keystore" in said and "distribute_key" in said
 
 
 def test_a_list_may_lack_what_expired(tmp_path: Path) -> None:

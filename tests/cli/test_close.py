@@ -317,7 +317,7 @@ def test_what_is_taken_out_of_the_policy_stays_out(robot: Robot) -> None:
     mine.write_text("A=1\n")
     first = robot.close("--apply", status=1)
     assert "the keystore has /listener, and the policy does not. If nothing needs" in first.out
-    assert f"{revoke} (then restart all closed processes: " in first.out
+    assert f"{revoke} (then restart all closed processes, " in first.out
     assert ". If it belongs to another machine, such as a laptop: sros close r" in first.out
     assert (
         "removed robot/start/listener.env: it was for an enclave without a " in first.err
@@ -649,7 +649,7 @@ def test_processes_that_started_after_the_watch(robot: Robot) -> None:
     said = robot.close(status=1).out
     assert "such as your own `sros demo listener`; stop what belongs in /late, and start " in said
     assert "it there: sros run /" in said and "/robot/export ENCLAVE -- COMMAND; to give an" in said
-    learn = "`sros generate_policy robot/policy.xml --enclave-per-node`; read the rights that this"
+    learn = "`sros generate_policy robot/policy.xml --enclave-per-node`; read the added rights"
     assert f"next to the closed robot, and run {learn}" in said
     assert "--undo" not in said, "no advice opens the robot"
     robot.more = ()
@@ -1080,7 +1080,7 @@ def test_a_node_whose_enclave_the_graph_does_not_show_is_named(robot: Robot) -> 
     """Any participant can have an identifier that looks like that of a secured one."""
     robot.nodes += (ros_node("ghost", "8f0f0000681200000000", "publish rt/cmd_vel"),)
     said = robot.close(status=1).out
-    assert "/ghost: the identifier of the participant is that of a secured process, so 'rob" in said
+    assert "/ghost: the participant has the identifier of a secured process, so 'rob" in said
     robot.by_hand = set(PID)
     robot.nodes = (TALKER, LISTENER)
     assert (
@@ -1589,9 +1589,9 @@ def test_an_enclave_that_gets_another_name_keeps_its_process(robot: Robot) -> No
     known = "/mission: process 4711, known by its process id, for the nodes /logger and /talker: "
     assert f"{known}--apply restarts talker.service\n" in said.out
     assert "named after" not in said.out
-    revoke = "sros revoke robot/keystore /logger (then restart all closed processes: each knows"
+    revoke = "sros revoke robot/keystore /logger (then restart all closed processes, because a"
     assert (
-        f"If nothing needs it any more: {revoke} only what was revoked before its start)"
+        f"If nothing needs it any more: {revoke} process reads revocations only when it starts)"
         in said.out
     )
 

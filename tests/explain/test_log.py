@@ -673,7 +673,7 @@ def test_nothing_found_is_said_of_what_was_read(tmp_path: Path) -> None:
         (tmp_path / "robot.log").write_text(line)
         ended = sros("explain", "--log", tmp_path / "robot.log").ok()
         assert "nothing that was refused to a node in '/k/enclaves/talker'. If a" in ended.err
-        assert "the strategy was not Enforce, it runs open: `sros check runtime`" in ended.err
+        assert "the strategy was not Enforce, the node runs open: `sros check runtime`" in ended.err
         assert len(ended.err) < 500
     for cause in ("CAs", "revocation list", "governance", "domains", "clock"):
         assert cause in ended.err

@@ -173,7 +173,7 @@ def test_what_lies_below_a_robot_is_revoked_with_it(unknown: Path, tmp_path: Pat
         "Also revoked, although the fleet does not record it: /r3, /r3/deep/er, in" in ended.err
     ), ended
     assert (
-        "Still valid, because the fleet does not record whose it is: /desk/r3, with" in ended.err
+        "Still valid: /desk/r3, with the name of a robot that you revoke in the path" in ended.err
     ), ended
     assert f"sros revoke {root} /desk/r3`" in ended.err, ended
     left = json.loads(sros("list_enclaves", root, "--json").out)["enclaves"]

@@ -341,7 +341,7 @@ def _validity_findings(enclave: CheckedEnclave, grant: Grant, file: str) -> Iter
         accepted = "" if is_early else enclave.accepts_expiry
         text = f"{text}, and now it is {iso(now)}"
         remedy = is_early and (
-            f"Wait: from {iso(window.not_before + _WEST)} on, they have begun in every time zone. "
+            f"Wait until {iso(window.not_before + _WEST)}: then they are valid in every time zone. "
             "Until then, let the hosts run in UTC. Sign later permissions with a not_before at "
             "least "
             "12 hours in the past, as sros does once the CA is that old."

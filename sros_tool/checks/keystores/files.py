@@ -45,8 +45,9 @@ KEY_READABLE = FindingKind(
     "keystore.key-readable",
     ERROR,
     "a private key that others can read",
-    "Anyone who can read it can act as that enclave, or with a CA key as any enclave. Neither rcl "
-    "nor DDS checks file modes, and ros2/sros2 creates keys with mode 0644.",
+    "Anyone who can read the key of an enclave can act as this enclave; anyone who can read the "
+    "key of a CA can act as any enclave. Neither rcl nor DDS checks file modes, and ros2/sros2 "
+    "creates keys with mode 0644.",
     "ros2/sros2 0.13; rcl 9, Fast DDS 2.14.5 and Cyclone DDS 0.10.2 check no modes.",
     "Run `chmod 600` on the key. If others had access, revoke the enclave, or "
     "replace the CA (`sros rotate_ca`).",
@@ -202,8 +203,8 @@ HIDDEN_ENCLAVE = FindingKind(
     "keystore.hidden-enclave",
     ERROR,
     "an enclave in a hidden folder",
-    "DDS loads the enclave, and a node that names it has its rights. No verb of sros lists, "
-    "renews, revokes or exports the enclave, and the check of enclaves leaves it out.",
+    "DDS loads the enclave, and a node that names the enclave has its rights. No verb of sros "
+    "lists, renews, revokes or exports the enclave, and the check of enclaves leaves it out.",
     "rcl 9 (rcl/src/rcl/security.c) takes a folder of any name; sros keystore layout.",
     "Remove the folder. If you need the enclave, create one without a dot in its name (`sros "
     "create_enclave`). If others had the folder, replace the CA (`sros rotate_ca`), because the "

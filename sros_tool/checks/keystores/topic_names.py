@@ -19,10 +19,9 @@ NO_ROS_NAME = FindingKind(
     "permissions.no-ros-name",
     WARNING,
     "names that no ROS topic, service or action has",
-    "DDS names of ROS topics begin with rt/, those of services with rq/ and rr/. A rule with "
-    "another "
-    "name matches no endpoint of a node: access that the rule should allow is denied, and access "
-    "that it should deny may be allowed.",
+    "The DDS names of ROS topics begin with rt/, and the DDS names of services with rq/ and rr/. A "
+    "rule with another name matches no endpoint of a node: access that the rule should allow is "
+    "denied, and access that it should deny may be allowed.",
     _MAPPING,
     "Write the DDS name, such as rt/chatter, rq/addRequest and rr/addReply, or let sros write it: "
     "`sros create_permission KEYSTORE ENCLAVE POLICY_FILE`. The current name is right only for a "
@@ -33,7 +32,7 @@ NOT_FOR_ROS = FindingKind(
     NOTE,
     "permissions without any ROS 2 name",
     "No ROS 2 node can run in this enclave: a node needs ros_discovery_info, and the DDS names "
-    "of ROS topics begin with rt/, those of services with rq/ and rr/.",
+    "of ROS topics begin with rt/, and the DDS names of services with rq/ and rr/.",
     _MAPPING,
     "Nothing to do if a program uses DDS without ROS. Otherwise give the enclave a policy: `sros "
     "create_permission KEYSTORE ENCLAVE POLICY_FILE`.",

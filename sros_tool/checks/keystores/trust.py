@@ -76,8 +76,9 @@ _REVOKE_AGAIN = (
 )
 _REVOKE_FIRST = (
     "The keystore was perhaps restored from a backup: the export's own list revokes certificates "
-    "that the keystore's list does not revoke. Unless they expired, first revoke them there again, "
-    "with `sros crl KEYSTORE --refresh --crl FILE`. FILE is the export's crl.pem. "
+    "that the keystore's list does not revoke. Unless these have expired, first revoke them again "
+    "in that keystore, with `sros crl KEYSTORE --refresh --crl FILE`. FILE is the export's "
+    "crl.pem. "
     f"{PEERS_ACCEPT.remedy}"
 )
 PEERS_PROTECTION = FindingKind(

@@ -233,7 +233,7 @@ def publish(
             behind,
             "Robots would refuse what is published now, or get it with wrong dates.",
             "Set the clock, and publish again. If it is right, and was ahead before, first run "
-            f"`sros crl {quote(str(root))} --refresh`, so that the last entry is of today.",
+            f"`sros crl {quote(str(root))} --refresh`, so that the last entry has today's date.",
         )
     with ExitStack() as stack:
         if not dry_run:
@@ -835,7 +835,7 @@ class _Publication:
         return KeystoreError(
             f"'{self._folder}' has nothing that the keystore '{self.keystore.root}' published",
             "The keystore has published before. If it was restored from a backup and the folder "
-            "was lost, too, robots that were revoked since would get releases again.",
+            "was lost, too, robots that were revoked later would get releases again.",
             "Name the folder in which the keystore publishes. If that folder is lost, or this is "
             f"an additional folder, add --new-folder to {self._command}; if the keystore was "
             "restored, first repeat its later revocations, and add --restored as well.",

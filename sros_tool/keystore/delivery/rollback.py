@@ -136,8 +136,8 @@ def check_rollback(
         raise KeystoreError(
             f"'{target / path}' has a later {role} CA than the keystore's",
             f"It trusts {authority_text(authority)}, and the keystore's CA is "
-            f"{_first_authority(files, path)}, from before that: the robot would trust the earlier "
-            "CA again, and what was revoked since. Nothing was changed.",
+            f"{_first_authority(files, path)}, an earlier CA: the robot would trust this CA again, "
+            "and certificates that were revoked since then. Nothing was changed.",
             "The keystore may come from a backup: docs/howto/keystore_is_lost.md says how to go "
             "on; or the folder has its files from another keystore. If the keystore's CA is right, "
             f"first {_removal_of(target, later)}",
@@ -148,10 +148,11 @@ def check_rollback(
             f"'{target / path}' has no CA that the keystore has, or had by its ledger",
             f"It trusts {authority_text(authority)}, and the keystore's CA is "
             f"{_first_authority(files, path)}: the robot could no longer communicate with "
-            "others of its keystore, and its revocation list would go. Nothing was changed.",
-            f"Export from the keystore that these files are from. If '{keystore.root}' is right, "
-            "such as in place of a lost one (docs/howto/keystore_is_lost.md), or if a rotation is "
-            "missing in its ledger, first "
+            "other robots of its keystore, and would lose its revocation list. Nothing was "
+            "changed.",
+            f"Export from the keystore that issued these files. If '{keystore.root}' is the right "
+            "keystore, because it replaces a lost keystore (docs/howto/keystore_is_lost.md) or its "
+            "ledger lacks a rotation, first "
             f"{_removal_of(target, foreign)}",
         )
     if lost := _lost_revocations(keystore, present, files, now):
@@ -162,6 +163,7 @@ def check_rollback(
             f"{why}: revoked enclaves would be trusted again. Nothing was changed.",
             "The keystore may come from a backup: docs/howto/keystore_is_lost.md says what to do, "
             f"and `sros crl {quote(str(keystore.root))} --refresh --crl {file}` revokes the same "
+            "certificates "
             f"again. If the keystore's list is right, export all enclaves of the folder, but first "
             f"{_removal_of(target, lost)}",
         )

@@ -202,8 +202,8 @@ class Issued:
             end = validity_of(self.certificate).not_after
             yield Note(
                 "enclave.short-lived",
-                f"{name} expires at {iso(end)}, as [[enclaves]] in the keystore's sros.toml "
-                "sets. `sros renew` issues it again.",
+                f"{name} expires at {iso(end)}, because of [[enclaves]] in the keystore's "
+                "sros.toml. `sros renew` issues it again.",
             )
         if self.document:
             yield from document_notes(name, self.permissions, len(self.document))

@@ -592,8 +592,9 @@ class KeystoreChange:
         strangers = [ca for role in ROLES for ca in unknown_authorities(self.keystore, role)]
         if strangers:
             text = (
-                f"every process trusts {authority_text(strangers[0])}, too, which the keystore "
-                f"does not know: find out who added it, with `sros check {quote(str(self.root))}`."
+                f"every process also trusts a CA that the keystore does not know, "
+                f"{authority_text(strangers[0])}: find out who added it, with `sros check "
+                f"{quote(str(self.root))}`."
             )
             self.notes.append(Note("keystore.unknown-authority", text))
 

@@ -197,8 +197,8 @@ def create_keystore(
 
 _OWN_LIST = Note(
     "keystore.own-list",
-    "this keystore has a revocation list of its own: it lacks what another keystore or program "
-    "with the same identity CA revokes, and their lists lack what this keystore revokes",
+    "this keystore has its own revocation list, which lacks the revocations of other keystores or "
+    "programs with the same identity CA; their lists lack the revocations of this keystore",
 )
 
 
@@ -341,8 +341,9 @@ def _expired_enclaves(change: KeystoreChange, names: Iterable[str]) -> Iterator[
         end = validity_of(change.keystore.certificate(path)).not_after
         if end < change.now:
             text = (
-                f"{name} stays as it is: it is short-lived, and expired at {iso(end)}. `sros renew "
-                f"{quote(str(change.root))} {quote(name)}` issues it again; then run this again."
+                f"{name} does not change: it is short-lived, and expired at {iso(end)}. `sros "
+                f"renew {quote(str(change.root))} {quote(name)}` issues it again; then repeat this "
+                "command."
             )
             yield name, Note("enclave.expired-short-lived", text)
 

@@ -323,9 +323,10 @@ class RevocationListSigner:
         )
         if entries and (published := publish_command(self._root)):
             text = (
-                "give the list to a web server of robots that fetch only when `sros fleet status "
-                f"{quote(str(self._root))}` shows that they have fetched ({published}): before, "
-                "the server would refuse a robot whose certificates are all replaced"
+                "give the list to a web server of robots that fetch, but only when `sros fleet "
+                f"status {quote(str(self._root))}` shows that they have fetched ({published}): "
+                "until "
+                "then, the server would refuse a robot whose certificates are all replaced"
             )
             self.remarks.append(Note("crl.web-server", text))
         return entries

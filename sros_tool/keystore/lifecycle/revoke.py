@@ -429,8 +429,8 @@ def _drop_routers(change: KeystoreChange, revoked: Collection[str]) -> None:
         change.set_network(replace(network, routers=left))
         names = ", ".join(router.name for router in dropped)
         text = (
-            f"{names}: no router any more. Sessions that connected to it, and are not revoked, "
-            "connect to another router by their new files."
+            f"{names} is no longer a router. By their new files, its sessions that are not revoked "
+            "connect to another router."
         )
         change.notes.append(Note("zenoh.router-revoked", text))
 

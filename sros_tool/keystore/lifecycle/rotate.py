@@ -277,7 +277,8 @@ def _cut_off_error(
         return KeystoreError(
             f"several stages at once would cut off every robot: {names}",
             "A robot trusts the new CA only once it has the new files, and its processes were "
-            f"restarted: before, it cannot communicate with robots that have the files{refuses}.",
+            "restarted: before that, it cannot communicate with robots that have the "
+            f"files{refuses}.",
             "If the robots may stand still, add --allow-unconfirmed, then bring the files to every "
             f"robot{by_hand}, and restart everything. Otherwise go stage by stage, with "
             f"`sros rotate_ca {where} --next`.",
@@ -1007,7 +1008,8 @@ def _make_successor(
                 )
             text = (
                 f"{older}, so robots take it for a CA that was replaced: the first `sros import` "
-                "on each robot needs --force, and the play `deliver` sros_replace_authorities."
+                "on each robot needs --force, and the play `deliver` needs "
+                "sros_replace_authorities."
             )
             change.notes.append(Note("rotation.older-ca", text))
     else:
