@@ -50,6 +50,7 @@ from sros_tool.folders import Folder
 from sros_tool.keystore.confirmation import (
     CONFIRMED_FILES,
     LONGEST_LIST,
+    LONGEST_SEAL,
     MESSAGE_FILE,
     MOST_REQUESTS,
     OF_SAME_NUMBER,
@@ -776,6 +777,7 @@ class _Round:
             problems=shortened_problems(self._problems),
             requests=asked.requests,
             crl=self._list_to_send(names),
+            seal=self._seal_to_send(),
         )
         message = self._signed(confirmation, (asked.signer,) if asked.signer else names)
         if not message:
@@ -799,6 +801,13 @@ class _Round:
     def _list_to_send(self, names: Iterable[str]) -> str | None:
         """Return a revocation list that the keystore may have lost; None if it has the list."""
         return self._replaced_list() if self._is_in_step else self._revocation_lists(names)
+
+    def _seal_to_send(self) -> str | None:
+        """Return the seal of the installed release; None without one, or if it is too long."""
+        with suppress(SrosError, ValueError):
+            seal = read_seal(self._folder).decode("ascii")
+            return seal if 0 < len(seal) <= LONGEST_SEAL else None
+        return None
 
     def _replaced_list(self) -> str | None:
         """Return the kept revocation list that a release replaced by a shorter one, or None."""

@@ -175,7 +175,7 @@ def _show_history(keystore: OpenedKeystore, policy: Path | None, as_json: bool) 
             subject = f"{entry.enclave or entry.subject}{named}"
             source = f"policy {entry.policy[:12]}" if entry.policy else ""
             from_backup = "from a backup; entries may be missing" * (entry.what == RESTORED)
-            words = (subject, until, entry.serial, source, entry.reason, from_backup)
+            words = (subject, until, entry.serial, source, from_backup or entry.reason)
             line = "  ".join(word for word in words if word)
             shown = f"{entry.time}  {entry.what:11}  {item.status:10}  {line}"
             echo(shown.rstrip())

@@ -80,6 +80,7 @@ _OF_AGENT = (
     "problems",
     "requests",
     "crl",
+    "seal",
 )
 """Keys that only `sros agent` writes, except ``crl_restart`` and ``problems``."""
 _OPTIONAL_KEYS = {"certificates", "restart", "dds", *_OF_AGENT}
@@ -93,6 +94,8 @@ MOST_PROBLEMS, LONGEST_PROBLEM = 50, 300
 MOST_REQUESTS = 500
 """Maximum number of signing requests in a confirmation; the agent sends others in later ones."""
 _LONGEST_REQUEST = 16 * 1024
+LONGEST_SEAL = 256 * 1024
+"""Maximum number of characters of a release's seal in a confirmation: about 200 enclaves."""
 LONGEST_LIST = 1024 * 1024
 """Maximum number of characters of a revocation list in a confirmation."""
 _LIBRARY_VERSION = re.compile(r"\d{1,6}\.\d{1,6}\.\d{1,6}\Z", re.ASCII)
@@ -191,7 +194,7 @@ class Confirmation:
     ``requests`` signing requests (PEM) for certificates that expire.  ``crl`` is the newest
     revocation list (PEM) of each identity CA on the robot, if they may differ from the lists that
     were published last.  From these lists, a keystore that was restored from a backup learns of its
-    later revocations.
+    later revocations.  ``seal`` is the seal of the installed release, which proves its number.
     """
 
     robot: str
@@ -210,6 +213,7 @@ class Confirmation:
     crl: str | None = None
     crl_restart: tuple[str, ...] | None = None
     boot: str | None = None
+    seal: str | None = None
 
     def enclaves(self) -> tuple[str, ...]:
         """Return the names of the enclaves in the confirmation, sorted."""
@@ -812,6 +816,12 @@ def _crl_from(value: Any) -> str:
     return value
 
 
+def _seal_from(value: Any) -> str:
+    if not (isinstance(value, str) and len(value) <= LONGEST_SEAL and value.isascii()):
+        raise _FormError("its seal is not the text of a seal")
+    return value
+
+
 def _boot_from(value: Any) -> str:
     return _digest_from(value, '"boot"')
 
@@ -827,6 +837,7 @@ _AGENT_READERS: Mapping[str, Callable[[Any], Any]] = {
     "crl": _crl_from,
     "crl_restart": _restart_from,
     "boot": _boot_from,
+    "seal": _seal_from,
 }
 
 

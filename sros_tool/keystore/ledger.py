@@ -72,6 +72,13 @@ REPORTED = "reported"
 
 Such a certificate can be revoked, but proves nothing.
 """
+LATER_RELEASE = "later release"
+"""The ``reason`` of a restore that the seal of a later release on a robot showed."""
+PUBLISHING = "publishing"
+"""The ``reason`` of a restore that `sros fleet publish --restored` recorded.
+
+A line with an enclave says that publishing was refused, and named rights that the enclave had lost.
+"""
 SAME_KEY = "same key"
 """The ``reason`` of a CA certificate with the same key as the CA's previous certificate."""
 FROM_BEFORE = "from before the ledger"
@@ -116,8 +123,8 @@ class Entry(NamedTuple):
     policy: str = ""
     """SHA-256 of the policy with its includes from which the permissions were made."""
     reason: str = ""
-    """Reason of a revocation; fault that a gap records; or how a certificate became known, if the
-    keystore did not issue it with this line.
+    """Reason of a revocation; fault that a gap records; what showed a restore; or how a certificate
+    became known, if the keystore did not issue it with this line.
     """
     key: str = ""
     """SHA-256 of the public key (DER) of the certificate, or of the revoked certificate."""

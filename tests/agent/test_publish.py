@@ -21,7 +21,6 @@ from tuf.api.metadata import Metadata, Root
 
 from sros_tool.agent.fetch import FetchProblem
 from sros_tool.cli.fleet import _published_lines
-from sros_tool.dds.permissions import Permissions, parse_permissions
 from sros_tool.errors import DocumentError, KeystoreError, SrosError
 from sros_tool.folders import Folder
 from sros_tool.keystore import transaction
@@ -79,6 +78,10 @@ def archives(publisher: Home) -> dict[str, bytes]:
         found[robot] = path.read_bytes()
         assert hashlib.sha256(found[robot]).hexdigest() == digest
     return found
+
+
+def _number(path: Path) -> int:
+    return read_release(path.read_bytes()).number
 
 
 def numbers(publisher: Home) -> dict[str, int]:
@@ -600,7 +603,9 @@ def test_a_keystore_that_was_restored(publisher: Home) -> None:
         publisher.publish(restored=True)
     shutil.rmtree(publisher.pub / "targets/robots")
     archives.rename(publisher.pub / "targets/robots")
+    planned = publisher.publish(restored=True, dry_run=True)
     done = publisher.publish(restored=True)
+    assert planned.names("published") == done.names("published") == ["r1", "r2"]
     assert [note.id for note in done.notes] == ["fleet.revocations-restored"]
     shown = sros("inspect", publisher.root, "--history").out
     assert "  restored     incomplete  from a backup; entries may" in shown
@@ -673,10 +678,10 @@ def test_a_key_that_was_replaced_after_the_backup_is_not_certified_again(
         if renewed_first or dry_run:
             what = "`sros renew .* /r2/base --new-key --revoke-old`"
         else:
-            what = "`sros renew [^ ]* /r1/base` and `sros renew [^ ]* /r2/base --new-key --revoke"
+            what = "`sros renew [^ ]* /r1/base`.*`sros renew [^ ]* /r2/base --new-key --revoke"
         with pytest.raises(KeystoreError, match=what) as refused:
             publisher.publish(restored=True, dry_run=dry_run)
-        done = "The keystore was changed already: " in str(refused.value)
+        done = "The keystore was changed already. " in str(refused.value)
         assert done == (not dry_run and not repeated)
         repeated = not dry_run
     crl = OpenedKeystore(publisher.root).revocation_list
@@ -1006,7 +1011,10 @@ def test_a_restore_in_which_nothing_shows_what_was_revoked_says_since_when(
     assert last
     (note,) = publisher.publish(restored=True, new_folder=True).notes
     assert note.id == "fleet.revocations-not-shown"
-    assert f"was revoked after {iso(last)}, the last entry of the ledger" in note.text
+    assert (
+        f"which rights were taken away, after {iso(last)}, the last entry of the ledger"
+        in note.text
+    )
     assert note.text.index("fleet collect ") < note.text.index("`sros revoke ")
     assert not publisher.publish().notes
 
@@ -1303,7 +1311,7 @@ def test_a_later_key_of_a_robot_is_certified_again_as_publishing_advises(publish
     backup.rename(root)
     with pytest.raises(KeystoreError, match=f"{name} got another key") as said:
         publisher.publish(restored=True)
-    _, *commands = re.findall(r"`sros ([^`]+)`", said.value.remedy)
+    commands = re.findall(r"`sros ([^`]+)`", said.value.remedy)
     for command in commands:
         publisher.run(*command.replace("REQUEST", str(files[1])).split())
     assert publisher.publish(restored=True).names("published") == ["r1", "r2", "r5"]
@@ -1312,7 +1320,9 @@ def test_a_later_key_of_a_robot_is_certified_again_as_publishing_advises(publish
     assert [known.is_revoked(key) for key in keys] == [True, False]
 
 
-@pytest.mark.parametrize("way", ["sign the present policy", "renew", "several grants"])
+@pytest.mark.parametrize(
+    "way", ["sign the present policy", "renew", "renewed before", "with the certificates"]
+)
 def test_a_right_that_was_taken_away_after_the_backup_does_not_come_back_in_silence(
     publisher: Home, way: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -1327,24 +1337,80 @@ def test_a_right_that_was_taken_away_after_the_backup_does_not_come_back_in_sile
     publisher.publish()
     backup = copy_of(publisher.root, publisher.folder / "backup")
     sign("x")
+    if way == "with the certificates":
+        publisher.run("renew", "ks", "--all", "--revoke-old")
     publisher.publish()
     shutil.rmtree(publisher.root)
     backup.rename(publisher.root)
-    if way == "several grants":  # as other tools write
-
-        def twice(data: bytes) -> Permissions:
-            read = parse_permissions(data)
-            return read._replace(grants=read.grants * 2)
-
-        monkeypatch.setattr(publishing, "parse_permissions", twice)
-    with pytest.raises(KeystoreError, match=r"rights of /r1/base, .* were taken away") as refused:
-        publisher.publish(restored=True)
-    assert f"`sros renew {publisher.root} /r1/base /r2/base /r5/base`" in refused.value.remedy
+    again = ("renew", "ks", "/r1/base", "/r2/base", "/r5/base")
+    if way == "renewed before":  # nobody has named the rights yet
+        publisher.run("renew", "ks", "--all")
+    for _ in range(1 + (way == "with the certificates")):
+        with pytest.raises(KeystoreError, match=r"rights of /r1/base, .* were taken away") as said:
+            publisher.publish(restored=True)
+        assert "(/{robot}/base: publish topic /cmd (all 3 robots))" in str(said.value)
+        assert f"`sros {' '.join(again)}`".replace(" ks ", f" {publisher.root} ") in str(said.value)
+        assert "is older than its robots" in sros("renew", publisher.root, "--all").err
+        with pytest.raises(KeystoreError, match="restored from a backup"):
+            publisher.publish()
+        if way == "with the certificates" and "certificates of /r1/base" in str(said.value):
+            assert "If the enclaves are to have" not in str(said.value)
+            publisher.run(*again)  # as the error advises: it agrees to no right yet
     if way == "renew":
-        publisher.run("renew", "ks", "/r1/base", "/r2/base", "/r5/base")
+        publisher.run(*again)
     else:
         sign("x")
     assert publisher.publish(restored=True).names("published") == ["r1", "r2", "r5"]
+
+
+def test_what_a_restored_keystore_cannot_know_is_not_published_in_silence(
+    publisher: Home, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A lost archive, another governance, another domain, and enclaves of only one side."""
+    monkeypatch.setattr("sros_tool.cli.common._clock", lambda: publisher.now)
+    publisher.publish()
+    backup = copy_of(publisher.root, publisher.folder / "backup")
+    publisher.run(
+        "update_keystore",
+        "ks",
+        "--set",
+        "protection.rtps=SIGN",
+        "--domain",
+        "7",
+        "--allow-looser",
+    )
+    publisher.publish()
+    number = numbers(publisher)["r2"]
+    shutil.rmtree(publisher.root)
+    backup.rename(publisher.root)
+    shutil.rmtree(publisher.root / "enclaves/r5/base")
+    (lost,) = (p for p in publisher.pub.glob("targets/robots/*.r2.tar.gz") if _number(p) == number)
+    lost.write_bytes(b"x")
+    for dry_run in (True, False):
+        with pytest.raises(KeystoreError, match="the governance was changed") as refused:
+            publisher.publish(restored=True, dry_run=dry_run)
+    assert "rtps_protection_kind SIGN" in refused.value.what
+    assert "/r2/base: not known, because the archive of the last release of r2" in str(
+        refused.value
+    )
+    assert "/r1/base: domain 0" in str(refused.value).replace("/{robot}/base", "/r1/base")
+    publisher.run(
+        "update_keystore",
+        "ks",
+        "--set",
+        "protection.rtps=SIGN",
+        "--domain",
+        "7",
+        "--allow-looser",
+    )
+    with pytest.raises(KeystoreError, match="rights of /r2/base were taken") as refused:
+        publisher.publish(restored=True)
+    assert "governance" not in str(refused.value)
+    publisher.run("renew", "ks", "/r2/base")
+    done = publisher.publish(restored=True)
+    assert [(e.change, e.enclave) for e in done.later] == [("missing", "/r5/base")]
+    (note,) = (note.text for note in done.notes if note.id == "fleet.changed-after-backup")
+    assert "/r5/base is in the last release of its robot, and the keystore lacks it" in note
 
 
 @pytest.mark.parametrize("steps", [(0, 1), (1, 3)])

@@ -42,7 +42,8 @@ from sros_tool.keystore.delivery.collect import (
     _DecidedRequest,
     collect,
 )
-from sros_tool.keystore.delivery.published import read_published
+from sros_tool.keystore.delivery.publish import publish as publish_releases
+from sros_tool.keystore.delivery.published import read_published, releases_in
 from sros_tool.keystore.delivery.signing import certify_requests
 from sros_tool.keystore.fleet import recorded_fleet
 from sros_tool.keystore.fleet_status import fleet_status
@@ -1099,8 +1100,73 @@ def test_messages_that_show_later_releases_refuse_a_new_folder(home: Home) -> No
         publish = ("fleet", "publish", "ks", folder, "--new-folder")
         refused = sros(*publish, cwd=home.folder)
         assert refused.status == 2
-        assert "messages of robots show that the keystore 'ks' is older" in refused.err
+        assert "the keystore 'ks' is older than its robots, as messages" in refused.err
     sros(*publish, "--restored", cwd=home.folder).ok()
+
+
+def test_only_the_seal_of_a_later_release_keeps_a_keystore_from_publishing(
+    home: Home, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A robot can invent a number; the office would never publish again."""
+    publish, now = ("fleet", "publish", "ks", "pub"), datetime.now(UTC)
+    home.run(*publish)
+    backup = copy_of(home.root, home.folder / "backup")
+    shutil.copytree(home.folder / "pub", home.folder / "pub of the backup")
+    home.run("renew", "ks", "/r1/base")
+    home.run(*publish)
+    number = read_published(OpenedKeystore(home.root)).robots["r1"].release.number
+    releases = {release.number: release for release in releases_in(home.folder / "pub", 3)}
+    seal = releases[number].seal.decode()
+    for path in (home.root, home.folder / "pub"):
+        shutil.rmtree(path)
+    backup.rename(home.root)
+    (home.folder / "pub of the backup").rename(home.folder / "pub")
+    forged = seal.replace(f"number {number}", "number 999999")
+    for sent in (forged, "x", releases[min(releases)].seal.decode(), None):
+        more = {} if sent is None else {"seal": sent}
+        home.send("r1", now, release=10**12, **more)
+        now += timedelta(minutes=1)
+        assert not home.collect(now).notes
+    home.run(*publish)
+    home.send("r2", DUE, seal=seal, requests=(home.request("r2"),))
+    found = home.collect(DUE, dry_run=True), home.collect(DUE)
+    for inbox in found:
+        (note,) = (note.text for note in inbox.notes)
+        assert note.startswith("r2 has a release that the keystore sealed but does not know: ")
+        (request,) = inbox.robots[1].requests
+        assert request.outcome == "refused" and "rights that were taken away" in request.why
+    monkeypatch.setattr("sros_tool.cli.common._clock", lambda: DUE)
+    status = sros("fleet", "status", "ks", cwd=home.folder)
+    assert "the keystore is older than its robots" in status.out and status.status == 1
+    for command in (publish, ("renew", "ks", "--all-expiring", "30d")):
+        refused = sros(*command, cwd=home.folder)
+        assert refused.status == 2
+        assert "the keystore 'ks' is older than its robots" in refused.err
+    assert not home.collect(DUE).notes, "it is said once"
+    publish_releases(home.root, home.folder / "pub", now=DUE, restored=True)
+    publish_releases(home.root, home.folder / "pub", now=DUE)
+    home.send("r3", DUE, seal=seal)
+    assert not home.collect(DUE).notes, "the restore is known"
+
+
+def test_a_new_key_that_a_robot_reports_before_the_list_is_not_revoked(home: Home) -> None:
+    """The enclave was revoked, and created again with a key of its robot; no list has this key."""
+    backup = copy_of(home.root, home.folder / "backup")
+    old = home.certificate("/r2/base")
+    home.run("revoke", "ks", "/r2/base")
+    home.run("create_enclave", "ks", "/r2/base")
+    new = home.certificate("/r2/base")
+    for robot in ("r1", "r2"):
+        home.run("distribute_key", "ks", "--robot", robot, robot, "--force")
+    home.send("r2")
+    crl = (home.folder / "r1/enclaves/r1/base/crl.pem").read_text()
+    shutil.rmtree(home.root)
+    backup.rename(home.root)
+    assert "not in the ledger" in home.of("r2").why
+    home.send("r1", crl=crl)
+    home.collect()
+    now = OpenedKeystore(home.root).revocation_list
+    assert now and now.revokes(old.serial_number) and not now.revokes(new.serial_number)
 
 
 def test_what_was_published_expires(home: Home) -> None:

@@ -44,6 +44,7 @@ from sros_tool.keystore.confirmation import (
     store_refusals,
 )
 from sros_tool.keystore.delivery.published import read_published
+from sros_tool.keystore.delivery.restored import LaterSeals, is_waiting
 from sros_tool.keystore.delivery.signing import certify_requests
 from sros_tool.keystore.expiry import read_credentials
 from sros_tool.keystore.fleet import checked_fleet, enclaves_of_robot, recorded_fleet
@@ -55,7 +56,7 @@ from sros_tool.keystore.layout import (
     confirmation_file,
     enclave_folder,
 )
-from sros_tool.keystore.ledger import REPORTED, Entry
+from sros_tool.keystore.ledger import LATER_RELEASE, REPORTED, Entry
 from sros_tool.keystore.lifecycle.change import ChangeOptions, KeystoreChange
 from sros_tool.keystore.lifecycle.revocation_list import LostRecords
 from sros_tool.keystore.lifecycle.revoke import (
@@ -219,16 +220,21 @@ def collect(
             fleet.robot(name)
         verifier = _Verifier(keystore, fleet, now, frozenset(restored))
         renewals = _Renewals(keystore, fleet, now)
-        forgotten = LostRecords(keystore, now)
+        forgotten, seals = LostRecords(keystore, now), LaterSeals(keystore)
         robots_with_lists: list[str] = []
+        robots_with_seals: list[str] = []
         changes: list[FileChange] = []
         taken: list[_ReceivedMessage] = []
         for message in _read_inbox(inbox, fleet, verifier):
             if message.verified:
                 message.requests = renewals.judge(message.robot, message.verified)
                 message.crl = message.verified.confirmation.crl
+                message.seal = message.verified.confirmation.seal
             if message.crl and forgotten.add(message.crl.encode()):
                 robots_with_lists.append(message.robot.name)
+            if seals.is_later(message.seal):
+                robots_with_seals.append(message.robot.name)
+                forgotten.has_later_release = True
             if message.signer_certificate:
                 forgotten.add_certificate(message.signer_certificate, REPORTED)
             if message.received:
@@ -244,7 +250,13 @@ def collect(
         not_signed, notes, signed = _revoke_again(
             root, forgotten, robots_with_lists, taken, now=now, keyring=keyring, dry_run=dry_run
         )
-        _defer_new_keys(OpenedKeystore(root), taken, is_restored=bool(signed))
+        notes = [*_later_release_notes(keystore, robots_with_seals), *notes]
+        _defer_requests(
+            OpenedKeystore(root),
+            taken,
+            is_restored=bool(signed),
+            is_older=forgotten.has_later_release,
+        )
         if not not_signed:
             not_signed, more_notes, more_signed = _sign(
                 root,
@@ -308,6 +320,8 @@ class _ReceivedMessage:
     received: ReceivedConfirmation | None = None
     crl: str | None = None
     """The revocation list in the message, which counts only if a CA of the keystore signed it."""
+    seal: str | None = None
+    """The seal of a release in the message, which counts only if a CA of the keystore signed it."""
     signer_certificate: x509.Certificate | None = None
     """The signer's certificate, if the message itself is not accepted."""
     remarks: list[str] = field(default_factory=list)
@@ -316,7 +330,7 @@ class _ReceivedMessage:
     def without_confirmation(self) -> _ReceivedMessage:
         """Return a copy without the verified content, to save memory."""
         if self.verified is None:
-            return replace(self, crl=None, signer_certificate=None)
+            return replace(self, crl=None, seal=None, signer_certificate=None)
         return replace(
             self,
             enclave=self.verified.enclave,
@@ -324,6 +338,7 @@ class _ReceivedMessage:
             verified=None,
             received=None,
             crl=None,
+            seal=None,
         )
 
     def result(self) -> CollectedMessage:
@@ -389,11 +404,12 @@ def _read_inbox(inbox: Path, fleet: Fleet, verifier: _Verifier) -> Iterator[_Rec
 
 
 def _add_signed_by_others(received: _ReceivedMessage, message: bytes) -> None:
-    """Add the signer's certificate and the revocation list of a message that is not accepted."""
+    """Add what others than the robot signed in a message that is not accepted."""
     with suppress(SrosError):
         signed = smime.parse_new(message)
         received.signer_certificate = signed.signer()
-        received.crl = parse_confirmation(signed.text, "it").crl
+        confirmation = parse_confirmation(signed.text, "it")
+        received.crl, received.seal = confirmation.crl, confirmation.seal
 
 
 def _read_message(inbox: Folder, robot: str) -> _File | None:
@@ -503,7 +519,8 @@ class _Verifier:
         is_older = before is not None and sequence < before.sequence and not is_restored
         # A message that came later may be from a robot with a restored disk, or may be replayed.
         if is_older and last and file.written < last.time:
-            return _ReceivedMessage(robot, "older", crl=verified.confirmation.crl, remarks=remarks)
+            said = verified.confirmation
+            return _ReceivedMessage(robot, "older", crl=said.crl, seal=said.seal, remarks=remarks)
         if before and sequence <= before.sequence and not is_restored:
             raise _RefusedError(
                 f"its sequence number {sequence} is not higher than {before.sequence}, the number "
@@ -514,7 +531,7 @@ class _Verifier:
         message = LastMessage(sequence, sha256, verified.enclave)
         boots, alternated = (before or message).successor(verified.confirmation.boot, arrived)
         received = ReceivedConfirmation(
-            replace(verified.confirmation, requests=None, crl=None),
+            replace(verified.confirmation, requests=None, crl=None, seal=None),
             arrived,
             message._replace(boots=boots, alternated=alternated),
         )
@@ -840,13 +857,16 @@ def _revoke_again(
     cannot be signed, no request is signed.  But for lists of a CA service there is only a note,
     because this service alone signs its lists and knows its certificates.
     """
-    if not (forgotten_lists.lists or forgotten_lists.unknown_certificates(OpenedKeystore(root))):
+    is_later = forgotten_lists.has_later_release
+    unknown = forgotten_lists.unknown_certificates(OpenedKeystore(root))
+    if not (forgotten_lists.lists or unknown or is_later):
         return "", [], []
     forgotten_serials = {entry.serial for crl in forgotten_lists.lists for entry in crl.revoked}
     requests = [request for message in messages for request in message.requests if request.request]
     for request in requests:
         if forgotten_serials & {*request.vouching}:
             request.set_outcome("refused", "its certificate was revoked")
+    notes: list[Note] = []
     have = (
         f"{first_few(robots_with_lists, _SHOWN)} {'has' if len(robots_with_lists) == 1 else 'have'}"
     )
@@ -856,15 +876,23 @@ def _revoke_again(
             f"{have} a revocation list of the CA service that the keystore lacks: import it "
             f"with `sros crl {quote(str(root))} --refresh --crl FILE`"
         )
-        return "", [Note("fleet.later-list", text)] if robots_with_lists else [], []
+        notes = [Note("fleet.later-list", text)] if robots_with_lists else []
+        if not is_later:
+            return "", notes, []
+        forgotten_lists, robots_with_lists = LostRecords(OpenedKeystore(root), now), ()
     try:
         restored = restore_revocations(
-            root, forgotten_lists, now=now, keyring=keyring, dry_run=dry_run
+            root,
+            forgotten_lists,
+            shown_by=LATER_RELEASE if is_later else "",
+            now=now,
+            keyring=keyring,
+            dry_run=dry_run,
         )
     except SrosError as error:
         if not robots_with_lists:
-            text = f"a certificate that the ledger lacks cannot be recorded: {error.what}"
-            return "", [Note("fleet.certificates-restored", text)], []
+            text = f"what messages of robots show cannot be recorded in the ledger: {error.what}"
+            return "", [*notes, Note("fleet.certificates-restored", text)], []
         why = (
             f"{have} a revocation list that the keystore signed but does not know, and it cannot "
             f"sign another: {error.what}"
@@ -873,33 +901,59 @@ def _revoke_again(
             if request.request:
                 request.set_outcome("not_signed", why)
         return why, [], []
-    notes = [restored_note(restored, have)] if robots_with_lists else []
+    notes += [restored_note(restored, have)] if robots_with_lists else []
     return "", [*notes, *restored.notes], [*changes_below(root, restored.changes)]
 
 
-def _defer_new_keys(
-    keystore: OpenedKeystore, messages: Sequence[_ReceivedMessage], *, is_restored: bool
+def _later_release_notes(keystore: OpenedKeystore, robots: Sequence[str]) -> Iterator[Note]:
+    """Yield a note on robots with releases that the keystore sealed, and does not know."""
+    if robots:
+        have = f"{first_few(robots, _SHOWN)} {'has' if len(robots) == 1 else 'have'}"
+        yield Note(
+            "fleet.later-release",
+            f"{have} a release that the keystore sealed but does not know: the keystore was "
+            "restored from a backup, or is a copy. It publishes and renews again only after "
+            f"{_restored_command(keystore)}; docs/howto/keystore_is_lost.md has the other steps.",
+        )
+
+
+def _restored_command(keystore: OpenedKeystore) -> str:
+    where = quote(str(keystore.root))
+    folder = quote(read_published(keystore).folder or "PUB")
+    return f"`sros fleet publish {where} {folder} --restored`"
+
+
+def _defer_requests(
+    keystore: OpenedKeystore,
+    messages: Sequence[_ReceivedMessage],
+    *,
+    is_restored: bool,
+    is_older: bool,
 ) -> None:
     """Refuse requests with new keys while something shows that the keystore was restored.
 
-    The key that vouches for a new key may have been revoked after the backup.  ``is_restored`` says
-    that messages of this run show it.
+    The key that vouches for a new key may have been revoked after the backup.  If the keystore must
+    not publish before ``--restored``, all requests are refused, because a new certificate comes
+    with the rights of the backup.  ``is_restored`` and ``is_older`` say what messages of this run
+    show.
     """
-    requests = [request for message in messages for request in message.requests]
-    new_keys = [request for request in requests if request.request and request.is_new_key]
-    if not new_keys:
+    requests = [request for message in messages for request in message.requests if request.request]
+    if not requests:
         return
     from sros_tool.keystore.delivery.publish import age_clause
 
-    if is_restored or age_clause(keystore):
-        where = quote(str(keystore.root))
-        folder = quote(read_published(keystore).folder or "PUB")
-        why = (
-            "the keystore was restored from a backup, or is a copy, so the key that vouches for "
-            f"the new key may be revoked: first run `sros fleet publish {where} {folder} "
-            "--restored`"
-        )
-        for request in new_keys:
+    if is_older := is_older or is_waiting(keystore):
+        reason = "rights that were taken away since would come back"
+    elif is_restored or age_clause(keystore):
+        reason = "the key that vouches for the new key may be revoked"
+    else:
+        return
+    why = (
+        f"the keystore was restored from a backup, or is a copy, so {reason}: first run "
+        f"{_restored_command(keystore)}"
+    )
+    for request in requests:
+        if is_older or request.is_new_key:
             request.set_outcome("refused", why)
 
 

@@ -24,7 +24,6 @@ from cryptography import x509
 from cryptography.x509.oid import ExtensionOID
 
 from sros_tool import __version__
-from sros_tool.dds.permissions import parse_permissions
 from sros_tool.errors import DocumentError, KeystoreError, Note, SrosError
 from sros_tool.files import remove_file, staged_file
 from sros_tool.fleet.robots import Fleet
@@ -53,7 +52,17 @@ from sros_tool.keystore.delivery.release import (
     seal_problem,
     seal_releases,
 )
-from sros_tool.keystore.delivery.rollback import retired_authorities
+from sros_tool.keystore.delivery.restored import (
+    LaterChange,
+    check_authorities,
+    is_waiting,
+    later_changes,
+    marks_after_last_release,
+    older_than_robots_error,
+    other_changes_notes,
+    refuse_lost_changes,
+    without_agreed,
+)
 from sros_tool.keystore.fleet import checked_fleet, enclaves_of_robot, recorded_fleet
 from sros_tool.keystore.issuing.keyring import IN_KEYSTORE, Keyring
 from sros_tool.keystore.layout import (
@@ -64,15 +73,13 @@ from sros_tool.keystore.layout import (
     IDENTITY_CA_FILE,
     LIST_FILES,
     PERMISSIONS,
-    PERMISSIONS_CA_FILE,
-    PERMISSIONS_FILE,
     PUBLISHED,
     ca_certificate,
     enclave_folder,
     enclave_path,
     fleet_key,
 )
-from sros_tool.keystore.ledger import REPORTED, RESTORED, Entry
+from sros_tool.keystore.ledger import PUBLISHING, REPORTED, Entry
 from sros_tool.keystore.lifecycle.change import KeystoreChange
 from sros_tool.keystore.lifecycle.revocation_list import LostRecords
 from sros_tool.keystore.lifecycle.revoke import (
@@ -84,19 +91,11 @@ from sros_tool.keystore.outcomes import changes_below
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.transaction import KeystoreLock
 from sros_tool.parallel import map_slices, tick
-from sros_tool.pki import smime
 from sros_tool.pki.certificates import (
-    authority_key,
-    authority_text,
     digest,
-    key_digest,
     load_certificates,
-    validity_of,
 )
 from sros_tool.pki.crl import lists_as_revoked, read_list
-from sros_tool.policy.model import ALLOW, DENY
-from sros_tool.policy.rights import Right, compare
-from sros_tool.translate import grant_rights
 from sros_tool.validity import iso
 from sros_tool.values import (
     DryRun,
@@ -176,6 +175,8 @@ class PublishedFleet(NamedTuple):
     """File in the publishing folder with the root metadata that robots should pin."""
     root_sha256: str
     """SHA-256 of the root metadata, in hexadecimal."""
+    later: Sequence[LaterChange]
+    """With ``--restored``: changes from after the backup that the keystore lacks."""
     changes: FileChanges
     notes: Notes
 
@@ -340,16 +341,9 @@ def age_clause(keystore: OpenedKeystore) -> str:
 
     It was restored from a backup, or is a copy, and has not published with ``--restored`` since.
     """
-    if _learned_after_restore(keystore):
+    if marks_after_last_release(keystore):
         return "robots have files that it signed but does not know"
     return _later_in_folder(keystore)
-
-
-def _learned_after_restore(keystore: OpenedKeystore) -> bool:
-    """Return whether the ledger recorded a restore after its last release."""
-    marked = keystore.ledger_file.with_values("what", (RESTORED, "release")).entries
-    marks = [entry.what for entry in marked if entry.what in (RESTORED, "release")]
-    return marks[-1:] == [RESTORED]
 
 
 def is_all_published(root: Path, published: PublishedRobot, enclaves: Sequence[str]) -> bool:
@@ -682,6 +676,10 @@ class _Publication:
         self._changes: Sequence[FileChange] = ()
         self._notes: list[Note] = []
         self._restored_texts: list[str] = []
+        self._is_restored = False
+        self._later: Sequence[LaterChange] = ()
+        self._revoked: Collection[str] = frozenset()
+        """Enclaves that a dry run with ``restored`` would revoke again."""
 
     @contextmanager
     def reporting_restore(self) -> Iterator[None]:
@@ -692,7 +690,7 @@ class _Publication:
             if self._restored_texts:
                 why = f"{error.why.rstrip('.')}. " if error.why else ""
                 done = " ".join(self._restored_texts)
-                error.why = f"{why}The keystore was changed already: {done}"
+                error.why = f"{why}The keystore was changed already. {done}"
             raise
 
     def check_restored(self, restored: bool, new_folder: bool, keyring: Keyring) -> None:
@@ -720,8 +718,11 @@ class _Publication:
             raise self._nothing_published_error()
         if self._is_other_folder:
             self._check_earlier_folder()
-        if (is_lost or self._is_other_folder) and not restored and self._robots_show_restore():
-            raise self._older_than_robots_error()
+        if not restored:
+            is_new_place = is_lost or self._is_other_folder
+            if is_waiting(self.keystore) or (is_new_place and self._robots_show_restore()):
+                doing = f"Publishing to '{self._folder}'"
+                raise older_than_robots_error(self.keystore, doing, str(self._folder))
         is_later = self._has_later_releases(restored)
         if restored and not (is_later or unknown or new_folder or self._shows_restore()):
             raise self._not_restored_error()
@@ -731,18 +732,15 @@ class _Publication:
             forgotten = LostRecords(self.keystore, self._now)
             if is_later or unknown:
                 unknown = [self._last_read()] if is_later else unknown
-                self._check_authorities(unknown[-1])
+                check_authorities(self.keystore, self._folder, unknown[-1])
                 for path, content in chain.from_iterable(of.files.items() for of in unknown):
                     if path.endswith(_LIST_PATHS):
                         forgotten.add(content)
             else:
                 self._notes.append(self._not_shown_note())
             self._restore(forgotten, keyring)
-            last_files = [*self._last_published_files()]
-            self._check_replaced_keys(last_files)
-            self._check_earlier_rights(last_files)
-        if not (is_later and self._dry_run):  # a dry run has not revoked the enclaves again
-            self._check_removed()
+            self._is_restored = True
+        self._check_removed()
         if is_lost or restored:
             self._least = int(self._now.timestamp())
             self.list.robots.clear()
@@ -758,7 +756,7 @@ class _Publication:
         """Return whether the ledger or a robot shows that the keystore was restored."""
         entries = self.keystore.ledger_with("what", "release").entries
         last = max((entry.number for entry in entries if entry.what == "release"), default=0)
-        if _learned_after_restore(self.keystore):
+        if marks_after_last_release(self.keystore):
             return True
         for robot in recorded_fleet(self.keystore).robots:
             with suppress(SrosError):
@@ -795,29 +793,19 @@ class _Publication:
                 " which says what to do.",
             )
 
-    def _older_than_robots_error(self) -> KeystoreError:
-        where = quote(str(self.keystore.root))
-        return KeystoreError(
-            f"messages of robots show that the keystore '{self.keystore.root}' is older than they "
-            "are",
-            "The keystore was restored from a backup, or is a copy. Publishing to "
-            f"'{self._folder}' would undo later changes, such as a revocation.",
-            f"Restore a later backup. If there is none, run `sros fleet collect {where} INBOX`, "
-            f"revoke again what was revoked, and add --restored to {self._command}.",
-        )
-
     def _not_shown_note(self) -> Note:
         """Return a note on revocations that neither keystore nor publishing folder shows."""
         where, since = quote(str(self.keystore.root)), "the backup"
         last = self.keystore.ledger_file.last_time()
-        if last and not _learned_after_restore(self.keystore):
+        if last and not marks_after_last_release(self.keystore):
             since = f"{iso(last)}, the last entry of the ledger"
         return Note(
             "fleet.revocations-not-shown",
-            f"nothing in '{self._folder}' shows what was revoked after {since}: a robot that was "
-            f"stolen after that gets releases, and is trusted. Unless you have done so, run `sros "
-            f"fleet collect {where} INBOX`, which revokes again what messages of robots show, "
-            f"revoke again what else was stolen (`sros revoke {where} --robot NAME`), and publish "
+            f"nothing in '{self._folder}' shows what was revoked, or which rights were taken away, "
+            f"after {since}: a robot that was stolen after that gets releases, and is trusted. "
+            f"Unless you have done so, run `sros fleet collect {where} INBOX`, which revokes again "
+            f"what messages of robots show, revoke again what else was stolen (`sros revoke {where} "
+            "--robot NAME`), sign the present policy (`sros generate_artifacts`), and publish "
             "again.",
         )
 
@@ -928,52 +916,6 @@ class _Publication:
             "keeps it as FOLDER/.agent/release.tar.gz.",
         )
 
-    def _check_authorities(self, last: Release) -> None:
-        """Refuse to publish with CAs that were replaced after the backup.
-
-        Raises:
-            KeystoreError: the keystore has a CA that the release ``last`` shows as replaced, or
-                lacks the newest CA.
-        """
-        replaced: dict[str, x509.Certificate] = {}
-        for role, file in ((IDENTITY, IDENTITY_CA_FILE), (PERMISSIONS, PERMISSIONS_CA_FILE)):
-            own = self.keystore.authority(role)
-            published = [
-                authority
-                for path, data in last.files.items()
-                if path.endswith(f"/{file}")
-                for authority in load_certificates(data, path)
-            ]
-            newest = max([*own, *published], key=lambda each: validity_of(each).not_before)
-            lost = authority_key(newest) not in map(authority_key, own)
-            if lost or retired_authorities(published, own):
-                replaced[role] = newest
-        if not replaced:
-            return
-        where = quote(str(self.keystore.root))
-        separate = len(self.keystore.authority_files) > 1
-        roles = tuple(replaced) if separate else tuple(replaced)[:1]
-        flag = f" --{roles[0]}" if separate and len(roles) == 1 else ""
-        names = " and ".join(f"the {role} CA" for role in roles)
-        later_ones = " and ".join(authority_text(replaced[role]) for role in roles)
-        options = " ".join(f"--{role}-ca FILE --{role}-key PLACE" for role in roles)
-        by_hand = (
-            " Otherwise, also bring the files of each robot by hand (`sros distribute_key "
-            f"{where} --robot NAME FOLDER --force`), because robots accept releases only "
-            "of the CA that they trust."
-        ) * (PERMISSIONS in replaced)
-        raise KeystoreError(
-            f"{names} {'was' if len(roles) == 1 else 'were'} replaced after the backup of the "
-            f"keystore '{self.keystore.root}'",
-            f"The last release in '{self._folder}' trusts {later_ones}. Publishing would put "
-            "robots back on an earlier CA, whose key somebody may have copied.",
-            "Restore a backup from after the rotation. If there is none, repeat later "
-            f"revocations, repeat the rotation (`sros rotate_ca {where}{flag} --finish "
-            "--allow-unconfirmed`), and repeat this command. If you have the key of each later "
-            f"CA, add {options} to the rotation, which goes back to the later CA "
-            f"(docs/howto/keystore_is_lost.md).{by_hand}",
-        )
-
     def _restore(self, forgotten_lists: LostRecords, keyring: Keyring) -> None:
         """Record that the keystore was restored, and revoke again what ``forgotten_lists`` revoke.
 
@@ -981,133 +923,58 @@ class _Publication:
         """
         for certificate in self._sealed_certificates():
             forgotten_lists.add_certificate(certificate)
+        changes = without_agreed(
+            self.keystore, later_changes(self.keystore, self._last_releases(), self._now)
+        )
+        lost = [change for change in changes if change.change in ("key", "governance")]
+        rights = [change.enclave for change in changes if change.change == "rights_taken"]
         revocation = restore_revocations(
             self.keystore.root,
             forgotten_lists,
+            shown_by=PUBLISHING,
+            rights_named=() if lost else rights,
             now=self._now,
             keyring=keyring,
             dry_run=self._dry_run,
         )
         self.keystore = OpenedKeystore(self.keystore.root)
+        self._revoked = frozenset(revocation.names("revoked"))
         if forgotten_lists.lists:
             whence = f"the last release in '{self._folder}' has"
             self._notes.append(restored_note(revocation, whence))
+        self._notes += (e for e in revocation.notes if e.id != REPLACED_AFTER_BACKUP)
         if revocation.changes and not self._dry_run:
-            notes = (*self._notes, *revocation.notes)
-            self._restored_texts += [
-                note.text for note in notes if note.id != REPLACED_AFTER_BACKUP
-            ]
-        for note in revocation.notes:
-            if note.id == REPLACED_AFTER_BACKUP:
-                raise KeystoreError(
-                    f"'{self._folder}' cannot be published yet: {note.text[:-1]}",
-                    "Robots would refuse these enclaves.",
-                    "Then repeat this command, with --restored.",
-                )
-        self._notes += revocation.notes
+            texts = (note.text.rstrip(".") for note in self._notes)
+            self._restored_texts += [f"{text[:1].upper()}{text[1:]}." for text in texts]
+        changes = [
+            LaterChange("key" if is_key else "certificate", name, "")
+            for name, is_key in revocation.replaced.items()
+        ] + [
+            change
+            for change in changes
+            if change.enclave not in self._revoked
+            and not (change.change == "key" and change.enclave in revocation.replaced)
+        ]
+        refuse_lost_changes(self.keystore, self._folder, changes)
+        self._notes += other_changes_notes(self.keystore, changes)
+        self._later = changes
 
-    def _check_replaced_keys(self, last_files: Sequence[tuple[str, Mapping[str, bytes]]]) -> None:
-        """Refuse to publish if the keystore has an earlier key of an enclave than its last release.
-
-        The seal shows this even if the keystore has lost the identity CA of the release.
-        """
-        replaced = sorted(
-            name
-            for name, files in last_files
-            if self._has_earlier_key(name, files.get(CERTIFICATE_FILE, b""))
-        )
-        if replaced:
-            root, names = quote(str(self.keystore.root)), " ".join(map(quote, replaced))
-            raise KeystoreError(
-                f"'{self._folder}' cannot be published yet: after the backup, "
-                f"{first_few(replaced, _MOST_NAMES)} got another key, and the keystore has only "
-                "the earlier one",
-                "Whoever has the earlier key could be trusted again.",
-                "Give these enclaves new keys: "
-                f"`sros renew {root} {names} --new-key --revoke-old`. For keys that were made on "
-                f"the robot, sign each request again, with `sros sign_request {root} REQUEST "
-                f"--no-answer --renew`, and then run `sros renew {root} {names} --revoke-old`. "
-                "Then repeat this command, with --restored.",
-            )
-
-    def _check_earlier_rights(self, last_files: Sequence[tuple[str, Mapping[str, bytes]]]) -> None:
-        """Refuse to publish if the last release of an enclave lacks rights that the keystore gives.
-
-        The enclave's permissions in the keystore are older than those in the release.
-        """
-        regained = sorted(
-            name
-            for name, files in last_files
-            if self._gives_earlier_rights(name, files.get(PERMISSIONS_FILE, b""))
-        )
-        if regained:
-            root, names = quote(str(self.keystore.root)), " ".join(map(quote, regained))
-            raise KeystoreError(
-                f"'{self._folder}' cannot be published yet: after the backup, rights of "
-                f"{first_few(regained, _MOST_NAMES)} were taken away, which the keystore's "
-                "permissions still give",
-                "Robots refuse earlier permissions, but would accept the rights again as soon as "
-                "the permissions are renewed.",
-                "Sign the present policy again, with `sros generate_artifacts`. If the enclaves "
-                f"are to have these rights, run `sros renew {root} {names}`. Then repeat this "
-                "command, with --restored.",
-            )
-
-    def _gives_earlier_rights(self, name: str, sent: bytes) -> bool:
-        """Return whether an enclave's permissions are older than those sent, and give more."""
-        with suppress(SrosError):  # without permissions on one side, no right was taken away
-            own = self.keystore.enclave(name, now=self._now).grant
-            later = parse_permissions(smime.parse(sent).text).grants
-            if own and any(own.validity.not_before < each.validity.not_before for each in later):
-                later_rights = frozenset[Right]().union(*(grant_rights(name, e) for e in later))
-                difference = compare(later_rights, grant_rights(name, own))
-                given = (right.qualifier is ALLOW for right in difference.only_second)
-                no_longer_denied = (right.qualifier is DENY for right in difference.only_first)
-                return any(given) or any(no_longer_denied)
-        return False
-
-    def _last_published_files(self) -> Iterator[tuple[str, Mapping[str, bytes]]]:
-        """Yield the enclaves that the keystore has, with their files in the last release.
+    def _last_releases(self) -> dict[str, Release | None]:
+        """Map robots to their last releases; None stands for a release that cannot be read.
 
         A release counts if a permissions CA of the keystore sealed it, or if metadata that the
         keystore's keys signed names it: the keystore may have lost a later permissions CA.
         """
-        named = []
+        releases = sorted(self._sealed_releases(), key=lambda release: release.number)
+        last: dict[str, Release | None] = {release.robot: release for release in releases}
         for robot, published in self._there.items():
-            with suppress(SrosError):  # publishing refuses damaged archives elsewhere
-                if data := self._read(robot, published):
-                    named.append(read_release(data))
-        releases = sorted((*self._sealed_releases(), *named), key=lambda release: release.number)
-        for release in {release.robot: release for release in releases}.values():
-            for name, files in release.enclaves().items():
-                if self.keystore.has_enclave(name):
-                    yield name, files
-
-    def _has_earlier_key(self, name: str, sent: bytes) -> bool:
-        """Return whether the keystore's key of an enclave is older than that of a certificate.
-
-        If the validity of both began at the same time, as at a fixed date, the older key is the one
-        that the ledger had first.
-        """
-        with suppress(SrosError):  # without a certificate on one side, no key was replaced
-            later, own = load_certificates(sent, name)[0], self.keystore.certificate_of(name)
-            later_key, own_key = (key_digest(each.public_key()) for each in (later, own))  # type: ignore[arg-type]
-            if own_key == later_key:
-                return False
-            entries = self.keystore.ledger_file.with_values("enclave", [name]).entries
-
-            def first(certificate: x509.Certificate, key: str, recorded: str) -> tuple[str, str]:
-                """Return when a key's validity began, and when the ledger had the key first."""
-                issued = (
-                    (entry.not_before, entry.time)
-                    for entry in entries
-                    if entry.what == "certificate" and entry.key == key
-                )
-                began = iso(validity_of(certificate).not_before)
-                return min(issued, default=(began, recorded))
-
-            return first(own, own_key, "") < first(later, later_key, iso(self._now))
-        return False
+            sealed = last.get(robot)
+            if sealed is None or sealed.number < published.number:
+                last[robot] = None
+                with suppress(SrosError):
+                    if data := self._read(robot, published):
+                        last[robot] = read_release(data)
+        return last
 
     def _unknown_releases(self) -> list[Release]:
         """Return the sealed releases, by number, whose number or list the keystore does not know.
@@ -1243,7 +1110,8 @@ class _Publication:
         return [
             name
             for name in enclaves_of_robot(self.keystore, fleet, fleet.robots[robot])
-            if (self.keystore.folder(name) / CERTIFICATE_FILE).exists()
+            if name not in self._revoked
+            and (self.keystore.folder(name) / CERTIFICATE_FILE).exists()
         ]
 
     def _has_files_of(self, robot: str, release: PublishedRelease) -> bool:
@@ -1310,7 +1178,7 @@ class _Publication:
             if not_valid:
                 text = f"{robot}: published although it is not valid now: {not_valid}"
                 self._notes.append(Note("fleet.release-not-valid", text))
-        if lines:
+        if lines or self._is_restored:
             digest = hashlib.sha256("".join(sorted(lines)).encode()).hexdigest()
             change.entries.append(Entry(iso(self._now), "release", sha256=digest, number=number))
 
@@ -1481,6 +1349,7 @@ class _Publication:
             {**self._composed.expires, "root": keys.roots.last.expires} if self._composed else {},
             self._folder / path,
             hashlib.sha256(data).hexdigest(),
+            self._later,
             self._changes,
             (*self._notes, *keys.notes),
         )

@@ -55,6 +55,16 @@ REPLACED_AFTER_BACKUP = "fleet.replaced-after-backup"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Restored(Changed):
+    """The result of `restore_revocations`.
+
+    ``replaced`` maps other enclaves with a revoked certificate to whether their key is revoked.
+    """
+
+    replaced: Mapping[str, bool]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Revocation(Changed):
     """The result of a revocation, or of signing the revocation list again.
 
@@ -153,8 +163,11 @@ def _later_keys_notes(
 def restore_revocations(
     root: Path,
     forgotten_lists: LostRecords,
+    *,
+    shown_by: str = "",
+    rights_named: Collection[str] = (),
     **options: Unpack[ChangeOptions],
-) -> Changed:
+) -> Restored:
     """Revoke again all certificates on revocation lists that the keystore signed and lost.
 
     The next list has a higher number than the lost lists.  Enclaves that were revoked are moved to
@@ -163,7 +176,9 @@ def restore_revocations(
     certificate that the ledger lacked has the same key; so is each key that such a key vouched for
     since then.  Certificates that the ledger lacks are recorded, so that they can be revoked; those
     of a revoked enclave are revoked immediately.  The ledger also records that the keystore was
-    restored, with a number that it never had: the seconds since 1970.
+    restored, with a number that it never had: the seconds since 1970.  ``shown_by`` is the
+    ``reason`` of this entry.  So that a later signature of their rights counts as consent, another
+    entry names each enclave of ``rights_named``, unless there are certificates to replace first.
 
     Raises:
         KeystoreError: as `revoke`.
@@ -205,9 +220,15 @@ def restore_revocations(
             reasons[entry.serial], issued[entry.serial] = SUPERSEDED, entry
             replaced_keys.add((entry.enclave, entry.key))
         _check_names(change, tuple(lost_revocations))
-        revocations = []
-        for name, reason in lost_revocations.items():
-            revocations += lists.revocations({name: _move_to_revoked(change, name)}, reason)
+        # Certificates from after the backup that no list has are good, as of a robot's new key.
+        shown = change.known.shown_after_restore(lost_revocations)
+        good = {entry.serial for entry in shown}.difference(reasons)
+        revocations = [
+            entry
+            for name, reason in lost_revocations.items()
+            for entry in lists.revocations({name: _move_to_revoked(change, name)}, reason)
+            if entry.serial not in good
+        ]
         done = {entry.serial for entry in revocations}
         for serial, reason in reasons.items():
             if serial not in done:
@@ -222,7 +243,12 @@ def restore_revocations(
                 revocations.append(entry)
         gone = frozenset(lost_revocations)
         number = max(change.keystore.ledger_file.next_number(), int(change.now.timestamp()))
-        change.entries = [Entry(iso(change.now), RESTORED, number=number), *unknown.values()]
+        revoked = known | {int(serial, 16) for serial in reasons}
+        replaced = _key_revoked_by_enclave(change, revoked, {key for _, key in replaced_keys}, gone)
+        mark = Entry(iso(change.now), RESTORED, number=number, reason=shown_by)
+        named = sorted({*rights_named} - gone) if not replaced else ()
+        change.entries = [mark, *(mark._replace(enclave=name) for name in named)]
+        change.entries += unknown.values()
         if revocations or forgotten_lists.lists:
             change.restart = tuple(name for name in change.names if name not in gone)
             _, entries = lists.sign(
@@ -236,14 +262,12 @@ def restore_revocations(
         _drop_routers(change, gone)
         change.stage_zenoh({}, gone_enclaves=gone)
         change.record()
-        revoked = known | {int(serial, 16) for serial in reasons}
         change.finish(command="revoke", revoked_before=revoked)
     if unknown:
         change.notes.append(_unknown_note(change, unknown))
-    replaced = _key_revoked_by_enclave(change, revoked, {key for _, key in replaced_keys}, gone)
     change.notes += _replaced_notes(change, replaced)
     outcomes = dict.fromkeys(lost_revocations, "revoked") | dict.fromkeys(replaced, "replaced")
-    return change.result(Changed, outcomes=outcomes)
+    return change.result(Restored, outcomes=outcomes, replaced=replaced)
 
 
 def _replaced_keys(

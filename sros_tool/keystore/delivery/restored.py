@@ -1,0 +1,446 @@
+"""What changed after the backup of a restored keystore, as the last releases of its robots show.
+
+A robot's release counts wherever it comes from, because the permissions CA sealed it.  So a number
+that a robot invents shows nothing, but the seal of a later release shows that the keystore is older
+than its robots.  Until the releases are published with ``--restored``, the keystore then neither
+publishes nor renews by itself: this would bring back rights that were taken away.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections import defaultdict
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
+from datetime import datetime
+from pathlib import Path
+from shlex import quote
+from typing import Annotated, NamedTuple
+
+from cryptography import x509
+
+from sros_tool.dds.governance import parse_governance, render_governance
+from sros_tool.dds.permissions import parse_permissions
+from sros_tool.errors import KeystoreError, Note, SrosError
+from sros_tool.fleet.robots import folded
+from sros_tool.keystore.delivery.published import read_published
+from sros_tool.keystore.delivery.release import Release, sealed_robot
+from sros_tool.keystore.delivery.rollback import retired_authorities
+from sros_tool.keystore.fleet import enclaves_of_robot, recorded_fleet
+from sros_tool.keystore.known_keys import KnownKeys
+from sros_tool.keystore.layout import (
+    CERTIFICATE_FILE,
+    GOVERNANCE_FILE,
+    IDENTITY,
+    IDENTITY_CA_FILE,
+    PERMISSIONS,
+    PERMISSIONS_CA_FILE,
+    PERMISSIONS_FILE,
+    key_on_robot,
+)
+from sros_tool.keystore.ledger import LATER_RELEASE, PUBLISHING, RESTORED
+from sros_tool.keystore.lifecycle.replaced import EarlierPermissions, replaced_rights
+from sros_tool.keystore.reader import OpenedKeystore
+from sros_tool.pki import smime
+from sros_tool.pki.certificates import (
+    authority_key,
+    authority_text,
+    key_digest,
+    load_certificates,
+    subject_text,
+    validity_of,
+)
+from sros_tool.validity import iso
+from sros_tool.values import Words
+from sros_tool.wording import first_few
+
+_SHOWN = 5
+
+
+class LaterChange(NamedTuple):
+    """A change from after the backup of a restored keystore, which the keystore lacks."""
+
+    change: Annotated[
+        str,
+        Words(
+            ("certificate", "key", "rights_taken", "governance", "rights_given", "missing", "added")
+        ),
+    ]
+    """``certificate``: the certificate was replaced and revoked; ``key``: the enclave got another
+    key; ``rights_taken``: the enclave lost rights or ROS domains; ``governance``: the governance
+    was changed; ``rights_given``: the enclave got rights or ROS domains; ``missing``: the keystore
+    lacks the enclave; ``added``: the robot's last release lacks the enclave.  The first four keep
+    ``--restored`` from publishing.
+    """
+    enclave: str
+    """Name of the enclave; empty for the governance."""
+    what: str
+    """The rights and domains; empty for other changes."""
+
+
+# ── whether the keystore is older than its robots ──────────────────────────────────────────
+
+
+def marks_after_last_release(keystore: OpenedKeystore) -> list[str]:
+    """Return the reasons of the restores that the ledger recorded after its last release."""
+    entries = keystore.ledger_file.with_values("what", (RESTORED, "release")).entries
+    reasons: list[str] = []
+    for entry in entries:
+        if entry.what == "release":
+            reasons.clear()
+        elif entry.what == RESTORED:
+            reasons.append(entry.reason)
+    return reasons
+
+
+def is_waiting(keystore: OpenedKeystore) -> bool:
+    """Return whether a restore is known that was not published with ``--restored`` yet."""
+    return bool({LATER_RELEASE, PUBLISHING}.intersection(marks_after_last_release(keystore)))
+
+
+def refuse_while_waiting(keystore: OpenedKeystore, doing: str) -> None:
+    """Raise `KeystoreError` if the keystore is known to be older than its robots.
+
+    ``doing`` is a verb form, such as "Publishing".
+    """
+    if is_waiting(keystore):
+        raise older_than_robots_error(keystore, doing)
+
+
+def older_than_robots_error(
+    keystore: OpenedKeystore, doing: str, folder: str = ""
+) -> KeystoreError:
+    """Return the error for a keystore that messages of robots show to be older than they are."""
+    where = quote(str(keystore.root))
+    place = quote(folder or read_published(keystore).folder or "PUB")
+    return KeystoreError(
+        f"the keystore '{keystore.root}' is older than its robots, as messages or releases show",
+        f"The keystore was restored from a backup, or is a copy. {doing} would undo later changes, "
+        "such as a revocation, or bring back rights that were taken away.",
+        f"Restore a later backup. If there is none, run `sros fleet collect {where} INBOX`, revoke "
+        f"again what was revoked, and run `sros fleet publish {where} {place} --restored`; "
+        "docs/howto/keystore_is_lost.md has the other steps.",
+    )
+
+
+class LaterSeals:
+    """Recognizes the seals of releases that a keystore sealed, and does not know any more."""
+
+    def __init__(self, keystore: OpenedKeystore) -> None:
+        entries = keystore.ledger_file.with_values("what", (RESTORED, "release")).entries
+        self._known = {entry.number for entry in entries if entry.what == "release"}
+        # A restore that is known already explains all lower numbers.
+        self._explained = max((e.number for e in entries if e.what == RESTORED), default=0)
+        self._authorities = keystore.authority(PERMISSIONS)
+
+    def is_later(self, seal: str | None) -> bool:
+        """Return whether a CA of the keystore signed a seal whose number the ledger lacks."""
+        with suppress(SrosError):
+            if seal:
+                number = sealed_robot(seal.encode()).number
+                is_unknown = number > self._explained and number not in self._known
+                return is_unknown and not smime.parse(seal.encode()).problem_for(self._authorities)
+        return False
+
+
+# ── what changed ───────────────────────────────────────────────────────────────────────────
+
+
+def later_changes(
+    keystore: OpenedKeystore, last: Mapping[str, Release | None], now: datetime
+) -> list[LaterChange]:
+    """Return what the last releases of robots show, and the keystore lacks.
+
+    ``last`` maps robots to their last releases; None stands for a release that cannot be read.
+    Certificates that were revoked are left out, because only the revocation lists show them.
+    Documents that the keystore knows show no later change, whatever it has signed since.
+    """
+    fleet, changes = recorded_fleet(keystore), list[LaterChange]()
+    releases = [release for release in last.values() if release]
+    known = _issued_documents(keystore, releases)
+    for robot, release in sorted(last.items()):
+        member = fleet.robots.get(robot)
+        own = enclaves_of_robot(keystore, fleet, member) if member else ()
+        if release is None:
+            text = f"not known, because the archive of the last release of {robot} cannot be read"
+            changes += (LaterChange("rights_taken", name, text) for name in own)
+            continue
+        sent = release.enclaves()
+        changes += (LaterChange("added", name, "") for name in own if name not in sent)
+        for name, files in sent.items():
+            if keystore.has_enclave(name):
+                changes += _changes_of(keystore, name, files, known, now)
+            else:
+                changes.append(LaterChange("missing", name, ""))
+    if releases:
+        changes += _governance_change(keystore, max(releases, key=lambda e: e.number), known)
+    missing = [change.enclave for change in changes if change.change == "missing"]
+    revoked = KnownKeys(keystore).revoked_before(missing) if missing else ()
+    return [change for change in changes if change.enclave not in revoked]
+
+
+def _issued_documents(keystore: OpenedKeystore, releases: Sequence[Release]) -> frozenset[str]:
+    """Return the SHA-256 of the signed documents in ``releases`` that the keystore issued."""
+    files = (PERMISSIONS_FILE, GOVERNANCE_FILE)
+    digests = {
+        hashlib.sha256(data).hexdigest()
+        for release in releases
+        for path, data in release.files.items()
+        if path.rpartition("/")[2] in files
+    }
+    entries = keystore.ledger_file.with_values("sha256", digests).entries
+    return frozenset(digests.intersection(entry.sha256 for entry in entries))
+
+
+def _changes_of(
+    keystore: OpenedKeystore,
+    name: str,
+    files: Mapping[str, bytes],
+    known: Collection[str],
+    now: datetime,
+) -> Iterator[LaterChange]:
+    """Yield the changes of an enclave that ``files`` of its last release show."""
+    certificate = None
+    with suppress(SrosError):  # without a certificate on one side, no key was replaced
+        certificate = load_certificates(files.get(CERTIFICATE_FILE, b""), name)[0]
+        if _has_earlier_key(keystore, name, certificate, now):
+            yield LaterChange("key", name, "")
+    sent = files.get(PERMISSIONS_FILE, b"")
+    if hashlib.sha256(sent).hexdigest() in known:
+        return
+    own = None
+    with suppress(SrosError):  # publishing refuses this robot
+        own = keystore.enclave(name, now=now).grant
+    if own is None:
+        return
+    later = None
+    with suppress(SrosError):
+        subject = subject_text(certificate.subject) if certificate else ""
+        later = parse_permissions(smime.parse(sent).text).grant_of(subject)
+    if later is None or certificate is None:
+        text = "not known, because the permissions in the last release cannot be read"
+        yield LaterChange("rights_taken", name, text)
+        return
+    difference = replaced_rights(name, EarlierPermissions(certificate, later), own, now)
+    if taken := difference.gained_text():
+        yield LaterChange("rights_taken", name, taken)
+    if given := difference.lost_text():
+        yield LaterChange("rights_given", name, given)
+
+
+def _has_earlier_key(
+    keystore: OpenedKeystore, name: str, later: x509.Certificate, now: datetime
+) -> bool:
+    """Return whether the keystore's key of an enclave is older than that of a certificate.
+
+    The seal shows this even if the keystore has lost the identity CA of the release.  If the
+    validity of both began at the same time, as at a fixed date, the older key is the one that the
+    ledger had first.
+    """
+    own = keystore.certificate_of(name)
+    later_key, own_key = (key_digest(each.public_key()) for each in (later, own))  # type: ignore[arg-type]
+    if own_key == later_key:
+        return False
+    entries = keystore.ledger_file.with_values("enclave", [name]).entries
+
+    def first(certificate: x509.Certificate, key: str, recorded: str) -> tuple[str, str]:
+        """Return when a key's validity began, and when the ledger had the key first."""
+        issued = (
+            (entry.not_before, entry.time)
+            for entry in entries
+            if entry.what == "certificate" and entry.key == key
+        )
+        return min(issued, default=(iso(validity_of(certificate).not_before), recorded))
+
+    return first(own, own_key, "") < first(later, later_key, iso(now))
+
+
+def _governance_change(
+    keystore: OpenedKeystore, release: Release, known: Collection[str]
+) -> Iterator[LaterChange]:
+    """Yield the change if a release has another governance, unless it was signed again since."""
+    paths = (path for path in release.files if path.endswith(f"/{GOVERNANCE_FILE}"))
+    sent = release.files[next(paths)]
+    if hashlib.sha256(sent).hexdigest() in known:
+        return
+    own = later = None
+    with suppress(SrosError):  # publishing refuses all robots if their governance is damaged
+        own = keystore.governance
+    with suppress(SrosError):
+        later = parse_governance(smime.parse(sent).text)
+    if own and own != later:
+        lines = (set(render_governance(each).decode().split("\n")) for each in (later, own) if each)
+        texts = (
+            _ELEMENT.sub(r"\1 \2", line.strip())
+            for line in sorted(next(lines) - next(lines, set()))
+        )
+        yield LaterChange("governance", "", first_few([*texts], _SHOWN) if later else "")
+
+
+_ELEMENT = re.compile(r"<(\w+)>(.*)</\w+>")
+
+
+# ── what keeps `--restored` from publishing ────────────────────────────────────────────────
+
+
+def without_agreed(keystore: OpenedKeystore, changes: Sequence[LaterChange]) -> list[LaterChange]:
+    """Return ``changes`` without rights and governance that were signed again on purpose.
+
+    Rights count as agreed to if they were signed after publishing was refused only because of them.
+    """
+    releases = keystore.ledger_with("what", "release").entries
+    last = max((entry.number for entry in releases if entry.what == "release"), default=0)
+    named, agreed = set[str](), set[str]()
+    names = {change.enclave for change in changes if change.change == "rights_taken"}
+    for entry in keystore.ledger_file.with_values("enclave", names).entries if names else ():
+        if entry.what == RESTORED and entry.number > last:
+            named.add(entry.enclave)
+        elif entry.what == "permissions" and entry.enclave in named:
+            agreed.add(entry.enclave)
+    is_refused = is_governance_agreed = False
+    kinds = ("governance", RESTORED)
+    for entry in keystore.ledger_file.with_values("what", kinds).entries:
+        if entry.what == RESTORED and entry.number > last:
+            is_refused |= entry.reason == PUBLISHING
+        elif entry.what == "governance":
+            is_governance_agreed = is_refused
+    return [
+        change
+        for change in changes
+        if not (
+            (change.change == "rights_taken" and change.enclave in agreed)
+            or (change.change == "governance" and is_governance_agreed)
+        )
+    ]
+
+
+def refuse_lost_changes(
+    keystore: OpenedKeystore, folder: Path, changes: Sequence[LaterChange]
+) -> None:
+    """Raise `KeystoreError` if publishing to ``folder`` would undo changes after the backup.
+
+    One error names all of them, so that the remedy for one does not undo another in silence: only
+    an error about nothing but rights asks for consent to them (`restore_revocations`).
+    """
+    root, names = quote(str(keystore.root)), defaultdict[str, list[str]](list)
+    for change in changes:
+        names[change.change].append(change.enclave)
+    what: list[str] = []
+    why: list[str] = []
+    steps: list[str] = []
+
+    def renew(enclaves: Sequence[str], options: str = "") -> str:
+        return f"`sros renew {root} {' '.join(map(quote, enclaves))}{options}`"
+
+    if certificates := names["certificate"]:
+        of = first_few(certificates, _SHOWN)
+        what.append(f"the certificates of {of} were replaced and revoked")
+        why.append("Robots would refuse the revoked certificates.")
+        steps.append(f"Give new certificates: {renew(certificates)}.")
+    if keys := names["key"]:
+        of = first_few(keys, _SHOWN)
+        what.append(f"{of} got another key, and the keystore has only the earlier one")
+        why.append("Whoever has an earlier key could be trusted again.")
+        on_robots = [name for name in keys if key_on_robot(keystore.folder(name))]
+        if here := [name for name in keys if name not in on_robots]:
+            steps.append(f"Give new keys: {renew(here, ' --new-key --revoke-old')}.")
+        if on_robots:
+            steps.append(
+                "For keys that were made on the robot, sign each request again, with `sros "
+                f"sign_request {root} REQUEST --no-answer --renew`, and then run "
+                f"{renew(on_robots, ' --revoke-old')}."
+            )
+    if rights := names["rights_taken"]:
+        taken = [
+            (e.enclave, f"{e.enclave}: {e.what}") for e in changes if e.change == "rights_taken"
+        ]
+        texts = first_few([*folded(recorded_fleet(keystore), taken)], _SHOWN)
+        what.append(
+            f"rights of {first_few(rights, _SHOWN)} were taken away, which the keystore's "
+            f"permissions still give ({texts})"
+        )
+        why.append("The rights would come back.")
+        steps.append("Sign the present policy again, with `sros generate_artifacts`.")
+        if not (certificates or keys or names["governance"]):
+            steps.append(f"If the enclaves are to have these rights, run {renew(rights)}.")
+    for change in changes:
+        if change.change == "governance":
+            what.append(f"the governance was changed{f' ({change.what})' if change.what else ''}")
+            why.append("Messages could be protected less.")
+            steps.append(f"Change it again: `sros update_keystore {root} --set KEY=VALUE`.")
+    if what:
+        raise KeystoreError(
+            f"'{folder}' cannot be published yet: after the backup, {'; '.join(what)}",
+            " ".join(why),
+            f"{' '.join(steps)} Then repeat this command, with --restored.",
+        )
+
+
+def check_authorities(keystore: OpenedKeystore, folder: Path, last: Release) -> None:
+    """Refuse to publish with CAs that were replaced after the backup.
+
+    Raises:
+        KeystoreError: the keystore has a CA that the release ``last`` shows as replaced, or
+            lacks the newest CA.
+    """
+    replaced: dict[str, x509.Certificate] = {}
+    for role, file in ((IDENTITY, IDENTITY_CA_FILE), (PERMISSIONS, PERMISSIONS_CA_FILE)):
+        own = keystore.authority(role)
+        published = [
+            authority
+            for path, data in last.files.items()
+            if path.endswith(f"/{file}")
+            for authority in load_certificates(data, path)
+        ]
+        newest = max([*own, *published], key=lambda each: validity_of(each).not_before)
+        lost = authority_key(newest) not in map(authority_key, own)
+        if lost or retired_authorities(published, own):
+            replaced[role] = newest
+    if not replaced:
+        return
+    where = quote(str(keystore.root))
+    separate = len(keystore.authority_files) > 1
+    roles = tuple(replaced) if separate else tuple(replaced)[:1]
+    flag = f" --{roles[0]}" if separate and len(roles) == 1 else ""
+    names = " and ".join(f"the {role} CA" for role in roles)
+    later_ones = " and ".join(authority_text(replaced[role]) for role in roles)
+    options = " ".join(f"--{role}-ca FILE --{role}-key PLACE" for role in roles)
+    by_hand = (
+        " Otherwise, also bring the files of each robot by hand (`sros distribute_key "
+        f"{where} --robot NAME FOLDER --force`), because robots accept releases only "
+        "of the CA that they trust."
+    ) * (PERMISSIONS in replaced)
+    raise KeystoreError(
+        f"{names} {'was' if len(roles) == 1 else 'were'} replaced after the backup of the "
+        f"keystore '{keystore.root}'",
+        f"The last release in '{folder}' trusts {later_ones}. Publishing would put "
+        "robots back on an earlier CA, whose key somebody may have copied.",
+        "Restore a backup from after the rotation. If there is none, repeat later "
+        f"revocations, repeat the rotation (`sros rotate_ca {where}{flag} --finish "
+        "--allow-unconfirmed`), and repeat this command. If you have the key of each later "
+        f"CA, add {options} to the rotation, which goes back to the later CA "
+        f"(docs/howto/keystore_is_lost.md).{by_hand}",
+    )
+
+
+def other_changes_notes(keystore: OpenedKeystore, changes: Sequence[LaterChange]) -> Iterator[Note]:
+    """Yield a note on changes that do not keep the keystore from publishing."""
+    texts = {
+        "rights_given": "got rights that the keystore does not give: {}",
+        "missing": "is in the last release of its robot, and the keystore lacks it",
+        "added": "is not in the last release of its robot",
+    }
+    lines = [
+        (change.enclave, f"{change.enclave} {texts[change.change].format(change.what)}")
+        for change in changes
+        if change.change in texts
+    ]
+    if lines:
+        shown = first_few([*folded(recorded_fleet(keystore), lines)], _SHOWN)
+        yield Note(
+            "fleet.changed-after-backup",
+            f"the releases from after the backup show other changes: {shown}. Sign the present "
+            "policy and fleet again with `sros generate_artifacts`; remove what is no longer to "
+            "be there.",
+        )
