@@ -37,7 +37,7 @@ from sros_tool.explain.asking import (
     rights_naming,
 )
 from sros_tool.explain.explanation import explain, likely_names, remapping_clause
-from sros_tool.faults import REFUSE_STRANGERS
+from sros_tool.faults import REFUSE_STRANGERS, Fault
 from sros_tool.keystore.layout import (
     KEY_FILE,
     SETTINGS,
@@ -217,7 +217,7 @@ def explain_on_dds(
         *_other_name_notes(answer, asked_enclave),
         *_note_on_fitting_permissions(evaluator, answer),
         *(note_on_lacking_keys(copied) if copied else ()),
-        *_note_on_key_mode(enclave),
+        *_notes_on_files(enclave),
         *_earlier_permissions_notes(answer, context.at),
         *_note_on_anybody([_opened_parts(evaluator, question)], refuse),
     )
@@ -362,8 +362,12 @@ def _other_name_notes(answer: Answer, asked_enclave: AskedEnclave) -> Iterator[N
         yield Note(f"explain.{kind}", text)
 
 
-def _note_on_key_mode(enclave: LoadedEnclave) -> Iterator[Note]:
-    """Yield a note if root alone can read the enclave's key."""
+def _notes_on_files(enclave: LoadedEnclave) -> Iterator[Note]:
+    """Yield notes on a key that root alone can read, and a revocation list that is left out."""
+    for problem in enclave.state.problems if enclave.state else ():
+        if problem.fault is Fault.CRL_LEFT_OUT:
+            text = f"{problem}: nodes of the enclave continue to communicate with revoked enclaves."
+            yield Note("explain.crl-left-out", text)
     key = enclave.folder / KEY_FILE if enclave.folder else None
     if key and key.is_file() and is_for_root_alone(mode := key.stat().st_mode):
         text = (

@@ -118,8 +118,9 @@ def vendor_problems(
     The problems are in the order in which a process finds them.  Of governance and permissions,
     only signature and size are checked here; problems in their content are taken from ``state``.
     """
-    specific = [problem for problem in state.problems if _is_vendor_specific(problem, state)]
-    kept = [problem for problem in state.problems if problem not in specific]
+    problems = [problem for problem in state.problems if problem.fault is not Fault.CRL_LEFT_OUT]
+    specific = [problem for problem in problems if _is_vendor_specific(problem, state)]
+    kept = [problem for problem in problems if problem not in specific]
     if state.token and not traits.reads_tokens:
         text = f"{traits.title} does not read it, and there is no {KEY_FILE}"
         kept.append(Problem(KEY_URI_FILE, text, Fault.KEY_ON_TOKEN))

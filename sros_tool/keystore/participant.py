@@ -470,7 +470,8 @@ def accepted_state(
     """Return an enclave's state without the faults that at least one of the vendors accepts.
 
     Documents that a vendor loads count as the enclave's documents if a CA signed them.  A document
-    that the enclave signed itself stays a fault, even if a vendor accepts it (CVE-2023-24011).
+    that the enclave signed itself stays a fault, even if a vendor accepts it (CVE-2023-24011).  So
+    does a revocation list that ROS leaves out.
     There must be at least one participant.
     """
     loading = [participant for participant in participants if participant.permissions is not None]
@@ -481,6 +482,7 @@ def accepted_state(
         problem
         for problem in state.problems
         if (problem.file == KEY_FILE and problem.fault is Fault.FILE_MISSING)
+        or problem.fault is Fault.CRL_LEFT_OUT
         or (problem.fault in _VENDOR_DECIDES and not sound)
         or all(problem in participant.problems for participant in participants)
         or (problem.fault is Fault.SIGNATURE and not _signed_by_ca(state, problem.file))

@@ -993,7 +993,11 @@ class _EnclaveFiles:
     ) -> bytes | None:
         """Check and return the revocation list; None if there is no readable list."""
         path = self._folder / CRL_FILE
-        if not path.exists():
+        if not os.path.lexists(path):
+            return None
+        if not path.is_file():
+            text = "it is a folder" if path.is_dir() else "it is no file, or a broken link"
+            self._add(CRL_FILE, f"{text}, which ROS 2 leaves out", Fault.CRL_LEFT_OUT)
             return None
         data = self._content(path, "revocation list")
         if data is None:

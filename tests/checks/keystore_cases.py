@@ -212,6 +212,7 @@ CASES |= {
     "enclave.pin-file": lambda b: on_token(
         b, f"object=base?pin-source=file:{b.path('enclaves/base/cert.pem')}"
     ),
+    "enclave.crl-left-out": lambda b: b.path("enclaves/base/crl.pem").mkdir(),
     "enclave.crl-malformed": lambda b: b.path("enclaves/base/crl.pem").write_text("x"),
     "enclave.crl-issuer": lambda b: b.revoke(by=b.foreign()),
     "enclave.crl-partial": lambda b: b.revoke(scope="http://example.org/crl"),

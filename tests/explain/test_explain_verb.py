@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 import sys
+from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -206,6 +207,20 @@ def test_what_cannot_load_is_denied_everything(breakage: str, keystore: Path) ->
         1 if "governance" in breakage and not (Enclave(keystore).folder / "governance.p7s").exists()
         else 0
     )  # fmt: skip
+
+
+@pytest.mark.parametrize("make", [Path.mkdir, lambda path: path.symlink_to("nowhere")])
+def test_a_list_that_ros_leaves_out_stops_only_sros_run(
+    make: Callable[[Path], None], keystore: Path
+) -> None:
+    """rmw_dds_common gives DDS a crl.pem only if it is a regular file, and a node starts."""
+    make(Enclave(keystore).folder / "crl.pem")
+    found = explain(keystore, ENCLAVE, "join")
+    assert found.status == 0
+    assert "continue to communicate with revoked enclaves" in found.err
+    refused = sros("run", keystore, ENCLAVE, "--", "true")
+    assert refused.status == 2
+    assert "which ROS 2 leaves out" in refused.err
 
 
 def test_expired_at_a_moment_to_come(whole: Path) -> None:

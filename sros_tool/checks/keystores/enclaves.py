@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from contextlib import suppress
 from datetime import timedelta
@@ -413,7 +414,7 @@ def _copy_findings(enclave: CheckedEnclave) -> Iterator[Finding]:
         text = "permissions.xml differs from the content of permissions.p7s"
         remedy = "" if enclave.keystore.looks_like_original else _NOT_IN_EXPORTS
         yield XML_DIFFERS.found(enclave.name, text, enclave.file("permissions.xml"), remedy=remedy)
-    if enclave.keystore.crl and not (enclave.folder / "crl.pem").exists():
+    if enclave.keystore.crl and not os.path.lexists(enclave.folder / "crl.pem"):
         text = "crl.pem is missing"
         yield CRL_MISSING.found(enclave.name, text, str(enclave.folder))
 
