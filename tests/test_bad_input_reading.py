@@ -100,7 +100,7 @@ LOG_VERBS = {
 def test_what_is_no_log(
     verb: str, kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("sros_tool.cli.common._WRITER_WITHIN", 0.2)
+    monkeypatch.setattr("sros_tool.cli.common._WRITER_TIMEOUT", 0.2)
     make, why = NOT_LOGS[kind]
     make(tmp_path / "log")
     check_refused(sros(*LOG_VERBS[verb], tmp_path / "log"), why)
@@ -111,7 +111,7 @@ def test_a_named_pipe_whose_writer_comes(
     late: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The writer opens the pipe after sros, which found nobody; then it may write at once."""
-    monkeypatch.setattr("sros_tool.cli.common._WRITER_WITHIN", PATIENCE)
+    monkeypatch.setattr("sros_tool.cli.common._WRITER_TIMEOUT", PATIENCE)
     pipe = tmp_path / "log"
     os.mkfifo(pipe)
 

@@ -94,7 +94,7 @@ def _merge_robots(
     """
     read = []
     for group in groups:
-        kinds = _kinds(group, fleet) if fleet else {}
+        kinds = _merge_keys(group, fleet) if fleet else {}
         same: list[tuple[Hashable, str]] = [(kind, robot) for robot, (kind, _) in kinds.items()]
         read.append((group, same or [(group, "")], [(kind, r) for r, (_, kind) in kinds.items()]))
     for (_, many), of_robot in grouped_by_robot(read, _MOST_SIMILAR).items():
@@ -113,7 +113,7 @@ _FEWEST_ENCLAVES = 2  # only more enclaves than this are merged into one finding
 _MOST_SIMILAR = 5  # more similar findings for different robots become one finding
 
 
-def _kinds(group: tuple[Finding, ...], fleet: Fleet) -> _Kinds:
+def _merge_keys(group: tuple[Finding, ...], fleet: Fleet) -> _Kinds:
     """Map each robot that a finding names to two keys by which findings are merged.
 
     The first key is equal for findings that differ only in this robot; the second key is also equal
@@ -192,18 +192,18 @@ def sarif(
         "name": "sros",
         "version": version,
         "semanticVersion": version,
-        "rules": [_rule(kind) for kind in kinds],
+        "rules": [_sarif_rule(kind) for kind in kinds],
     }
     run = {
         "tool": {"driver": driver},
         "columnKind": "unicodeCodePoints",
         "originalUriBaseIds": {_BASE: {"uri": f"{base.absolute().as_uri()}/"}},
-        "results": [_result(finding, rules[finding.id], base) for finding in findings],
+        "results": [_sarif_result(finding, rules[finding.id], base) for finding in findings],
     }
     return {"$schema": _SCHEMA, "version": _VERSION, "runs": [run]}
 
 
-def _rule(kind: FindingKind) -> dict[str, Any]:
+def _sarif_rule(kind: FindingKind) -> dict[str, Any]:
     return {
         "id": kind.id,
         "name": "".join(part.capitalize() for part in kind.id.replace(".", "-").split("-")),
@@ -214,7 +214,7 @@ def _rule(kind: FindingKind) -> dict[str, Any]:
     }
 
 
-def _result(finding: Finding, rule: int, base: Path) -> dict[str, Any]:
+def _sarif_result(finding: Finding, rule: int, base: Path) -> dict[str, Any]:
     result: dict[str, Any] = {
         "ruleId": finding.id,
         "ruleIndex": rule,
@@ -222,12 +222,12 @@ def _result(finding: Finding, rule: int, base: Path) -> dict[str, Any]:
         "message": {"text": _without_links(f"{finding.subject}: {finding.text}. {finding.remedy}")},
     }
     if finding.file:
-        result["locations"] = [_location(finding.file, finding.line, base)]
+        result["locations"] = [_sarif_location(finding.file, finding.line, base)]
     if finding.related:
         result["relatedLocations"] = [
             {
                 "id": number,
-                **_location(place.file, place.line, base),
+                **_sarif_location(place.file, place.line, base),
                 "message": {"text": _without_links(place.text)},
             }
             for number, place in enumerate(finding.related)
@@ -265,7 +265,7 @@ def _escaped(text: str, characters: str = "") -> str:
     return "".join(f"%{ord(one):02X}" if one in f"%{characters}" else one for one in line)
 
 
-def _location(file: str, line: int | None, base: Path) -> dict[str, Any]:
+def _sarif_location(file: str, line: int | None, base: Path) -> dict[str, Any]:
     return {
         "physicalLocation": {
             "artifactLocation": {
@@ -346,7 +346,7 @@ def keystore_metrics(
         Metric(
             "sros_examined_timestamp_seconds",
             "When the keystore was examined, in seconds since 1970.",
-            (Sample(_seconds(now), place),),
+            (Sample(_timestamp(now), place),),
         ),
         Metric(
             "sros_enclaves",
@@ -363,7 +363,7 @@ def keystore_metrics(
             f"The first expiry of all files of a kind ({_KINDS}), in seconds since 1970, without "
             "short-lived enclaves, which a person renews when they are needed.",
             tuple(
-                Sample(_seconds(moment), {**place, "kind": kind})
+                Sample(_timestamp(moment), {**place, "kind": kind})
                 for kind, moment in earliest.items()
             ),
         ),
@@ -373,7 +373,7 @@ def keystore_metrics(
             "without enclave for a file that all share.",
             tuple(
                 Sample(
-                    _seconds(expiry.moment),
+                    _timestamp(expiry.moment),
                     {**place, "kind": expiry.kind, "enclave": expiry.enclave},
                 )
                 for expiry in expiries
@@ -421,10 +421,10 @@ def _enclave_expiries(keystore: OpenedKeystore, lifetimes: Iterable[Lifetime]) -
         yield Expiry("certificate", lifetime.name, lifetime.certificate.not_after)
         yield Expiry("permissions", lifetime.name, lifetime.permissions.not_after)
         if not keystore.is_original:
-            yield from _exported(keystore, lifetime.name)
+            yield from _exported_expiries(keystore, lifetime.name)
 
 
-def _exported(keystore: OpenedKeystore, name: str) -> Iterator[Expiry]:
+def _exported_expiries(keystore: OpenedKeystore, name: str) -> Iterator[Expiry]:
     """Yield the expiry of an exported enclave's copies of the shared files."""
     folder = keystore.folder(name)
     for file in (IDENTITY_CA_FILE, PERMISSIONS_CA_FILE):
@@ -437,5 +437,5 @@ def _exported(keystore: OpenedKeystore, name: str) -> Iterator[Expiry]:
             yield Expiry("crl", name, crl.next_update)
 
 
-def _seconds(moment: datetime) -> int:
+def _timestamp(moment: datetime) -> int:
     return int(moment.timestamp())

@@ -609,14 +609,14 @@ _BASICS = (
     (NO_PARAMETER_EVENTS, "publish", ("/parameter_events",)),
     (NO_PARAMETER_SERVICES, "reply", tuple(f"~/{name}" for name in PARAMETER_SERVICES)),
 )
-_STARTING = {
+_START_ACTIONS = {
     NO_ROSOUT: "publish /rosout",
     NO_PARAMETER_EVENTS: "publish /parameter_events",
     NO_PARAMETER_SERVICES: "offer its parameter services",
     NO_TYPE_DESCRIPTION: "offer ~/get_type_description",
 }
 """Kind of finding → action of a starting node that the policy denies."""
-_LISTENER = "transform_listener_impl_"
+_TF_LISTENER_PREFIX = "transform_listener_impl_"
 """Name prefix of the nodes of tf2_ros listeners, which have no parameter services."""
 _OF_LISTENERS = (NO_TYPE_DESCRIPTION, NO_ROSOUT)
 
@@ -637,7 +637,7 @@ def _check_nodes(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
         if not (_is_any_node(profile.node) and _has_named_node(enclave))
         for gap in _lacking_basics(checked_policy, enclave, profile)
     ]
-    groups: dict[tuple[str, str], list[_Lacking]] = defaultdict(list)
+    groups: dict[tuple[str, str], list[_NodeLackingRight]] = defaultdict(list)
     differs = cache(_is_not_shipped)
     for gap in lacking:
         if gap.has_include:
@@ -721,7 +721,7 @@ _NAME_THEM = "Name the {} of this enclave in place of the wildcard."
 
 
 @dataclass(slots=True)
-class _Lacking:
+class _NodeLackingRight:
     """A finding about a node without a right that every node needs.
 
     ``included`` is the folder of the common parts that the node's profile includes, or "".
@@ -761,13 +761,13 @@ def _is_not_shipped(folder: str) -> bool:
     return False
 
 
-def _denied_at_start(lacking: Sequence[_Lacking]) -> str:
+def _denied_at_start(lacking: Sequence[_NodeLackingRight]) -> str:
     """Return a sentence on actions of each starting node that the policy denies."""
     nodes = list(dict.fromkeys(gap.node for gap in lacking))
     kinds = Counter(gap.finding.kind for gap in lacking)
     verbs = [
         verb if kinds[kind] == len(nodes) else f"{verb} ({counted(kinds[kind], 'node')})"
-        for kind, verb in _STARTING.items()
+        for kind, verb in _START_ACTIONS.items()
         if kinds[kind]
     ]
     return (
@@ -776,7 +776,7 @@ def _denied_at_start(lacking: Sequence[_Lacking]) -> str:
     )
 
 
-def _different_common_part_cause(folder: str, lacking: Sequence[_Lacking]) -> Cause:
+def _different_common_part_cause(folder: str, lacking: Sequence[_NodeLackingRight]) -> Cause:
     """Return the common cause of findings: an included common part differs from the one of sros."""
     new, old = quote(folder), quote(f"{folder}.old")
     return Cause(
@@ -789,7 +789,7 @@ def _different_common_part_cause(folder: str, lacking: Sequence[_Lacking]) -> Ca
     )
 
 
-def _missing_common_part_cause(lacking: Sequence[_Lacking]) -> Cause:
+def _missing_common_part_cause(lacking: Sequence[_NodeLackingRight]) -> Cause:
     """Return the common cause of findings in one file: ``common/node.xml`` is not included."""
     file = Path(lacking[0].finding.file)
     nodes = list(dict.fromkeys(gap.node for gap in lacking))
@@ -837,9 +837,9 @@ def _has_named_node(enclave: Enclave) -> bool:
 
 def _lacking_basics(
     checked_policy: _CheckedPolicy, enclave: Enclave, profile: Profile
-) -> Iterator[_Lacking]:
+) -> Iterator[_NodeLackingRight]:
     node = expand("~", profile.ns, profile.node)
-    listener = profile.node.startswith(_LISTENER)
+    listener = profile.node.startswith(_TF_LISTENER_PREFIX)
     lacks_others = False
     for kind, right, names in _BASICS:
         if listener and kind not in _OF_LISTENERS:
@@ -860,7 +860,7 @@ def _lacking_basics(
         finding = kind.found(
             enclave.path, text, profile.source.file, profile.source.line, remedy=remedy
         )
-        yield _Lacking(finding, node, listener, _common_folder(profile))
+        yield _NodeLackingRight(finding, node, listener, _common_folder(profile))
 
 
 DOCUMENT_SIZE = FindingKind(
@@ -1667,7 +1667,7 @@ def _is_near(first_name: str, second_name: str) -> bool:
     a, b = sorted(different[0], key=len)
     if len(b) < _SHORTEST or _DIGITS.sub("", a) == _DIGITS.sub("", b):
         return False
-    return _one_edit(a, b)
+    return _is_one_edit(a, b)
 
 
 def _is_typed(a: str, b: str) -> bool:
@@ -1675,7 +1675,7 @@ def _is_typed(a: str, b: str) -> bool:
     return _without_separators(a) != _without_separators(b) and _is_near(a, b)
 
 
-def _one_edit(a: str, b: str) -> bool:
+def _is_one_edit(a: str, b: str) -> bool:
     """Return whether one typing error turns ``a`` into ``b``; ``b`` is at least as long."""
     at = next((index for index, (x, y) in enumerate(zip(a, b, strict=False)) if x != y), len(a))
     if len(a) < len(b):

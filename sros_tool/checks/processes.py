@@ -154,7 +154,7 @@ ROOT_IS_NOT_ENOUGH = (
     "sros lacks the capability CAP_SYS_PTRACE. Run the check on the host, outside of containers."
 )
 
-_NEW_AUTHORITY = Fault.CA_EXPIRED.remedy_in_export("").format(root="KEYSTORE")
+_EXPIRED_CA_REMEDY = Fault.CA_EXPIRED.remedy_in_export("").format(root="KEYSTORE")
 """Remedy for an expired CA, which can no longer renew anything."""
 _MOST_LEDGER = 64 * 1024 * 1024
 _MOST_LEDGERS = 2 * _MOST_LEDGER
@@ -198,7 +198,7 @@ def _file_findings(
     }
     if ends:
         expired = ", ".join(f"{document} at {iso(end)}" for document, end in ends.items())
-        remedy = _NEW_AUTHORITY if ends.keys() & set(_AUTHORITIES.values()) else ""
+        remedy = _EXPIRED_CA_REMEDY if ends.keys() & set(_AUTHORITIES.values()) else ""
         yield PROCESS_EXPIRED.found(process.label, f"of {name} expired: {expired}", remedy=remedy)
     yield from _local_time_findings(process, loaded, now, zone)
     if enclave.writable:
@@ -274,7 +274,7 @@ def _unread_file_findings(process: Process, enclave: ProcessEnclave) -> Iterator
 
 
 @dataclass(frozen=True, slots=True)
-class _Loaded:
+class _LoadedFiles:
     """The certificates and permissions that a process loaded at its start.
 
     ``windows`` maps a description, such as "its certificate", to a validity.  ``grant`` is the
@@ -291,7 +291,7 @@ class _Loaded:
 
 def _loaded_files(
     enclave: ProcessEnclave, newer_files: Sequence[str], process: Process, ledgers: _Ledgers
-) -> _Loaded:
+) -> _LoadedFiles:
     """Return the files that a process loaded; the ledger has files that changed since."""
     windows: dict[str, Window] = {}
     changed = {file.split()[0] for file in newer_files}
@@ -318,7 +318,7 @@ def _loaded_files(
         valid = [validity_of(issuer) for issuer in issuers or certificates]
         if valid:
             windows[authority] = max(valid, key=lambda window: window.not_after)
-    return _Loaded(windows, grant, _revocation_clause(enclave, entries, serial), unknown)
+    return _LoadedFiles(windows, grant, _revocation_clause(enclave, entries, serial), unknown)
 
 
 _AUTHORITIES = {
@@ -408,7 +408,7 @@ def _grant(enclave: ProcessEnclave, subject: str) -> Grant | None:
 
 
 def _local_time_findings(
-    process: Process, loaded_files: _Loaded, now: datetime, zone: tzinfo
+    process: Process, loaded_files: _LoadedFiles, now: datetime, zone: tzinfo
 ) -> Iterator[Finding]:
     """Yield a finding if permissions, read in local time as Fast DDS does, are not valid."""
     grant = loaded_files.grant
@@ -417,7 +417,7 @@ def _local_time_findings(
         return
     if vendor_of(process.rmw) is not Vendor.FAST:
         return
-    process_zone = _zone(process.environment.get("TZ", ""), zone)
+    process_zone = _parse_zone(process.environment.get("TZ", ""), zone)
     begin, end = (
         read_date(DateRule.LOCAL, e, process_zone) for e in (grant.not_before, grant.not_after)
     )
@@ -434,7 +434,7 @@ def _local_time_findings(
 _POSIX_ZONE = re.compile(r"(?:[A-Za-z]{3,}|<[^>]+>)([+-]?)(\d{1,2})(?::(\d\d))?\Z", re.ASCII)
 
 
-def _zone(text: str, otherwise: tzinfo) -> tzinfo:
+def _parse_zone(text: str, otherwise: tzinfo) -> tzinfo:
     """Return the time zone that ``text``, a value of TZ, names, or ``otherwise`` if it is empty.
 
     An unknown time zone is UTC, as in libc.
@@ -965,15 +965,17 @@ def _keystore(process: Process) -> str:
     return plain(process.environment.get(KEYSTORE, ""), _LONGEST_PATH)
 
 
-_Keys = frozenset[bytes]
+_PublicKeys = frozenset[bytes]
 """Public keys of identity CAs, as bytes in DER."""
 
 
-def _group_by_authorities(processes: Iterable[Process]) -> list[tuple[_Keys, list[Process]]]:
+def _group_by_authorities(processes: Iterable[Process]) -> list[tuple[_PublicKeys, list[Process]]]:
     """Group processes by a common identity CA; leave out processes whose CA is not known."""
-    groups: list[tuple[_Keys, list[Process]]] = []
+    groups: list[tuple[_PublicKeys, list[Process]]] = []
     for process in processes:
-        keys = _keys(_certificates_in(process.enclave, IDENTITY_CA_FILE) if process.enclave else ())
+        keys = _public_keys(
+            _certificates_in(process.enclave, IDENTITY_CA_FILE) if process.enclave else ()
+        )
         if keys:
             together = [process]
             for of, group in [group for group in groups if group[0] & keys]:
@@ -983,18 +985,18 @@ def _group_by_authorities(processes: Iterable[Process]) -> list[tuple[_Keys, lis
     return groups
 
 
-def _authorities_here(environment: Mapping[str, str]) -> _Keys:
+def _authorities_here(environment: Mapping[str, str]) -> _PublicKeys:
     """Return the identity CAs of the enclave that an environment names, or of any enclave."""
     root = Path(environment.get(KEYSTORE, ""))
     name = environment.get(ENCLAVE) or next(iter(search_enclaves(root)[0]), "/")
     folder = enclave_path(root, name)
     with suppress(SrosError):  # other findings say what is wrong there
         file = folder / IDENTITY_CA_FILE
-        return _keys(load_certificates(read_bytes(file, "CA certificate"), str(file)))
+        return _public_keys(load_certificates(read_bytes(file, "CA certificate"), str(file)))
     return frozenset()
 
 
-def _keys(certificates: Iterable[x509.Certificate]) -> _Keys:
+def _public_keys(certificates: Iterable[x509.Certificate]) -> _PublicKeys:
     keys = set()
     for certificate in certificates:
         with suppress(ValueError, UnsupportedAlgorithm):

@@ -77,7 +77,7 @@ ROBOTS_UNKNOWN = FindingKind(
 NOTES_ON_LIBRARIES = (PACKAGE_VULNERABILITIES, VERSION_UNKNOWN, ROBOTS_UNKNOWN)
 """Notes that are shown among warnings: they say that a library may be vulnerable."""
 _ROS_PACKAGES = "/opt/ros/"
-_FASTRTPS = ("foxy", "galactic", "humble", "iron", "jazzy")
+_FASTRTPS_DISTRIBUTIONS = ("foxy", "galactic", "humble", "iron", "jazzy")
 """Distributions whose package of Fast DDS is named fastrtps; later ones have fastdds."""
 
 
@@ -87,7 +87,7 @@ def vulnerability_findings(
     advisories: Sequence[Advisory] | None = None,
 ) -> Iterator[Finding]:
     """Yield one finding for each DDS library of the processes, and of ``libraries``."""
-    users = _users(running, libraries)
+    users = _users_by_library(running, libraries)
     by = {library: [f"loaded by {names_text(of)}"] if of else [] for library, of in users.items()}
     yield from _library_findings(by, advisories)
 
@@ -169,13 +169,13 @@ def _library_findings(
             number = _counted_vulnerabilities(known.known, library.version)
             ids = f": {', '.join(advisory.id for advisory in known.known)}"
             if known.unclear:
-                ids += f". {_unclear(known.unclear)}"
+                ids += f". {_unclear_text(known.unclear)}"
             if (first := place_by_text.setdefault(f"{name}: {number}{ids}", place)) != place:
                 number, ids = f"the same known vulnerabilities as {first}", ""
             text = f"{'; '.join((number, *clauses))}; in {place}{ids}"
             yield kind.found(name, text, remedy=_remedy(kind, library))
         elif known.unclear:
-            text = f"{place}{by}. {_unclear(known.unclear)}"
+            text = f"{place}{by}. {_unclear_text(known.unclear)}"
             yield UNCLEAR_VULNERABILITIES.found(name, text)
 
 
@@ -191,7 +191,7 @@ def vulnerability_metrics(
     """
     most: dict[str, int] = {}
     unknown: Counter[str] = Counter()
-    for library in _users(running):
+    for library in _users_by_library(running):
         known = known_vulnerabilities(library.product, library.version, advisories)
         if known is None:
             unknown[library.product] += 1
@@ -216,7 +216,7 @@ def vulnerability_metrics(
     )
 
 
-def _users(
+def _users_by_library(
     running: RunningProcesses, libraries: Iterable[MappedLibrary] = ()
 ) -> Mapping[MappedLibrary, list[str]]:
     """Map libraries to the names of the processes that have mapped them."""
@@ -248,7 +248,7 @@ def _counted_vulnerabilities(advisories: Sequence[Advisory], version: str) -> st
     return f"{count} ({'; '.join(needs)}), {', '.join(fixes)}"
 
 
-def _unclear(advisories: Sequence[Advisory]) -> str:
+def _unclear_text(advisories: Sequence[Advisory]) -> str:
     return f"Not known for this release: {', '.join(advisory.id for advisory in advisories)}"
 
 
@@ -264,7 +264,7 @@ def _remedy(kind: FindingKind, library: MappedLibrary) -> str:
         return ""
     package = "cyclonedds"
     if library.product == "Fast DDS":
-        package = "fastrtps" if distribution in _FASTRTPS else "fastdds"
+        package = "fastrtps" if distribution in _FASTRTPS_DISTRIBUTIONS else "fastdds"
     return (
         f"Upgrade the package ros-{distribution}-{package}, and restart the processes. "
         "Against vulnerabilities that no release fixes, keep strangers out of the network."

@@ -228,12 +228,12 @@ ADMIN_SPACE = FindingKind(
 )
 
 _LINK, _TLS, _ACCESS = "transport/link", "transport/link/tls", "access_control"
-_WITH_WILDCARDS = frozenset(Message) - {Message.REPLY, Message.LIVELINESS_TOKEN}
+_WILDCARD_MESSAGES = frozenset(Message) - {Message.REPLY, Message.LIVELINESS_TOKEN}
 """The messages that can name a key with wildcards."""
 _FEW = 3
 _MOST_PAIRS = 1000
 """Maximum number of pairs of subjects that are counted."""
-_COMPARISON = 20
+_COMPARISON_COST = 20
 """Cost of comparing two subjects, in characters, the unit of `ComparisonLimit`."""
 
 
@@ -384,7 +384,7 @@ def _subject_findings(document: ConfigurationDocument) -> Iterator[Finding]:
     access = document.access
     open_to_all = _allowing_subjects_without_name(document)
     if open_to_all and is_self_limiting(document):
-        text = f"no subject has a name: {_ids(open_to_all)}"
+        text = f"no subject has a name: {_ids_text(open_to_all)}"
         yield SELF_LIMITING.found(document.mode.value, text, document.name, open_to_all[0].line)
     else:
         for subject in open_to_all:
@@ -412,10 +412,10 @@ def _overlapping_subjects(
             if pair[0].overlaps(pair[1]):
                 yield pair
             else:
-                limit.spend(_COMPARISON)
+                limit.spend(_COMPARISON_COST)
 
 
-def _ids(subjects: Sequence[AclSubject]) -> str:
+def _ids_text(subjects: Sequence[AclSubject]) -> str:
     return first_few([subject.id for subject in subjects], _FEW)
 
 
@@ -432,7 +432,7 @@ def _denial_findings(document: ConfigurationDocument) -> Iterator[Finding]:
         denials = [rule for rule in access.rules_of(subject.id) if not rule.allows]
         if not denials:
             continue
-        limit.spend(_COMPARISON * len(access.subjects))
+        limit.spend(_COMPARISON_COST * len(access.subjects))
         overlapping = [other for other in access.subjects if other.overlaps(subject)]
         for rule in denials:
             for kind, text in (
@@ -450,7 +450,7 @@ def _wildcard_that_circumvents(
     """Return how a message with a wildcard circumvents a denial, or "" if none can."""
     rules = access.rules_of(subject.id)
     for flow, message in product(rule.flows, rule.messages):
-        if message not in _WITH_WILDCARDS:
+        if message not in _WILDCARD_MESSAGES:
             continue
         applying = _rules_for(rules, flow, message)
         denied = _keys(applying, allows=False)

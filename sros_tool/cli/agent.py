@@ -180,15 +180,15 @@ def _init(
         )
     settings = AgentSettings(
         robot,
-        _place(source),
-        _place(inbox),
+        _absolute_source(source),
+        _absolute_source(inbox),
         authorities=tuple(sorted({pin for text in authorities for pin in read_pin(text)})),
         tls_ca=str(tls_ca.absolute()) if tls_ca else "",
         new_key=new_key,
         restart=restart,
         restart_if=tuple(split(restart_if or "")),
         systemctl=tuple(split(systemctl)),
-        units=tuple(_unit(text) for text in units),
+        units=tuple(_parse_unit(text) for text in units),
     )
     settings_from(parse_toml(render_settings(settings).decode()), "these options")
     if tls_ca and not tls_ca.is_file():
@@ -218,12 +218,12 @@ def _init(
         echo(f"root metadata: SHA-256 {digest}")
 
 
-def _place(text: str) -> str:
+def _absolute_source(text: str) -> str:
     """Return a URL as it is, and the path of a folder as an absolute path."""
     return text if "://" in text else str(Path(text).absolute())
 
 
-def _unit(text: str) -> Unit:
+def _parse_unit(text: str) -> Unit:
     from sros_tool.agent.settings import Unit
 
     name, mark, enclaves = text.partition("=")
@@ -390,13 +390,13 @@ def _status_lines(status: AgentStatus, moment: datetime) -> Iterator[str]:
     release = f"release {status.accepted}" if status.accepted else "no release"
     release += ", not yet complete" * (status.accepted > status.release)
     yield f"robot {status.robot}: {release}"
-    yield f"fetched {_ago(status.fetched, moment)} from {status.source}"
-    yield f"confirmed {_ago(status.sent, moment)} to {status.inbox}"
+    yield f"fetched {_time_ago(status.fetched, moment)} from {status.source}"
+    yield f"confirmed {_time_ago(status.sent, moment)} to {status.inbox}"
     yield from _due_lines(status.folder, status.restart, status.unseen)
     yield from status.problems
 
 
-def _ago(time: datetime | None, moment: datetime) -> str:
+def _time_ago(time: datetime | None, moment: datetime) -> str:
     from sros_tool.validity import elapsed
 
     if time is None:

@@ -65,7 +65,7 @@ def print_changed(
     else:
         for line in lines:
             echo(line)
-    _tell(first)
+    _print_to_stderr(first)
     print_follow_up(result, after, rights=rights, exported=exported, restart=restart)
 
 
@@ -108,15 +108,15 @@ def print_follow_up(
     if not result.dry_run:
         print_closed(result.root, result.changes)
     if rights:  # on stderr: stdout has the same lines as with ros2/sros2
-        _tell(rights_lines(result.root, result.rights, dry_run=result.dry_run))
-    _tell(after)
+        _print_to_stderr(rights_lines(result.root, result.rights, dry_run=result.dry_run))
+    _print_to_stderr(after)
     if restart:
         _print_restart(result.root, result.restart, result.zenoh, exported=exported)
-    _tell(remark.text for remark in result.remarks)
+    _print_to_stderr(remark.text for remark in result.remarks)
     print_notes(result.notes)
 
 
-def _tell(lines: Iterable[str]) -> None:
+def _print_to_stderr(lines: Iterable[str]) -> None:
     for line in lines:
         echo(line, err=True)
 

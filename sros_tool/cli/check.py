@@ -279,7 +279,7 @@ def check(
     from sros_tool.checks.kind import FindingFilter, Severity
 
     check_one_format()
-    family, paths = _family(targets)
+    family, paths = _split_family(targets)
     form = "json" if as_json else "sarif" if as_sarif else form
     if needs_renewal is not None:
         if family not in ("", "keystore") or len(paths) > 1:
@@ -290,7 +290,7 @@ def check(
             raise UsageError("--needs-renewal has no SARIF output", "", "Use --json.")
         return _needs_renewal(root, needs_renewal, at.now, form)
     lowest = Severity[severity.upper()]
-    if _is_named("fail_on") and fail_on != "never":  # a hidden finding fails no check
+    if _is_option_given("fail_on") and fail_on != "never":  # a hidden finding fails no check
         lowest = min(lowest, Severity[fail_on.upper()])
     check_one_decider()
     vendors = _vendors(vendor, distro, all_distros=all_distros)
@@ -322,10 +322,10 @@ def check(
         _watch_processes(_environment(domain_of(domain)), selection, known, as_json=form == "json")
         return 0
     at = _circumstances(domain, moment, policies, fleet_file, paths)
-    nodes_of = _nodes_of(distro, all_distros=all_distros)
+    nodes_of = _distribution_of_nodes(distro, all_distros=all_distros)
     at = replace(at, distribution=nodes_of, vendors=vendors, advisories=known)
     if upgrade_to:
-        _refuse_besides_upgrade()
+        _refuse_options_with_upgrade()
         from sros_tool.distributions import ROS_DISTRO, sourced_distribution
         from sros_tool.proof.upgrade import check_upgrade
 
@@ -343,16 +343,16 @@ def check(
         not_compared = changed.enclaves - changed.compared
         upgraded = f"; {not_compared} already for {upgrade_to.title}" if not_compared else ""
         echo(f"compared {counted(changed.compared, 'enclave')}{upgraded}", err=True)
-        _SHOW[form](chosen, selection)
+        _PRINTERS[form](chosen, selection)
         return _status(chosen, fail_on)
     if suggest:
         if form != "text" or requirements or earlier:
             raise UsageError("--suggest prints TOML", "", "Give it alone.")
         systems = _paths_of_systems(family, paths, "--suggest")
         if len(systems) > 1:
-            raise _not_one_system("--suggest")
+            raise _not_one_system_error("--suggest")
         with progress("deciding"):
-            text = _suggested(_system(systems[0], at, template))
+            text = _suggested_requirements(_load_system(systems[0], at, template))
         echo_document(text)
         return 0
     if template and not requirements:
@@ -366,7 +366,7 @@ def check(
     with progress("checking"):
         findings = [*_findings(family, paths, at), *_stated_differences(paths, at)]
         if decide:
-            findings += decide(lambda paths: _system(paths, at, template))
+            findings += decide(lambda paths: _load_system(paths, at, template))
     if template:
         from sros_tool.checks.policies import is_mended_by  # most checks read no policy
         from sros_tool.keystore.template import load_template
@@ -379,7 +379,7 @@ def check(
     elif form == "markdown":
         _print_markdown(chosen, _fleet_of(at, paths))
     else:
-        _SHOW[form](chosen, selection)
+        _PRINTERS[form](chosen, selection)
     return _status(chosen, fail_on)
 
 
@@ -450,7 +450,7 @@ def _status(chosen_findings: ChosenFindings, fail_on: str) -> int:
     return 1 if failing else 0
 
 
-def _is_named(parameter: str) -> bool:
+def _is_option_given(parameter: str) -> bool:
     """Return whether the user gave this parameter's option on the command line."""
     source = click.get_current_context().get_parameter_source(parameter)
     return source is ParameterSource.COMMANDLINE
@@ -478,11 +478,11 @@ def _paths_of_systems(
     paths = paths or (() if family == "runtime" else (keystore_from_environment(),))
     keystores = [path for path in paths if is_keystore(path)]
     if not paths or len(keystores) > 1:
-        raise _not_one_system(option)
+        raise _not_one_system_error(option)
     return [*filter(None, ([path for path in paths if path not in keystores], keystores))]
 
 
-def _not_one_system(option: str) -> UsageError:
+def _not_one_system_error(option: str) -> UsageError:
     return UsageError(
         f"{option} takes one keystore, or the policies of one robot or fleet",
         "Several policies count as one.",
@@ -490,7 +490,7 @@ def _not_one_system(option: str) -> UsageError:
     )
 
 
-def _system(
+def _load_system(
     paths: Sequence[Path], circumstances: Circumstances, template: str | None = None
 ) -> System:
     from sros_tool.keystore.template import load_template
@@ -499,14 +499,14 @@ def _system(
     return load_system(paths, circumstances, load_template(template) if template else None)
 
 
-def _suggested(system: System) -> str:
+def _suggested_requirements(system: System) -> str:
     from sros_tool.proof.suggestions import render_requirements, suggest
 
     proposed = suggest(system.rights, system.worlds, system.fleet())
     return render_requirements(proposed.requirements, system.file, proposed.comments)
 
 
-def _family(targets: tuple[Path, ...]) -> tuple[str, tuple[Path, ...]]:
+def _split_family(targets: tuple[Path, ...]) -> tuple[str, tuple[Path, ...]]:
     """Return the family of checks that the first word names, or "", and the paths.
 
     A single word is a path if that path exists: many keystores are named `keystore`.  Next to other
@@ -583,7 +583,7 @@ def _stated_differences(paths: Sequence[Path], circumstances: Circumstances) -> 
             yield from check_distributions(keystore, circumstances)
 
 
-def _nodes_of(distro: Distribution | None, *, all_distros: bool) -> str:
+def _distribution_of_nodes(distro: Distribution | None, *, all_distros: bool) -> str:
     """Return the distribution of the nodes in policies; "" stands for the latest one."""
     if all_distros:
         return ""
@@ -601,7 +601,7 @@ def _vendors(
     return selected_vendors(vendor or "", SUPPORTED if all_distros else (distro,) if distro else ())
 
 
-def _refuse_besides_upgrade() -> None:
+def _refuse_options_with_upgrade() -> None:
     """Raise `UsageError` for options that exclude --upgrade-to."""
     parameters = click.get_current_context().params
     for option in ("requirements", "suggest", "template", "all_distros", "policies"):
@@ -650,7 +650,7 @@ def _findings(family: str, paths: tuple[Path, ...], circumstances: Circumstances
 
 
 def _runtime(circumstances: Circumstances) -> list[Finding]:
-    return _findings_here(
+    return _machine_findings(
         _environment(circumstances.domain),
         circumstances.now,
         {},
@@ -663,7 +663,7 @@ def _environment(domain: int | None) -> dict[str, str]:
     return {**os.environ, **({} if domain is None else {"ROS_DOMAIN_ID": str(domain)})}
 
 
-def _findings_here(
+def _machine_findings(
     environment: Mapping[str, str],
     moment: datetime,
     insecure_rmws: Mapping[str, str],
@@ -692,11 +692,11 @@ def _findings_here(
 
 def _with_relative_paths(finding: Finding) -> Finding:
     """Return the finding; files below the working directory get relative paths."""
-    related = tuple(place._replace(file=_relative(place.file)) for place in finding.related)
-    return finding._replace(file=_relative(finding.file), related=related)
+    related = tuple(place._replace(file=_relative_path(place.file)) for place in finding.related)
+    return finding._replace(file=_relative_path(finding.file), related=related)
 
 
-def _relative(file: str) -> str:
+def _relative_path(file: str) -> str:
     path = Path(file)
     below = path.is_absolute() and path.is_relative_to(Path.cwd())
     return str(path.relative_to(Path.cwd())) if below else file
@@ -835,7 +835,7 @@ class MachineReport(NamedTuple):
     """Findings of ``sros check runtime``."""
 
 
-_SHOW: Mapping[str, Callable[[ChosenFindings, FindingFilter], None]] = {
+_PRINTERS: Mapping[str, Callable[[ChosenFindings, FindingFilter], None]] = {
     "text": _print_all,
     "json": _print_json,
     "sarif": _print_sarif,
@@ -895,7 +895,7 @@ def doctor(report: Path | None, force: bool, advisories: Path | None, as_json: b
         for stack in diagnosis.stacks
         if stack.rmw and stack.enforces is False
     }
-    findings = _findings_here(os.environ, moment, insecure, diagnosis.libraries, known)
+    findings = _machine_findings(os.environ, moment, insecure, diagnosis.libraries, known)
     provider = security_provider(os.environ)
     if as_json:
         print_json(MachineReport(diagnosis, provider, findings))
@@ -942,9 +942,9 @@ def _report_sections(
 # ── check runtime --watch ──────────────────────────────────────────────────────────────────
 
 
-_SECONDS = 2.0
+_POLL_SECONDS = 2.0
 """Seconds between two looks at the processes."""
-_AGAIN = timedelta(minutes=1)
+_RECHECK_AFTER = timedelta(minutes=1)
 """Time after which unchanged processes are checked again, because their files may have expired."""
 _ENDING = (signal.SIGINT, signal.SIGTERM)
 
@@ -971,7 +971,7 @@ def _watch_processes(
         while True:
             moment = now()
             running = table.look(moment)
-            if judged is None or judged[0] != running or moment - judged[1] >= _AGAIN:
+            if judged is None or judged[0] != running or moment - judged[1] >= _RECHECK_AFTER:
                 judged = running, moment
                 findings = [
                     *process_findings(
@@ -985,7 +985,7 @@ def _watch_processes(
                         echo_lines(visible_json(line))
                     else:
                         echo(str(change))
-            if signal.sigtimedwait(_ENDING, _SECONDS):
+            if signal.sigtimedwait(_ENDING, _POLL_SECONDS):
                 return
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)

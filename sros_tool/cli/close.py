@@ -210,7 +210,7 @@ def _show(robot: LocalRobot, closed: CloseState) -> None:
         why = "has ended" if name in closed.observed.ended else "new"
         start = closed.observed.command_of_new(robot.export.absolute(), name)
         echo(f"  {name}: {why}, start it with: {start}")
-    if naming := _naming(closed, policy):
+    if naming := _renaming_advice(closed, policy):
         echo(naming)
     if not_here := closed.observed.not_here:
         bring = f"sros distribute_key {shlex.quote(str(robot.keystore))} ENCLAVE FOLDER"
@@ -273,7 +273,7 @@ def _node_names(policy: Policy, enclave: str) -> Sequence[str]:
     return sorted(f"{profile.ns.rstrip('/')}/{profile.node}" for profile in profiles)
 
 
-def _naming(closed: CloseState, policy: Policy) -> str:
+def _renaming_advice(closed: CloseState, policy: Policy) -> str:
     """Return how to rename an enclave that sros named after one of its nodes.
 
     Returns "" when processes already run closed: another name would then need a restart.
@@ -309,7 +309,7 @@ def _show_end(robot: LocalRobot, closed: CloseState, *, apply: bool, holds: bool
         accept = " (--partial accepts this)" if proof.is_accepted_by_partial else ""
         echo(f"{_ANSWERS[proof.holds]}: {proof.claim}: {proof.reason}{accept}")
     if closed.problems:
-        echo(f"{_state(closed, apply=apply)}; fix this first:")
+        echo(f"{_state_text(closed, apply=apply)}; fix this first:")
         for problem in closed.problems:
             echo(f"  {problem}")
         answer = f"next: sros close {folder}{' --apply' if apply else ''}"
@@ -322,7 +322,7 @@ def _show_end(robot: LocalRobot, closed: CloseState, *, apply: bool, holds: bool
         following += "hands)"
         if robot.keystore.exists():
             following += f", and bring {folder}/keystore to another machine: it has the CA keys"
-        answer = f"the robot is closed{exceptions}{_until(closed)}{following}"
+        answer = f"the robot is closed{exceptions}{_validity_text(closed)}{following}"
     elif closed.proofs:
         accept = _ACCEPT if closed.is_proved(partial=True) else ""
         next_command = (
@@ -351,8 +351,8 @@ def _show_end(robot: LocalRobot, closed: CloseState, *, apply: bool, holds: bool
             following = f"{steps}, and ask {ask}"
         if not closed.secured and rmws_without_security(robot, observed):
             following = "sros doctor, to find an RMW that enforces security, and set it"
-        answer = f"{_state(closed, apply=apply)}{_until(closed)}; next: {following}"
-    echo(f"{answer}{_elsewhere(robot, closed)}", err=True)
+        answer = f"{_state_text(closed, apply=apply)}{_validity_text(closed)}; next: {following}"
+    echo(f"{answer}{_other_machines_advice(robot, closed)}", err=True)
 
 
 def _show_undone(robot: LocalRobot, closed: CloseState) -> None:
@@ -377,7 +377,7 @@ def _show_undone(robot: LocalRobot, closed: CloseState) -> None:
         echo(f"{state}: sros sees no process in an enclave of this folder{more}", err=True)
 
 
-def _state(closed: CloseState, *, apply: bool) -> str:
+def _state_text(closed: CloseState, *, apply: bool) -> str:
     """Return a clause on which processes run in their enclaves, and which do not."""
     if not closed.secured:
         not_closed = "nothing was closed" if apply else "nothing is closed yet"
@@ -394,7 +394,7 @@ def _state(closed: CloseState, *, apply: bool) -> str:
     return f"the processes run in their enclaves{', except for ' * bool(words)}{exceptions}"
 
 
-def _elsewhere(robot: LocalRobot, closed: CloseState) -> str:
+def _other_machines_advice(robot: LocalRobot, closed: CloseState) -> str:
     """Return which files other machines need; sros does not see whether the files are there."""
     needed = ", ".join(f"{name} ({iso(of)})" for name, of in closed.needed_elsewhere.items())
     return needed and (
@@ -404,7 +404,7 @@ def _elsewhere(robot: LocalRobot, closed: CloseState) -> str:
     )
 
 
-def _until(closed: CloseState) -> str:
+def _validity_text(closed: CloseState) -> str:
     """Return a clause with the expiry of the closed processes' files, or "" if none runs closed."""
     if not (closed.secured and closed.valid_until):
         return ""

@@ -736,7 +736,7 @@ def domain_of(text: str | None) -> int | None:
 _PASSPHRASE, _PASSPHRASE_FILE = "SROS_CA_PASSPHRASE", "SROS_CA_PASSPHRASE_FILE"
 _PIN = "SROS_PKCS11_PIN"
 _taken: dict[str, str] = {}
-_noted: set[Note] = set()
+_printed_notes: set[Note] = set()
 """Notes on secrets that were printed already."""
 _KEY_PLACES = {"identity": "SROS_IDENTITY_KEY", "permissions": "SROS_PERMISSIONS_KEY"}
 
@@ -755,7 +755,7 @@ def without_secrets() -> Iterator[None]:
     finally:
         os.environ.update(_taken)
         _taken.clear()
-        _noted.clear()
+        _printed_notes.clear()
 
 
 def taken_secrets() -> tuple[str, ...]:
@@ -874,8 +874,8 @@ def passphrase_file_notes(path: Path) -> Iterator[Note]:
 
 
 def _new_notes(notes: Iterable[Note]) -> list[Note]:
-    new = [note for note in notes if note not in _noted]
-    _noted.update(new)
+    new = [note for note in notes if note not in _printed_notes]
+    _printed_notes.update(new)
     return new
 
 
@@ -919,7 +919,7 @@ def read_named(path: Path, kind: str, *, max_bytes: int = 16 * 1024 * 1024) -> b
     return data
 
 
-_WRITER_WITHIN = 5.0
+_WRITER_TIMEOUT = 5.0
 """Seconds to wait for a pipe's writer, which may have been started at the same time."""
 
 
@@ -938,9 +938,9 @@ def _read_at_most(path: Path, count: int) -> bytes:
         poll = select.poll()
         poll.register(handle, select.POLLIN)
         while len(data) < count:
-            poll.poll(_SIGNALS_WITHIN)
+            poll.poll(_POLL_MILLISECONDS)
             with suppress(BlockingIOError):
-                part = os.read(handle, min(count - len(data), _PART))
+                part = os.read(handle, min(count - len(data), _CHUNK_BYTES))
                 if not part:
                     break
                 data += part
@@ -952,9 +952,9 @@ def _read_at_most(path: Path, count: int) -> bytes:
         os.close(handle)
 
 
-_SIGNALS_WITHIN = 100
+_POLL_MILLISECONDS = 100
 """Milliseconds after which a signal that came just before a wait is noticed."""
-_PART = 1024 * 1024
+_CHUNK_BYTES = 1024 * 1024
 """Number of bytes that are read at a time."""
 
 
@@ -966,7 +966,7 @@ def _first_bytes_of_pipe(handle: int, path: Path) -> bytes:
     """
     poll = select.poll()
     poll.register(handle, select.POLLIN)
-    deadline = time.monotonic() + _WRITER_WITHIN
+    deadline = time.monotonic() + _WRITER_TIMEOUT
     while time.monotonic() < deadline:
         with suppress(BlockingIOError):
             if begin := os.read(handle, 1):
@@ -1096,11 +1096,11 @@ _MOST_SHOWN = 3
 
 
 _FIRST, _EVERY = 1.0, 0.5  # seconds
-_ESTIMATED = 3.0
+_ESTIMATE_AFTER = 3.0
 """Seconds of work after which the remaining time is shown, too."""
 
 
-class _Line:
+class _ProgressLine:
     """A progress line on the terminal that a timer redraws.
 
     The timer is a signal: unlike a thread, it does not disturb the processes that are forked for
@@ -1145,7 +1145,9 @@ class _Line:
         count = f" {done} of {total}" if total and done else ""
         seconds = time.monotonic() - self._began
         time_left = (
-            "" if left is None or seconds < _ESTIMATED else f", about {_duration_text(left)} left"
+            ""
+            if left is None or seconds < _ESTIMATE_AFTER
+            else f", about {_duration_text(left)} left"
         )
         redraw(f"{self._label}{count} ... {seconds:.0f} s{time_left}")
         self._drawn = True
@@ -1156,7 +1158,7 @@ def _duration_text(seconds: float) -> str:
     return f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min"
 
 
-_lines: list[_Line] = []
+_lines: list[_ProgressLine] = []
 
 
 @contextmanager
@@ -1176,7 +1178,7 @@ def progress(label: str, total: int = 0) -> Iterator[Callable[[str], None] | Non
     from sros_tool.parallel import tallied
 
     with tallied() as tally:
-        line = _Line(label, total, tally)
+        line = _ProgressLine(label, total, tally)
         _lines.append(line)
         try:
             yield line.step

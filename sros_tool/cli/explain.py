@@ -124,7 +124,7 @@ def _complete_enclave(
     return [*completions(names, incomplete)]
 
 
-_IGNORED = {
+_IGNORED_PARAMETERS = {
     "": ("infrastructure", "patterns", "robots"),
     "--who": ("infrastructure", "all_vendors", "all_distros"),
     "--reach": (
@@ -145,7 +145,7 @@ def _refuse_ignored(mode: str) -> None:
     context = click.get_current_context()
     for parameter in context.command.params:
         name = parameter.name or ""
-        if name in _IGNORED[mode] and context.params[name]:
+        if name in _IGNORED_PARAMETERS[mode] and context.params[name]:
             option = parameter.opts[0]
             text = f"{mode} takes no {option}" if mode else f"{option} goes with {_GOES_WITH[name]}"
             remedy = "Leave it out."
@@ -295,7 +295,7 @@ def explain(
     mode = "--who" if who else "--reach" if reach else "--log" if logs else ""
     _refuse_ignored(mode)
     check_one_decider()
-    root, rest = _split(arguments, keystore, verb=0 if who else 1)
+    root, rest = _split_keystore(arguments, keystore, verb=0 if who else 1)
     if logs and root and policy:
         raise UsageError(
             "--log takes either a keystore or a policy",
@@ -342,8 +342,8 @@ def explain(
                 opened, chosen, why_zenoh, asking, only, stated=by_stated
             )
         return _print_answer_for_all(decider, question, kind, where, as_json)
-    question = _question(opened, rest, kind)
-    asked = _open(opened, rest[0], policy, asking)
+    question = _parse_question(opened, rest, kind)
+    asked = _open_enclave(opened, rest[0], policy, asking)
     context = asking.context(asked.enclave.joined_domains)
     explanation: DdsExplanation | ZenohExplanation
     if why_zenoh:
@@ -368,12 +368,12 @@ def explain(
     if as_json:
         print_json(explanation)
     else:
-        _echo(lines)
+        _echo_answer(lines)
     print_notes([*_policy_alone(opened, asked, policy), *explanation.notes])
     return 0 if explanation.allowed else 1
 
 
-def _split(
+def _split_keystore(
     arguments: tuple[str, ...], keystore: Path | None, *, verb: int
 ) -> tuple[Path | None, tuple[str, ...]]:
     """Return the keystore (the first argument, or the option) and the other arguments.
@@ -445,7 +445,7 @@ def _reason_for_zenoh(vendor: str | None, keystore: OpenedKeystore | None) -> st
 # ── one question ───────────────────────────────────────────────────────────────────────────
 
 
-def _open(
+def _open_enclave(
     keystore: OpenedKeystore | None, name: str, policy: Path | None, asking: AskingContext
 ) -> AskedEnclave:
     """Open an enclave of a keystore, in its folder, or in a policy alone."""
@@ -498,7 +498,7 @@ def _policy_alone(
     return [Note("explain.policy-alone", text)]
 
 
-def _question(
+def _parse_question(
     keystore: OpenedKeystore | None, other_arguments: tuple[str, ...], kind: str | None
 ) -> Question:
     """Return the question in the arguments after the keystore: enclave, operation and name."""
@@ -528,7 +528,7 @@ def _question(
     return ask(other_arguments[1], other_arguments[2] if len(other_arguments) > 2 else "", kind)
 
 
-def _echo(lines: Iterator[str]) -> None:
+def _echo_answer(lines: Iterator[str]) -> None:
     """Print lines; a yes or no at the beginning of an answer is colored."""
     for number, line in enumerate(lines):
         word, colon, rest = line.partition(":")
@@ -815,9 +815,9 @@ def _link_text(link: CheckedLink) -> str:
 # ── --who ──────────────────────────────────────────────────────────────────────────────────
 
 
-_Where = tuple["Fleet | None", int | None, "DomainSet | None", str]
+_WhoContext = tuple["Fleet | None", int | None, "DomainSet | None", str]
 """The arguments of `_who_lines` after ``answer``."""
-_Only = tuple[tuple[str, ...], tuple[str, ...]]
+_EnclaveFilter = tuple[tuple[str, ...], tuple[str, ...]]
 """The values of --match and --robot."""
 
 
@@ -826,10 +826,10 @@ def _keystore_to_decide(
     chosen_vendor: tuple[Vendor, str] | None,
     why_zenoh: str,
     asking: AskingContext,
-    only: _Only,
+    only: _EnclaveFilter,
     *,
     stated: bool,
-) -> tuple[Decider, _Where]:
+) -> tuple[Decider, _WhoContext]:
     """Return the decider for the enclaves of a keystore, and the keystore's fleet and domains.
 
     ``chosen_vendor`` is the DDS vendor that decides, None for Zenoh. With ``stated``, the deciding
@@ -875,8 +875,8 @@ def _policy_to_decide(
     keystore: OpenedKeystore | None,
     chosen_vendor: tuple[Vendor, str] | None,
     asking: AskingContext,
-    only: _Only,
-) -> tuple[Decider, _Where]:
+    only: _EnclaveFilter,
+) -> tuple[Decider, _WhoContext]:
     """Return the decider for the enclaves of a policy, and the policy's fleet and domains."""
     from sros_tool.explain.asking import fleet_of, policy_to_ask
     from sros_tool.explain.vendors import VendorOfPolicy
@@ -914,7 +914,7 @@ def _question_to_all(other_arguments: tuple[str, ...], kind: str | None) -> Ques
 
 
 def _print_answer_for_all(
-    decider: Decider, question: Question, kind: str | None, where: _Where, as_json: bool
+    decider: Decider, question: Question, kind: str | None, where: _WhoContext, as_json: bool
 ) -> int:
     """Print the decisions on all enclaves; return 0 if any enclave may do it, else 1."""
     from sros_tool.explain.who import answer_for_all, callable_action, names_meant
@@ -924,7 +924,7 @@ def _print_answer_for_all(
     if as_json:
         print_json(decider.printed(answer.question, answer.outcomes))
     else:
-        _echo(_who_lines(answer, *where))
+        _echo_answer(_who_lines(answer, *where))
         echo(f"decided by {decider.title}", err=True)
         if not (kind or answer.allowed or any(outcome.in_part for outcome in answer.outcomes)):
             enclaves = {outcome.enclave for outcome in answer.outcomes}
@@ -1032,7 +1032,7 @@ def _show_reach(
     if as_json:
         print_json(followed)
     else:
-        _echo(_followed_lines(followed))
+        _echo_answer(_followed_lines(followed))
     print_notes(followed.notes)
     if not infrastructure and not as_json:
         topics = ", ".join(topic for topic in followed.left_out if not topic.startswith("*"))
@@ -1084,7 +1084,7 @@ def _show_log(
         print_json(explained)
         return 1 if explained.findings else 0
     for finding in explained.findings:
-        _echo(_finding_lines(finding))
+        _echo_answer(_finding_lines(finding))
     print_notes(explained.notes)
     if not explained.findings:
         lines = text.count("\n") + (not text.endswith("\n")) if text else 0

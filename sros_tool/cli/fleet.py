@@ -418,7 +418,7 @@ def _outcome_numbers(numbers: Mapping[str, int], outcomes: Sequence[str], verb_f
     )
 
 
-def _durations(function: Decorated) -> Decorated:
+def _validity_options(function: Decorated) -> Decorated:
     """Add an option for the validity of the metadata of each role."""
     for role, help_text in reversed(_VALIDITIES.items()):
         function = click.option(f"--{role}-validity", metavar="DURATION", help=help_text)(function)
@@ -449,7 +449,7 @@ _VALIDITIES = {
     multiple=True,
     help="Give this role a new key, which needs the root key; repeatable.",
 )
-@_durations
+@_validity_options
 @click.option(
     "--restored",
     is_flag=True,
@@ -721,8 +721,8 @@ def _status(
         list_lacking = "".join(_list_facts(compared)) if in_force < total else ""
         text = render_fleet_page(
             as_plain(compared),
-            _WORDS,
-            [fact for fact in _facts(compared) if fact != list_lacking],
+            _STATE_WORDS,
+            [fact for fact in _fleet_facts(compared) if fact != list_lacking],
             rows,
             _remedies(status, {to_do for *_, to_do, _ in rows}),
             list_lacking,
@@ -740,7 +740,7 @@ def _status(
     return exit_status
 
 
-_WORDS = {
+_STATE_WORDS = {
     "none": "no enclave",
     "restart": "restart due",
     "missing": "lacking files",
@@ -782,21 +782,21 @@ def _lines(
     )
     doubt = f" ({doubt})" if doubt else ""
     yield f"{counted(len(status.robots), 'robot')}: {counts}{doubt}{upgrade}"
-    yield from _facts(compared_fleet)
+    yield from _fleet_facts(compared_fleet)
     rows = list(_rows(compared_fleet, robots))
     widths = [max(len(row[column]) for row in rows) for column in range(4)] if rows else []
     for row in rows:
         cells = (f"{cell:{width}}" for cell, width in zip(row, widths, strict=False))
         yield "  ".join((*cells, row[4])).rstrip()
     for robot in status.robots if robots else ():
-        yield from _details(robot)
+        yield from _file_details(robot)
     if findings:
         yield from _dds_findings(compared_fleet)
     else:
         yield from _dds_count_lines(compared_fleet)
 
 
-def _facts(compared_fleet: ComparedFleet) -> Iterator[str]:
+def _fleet_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
     """Yield sentences about the fleet as a whole."""
     from sros_tool.keystore.fleet import FLEET_REMEDY
     from sros_tool.validity import elapsed
@@ -891,7 +891,7 @@ def _remedies(status: FleetStatus, to_dos: Collection[str]) -> Mapping[str, str]
         "then deliver to both robots",
         "deliver": by_hand,
         "publish": publish_command(root),
-        "renew": f"`{renewal_command(root)}`, then {_bringing(root, to_renew)}",
+        "renew": f"`{renewal_command(root)}`, then {_delivery_advice(root, to_renew)}",
         "take it out of the fleet file": "remove the robot from the fleet file, and run "
         f"`sros generate_artifacts -k {where} -p POLICY --fleet FILE`",
         "upgrade the DDS": "upgrade the package of the library, which is named below, on the "
@@ -906,7 +906,7 @@ def _remedies(status: FleetStatus, to_dos: Collection[str]) -> Mapping[str, str]
     return shown
 
 
-def _bringing(root: Path, robots: Sequence[RobotStatus]) -> str:
+def _delivery_advice(root: Path, robots: Sequence[RobotStatus]) -> str:
     """Return how to bring renewed files to robots: by a publication, a delivery, or both."""
     from sros_tool.keystore.fleet import publish_command
 
@@ -951,7 +951,7 @@ def _expiry_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
         command = f"`sros crl {quote(str(root))} --refresh`, then "
     if not any("current" in robot.files.get(kind, ()) for robot in soon):
         command = ""  # the keystore has renewed these files
-    bring = f"{command}{_bringing(root, soon)}"
+    bring = f"{command}{_delivery_advice(root, soon)}"
     if not command and all(robot.has_release for robot in soon):
         bring = "new files are published; see the column `to do`"
     yield f"{label}: {when} ({first}, {_KINDS.get(kind, kind)}){others}: {bring}"
@@ -993,7 +993,7 @@ def _groups(compared_fleet: ComparedFleet, robots: Sequence[str]) -> list[_Group
                 *_expiry_clauses(robot, compared_fleet.at),
                 *_summary(robot, status.stage, compared_fleet.at),
             )
-            what = _CLOCK.sub("", _without_robot_name("; ".join(clauses), robot.robot))
+            what = _CLOCK_SENTENCE.sub("", _without_robot_name("; ".join(clauses), robot.robot))
             clauses_by_robot[robot.robot] = what
             row = (robot.state.value, robot.to_do, *_DURATION.split(what))
             robots_by_texts.setdefault((*row, robot.robot if robots else ""), []).append(robot)
@@ -1056,7 +1056,7 @@ _ROBOT = "{robot}"
 
 _DURATION = re.compile(r"(?<![\w.])\d+ (?:d|h|min|s)(?: \d+ (?:h|min|s))?(?![\w.])")
 """A duration as `elapsed` writes it."""
-_CLOCK = re.compile(r" The clock here shows \S+\.")
+_CLOCK_SENTENCE = re.compile(r" The clock here shows \S+\.")
 """The time at which a robot reported a problem, which the row shows as well."""
 _UNITS = {"d": 86400, "h": 3600, "min": 60, "s": 1}
 
@@ -1243,7 +1243,7 @@ def _kind_in_plural(number: int, kind: str) -> str:
     return f"{number} certificates" if kind == "certificate" else f"{number} {kind} files"
 
 
-def _details(robot: RobotStatus) -> Iterator[str]:
+def _file_details(robot: RobotStatus) -> Iterator[str]:
     """Yield the files of a robot: their number by kind and state, and those that differ."""
     yield f"{robot.robot}:"
     where = ("in its folder", "elsewhere, with its name in the path")
@@ -1288,4 +1288,4 @@ def _age_text(robot: RobotStatus, moment: datetime) -> str:
 
 
 def _state_text(state: str) -> str:
-    return _WORDS.get(state, state)
+    return _STATE_WORDS.get(state, state)

@@ -230,10 +230,10 @@ def _keystore_lines(keystore: DescribedKeystore) -> Iterator[str]:
     yield f"  {counted(len(keystore.enclaves), 'enclave')}"
     for enclave in keystore.enclaves:
         facts = enclave.facts
-        state = _state(facts, key_on_robot=enclave.key_on_robot)
+        state = _state_text(facts, key_on_robot=enclave.key_on_robot)
         if facts.token:
             state += f", key on the token {facts.token.token}"
-        yield f"    {enclave.name}  {state}, expires {_moment(facts.expires)}"
+        yield f"    {enclave.name}  {state}, expires {_moment_text(facts.expires)}"
         for problem in facts.problems:
             yield f"      {problem}"
     for problem in keystore.unreadable:
@@ -258,7 +258,7 @@ def _authority_lines(role: str, authority: AuthorityFile | UnreadableFile) -> It
             f"valid until {iso(further.not_after)}, serial {further.serial}"
         )
     if crl := authority.file.crl:
-        yield f"    {_list(crl)}"
+        yield f"    {_list_text(crl)}"
 
 
 def _authority_name(subject: str | None, sha256: str | None) -> str:
@@ -266,11 +266,11 @@ def _authority_name(subject: str | None, sha256: str | None) -> str:
     return f"{subject} (SHA-256 {sha256[:8]})" if sha256 else str(subject)
 
 
-def _moment(moment: datetime | None) -> str:
+def _moment_text(moment: datetime | None) -> str:
     return iso(moment) if moment else "at an unknown time"
 
 
-def _state(facts: EnclaveFacts, *, key_on_robot: bool) -> str:
+def _state_text(facts: EnclaveFacts, *, key_on_robot: bool) -> str:
     if key_on_robot and not facts.problems:
         return "key on its robot"
     return "loadable" if facts.loadable else "NOT LOADABLE"
@@ -278,17 +278,17 @@ def _state(facts: EnclaveFacts, *, key_on_robot: bool) -> str:
 
 def _enclave_lines(enclave: DescribedEnclave) -> Iterator[str]:
     facts = enclave.facts
-    yield f"enclave {enclave.path}: {_state(facts, key_on_robot=enclave.key_on_robot)}"
+    yield f"enclave {enclave.path}: {_state_text(facts, key_on_robot=enclave.key_on_robot)}"
     for problem in facts.problems:
         yield f"  {problem}"
-    yield f"  expires {_moment(facts.expires)} (the first of its files)"
-    yield f"  subject {facts.subject}, certificate until {_moment(facts.valid_until)}"
+    yield f"  expires {_moment_text(facts.expires)} (the first of its files)"
+    yield f"  subject {facts.subject}, certificate until {_moment_text(facts.valid_until)}"
     identity = _authority_name(facts.identity_ca, facts.identity_ca_sha256)
     permissions = _authority_name(facts.permissions_ca, facts.permissions_ca_sha256)
     yield f"  identity CA {identity}, permissions CA {permissions}"
     yield f"  domains {facts.domains}"
     if facts.token:
-        yield f"  {_place(facts.token)}"
+        yield f"  {_token_place_text(facts.token)}"
     for grant in facts.permissions or ():
         yield from _indented(_grant_lines(grant))
     if zenoh := enclave.zenoh:
@@ -305,7 +305,7 @@ def _certificate_file_lines(certificates: DescribedCertificates) -> Iterator[str
         yield "next to it, in the same file"
         yield from _indented(_certificate_lines(further))
     if file.crl:
-        yield _list(file.crl)
+        yield _list_text(file.crl)
 
 
 def _certificate_lines(certificate: CertificateFacts) -> Iterator[str]:
@@ -319,12 +319,12 @@ def _certificate_lines(certificate: CertificateFacts) -> Iterator[str]:
 
 
 def _revocation_list_lines(described_list: DescribedList) -> Iterator[str]:
-    yield _list(described_list.facts)
+    yield _list_text(described_list.facts)
     for serial in described_list.facts.revoked:
         yield f"  {serial}"
 
 
-def _list(crl: ListFacts) -> str:
+def _list_text(crl: ListFacts) -> str:
     valid = "" if crl.valid_now else ": NOT VALID NOW"
     return (
         f"revocation list {crl.number} of {crl.issuer}, until {iso(crl.not_after)}{valid}, "
@@ -338,13 +338,13 @@ def _key_lines(key: DescribedKey) -> Iterator[str]:
         yield "  others can read it: chmod 600"
 
 
-def _place(place: TokenPlace) -> str:
+def _token_place_text(place: TokenPlace) -> str:
     pin = f", PIN in {place.pin_source}" if place.pin_source else ""
     return f"key {place.object} on the token {place.token}{pin}"
 
 
 def _token_lines(described_token: DescribedToken) -> Iterator[str]:
-    yield f"{described_token.path}: {_place(described_token.place)}"
+    yield f"{described_token.path}: {_token_place_text(described_token.place)}"
 
 
 def _permissions_lines(permissions: DescribedPermissions) -> Iterator[str]:

@@ -324,10 +324,10 @@ def crl(
     if as_json:
         from sros_tool.keystore.lifecycle.shown import shown_lists
 
-        enclaves = _names(keystore, lists)
+        enclaves = _enclaves_by_serial(keystore, lists)
         print_json(shown_lists(keystore, result, enclaves, expires_soon=soon, dry_run=dry_run))
     elif lists:
-        for line in _list_lines(lists, _names(keystore, lists)):
+        for line in _list_lines(lists, _enclaves_by_serial(keystore, lists)):
             echo(line)
     else:
         echo("nothing was ever revoked", err=True)
@@ -348,7 +348,9 @@ def _read_given_list(path: Path | None) -> bytes:
     return read_bytes(path, "revocation list") if path else b""
 
 
-def _names(keystore: OpenedKeystore, lists: Sequence[RevocationList]) -> dict[str, str]:
+def _enclaves_by_serial(
+    keystore: OpenedKeystore, lists: Sequence[RevocationList]
+) -> dict[str, str]:
     """Map the serial numbers in ``lists`` to enclaves, by the records of the ledger."""
     serials = {f"{entry.serial:x}" for crl in lists for entry in crl.revoked}
     ledger = keystore.ledger_file.with_values("serial", serials)

@@ -174,7 +174,7 @@ def merge_policy(
 
 
 _MOST_ADDED = 20
-_MOST_OF_ENCLAVE = 2
+_MAX_LISTED_PER_ENCLAVE = 2
 """Maximum number of rights that a merge lists for an enclave; of more rights, it shows the number.
 """
 
@@ -195,7 +195,7 @@ def _print_added(merged: Merged) -> None:
     if folded:
         for enclave, rights in groupby(rights_shown, lambda right: right.enclave):
             texts = [str(right).removeprefix(f"{enclave} ") for right in rights]
-            echo(f"  {enclave} {first_few(texts, _MOST_OF_ENCLAVE)}", err=True)
+            echo(f"  {enclave} {first_few(texts, _MAX_LISTED_PER_ENCLAVE)}", err=True)
     else:
         for right in rights_shown:
             echo(f"  {right}", err=True)

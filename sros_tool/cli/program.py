@@ -362,7 +362,7 @@ def _print_error(text: str) -> int:
 
 
 def _with_usage_prefix(text: str, arguments: Sequence[str]) -> str:
-    verb = _verb(arguments)
+    verb = _verb_in(arguments)
     if verb is None:
         return f"sros: {text}"
     words = " ".join([word for word in arguments if not word.startswith("-")][:2])
@@ -370,7 +370,7 @@ def _with_usage_prefix(text: str, arguments: Sequence[str]) -> str:
     return f"Unable to {phrase}: {text}"
 
 
-def _verb(arguments: Sequence[str]) -> str | None:
+def _verb_in(arguments: Sequence[str]) -> str | None:
     for word in arguments:
         if not word.startswith("-"):
             return _NAMES.get(word.replace("-", "_"))
@@ -404,7 +404,9 @@ def _outdated_dependency() -> str:
                 installed_version = version(name)
             except PackageNotFoundError:
                 installed_version = ""
-            if not installed_version or _numbers(installed_version) < _numbers(least):
+            if not installed_version or _version_numbers(installed_version) < _version_numbers(
+                least
+            ):
                 present = f"version {installed_version} is" if installed_version else "none is"
                 return (
                     f"sros needs the Python package {name} {least} or newer, "
@@ -414,7 +416,7 @@ def _outdated_dependency() -> str:
     return ""
 
 
-def _numbers(version: str) -> list[int]:
+def _version_numbers(version: str) -> list[int]:
     return [int(digits) for digits in re.findall(r"\d+", version)[:2]]
 
 

@@ -43,9 +43,9 @@ if TYPE_CHECKING:
 else:  # generic from click 8.2 on
     _PathsType = click.ParamType
 
-_MOST = 60_000
+_MAX_MARKDOWN = 60_000
 """Maximum length of the Markdown, in characters: a comment on GitHub has at most 65,536."""
-_MOST_REASONS = 20
+_MAX_REASONS = 20
 """Maximum number of lines below a failed step."""
 _SIGNS = {0: "🟢", 1: "🔴", 2: "⚪"}
 _SIGN_ALLOWED = "🟡"
@@ -69,7 +69,7 @@ _ALLOWED_BY = {
 """Kind of step → the option that allows its findings; ``--new-access allow`` for other kinds."""
 
 
-class _Lines(_PathsType):
+class _PathLines(_PathsType):
     """Paths relative to the top of the repository, one on each line, as code hosts pass lists."""
 
     name = "paths"
@@ -90,7 +90,7 @@ def _paths_option(name: str, help_text: str) -> Callable[[Decorated], Decorated]
     return click.option(
         f"--{name}",
         name.replace("-", "_"),
-        type=_Lines(),
+        type=_PathLines(),
         multiple=True,
         metavar="PATH",
         help=f"{help_text}  Can be repeated, or name several on separate lines.",
@@ -567,8 +567,8 @@ def _text(result: Review) -> list[str]:
         mark = "allowed" if step.allowed else _MARKS[step.status]
         lines.append(f"[{mark}] {step.kind}{subject}: {sentence}")
         lines_to_read = _lines_to_read(step)
-        further = [f"and {len(lines_to_read) - _MOST_REASONS} more (--summary FILE has all)"]
-        shown = lines_to_read[:_MOST_REASONS] + further * (len(lines_to_read) > _MOST_REASONS)
+        further = [f"and {len(lines_to_read) - _MAX_REASONS} more (--summary FILE has all)"]
+        shown = lines_to_read[:_MAX_REASONS] + further * (len(lines_to_read) > _MAX_REASONS)
         lines += [f"  {result.with_shown_paths(line)}" for line in shown]
     return [*lines, _verdict(result)]
 
@@ -673,7 +673,7 @@ def _markdown(result: Review, request: ReviewRequest) -> str:
     parts = [f"## Review: {plain(verdict)}{out}"]
     parts += [bounded_list(map(code, result.left_out), 6000, printed)] if count else []
     parts += [sides, bounded_list(lines, 12_000, printed)]
-    characters_left = _MOST - sum(map(len, parts))
+    characters_left = _MAX_MARKDOWN - sum(map(len, parts))
     for step in _sorted_by_weight(result):
         detail = result.with_shown_paths(_detail(result, step, request))
         if detail and len(detail) > characters_left:

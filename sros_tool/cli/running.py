@@ -57,7 +57,7 @@ from sros_tool.wording import first_few
 if TYPE_CHECKING:
     from sros_tool.enclave_environment import EnclaveEnvironment
 
-_COMMAND = "sros.command"
+_COMMAND_KEY = "sros.command"
 """The key in ``ctx.meta`` for the words that a `_WithCommand` gets after ``--``."""
 _FAST_DDS_PIN = "FASTDDS_PKCS11_PIN"
 """The variable from which Fast DDS takes the PIN of a token (Pkcs11Provider.cpp)."""
@@ -288,7 +288,7 @@ class _WithCommand(Verb):
             own_arguments, command = args[: args.index("--")], args[args.index("--") + 1 :]
         elif self.needs_no_dashes:
             ctx.allow_interspersed_args = False
-        ctx.meta[_COMMAND] = command
+        ctx.meta[_COMMAND_KEY] = command
         return super().parse_args(ctx, own_arguments)
 
 
@@ -336,13 +336,13 @@ def run(
     from sros_tool.runtime.environment import enclave_argument, named_enclave, with_enclave
 
     root, rest = split_root(arguments)
-    if policy and rest and ctx.meta[_COMMAND]:
+    if policy and rest and ctx.meta[_COMMAND_KEY]:
         raise UsageError(
             f"--policy and the enclave {rest[0]} exclude each other",
             "With --policy, the policy names the enclave of the node.",
             "Leave one of them out.",
         )
-    command = [*rest[0 if policy else 1 :], *ctx.meta[_COMMAND]]
+    command = [*rest[0 if policy else 1 :], *ctx.meta[_COMMAND_KEY]]
     if not command:
         remedy = "Write `sros run KEYSTORE ENCLAVE -- COMMAND...`."
         raise UsageError("no command is given", "", remedy)
@@ -539,7 +539,7 @@ def units(
     from sros_tool.validity import parse_duration
 
     root, rest = split_root(arguments)
-    command = tuple(ctx.meta[_COMMAND])
+    command = tuple(ctx.meta[_COMMAND_KEY])
     several = bool(patterns or robots)
     if not rest or not (rest[1:] or several or jobs):
         raise UsageError("units takes a keystore, enclaves or --job, and a folder")

@@ -172,7 +172,7 @@ def zenoh(
         "endpoints": ",".join(endpoints),
         "listen": ",".join(listen),
         "mode": mode,
-        "domains": _domains(domain),
+        "domains": _parse_domains(domain),
     }
     chosen_settings = {f"zenoh.{key}": text for key, text in chosen.items() if text}
     further = [name.partition("=")[::2] for name in routers if "=" in name]
@@ -188,7 +188,7 @@ def zenoh(
         for change in result.changes
         if Path(change.path).name in ZENOH_FILES
     }
-    changed = dict.fromkeys(map(_document, actions))
+    changed = dict.fromkeys(map(_document_path, actions))
     if as_json:
         from sros_tool.keystore.lifecycle.shown import shown_zenoh
 
@@ -276,14 +276,14 @@ def _with_router(network: ZenohNetwork, name: str, endpoint: str) -> ZenohNetwor
     return replace(network, routers=tuple(known.values()))
 
 
-def _domains(text: str | None) -> str:
+def _parse_domains(text: str | None) -> str:
     """Return domain ids such as ``3-5,9`` one by one."""
     from sros_tool.dds.domains import DomainSet
 
     return ",".join(map(str, DomainSet.parse(text, "--domain"))) if text else ""
 
 
-def _document(path: str) -> str:
+def _document_path(path: str) -> str:
     """Return the path of the document to which a Zenoh file belongs."""
     return path.removesuffix(".p7s").removesuffix(".json5") + ".json5"
 

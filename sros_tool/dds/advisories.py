@@ -127,7 +127,8 @@ def known_vulnerabilities(
     unclear = tuple(
         advisory
         for advisory in advisories_of_library
-        if not advisory.affects(numbers) and _line(product, numbers) in advisory.unclear_lines
+        if not advisory.affects(numbers)
+        and _release_line(product, numbers) in advisory.unclear_lines
     )
     return KnownVulnerabilities(known, unclear)
 
@@ -300,7 +301,7 @@ def _text(value: object) -> str:
     return value[:_LONGEST_SUMMARY]
 
 
-def _line(product: str, version: Version) -> str:
+def _release_line(product: str, version: Version) -> str:
     """Return the release line of a version; Fast DDS 2.7 to 2.14 belong to the line 2.14."""
     if product != "Fast DDS":
         return f"{version[0]}.{version[1]}"

@@ -445,7 +445,7 @@ def _blocked_by_denials(
     ]
 
 
-_FEW_PARTS = 20
+_MAX_PARTS_FOR_SEARCH = 20
 """Number of distinct name parts up to which searching all names for the parts is faster.
 
 With more parts, comparing all pairs of names is faster.
@@ -460,7 +460,7 @@ def name_notes(names: Iterable[str], new: Iterable[str]) -> Iterator[Note]:
     new_names = set(new)
     # If Cyclone DDS mistakes one name for another, one has all parts of the other.
     parts = {part for name in new_names for part in name.strip("/").split("/")}
-    if len(parts) <= _FEW_PARTS:
+    if len(parts) <= _MAX_PARTS_FOR_SEARCH:
         names = new_names.union(name for name in names if any(part in name for part in parts))
     pairs = [pair for pair in mistaken_names(names) if not new_names.isdisjoint(pair)]
     if pairs:

@@ -60,12 +60,12 @@ _NO_RCLPY = (
 _PYTHON = (sys.executable, "-P")  # never import modules from the current folder
 _LEAN_PYTHON = (*_PYTHON, "-S")
 """Python without site packages: their start-up files can take longer than a node."""
-_ON_THE_WIRE = {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}
+_WITHOUT_SHARED_MEMORY = {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}
 """Environment variable that keeps Fast DDS from using shared memory, so packets can be seen."""
 
 
 @cache
-def _modules() -> Mapping[str, str]:
+def _module_path_variable() -> Mapping[str, str]:
     """Return the environment variable with which `_LEAN_PYTHON` finds the nodes' modules."""
     modules = map(importlib.util.find_spec, ("sros_tool", "lxml", "zenoh"))
     folders = (Path(module.origin).parents[1] for module in modules if module and module.origin)
@@ -163,13 +163,13 @@ class Backend:
         denied.
         """
         if self.on_zenoh:
-            return _modules()
+            return _module_path_variable()
         on_ros = self.library(role, secured=secured) == RCLPY
-        variables = {} if on_ros else {**_modules()}
+        variables = {} if on_ros else {**_module_path_variable()}
         if on_ros and self.rmw:
             variables[RMW] = self.rmw
         if on_ros and wire:
-            variables |= _ON_THE_WIRE
+            variables |= _WITHOUT_SHARED_MEMORY
         if denied and not on_ros:
             # Traced to stdout, because `CycloneLog` takes the stderr of the C library.
             variables |= denial_trace_variables("stdout")
@@ -313,7 +313,7 @@ _SILENCE = 5.0
 
 _LIBRARIES = {CYCLONE: "Cyclone DDS", RCLPY: "rclpy", ZENOH: "Zenoh"}
 _MODULES = {CYCLONE: "cyclone", RCLPY: "ros", ZENOH: "zenoh"}
-_LONGEST_LINE = 1 << 20
+_MAX_EVENT_BYTES = 1 << 20
 """Maximum size of an event in bytes; after a longer event, the reports of a process are ignored."""
 
 
@@ -446,7 +446,7 @@ def run_by_hand(
             timer.start()
         with open(events, "rb", buffering=0) as pipe:
             try:
-                last = _tell(node, pipe.fileno(), say)
+                last = _report(node, pipe.fileno(), say)
             except BaseException:  # such as nobody who reads the lines any more
                 end_within(_SECONDS_TO_STOP, process)
                 process.wait()
@@ -475,11 +475,11 @@ def end_within(seconds: float, process: subprocess.Popen[bytes]) -> None:
     timer.start()
 
 
-def _tell(node: HandNode, pipe: int, say: Callable[[str], None]) -> Event | None:
+def _report(node: HandNode, pipe: int, say: Callable[[str], None]) -> Event | None:
     """Pass the node's reports to ``say`` until the node ends, and return the last report."""
     data, seen, event = b"", "", None
     connected = node.backend != ZENOH
-    while len(data) < _LONGEST_LINE:
+    while len(data) < _MAX_EVENT_BYTES:
         ready, _, _ = select.select([pipe], [], [], _SILENCE)
         if not ready:
             if not connected:
@@ -499,7 +499,9 @@ def _tell(node: HandNode, pipe: int, say: Callable[[str], None]) -> Event | None
             seen = event.text if event.kind is EventKind.SEEN else seen
             if text := _line(event, node.type):
                 say(text)
-    raise SrosError("a node reported too long a message", f"It is over {_LONGEST_LINE} bytes long.")
+    raise SrosError(
+        "a node reported too long a message", f"It is over {_MAX_EVENT_BYTES} bytes long."
+    )
 
 
 def _line(event: Event, own_type: str) -> str:

@@ -138,7 +138,7 @@ def _indented(texts: Sequence[str]) -> list[str]:
     return [f"    {text}" for text in texts if text]
 
 
-_OURS = ("sros_tool", "sros_ros2_security")
+_SROS_PACKAGES = ("sros_tool", "sros_ros2_security")
 """Python packages that provide the `ros2 security` of sros; the second package is for workspaces.
 """
 _SECONDS = 60.0
@@ -163,7 +163,7 @@ class SecurityProvider:
     @property
     def ours(self) -> bool:
         """Whether the command that runs is sros's."""
-        return self.provider in _OURS
+        return self.provider in _SROS_PACKAGES
 
     def __str__(self) -> str:
         if self.ours:
@@ -192,7 +192,7 @@ def security_provider(environment: Mapping[str, str]) -> SecurityProvider | None
         )
         names = [str(package) for package in json.loads(ended.stdout)]
         if names:
-            hidden = {name for name in names if name != names[-1] and name not in _OURS}
+            hidden = {name for name in names if name != names[-1] and name not in _SROS_PACKAGES}
             return SecurityProvider(names[-1], tuple(sorted(hidden)))
     return None
 
@@ -227,7 +227,7 @@ _KNOWN_VALUES: Mapping[str, frozenset[str] | re.Pattern[str]] = {
     ),
 }
 """Environment variables with their values that are safe to show; other values are private."""
-_PRESENT = (
+_PRESENCE_ONLY_VARIABLES = (
     "AMENT_PREFIX_PATH",
     "CYCLONEDDS_URI",
     "FASTDDS_PKCS11_PIN",
@@ -308,7 +308,7 @@ def _environment(environment: Mapping[str, str]) -> list[str]:
         if value is not None:
             fits = known.match(value) if isinstance(known, re.Pattern) else value in known
             lines.append(f"{name}={value}" if fits else f"{name} has another value")
-    return lines + [f"{name} is set" for name in _PRESENT if name in environment]
+    return lines + [f"{name} is set" for name in _PRESENCE_ONLY_VARIABLES if name in environment]
 
 
 class _PrivateDataRemover:

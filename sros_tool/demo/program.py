@@ -103,7 +103,7 @@ _DEFAULT_DOMAIN = 80
 
 _DEFAULT_TEMPLATE = "production"
 
-_ENDPOINT = "localhost:7447"
+_ROUTER_ENDPOINT = "localhost:7447"
 """Endpoint of the Zenoh routers; every router has a separate network."""
 
 _ZENOH_WINDOW = 2.0
@@ -193,7 +193,7 @@ def run_demo(options: DemoOptions, now: datetime, progress: Progress) -> DemoRes
             keystore_domains = (
                 user.domains if user else DomainSet.of((row_domains[0], row_domains[-1]))
             )
-            endpoint = _ENDPOINT if isolation.isolated else f"localhost:{_free_port()}"
+            endpoint = _ROUTER_ENDPOINT if isolation.isolated else f"localhost:{_free_port()}"
             spec = KeystoreSpec(topic, keystore_domains, template, now, endpoint)
             rows = tuple(_with_expectation(row, backend, template, topic) for row in scenario.rows)
             if user:
@@ -477,14 +477,14 @@ def _isolation(network: str) -> Isolation:
 
 _LOG = logging.getLogger(__name__)
 
-_TICK = 0.05
+_POLL_SECONDS = 0.05
 """Seconds between two reads of the processes' reports."""
 
-_GRACE = 0.3
+_GRACE_SECONDS = 0.3
 """Seconds in which messages on the wire may still arrive after the observation."""
 
 
-class _Patience(NamedTuple):
+class _TimeLimits(NamedTuple):
     """Time limits in seconds, which are longer when an undecided row is tried again.
 
     ``lifetime`` is the lifetime of a short-lived certificate.  A process that should be refused
@@ -495,9 +495,9 @@ class _Patience(NamedTuple):
     connect: float
 
 
-_PATIENCE = (_Patience(8, 2.0), _Patience(20, 8.0), _Patience(60, 30.0))
+_PATIENCE = (_TimeLimits(8, 2.0), _TimeLimits(20, 8.0), _TimeLimits(60, 30.0))
 
-_AFTER_EXPIRY = 2.0
+_SECONDS_AFTER_EXPIRY = 2.0
 """Seconds that a row continues after a certificate's expiry."""
 
 _ENOUGH_MESSAGES = 3
@@ -603,7 +603,7 @@ class _Runner:
             return "the row needs a separate network namespace"
         return self._plan.keystores.problem(row)
 
-    async def _play(self, index: int, row: Row, patience: _Patience) -> RowRecord:
+    async def _play(self, index: int, row: Row, patience: _TimeLimits) -> RowRecord:
         plan, domain = self._plan, self._plan.domains[index]
         folder = plan.folder / f"row_{index + 1:02}"
         shutil.rmtree(folder, ignore_errors=True)  # left by an attempt with shorter time limits
@@ -676,7 +676,7 @@ class _Runner:
         while not all(process.settled for process in processes):
             if time.monotonic() > deadline:
                 return False
-            await asyncio.sleep(_TICK)
+            await asyncio.sleep(_POLL_SECONDS)
         return True
 
     def _listen_in(self, index: int, row: Row) -> Wiretap:
@@ -685,7 +685,7 @@ class _Runner:
         return Wiretap(texts, topic, replayed=bool(row.replay or row.impersonate))
 
     def _start(
-        self, index: int, row: Row, party: Party, folder: Path, patience: _Patience
+        self, index: int, row: Row, party: Party, folder: Path, patience: _TimeLimits
     ) -> _PartyProcess:
         plan, domain = self._plan, self._plan.domains[index]
         topic = plan.keystores.topic(party, plan.topic)
@@ -747,7 +747,7 @@ class _Runner:
         if row.meanwhile is not None:
             self._plan.keystores.change(row.party(row.claims[0].subject).identity, row.meanwhile)
         start = time.monotonic()
-        shortest = max(start + limits.window, (expiry or 0.0) + _AFTER_EXPIRY)
+        shortest = max(start + limits.window, (expiry or 0.0) + _SECONDS_AFTER_EXPIRY)
         shortest = min(shortest, self._end)
         longest = min(max(start + limits.longest_window, shortest), self._end)
         claims = (*row.claims, *row.controls)
@@ -769,8 +769,8 @@ class _Runner:
                     break
             if now >= longest or any(process.ended for process in needed):
                 break
-            await asyncio.sleep(_TICK)
-        await asyncio.sleep(_GRACE)
+            await asyncio.sleep(_POLL_SECONDS)
+        await asyncio.sleep(_GRACE_SECONDS)
         return start, now
 
     def _is_met(self, claim: Claim, processes: Mapping[str, _PartyProcess]) -> bool:
@@ -839,7 +839,7 @@ async def _end_softly(processes: Collection[_PartyProcess]) -> None:
         process.ask_to_end()
     latest = time.monotonic() + _SECONDS_TO_END
     while time.monotonic() < latest and not all(process.gone for process in processes):
-        await asyncio.sleep(_TICK)
+        await asyncio.sleep(_POLL_SECONDS)
 
 
 _AFTER_REPLAY = 2.0
@@ -859,7 +859,7 @@ async def _replay_packets(talker: _PartyProcess, tap: Wiretap, lease: float) -> 
     """
     packets = tap.packets(talker.ports())
     await _end_softly([talker])
-    await asyncio.sleep(lease + _GRACE)
+    await asyncio.sleep(lease + _GRACE_SECONDS)
     started = time.monotonic()
     # Twice, since the listener may use the first round only to discover the talker.
     for _ in range(_REPLAY_ROUNDS):
@@ -877,7 +877,7 @@ async def _forge_packets(talker: _PartyProcess, tap: Wiretap) -> Injection:
     is a copy for each place in which a bit is changed, because a reader drops malformed copies.
     """
     talker.hold()
-    await asyncio.sleep(_GRACE)
+    await asyncio.sleep(_GRACE_SECONDS)
     last = {
         len(packet.packet): packet.packet for packet in tap.packets(talker.ports())[-_LAST_PACKETS:]
     }

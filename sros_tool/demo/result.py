@@ -161,20 +161,20 @@ class RowResult:
         return not self.accepted and (self.unaccepted or not self.open_because)
 
 
-class _Finding(NamedTuple):
+class _ClaimFinding(NamedTuple):
     """The observed outcome for a claim, with the evidence."""
 
     status: RowStatus
     detail: str
 
 
-def _undecided(why: str) -> _Finding:
-    return _Finding(RowStatus.UNDECIDED, why)
+def _undecided(why: str) -> _ClaimFinding:
+    return _ClaimFinding(RowStatus.UNDECIDED, why)
 
 
 def judge_row(record: RowRecord) -> RowResult:
     """Judge a row by the record of its processes, and return its result."""
-    finding = _observe(record)
+    finding = _observe_row(record)
     row = record.row
     return RowResult(
         name=row.name,
@@ -195,13 +195,13 @@ def judge_row(record: RowRecord) -> RowResult:
     )
 
 
-def _observe(record: RowRecord) -> _Finding:
+def _observe_row(record: RowRecord) -> _ClaimFinding:
     if record.skipped:
-        return _Finding(RowStatus.SKIPPED, record.skipped)
+        return _ClaimFinding(RowStatus.SKIPPED, record.skipped)
     for party in record.row.parties:
         lost = _missing_import(party, record.parties[party.name])
         if lost:
-            return _Finding(RowStatus.SKIPPED, lost)
+            return _ClaimFinding(RowStatus.SKIPPED, lost)
     claims = [(claim, _judge_claim(claim, record)) for claim in record.row.claims]
     controls = [(claim, _judge_claim(claim, record)) for claim in record.row.controls]
     wrong = [finding for claim, finding in claims if finding.status is not claim.expected]
@@ -209,7 +209,7 @@ def _observe(record: RowRecord) -> _Finding:
         definite = wrong[0].status in chain(*OUTCOMES.values())
         several = len(claims) > 1
         status = RowStatus.DISTURBED if several and definite else wrong[0].status
-        return _Finding(status, wrong[0].detail)
+        return _ClaimFinding(status, wrong[0].detail)
     for claim, finding in controls:
         if finding.status is not claim.expected:
             claim_text = f"{claim.subject} {claim.relation} {claim.talker}".strip()
@@ -218,7 +218,7 @@ def _observe(record: RowRecord) -> _Finding:
             )
     details = [finding.detail for _, finding in claims]
     details += [f"control: {finding.detail}" for _, finding in controls]
-    return _Finding(record.row.expected, "; ".join(details))
+    return _ClaimFinding(record.row.expected, "; ".join(details))
 
 
 def _missing_import(party: Party, record: PartyRecord) -> str:
@@ -242,9 +242,9 @@ class _Case:
         self.subject = record.parties[claim.subject]
         self.talker = record.parties.get(claim.talker, self.subject)
 
-    def result(self, holds: bool, detail: str) -> _Finding:
+    def result(self, holds: bool, detail: str) -> _ClaimFinding:
         """Return the finding of a claim whose relation ``holds`` or does not hold."""
-        return _Finding(OUTCOMES[self.claim.relation][holds], detail)
+        return _ClaimFinding(OUTCOMES[self.claim.relation][holds], detail)
 
     def messages_sent(self, party: PartyRecord) -> list[Event]:
         """Return the messages that a party sent during the observation."""
@@ -257,7 +257,7 @@ class _Case:
         return _messages_heard(self.talker, self.subject)
 
 
-def _judge_claim(claim: Claim, record: RowRecord) -> _Finding:
+def _judge_claim(claim: Claim, record: RowRecord) -> _ClaimFinding:
     for name in filter(None, (claim.subject, claim.talker)):
         if problem := _why_not_running(name, record.parties[name]):
             unexpected = problem.status is RowStatus.REFUSED is not claim.expected
@@ -266,9 +266,9 @@ def _judge_claim(claim: Claim, record: RowRecord) -> _Finding:
                 return problem._replace(detail=f"{problem.detail}; {hint}")
             return _with_evidence(problem, claim, record)
     if claim.relation is Relation.IS_REFUSED:
-        return _Finding(RowStatus.STARTED, f"{claim.subject} was not refused")
+        return _ClaimFinding(RowStatus.STARTED, f"{claim.subject} was not refused")
     if claim.relation is Relation.STARTS:
-        return _Finding(RowStatus.STARTED, f"{claim.subject} started")
+        return _ClaimFinding(RowStatus.STARTED, f"{claim.subject} started")
     if record.window is None:
         return _undecided("not all processes were ready in time")
     return _JUDGES[claim.relation](_Case(claim, record))
@@ -279,7 +279,7 @@ def _is_of_user(name: str, row: Row) -> bool:
     return any(e.name == name and e.identity.enclave.startswith("/") for e in row.parties)
 
 
-def _judge_hearing(case: _Case) -> _Finding:
+def _judge_hearing(case: _Case) -> _ClaimFinding:
     claim, record = case.claim, case.record
     sent = {event.text for event in case.messages_sent(case.talker)}
     if not sent:
@@ -292,7 +292,7 @@ def _judge_hearing(case: _Case) -> _Finding:
     return case.result(bool(heard), f"{claim.subject} heard {heard_of} in {record.seconds:.1f} s")
 
 
-def _judge_answers(case: _Case) -> _Finding:
+def _judge_answers(case: _Case) -> _ClaimFinding:
     claim, asked = case.claim, case.messages_sent(case.subject)
     if not asked:
         return _undecided(f"{claim.subject} sent no request in the window")
@@ -302,7 +302,7 @@ def _judge_answers(case: _Case) -> _Finding:
     return case.result(bool(answers), f"{claim.subject} asked {len(asked)} times and got {right}")
 
 
-def _judge_execution(case: _Case) -> _Finding:
+def _judge_execution(case: _Case) -> _ClaimFinding:
     """Judge a call by the requests that the server executed, because a reply may be lost."""
     claim, asked = case.claim, case.messages_sent(case.talker)
     if not asked:
@@ -312,15 +312,15 @@ def _judge_execution(case: _Case) -> _Finding:
     return case.result(bool(reached), f"{claim.subject} executed {number}")
 
 
-_ON_ITS_WAY = 1.0
+_SECONDS_IN_TRANSIT = 1.0
 """Seconds after expiry in which messages may still arrive: certificates have whole seconds."""
 
 
-def _judge_expiry(case: _Case) -> _Finding:
+def _judge_expiry(case: _Case) -> _ClaimFinding:
     claim, expiry, heard = case.claim, case.record.expiry, case.heard()
     if expiry is None or not any(event.time < expiry for event in heard):
         return _undecided(f"{claim.talker} was not heard before its certificate expired")
-    after = expiry + _ON_ITS_WAY
+    after = expiry + _SECONDS_IN_TRANSIT
     sent = [e for e in case.talker.events if e.kind is EventKind.SENT and e.time > after]
     if not sent:
         return _undecided(f"{claim.talker} sent nothing after its certificate had expired")
@@ -332,7 +332,7 @@ def _judge_expiry(case: _Case) -> _Finding:
     )
 
 
-def _with_evidence(finding: _Finding, claim: Claim, record: RowRecord) -> _Finding:
+def _with_evidence(finding: _ClaimFinding, claim: Claim, record: RowRecord) -> _ClaimFinding:
     """Return a refusal with the log line that proves it, if the claim names a log text.
 
     Without such a line, a refusal is not proved: a process without a connection may only be slow.
@@ -347,7 +347,7 @@ def _with_evidence(finding: _Finding, claim: Claim, record: RowRecord) -> _Findi
     if logged is None:
         return _undecided(f"{finding.detail}, but no process logged {claim.evidence!r}")
     name, line = logged
-    return _Finding(finding.status, f"{finding.detail}; {name}: {_message_of(line)}")
+    return _ClaimFinding(finding.status, f"{finding.detail}; {name}: {_message_of(line)}")
 
 
 def _message_of(line: str) -> str:
@@ -356,7 +356,7 @@ def _message_of(line: str) -> str:
     return " ".join(message.split()).rstrip(".") or line.strip()
 
 
-def _judge_replay(case: _Case) -> _Finding:
+def _judge_replay(case: _Case) -> _ClaimFinding:
     claim, injected = case.claim, case.record.injected
     if injected is None or not injected.packets:
         return _undecided("no packets of the talker were captured to send again")
@@ -368,7 +368,7 @@ def _judge_replay(case: _Case) -> _Finding:
     )
 
 
-def _judge_forgery(case: _Case) -> _Finding:
+def _judge_forgery(case: _Case) -> _ClaimFinding:
     claim, talker, injected = case.claim, case.talker, case.record.injected
     if injected is None or not injected.packets:
         return _undecided("no packet of the talker could be changed")
@@ -390,7 +390,7 @@ def _messages_heard(speaker: PartyRecord, listener: PartyRecord) -> list[Event]:
     return [e for e in listener.events if e.kind is EventKind.HEARD and e.text.startswith(mark)]
 
 
-def _judge_view(case: _Case) -> _Finding:
+def _judge_view(case: _Case) -> _ClaimFinding:
     claim, observer, topic = case.claim, case.subject, case.talker.topic
     serves = case.record.row.party(claim.talker).role is Role.SERVER
     # A server only has to exist; no client has to call it.
@@ -406,7 +406,7 @@ def _judge_view(case: _Case) -> _Finding:
     return case.result(most > 0, f"{observer.through} counts {counted} in {len(looks)} polls")
 
 
-def _judge_loss(case: _Case) -> _Finding:
+def _judge_loss(case: _Case) -> _ClaimFinding:
     claim, topic = case.claim, case.talker.topic
     if not any(event.kind is EventKind.SENT for event in case.talker.events):
         return _undecided(f"{claim.talker} found no node")
@@ -423,7 +423,7 @@ def _judge_loss(case: _Case) -> _Finding:
     return case.result(not left, f"{detail}; {claim.talker} tried it")
 
 
-def _judge_wire(case: _Case) -> _Finding:
+def _judge_wire(case: _Case) -> _ClaimFinding:
     claim, record = case.claim, case.record
     if claim.wire is Wire.MEMORY:
         segments = record.memory.get(claim.subject, 0)
@@ -448,7 +448,7 @@ def _judge_wire(case: _Case) -> _Finding:
     return case.result(False, f"0 packets show the text, {count.protected} are encrypted")
 
 
-_JUDGES: Mapping[Relation, Callable[[_Case], _Finding]] = {
+_JUDGES: Mapping[Relation, Callable[[_Case], _ClaimFinding]] = {
     Relation.HEARS: _judge_hearing,
     Relation.HEARS_AGAIN: _judge_replay,
     Relation.BELIEVES: _judge_forgery,
@@ -461,7 +461,7 @@ _JUDGES: Mapping[Relation, Callable[[_Case], _Finding]] = {
 }
 
 
-def _why_not_running(name: str, record: PartyRecord) -> _Finding | None:
+def _why_not_running(name: str, record: PartyRecord) -> _ClaimFinding | None:
     """Return why a party did not run until the end of the row, or None if it ran."""
     ready = any(event.kind is EventKind.READY for event in record.events)
     for event in record.events:
@@ -470,17 +470,17 @@ def _why_not_running(name: str, record: PartyRecord) -> _Finding | None:
         if event.kind is EventKind.FAILED:
             return _failure(name, record, event)
     if record.status is not None:
-        return _Finding(RowStatus.CRASHED, f"{name} {_exit_text(record)}")
+        return _ClaimFinding(RowStatus.CRASHED, f"{name} {_exit_text(record)}")
     if not ready:
-        return _Finding(RowStatus.NOT_STARTED, f"{name} was not ready in time")
+        return _ClaimFinding(RowStatus.NOT_STARTED, f"{name} was not ready in time")
     return None
 
 
-def _failure(name: str, record: PartyRecord, event: Event) -> _Finding:
+def _failure(name: str, record: PartyRecord, event: Event) -> _ClaimFinding:
     reported = f"{event.text}\n{record.output}"
     reason = " ".join(event.text.split())
     if lacking := missing_security(reported):
-        return _Finding(RowStatus.NOT_STARTED, f"{name}: {lacking}")
+        return _ClaimFinding(RowStatus.NOT_STARTED, f"{name}: {lacking}")
     if event.stage is ProcessStage.ENDPOINT and (refusal := _denial_by_itself(record, event.text)):
         return _refusal_finding(name, ProcessStage.ENDPOINT, refusal)
     if event.stage in (ProcessStage.PARTICIPANT, ProcessStage.ENDPOINT):
@@ -488,7 +488,7 @@ def _failure(name: str, record: PartyRecord, event: Event) -> _Finding:
         refusal = participant_refusal(reported) or endpoint_refusal(reported)
         if refusal:
             return _refusal_finding(name, ProcessStage.PARTICIPANT, refusal)
-    return _Finding(RowStatus.CRASHED, f"{name} failed: {reason}")
+    return _ClaimFinding(RowStatus.CRASHED, f"{name} failed: {reason}")
 
 
 def _denial_by_itself(record: PartyRecord, reported: str) -> str:
@@ -503,11 +503,13 @@ def _is_about(line: str, topic: str) -> bool:
     return bool(re.search(name, line)) or "not allowed by security" in line.lower()
 
 
-def _refusal_finding(name: str, stage: ProcessStage | None, reason: str) -> _Finding:
+def _refusal_finding(name: str, stage: ProcessStage | None, reason: str) -> _ClaimFinding:
     reason = plain_refusal(reason)
     if stage is ProcessStage.ENDPOINT:
-        return _Finding(RowStatus.REFUSED, f"{name}: {reason}")
-    return _Finding(RowStatus.NOT_LET_IN, f"{name} was refused before it used the topic: {reason}")
+        return _ClaimFinding(RowStatus.REFUSED, f"{name}: {reason}")
+    return _ClaimFinding(
+        RowStatus.NOT_LET_IN, f"{name} was refused before it used the topic: {reason}"
+    )
 
 
 def _exit_text(record: PartyRecord) -> str:

@@ -58,7 +58,7 @@ _ACTION_TYPES = {
     "feedback": ("example_interfaces::action::dds_::Fibonacci_FeedbackMessage_", _NO_HASH),
     "status": ("action_msgs::msg::dds_::GoalStatusArray_", _NO_HASH),
 }
-_QOS = "::,7:,:,:,,"
+_GRAPH_QOS = "::,7:,:,:,,"
 """The QoS in a graph token: keep the last 7, else the defaults of rmw_zenoh."""
 _CDR_HEADER = b"\0\1\0\0"
 
@@ -106,7 +106,7 @@ class _ZenohNode:
         identity = f"{self._session.info.zid()}/0/{number}/{kind}"
         token = f"@ros2_lv/{self._domain}/{identity}/{self._place}"
         if name:
-            token = "/".join((token, self.wire_name(name), *types, _QOS))
+            token = "/".join((token, self.wire_name(name), *types, _GRAPH_QOS))
         self._keep(self._session.liveliness().declare_token(token))
         return hashlib.blake2b(token.encode(), digest_size=16).digest()
 

@@ -191,7 +191,7 @@ def about_action(question: Question, rights: Iterable[Right]) -> Question | None
     return ask(_OF_ACTIONS[question.word], question.name, "action")
 
 
-_COMMANDS = ("send_goal", "cancel_goal")
+_COMMANDING_SERVICES = ("send_goal", "cancel_goal")
 """The services of an action that command its server; get_result only reads."""
 
 
@@ -207,7 +207,7 @@ def acting_parts(question: Question) -> dict[str, Question]:
     parts = {}
     for right, inside in reversed(ACTION_PARTS[question.right]):
         part = inside.removeprefix(ACTION_SEPARATOR)
-        if question.right == "execute" or part in _COMMANDS:
+        if question.right == "execute" or part in _COMMANDING_SERVICES:
             name = question.name + inside
             kind = "topic" if right == "publish" else "service"
             written = (Part(AccessVerb.PUBLISH, t) for t in dds_names(right, name).publish)

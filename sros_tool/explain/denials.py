@@ -54,7 +54,7 @@ from sros_tool.runtime.vendor_log import (
     plain_text,
 )
 
-_NEAR_LINES = 3
+_MAX_LINES_TO_DIRECTION = 3
 """Number of log lines after a denial that are searched for its direction."""
 
 
@@ -131,7 +131,9 @@ def _denials_of(process: str, numbered: list[tuple[int, str]]) -> Iterator[Denia
         if denied := denied_topic(line):
             vendor, match = denied
             topic = match["topic"]
-            remote, direction = _direction(lines[index : index + 1 + _NEAR_LINES], topic)
+            remote, direction = _direction(
+                lines[index : index + 1 + _MAX_LINES_TO_DIRECTION], topic
+            )
             rule = match.groupdict().get("rule")
             by_rule = "deny" in rule.lower() if rule else None
             yield Denial(
@@ -239,7 +241,7 @@ _SEVERAL = Note(
     "such as the [talker-1] of ros2 launch",
 )
 
-_NODE_PARTS = ("common/node.xml", "common/node/parameters.xml")
+_COMMON_NODE_FILES = ("common/node.xml", "common/node/parameters.xml")
 """Files to include, the largest first; a node without a right of a file lacks this include."""
 
 
@@ -428,7 +430,7 @@ def _missing_common_part(
     """
     if is_expression(profile[1]):
         return ()
-    for part in _NODE_PARTS:
+    for part in _COMMON_NODE_FILES:
         if part in common.rights:
             rights = common.included_rights([part], *profile)
             if (denied is None or rights & denied) and not rights & node_rights:

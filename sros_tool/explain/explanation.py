@@ -142,7 +142,7 @@ _VENDOR = (
     "POLICY`."
 )
 
-_BY_REASON: dict[str, str | Fault] = {
+_FAULT_OF_REASON: dict[str, str | Fault] = {
     "expired": Fault.PERMISSIONS_EXPIRED,
     "not-yet-valid": Fault.PERMISSIONS_NOT_YET_VALID,
     "no-grant": Fault.PERMISSIONS_SUBJECT,
@@ -175,7 +175,9 @@ def remedy(cause: Fault | str, root: str, enclave: str, file: str = "") -> str:
         enclave: the name of the enclave.
         file: the enclave's file that has the fault, if known.
     """
-    known = cause if isinstance(cause, Fault) else FAULTS.get(cause, _BY_REASON.get(cause, ""))
+    known = (
+        cause if isinstance(cause, Fault) else FAULTS.get(cause, _FAULT_OF_REASON.get(cause, ""))
+    )
     fault, text = (known, "") if isinstance(known, Fault) else (None, known)
     if fault:
         file = file or (GOVERNANCE_FILE if fault in _OF_GOVERNANCE else "")
@@ -359,7 +361,7 @@ def _granted_rights(name: str, answer: Answer) -> Iterator[Right]:
         yield from grant_rights(name, answer.grant)
 
 
-_ALIKE = 0.9
+_LEAST_SIMILARITY = 0.9
 """Lowest similarity (`difflib` ratio, 0 to 1) that counts as a typing error in a ROS name."""
 
 
@@ -420,16 +422,18 @@ def named_rights(answer: Answer) -> tuple[Right, ...]:
 def _similar_names(name: str, names: AbstractSet[str], is_service: bool) -> tuple[str, ...]:
     last = name.rpartition("/")[2]
     same_last = sorted(other for other in names if other.rpartition("/")[2] == last)
-    if (is_service and last in NODE_SERVICES) or 0 < len(same_last) <= _SHOWN:
-        return tuple(same_last) if len(same_last) <= _SHOWN else ()
+    if (is_service and last in NODE_SERVICES) or 0 < len(same_last) <= _MAX_PROPOSED_NAMES:
+        return tuple(same_last) if len(same_last) <= _MAX_PROPOSED_NAMES else ()
     if not names:
         return ()
     from difflib import get_close_matches  # imported only for this last search
 
-    return tuple(get_close_matches(name, sorted(names), n=_SHOWN, cutoff=_ALIKE))
+    return tuple(
+        get_close_matches(name, sorted(names), n=_MAX_PROPOSED_NAMES, cutoff=_LEAST_SIMILARITY)
+    )
 
 
-_SHOWN = 3
+_MAX_PROPOSED_NAMES = 3
 """Maximum number of names that are proposed."""
 
 

@@ -99,10 +99,10 @@ from sros_tool.translate_zenoh.rights import name_of_key
 from sros_tool.values import shows
 from sros_tool.wording import first_few
 
-_WORDS = (re.compile(r"[\w/]+"), re.compile(r"[^\s(]+"), re.compile(r"\S+"))
+_WORD_PATTERNS = (re.compile(r"[\w/]+"), re.compile(r"[^\s(]+"), re.compile(r"\S+"))
 """Patterns that split a log line into words: without punctuation, or with that of topics."""
 _NUMBERS = re.compile(r"\b[0-9a-f]{2}(?:\.[0-9a-f]{2}){5,}\S*|\d+")
-_LONGEST = 8000
+_MAX_LINE_LENGTH = 8000
 """Maximum number of characters read from a line, because a line may have many megabytes."""
 
 
@@ -448,14 +448,14 @@ def _joined_lines(lines: list[str]) -> Iterator[tuple[int, str]]:
     number, current = 0, ""
     for index, line in enumerate(lines, 1):
         if current and CONTINUATION.match(line):
-            if len(current) < _LONGEST:
+            if len(current) < _MAX_LINE_LENGTH:
                 current += " " + line
             continue
         if current:
-            yield number, current[:_LONGEST]
+            yield number, current[:_MAX_LINE_LENGTH]
         number, current = index, line
     if current:
-        yield number, current[:_LONGEST]
+        yield number, current[:_MAX_LINE_LENGTH]
 
 
 def _log_hits(lines: Iterable[tuple[int, str]]) -> Iterator[_Hit]:
@@ -548,7 +548,7 @@ def _lines_naming(
     lines_of = defaultdict[Denial, list[tuple[int, str]]](list)
     for number, line in enumerate(lines, 1):
         process, text = labeled_line(line)
-        words = (word for pattern in _WORDS for word in pattern.findall(text))
+        words = (word for pattern in _WORD_PATTERNS for word in pattern.findall(text))
         for topic in topics.intersection(words):
             causes = of_topic[process, topic]
             own = [denial for denial in causes if denial_at.get(number) == denial]
@@ -561,7 +561,7 @@ def _lines_naming(
 
 # ── what Zenoh drops ───────────────────────────────────────────────────────────────────────
 
-_DROPPED: Mapping[tuple[str, bool], str] = {
+_RIGHT_OF_DROPPED_MESSAGE: Mapping[tuple[str, bool], str] = {
     ("Put", True): "publish",
     ("Delete", True): "publish",
     ("Declare Subscriber", True): "subscribe",
@@ -593,7 +593,7 @@ def _dropped_message_findings(
     drops a message to or from its router, the process itself lacks the right, because its rules for
     the router are its own rights.
     """
-    numbered = ((n, *labeled_line(line[:_LONGEST])) for n, line in enumerate(lines, 1))
+    numbered = ((n, *labeled_line(line[:_MAX_LINE_LENGTH])) for n, line in enumerate(lines, 1))
     groups: dict[tuple[str, str, bool, str], list[DroppedMessage]] = {}
     dropped = [*dropped_messages(numbered)]
     routers = keystore.zenoh_routers if keystore and dropped else frozenset[str]()
@@ -603,7 +603,7 @@ def _dropped_message_findings(
         lacks_own = message.name in routers and is_node
         kind = message.message, message.ingress is not lacks_own
         _, name = name_of_key(message.key)
-        right = _DROPPED.get(kind, "") if name else ""
+        right = _RIGHT_OF_DROPPED_MESSAGE.get(kind, "") if name else ""
         dropped_right = f"{right} {name}" if right else _GRAPH.get(kind, "")
         dropped_right = dropped_right or f"pass {message.message} of {message.key}"
         group = message.process, message.name or message.zid, lacks_own, dropped_right
@@ -793,7 +793,7 @@ class _Examiner:
             hit.fields["participant"] for hit in hits if hit.fields.get("participant")
         )
         names = (
-            [self._keystore.peer(peer) for peer in islice(shown, _MOST_PEERS)]
+            [self._keystore.peer(peer) for peer in islice(shown, _MAX_PEERS)]
             if self._keystore
             else []
         )
@@ -1121,7 +1121,7 @@ def _with_name(text: str, word: str, name: str) -> str:
 
 _COMMAND = re.compile(r"(`sros\b[^`]*`)")
 _MOST_LINES = 20
-_MOST_PEERS = 5
+_MAX_PEERS = 5
 """Maximum number of peers that are examined for one message."""
 _OF_ROTATION = ("peer-signature", "peer-permissions-ca")
 _NOT_RESTARTED = {

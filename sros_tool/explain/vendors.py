@@ -659,7 +659,7 @@ class VendorOfPolicy(NamedTuple):
         return _note_on_anybody(opened, f"Change the template, or run {REFUSE_STRANGERS}.")
 
 
-_MOST_NARROWED = 100
+_MAX_DECIDED_ALONE = 100
 """Maximum number of enclaves that are decided on alone; for more, sros decides on all enclaves.
 
 Other enclaves matter because their permissions may also fit.
@@ -721,7 +721,7 @@ class VendorOfKeystore(NamedTuple):
         every_name = self.keystore.names
         names = every_name if self.names is None else self.names
         holders: Sequence[str] = ()
-        if len(names) > _MOST_NARROWED:
+        if len(names) > _MAX_DECIDED_ALONE:
             holders = every_name
         elif names != every_name:
             own_parts = [{*name.split("/")} for name in names]

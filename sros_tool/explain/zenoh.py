@@ -88,7 +88,7 @@ from sros_tool.zenoh.delivery import (
 from sros_tool.zenoh.document import ZenohEndpoint, parse_configuration
 from sros_tool.zenoh.key_expressions import includes
 
-_OF_TLS = (CERTIFICATE_FILE, KEY_FILE, IDENTITY_CA_FILE)
+_TLS_FILES = (CERTIFICATE_FILE, KEY_FILE, IDENTITY_CA_FILE)
 """Names of the enclave files that a process on Zenoh needs for TLS."""
 
 
@@ -531,7 +531,7 @@ class ZenohEvaluator:
         faults = [
             problem
             for problem in identity.problems
-            if problem.file in _OF_TLS and not self._is_left_out(problem)
+            if problem.file in _TLS_FILES and not self._is_left_out(problem)
         ]
         if faults or certificate is None:
             problem = str(faults[0]) if faults else f"{CERTIFICATE_FILE} cannot be read"
@@ -790,7 +790,7 @@ def _unrestricted_process(name: str, mode: Mode) -> ZenohProcess:
     return ZenohProcess(name, mode, Enforcement())
 
 
-_DATA = (Message.PUT, Message.QUERY, Message.LIVELINESS_TOKEN)
+_DATA_MESSAGES = (Message.PUT, Message.QUERY, Message.LIVELINESS_TOKEN)
 """The messages that transport data or announce a node; other messages only prepare these."""
 
 
@@ -802,7 +802,7 @@ def _check_to_report(checks: Iterable[Check], enclave: str) -> Check | None:
     """
     return min(
         checks,
-        key=lambda check: (check.message not in _DATA, check.enforcer == enclave),
+        key=lambda check: (check.message not in _DATA_MESSAGES, check.enforcer == enclave),
         default=None,
     )
 

@@ -333,7 +333,7 @@ _CHANGING = (
     (re.compile(r"(rqt_gui_(?:py|cpp)_node_)[0-9]+\Z"), r"\1*"),
 )
 _TOOLS = re.compile(r"_ros2cli(_.*)?\Z|(?P<observer>_sros_observer)(_.*)?\Z")
-_OF_OBSERVER = frozenset({Endpoint("rt/parameter_events", PUBLISH)})
+_OBSERVER_ENDPOINTS = frozenset({Endpoint("rt/parameter_events", PUBLISH)})
 """The endpoints of an observer of sros.
 
 A node with an observer's name and other endpoints is no observer.
@@ -343,7 +343,7 @@ A node with an observer's name and other endpoints is no observer.
 def is_tool(node: ObservedNode) -> bool:
     """Return whether a node belongs to a tool that observes the robot."""
     tool = _TOOLS.match(node.name)
-    return tool is not None and (not tool["observer"] or node.endpoints <= _OF_OBSERVER)
+    return tool is not None and (not tool["observer"] or node.endpoints <= _OBSERVER_ENDPOINTS)
 
 
 def is_tool_name(name: str) -> bool:

@@ -186,7 +186,7 @@ _ORDERED = ("rmw_fastrtps_cpp", "rmw_fastrtps_dynamic_cpp", "rmw_cyclonedds_cpp"
 _LOG_FLUSH_SECONDS = 0.3
 """Seconds to wait before exit, so that the logging thread of Fast DDS can print its errors."""
 _ATTEMPTS = 5
-_AGAIN_SECONDS = 0.01
+_REREAD_SECONDS = 0.01
 """Seconds until a changing graph is read again."""
 
 
@@ -248,7 +248,7 @@ def report_graph(observer: GraphObserver, report: Any, period: float, *, ordered
         if now is not None and changes:
             listed, endpoints = before = now
             send(report, {"ordered": ordered, "listed": listed, "endpoints": endpoints})
-        if select.select([sys.stdin], [], [], _AGAIN_SECONDS if changes else period)[0]:
+        if select.select([sys.stdin], [], [], _REREAD_SECONDS if changes else period)[0]:
             return
 
 

@@ -44,7 +44,7 @@ from sros_tool.pki.certificates import IDENTITY_DIGITS
 _LOG = logging.getLogger(__name__)
 _NO_SHARED_MEMORY = {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}
 """Variables against shared memory: Fast DDS cannot write to another user's shared memory."""
-_PERIOD_SECONDS = 0.1
+_READING_SECONDS = 0.1
 """Seconds between two readings of the graph; short, to see a node that runs for a second."""
 _START_SECONDS = 30.0
 _END_SECONDS = 3.0
@@ -95,7 +95,7 @@ class RosGraph:
                 # -P: never import modules from the current folder.
                 [
                     *(sys.executable, "-P", "-m", self._module),
-                    *(str(write_end), str(_PERIOD_SECONDS)),
+                    *(str(write_end), str(_READING_SECONDS)),
                 ],
                 stdin=subprocess.PIPE,
                 stdout=self._output,
@@ -495,7 +495,7 @@ def _serving_nodes(endpoints: Iterable[Endpoint]) -> Iterator[_Name]:
 # ── enclaves by certificates ────────────────────────────────────────────────────────────
 
 
-_SECURED = tuple("89abcdef")
+_FIRST_DIGITS_OF_SECURED = tuple("89abcdef")
 """First hexadecimal digits of identifiers of secured participants, whose first bit is set."""
 _DEFAULT_ENCLAVE = ("/",)
 
@@ -511,7 +511,10 @@ def with_certified_enclaves(observation: Observation, enclaves: Mapping[str, str
         enclave = enclaves.get(node.participant[:IDENTITY_DIGITS])
         if enclave is not None:
             node = replace(node, enclaves=(enclave,))
-        elif node.participant.startswith(_SECURED) and node.enclaves == _DEFAULT_ENCLAVE:
+        elif (
+            node.participant.startswith(_FIRST_DIGITS_OF_SECURED)
+            and node.enclaves == _DEFAULT_ENCLAVE
+        ):
             node = replace(node, enclaves=())
         nodes.append(node)
     return make_observation(nodes, observation.silent, observation.strays)

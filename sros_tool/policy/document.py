@@ -382,7 +382,7 @@ _EARLIER = "Version 0.1.0, of ROS 2 Crystal to Eloquent, has nodes in place of e
 _EARLIER_BLOCKS = ("profiles", "contexts")
 _EARLIER_ROOTS = ("profiles",)
 """Root elements of earlier formats that are converted without a <policy> around them."""
-_REQUIRED = {
+_REQUIRED_ATTRIBUTES = {
     "version": '<policy version="0.2.0">',
     "path": 'path="/NAME", with the name of the enclave',
     "ns": 'ns="/", or the namespace of the node',
@@ -820,7 +820,7 @@ class _Reader:
                 raise PolicyError(
                     f"{self._place_text(element, place)}: <{tag_of(element)}> lacks its {name}=",
                     "",
-                    f"Write {_REQUIRED[name]}.",
+                    f"Write {_REQUIRED_ATTRIBUTES[name]}.",
                 )
 
     def _source_of(self, element: etree._Element, place: IncludedFile) -> Source:
@@ -1173,7 +1173,7 @@ def _write_profile(
 
 _MOST_LEVELS = 100
 _MOST_FILES = 10_000
-_MOST_SEARCHED = 256 * 1024
+_MAX_SEARCHED_BYTES = 256 * 1024
 """Size in bytes of the largest file without the ending ``.xml`` in which a policy is looked for."""
 
 
@@ -1233,7 +1233,7 @@ def is_policy(name: str, content: bytes, shown: str) -> bool:
     if name.lower().endswith(".xml"):
         return parse(content, shown, instructions=True).tag == "policy"
     # Without zero bytes, the text can be found in UTF-16, too.
-    begin = content[:_MOST_SEARCHED].replace(b"\0", b"")
+    begin = content[:_MAX_SEARCHED_BYTES].replace(b"\0", b"")
     if begin.lstrip(b"\xef\xbb\xbf\xff\xfe \t\r\n").startswith(b"<") and b"<policy" in begin:
         raise DocumentError(
             f"{shown} looks like a policy, but its name does not end with .xml",
@@ -1282,6 +1282,6 @@ def _content(path: Path) -> bytes:
         return read_bytes(path, "policy file")
     try:
         with path.open("rb") as file:
-            return file.read(_MOST_SEARCHED)
+            return file.read(_MAX_SEARCHED_BYTES)
     except OSError as error:
         raise DocumentError(f"'{path}' cannot be read", str(error.strerror)) from error

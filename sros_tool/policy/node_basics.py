@@ -15,7 +15,7 @@ from sros_tool.policy.rights import Right, Rules, policy_rights, split_actions
 
 _ANY_NODE = "/*"
 """The name that stands for every node, in the rights of an enclave without a policy."""
-_WITHOUT_PARAMETERS = {"get_type_description"}
+_SERVICES_WITHOUT_PARAMETERS = {"get_type_description"}
 """The services of a node without parameters."""
 
 
@@ -57,12 +57,14 @@ class NodeRights:
                 return True
             # Nodes without parameters, such as those of tf2_ros, can have the same name in many
             # processes.
-            compared = PARAMETER_SERVICES if services == _WITHOUT_PARAMETERS else NODE_SERVICES
+            compared = (
+                PARAMETER_SERVICES if services == _SERVICES_WITHOUT_PARAMETERS else NODE_SERVICES
+            )
             names = {f"{node}/{service}" for service in compared}
             names |= {expression for name in [*names] for expression in wild.overlapping(name)}
             return all(enclaves.get(name, {enclave}) <= {enclave} for name in names)
 
-        complete = (set(NODE_SERVICES), set(PARAMETER_SERVICES), _WITHOUT_PARAMETERS)
+        complete = (set(NODE_SERVICES), set(PARAMETER_SERVICES), _SERVICES_WITHOUT_PARAMETERS)
         self._own = {
             place
             for place, services in served.items()

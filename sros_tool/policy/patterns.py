@@ -36,7 +36,7 @@ _PIECE = re.compile(r"\*+|\?|\[(!?)([^\]]+)\]|(.)", re.DOTALL)
 _RANGE = re.compile(r"(.)-(.)|(.)", re.DOTALL)
 # More than the letters of ROS names, because DDS topics need not be from ROS.
 _ALPHABET = frozenset(map(chr, range(33, 127)))
-_ANY = frozenset([""])
+_STAR = frozenset([""])
 """The piece for ``*`` in an expression."""
 OTHER_NAMESPACE = "/[\ue000]"
 """Any namespace except ``/``, as an expression.
@@ -108,7 +108,7 @@ class _Pattern:
 
     def __init__(self, pieces: _Pieces) -> None:
         self.pieces = pieces
-        at = [i for i, piece in enumerate(pieces) if piece is _ANY]
+        at = [i for i, piece in enumerate(pieces) if piece is _STAR]
         self.starred = bool(at)
         self.stars = sum(1 << i for i in at)
         self.front = pieces[: at[0]] if at else pieces
@@ -122,7 +122,7 @@ class _Pattern:
         reached = self._begin()
         for piece in narrow.pieces:
             kept = reached & self.stars
-            if piece is not _ANY:
+            if piece is not _STAR:
                 kept |= (reached & self._covering_positions(piece)) << 1
             reached = kept | (kept & self.stars) << 1
             if not reached:
@@ -195,7 +195,7 @@ def _pattern(expression: str) -> _Pattern:
 
 
 def _pieces(expression: str) -> _Pieces:
-    """Split an expression into pieces: `_ANY` for ``*``, or else a set of matching characters."""
+    """Split an expression into pieces: `_STAR` for ``*``, or else a set of matching characters."""
     letter_sets: list[frozenset[str]] = []
     for piece in _PIECE.finditer(expression):
         negated, members, literal = piece.groups()
@@ -205,7 +205,7 @@ def _pieces(expression: str) -> _Pieces:
             chosen = _members(members)
             letter_sets.append(_ALPHABET - chosen if negated else chosen)
         else:
-            letter_sets.append(_ALPHABET if piece[0] == "?" else _ANY)
+            letter_sets.append(_ALPHABET if piece[0] == "?" else _STAR)
     return tuple(letter_sets)
 
 
@@ -247,7 +247,7 @@ class ComparisonLimit:
             )
 
 
-_FEW = 16
+_MAX_WITHOUT_INDEX = 16
 """Maximum number of expressions that are compared one by one, without an index."""
 _LAST = "\U0010ffff"
 _END = re.compile(r".*[*?\]]", re.DOTALL)
@@ -305,7 +305,7 @@ class Names:
         return fits
 
     def _cover_candidates(self, name: str) -> Iterable[str]:
-        if len(self._wild) <= _FEW:
+        if len(self._wild) <= _MAX_WITHOUT_INDEX:
             return self._wild
         text = _letters_of(name)
         keys = {
@@ -339,7 +339,7 @@ class Names:
 
     def _overlap_candidates(self, expression: str) -> Sequence[int]:
         """Return the positions of expressions that may overlap ``expression``."""
-        if len(self._names) <= _FEW:
+        if len(self._names) <= _MAX_WITHOUT_INDEX:
             return range(len(self._names))
         begin, end = literal_prefix(expression), _END.sub("", expression)[::-1]
         return min(
@@ -433,7 +433,8 @@ def _names_of(expression: str) -> NameSet:
         return NameSet([expression])
     pieces = _pieces(expression)
     return NameSet(
-        (), [Automaton.sequence(None if piece is _ANY else _as_letters(piece) for piece in pieces)]
+        (),
+        [Automaton.sequence(None if piece is _STAR else _as_letters(piece) for piece in pieces)],
     )
 
 

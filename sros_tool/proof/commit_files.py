@@ -405,7 +405,7 @@ def may_match(pattern: str, path: str) -> bool:
 
 # ── policies, and their parts ──────────────────────────────────────────────────────────────
 
-_OF_POLICIES = (
+_POLICY_TEXTS = (
     *((b"<policy", b"version"), (b"<enclaves", b"path"), (b"<profile", b" ns=")),
     *((b"<topics", b"ALLOW"), (b"<services", b"ALLOW"), (b"<actions", b"ALLOW")),
 )
@@ -414,12 +414,12 @@ _EBCDIC = b"\x4c\x6f\xa7\x94"
 """The beginning of an XML file in EBCDIC (XML 1.0, appendix F)."""
 _ENCODING = re.compile(rb"encoding ?= ?[\"']([^\"']*)")
 _READABLE = (b"utf-8", b"utf8", b"utf-16", b"us-ascii", b"ascii", b"iso-8859-", b"windows-125")
-_BEFORE = b"\xef\xbb\xbf\xfe\xff \t\r\n"
+_LEADING_BYTES = b"\xef\xbb\xbf\xfe\xff \t\r\n"
 """Byte order marks and white space, which may precede the first XML element."""
 _BEGIN = 4096
 _NAMES = frozenset(kind.removesuffix("s") for kind in RIGHTS)
 _WITH_PARTS = ("policy", "enclaves", "enclave", "profiles", "profile", *RIGHTS)
-_WHOLE = re.compile(r"(?:xpointer\(/(?:\*|[\w.-]+)(?P<below>/\*)?\))?")
+_WHOLE_FILE_POINTER = re.compile(r"(?:xpointer\(/(?:\*|[\w.-]+)(?P<below>/\*)?\))?")
 """An xpointer that selects a whole file, or everything below its root element."""
 
 
@@ -428,13 +428,13 @@ def may_be_policy(content: bytes) -> bool:
     text = content.replace(b"\0", b"")  # in UTF-16, ASCII letters have a zero byte
     if text.startswith(_EBCDIC):
         return True
-    if not text.lstrip(_BEFORE).startswith(b"<"):
+    if not text.lstrip(_LEADING_BYTES).startswith(b"<"):
         return False
     text = b" ".join(text.split())
     encoding = _ENCODING.search(text.partition(b"?>")[0])
     if encoding and not encoding[1].lower().startswith(_READABLE):
         return True  # such as UTF-7, in which no element is readable here
-    if any(second in text.partition(first)[2] for first, second in _OF_POLICIES):
+    if any(second in text.partition(first)[2] for first, second in _POLICY_TEXTS):
         return True
     try:
         return _is_part(parse(content, "the file"))
@@ -491,7 +491,7 @@ def used_whole(policies: Iterable[str], content: Callable[[str], bytes | None]) 
     while left:
         path = left.pop()
         for target, pointer in _includes(path, content(path)):
-            whole = _WHOLE.fullmatch(pointer)
+            whole = _WHOLE_FILE_POINTER.fullmatch(pointer)
             if whole and (target not in used or (not used[target] and not whole["below"])):
                 used[target] = not whole["below"]
                 left.append(target)
@@ -500,7 +500,7 @@ def used_whole(policies: Iterable[str], content: Callable[[str], bytes | None]) 
 
 def includes_files(content: bytes) -> bool:
     """Return whether a file may be XML, and so may include other files."""
-    begin = content[:_BEGIN].replace(b"\0", b"").lstrip(_BEFORE)
+    begin = content[:_BEGIN].replace(b"\0", b"").lstrip(_LEADING_BYTES)
     return not begin or begin.startswith((b"<", _EBCDIC))
 
 

@@ -636,7 +636,12 @@ def _uses(hop: TopicHop) -> Iterator[Use]:
 # ── requirements that cannot fail ──────────────────────────────────────────────────────────
 
 
-_OF_OTHER_KIND = {"call": "request", "request": "call", "execute": "reply", "reply": "execute"}
+_RIGHT_OF_OTHER_KIND = {
+    "call": "request",
+    "request": "call",
+    "execute": "reply",
+    "reply": "execute",
+}
 """Right → the right with the same role in the other kind: action for service, service for action.
 """
 
@@ -654,7 +659,7 @@ def _missing_enclaves_clauses(requirement: Requirement, world: World) -> Iterato
         if pattern[0] == EXCEPT and is_expression(name):
             continue  # an exception for enclaves that do not exist yet
         if not fnmatch.filter(world.enclaves, name):
-            yield f"there is no enclave {pattern}{_meant(name, [frozenset(world.enclaves)])}"
+            yield f"there is no enclave {pattern}{_meant_clause(name, [frozenset(world.enclaves)])}"
 
 
 def _unused_names(
@@ -672,9 +677,9 @@ def _unused_names(
         named = _named_right(right, name)
         stated = [world.stated_names(part.begin, part.end) for part in _parts_of(right)]
         known = is_expression(name) or any(name in names for names in stated)
-        meant = "" if known else _meant(name, stated)
+        meant = "" if known else _meant_clause(name, stated)
         if not _is_used_by_anybody(world, parts, name, limit):
-            other = _OF_OTHER_KIND.get(right, "")
+            other = _RIGHT_OF_OTHER_KIND.get(right, "")
             if other and _is_used_by_anybody(world, _sufficient_parts(other), name, limit):
                 meant = f", but some may {other} {_named_right(other, name)}"
             if isinstance(requirement, Nobody) and not meant:
@@ -708,7 +713,7 @@ def _restricted_names(requirement: Requirement) -> Iterator[tuple[str, str, tupl
         yield from ((right, name, parts) for name in names)
 
 
-def _meant(name: str, stated: Iterable[frozenset[str]]) -> str:
+def _meant_clause(name: str, stated: Iterable[frozenset[str]]) -> str:
     """Return a clause with a stated name that differs by one typing error, or ""."""
     similar = shortest(one for names in stated for one in names.intersection(_with_one_slip(name)))
     return f" (perhaps {similar} is meant)" if similar else ""
@@ -728,11 +733,17 @@ def _with_one_slip(name: str) -> Iterator[str]:
                 continue
             if any(map(str.isdigit, wrong)):
                 continue
-            rights = ("", *_LETTERS) if length == 1 else (wrong[::-1],) if wrong else _LETTERS
+            rights = (
+                ("", *_LETTERS_IN_NAMES)
+                if length == 1
+                else (wrong[::-1],)
+                if wrong
+                else _LETTERS_IN_NAMES
+            )
             yield from (f"{begin}{right}{rest}" for right in rights if right != wrong)
 
 
-_LETTERS = tuple(f"{ascii_letters}_/")
+_LETTERS_IN_NAMES = tuple(f"{ascii_letters}_/")
 """The characters in names of ROS, without digits."""
 
 
@@ -781,7 +792,7 @@ def _is_used_by_anybody(
 
 # ── the flow of information ────────────────────────────────────────────────────────────────
 
-_IGNORED = NameSet.union(
+_IGNORED_TOPICS = NameSet.union(
     names_of_expression(topic)
     for topic in (
         ROS_DISCOVERY_TOPIC,
@@ -861,7 +872,7 @@ def _may_learn(world: World, enclave: str, excluded: Container[str]) -> bool:
     return any(
         writer != enclave and writer not in excluded
         for topic in around.exact
-        if topic not in _IGNORED
+        if topic not in _IGNORED_TOPICS
         for writer in world.writers_of(topic)
     )
 
@@ -901,7 +912,7 @@ class _Flow:
         Only readers for which ``is_new`` returns True count. Exact topics come first, except topics
         for which ``is_unused`` returns False; matches of wildcards follow.
         """
-        written, around, exact = self._world.written_by(enclave, _IGNORED)
+        written, around, exact = self._world.written_by(enclave, _IGNORED_TOPICS)
         for topic in sorted(exact, key=_topics_before_services):
             if is_unused(topic):
                 for reader in self._world.readers_of(topic):

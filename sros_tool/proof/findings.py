@@ -190,7 +190,7 @@ def decide_all(requirements: Sequence[Requirement], system: System) -> Decided:
             )
         if reasons := tuple(_never_fails([verdict for _, verdict in verdicts])):
             vacuous.append((requirement, reasons))
-        if not broken and (names := _in_all(verdict.unnamed for _, verdict in verdicts)):
+        if not broken and (names := _texts_in_all(verdict.unnamed for _, verdict in verdicts)):
             unnamed.append((requirement, names))
         if not broken and (
             assumed_names := [verdict.assumed for _, verdict in verdicts if verdict.assumed]
@@ -211,13 +211,13 @@ def _step(use: Use, world: World, system: System) -> Step:
 
 def _never_fails(verdicts: Sequence[Verdict]) -> Iterator[str]:
     """Yield clauses that say why a requirement, or a part of it, cannot fail in any world."""
-    if empty := _in_all(verdict.empty for verdict in verdicts):
+    if empty := _texts_in_all(verdict.empty for verdict in verdicts):
         yield _listed_names(empty)
     if all(verdict.always for verdict in verdicts):
         yield verdicts[0].always
 
 
-def _in_all(lists: Iterable[Sequence[str]]) -> tuple[str, ...]:
+def _texts_in_all(lists: Iterable[Sequence[str]]) -> tuple[str, ...]:
     """Return the texts that are in all ``lists``, in the order of the first list."""
     first, *others = lists
     return tuple(text for text in first if all(text in other for other in others))

@@ -719,7 +719,7 @@ def _each_gain(
                 before, after = (world.access(side, enclave, domain) for side in (old, new))
                 gained_topics = {verb: after.topics[verb] - before.topics[verb] for verb in _VERBS}
                 gained = False
-                place = _Place(enclave, world, domain, limit)
+                place = _PlaceOfEnclave(enclave, world, domain, limit)
                 for gain in _added_gains(stated, place, gained_topics, (before, after)):
                     gained = True
                     yield gain
@@ -730,7 +730,7 @@ def _each_gain(
 
 
 @dataclass(frozen=True, slots=True)
-class _Place:
+class _PlaceOfEnclave:
     """An enclave in a domain of a world, and the limit on the search for its added access."""
 
     enclave: str
@@ -741,7 +741,7 @@ class _Place:
 
 def _added_gains(
     stated_rights: _Stated,
-    place: _Place,
+    place: _PlaceOfEnclave,
     topics: Mapping[AccessVerb, NameSet],
     sides: tuple[_Access, _Access],
 ) -> Iterator[Gain]:
@@ -805,7 +805,7 @@ class AccessByVendors:
             )
             gained = NameSet() if old == new else (new - old) & ROS_TOPICS
             topics[verb] = gained | NameSet(exact)
-        place = _Place(enclave, world, domain, SearchLimit())
+        place = _PlaceOfEnclave(enclave, world, domain, SearchLimit())
         yield from _added_gains(self._stated, place, topics, sides)
 
 
@@ -880,7 +880,9 @@ class _Stated:
         topics = {topic for right in rights for side in right.topics for topic in side}
         self._exact = sorted(topic for topic in topics if not is_expression(topic))
 
-    def gains(self, place: _Place, verb: AccessVerb, added_names: NameSet) -> Iterator[Gain]:
+    def gains(
+        self, place: _PlaceOfEnclave, verb: AccessVerb, added_names: NameSet
+    ) -> Iterator[Gain]:
         """Yield the access that an enclave gains to the topics ``added_names``.
 
         Yields a `Gain` for each right of the policy that covers some of these topics, and a `Gain`
@@ -896,7 +898,7 @@ class _Stated:
             yield replace(gain, worlds=(world.title,), domains=(place.domain,))
 
     def _searched_gains(
-        self, place: _Place, verb: AccessVerb, added_names: NameSet
+        self, place: _PlaceOfEnclave, verb: AccessVerb, added_names: NameSet
     ) -> Iterator[Gain]:
         enclave, world = place.enclave, place.world
         allowed = [
@@ -931,7 +933,7 @@ class _Stated:
         return self._denials_of[key]
 
     def _example(
-        self, names: NameSet, verb: AccessVerb, expression: str, place: _Place
+        self, names: NameSet, verb: AccessVerb, expression: str, place: _PlaceOfEnclave
     ) -> str | None:
         """Return an example name; preferably the example of another world, or a stated name."""
         longest, known = place.world.longest, self._examples[place.enclave, verb, expression]
@@ -954,14 +956,19 @@ class _Stated:
         prefix = literal_prefix(expression)
         if prefix != expression:
             first = bisect_left(self._exact, prefix)
-            near = islice(self._exact, first, first + _MOST_NEAR)
+            near = islice(self._exact, first, first + _MAX_LIKELY_TOPICS)
             fitting = takewhile(lambda topic: topic.startswith(prefix), near)
             yield from sorted(
                 fitting, key=lambda topic: bool(node_of_service(service_of(topic)[0]))
             )
 
     def _gain(
-        self, place: _Place, verb: AccessVerb, right: Right | None, expression: str, topic: str
+        self,
+        place: _PlaceOfEnclave,
+        verb: AccessVerb,
+        right: Right | None,
+        expression: str,
+        topic: str,
     ) -> Gain:
         denied = self._denials(place.enclave, verb, place.world.style).of(topic)
         name, action = topic, "write" if verb is AccessVerb.PUBLISH else "read"
@@ -983,7 +990,7 @@ class _Stated:
         )
 
 
-_MOST_NEAR = 100
+_MAX_LIKELY_TOPICS = 100
 """Maximum number of stated topics that are tried as an example."""
 
 _Sources = dict[str, dict[Right, Source]]

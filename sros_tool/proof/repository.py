@@ -49,13 +49,13 @@ _ALWAYS = {
     **dict.fromkeys(("GIT_TRACE", "GIT_TRACE2", "GIT_TRACE2_EVENT", "GIT_TRACE2_PERF"), "0"),
     "LC_ALL": "C",
 }
-_ELSEWHERE = (
+_REPOSITORY_VARIABLES = (
     *("GIT_ALTERNATE_OBJECT_DIRECTORIES", "GIT_COMMON_DIR", "GIT_CONFIG", "GIT_DIR"),
     *("GIT_GRAFT_FILE", "GIT_INDEX_FILE", "GIT_NAMESPACE", "GIT_OBJECT_DIRECTORY", "GIT_PREFIX"),
     *("GIT_REPLACE_REF_BASE", "GIT_SHALLOW_FILE", "GIT_WORK_TREE"),
 )
 """Environment variables that make git read another repository than the given folder."""
-_OF_SETTINGS = ("HOME", "XDG_CONFIG_HOME", "GIT_CONFIG_GLOBAL", "GIT_CONFIG_SYSTEM")
+_SETTINGS_VARIABLES = ("HOME", "XDG_CONFIG_HOME", "GIT_CONFIG_GLOBAL", "GIT_CONFIG_SYSTEM")
 """Environment variables that tell git where it finds settings outside of the repository."""
 _NO_BASE = "none"
 _FIRST_PARENT = "^1"
@@ -455,7 +455,7 @@ class Repository:
         if top is None:
             return
         inside = os.path.realpath(top)
-        for name in _OF_SETTINGS:
+        for name in _SETTINGS_VARIABLES:
             place = os.environ.get(name, "")
             if place and Path(os.path.realpath(self.folder / place)).is_relative_to(inside):
                 raise UsageError(
@@ -503,7 +503,9 @@ class Repository:
             DocumentError: git fails, warns, or does not end in time.
             UnavailableError: git is not installed.
         """
-        variables = {name: text for name, text in os.environ.items() if name not in _ELSEWHERE}
+        variables = {
+            name: text for name, text in os.environ.items() if name not in _REPOSITORY_VARIABLES
+        }
         try:
             done = subprocess.run(
                 [_program(variables.get("PATH", os.defpath)), *_SAFE, *words],

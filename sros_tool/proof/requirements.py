@@ -60,9 +60,9 @@ _MOST_FILLED = 20_000  # after filling in the robots of a fleet
 _LONGEST_TEXT = 500  # characters of a name or a reason
 EXCEPT = "!"
 """Prefix of an enclave that is excepted from a list of enclaves."""
-_WORDS = ("name", "why")
+_WORD_KEYS = ("name", "why")
 """Keys with words, which are in every table."""
-_NO_NAMES = (*_WORDS, "enclave", "enclaves", "from", "to", "through", "level")
+_KEYS_WITHOUT_NAMES = (*_WORD_KEYS, "enclave", "enclaves", "from", "to", "through", "level")
 """Keys whose values are no names of topics, services or actions."""
 _LEVELS = {"sign": Level.SIGN, "encrypt": Level.ENCRYPT}
 
@@ -488,7 +488,7 @@ class _Table:
         Raises:
             DocumentError: a key of the table is not in ``keys``.
         """
-        known_keys = (*keys, *_WORDS)
+        known_keys = (*keys, *_WORD_KEYS)
         for key in self.values:
             if key not in known_keys:
                 raise self.error(
@@ -496,10 +496,10 @@ class _Table:
                     f"{shortened(key)} is not a key of [[{self.kind}]]",
                     (f"There are {', '.join(known_keys)}."),
                 )
-        texts = {key: self.text(key) if key in self.values else "" for key in _WORDS}
+        texts = {key: self.text(key) if key in self.values else "" for key in _WORD_KEYS}
         robots = {"robot": self.robot, "of_robots": self.of_robots}
         as_written = not self.robot and self.namespace == "/" and not self.remaps
-        values = [value for key, value in self.values.items() if key not in _NO_NAMES]
+        values = [value for key, value in self.values.items() if key not in _KEYS_WITHOUT_NAMES]
         names = (name for name in _names_in(values) if not name.startswith(("/", "*")))
         written = {"as_written": as_written, "is_relative": any(names)}
         return {"source": self.source, **written, **robots, **texts}
@@ -603,7 +603,7 @@ class _Table:
                     return value
 
         values = {
-            key: value if key in _WORDS else with_new_names(value)
+            key: value if key in _WORD_KEYS else with_new_names(value)
             for key, value in self.values.items()
         }
         return replace(self, values=values)
@@ -643,7 +643,7 @@ def _filled_tables(table: _Table, fleet: FleetSource) -> Iterator[_Table]:
         filled = table.with_names(partial(_filled_names, members=members, robot=robot))
         words = {
             key: _filled_words(filled.values[key], singular, robot)
-            for key in _WORDS
+            for key in _WORD_KEYS
             if key in filled.values
         }
         of_robots = tuple(_plural_names(table, members, robot))
@@ -656,7 +656,7 @@ def _placeholders(table: _Table) -> dict[Placeholder, str]:
     """Map the placeholders in the names of a table to a key whose value has the placeholder."""
     used: dict[Placeholder, str] = {}
     for key, value in table.values.items():
-        for name in filter(has_placeholder, () if key in _WORDS else _names_in(value)):
+        for name in filter(has_placeholder, () if key in _WORD_KEYS else _names_in(value)):
             try:
                 placeholders = placeholders_of(parts_of(name.removeprefix(EXCEPT)))
             except ValueError as error:
@@ -740,7 +740,7 @@ def _plural_names(
     table: _Table, members: Mapping[str, Sequence[Robot]], robot: Robot
 ) -> Iterator[RobotNames]:
     """Yield the names for which each name with a plural placeholder in a table stands."""
-    values = [value for key, value in table.values.items() if key not in _WORDS]
+    values = [value for key, value in table.values.items() if key not in _WORD_KEYS]
     for name in filter(has_placeholder, _names_in(values)):
         if name.startswith(EXCEPT):
             continue

@@ -117,12 +117,19 @@ _FILE_MISSING = f"enclave.{Fault.FILE_MISSING.id}"
 _MOST_ENTRIES = 200_000
 _MOST_CHANGED = 20_000
 _MOST_BYTES = 1024 * 1024 * 1024
-_MOST_OUTSIDE = 32 * 1024 * 1024
+_MAX_SEARCHED_BYTES = 32 * 1024 * 1024
 """Size in bytes of the largest changed file that is searched for a policy.
 
 No policy is larger than that.
 """
-_PACKED = (b"\x1f\x8b", b"PK\x03\x04", b"\xfd7zXZ", b"BZh", b"\x28\xb5\x2f\xfd", b"7z\xbc\xaf")
+_ARCHIVE_SIGNATURES = (
+    b"\x1f\x8b",
+    b"PK\x03\x04",
+    b"\xfd7zXZ",
+    b"BZh",
+    b"\x28\xb5\x2f\xfd",
+    b"7z\xbc\xaf",
+)
 """First bytes of files of gzip, ZIP, xz, bzip2, Zstandard and 7z."""
 _MOST_NAMESPACES = 20
 _LONGEST = 200  # characters that are shown of a link's target
@@ -133,12 +140,12 @@ _NOT_USED = (
 _BOTH_NAMES = "name the folder of both names with --policy, which compares them"
 _PRIVATE_KEY = re.compile(rb"-----BEGIN (?:[A-Z0-9]+ )*PRIVATE KEY-----(?:\s|\\[nr])+[\w+/]")
 """A private key in PEM; a text that only mentions the first line does not match."""
-_OF_POLICIES = tuple(
+_UNSIGNED_POLICY_IDS = tuple(
     kind.id for kind in (STALE, LESS_PROTECTED, NOT_IN_POLICY, NOT_IN_KEYSTORE, NOT_IN_EXPORT)
 )
 """Ids of findings which say that a keystore is not signed for the policies."""
 _OF_TEMPLATES = ("authorities", "certificates", "permissions", "protection")
-_SETTINGS = re.compile(
+_SETTINGS_TABLE = re.compile(
     rf"^[ \t]*\[+(?:{'|'.join((*_OF_TEMPLATES, *KINDS))})\b".encode(), re.MULTILINE
 )
 """A table of a keystore template or of requirements."""
@@ -635,7 +642,7 @@ class _Review:
         return (_FOUND, Facts(tuple(lines))) if lines else None
 
     def _contents(
-        self, ids: Iterable[str], largest: int = _MOST_OUTSIDE
+        self, ids: Iterable[str], largest: int = _MAX_SEARCHED_BYTES
     ) -> Iterator[tuple[str, bytes]]:
         """Yield ids and contents of files that need not be policies; large files are left out."""
         return self.request.repository.contents_in_batches(ids, _MOST_BYTES, largest=largest)
@@ -705,7 +712,7 @@ class _Review:
             lines.append(("is not reviewed, and includes a file that changes", path))
         sizes = self.request.repository.sizes(names)
         for path, entry in changed:
-            if sizes.get(entry.id, 0) > _MOST_OUTSIDE and entry.mode in FILES:
+            if sizes.get(entry.id, 0) > _MAX_SEARCHED_BYTES and entry.mode in FILES:
                 named.append(("changes and is too large to be reviewed", path))
             if clause := self._hidden_entry_clause(path, entry):
                 lines.append((f"changes and is not reviewed: it is {clause}", path))
@@ -916,7 +923,7 @@ class _Review:
                 if path.endswith(".toml") and path not in self.head.files and entry.mode in FILES
             }
             contents = self._contents(files.values(), _LARGEST_SETTINGS)
-            settings = {digits for digits, content in contents if _SETTINGS.search(content)}
+            settings = {digits for digits, content in contents if _SETTINGS_TABLE.search(content)}
             return sorted(path for path, digits in files.items() if digits in settings)
         return []
 
@@ -1210,11 +1217,11 @@ class _Review:
                 and (not finding.file or _is_below(os.path.normpath(finding.file), (str(folder),)))
             )
             strict = bool(self.base) and not is_same
-            chosen = FindingFilter(exclude=_OF_POLICIES, strict=strict).choose(findings)
+            chosen = FindingFilter(exclude=_UNSIGNED_POLICY_IDS, strict=strict).choose(findings)
             return _status(chosen), chosen
 
         def signed() -> tuple[int, Content]:
-            chosen = FindingFilter(include=_OF_POLICIES).choose(all_findings())
+            chosen = FindingFilter(include=_UNSIGNED_POLICY_IDS).choose(all_findings())
             return _status(chosen), chosen
 
         def access() -> tuple[int, Content]:
@@ -1256,7 +1263,7 @@ def _holders(files: Iterable[Path], fleet: Fleet | None) -> dict[str, Robot | No
 
 
 _FILES_OF_ENCLAVES = (*REQUIRED_FILES, *OPTIONAL_FILES, *ZENOH_FILES)
-_TRUSTED = (CRL, *map(ca_certificate, ROLES))
+_TRUSTED_FILES = (CRL, *map(ca_certificate, ROLES))
 """The files of a keystore that all enclaves trust."""
 
 
@@ -1265,13 +1272,13 @@ def _keystore_with(path: str) -> str | None:
     keystore, enclaves, file = f"/{path}".partition(f"/{ENCLAVES}/")
     if enclaves and Path(file).name in _FILES_OF_ENCLAVES:
         return keystore[1:]
-    trusted = next((name for name in _TRUSTED if f"/{path}".endswith(f"/{name}")), "")
+    trusted = next((name for name in _TRUSTED_FILES if f"/{path}".endswith(f"/{name}")), "")
     return f"/{path}".removesuffix(f"/{trusted}")[1:] if trusted else None
 
 
 def _is_packed(content: bytes) -> bool:
     """Return whether a file is an archive, or compressed."""
-    return content.startswith(_PACKED) or content[257:262] == b"ustar"
+    return content.startswith(_ARCHIVE_SIGNATURES) or content[257:262] == b"ustar"
 
 
 def _is_below(path: str, folders: Iterable[str]) -> bool:

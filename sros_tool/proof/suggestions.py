@@ -33,17 +33,17 @@ from sros_tool.wording import counted
 
 _NOWHERE = Source("", 0)
 _OF_EVERY_NODE = frozenset({"/rosout", "/parameter_events"})
-_SENDING = ("publish", "call", "request")
+_SENDING_RIGHTS = ("publish", "call", "request")
 """The rights with which an enclave sends without being asked, in the order of the proposals."""
-_PEOPLE = "/operator/*"
+_ENCLAVES_OF_PEOPLE = "/operator/*"
 """The enclaves of people, such as those that sros ships: `ros2 topic echo` needs wildcards."""
-_FEW = 3
+_MAX_HOLDERS = 3
 """Maximum number of enclaves with a right to a name that are proposed as its only users."""
-_MOST = 1000
+_MAX_CANDIDATES = 1000
 """Maximum number of candidates for each robot, so that a person can read the proposals."""
-_MOST_ROBOTS = 100
+_MAX_ROBOTS = 100
 """Maximum number of robots whose candidates are decided."""
-_WIDE_LIST = 50
+_MAX_JOINED_NAMES = 50
 """Maximum number of names that are joined into one requirement."""
 
 
@@ -68,7 +68,7 @@ def suggest(
     requirements: list[Requirement] = []
     limit = SearchLimit(MOST_STEPS)
     all_worlds, stated = Worlds(worlds), _Stated(rights)
-    most = _MOST * min(len(fleet.robots) if fleet else 1, _MOST_ROBOTS)
+    most = _MAX_CANDIDATES * min(len(fleet.robots) if fleet else 1, _MAX_ROBOTS)
     for requirement in islice(_candidates(stated, worlds), most):
         verdicts = all_worlds.decide(requirement, limit)
         if not any(verdict.witness or verdict.empty or verdict.always for _, verdict in verdicts):
@@ -94,7 +94,7 @@ def _missing(stated: _Stated, proposed: Iterable[Requirement]) -> Iterator[Only]
         for name in names
     }
     for (right, name), users in sorted(stated.users.items()):
-        if right in _SENDING and moves_robot(name) and (right, name) not in reserved:
+        if right in _SENDING_RIGHTS and moves_robot(name) and (right, name) not in reserved:
             enclaves = tuple(sorted(users))
             yield Only(source=_NOWHERE, rights=((right, (name,)),), enclaves=enclaves)
 
@@ -115,7 +115,7 @@ def _joined_requirement(requirement: Requirement, other: Requirement) -> Require
         case (
             Nobody(rights=(("request", names),)),
             Nobody(rights=(("request", more),)),
-        ) if len(names) < _WIDE_LIST:
+        ) if len(names) < _MAX_JOINED_NAMES:
             return replace(requirement, rights=(("request", (*names, *more)),))
         case Protected(names=names, level=level), Protected(names=more) if other.level is level:
             return replace(requirement, names=(*names, *more))
@@ -132,7 +132,7 @@ class _Stated:
             if right.kind == "dds" or expression_problem(right.name):
                 continue  # permissions that others wrote may have any text
             if is_expression(right.name):
-                if not matches(_PEOPLE, right.enclave):
+                if not matches(_ENCLAVES_OF_PEOPLE, right.enclave):
                     self.wild[right.right].add(right.name)
             else:
                 self.users[right.right, right.name].add(right.enclave)
@@ -143,7 +143,7 @@ class _Stated:
 
 
 def _candidates(stated_rights: _Stated, worlds: Sequence[World]) -> Iterator[Requirement]:
-    for right in _SENDING:
+    for right in _SENDING_RIGHTS:
         yield from _few_holders(stated_rights, right)
     yield from _unused_services(stated_rights)
     yield from _gate_requirements(worlds[0])
@@ -152,7 +152,9 @@ def _candidates(stated_rights: _Stated, worlds: Sequence[World]) -> Iterator[Req
             yield Protected(source=_NOWHERE, names=((kind, "/*"),), level=Level.ENCRYPT)
     for right in ("publish", "request", "call"):
         wild = tuple(sorted(stated_rights.wild[right]))
-        yield Widest(source=_NOWHERE, rights=((right, wild),), enclaves=("*", EXCEPT + _PEOPLE))
+        yield Widest(
+            source=_NOWHERE, rights=((right, wild),), enclaves=("*", EXCEPT + _ENCLAVES_OF_PEOPLE)
+        )
 
 
 def _few_holders(stated_rights: _Stated, right: str) -> Iterator[Only]:
@@ -166,7 +168,7 @@ def _few_holders(stated_rights: _Stated, right: str) -> Iterator[Only]:
     for name in stated_rights.names(right):
         users = tuple(sorted(stated_rights.users[right, name]))
         received = name not in _OF_EVERY_NODE and (other, name) in stated_rights.users
-        if moves_robot(name) or (len(users) <= _FEW and received):
+        if moves_robot(name) or (len(users) <= _MAX_HOLDERS and received):
             names[users].append(name)
     for enclaves, names_held in sorted(names.items(), key=lambda item: (len(item[0]), item[0])):
         yield Only(source=_NOWHERE, rights=((right, tuple(names_held)),), enclaves=enclaves)

@@ -80,9 +80,9 @@ _ZENOH = "zenoh"
 """Name of the Zenoh world."""
 WORLDS = (*(vendor.value for vendor in TESTED), _ZENOH)
 """The worlds that are decided: the tested vendors, and Zenoh."""
-_PLANNED = timedelta(days=365)
+_ASSUMED_VALIDITY = timedelta(days=365)
 """Assumed validity of permissions that are not signed yet."""
-_OF_EVERY_NODE = ((True, ROS_DISCOVERY_TOPIC), (False, ROS_DISCOVERY_TOPIC))
+_TOPICS_OF_EVERY_NODE = ((True, ROS_DISCOVERY_TOPIC), (False, ROS_DISCOVERY_TOPIC))
 """Topics without which no ROS 2 node starts on DDS, as pairs: whether the node writes, topic."""
 
 
@@ -170,7 +170,7 @@ def policy_system(policy: Policy, at: Circumstances, template: Template | None =
         enclave.path: permissions_for(
             enclave,
             subject=subjects[enclave.path],
-            validity=window(at.now, _PLANNED),
+            validity=window(at.now, _ASSUMED_VALIDITY),
             domains=domains,
         )
         for enclave in policy.enclaves
@@ -277,7 +277,7 @@ def _dds_world(
         stated_access=stated_access,
         weak=weak,
         demanded=None if demanded is None else NameSet.union(demanded.values()),
-        needed=_OF_EVERY_NODE,
+        needed=_TOPICS_OF_EVERY_NODE,
         idle=idle,
         fitting_others=fitting_others or {},
         longest=vendor.traits.longest_topic_name or LONGEST,
@@ -334,7 +334,7 @@ def _stated_topics(enclaves: Iterable[str], rights: Iterable[Right]) -> dict[str
         if right.enclave in topics_of_enclave and not is_expression(right.name):
             for writes, topic in topics_of(right):
                 topics_of_enclave[right.enclave][not writes].add(topic)
-    for writes, topic in _OF_EVERY_NODE:
+    for writes, topic in _TOPICS_OF_EVERY_NODE:
         for topics in topics_of_enclave.values():
             topics[not writes].add(topic)
     return {name: TopicAccess(*map(NameSet, topics)) for name, topics in topics_of_enclave.items()}

@@ -465,13 +465,15 @@ def _changes_of_enclave(
             )
         )
         if gains:
-            accesses = first_few(list(dict.fromkeys(map(_words, gains))), _SHOWN, "; ", "; and ")
+            accesses = first_few(
+                list(dict.fromkeys(map(_gain_text, gains))), _SHOWN, "; ", "; and "
+            )
             closed = first.shipped.title
             opened = f"{where}{accesses}: open on {second.shipped.title}, closed on {closed}"
             yield DecisionChange(kind, name, opened, file)
 
 
-def _words(gain: Gain) -> str:
+def _gain_text(gain: Gain) -> str:
     """Return an access in words, such as ``publish topic /cmd_vel``."""
     if gain.right is None:
         return f"{gain.action} DDS topic {gain.topic}"
@@ -541,7 +543,7 @@ def _zenoh_findings(
         f"{version_text(new.begin)} or later; the files need at least {version_text(new.least)}"
     )
     yield ZENOH.found(files.file, text)
-    more = [key for key in new.below_topics if key not in (*old.below_topics, _OF_EACH)]
+    more = [key for key in new.below_topics if key not in (*old.below_topics, _SUBSCRIPTION_KEYS)]
     source = load_zenoh_rights(files.keystore, hidden=True)
     domains = domains_of(source.enforcers)
     dropped = {
@@ -555,7 +557,7 @@ def _zenoh_findings(
         yield BUFFERS.found(files.file, f"for {first_few(sorted(dropped), _SHOWN)}")
 
 
-_OF_EACH = "_buf/*"
+_SUBSCRIPTION_KEYS = "_buf/*"
 """Keys that rmw_zenoh uses for single subscriptions; only a wildcard can name them."""
 
 

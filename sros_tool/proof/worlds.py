@@ -35,7 +35,7 @@ LONGEST = 255
 ANYBODY = "anybody without an identity"
 """Name that stands for all processes without an enclave, where a governance admits them."""
 _LAST = "\U0010ffff"
-_OF_A_STEP = 4
+_COMPARISONS_PER_STEP = 4
 """Number of comparisons of wildcard prefixes and suffixes that count as one search step."""
 
 
@@ -166,7 +166,7 @@ class Side:
                 automaton for automaton in self._wild if automaton.matches(topics.expression)
             ]
         else:
-            limit.spend(len(self._wild) // _OF_A_STEP)
+            limit.spend(len(self._wild) // _COMPARISONS_PER_STEP)
             matching = [automaton for automaton in self._wild if automaton.may_meet(own_automaton)]
         wild = {enclave for automaton in matching for enclave in self._wild[automaton]}.union(
             self._any
@@ -218,7 +218,7 @@ class Side:
         return sorted(enclaves)
 
     def _users_by_wildcard(self, own_automaton: Automaton, limit: SearchLimit) -> frozenset[str]:
-        limit.spend(len(self._wild) // _OF_A_STEP)
+        limit.spend(len(self._wild) // _COMPARISONS_PER_STEP)
         met: set[str] = set()
         for topic in self._accepted_topics(own_automaton, limit):
             met.update(self.exact[topic])
@@ -527,7 +527,7 @@ def topics_of(right: Right) -> Iterator[tuple[bool, str]]:
 
 _IN, _OUT = Flow.INGRESS, Flow.EGRESS
 _ENDS = {"rt": "", **SERVICE_ENDS}
-_USES: dict[tuple[bool, str], tuple[tuple[Flow, Message], ...]] = {
+_MESSAGES_BY_USE: dict[tuple[bool, str], tuple[tuple[Flow, Message], ...]] = {
     (True, "rt"): ((_IN, Message.PUT),),
     (False, "rt"): ((_OUT, Message.PUT),),
     (True, "rq"): ((_IN, Message.QUERY),),
@@ -539,7 +539,7 @@ _USES: dict[tuple[bool, str], tuple[tuple[Flow, Message], ...]] = {
 
 All these messages have to pass: replies without the offer to reply belong to the history of topics.
 """
-_TYPE = f"/{ANY_TYPE}"
+_ANY_TYPE_CHUNKS = f"/{ANY_TYPE}"
 """Type and hash at the end of a key, as wildcards: rules that sros writes apply to all types."""
 _UNTYPED = "/*/*"
 
@@ -578,7 +578,9 @@ def enforced_access(enforcers: Iterable[Enforcement], enclave: str, domain: int)
         def of(keys: Iterable[str]) -> NameSet:
             return NameSet.union(_topics(key, domain, begin) for key in keys)
 
-        first, *other_sets = (enforcer.passing(remote, *use, of) for use in _USES[writes, begin])
+        first, *other_sets = (
+            enforcer.passing(remote, *use, of) for use in _MESSAGES_BY_USE[writes, begin]
+        )
         for names in other_sets:
             first &= names
         return first & names_of_expression(f"{begin}/*{_ENDS[begin]}")
@@ -663,11 +665,11 @@ def _topics(key: str, domain: int, begin: str) -> NameSet:
         return NameSet((f"{begin}{name}{end}",)) if name.startswith("/") else NameSet()
     around = names_of_keys((key,)).around()
     assert around
-    inner = (automaton.between(space, _TYPE) for automaton in around.automata)
+    inner = (automaton.between(space, _ANY_TYPE_CHUNKS) for automaton in around.automata)
     exact = (
-        f"{begin}{key[len(space) : -len(_TYPE)]}{end}"
+        f"{begin}{key[len(space) : -len(_ANY_TYPE_CHUNKS)]}{end}"
         for key in around.exact
-        if key.startswith(f"{space}/") and key.endswith(_TYPE)
+        if key.startswith(f"{space}/") and key.endswith(_ANY_TYPE_CHUNKS)
     )
     return NameSet(exact, (automaton.surrounded(begin, end) for automaton in inner))
 
@@ -681,5 +683,5 @@ def zenoh_message(topic: str, domain: int, *, writes: bool) -> list[tuple[Flow, 
     end = _ENDS.get(begin)
     if end is None or not topic[2:].startswith("/") or not topic.endswith(end):
         return []
-    key = f"{domain}{topic[2 : len(topic) - len(end)]}{_TYPE}"
-    return [(flow, message, key) for flow, message in _USES[writes, begin]]
+    key = f"{domain}{topic[2 : len(topic) - len(end)]}{_ANY_TYPE_CHUNKS}"
+    return [(flow, message, key) for flow, message in _MESSAGES_BY_USE[writes, begin]]

@@ -35,7 +35,7 @@ _Files = Mapping[str, SignedConfiguration]
 """
 LONE = "the file"
 
-_OPEN: tuple[tuple[str, Callable[[ConfigurationDocument], bool], bool, str], ...] = (
+_TWO_VALUED_SETTINGS: tuple[tuple[str, Callable[[ConfigurationDocument], bool], bool, str], ...] = (
     (
         "transport/link/tls/enable_mtls",
         lambda document: document.tls.mutual,
@@ -100,21 +100,21 @@ _OPEN: tuple[tuple[str, Callable[[ConfigurationDocument], bool], bool, str], ...
 """Settings with two values: path, function that reads the value, value that permits more, clause.
 """
 
-_COMPARED = re.compile(
+_COMPARED_PATHS = re.compile(
     r"mode|namespace|(?:listen|connect)/endpoints(?:/\w+)?|transport/link/protocols"
     r"|adminspace/enabled|adminspace/permissions/(?:read|write)"
     r"|transport/link/tls/(?:enable_mtls|verify_name_on_connect|close_link_on_expiration)"
     r"|transport/shared_memory/enabled|scouting/(?:multicast|gossip)/enabled"
 )
-"""Paths of the compared settings: `_OPEN`, endpoints and access control."""
-_HARMLESS = re.compile(
+"""Paths of the compared settings: `_TWO_VALUED_SETTINGS`, endpoints and access control."""
+_HARMLESS_PATHS = re.compile(
     r"metadata(?:/.*)?|timestamping/.*|queries_default_timeout|open/.*|stats/.*"
     r"|transport/unicast/.*|transport/link/[tr]x/.*|transport/link/tls/so_(?:snd|rcv)buf"
     r"|(?:listen|connect)/(?:timeout_ms|exit_on_failure|retry)(?:/.*)?|scouting/(?:timeout|delay)"
     r"|scouting/gossip/autoconnect_strategy/.*|routing/router/peers_failover_brokering"
 )
 """Paths of settings that give nobody access: times, sizes, names, order of connecting."""
-_GIVING = (
+_PATHS_GIVING_ACCESS = (
     (re.compile(r"plugins(?:/.*)?"), "a plugin answers other processes by its own rules"),
     (re.compile(r"plugins_loading(?:/.*)?"), "it loads plugins, which answer other processes"),
     (
@@ -151,8 +151,8 @@ def unknown_settings(old: _Files, new: _Files) -> Iterator[str]:
         before = old[place].document if place in old else _default_configuration(file.document.mode)
         old_settings, new_settings = before.settings, file.document.settings
         for path in sorted({*old_settings, *new_settings, *file.document.unknown}):
-            known = any(pattern.fullmatch(path) for pattern in (_COMPARED, _HARMLESS))
-            gives = any(pattern.fullmatch(path) for pattern, _ in _GIVING)
+            known = any(pattern.fullmatch(path) for pattern in (_COMPARED_PATHS, _HARMLESS_PATHS))
+            gives = any(pattern.fullmatch(path) for pattern, _ in _PATHS_GIVING_ACCESS)
             if old_settings.get(path) != new_settings.get(path) and not known and not gives:
                 files[path].append(place)
     for path, places in files.items():
@@ -175,7 +175,7 @@ def _changes(
     if file.signature != SIGNED and (known is None or known.signature == SIGNED):
         meaning = "anybody who can write the file states the rights and settings"
         yield "signature", SIGNED, file.signature, meaning
-    for path, value, open_value, meaning in _OPEN:
+    for path, value, open_value, meaning in _TWO_VALUED_SETTINGS:
         if value(after) is open_value is not value(before):
             old_value, new_value = (str(value(document)).lower() for document in (before, after))
             yield path, old_value, new_value, meaning
@@ -198,7 +198,7 @@ def _changes(
         yield "transport/link/protocols", "without", f"with {protocols}", meaning
     for path in sorted({*before.settings, *after.settings}):
         values = before.settings.get(path), after.settings.get(path)
-        for expression, meaning in _GIVING:
+        for expression, meaning in _PATHS_GIVING_ACCESS:
             plugin = "/".join(path.split("/")[:2])
             gone = plugin.startswith("plugins") and not any(
                 setting == plugin or setting.startswith(f"{plugin}/") for setting in after.settings

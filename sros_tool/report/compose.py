@@ -249,7 +249,7 @@ def _picture(
         return [any(ends) for ends in zip(drawn[kind, name], *of_known, strict=True)]
 
     stated = next((source.protections for source in reversed(sources) if source.protections), ())
-    demanded = _Demanded(() if governance else stated)
+    demanded = _DemandedProtection(() if governance else stated)
     names = sorted({(edge.kind, edge.name) for edge in edges})
     return Picture(
         title=" and ".join(source.origin.title for source in sources),
@@ -263,7 +263,7 @@ def _picture(
                 protection := demanded.protection(kind, name)
                 or protection_of(governance, kind, name),
                 is_expression(name),
-                _lack(protection, *sides(kind, name)),
+                _lacking_side(protection, *sides(kind, name)),
             )
             for kind, name in names
         ),
@@ -290,7 +290,7 @@ def _senders_and_receivers(edges: Iterable[Edge]) -> Mapping[tuple[str, str], li
     return allowed
 
 
-def _lack(protection: Protection, sends: bool, receives: bool) -> Lack:
+def _lacking_side(protection: Protection, sends: bool, receives: bool) -> Lack:
     """Return the side of a name (senders or receivers) on which no enclave is allowed."""
     if sends and not receives and protection.read_control:
         return Lack.RECEIVER
@@ -529,7 +529,7 @@ class Known:
                 part in chosen or not self.matching_names(part.kind, part.name)
             ):
                 wild[part.kind].append(part.name)
-        self._open = {kind: _Wild(names) for kind, names in wild.items()}
+        self._open = {kind: _DrawnWildcards(names) for kind, names in wild.items()}
 
     def matching_names(self, kind: str, name: str) -> tuple[str, ...]:
         """Return the exact names of this kind that an expression matches."""
@@ -564,7 +564,7 @@ class Known:
         return fitting
 
 
-class _Wild:
+class _DrawnWildcards:
     """The wildcards in rights that are drawn as names."""
 
     def __init__(self, names: Sequence[str]) -> None:
@@ -705,7 +705,7 @@ def protection_of(governance: Governance | None, kind: str, name: str) -> Protec
 _ORDER = list(WireLevel)
 
 
-class _Demanded:
+class _DemandedProtection:
     """The protection that a policy demands for names, for pictures without a governance."""
 
     def __init__(self, stated_protections: Iterable[StatedProtection]) -> None:

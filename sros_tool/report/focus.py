@@ -58,7 +58,7 @@ from sros_tool.report.picture import (
 from sros_tool.wording import counted, enumerated
 
 _ENCLAVE = "enclave"
-_VERBS = {
+_WORDS_OF_KIND = {
     "topics": ("publish", "publisher", "subscribe to"),
     "services": ("call", "caller", "serve"),
     "actions": ("call action", "caller", "execute"),
@@ -269,7 +269,7 @@ class _System:
         if not kinds:
             kinds = [
                 kind
-                for kind in _VERBS
+                for kind in _WORDS_OF_KIND
                 if any(_overlaps_word(right, kind, word) for right in self._rights)
             ]
         if not kinds:
@@ -409,7 +409,7 @@ def _sentence(
 
     With ``partial``, there may be other enclaves, so no enclave is said to be the only one.
     """
-    sends, sender, receives = _VERBS[kind]
+    sends, sender, receives = _WORDS_OF_KIND[kind]
     who = "every enclave" if open_to_all else _enclaves_text(senders, partial=partial)
     text = f"{who} may {sends} {name}"
     text += ", which the governance leaves open" if open_to_all else ""
@@ -447,7 +447,7 @@ HOPS = 2
 _MOST_ENCLAVES = 24  # if a column has more, groups are drawn; with more groups, one card
 _MOST_BUNDLES = 40  # if a stage has more, names with the same senders are joined
 _GUTTER, _LETTER, _SMALL_LETTER = 76, 7.4, 6.2
-_ROOM = {"names": 66, "enclave": 24, "group": 24}
+_UNUSED_WIDTH = {"names": 66, "enclave": 24, "group": 24}
 """Width on a card besides its text, in pixels."""
 
 
@@ -647,7 +647,7 @@ class _Draft:
         kinds = {focus.kind for focus in self._picture.focus}
         sends, receives = "in focus" if _ENCLAVE in kinds else "1 hop before", "1 hop behind"
         if len(kinds) == 1 and _ENCLAVE not in kinds:
-            publish, _, subscribe = _VERBS[kinds.pop()]
+            publish, _, subscribe = _WORDS_OF_KIND[kinds.pop()]
             sends, receives = f"may {publish}", f"may {subscribe.removesuffix(' to')}"
         texts = {
             self._column_of(before, hop): text
@@ -671,4 +671,4 @@ def _width(card: Card) -> int:
     """Return the width that a card needs for its text, in pixels."""
     widest = max((len(line) for line in card.lines), default=0) * _LETTER
     small = max((len(note) for note in card.notes), default=0) * _SMALL_LETTER
-    return max(96, round(max(widest, small) + _ROOM[card.role]))
+    return max(96, round(max(widest, small) + _UNUSED_WIDTH[card.role]))

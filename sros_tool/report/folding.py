@@ -47,10 +47,10 @@ from sros_tool.report.picture import (
 )
 from sros_tool.wording import counted
 
-_MARKS = "{}…"
+_LABEL_CHARACTERS = "{}…"
 """Characters of labels, which ROS names cannot have; pictures with these are not folded."""
 _WORD = re.compile(r"[A-Za-z0-9_]+")
-_MOST_PIECES = 16
+_MAX_PIECES = 16
 """Maximum number of pieces of a word (split at underscores) that are compared with unit names."""
 _SELF = -1
 _TITLE_LETTERS = 30
@@ -246,7 +246,7 @@ class UnitNames:
         The unit is a pair of numbers, of the unit and of the word in its ``values``, or None; the
         length is a number of pieces.
         """
-        for size in range(min(len(pieces) - at, _MOST_PIECES), 0, -1):
+        for size in range(min(len(pieces) - at, _MAX_PIECES), 0, -1):
             unit = self.words.get("_".join(pieces[at : at + size]))
             if unit:
                 return unit, size
@@ -289,7 +289,7 @@ class _Draft:
             *(enclave.group for enclave in self._picture.enclaves),
             *(name.name for name in self._picture.names),
         )
-        return any(mark in text for text in texts for mark in _MARKS)
+        return any(mark in text for text in texts for mark in _LABEL_CHARACTERS)
 
     # ── what is seen of each unit ──────────────────────────────────────────────────────────
 

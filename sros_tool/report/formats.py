@@ -283,7 +283,7 @@ def _card(card: Card) -> Iterable[str]:
 def _legend(picture: Picture, scene: Scene) -> Iterable[str]:
     """Yield the lines of the legend for the symbols in a scene."""
     kinds = sorted({card.kind for card in scene.cards if card.kind}, key=list(_GLYPHS).index)
-    yield _row(
+    yield _legend_row(
         (
             f'<path class="glyph" transform="translate(0 -10)" d="{_GLYPHS[kind]}"/>',
             KIND_NAMES[kind],
@@ -292,7 +292,7 @@ def _legend(picture: Picture, scene: Scene) -> Iterable[str]:
     )
     levels = [level for level in _LOCKS if any(link.level is level for link in scene.links)]
     if levels:
-        yield _row(
+        yield _legend_row(
             (
                 f'<path class="lock lock-{level.value}" transform="translate(0 -10)" '
                 f'd="{_LOCKS[level]}"/><path class="link {level.value}" d="M20 -4h40"/>',
@@ -314,12 +314,12 @@ def _legend(picture: Picture, scene: Scene) -> Iterable[str]:
     if picture.overlay:
         rows.append(('<path class="link first" d="M0 -4h40"/>', picture.overlay.first))
         rows.append(('<path class="link second" d="M0 -4h40"/>', picture.overlay.second))
-    yield _row(rows)
+    yield _legend_row(rows)
     yield from _card_legend(picture, scene)
     if any(note.startswith(OWN) for card in scene.cards for note in card.notes):
-        yield _row([("", f"{OWN} names that no other enclave may use")])
+        yield _legend_row([("", f"{OWN} names that no other enclave may use")])
     if scene.onlookers:
-        yield _row(
+        yield _legend_row(
             (
                 f'<text class="tag" x="4" y="0">{onlooker.tag}</text>',
                 f"{ONLOOKERS[onlooker.right]} {onlooker.enclave.removeprefix(':')}",
@@ -336,12 +336,12 @@ def _card_legend(picture: Picture, scene: Scene) -> Iterable[str]:
     if any(card.lacks for card in scene.cards):
         rows.append((_BOX.format("lacking"), "nobody may send it, or nobody may receive it"))
     if rows:
-        yield _row(rows)
+        yield _legend_row(rows)
     for units in picture.equal[:_MOST_LABELS]:
         of_each = f"each of {len(units.members)} {units.what}s, which are equal but for their names"
-        yield _row([("", f"{units.label}: {of_each}")])
+        yield _legend_row([("", f"{units.label}: {of_each}")])
     if any(word in line for word in OTHERS for card in scene.cards for line in card.lines):
-        yield _row(
+        yield _legend_row(
             [("", f"{{1 {OTHERS[0]} …}}: this name of one other robot, namespace or enclave")]
         )
 
@@ -350,7 +350,7 @@ _BOX = '<g class="card {}"><rect y="-11" width="34" height="14" rx="4"/></g>'
 _MOST_LABELS = 8
 
 
-def _row(rows: Iterable[tuple[str, str]]) -> str:
+def _legend_row(rows: Iterable[tuple[str, str]]) -> str:
     """Return one row of the legend as SVG, from pairs of symbol (SVG) and text."""
     x, cells = 0, []
     for drawn, text in rows:
@@ -506,7 +506,7 @@ def _node_cards(scene: Scene) -> Mapping[str, Card]:
     """Map node ids to cards; both cards of an enclave become one node."""
     cards: dict[str, Card] = {}
     for card in sorted(scene.cards, key=lambda card: (card.role, card.members, card.column)):
-        cards.setdefault(_key(card.id), card)
+        cards.setdefault(_node_key(card.id), card)
     return cards
 
 
@@ -519,7 +519,7 @@ def _clusters(cards: Mapping[str, Card]) -> dict[str, list[str]]:
     return dict(sorted(groups.items())) if len(groups) > 1 else {}
 
 
-def _key(card: str) -> str:
+def _node_key(card: str) -> str:
     """Return the node id for a card: "e" and the enclave, or "n" and the card's number."""
     return card if card[0] == "n" else f"e{card[1:]}"
 
@@ -574,7 +574,7 @@ def _dot_edge(picture: Picture, link: Link) -> str:
     ]
     attributes += ["arrowhead=tee"] if denied else []
     attributes += ["penwidth=3"] if link.violates else []
-    ends = f"{_quoted(_key(link.source))} -> {_quoted(_key(link.target))}"
+    ends = f"{_quoted(_node_key(link.source))} -> {_quoted(_node_key(link.target))}"
     return f"{ends} [{', '.join(attributes)}]"
 
 
@@ -591,7 +591,7 @@ def _escaped(text: str) -> str:
 
 def _mermaid_node(scene: Scene, key: str, card: Card) -> str:
     around = '["{}"]' if card.role == "names" else '("{}")'
-    return _id(key) + around.format(_label(scene, card))
+    return _identifier(key) + around.format(_label(scene, card))
 
 
 def _label(scene: Scene, card: Card) -> str:
@@ -599,10 +599,10 @@ def _label(scene: Scene, card: Card) -> str:
 
 
 def _node_id(card: str) -> str:
-    return _id(_key(card))
+    return _identifier(_node_key(card))
 
 
-def _id(key: str) -> str:
+def _identifier(key: str) -> str:
     """Return a unique identifier of ASCII letters and digits for a key."""
     plain = "".join(
         letter if letter.isalnum() and letter.isascii() else f"_{ord(letter):x}_" for letter in key

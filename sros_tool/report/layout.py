@@ -67,7 +67,7 @@ _REACHES = {
     "call": "calls",
     "execute": "executes",
 }
-_COMMON = {
+_COMMON_NAME_NOTES = {
     "topics": "used by every node",
     "services": "served by every node",
     "actions": "used by every node",
@@ -392,7 +392,7 @@ class _Draft:
         shared = len(self._everybody[bundle.kind, bundle.names[0]] - drawn) > 0
         tags = {self._tags[tie.node, tie.right] for tie in bundle.ties if self._is_onlooker(tie)}
         x = MARGIN + _SIDE_WIDTH + _GUTTER
-        notes = (_COMMON[bundle.kind],) if shared else ()
+        notes = (_COMMON_NAME_NOTES[bundle.kind],) if shared else ()
         card = names_card(f"n{number}", bundle, 1, notes)
         return replace(card, x=x, width=_NAMES_WIDTH, tags="".join(sorted(tags)))
 

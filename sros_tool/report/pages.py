@@ -386,12 +386,12 @@ def _demo_vulnerabilities(result: Json) -> str:
         number = counted(len(ids), "known vulnerability", "known vulnerabilities")
         fixed = " (its package may have the fixes)" if used["packaged"] and ids else ""
         listed = ", ".join((*ids, *(f"{name} (not known for this release)" for name in unclear)))
-        lines.append(_fold(f"{name}: {number}{fixed}", listed))
+        lines.append(_unfolding_html(f"{name}: {number}{fixed}", listed))
     shown = "".join(lines) or f"<p>{_with_marks(result['vulnerabilities'])}</p>"
     return f"<section><h2>Known vulnerabilities</h2>{shown}</section>"
 
 
-def _fold(title: str, text: str) -> str:
+def _unfolding_html(title: str, text: str) -> str:
     """Return an HTML element with a title that unfolds ``text``."""
     return (
         f"<details><summary>{escape(title)}</summary>{_with_marks(text)}</details>"
@@ -563,7 +563,7 @@ def _dds_finding(finding: Json) -> str:
     """Return a finding on the DDS of robots; path and numbers are in a part that unfolds."""
     text, comma, rest = finding["text"].partition("; in '")
     folded = f"In '{rest}. {finding['remedy']}" if comma else ""
-    return _fold(f"{finding['subject']}: {text}", folded)
+    return _unfolding_html(f"{finding['subject']}: {text}", folded)
 
 
 _FLEET_COLUMNS = ("State", "Robots", "To do", "Details", "Confirmed (UTC)", "First expiry")

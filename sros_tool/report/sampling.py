@@ -24,11 +24,11 @@ from sros_tool.report.folding import DrawnUnit, UnitNames, name_order, units_of
 from sros_tool.report.picture import UnreadUnits
 from sros_tool.xml import read_bytes
 
-_LARGE = 1000
+_MAX_READ_IN_FULL = 1000
 """Maximum number of enclaves for which a picture reads all enclaves."""
 _BOUNDARY = re.compile(rb'(?i)multipart/signed[^\r\n]*boundary="([^"\r\n]+)"')
 _VALIDITY = re.compile(r"<not_(before|after)>[^<]*</not_\1>")
-_MARKS = "\x01\x02"
+_UNIT_MARKS = "\x01\x02"
 """Characters that stand for the name of a unit and its namespace; XML cannot have them."""
 
 
@@ -65,7 +65,7 @@ def sample_of(
     """
     paths = keystore.names
     whole_keystore = SampledKeystore(keystore, paths)
-    if len(paths) <= _LARGE:
+    if len(paths) <= _MAX_READ_IN_FULL:
         return whole_keystore
     units = units_of(paths, robots)
     names = UnitNames(units, paths)
@@ -86,7 +86,7 @@ def sample_of(
         for n in (first, *further)
     }
     other_paths = [path for path in paths if names.of.get(path) not in few]
-    if len(other_paths) > _LARGE:
+    if len(other_paths) > _MAX_READ_IN_FULL:
         return whole_keystore
     named: dict[int, set[Right]] = defaultdict(set)
     for right in load_rights(keystore, only_enclaves=other_paths).rights:
@@ -120,7 +120,7 @@ def _is_ambiguous(word: str, words: Collection[str]) -> bool:
     )
 
 
-_UNIQUE = re.compile(",OU=[0-9a-f]{16}(?=</subject_name>)")
+_UNIQUE_SUBJECT_PART = re.compile(",OU=[0-9a-f]{16}(?=</subject_name>)")
 """The part that makes a certificate's subject unique, and that says nothing about rights."""
 
 
@@ -135,10 +135,10 @@ def _digest_of(
     hidden = [
         hashlib.sha256(
             f"{_without_unit_names(path, unit, names)}\n"
-            f"{_without_unit_names(_UNIQUE.sub('', text), unit, names)}".encode()
+            f"{_without_unit_names(_UNIQUE_SUBJECT_PART.sub('', text), unit, names)}".encode()
         )
         for path, text in texts.items()
-        if text and not any(mark in text for mark in _MARKS)
+        if text and not any(mark in text for mark in _UNIT_MARKS)
     ]
     if len(hidden) < len(enclaves):
         return ""
@@ -149,7 +149,7 @@ def _without_unit_names(text: str, unit: DrawnUnit, names: UnitNames) -> str:
     """Return a text in which a mark replaces each name of the unit."""
     for word in sorted(unit.values, key=len, reverse=True):
         if word in names.words:
-            text = _with_mark(text, word, _MARKS[names.words[word][1]])
+            text = _with_mark(text, word, _UNIT_MARKS[names.words[word][1]])
     return text
 
 

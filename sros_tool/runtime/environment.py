@@ -117,7 +117,7 @@ def render_environment(variables: Mapping[str, str], form: str) -> str:
         UsageError: in this format, not all programs would read the same value.
     """
     for name, value in variables.items():
-        if form in _UNREADABLE and _UNREADABLE[form](value):
+        if form in _INEXPRESSIBLE_IN and _INEXPRESSIBLE_IN[form](value):
             raise UsageError(
                 f"{name} cannot be written in the form {form}: {value!r}",
                 "A program that reads this form would get another value, or several values.",
@@ -165,7 +165,7 @@ def _is_interpreted(value: str) -> bool:
     return not value.isprintable() or "$" in value or " #" in value or value != value.strip()
 
 
-_UNREADABLE: dict[str, Callable[[str], bool]] = {
+_INEXPRESSIBLE_IN: dict[str, Callable[[str], bool]] = {
     "json": _is_not_unicode,
     "systemd": _is_not_printable,
     "docker": _is_interpreted,
@@ -418,7 +418,7 @@ CONTAINER_FORMS = (COMPOSE, KUBERNETES, SECRET)
 MAX_SECRET = 1024 * 1024
 """Largest size of the files in a Secret, in bytes (MaxSecretSize of core/v1)."""
 
-_USER = 1000
+_CONTAINER_USER = 1000
 """User id and group id of the process in a container, as in most ROS images."""
 _OWNER_READS = 0o400
 _LOGS = {"ROS_LOG_DIR": "/tmp"}  # noqa: S108 (a path in the container, which has it alone)
@@ -596,9 +596,9 @@ def _pod(container: Container) -> dict[str, Any]:
         "automountServiceAccountToken": False,
         "securityContext": {
             "runAsNonRoot": True,
-            "runAsUser": _USER,
-            "runAsGroup": _USER,
-            "fsGroup": _USER,
+            "runAsUser": _CONTAINER_USER,
+            "runAsGroup": _CONTAINER_USER,
+            "fsGroup": _CONTAINER_USER,
             "seccompProfile": {"type": "RuntimeDefault"},
         },
         "containers": [process],

@@ -40,7 +40,7 @@ _IFF_MULTICAST = 0x1000
 _RTF_UP = 0x1
 
 _LOCAL_PORTS = Path("/proc/sys/net/ipv4/ip_local_port_range")
-_BELOW_DDS = "1024 7399"
+_PORTS_BELOW_DDS = "1024 7399"
 """A port range that no domain uses: DDS ports begin at 7400 (RTPS 2.5 §9.6.2.3)."""
 
 _TRIAL_SECONDS = 60
@@ -162,7 +162,7 @@ def _keep_off_ports_of_dds() -> None:
     participant could not join if its port was assigned to another socket.
     """
     with contextlib.suppress(OSError):  # a container may forbid it
-        _LOCAL_PORTS.write_text(_BELOW_DDS, encoding="ascii")
+        _LOCAL_PORTS.write_text(_PORTS_BELOW_DDS, encoding="ascii")
 
 
 def _internet_address(text: str) -> bytes:

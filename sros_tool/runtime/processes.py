@@ -65,15 +65,15 @@ _ZENOHD = "zenohd"
 _ROUTERS = ("rmw_zenohd", _ZENOHD)
 _BRIDGES = ("zenoh-bridge-ros2dds", "zenoh-bridge-dds")
 _INTERPRETER = re.compile(r"(?:python[\d.]*|sh|bash|dash|perl|ruby|node)\Z")
-_FLAGS = re.compile(r"-[BEIOPbdiqsuvx]+\Z")
+_PYTHON_FLAGS = re.compile(r"-[BEIOPbdiqsuvx]+\Z")
 """Python options without a value (such as -u); some of them are also options of shells."""
 _SCRIPTS_OF_SROS = ("sros", "sros_tool")
 
-_LOADING = timedelta(milliseconds=20)
+_SHORTEST_LOADING_TIME = timedelta(milliseconds=20)
 """Shortest time from a process's start (known in steps of 10 ms) to loading its enclave."""
 _CLOCK_TOLERANCE = timedelta(seconds=1)
 """Maximum time by which a process's folder can seem older than the process, if no clock was set."""
-_FIRST_LOOK = timedelta(minutes=1)
+_LONGEST_TIME_TO_FIRST_LOOK = timedelta(minutes=1)
 """Maximum time from the start to the first look, for the process that was seen soonest."""
 _MOST_BYTES = 4 * 1024 * 1024
 _MOST_MAPS = 32 * 1024 * 1024
@@ -266,7 +266,7 @@ def program_of(command: tuple[str, ...]) -> str:
     """Return the name of a command's program, or of the script or module that the program runs."""
     name, *words = (Path(command[0]).name, *command[1:]) if command else ("",)
     if _INTERPRETER.match(name):
-        while words and _FLAGS.match(words[0]):
+        while words and _PYTHON_FLAGS.match(words[0]):
             del words[0]
         if words[:1] == ["-m"] and len(words) > 1:
             name = words[1]
@@ -372,11 +372,13 @@ class ProcessTable:
             command: tuple[str, ...] = ()
             try:
                 command = tuple(_words(folder, "cmdline"))
-                started = begin + timedelta(seconds=stat.ticks / self._ticks) + _LOADING
+                started = (
+                    begin + timedelta(seconds=stat.ticks / self._ticks) + _SHORTEST_LOADING_TIME
+                )
                 advanced = _clock_advanced(folder, started)
                 if advanced:
                     advanced = max(advanced, longest_advance())
-                    started -= advanced + _FIRST_LOOK
+                    started -= advanced + _LONGEST_TIME_TO_FIRST_LOOK
                 if before and before.process and before.stat.identity == stat.identity:
                     # Kept from the last look, because the clock may have been set since.
                     started, advanced = before.process.started, before.process.clock_advanced
@@ -802,7 +804,7 @@ def _namespace(path: Path) -> str:
 
 _CRL = "crl.pem"
 _KEY, _KEY_ON_TOKEN = "key.pem", "key.p11"
-_UNREAD = (_KEY, _KEY_ON_TOKEN, "governance.p7s")
+_UNREAD_FILES = (_KEY, _KEY_ON_TOKEN, "governance.p7s")
 """Files that are not read: private keys, and files whose content shows nothing about a process."""
 _MOST_FILE_BYTES = 16 * 1024 * 1024
 _MOST_BYTES_OF_FILES = 64 * 1024 * 1024
@@ -1068,7 +1070,7 @@ def _loaded_enclave(
         keystore,
         name,
         tuple(
-            root.load(file, f"{place}/{file}", read=file not in _UNREAD)
+            root.load(file, f"{place}/{file}", read=file not in _UNREAD_FILES)
             for file in (*ENCLAVE_FILES, _KEY_ON_TOKEN, _CRL)
         ),
         is_there=True,

@@ -42,7 +42,7 @@ from sros_tool.zenoh.key_expressions import (
 
 GRAPH = "@ros2_lv"
 _NODE, _NAME = "NN", 9
-_KINDS = {"publish": "MP", "subscribe": "MS", "reply": "SS", "request": "SC"}
+_ENTITY_KIND_OF_RIGHT = {"publish": "MP", "subscribe": "MS", "reply": "SS", "request": "SC"}
 """Right → kind of entity, as in tokens, that a node with this right may announce."""
 _MOST_TOKENS = 4096
 """Maximum number of key expressions for the tokens of a right of an enclave."""
@@ -86,7 +86,7 @@ def announced_names(
     ``domain``.
     """
     names: dict[bool, dict[str, None]] = {True: {}, False: {}}
-    begin, of_right = [GRAPH, str(domain)], [_KINDS[right], _part(enclave)]
+    begin, of_right = [GRAPH, str(domain)], [_ENTITY_KIND_OF_RIGHT[right], _part(enclave)]
     for rule in rules:
         for key in rule.key_expressions if _ANNOUNCING[0] in rule.messages else ():
             chunks = key.split("/")
@@ -180,7 +180,7 @@ class _Tokens:
             wild = [expression for expression in stated if is_expression(expression)]
             allowed += self._announced(right, stated)
             denied += [
-                self._key(_KINDS[right], "*/*", part, ANY_CHUNKS)
+                self._key(_ENTITY_KIND_OF_RIGHT[right], "*/*", part, ANY_CHUNKS)
                 for name in without
                 if any(overlap(wide, name) for wide in wild)
                 for part in _parts(name)
@@ -206,7 +206,7 @@ class _Tokens:
         if len(everybody) * sum(not owner for owner in owners.values()) > _MOST_TOKENS:
             everybody = ("*/*",)
         return [
-            self._key(_KINDS[right], node, part, ANY_CHUNKS)
+            self._key(_ENTITY_KIND_OF_RIGHT[right], node, part, ANY_CHUNKS)
             for part, owner in owners.items()
             for node in ((owner,) if owner else everybody)
         ]

@@ -84,7 +84,7 @@ _UNTYPED = ("*", "*")
 ANY_TYPE = "any::type/hash"
 """An example of a type and its hash; the rules of sros decide alike for all types."""
 _BELOW_TOPICS = (ANY_CHUNKS,) if any(release.below_topics for release in RELEASES) else ()
-_BELOW = {"publish": _BELOW_TOPICS, "subscribe": _BELOW_TOPICS}
+_CHUNKS_BELOW = {"publish": _BELOW_TOPICS, "subscribe": _BELOW_TOPICS}
 """Right → chunks that a release of rmw_zenoh adds to the keys of the right."""
 _ADVANCED = f"@adv/{ANY_CHUNKS}"
 """The end of the keys for the history of a topic (TRANSIENT_LOCAL), below the topic's key."""
@@ -274,7 +274,7 @@ def _allowed_keys(
         side = allowed if qualifier is ALLOW else denied
         side.setdefault(right, {}).setdefault(name, source)
     for right, places in sorted(allowed.items()):
-        end = "/".join(("", *_TYPE, *_BELOW.get(right, ())))
+        end = "/".join(("", *_TYPE, *_CHUNKS_BELOW.get(right, ())))
         never = denied.get(right, {})
         if not never and _EXACT_NAMES.fullmatch("".join(places)):
             yield right, tuple([f"{domain}{name}{end}" for name in places]), None
@@ -446,7 +446,7 @@ def _chunks_of_part(texts: list[str]) -> list[list[str]]:
 
 # ── Zenoh rules in ROS terms ────────────────────────────────────────────────────────────
 
-_USE = {
+_RIGHT_OF_MESSAGE = {
     (Flow.INGRESS, Message.PUT): "publish",
     (Flow.EGRESS, Message.PUT): "subscribe",
     (Flow.INGRESS, Message.QUERY): "request",
@@ -560,7 +560,7 @@ def _differences_in(
 
 def _right_keys(rule: AclRule) -> Iterator[tuple[str, str]]:
     """Yield pairs of a right and a key expression of the right to which a rule applies."""
-    for (flow, message), right in _USE.items():
+    for (flow, message), right in _RIGHT_OF_MESSAGE.items():
         if flow in rule.flows and message in rule.messages:
             # Keys with @adv are for the history of a topic, and belong to the same right.
             yield from ((right, key) for key in rule.key_expressions if "/@adv" not in key)

@@ -78,7 +78,9 @@ class RemoteRights:
 
     common_name: str
     rules: tuple[AccessRule, ...]
-    differences: Mapping[_Use, tuple[Difference, ...]] = field(default_factory=dict, compare=False)
+    differences: Mapping[_RuleUse, tuple[Difference, ...]] = field(
+        default_factory=dict, compare=False
+    )
 
     def mirrored(self, common_name: str) -> RemoteRights:
         """Return the rights that the remote process must give to this one for the same messages.
@@ -97,7 +99,7 @@ class RemoteRights:
         return keys_of(frozenset(rule.key_expressions), differences)
 
 
-_Use = tuple[Flow, tuple[Message, ...]]
+_RuleUse = tuple[Flow, tuple[Message, ...]]
 """The direction and message kinds of a rule."""
 
 
@@ -241,12 +243,12 @@ def _decide_by_rules(
     return AccessDecision(bool(allowed), allowed, subjects, why)
 
 
-_FEW = 16
+_MAX_WITHOUT_INDEX = 16
 """Maximum number of key expressions that are compared one by one, without an index."""
 
 
 def _include(expressions: tuple[str, ...], key: str) -> bool:
-    if len(expressions) <= _FEW:
+    if len(expressions) <= _MAX_WITHOUT_INDEX:
         return any(includes(wide, key) for wide in expressions)
     return _search(expressions).include(key)
 
@@ -271,7 +273,7 @@ def joined(rules: Iterable[AccessRule]) -> tuple[AccessRule, ...]:
 
 
 def _joined_keys(keys: Sequence[tuple[str, ...]]) -> tuple[str, ...]:
-    if len(keys) == 1 and len(keys[0]) > _FEW:
+    if len(keys) == 1 and len(keys[0]) > _MAX_WITHOUT_INDEX:
         return tuple(sorted(keys[0]))
     return _needed_keys(frozenset(key for some_keys in keys for key in some_keys))
 
@@ -291,7 +293,7 @@ def sorted_rules(rules: Iterable[AccessRule]) -> tuple[AccessRule, ...]:
 def joined_rights(name: str, rights: Iterable[RemoteRights]) -> RemoteRights:
     """Return the joint rights of all processes, as the rights of a process named ``name``."""
     of_all = list(rights)
-    differences: dict[_Use, dict[Difference, None]] = {}
+    differences: dict[_RuleUse, dict[Difference, None]] = {}
     for use, of in (item for rights in of_all for item in rights.differences.items()):
         differences.setdefault(use, {}).update(dict.fromkeys(of))
     return RemoteRights(

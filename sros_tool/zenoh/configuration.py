@@ -140,7 +140,7 @@ class ZenohNetwork:
 
 
 _REVOKED = "last_revocation"
-_QUERY_MILLISECONDS = 600_000
+_REPLY_TIMEOUT_MILLISECONDS = 600_000
 """Time that rmw_zenoh waits for a reply; Zenoh's default of 10 s would end long calls."""
 _MICROSECONDS_UNTIL_CLOSED = 60_000_000
 """Time that a session of rmw_zenoh waits for a stuck receiver before closing the connection."""
@@ -264,7 +264,7 @@ def _text_without_control(
             },
         },
         "timestamping": {"enabled": {"router": True, "peer": True, "client": True}},
-        "queries_default_timeout": _QUERY_MILLISECONDS,
+        "queries_default_timeout": _REPLY_TIMEOUT_MILLISECONDS,
         "transport": {
             "link": {
                 # Without this list, the process could also open an endpoint tcp/... in addition to

@@ -52,7 +52,7 @@ _TLS = frozenset(
     {*_TLS_FILES, *(f"{name}_base64" for name in _TLS_FILES), "enable_mtls"}
     | {"verify_name_on_connect", "close_link_on_expiration", "so_sndbuf", "so_rcvbuf"}
 )
-_LISTEN: Mapping[Mode, tuple[str, ...]] = {
+_DEFAULT_ENDPOINTS: Mapping[Mode, tuple[str, ...]] = {
     Mode.ROUTER: ("tcp/[::]:7447",),
     Mode.PEER: ("tcp/[::]:0",),
     Mode.CLIENT: (),
@@ -67,7 +67,7 @@ _AS_YAML = (".yaml", ".yml")
 _AS_TOML = (".toml",)
 ENDINGS = (".json5", ".json", *_AS_YAML, *_AS_TOML)
 """Endings of file names that Zenoh reads (tested with 1.10.2)."""
-_OTHER_IN_YAML = re.compile(r"\\u|[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\u2028\u2029\ufeff]")
+_DIFFERENT_IN_YAML = re.compile(r"\\u|[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\u2028\u2029\ufeff]")
 """Characters and escapes that YAML refuses, or reads differently from JSON."""
 _MOST_MEANT = 1_000_000
 _MOST_PARTS = 10
@@ -263,7 +263,7 @@ def _parse_yaml(text: str, name: str) -> object:
         UnreadConfigurationError: the text is other YAML, or TOML.
     """
     value: object = None
-    if not _has_ending(name, _AS_TOML) and not _OTHER_IN_YAML.search(text):
+    if not _has_ending(name, _AS_TOML) and not _DIFFERENT_IN_YAML.search(text):
         with suppress(Json5Error):
             value = parse_json(text)
     if value is None:
@@ -404,7 +404,7 @@ def _configuration(root: _Section, name: str) -> ConfigurationDocument:
     return ConfigurationDocument(
         name,
         mode,
-        _read_endpoints(root.section("listen"), mode, _LISTEN[mode]),
+        _read_endpoints(root.section("listen"), mode, _DEFAULT_ENDPOINTS[mode]),
         _read_endpoints(root.section("connect"), mode, ()),
         link.texts("protocols"),
         TlsOptions(

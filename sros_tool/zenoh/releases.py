@@ -31,7 +31,7 @@ class RmwZenohRelease(NamedTuple):
     below_topics: tuple[str, ...] = ()
 
 
-_BUFFERS = ("_buf_cpu", "_buf/*")
+_BUFFER_KEYS = ("_buf_cpu", "_buf/*")
 """Keys for messages with an array of bytes (images, point clouds) between C++ nodes.
 
 All subscriptions in main memory share ``_buf_cpu``; every subscription on an accelerator has a
@@ -42,7 +42,7 @@ RELEASES = (
     RmwZenohRelease("Humble", (0, 1, 0), (0, 1, 2)),
     RmwZenohRelease("Jazzy", (0, 2, 0), (0, 2, 3)),
     RmwZenohRelease("Kilted", (0, 3, 0), (0, 6, 0)),
-    RmwZenohRelease("Lyrical", (0, 7, 0), (0, 7, 0), _BUFFERS),
+    RmwZenohRelease("Lyrical", (0, 7, 0), (0, 7, 0), _BUFFER_KEYS),
 )
 """All supported releases, earliest first; Rolling's versions count for the next distribution."""
 

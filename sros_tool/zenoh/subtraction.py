@@ -122,7 +122,7 @@ _MOST_COMPARED = 64
 
 The comparison finds expressions that another expression covers.
 """
-_MOST_WILD = 32
+_MAX_WILD_CHUNKS = 32
 """Maximum number of denied chunks with wildcards at one position of an expression."""
 _MOST_KINDS = 1024
 """Maximum number of kinds of chunks; chunks of one kind match the same denied chunks."""
@@ -291,7 +291,7 @@ def _kinds(first: str, first_chunks: tuple[str, ...]) -> Mapping[frozenset[str],
     The kind of a chunk is the set of matching chunks in ``first_chunks``.
     """
     wild = [chunk for chunk in first_chunks if "*" in chunk]
-    _check_number(len(wild), _MOST_WILD)
+    _check_number(len(wild), _MAX_WILD_CHUNKS)
     shared_by_kind: dict[frozenset[str], Chunks] = {frozenset(): (first,)}
     for chunk in wild:
         for kind, shared_chunks in list(shared_by_kind.items()):
@@ -703,15 +703,15 @@ def keys_of(expressions: frozenset[str], differences: tuple[Difference, ...] = (
     return RuleKeys(expressions, differences)
 
 
-_TYPE = "/$*::$*/*"
+_ANY_TYPE = "/$*::$*/*"
 """Matches any type with its hash, the chunks after the name in a key."""
-_ENDS = re.compile(rf"{re.escape(_TYPE)}(?:/\*\*)?(?:/@adv/\*\*)?\Z")
+_ENDS = re.compile(rf"{re.escape(_ANY_TYPE)}(?:/\*\*)?(?:/@adv/\*\*)?\Z")
 
 
 def _expression_parts(expression: str) -> tuple[str, str, str]:
     """Return the parts of a key expression before the name, of the name, and after the name."""
     begin, _, rest = expression.partition("/")
-    name, of_type, below = rest.partition(_TYPE)
+    name, of_type, below = rest.partition(_ANY_TYPE)
     return begin, name, of_type + below
 
 

@@ -1504,8 +1504,8 @@ def test_a_robot_whose_files_expire_soon(keystore: Path, tmp_path: Path) -> None
         return found._replace(folder=Path("robot"), secured={"/a": True})
 
     now = state_at(datetime.now(UTC))
-    assert now.valid_until and close._until(now).endswith("Z")
-    soon = close._until(state_at(now.valid_until - timedelta(days=1)))
+    assert now.valid_until and close._validity_text(now).endswith("Z")
+    soon = close._validity_text(state_at(now.valid_until - timedelta(days=1)))
     assert soon.endswith("Z, so renew them now: sros renew robot/keystore --all-expiring soon")
     (tmp_path / "export/enclaves/b/permissions.p7s").write_bytes(b"damaged")
     assert state_at(datetime.now(UTC)).valid_until is None, "nobody knows until when /b works"

@@ -70,7 +70,7 @@ def test_long_work_is_shown_and_leaves_no_line(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_the_time_that_is_left_is_shown(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("_FIRST", "_EVERY", "_ESTIMATED"):
+    for name in ("_FIRST", "_EVERY", "_ESTIMATE_AFTER"):
         monkeypatch.setattr(showing, name, 0.01)
 
     def sign(names: Sequence[int]) -> None:

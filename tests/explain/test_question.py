@@ -12,11 +12,11 @@ import sros_tool.dds.decision as decision
 from sros_tool.dds.decision.access import AccessVerb
 from sros_tool.errors import UsageError
 from sros_tool.explain.answer import TYPES, WORDS, ask
-from sros_tool.explain.explanation import _BY_REASON, remedy
+from sros_tool.explain.explanation import _FAULT_OF_REASON, remedy
 from sros_tool.faults import FAULTS, Fault
 from sros_tool.names import dds_names
 
-KNOWN_CAUSES = frozenset((*FAULTS, *_BY_REASON))
+KNOWN_CAUSES = frozenset((*FAULTS, *_FAULT_OF_REASON))
 """The ids of faults, and the reasons of decisions, that have a remedy."""
 MEANT = {
     ("publish", "topic"): "publish",

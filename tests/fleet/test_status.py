@@ -25,7 +25,7 @@ from sros_tool.agent.state import AgentState, write_state
 from sros_tool.cli import fleet as fleet_verbs
 from sros_tool.cli.fleet import (
     ComparedFleet,
-    _facts,
+    _fleet_facts,
     _joined_durations,
     _lines,
     _remedies,
@@ -929,7 +929,7 @@ def test_robots_with_files_that_expire_soon_are_named(
     status = fleet_status(OpenedKeystore(field.root))
     kind, end = min(status.robots[0].expiry.items(), key=lambda item: item[1])
     lines = {
-        days: [*_facts(ComparedFleet(end - timedelta(days=days), status, [], []))]
+        days: [*_fleet_facts(ComparedFleet(end - timedelta(days=days), status, [], []))]
         for days in (31, 24)
     }
     assert not any("expiry" in line for line in lines[31])
@@ -938,7 +938,7 @@ def test_robots_with_files_that_expire_soon_are_named(
     assert line.endswith("--all-expiring soon`, then deliver")
 
     def command(status: FleetStatus) -> str:
-        lines = _facts(ComparedFleet(end - timedelta(days=1), status, [], []))
+        lines = _fleet_facts(ComparedFleet(end - timedelta(days=1), status, [], []))
         return next(line.partition("3 robots: ")[2] for line in lines if "expiry" in line)
 
     robots = [replace(robot, files={}, has_release=True) for robot in status.robots]

@@ -237,7 +237,7 @@ def test_a_passphrase_from_a_pipe_serves_both_cas(tmp_path: Path) -> None:
 def test_a_pipe_without_a_writer_is_not_waited_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("sros_tool.cli.common._WRITER_WITHIN", 0.2)
+    monkeypatch.setattr("sros_tool.cli.common._WRITER_TIMEOUT", 0.2)
     os.mkfifo(tmp_path / "pipe")
     env = {"SROS_CA_PASSPHRASE": None, "SROS_CA_PASSPHRASE_FILE": str(tmp_path / "pipe")}
     refused = sros("create_keystore", tmp_path / "ks", "--encrypt-ca-keys", env=env)

@@ -128,7 +128,7 @@ def test_many_expressions(names: list[str], asked: str) -> None:
     known = list(dict.fromkeys(names))
     for few in (0, 100):  # with the index, and one by one
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("sros_tool.policy.patterns._FEW", few)
+            patch.setattr("sros_tool.policy.patterns._MAX_WITHOUT_INDEX", few)
             found = Names(names)
             covering = [e for e in known if e != asked and plainly_covers(e, asked)]
             assert list(found.covering(asked)) == [e for e in covering if is_expression(e)]

@@ -57,7 +57,7 @@ def make(root: Path) -> None:
 @pytest.fixture
 def large(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A keystore of which a sample is read."""
-    monkeypatch.setattr(sampling, "_LARGE", 20)
+    monkeypatch.setattr(sampling, "_MAX_READ_IN_FULL", 20)
     return made_once(tmp_path / "ks", make)
 
 

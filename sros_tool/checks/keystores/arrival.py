@@ -192,7 +192,7 @@ def verify_arrival(
         refuse_earlier(path)
         raise DocumentError(
             f"'{path}' is neither a keystore nor an enclave",
-            _why_none(path),
+            _why_no_enclaves(path),
             f"Unpack it first: `mkdir robot && tar -xzf {quote(str(path))} -C robot && sros verify "
             "robot`."
             if path.is_file() and path.name.endswith(SUFFIXES)
@@ -269,7 +269,7 @@ def _token_findings(
         yield TOKEN_KEY.found(name, str(error), file)
 
 
-def _why_none(path: Path) -> str:
+def _why_no_enclaves(path: Path) -> str:
     """Return why a path holds no enclaves, as a sentence."""
     if not path.exists():
         return "It does not exist."

@@ -528,11 +528,11 @@ def shared_ca_findings(
             ONE_AUTHORITY, lambda settings: not settings.separate_authorities
         )
         in_keystore = f"In the {ORIGINAL_KEYSTORE}: {ONE_AUTHORITY.remedy}"
-        remedy = _separation(keystore) if keystore.can_issue else in_keystore
+        remedy = _separation_remedy(keystore) if keystore.can_issue else in_keystore
         yield ONE_AUTHORITY.found("the CAs", text, file, remedy=remedy, accepted=accepted)
 
 
-def _separation(keystore: CheckedKeystore) -> str:
+def _separation_remedy(keystore: CheckedKeystore) -> str:
     """Return a remedy: the commands that give identity CA and permissions CA separate keys."""
     from sros_tool.keystore.lifecycle.rotation import RotationStage, read_rotation
 

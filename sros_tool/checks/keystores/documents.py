@@ -332,7 +332,7 @@ def _validity_findings(enclave: CheckedEnclave, grant: Grant, file: str) -> Iter
     if begin is None or end is None:
         return  # the finding TIME_FORMAT reports the dates
     if not begin <= int(now.timestamp()) <= end:
-        zone, dates = enclave.keystore.at.zone, f"{_utc(begin)} to {_utc(end)}"
+        zone, dates = enclave.keystore.at.zone, f"{_utc_text(begin)} to {_utc_text(end)}"
         utc_dates = f"in {zone} Fast DDS reads these dates as {dates}"
         accepted = enclave.accepts_expiry if now.timestamp() > end else ""
         yield LOCAL_TIME.found(enclave.name, f"{text}, and {utc_dates}", file, accepted=accepted)
@@ -349,7 +349,7 @@ def _validity_findings(enclave: CheckedEnclave, grant: Grant, file: str) -> Iter
         yield TIME_WINDOW.found(enclave.name, text, file, remedy=remedy or "", accepted=accepted)
 
 
-def _utc(seconds: float) -> str:
+def _utc_text(seconds: float) -> str:
     return iso(datetime.fromtimestamp(seconds, UTC)) if isfinite(seconds) else "never"
 
 
@@ -608,7 +608,7 @@ XML_DIFFERS = FindingKind(
     f"{edit_remedy('KEYSTORE')}",
 )
 
-_OPEN = {
+_OPEN_KINDS = {
     "allow_unauthenticated_participants": UNAUTHENTICATED,
     "enable_join_access_control": NO_JOIN_CONTROL,
     "discovery_protection_kind": DISCOVERY_OPEN,
@@ -617,7 +617,7 @@ _OPEN = {
     "enable_liveliness_protection": LIVELINESS_OPEN,
 }
 """The kind of finding for each governance attribute that is open."""
-_OF_ROS = ("rt/*", "rq/*Request", "rr/*Reply")
+_ROS_TOPICS = ("rt/*", "rq/*Request", "rr/*Reply")
 """The DDS topics of all topics, services and actions of ROS."""
 _SIGNING = (ProtectionKind.SIGN, ProtectionKind.SIGN_WITH_ORIGIN_AUTHENTICATION)
 _NONE = (ProtectionKind.NONE,)
@@ -643,7 +643,7 @@ def check_governance(
 
 
 @dataclass(frozen=True, slots=True)
-class _Chosen:
+class _ChosenByTemplate:
     """A predicate for templates that choose settings whose governance has the same finding."""
 
     kind: FindingKind
@@ -681,7 +681,11 @@ def governance_findings(
             # A template may choose open topics, but none chooses lost messages or a rule without
             # effect.
             flaw = kind in (SIGNED_PAYLOAD, UNREACHABLE_TOPIC_RULE)
-            by = "" if flaw else keystore.accepts(kind, _Chosen(kind, text, domains, vendors))
+            by = (
+                ""
+                if flaw
+                else keystore.accepts(kind, _ChosenByTemplate(kind, text, domains, vendors))
+            )
             yield kind.found(subject, text, file, accepted=by)
         for part in rule.domains.ranges:
             kind = GOVERNANCE_DOMAIN_RANGE if part.last is not None else GOVERNANCE_OPEN_RANGE
@@ -725,7 +729,7 @@ def _reach_of_strangers(rule: DomainRule, vendor: Vendor) -> str:
 
 def _domain_rule(rule: DomainRule, vendors: Sequence[Vendor]) -> Iterator[tuple[FindingKind, str]]:
     for attribute, text in _open_attributes(rule):
-        kind = _OPEN[attribute]
+        kind = _OPEN_KINDS[attribute]
         if kind is UNAUTHENTICATED:
             kind, reach = _unauthenticated_text(rule, vendors)
             text = f"{text}: {reach}"
@@ -733,9 +737,9 @@ def _domain_rule(rule: DomainRule, vendors: Sequence[Vendor]) -> Iterator[tuple[
 
 
 def _open_attributes(rule: DomainRule | TopicRule) -> Iterator[tuple[str, str]]:
-    """Yield the name and a description of each attribute of `_OPEN` with an open value."""
+    """Yield the name and a description of each attribute of `_OPEN_KINDS` with an open value."""
     for attribute in attributes(type(rule)):
-        if attribute.name in _OPEN and attribute.is_open(rule):
+        if attribute.name in _OPEN_KINDS and attribute.is_open(rule):
             value = json.dumps(attribute.open) if attribute.is_flag else attribute.open
             yield attribute.name, f"{attribute.name} is {value}"
 
@@ -745,7 +749,7 @@ def _topic_rules(rule: DomainRule) -> Iterator[tuple[FindingKind, str]]:
     if not any(covers(expression, ROS_DISCOVERY_TOPIC) for expression in expressions):
         yield NO_TOPIC_RULE, f"no topic rule matches {ROS_DISCOVERY_TOPIC}"
     elif "*" not in expressions:
-        of_ros = all(any(covers(wide, topic) for wide in expressions) for topic in _OF_ROS)
+        of_ros = all(any(covers(wide, topic) for wide in expressions) for topic in _ROS_TOPICS)
         yield NO_OTHER_TOPIC_RULE if of_ros else NO_TOPIC_RULE, "there is no rule for *"
     names = Names(expressions)
     first = {expression: index for index, expression in reversed([*enumerate(expressions)])}
@@ -785,7 +789,7 @@ def _topic_rule(rule: DomainRule, topic: TopicRule) -> Iterator[tuple[FindingKin
     if topic.data_protection_kind in _SIGNING:
         yield SIGNED_PAYLOAD, f"data_protection_kind is {topic.data_protection_kind} for {name}"
     for attribute, text in _open_attributes(topic):
-        yield _OPEN[attribute], f"{text} for {name}"
+        yield _OPEN_KINDS[attribute], f"{text} for {name}"
 
 
 def governance_copy_findings(keystore: CheckedKeystore) -> Iterator[Finding]:

@@ -72,9 +72,11 @@ from sros_tool.policy.rights import Right
 from sros_tool.wording import counted, first_few
 
 _NAMES_SHOWN = 3
-_OF_THE_KEYSTORE = frozenset({EVERYTHING.id, ANY_NODE.id, LONG_PERMISSIONS.id, TIME_FORMAT.id})
+_IDS_WITH_KEYSTORE_CAUSE = frozenset(
+    {EVERYTHING.id, ANY_NODE.id, LONG_PERMISSIONS.id, TIME_FORMAT.id}
+)
 """Ids of findings with one cause in all enclaves: a setting, or the signer of their files."""
-_OF_SEVERAL_FILES = frozenset(
+_IDS_JOINED_BY_TEXT = frozenset(
     {
         REFUSED.id,
         SOME_REFUSE.id,
@@ -112,7 +114,7 @@ def keystore_findings(
         union = {vendor for of_enclave in deciding.values() for vendor in of_enclave}
         asked = asked if len(stated) < len(names) else asked_vendors(tuple(union))
     about_authorities = list(check_authorities(keystore))
-    first, common = _governing(keystore, names)
+    first, common = _governing_enclave(keystore, names)
     about_governance = list(_governance_findings(keystore, first, asked))
 
     def work(
@@ -228,14 +230,14 @@ def with_joined_findings(findings: Sequence[Finding]) -> list[Finding]:
     """Return findings; findings that a shared file or a keystore setting causes are joined."""
     together: dict[tuple[object, ...], list[Finding]] = {}
     for finding in findings:
-        joined = finding.accepted or finding.id in _OF_THE_KEYSTORE
-        file = "" if finding.id in _OF_SEVERAL_FILES else finding.file
+        joined = finding.accepted or finding.id in _IDS_WITH_KEYSTORE_CAUSE
+        file = "" if finding.id in _IDS_JOINED_BY_TEXT else finding.file
         place = (finding.accepted,) if joined else (file, finding.line, finding.text)
         together.setdefault((finding.id, *place), []).append(finding)
     return [_joined_finding(group) for group in together.values()]
 
 
-def _governing(keystore: CheckedKeystore, names: Sequence[str]) -> tuple[str, bytes]:
+def _governing_enclave(keystore: CheckedKeystore, names: Sequence[str]) -> tuple[str, bytes]:
     """Return the first enclave with the keystore's signed governance, and this governance.
 
     For an export, return the first enclave and its governance.
@@ -281,7 +283,7 @@ def _with_real_file(finding: Finding, keystore: OpenedKeystore, real_root: str) 
     return finding._replace(file=str(keystore.root / real.relative_to(real_root)))
 
 
-_OF_SEVERAL = re.compile(
+_COMMAND_FOR_SEVERAL = re.compile(
     r"(\bsros (?:renew|revoke|create_permission|create_enclave|distribute_key) \S+ )([^\s`]+)"
 )
 """Matches a command that takes several enclaves, up to the first enclave."""
@@ -314,7 +316,7 @@ def _joined_finding(group: list[Finding]) -> Finding:
     if len(subjects) == 1:
         return group[0]
     shown = " ".join(map(quote, subjects)) if len(subjects) <= _MOST_NAMED else "ENCLAVE..."
-    remedy = _OF_SEVERAL.sub(
+    remedy = _COMMAND_FOR_SEVERAL.sub(
         lambda match: match[1] + (shown if match[2] == quote(subjects[0]) else match[2]),
         group[0].remedy,
     )
@@ -325,9 +327,16 @@ def _joined_finding(group: list[Finding]) -> Finding:
 # ── one cause for what ros2/sros2 made ────────────────────────────────────────────────────
 
 
-_OF_A_KEYSTORE = (KEY_READABLE, FOLDER_OPEN, TIME_FORMAT, LONG_PERMISSIONS, ONE_AUTHORITY)
+_IDS_OF_ROS2_KEYSTORES = (KEY_READABLE, FOLDER_OPEN, TIME_FORMAT, LONG_PERMISSIONS, ONE_AUTHORITY)
 """Ids of findings in any ros2/sros2 keystore; `update_keystore --template sros2` resolves them."""
-_OF_AN_ENCLAVE = (UNEXPLAINED, KEY_READABLE, TIME_FORMAT, NOT_UNIQUE, LONG_PERMISSIONS, EVERYTHING)
+_IDS_OF_ROS2_ENCLAVES = (
+    UNEXPLAINED,
+    KEY_READABLE,
+    TIME_FORMAT,
+    NOT_UNIQUE,
+    LONG_PERMISSIONS,
+    EVERYTHING,
+)
 """Ids of findings in every ros2/sros2 enclave; `create_permission --revoke-old` resolves them."""
 _MOST_NAMED = 3
 
@@ -336,8 +345,8 @@ def _with_cause_of_ros2(findings: Sequence[Finding], keystore: OpenedKeystore) -
     """Return the findings; several findings that ros2/sros2 causes get a common cause."""
     root = keystore.root
     if keystore.is_of_ros2:
-        chosen = [finding for finding in findings if finding.kind in _OF_A_KEYSTORE]
-        text = f"It has neither sros.toml nor ledger.jsonl. Found: {_kinds(chosen)}."
+        chosen = [finding for finding in findings if finding.kind in _IDS_OF_ROS2_KEYSTORES]
+        text = f"It has neither sros.toml nor ledger.jsonl. Found: {_kinds_text(chosen)}."
         return _with_cause(
             findings,
             chosen,
@@ -354,7 +363,8 @@ def _with_cause_of_ros2(findings: Sequence[Finding], keystore: OpenedKeystore) -
     chosen = [
         finding
         for finding in findings
-        if finding.kind in _OF_AN_ENCLAVE and (finding.subject in names or finding.file in keys)
+        if finding.kind in _IDS_OF_ROS2_ENCLAVES
+        and (finding.subject in names or finding.file in keys)
     ]
     shown = " ".join(map(quote, names)) if len(names) <= _MOST_NAMED else "ENCLAVE..."
     command = f"sros create_permission {quote(str(root))} {shown} POLICY_FILE --revoke-old"
@@ -366,7 +376,7 @@ def _with_cause_of_ros2(findings: Sequence[Finding], keystore: OpenedKeystore) -
         if len(names) > 1
         else "an enclave that the keystore never issued",
         f"{names_text(names)}: the ledger has neither the certificate nor the permissions; `ros2 "
-        f"security create_enclave` leaves enclaves in this state. Found: {_kinds(chosen)}.",
+        f"security create_enclave` leaves enclaves in this state. Found: {_kinds_text(chosen)}.",
         f"If you made the enclave, state its rights with `{command}`, which also issues the "
         "certificate again. If nobody of your team made it, somebody else has the CA key: revoke "
         "the "
@@ -420,7 +430,7 @@ def _with_cause(
     ]
 
 
-def _kinds(findings: Sequence[Finding]) -> str:
+def _kinds_text(findings: Sequence[Finding]) -> str:
     """Return text with the title of each kind of finding and the number of its findings."""
     titles = Counter(finding.kind.title for finding in findings if finding.severity >= WARNING)
     return "; ".join(

@@ -62,7 +62,7 @@ _TOKENS = r"(?:/[A-Za-z_][A-Za-z0-9_]*)+"
 _ROS_NAME = re.compile(
     rf"(?:r[apst]{_TOKENS}|rq{_TOKENS}(?<=Request)|rr{_TOKENS}(?<=Reply)|{ROS_DISCOVERY_TOPIC})\Z"
 )
-_OF_DDS = re.compile(r"DCPS[A-Z]\w*\Z")
+_BUILT_IN_TOPIC = re.compile(r"DCPS[A-Z]\w*\Z")
 """Built-in topics of DDS, which need no right but appear in some permissions."""
 _TYPE = re.compile(r"[a-z][a-z0-9_]*/(?:msg|srv|action)/[A-Z][A-Za-z0-9]*\Z")
 _WILDCARD = re.compile(r"\[[^\]]*\]|[*?]")
@@ -124,7 +124,7 @@ def ros_name_problem(text: str) -> str:
     Blanks around the text are ignored.
     """
     name = text.strip()
-    if not name or _ROS_NAME.match(name) or _OF_DDS.match(name):
+    if not name or _ROS_NAME.match(name) or _BUILT_IN_TOPIC.match(name):
         return ""
     if has_invalid_characters(name):
         return _character_problem(name)

@@ -105,7 +105,7 @@ PEERS_DOMAINS = FindingKind(
 )
 
 _Certificates = tuple[x509.Certificate, ...]
-_Kind = tuple[tuple[_Certificates, ...], tuple[bool, ...], x509.Certificate | None]
+_TrustKey = tuple[tuple[_Certificates, ...], tuple[bool, ...], x509.Certificate | None]
 """The trusted CAs of an enclave, which of them issued its certificate, and its permissions' signer.
 """
 
@@ -150,10 +150,10 @@ def findings_between(
             no revocation list.
     """
     refused: set[frozenset[str]] = set()
-    yield from _strangers(targets, refused, on_zenoh=on_zenoh)
+    yield from _stranger_findings(targets, refused, on_zenoh=on_zenoh)
     if not on_zenoh:
-        yield from _revoked(targets)
-        yield from _earlier_lists(targets, now)
+        yield from _revoked_findings(targets)
+        yield from _earlier_list_findings(targets, now)
         governed = {shown: _Governed(*target, now) for shown, target in targets.items()}
         yield from _incompatible_governance_findings(governed, refused)
 
@@ -161,7 +161,7 @@ def findings_between(
 # ── CAs ────────────────────────────────────────────────────────────────────────────────────
 
 
-def _strangers(
+def _stranger_findings(
     targets: Targets, refused_pairs: set[frozenset[str]], *, on_zenoh: bool
 ) -> Iterator[Finding]:
     """Yield findings about two keystores or exports whose enclaves all refuse each other.
@@ -171,7 +171,7 @@ def _strangers(
     """
     read = {shown: dict(_parties(*target)) for shown, target in targets.items()}
     # Most exports trust and present the same CAs as others: only one of each kind is compared.
-    names_by_kinds: dict[frozenset[_Kind], list[str]] = defaultdict(list)
+    names_by_kinds: dict[frozenset[_TrustKey], list[str]] = defaultdict(list)
     for shown, of_target in read.items():
         names_by_kinds[frozenset(of_target)].append(shown)
     parties = {
@@ -216,7 +216,9 @@ def _refused_roles(
     return min(pairs, key=len, default=())
 
 
-def _parties(keystore: OpenedKeystore, enclaves: Sequence[str]) -> Iterator[tuple[_Kind, _Party]]:
+def _parties(
+    keystore: OpenedKeystore, enclaves: Sequence[str]
+) -> Iterator[tuple[_TrustKey, _Party]]:
     """Yield a `_Party` for each different set of CAs that enclaves trust and present."""
     seen = set()
     for name in enclaves:
@@ -243,7 +245,7 @@ def _parties(keystore: OpenedKeystore, enclaves: Sequence[str]) -> Iterator[tupl
 # ── revocation lists ───────────────────────────────────────────────────────────────────────
 
 
-def _revoked(targets: Targets) -> Iterator[Finding]:
+def _revoked_findings(targets: Targets) -> Iterator[Finding]:
     """Yield findings about enclaves that the revocation lists of other targets revoke."""
     holders: dict[bytes, dict[str, None]] = defaultdict(dict)
     for shown, (keystore, enclaves) in targets.items():
@@ -278,7 +280,7 @@ def _names_revoked(data: bytes, keystore: OpenedKeystore, enclaves: Sequence[str
                     yield name
 
 
-def _earlier_lists(targets: Targets, now: datetime) -> Iterator[Finding]:
+def _earlier_list_findings(targets: Targets, now: datetime) -> Iterator[Finding]:
     """Yield findings about targets that accept certificates which another target's list revokes.
 
     A later list may lack certificates that have expired. The ledger of a keystore shows which
@@ -310,7 +312,7 @@ def _earlier_lists(targets: Targets, now: datetime) -> Iterator[Finding]:
             for other, holding in sorted(of_list.items(), key=lambda held: -held[0].number):
                 lacking = other.serials - own.serials
                 if other.number < newest:
-                    lacking = _unexpired(lacking - said, authority, targets, now)
+                    lacking = _unexpired_serials(lacking - said, authority, targets, now)
                     said |= lacking
                 if not lacking:
                     continue
@@ -326,7 +328,7 @@ def _earlier_lists(targets: Targets, now: datetime) -> Iterator[Finding]:
         yield PEERS_ACCEPT.found(shown, text, shown, remedy=remedy)
 
 
-def _unexpired(
+def _unexpired_serials(
     serials: frozenset[int], authority: x509.Certificate, targets: Targets, now: datetime
 ) -> frozenset[int]:
     """Return the serial numbers of certificates that have not expired, by the ledgers of their CA.
@@ -490,10 +492,10 @@ def _differences_between(
     values = {
         change.key: (change.key, change.after, change.before)
         for change in compare_governance(other, own_governance)
-        if change.key.startswith("protection") and not change.key.endswith(_HARMLESS)
+        if change.key.startswith("protection") and not change.key.endswith(_HARMLESS_SETTINGS)
     }
     return disturbed, tuple(values.values())
 
 
-_HARMLESS = ("allow_unauthenticated_participants", "join_access_control")
+_HARMLESS_SETTINGS = ("allow_unauthenticated_participants", "join_access_control")
 """Settings in which two ends may differ; see `Mismatch`."""

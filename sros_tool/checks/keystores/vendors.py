@@ -74,7 +74,7 @@ DIFFER = FindingKind(
     "vendor.",
 )
 
-_NAMED_BY: Mapping[str, frozenset[str]] = {
+_IDS_BY_REASON: Mapping[str, frozenset[str]] = {
     reason: frozenset(ids)
     for reason, ids in {
         Fault.SIGNATURE_HASH.id: ("portable.signature-hash",),
@@ -284,10 +284,10 @@ def _refusal_findings(
 
 def _is_named(cause: RefusalCause, known_findings: Iterable[Finding]) -> bool:
     """Return whether a known finding already names the cause of a refusal."""
-    wanted = _NAMED_BY.get(cause.reason, frozenset())
+    wanted = _IDS_BY_REASON.get(cause.reason, frozenset())
     fault_id = f"enclave.{cause.reason}"
     return any(
-        finding.id in wanted or (finding.id == fault_id and _file(finding) == cause.file)
+        finding.id in wanted or (finding.id == fault_id and _file_name(finding) == cause.file)
         for finding in known_findings
     )
 
@@ -295,10 +295,10 @@ def _is_named(cause: RefusalCause, known_findings: Iterable[Finding]) -> bool:
 def _is_about_rules(finding: Finding) -> bool:
     """Return whether a finding is about the rules of the permissions or the names in them."""
     family, _, _ = finding.id.partition(".")
-    return family in {"permissions", "portable"} and _file(finding) == PERMISSIONS_FILE
+    return family in {"permissions", "portable"} and _file_name(finding) == PERMISSIONS_FILE
 
 
-def _file(finding: Finding) -> str:
+def _file_name(finding: Finding) -> str:
     """Return the name, without folder, of the file that a finding is about."""
     return finding.file.rpartition("/")[2]
 
@@ -370,11 +370,11 @@ def _topics_to_ask(enclave: CheckedEnclave, known: Collection[str]) -> list[str]
                 if not (_BLANKS in known and topic != topic.strip()) and not (
                     NO_ROS_NAME.id in known and has_invalid_characters(topic)
                 ):
-                    named[_example(topic)] = None
+                    named[_example_name(topic)] = None
     return [*named, _UNNAMED_TOPIC]
 
 
-def _example(expression: str) -> str:
+def _example_name(expression: str) -> str:
     """Return an example name that matches a wildcard; a [set] becomes its first character."""
     if not is_expression(expression):
         return expression
@@ -521,7 +521,7 @@ def _ordinary_node_denial(
     if described and not _offers_types(access, grant):
         wanted.append(f"offer ~/{_TYPES}")
     is_tool = not set(denied).intersection(_OF_TOOLS)
-    if not wanted or (is_tool and not any(map(_is_own, _allowed_to_publish(grant)))):
+    if not wanted or (is_tool and not any(map(_is_topic_of_robot, _allowed_to_publish(grant)))):
         return None
     text = f"no node may {' or '.join(wanted)}"
     for verb, topic in denied:
@@ -588,7 +588,7 @@ def _allowed_to_publish(grant: Grant) -> Iterator[str]:
             yield from criteria.topics
 
 
-def _is_own(topic: str) -> bool:
+def _is_topic_of_robot(topic: str) -> bool:
     """Return whether a topic belongs to the robot, and not to the topics that every node has."""
     name = topic.rpartition("/")[2].removesuffix("Reply")
     common = topic in (ROS_DISCOVERY_TOPIC, _PARAMETER_EVENTS, _ROSOUT)

@@ -242,7 +242,7 @@ class RuleVerdict(NamedTuple):
         return self.outcome is Outcome.ALLOWED
 
 
-class _Entry(NamedTuple):
+class _TopicEntry(NamedTuple):
     """A ``<topic>`` of a rule, with the ``partitions`` that the vendor compares for the topic."""
 
     criteria: int
@@ -303,10 +303,10 @@ class _GrantRules:
         self._verbs = verbs
 
     @cached_property
-    def _entries(self) -> Sequence[_Entry]:
+    def _entries(self) -> Sequence[_TopicEntry]:
         """The ``<topic>`` elements of the rules, in order."""
         traits = self._traits
-        entries: list[_Entry] = []
+        entries: list[_TopicEntry] = []
         count = 0
         for index, rule in self._rules:
             for verb, criterion in rule.criteria_of(self._verbs):
@@ -315,7 +315,7 @@ class _GrantRules:
                 joined = getattr(rule, verb) if traits.topic_decides else (criterion,)
                 weighed = _partitions(traits, rule, joined)
                 entries += [
-                    _Entry(count, index, rule.allow, _trimmed(traits, expression), weighed)
+                    _TopicEntry(count, index, rule.allow, _trimmed(traits, expression), weighed)
                     for expression in criterion.topics
                     if _trimmed(traits, expression) or traits.crashes_on_empty_texts
                 ]
@@ -373,7 +373,7 @@ class _GrantRules:
         crashing = [self._crashing_topics(list(group)) for _, group in groups]
         return _every_topic() - NameSet.union(filter(None, crashing))
 
-    def _crashing_topics(self, group: Sequence[_Entry]) -> NameSet | None:
+    def _crashing_topics(self, group: Sequence[_TopicEntry]) -> NameSet | None:
         """Return the topics for which reading a criteria crashes the process, or None.
 
         An empty ``<topic>`` crashes the process, unless an earlier ``<topic>`` of the criteria
@@ -405,7 +405,7 @@ class _GrantRules:
 
         return NameSet.first(self._decisions_by_topic(self._entries), self._otherwise.allowed)
 
-    def _decisions_by_topic(self, entries: Iterable[_Entry]) -> Iterator[tuple[NameSet, bool]]:
+    def _decisions_by_topic(self, entries: Iterable[_TopicEntry]) -> Iterator[tuple[NameSet, bool]]:
         """Yield sets of topics, in the order of the rules, and whether the topics are allowed.
 
         Consecutive entries with the same verdict are joined.
@@ -415,11 +415,11 @@ class _GrantRules:
         ):
             yield self._names_of(group), allowed
 
-    def _names_of(self, entries: Iterable[_Entry]) -> NameSet:
+    def _names_of(self, entries: Iterable[_TopicEntry]) -> NameSet:
         texts = tuple([_usable_expression(self._traits, entry.expression) for entry in entries])
         return _cached_names(self._traits.style, texts)
 
-    def _matches_partitions(self, entry: _Entry, wanted: tuple[str, ...]) -> bool:
+    def _matches_partitions(self, entry: _TopicEntry, wanted: tuple[str, ...]) -> bool:
         style, named = self._traits.style, entry.partitions
         if entry.allow:
             if wanted is _DEFAULT_PARTITION is named:
@@ -638,7 +638,7 @@ def _decide_join(
     return _Joining(otherwise.outcome, otherwise.reason, text)
 
 
-class _Basis(Enum):
+class _DecisionBasis(Enum):
     """The basis of decisions on access to the topics of a governance topic rule."""
 
     NOTHING = auto()
@@ -820,7 +820,7 @@ class Access:
             )
             & self._allowed_in(verb, basis)
             for basis in dict.fromkeys(bases)
-            if basis is not _Basis.NOTHING
+            if basis is not _DecisionBasis.NOTHING
         )
         return NameSet.union(topics)
 
@@ -838,31 +838,33 @@ class Access:
         """
         return self._governed.topics_of_unauthenticated()
 
-    def _basis_of(self, verb: AccessVerb, rule: TopicRule) -> _Basis:
+    def _basis_of(self, verb: AccessVerb, rule: TopicRule) -> _DecisionBasis:
         """Return the basis of decisions on a topic rule's topics, as in `_decision_by_rules`."""
         if self._traits.crashes_on_empty_texts and not rule.topic_expression.strip():
-            return _Basis.NOTHING
+            return _DecisionBasis.NOTHING
         writes, reads = rule.enable_write_access_control, rule.enable_read_access_control
         refused = self._join.outcome is Outcome.PEER_DENIES
         if not (writes if verb is AccessVerb.PUBLISH else reads):
             return (
-                _Basis.NOTHING
+                _DecisionBasis.NOTHING
                 if refused and not self._can_exchange_unprotected(rule)
-                else _Basis.EVERYTHING
+                else _DecisionBasis.EVERYTHING
             )
         if refused:
-            return _Basis.NOTHING
+            return _DecisionBasis.NOTHING
         return (
-            _Basis.BOTH_WAYS if self._traits.creates_topics and writes and reads else _Basis.RULES
+            _DecisionBasis.BOTH_WAYS
+            if self._traits.creates_topics and writes and reads
+            else _DecisionBasis.RULES
         )
 
-    def _allowed_in(self, verb: AccessVerb, basis: _Basis) -> NameSet:
-        if basis is _Basis.EVERYTHING:
+    def _allowed_in(self, verb: AccessVerb, basis: _DecisionBasis) -> NameSet:
+        if basis is _DecisionBasis.EVERYTHING:
             return _every_topic()
         allowed = self._granted.topics(verb)
         # If the rules deny nothing, the rule that allows an endpoint also allows creating its
         # topic.
-        if basis is not _Basis.BOTH_WAYS or self._either.only_allows():
+        if basis is not _DecisionBasis.BOTH_WAYS or self._either.only_allows():
             return allowed
         return allowed & self._creatable_names()
 

@@ -194,7 +194,7 @@ class _Reader:
 
 _SCHEMA_ATTRIBUTES = ("xmlns:xsi", "xsi:nonamespaceschemalocation")
 _IGNORED = ("relay", "value", "name", "tag", "data_tags")
-_NOTHING = "["
+_MATCHES_NOTHING = "["
 """An expression that matches no name: a set of characters without a closing bracket."""
 _LONGEST_NUMBER = 4000
 """Maximum number of digits that are converted; a 64-bit number has at most 20."""
@@ -454,7 +454,7 @@ def _read_criteria(node: _Node) -> Criteria:
     return Criteria(
         tuple(topic.text for topic in topics.all("topic")) if topics else (),
         # An empty list of partitions matches no partition, not even the default partition.
-        tuple(partition.text for partition in partitions.all("partition")) or (_NOTHING,)
+        tuple(partition.text for partition in partitions.all("partition")) or (_MATCHES_NOTHING,)
         if partitions
         else (),
     )

@@ -128,7 +128,7 @@ def _part_end(text: bytes, start: int) -> int:
 
 
 _MOST_ATTRIBUTES = 20  # Fast DDS 2.14 ignores attributes beyond these
-_BEFORE = {
+_TEXT_BEFORE = {
     wanted: re.compile(rf'(?:\\.|"(?:\\.|[^"\\])*(?:"|\\?\Z)|[^"\\{wanted}])*', re.DOTALL)
     for wanted in "=,"
 }
@@ -171,7 +171,7 @@ def _types_and_values(name: str) -> list[tuple[str, str]]:
 
 def _outside_quotes(text: str, wanted: str) -> int:
     """Return the index of the first ``wanted`` character outside of escapes and quotes, or -1."""
-    before = _BEFORE[wanted].match(text)
+    before = _TEXT_BEFORE[wanted].match(text)
     end = before.end() if before else 0
     return end if text[end : end + 1] == wanted else -1
 

@@ -104,7 +104,7 @@ _CLAIMS: Mapping[str, tuple[Relation, bool]] = {
 }
 _EXAMPLE = 'Write a table: listener = "spy", talker = "camera", expected = "not heard".'
 
-_FITTING: Mapping[str, tuple[Role, ...]] = {
+_ROLES_OF_KEY: Mapping[str, tuple[Role, ...]] = {
     "talker": (Role.TALKER, Role.COMPOSED),
     "listener": (Role.LISTENER, Role.COMPOSED),
     "observer": (Role.OBSERVER,),
@@ -114,7 +114,7 @@ _FITTING: Mapping[str, tuple[Role, ...]] = {
 }
 """Key of a claim → roles that the named party may have."""
 
-_NAMED = (Role.SERVER, Role.CLIENT, Role.ACTION_SERVER, Role.ACTION_CLIENT)
+_ROLES_WITH_NAMES = (Role.SERVER, Role.CLIENT, Role.ACTION_SERVER, Role.ACTION_CLIENT)
 """Roles of parties that have to name a service or an action."""
 
 _ZENOH_ROLES = (Role.ROUTER, Role.RELAY, Role.FLOODER, Role.ERASER)
@@ -245,7 +245,7 @@ def _read_party(table: _Table, policy: Policy) -> Party:
         raise table.error("role", f"{word!r} is not a role; use one of {', '.join(roles)}")
     role = roles[word]
     topic = table.text("topic", "")
-    if not topic and role in _NAMED:
+    if not topic and role in _ROLES_WITH_NAMES:
         problem = f"the {word} {name!r} needs a topic: the name of its service or action"
         raise table.error("name", problem)
     try:
@@ -332,7 +332,7 @@ def _read_claim(table: _Table, key: str, claim: Any, parties: Mapping[str, Party
             problem = f"there is no party {name!r}; use one of {', '.join(parties)}"
             raise table.error(key, problem)
         role = parties[name].role
-        if role not in (SPEAKING if relation is Relation.READABLE else _FITTING[side]):
+        if role not in (SPEAKING if relation is Relation.READABLE else _ROLES_OF_KEY[side]):
             problem = f"{name} is a {role}, and cannot be the {side} of status {expected!r}"
             raise table.error(key, problem)
     if relation is Relation.IS_ANSWERED:
