@@ -260,8 +260,8 @@ class Fault(Enum):
         "crl-left-out",
         "a folder, a pipe or a broken link in place of a revocation list",
         "ROS 2 leaves it out: nodes start, and continue to communicate with revoked enclaves. "
-        "`sros run` refuses the enclave. If a file to be mounted into a container does not exist, some "
-        "container programs make a folder with its name.",
+        "`sros run` refuses the enclave. If a file to be mounted into a container does not exist, "
+        "some container programs make a folder with its name.",
         "rmw_dds_common of ROS 2 Jazzy (security.cpp).",
         f"Move {{path}} away. {_CRL}",
     )
