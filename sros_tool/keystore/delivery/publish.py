@@ -805,8 +805,8 @@ class _Publication:
             f"after {since}: a robot that was stolen after that gets releases, and is trusted. "
             f"Unless you have done so, run `sros fleet collect {where} INBOX`, which revokes again "
             f"what messages of robots show, revoke again what else was stolen (`sros revoke "
-            f"{where} --robot NAME`), sign the present policy (`sros generate_artifacts`), and publish "
-            "again.",
+            f"{where} --robot NAME`), sign the present policy (`sros generate_artifacts`), and "
+            "publish again.",
         )
 
     def _not_restored_error(self) -> KeystoreError:
