@@ -44,8 +44,8 @@ Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
 
 
-def _checked(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
-    """Decorate a public function so that it refuses arguments of other types than annotated."""
+def _with_checked_arguments(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
+    """Decorate a public function so that arguments of a wrong type raise `UsageError`."""
     code, annotations = function.__code__, function.__annotations__
     positional = code.co_varnames[: code.co_argcount]
     # The first is an argument such as "*paths".
@@ -55,11 +55,11 @@ def _checked(function: Callable[Parameters, Result]) -> Callable[Parameters, Res
     def call(*arguments: Parameters.args, **named: Parameters.kwargs) -> Result:
         names = [*positional, *[*others[:1]] * len(arguments)][: len(arguments)]
         given: list[Any] = [
-            _argument(name, annotations.get(name, ""), argument)
+            _checked_argument(name, annotations.get(name, ""), argument)
             for name, argument in zip(names, arguments, strict=True)
         ]
         for name, argument in named.items():
-            named[name] = _argument(name, annotations.get(name, ""), argument)
+            named[name] = _checked_argument(name, annotations.get(name, ""), argument)
         return function(*given, **named)
 
     return call
@@ -81,18 +81,20 @@ _TYPE_TEXTS = {
 }
 
 
-def _argument(name: str, annotation: str, argument: Any) -> Any:
-    """Return an argument, or a list as a tuple, if it and its items are of an annotated type.
+def _checked_argument(name: str, annotation: str, argument: Any) -> Any:
+    """Return an argument after a check of its type; a list becomes a tuple.
 
     Raises:
-        UsageError: it is of another type.
+        UsageError: the argument or an item of it has another type than annotated.
     """
     texts = []
     for kind, items in re.findall(r"(\w+)(?:\[([^\]]*)\])?", annotation):
         if kind in ("Iterable", "Sequence"):
             texts.append("a list")
             if isinstance(argument, Iterable) and not isinstance(argument, str | bytes):
-                return tuple(_argument(f"an item of {name}", items, item) for item in argument)
+                return tuple(
+                    _checked_argument(f"an item of {name}", items, item) for item in argument
+                )
         elif _is_of_type(argument, kind):
             if kind == "AnyPath" and "\0" in fspath(argument):
                 raise UsageError(f"{name} has a NUL character", "", "Pass the path of a file.")
@@ -177,7 +179,7 @@ class AccessAnswer:
         return self.allowed
 
 
-@_checked
+@_with_checked_arguments
 def create_keystore(
     path: AnyPath,
     template: AnyPath | Template = "development",
@@ -220,13 +222,15 @@ def create_keystore(
         template=load_template(template) if isinstance(template, str | PathLike) else template,
         domains=DomainSet.parse(str(domains), "domains"),
         now=_time_or_now(now),
-        keyring=_keyring(secrets, identity_key, encrypt=encrypt_ca_keys, short=short_passphrase),
-        imported_cas={} if identity_ca is None else {"identity": _content(identity_ca)},
+        keyring=_make_keyring(
+            secrets, identity_key, encrypt=encrypt_ca_keys, short=short_passphrase
+        ),
+        imported_cas={} if identity_ca is None else {"identity": _read_file(identity_ca)},
     )
     return Keystore(result.root, result.notes)
 
 
-@_checked
+@_with_checked_arguments
 def open_keystore(path: AnyPath) -> Keystore:
     """Return the keystore in the folder ``path``, whether sros or ros2/sros2 created it.
 
@@ -243,7 +247,7 @@ def open_keystore(path: AnyPath) -> Keystore:
     return Keystore(Path(path))
 
 
-@_checked
+@_with_checked_arguments
 def load_template(choice: AnyPath) -> Template:
     """Return the keystore template named ``choice`` ("production"), or in the TOML file ``choice``.
 
@@ -261,7 +265,7 @@ def load_template(choice: AnyPath) -> Template:
     return template.load_template(fspath(choice))
 
 
-@_checked
+@_with_checked_arguments
 def read_policy(path: AnyPath) -> Policy:
     """Return the policy in the file ``path``, with the files that it includes.
 
@@ -290,9 +294,9 @@ def read_policy(path: AnyPath) -> Policy:
         ) from error
 
 
-@_checked
+@_with_checked_arguments
 def policy_rights(policy: AnyPath | Policy) -> tuple[Right, ...]:
-    """Return the rights in a policy, as it states them but with absolute names, sorted.
+    """Return the sorted rights that a policy states, with absolute names.
 
     Returns:
         Rights with ``enclave``, ``qualifier`` (``ALLOW`` or ``DENY``), ``right`` (such as
@@ -308,10 +312,10 @@ def policy_rights(policy: AnyPath | Policy) -> tuple[Right, ...]:
     """
     from sros_tool.policy import rights
 
-    return tuple(sorted(rights.policy_rights(_policy(policy)), key=rights.order))
+    return tuple(sorted(rights.policy_rights(_as_policy(policy)), key=rights.order))
 
 
-@_checked
+@_with_checked_arguments
 def merge_policies(
     policy: AnyPath,
     *others: AnyPath | Policy,
@@ -350,11 +354,11 @@ def merge_policies(
     """
     from sros_tool.graph import learn
 
-    additions = list(map(_policy, others))
+    additions = list(map(_as_policy, others))
     return learn.merge_policies(Path(policy), additions, namespace, remaps, enclave, nodes)
 
 
-@_checked
+@_with_checked_arguments
 def generate(
     keystore: AnyPath,
     *policies: AnyPath | Policy,
@@ -405,10 +409,10 @@ def generate(
     return create.generate_artifacts(
         Path(keystore),
         enclaves=names,
-        policies=_fleet_policies(policies, fleet) if fleet else [_policy(e) for e in policies],
+        policies=_fleet_policies(policies, fleet) if fleet else [_as_policy(e) for e in policies],
         now=_time_or_now(now),
-        domain=_domain(domain),
-        keyring=_keyring(secrets),
+        domain=_checked_domain(domain),
+        keyring=_make_keyring(secrets),
         dry_run=dry_run,
     )
 
@@ -430,7 +434,7 @@ def _fleet_policies(policies: Iterable[AnyPath | Policy], fleet: AnyPath) -> lis
     return read
 
 
-@_checked
+@_with_checked_arguments
 def create_enclaves(
     keystore: AnyPath,
     enclaves: Iterable[str],
@@ -465,7 +469,7 @@ def create_enclaves(
     )
 
 
-@_checked
+@_with_checked_arguments
 def renew(
     keystore: AnyPath,
     enclaves: Iterable[str] = (),
@@ -515,12 +519,12 @@ def renew(
         expiring=None if expiring is None else Threshold(remaining=expiring),
         new_key=new_key,
         revoke_old=revoke_old,
-        keyring=_keyring(secrets),
+        keyring=_make_keyring(secrets),
         dry_run=dry_run,
     )
 
 
-@_checked
+@_with_checked_arguments
 def revoke(
     keystore: AnyPath,
     enclaves: Iterable[str],
@@ -568,13 +572,13 @@ def revoke(
         names,
         now=_time_or_now(now),
         reason=reason,
-        crl=b"" if crl is None else _content(crl),
-        keyring=_keyring(secrets),
+        crl=b"" if crl is None else _read_file(crl),
+        keyring=_make_keyring(secrets),
         dry_run=dry_run,
     )
 
 
-@_checked
+@_with_checked_arguments
 def fleet_status(
     keystore: AnyPath,
     robots: Iterable[str] = (),
@@ -612,7 +616,7 @@ def fleet_status(
     return fleet.with_overdue(_time_or_now(now), max_age)
 
 
-@_checked
+@_with_checked_arguments
 def export_enclaves(
     keystore: AnyPath,
     enclaves: Iterable[str],
@@ -649,7 +653,7 @@ def export_enclaves(
     ).target
 
 
-@_checked
+@_with_checked_arguments
 def explain_access(
     keystore: AnyPath | Policy,
     enclave: str,
@@ -669,8 +673,7 @@ def explain_access(
     Zenoh decides by the files that `sros zenoh` has written into the keystore.
 
     Args:
-        keystore: The keystore, or its path; or a policy, or its file, by which sros decides as if
-            it were signed.
+        keystore: The keystore, or its path; or a policy or policy file, which counts as signed.
         enclave: The name of the enclave, such as "/talker".
         action: "publish", "subscribe", "call", "serve", "execute" or "join"; "request" and "reply",
             the words of policies, mean "call" and "serve" for a service.
@@ -680,8 +683,7 @@ def explain_access(
         vendor: "fastdds" (2.14, or the release in ``distribution``), "cyclonedds" (0.10, or the
             release in ``distribution``), or another name that `sros explain --vendor` takes, such
             as "fastdds-3.2" or "zenoh".
-        distribution: A ROS 2 distribution, such as "lyrical", whose release of ``vendor``
-            decides.
+        distribution: A ROS 2 distribution, such as "lyrical", whose release of ``vendor`` decides.
         policy: The policy of the enclave, or its file, in which to find the ``policy_lines``.
         domain: The ROS domain id; by default 0, or the first domain of the governance.
         now: The time of the access; the current time by default.
@@ -704,14 +706,14 @@ def explain_access(
     from sros_tool.explain.explanation import explain
 
     question = ask(action, name, kind)
-    domain = _domain(domain)
+    domain = _checked_domain(domain)
     vendors = [*(known.value for known in Vendor), ZENOH]
     if vendor not in vendors:
         raise UsageError(f"unknown vendor {vendor!r}", "", f"Choose {', '.join(vendors)}.")
     if vendor == ZENOH and distribution:
         text = "Zenoh decides alike in every distribution."
         raise UsageError("vendor 'zenoh' takes no distribution", text, "Leave it out.")
-    (vendor,) = _vendors(vendor, distribution)
+    (vendor,) = _selected_vendors(vendor, distribution)
     asking = AskingContext(_time_or_now(now), zone, domain)
     asked = _enclave_to_ask(keystore, enclave, policy, asking)
     context = asking.context(asked.enclave.joined_domains)
@@ -775,7 +777,7 @@ def _enclave_to_ask(
     if not isinstance(keystore, str | PathLike) or is_policy(Path(keystore)):
         if policy is not None:
             raise UsageError("two policies are named", "", "Leave policy= out.")
-        alone = _policy(keystore)
+        alone = _as_policy(keystore)
         stated_enclave = alone.enclave(name)
         if stated_enclave is None:
             raise not_in_policy_error(alone, name, Path(alone.file))
@@ -786,12 +788,12 @@ def _enclave_to_ask(
     opened.check()
     signed = signed_enclave(opened, name, asking.at)
     assert signed
-    stated = _policy(policy) if policy is not None else None
+    stated = _as_policy(policy) if policy is not None else None
     stated_enclave = stated.enclave(name) if stated else None
     return AskedEnclave(signed._replace(keystore=opened, policy=stated_enclave), stated)
 
 
-@_checked
+@_with_checked_arguments
 def check(
     *paths: AnyPath,
     policies: Iterable[AnyPath | Policy] = (),
@@ -847,16 +849,16 @@ def check(
     read = tuple(
         read_policy_for(Path(policy), robots)
         if robots and isinstance(policy, str | PathLike)
-        else _policy(policy)
+        else _as_policy(policy)
         for policy in policies
     )
     at = Circumstances(
         _time_or_now(now),
         zone,
-        _domain(domain),
+        _checked_domain(domain),
         read,
         find_distribution(distribution).given_name if distribution else "",
-        _vendors("", distribution),
+        _selected_vendors("", distribution),
         robots,
     )
     findings = path_findings(map(Path, paths), at)
@@ -864,7 +866,7 @@ def check(
     return chosen.choose(findings).shown
 
 
-@_checked
+@_with_checked_arguments
 def check_requirements(
     path: AnyPath | Sequence[AnyPath],
     requirements: AnyPath | Sequence[AnyPath],
@@ -939,8 +941,8 @@ def check_requirements(
     at = Circumstances(
         _time_or_now(now),
         zone,
-        _domain(domain),
-        vendors=_vendors(vendor, distribution),
+        _checked_domain(domain),
+        vendors=_selected_vendors(vendor, distribution),
         fleet=read_fleet(Path(fleet)) if fleet else None,
     )
     files = [requirements] if isinstance(requirements, str | PathLike) else requirements
@@ -963,7 +965,7 @@ def check_requirements(
     )
 
 
-@_checked
+@_with_checked_arguments
 def new_access(
     base: AnyPath,
     head: AnyPath,
@@ -1017,14 +1019,14 @@ def _time_or_now(now: datetime | None) -> datetime:
     return now
 
 
-def _domain(domain: int | None) -> int | None:
+def _checked_domain(domain: int | None) -> int | None:
     """Return the ROS domain id; raise `UsageError` if it is not a valid id."""
     from sros_tool.dds.domains import DomainSet
 
     return None if domain is None else DomainSet.parse(str(domain), "domain").only()
 
 
-def _vendors(vendor: str, distribution: str) -> tuple[str, ...]:
+def _selected_vendors(vendor: str, distribution: str) -> tuple[str, ...]:
     """Return the vendors that a caller selects; () for all.
 
     Raises:
@@ -1037,11 +1039,11 @@ def _vendors(vendor: str, distribution: str) -> tuple[str, ...]:
     return selected_vendors(vendor, named if vendor != ZENOH else ())
 
 
-def _policy(source: AnyPath | Policy) -> Policy:
+def _as_policy(source: AnyPath | Policy) -> Policy:
     return read_policy(source) if isinstance(source, str | PathLike) else source
 
 
-def _keyring(
+def _make_keyring(
     secrets: Secrets | None,
     identity_key: str | None = None,
     *,
@@ -1051,20 +1053,20 @@ def _keyring(
     from sros_tool.keystore.issuing.keyring import Keyring, absolute_place, no_secrets
 
     places = {"identity": absolute_place(identity_key)} if identity_key else {}
-    return Keyring(_texts(secrets) if secrets else no_secrets, places, encrypt, short)
+    return Keyring(_checked_secrets(secrets) if secrets else no_secrets, places, encrypt, short)
 
 
-def _texts(secrets: Secrets) -> Secrets:
-    """Return ``secrets``, which then refuses to return anything but a string."""
+def _checked_secrets(secrets: Secrets) -> Secrets:
+    """Wrap ``secrets`` so that any result but a string raises an error."""
 
     def secret(prompt: str) -> str:
-        text: str = _argument("the return value of secrets", "str", secrets(prompt))
+        text: str = _checked_argument("the return value of secrets", "str", secrets(prompt))
         return text
 
     return secret
 
 
-def _content(path: AnyPath) -> bytes:
+def _read_file(path: AnyPath) -> bytes:
     from sros_tool.xml import read_bytes
 
     return read_bytes(Path(path), "file")

@@ -25,10 +25,10 @@ from sros_tool.errors import DocumentError
 
 # ── letters ────────────────────────────────────────────────────────────────────────────────
 
-_LAST = 0x10FFFF
-_NO_LETTERS = ((0, 0), (0xD800, 0xDFFF))
+_LAST_CODE_POINT = 0x10FFFF
+_EXCLUDED_RANGES = ((0, 0), (0xD800, 0xDFFF))
 """Characters that no name can have: NUL, and surrogates, which UTF-8 cannot encode."""
-_PREFERRED = ascii_lowercase + ascii_uppercase + digits + "_/" + punctuation + " "
+_PREFERRED_LETTERS = ascii_lowercase + ascii_uppercase + digits + "_/" + punctuation + " "
 """The characters to build readable examples from, best first."""
 
 
@@ -45,7 +45,7 @@ class Letters:
 
     @classmethod
     def between(cls, ends: Iterable[tuple[str, str]]) -> Letters:
-        """Return the characters of inclusive ranges; one whose end is before its start is empty."""
+        """Return the characters of inclusive ranges; a range that is in reverse order is empty."""
         return cls._joined_ranges((ord(low), ord(high)) for low, high in ends)
 
     @classmethod
@@ -71,7 +71,7 @@ class Letters:
 
     def __invert__(self) -> Letters:
         """Return all characters that are not in this set."""
-        ends = [-1, *(end for part in self.ranges for end in part), _LAST + 1]
+        ends = [-1, *(end for part in self.ranges for end in part), _LAST_CODE_POINT + 1]
         between = zip(ends[::2], ends[1::2], strict=True)
         return Letters(tuple((a + 1, b - 1) for a, b in between if a + 1 < b))
 
@@ -88,8 +88,8 @@ class Letters:
         return ""
 
 
-ANY_LETTER = Letters(((0, _LAST),))
-_USABLE = ~Letters(_NO_LETTERS)
+ANY_LETTER = Letters(((0, _LAST_CODE_POINT),))
+_USABLE_LETTERS = ~Letters(_EXCLUDED_RANGES)
 
 
 # ── automata ───────────────────────────────────────────────────────────────────────────────
@@ -100,7 +100,7 @@ stay.
 """
 
 
-_MOST_KNOWN = 20_000
+_MOST_CACHED_NAMES = 20_000
 """Maximum number of cached answers of an automaton; callers ask about the same names again."""
 
 
@@ -132,7 +132,7 @@ class Automaton:
 
     @lru_cache(maxsize=4096)  # noqa: B019 - few automata, and each is compared by its hash
     def between(self, begin: str, end: str) -> Automaton:
-        """Return an automaton for the texts that this one accepts between ``begin`` and ``end``."""
+        """Return an automaton for each ``x`` such that this one accepts begin + ``x`` + end."""
         starts = self._reached_places(frozenset((0,)), begin)
         stops = frozenset(
             at for at in range(self.size) if self._reached_places(frozenset((at,)), end) & self.ends
@@ -143,7 +143,7 @@ class Automaton:
         return Automaton((*dict.fromkeys(first), *edges), frozenset(ends))
 
     def surrounded(self, begin: str, end: str) -> Automaton:
-        """Return an automaton for ``begin`` + name + ``end``, for every accepted name."""
+        """Return an automaton for ``begin`` + name + ``end``, for each name accepted here."""
         size, more = self.size, len(begin)
         edges = [(i, Letters.of(letter), i + 1) for i, letter in enumerate(begin)]
         edges += [(at + more, letters, to + more) for at, letters, to in self.edges]
@@ -172,7 +172,7 @@ class Automaton:
         if not name.startswith(self.prefix) or not name.endswith(self.suffix):
             return False
         if name not in self._known:
-            if len(self._known) >= _MOST_KNOWN:
+            if len(self._known) >= _MOST_CACHED_NAMES:
                 self._known.clear()
             self._known[name] = self._accepts(name)
         return self._known[name]
@@ -190,7 +190,7 @@ class Automaton:
                 self._moves[letter] = _moves(
                     (start, stop) for start, letters, stop in self.edges if letter in letters
                 )
-            reached = _moved_places(reached, self._moves[letter])
+            reached = _positions_after(reached, self._moves[letter])
             if not reached:
                 return False
         return bool(reached & self.end_bits)
@@ -217,9 +217,10 @@ class Automaton:
 
     @cached_property
     def levels(self) -> tuple[tuple[int, int], ...]:
-        """Pairs of a number of letters and positions (as bits), sorted by the number.
+        """Pairs of a number of letters and positions (bits), sorted by the number.
 
-        From these positions, at least that number of letters leads to an accepting position.
+        From the positions of a pair, at least that number of letters leads to an accepting
+        position.
         """
         before: dict[int, list[int]] = {}
         for at, letters, to in self.edges:
@@ -258,7 +259,7 @@ class Automaton:
 
     def may_meet(self, other: Automaton) -> bool:
         """Return False if the prefixes or suffixes show that both automata share no name."""
-        return _have_same_value(self.prefix, other.prefix) and _have_same_value(
+        return _can_overlap(self.prefix, other.prefix) and _can_overlap(
             self.suffix[::-1], other.suffix[::-1]
         )
 
@@ -277,7 +278,7 @@ def _forced_text(
     return text
 
 
-def _have_same_value(first_text: str, second_text: str) -> bool:
+def _can_overlap(first_text: str, second_text: str) -> bool:
     return first_text.startswith(second_text) or second_text.startswith(first_text)
 
 
@@ -288,7 +289,7 @@ def _moves(edges: Iterable[tuple[int, int]]) -> _Moves:
     return places_by_distance
 
 
-def _moved_places(positions: int, moves: _Moves) -> int:
+def _positions_after(positions: int, moves: _Moves) -> int:
     following = 0
     for by, places in moves.items():
         movable = positions & places
@@ -300,11 +301,11 @@ def _moved_places(positions: int, moves: _Moves) -> int:
 
 _Truth = bool | None
 """Whether a name is in a set; None while that depends on the rest of the name."""
-_Test = Callable[["_Some"], _Truth]
+_Test = Callable[["_Union"], _Truth]
 
 
 @dataclass(frozen=True)
-class _Some:
+class _Union:
     """The ``exact`` names, and all names that one of the ``automata`` accepts."""
 
     exact: frozenset[str] = frozenset()
@@ -362,7 +363,7 @@ class _Some:
 
 
 @dataclass(frozen=True)
-class _Not:
+class _Complement:
     """The names that are not in the set ``of``."""
 
     of: _Node
@@ -395,7 +396,7 @@ class _Intersection:
 
 
 @dataclass(frozen=True)
-class _First:
+class _FirstMatch:
     """The names that a list of rules accepts: the first rule whose set has the name decides.
 
     ``of`` has pairs of a set and whether its names are accepted; ``last`` is the answer for names
@@ -445,7 +446,7 @@ class _AtLeast:
         return None
 
 
-_Node = _Some | _Not | _Intersection | _First | _AtLeast
+_Node = _Union | _Complement | _Intersection | _FirstMatch | _AtLeast
 
 
 class SearchLimit:
@@ -485,7 +486,7 @@ class NameSet:
 
     def __init__(self, exact_names: Iterable[str] = (), automata: Iterable[Automaton] = ()) -> None:
         """Create the set of the ``exact_names`` and of all names that an automaton accepts."""
-        self._node: _Node = _Some(frozenset(exact_names), frozenset(automata))
+        self._node: _Node = _Union(frozenset(exact_names), frozenset(automata))
 
     @classmethod
     def _of(cls, node: _Node) -> NameSet:
@@ -508,7 +509,7 @@ class NameSet:
             joined.pop()  # removes names that no other rule accepts
         if not otherwise and len(joined) == 1:
             return cls._of(joined[0][0])
-        return cls._of(_First(tuple(joined), otherwise))
+        return cls._of(_FirstMatch(tuple(joined), otherwise))
 
     @classmethod
     def union(cls, sets: Iterable[NameSet]) -> NameSet:
@@ -517,15 +518,15 @@ class NameSet:
         exact: set[str] = set()
         automata: set[Automaton] = set()
         for names in sets:
-            if isinstance(names._node, _Some):
+            if isinstance(names._node, _Union):
                 exact |= names._node.exact
                 automata |= names._node.automata
             else:
                 other_nodes.append(names._node)
-        plain = _Some(frozenset(exact), frozenset(automata))
+        plain = _Union(frozenset(exact), frozenset(automata))
         if not other_nodes:
             return cls._of(plain)
-        return cls._of(_First(tuple((part, True) for part in (plain, *other_nodes)), False))
+        return cls._of(_FirstMatch(tuple((part, True) for part in (plain, *other_nodes)), False))
 
     @classmethod
     def at_least(cls, count: int, sets: Iterable[NameSet]) -> NameSet:
@@ -536,29 +537,29 @@ class NameSet:
         """Return the texts ``x`` for which ``begin`` + ``x`` + ``end`` is in this set."""
         return NameSet._of(_between(self._node, begin, end))
 
-    def around(self) -> Surroundings | None:
-        """Return exact names and automata that include all names of this set, and perhaps more.
+    def superset(self) -> Superset | None:
+        """Return a simple set with all names of this set, and perhaps others.
 
-        Returns None if that would be all names.
+        Returns None if no such set smaller than all names is found.
         """
-        return _including_set(self._node, _longest_affixes_first)
+        return _superset_of(self._node, _longest_affixes_first)
 
     def __or__(self, other: NameSet) -> NameSet:
         return NameSet.union((self, other))
 
     def __and__(self, other: NameSet) -> NameSet:
         for name_set, two in ((self, other), (other, self)):
-            if isinstance(name_set._node, _Some) and not name_set._node.automata:
+            if isinstance(name_set._node, _Union) and not name_set._node.automata:
                 return NameSet(name for name in name_set._node.exact if name in two)
         return NameSet._of(_Intersection((self._node, other._node)))
 
     def __sub__(self, other: NameSet) -> NameSet:
-        if isinstance(self._node, _Some) and not self._node.automata:
+        if isinstance(self._node, _Union) and not self._node.automata:
             return NameSet(name for name in self._node.exact if name not in other)
-        return NameSet._of(_Intersection((self._node, _Not(other._node))))
+        return NameSet._of(_Intersection((self._node, _Complement(other._node))))
 
     def __invert__(self) -> NameSet:
-        return NameSet._of(_Not(self._node))
+        return NameSet._of(_Complement(self._node))
 
     def __eq__(self, other: object) -> bool:
         """Return whether both sets were built in the same way.
@@ -616,75 +617,75 @@ class NameSet:
 
 def _between(node: _Node, begin: str, end: str) -> _Node:
     match node:
-        case _Some():
+        case _Union():
             size = len(begin) + len(end)
             exact = frozenset(
                 name[len(begin) : len(name) - len(end)]
                 for name in node.exact
                 if len(name) >= size and name.startswith(begin) and name.endswith(end)
             )
-            return _Some(
+            return _Union(
                 exact, frozenset(automaton.between(begin, end) for automaton in node.automata)
             )
-        case _Not():
-            return _Not(_between(node.of, begin, end))
+        case _Complement():
+            return _Complement(_between(node.of, begin, end))
         case _Intersection():
             return _Intersection(tuple(_between(part, begin, end) for part in node.of))
-        case _First():
+        case _FirstMatch():
             of = tuple((_between(part, begin, end), kept) for part, kept in node.of)
-            return _First(of, node.last)
+            return _FirstMatch(of, node.last)
         case _AtLeast():
             return _AtLeast(tuple(_between(part, begin, end) for part in node.of), node.count)
 
 
 @dataclass(frozen=True, slots=True)
-class Surroundings:
-    """A simple set that includes a complicated set: exact names, and automata."""
+class Superset:
+    """A set with all names of another set: ``exact`` names, and the names of ``automata``."""
 
     exact: frozenset[str]
     automata: frozenset[Automaton]
 
 
-def _including_set(
-    node: _Node, rank: Callable[[Surroundings], tuple[int, int]]
-) -> Surroundings | None:
-    """Return a simple set that includes ``node``, or None; of several, the smallest by ``rank``."""
+def _superset_of(node: _Node, rank: Callable[[Superset], tuple[int, int]]) -> Superset | None:
+    """Return a simple set with all names of ``node``, or None; of several, the first in rank."""
     match node:
-        case _Some():
-            return Surroundings(node.exact, node.automata)
-        case _Not():
+        case _Union():
+            return Superset(node.exact, node.automata)
+        case _Complement():
             return None
         case _Intersection():
-            parts = (_including_set(part, rank) for part in node.of)
+            parts = (_superset_of(part, rank) for part in node.of)
             return min(filter(None, parts), key=rank, default=None)
-        case _First():
+        case _FirstMatch():
             operands = [part for part, kept in node.of if kept]
             if node.last:
                 return None
         case _AtLeast():
             operands = list(node.of)
-    surroundings_of_operands = [_including_set(operand, rank) for operand in operands]
-    known = [surroundings for surroundings in surroundings_of_operands if surroundings is not None]
-    if len(known) < len(surroundings_of_operands):
+    supersets_of_operands = [_superset_of(operand, rank) for operand in operands]
+    known = [surroundings for surroundings in supersets_of_operands if surroundings is not None]
+    if len(known) < len(supersets_of_operands):
         return None
-    return Surroundings(
+    return Superset(
         frozenset[str]().union(*(surroundings.exact for surroundings in known)),
         frozenset[Automaton]().union(*(surroundings.automata for surroundings in known)),
     )
 
 
-def _longest_affixes_first(around: Surroundings) -> tuple[int, int]:
+def _longest_affixes_first(superset: Superset) -> tuple[int, int]:
     """Return a sort key for sets that puts long prefixes and suffixes first."""
-    known = min((len(a.prefix) + len(a.suffix) for a in around.automata), default=_LAST)
-    return -known, -len(around.exact)
+    known = min(
+        (len(a.prefix) + len(a.suffix) for a in superset.automata), default=_LAST_CODE_POINT
+    )
+    return -known, -len(superset.exact)
 
 
 def _shortest_first(name: str) -> tuple[int, str]:
     return len(name.encode(errors="surrogatepass")), name
 
 
-def _leaves(node: _Node) -> Iterator[_Some]:
-    if isinstance(node, _Some):
+def _leaves(node: _Node) -> Iterator[_Union]:
+    if isinstance(node, _Union):
         yield node
     for part in node.parts():
         yield from _leaves(part)
@@ -698,22 +699,23 @@ def _simplified(
     certain_automata: frozenset[Automaton],
     possible_automata: frozenset[Automaton] | None,
 ) -> _Node | bool:
-    """Return a set in which automata are replaced by what is known about them.
+    """Return a set in which automata are replaced by their known answers for some names.
 
-    Every considered name is accepted by the automata ``certain_automata``; of all others, only
-    automata in ``possible_automata`` may accept it (None: any).  The exact names of the set are
-    left out. Returns True or False if the set then has all names or none.
+    Only names count that all of ``certain_automata`` accept, and that no automaton accepts except
+    these and ``possible_automata`` (None: every automaton may accept them). The exact names of the
+    set are left out. The result is True if the set then has all of the names that count, and False
+    if the set has none of them.
     """
-    if isinstance(node, _Some):
+    if isinstance(node, _Union):
         if not certain_automata.isdisjoint(node.automata):
             return True
         left = node.automata if possible_automata is None else possible_automata & node.automata
         if not left:
             return False
-        return _Some(automata=left) if len(left) < len(node.automata) or node.exact else node
-    if isinstance(node, _Not):
+        return _Union(automata=left) if len(left) < len(node.automata) or node.exact else node
+    if isinstance(node, _Complement):
         inner = _simplified(node.of, certain_automata, possible_automata)
-        return not inner if isinstance(inner, bool) else _Not(inner)
+        return not inner if isinstance(inner, bool) else _Complement(inner)
     if isinstance(node, _Intersection):
         kept: list[_Node] = []
         for part in node.of:
@@ -741,12 +743,12 @@ def _simplified(
             rules.append((inner, says))
     while rules and rules[-1][1] is last:
         rules.pop()
-    return _First(tuple(rules), last) if rules else last
+    return _FirstMatch(tuple(rules), last) if rules else last
 
 
-_OF_A_STEP = 16
+_AUTOMATA_PER_STEP = 16
 """Number of automata that can be compared in the time of one search step."""
-_FEW = 64
+_SMALL_SET = 64
 _MOST_AUTOMATA = 8192
 """Largest number of automata in one search: more could take gigabytes of memory."""
 
@@ -754,9 +756,9 @@ _MOST_AUTOMATA = 8192
 def _searches(node: _Node, limit: SearchLimit) -> Iterator[_Search]:
     """Yield searches that together find every name of a set, except its exact names.
 
-    A search considers the names of one automaton, and only those other automata that may share
-    names with it.  If no small group of automata covers the set, the last search considers the
-    names that no automaton accepts.
+    A search considers the names that one automaton accepts, and only the other automata that may
+    accept some of these names.  If no small group of automata covers the set, the last search
+    considers the names that no automaton accepts.
     """
     leaves = tuple(_leaves(node))
     automata = frozenset[Automaton]().union(*(leaf.automata for leaf in leaves))
@@ -764,12 +766,14 @@ def _searches(node: _Node, limit: SearchLimit) -> Iterator[_Search]:
         raise _too_many_error()
     exact = frozenset[str]().union(*(leaf.exact for leaf in leaves))
     accepting_all = frozenset[Automaton]().union(*(leaf.everything for leaf in leaves))
-    around = _including_set(node, _fewest_automata_first)
-    for searched in sorted(automata if around is None else around.automata, key=_automaton_order):
+    superset = _superset_of(node, _fewest_automata_first)
+    for searched in sorted(
+        automata if superset is None else superset.automata, key=_automaton_order
+    ):
         met = frozenset(
             automaton for leaf in leaves for automaton in leaf.possibly_overlapping(searched)
         )
-        if further_steps := len(met) // _OF_A_STEP:
+        if further_steps := len(met) // _AUTOMATA_PER_STEP:
             limit.spend(further_steps)
         left = _simplified(node, accepting_all | {searched}, met)
         if left is not False:
@@ -777,28 +781,28 @@ def _searches(node: _Node, limit: SearchLimit) -> Iterator[_Search]:
                 _accepted_names(searched, left), frozenset(filter(searched.matches, exact))
             )
     no_automata = frozenset[Automaton]()
-    if around is None and not accepting_all and _simplified(node, no_automata, no_automata):
+    if superset is None and not accepting_all and _simplified(node, no_automata, no_automata):
         left = _simplified(node, no_automata, None)
-        yield _Search(_Not(_Some()) if isinstance(left, bool) else left, exact)
+        yield _Search(_Complement(_Union()) if isinstance(left, bool) else left, exact)
 
 
-def _fewest_automata_first(around: Surroundings) -> tuple[int, int]:
+def _fewest_automata_first(superset: Superset) -> tuple[int, int]:
     """Return a sort key that puts sets with few automata first.
 
     Small sets with an automaton without prefix and suffix come after other small sets.
     """
-    if len(around.automata) > _FEW:
-        return len(around.automata), 0
-    affixes, _ = _longest_affixes_first(around)
-    return len(around.automata) + (not affixes) * _MOST_AUTOMATA, affixes
+    if len(superset.automata) > _SMALL_SET:
+        return len(superset.automata), 0
+    affixes, _ = _longest_affixes_first(superset)
+    return len(superset.automata) + (not affixes) * _MOST_AUTOMATA, affixes
 
 
 def _including_automata(node: _Node) -> frozenset[Automaton]:
     """Return automata that accept every name of a set, which has no exact names."""
     match node:
-        case _Some():
+        case _Union():
             return node.automata if len(node.automata) == 1 else frozenset()
-        case _Not():
+        case _Complement():
             return _excluding_automata(node.of)
         case _Intersection():
             return frozenset[Automaton]().union(*map(_including_automata, node.of))
@@ -806,7 +810,7 @@ def _including_automata(node: _Node) -> frozenset[Automaton]:
             counts = Counter(need for part in node.of for need in _including_automata(part))
             spare = len(node.of) - node.count
             return frozenset(automaton for automaton, number in counts.items() if number > spare)
-        case _First(last=False):
+        case _FirstMatch(last=False):
             return _common_automata(_including_automata(part) for part, says in node.of if says)
     return frozenset()
 
@@ -814,11 +818,11 @@ def _including_automata(node: _Node) -> frozenset[Automaton]:
 def _excluding_automata(node: _Node) -> frozenset[Automaton]:
     """Return automata that accept every name outside of a set, which has no exact names."""
     match node:
-        case _Not():
+        case _Complement():
             return _including_automata(node.of)
         case _Intersection():
             return _common_automata(map(_excluding_automata, node.of))
-        case _First(last=True):
+        case _FirstMatch(last=True):
             return _common_automata(_including_automata(part) for part, says in node.of if not says)
     return frozenset()
 
@@ -831,7 +835,7 @@ def _common_automata(sets: Iterable[frozenset[Automaton]]) -> frozenset[Automato
 
 def _accepted_names(automaton: Automaton, left: _Node | bool) -> _Node:
     """Return the names of the set ``left`` (True: all names) that ``automaton`` accepts."""
-    node = _Some(automata=frozenset((automaton,)))
+    node = _Union(automata=frozenset((automaton,)))
     return node if isinstance(left, bool) else _Intersection((node, left))
 
 
@@ -840,7 +844,7 @@ def _automaton_order(automaton: Automaton) -> tuple[str, str, str]:
 
 
 class _Search:
-    """The search for the shortest name of a set, other than the names in ``taken``.
+    """The search for the shortest name of a set, except the names in ``taken``.
 
     The set has no exact names.  The search is A*: a state is the set of positions that all automata
     have reached, and a state comes early if few letters are left to a name of the set.
@@ -875,7 +879,7 @@ class _Search:
             ways = taken.next_letters(place, machine.classes)
             limit.spend(len(ways) * (1 + machine.size // 1024))
             for letter, moves, next_place in ways:
-                to = _moved_places(reached, moves) & machine.useful
+                to = _positions_after(reached, moves) & machine.useful
                 new, new_cost = (to, next_place), cost + len(letter.encode())
                 if (
                     costs.get(new, new_cost + 1) <= new_cost
@@ -910,7 +914,10 @@ def _contains_test(name: str) -> _Test:
 def _letters_to(
     state: tuple[int, int], before: Mapping[tuple[int, int], tuple[tuple[int, int], str]]
 ) -> str:
-    """Return the letters on the way to a state, which ``before`` leads back to the start."""
+    """Return the letters that lead from the start to ``state``.
+
+    ``before`` maps a state to the previous state and the letter between the two.
+    """
     letters = []
     while state in before:
         state, letter = before[state]
@@ -923,7 +930,7 @@ def _machine(automata: tuple[Automaton, ...]) -> _Machine:
     return _Machine(automata)
 
 
-class _Class(NamedTuple):
+class _LetterClass(NamedTuple):
     """Letters that every automaton treats in the same way, with the best letter for examples."""
 
     letters: Letters
@@ -950,7 +957,7 @@ class _Machine:
         }
         self.useful = sum(places for levels in self._levels.values() for _, places in levels)
         self.start = sum(1 << begin for begin in begins.values()) & self.useful
-        self.classes = _classes(
+        self.classes = _letter_classes(
             (at + begin, letters, to + begin)
             for a, begin in begins.items()
             for at, letters, to in a.edges
@@ -963,7 +970,7 @@ class _Machine:
     def longer_acceptance_test(self, positions: int) -> _Test:
         """Return a test whether an automaton of a set may accept a longer text."""
 
-        def ask(leaf: _Some) -> _Truth:
+        def ask(leaf: _Union) -> _Truth:
             if any(positions & self._endless[automaton] for automaton in leaf.automata):
                 return True
             return (
@@ -982,18 +989,20 @@ class _Machine:
         return None
 
 
-def _classes(edges: Iterable[tuple[int, Letters, int]]) -> tuple[_Class, ...]:
+def _letter_classes(edges: Iterable[tuple[int, Letters, int]]) -> tuple[_LetterClass, ...]:
     """Return classes of letters that all edges treat alike, sorted by their best letter."""
     by_letters: dict[Letters, list[tuple[int, int]]] = {}
     for at, letters, to in edges:
         by_letters.setdefault(letters, []).append((at, to))
     kinds = list(by_letters)
-    borders = {low for low, _ in _NO_LETTERS} | {high + 1 for _, high in _NO_LETTERS} | {0}
+    borders = (
+        {low for low, _ in _EXCLUDED_RANGES} | {high + 1 for _, high in _EXCLUDED_RANGES} | {0}
+    )
     borders |= {end for kind in kinds for low, high in kind.ranges for end in (low, high + 1)}
     ranges_by_membership: dict[tuple[bool, ...], list[tuple[int, int]]] = {}
-    ordered = sorted(borders | {_LAST + 1})
+    ordered = sorted(borders | {_LAST_CODE_POINT + 1})
     for low, after in pairwise(ordered):
-        if (letter := chr(low)) in _USABLE:
+        if (letter := chr(low)) in _USABLE_LETTERS:
             key = tuple(letter in kind for kind in kinds)
             ranges_by_membership.setdefault(key, []).append((low, after - 1))
     classes = []
@@ -1001,7 +1010,7 @@ def _classes(edges: Iterable[tuple[int, Letters, int]]) -> tuple[_Class, ...]:
         letters = Letters(tuple(ranges))
         of = (by_letters[kind] for kind, has in zip(kinds, key, strict=True) if has)
         classes.append(
-            _Class(
+            _LetterClass(
                 letters,
                 _best_letter(letters),
                 _moves(edge for edges_of_kind in of for edge in edges_of_kind),
@@ -1012,7 +1021,7 @@ def _classes(edges: Iterable[tuple[int, Letters, int]]) -> tuple[_Class, ...]:
 
 def _best_letter(letters: Letters, excluded: Container[str] = ()) -> str:
     """Return the best letter for an example, or "" if all of them are excluded."""
-    for letter in _PREFERRED:
+    for letter in _PREFERRED_LETTERS:
         if letter in letters and letter not in excluded:
             return letter
     # Control characters come last.
@@ -1022,14 +1031,14 @@ def _best_letter(letters: Letters, excluded: Container[str] = ()) -> str:
 
 
 def _letter_rank(letter: str) -> tuple[int, str]:
-    at = _PREFERRED.find(letter)
-    return (at if at >= 0 else len(_PREFERRED)), letter
+    at = _PREFERRED_LETTERS.find(letter)
+    return (at if at >= 0 else len(_PREFERRED_LETTERS)), letter
 
 
 class _ExcludedNames:
     """Names that a search leaves out, as a tree of their letters.
 
-    A place is the number of a node of the tree; -1 is every place outside of it.
+    A place is the number of a node of the tree; -1 is every place outside of the tree.
     """
 
     def __init__(self, names: Iterable[str]) -> None:
@@ -1044,7 +1053,9 @@ class _ExcludedNames:
             self.ends.add(at)
         self._ways: dict[int, list[tuple[str, _Moves, int]]] = {}
 
-    def next_letters(self, place: int, classes: Sequence[_Class]) -> list[tuple[str, _Moves, int]]:
+    def next_letters(
+        self, place: int, classes: Sequence[_LetterClass]
+    ) -> list[tuple[str, _Moves, int]]:
         """Return the next letters to try at a place, each with its moves and the next place."""
         if place not in self._ways:
             children = self._tree[place] if place >= 0 else {}

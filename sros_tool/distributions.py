@@ -21,8 +21,8 @@ ROS_DISTRO = "ROS_DISTRO"
 class Shipped(NamedTuple):
     """A DDS that a distribution ships.
 
-    ``latest`` is its latest version; ``vendor`` has the rules that sros decides by, which are those
-    of another release if this one was not tested.
+    ``latest`` is its latest version; ``vendor`` has the rules by which sros decides: the rules of
+    another release if ``latest`` was not tested.
     """
 
     product: str
@@ -75,21 +75,21 @@ class Distribution(NamedTuple):
 
     @property
     def shipped(self) -> tuple[Shipped, ...]:
-        """The DDS products that it ships, its default first."""
+        """The DDS products that the distribution ships, the default first."""
         products = (("Fast DDS", self.fast), ("Cyclone DDS", self.cyclone))
         return tuple(
-            Shipped(product, version, _decided_as(product, version), self)
+            Shipped(product, version, _tested_vendor(product, version), self)
             for product, version in products
         )
 
     @property
     def vendors(self) -> tuple[Vendor, ...]:
-        """The vendors that decide for its nodes, its default first."""
+        """The vendors that decide for nodes of the distribution, the default first."""
         return tuple(shipped.vendor for shipped in self.shipped)
 
     @property
     def zenoh(self) -> RmwZenohRelease:
-        """The release of rmw_zenoh that it ships."""
+        """The release of rmw_zenoh that the distribution ships."""
         return next(release for release in RELEASES if release.distribution.lower() == self.name)
 
     @property
@@ -163,9 +163,9 @@ def find_distribution(name: str) -> Distribution:
 
 
 def shipped_title(vendor: Vendor, distributions: Sequence[Distribution]) -> str:
-    """Return the title of a vendor, with the distributions that it decides for.
+    """Return the title of a vendor, with the distributions for which the vendor decides.
 
-    That is text such as ``Fast DDS 2.14 of Jazzy and Fast DDS 3.2 of Kilted``.
+    An example is ``Fast DDS 2.14 of Jazzy and Fast DDS 3.2 of Kilted``.
     """
     by_release: dict[str, list[str]] = {}
     for distribution in distributions:
@@ -179,7 +179,7 @@ def shipped_title(vendor: Vendor, distributions: Sequence[Distribution]) -> str:
 def selected_vendors(vendor: str, distributions: Sequence[Distribution]) -> tuple[str, ...]:
     """Return the vendor of this name, or the vendors of distributions; () if neither is given.
 
-    If both are given, the releases of the vendor that the distributions ship.
+    If both are given, the result is the releases of the vendor that the distributions ship.
 
     Raises:
         UsageError: a distribution does not ship the vendor.
@@ -199,7 +199,7 @@ def sourced_distribution(environment_value: str | None) -> Distribution | None:
 
 
 def unknown_distribution(environment: Mapping[str, str]) -> list[Note]:
-    """Return a note if $ROS_DISTRO names no distribution, so that it chooses no vendor."""
+    """Return a note if $ROS_DISTRO names an unknown distribution, and so selects no vendor."""
     name = environment.get(ROS_DISTRO, "")
     if not name or not distribution_problem(name):
         return []
@@ -209,8 +209,8 @@ def unknown_distribution(environment: Mapping[str, str]) -> list[Note]:
     return [Note("distribution.unknown", f"{text}Name the sourced distribution, such as jazzy.")]
 
 
-def _decided_as(product: str, version: str) -> Vendor:
-    """Return the tested vendor for a version: of the same release, or the latest before it."""
+def _tested_vendor(product: str, version: str) -> Vendor:
+    """Return the tested vendor with a version's release, or else with the latest one before."""
     vendors = sorted(
         (vendor for vendor in TESTED if vendor.traits.product == product),
         key=lambda vendor: _numbers(vendor.release),

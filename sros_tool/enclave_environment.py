@@ -85,8 +85,8 @@ def loadable_environment(
 
     Raises:
         UsageError: the domain, the RMW or the enclave's name is invalid.
-        KeystoreError: the enclave does not exist, a process cannot run in it, or others can read
-            its private key.
+        KeystoreError: the enclave does not exist, a process cannot run in it, or other users can
+            read its private key.
     """
     from sros_tool.distributions import unknown_distribution
     from sros_tool.keystore.known_keys import other_enclave
@@ -229,8 +229,8 @@ def _check_joining(
     """Return an enclave with its faults for a DDS vendor; for all vendors if ``vendor`` is None.
 
     Raises:
-        KeystoreError: each of these vendors refuses the enclave, and none of its own faults says
-            why.
+        KeystoreError: each of these vendors refuses the enclave for a reason that is not a fault of
+            the enclave.
     """
     from sros_tool.dds.decision.vendors import TESTED
     from sros_tool.faults import Fault
@@ -302,7 +302,7 @@ def _check_token_used(place: TokenUri, name: str, rmw: str) -> None:
 
 
 def _check_pin(place: TokenUri, name: str) -> None:
-    """Raise `KeystoreError` if the token's PIN file is readable by others, or not by this user."""
+    """Raise `KeystoreError` if other users can read a token's PIN file, or this user cannot."""
     from sros_tool.pki.token import pin_file_problem
 
     if problem := pin_file_problem(place):
@@ -317,7 +317,9 @@ def _check_pin(place: TokenUri, name: str) -> None:
 
 
 def _uses_zenoh(named: str | None, rmw: str) -> bool:
-    """Return whether a process of ``rmw``, which the user may have ``named``, uses Zenoh.
+    """Return whether a process with the RMW ``rmw`` uses Zenoh.
+
+    ``named`` is the RMW that the user named with --rmw; None if the environment chose ``rmw``.
 
     Raises:
         UsageError: the process would use an RMW that sros does not know to enforce security.
@@ -363,8 +365,8 @@ def _opened_zenoh(
     """Return the Zenoh configurations of an enclave.
 
     Raises:
-        KeystoreError: the enclave has no configuration, or one whose signature is not valid, or
-            whose rights are not those of its permissions.
+        KeystoreError: the enclave has no configuration, or the signature of a configuration is not
+            valid, or a configuration does not state the rights in the permissions.
     """
     from sros_tool.keystore.layout import PUBLIC
     from sros_tool.keystore.zenoh_files import ZenohFault, open_zenoh
@@ -422,10 +424,11 @@ def _refuse_outdated(keystore: OpenedKeystore, name: str, now: datetime) -> None
 
 
 def _choose_domain(domains: DomainSet, wanted_domain: int | None, keystore: OpenedKeystore) -> int:
-    """Return the ROS domain for a process that uses a keystore, which is for ``domains``.
+    """Return the ROS domain for a process: ``wanted_domain``, or a default.
 
-    Without ``wanted_domain``, from an option or ROS_DOMAIN_ID, this is 0, the default of ROS, if
-    the keystore is for it, else the keystore's first domain.
+    ``wanted_domain`` comes from an option or ROS_DOMAIN_ID, and ``domains`` are the domains of the
+    keystore. The default is 0, as in ROS, if the keystore has that domain, or else the first domain
+    of the keystore.
 
     Raises:
         KeystoreError: the keystore is not for ``wanted_domain``.
@@ -521,8 +524,8 @@ def _zenoh_environment(
 def _router_notes(session: Configuration | None) -> Iterator[Note]:
     """Yield a note if a session connects to a router of this machine that does not run.
 
-    A client waits for the router without any output.  A peer of rmw_zenoh starts, and reports it
-    itself.
+    A client waits for the router without any output.  A peer of rmw_zenoh starts, and itself
+    reports the missing router.
     """
     from sros_tool.zenoh.configuration import Mode
 
@@ -577,7 +580,7 @@ def target_path(text: str) -> Path:
     """Parse the absolute path of a keystore on another machine.
 
     Raises:
-        UsageError: it is not absolute, or not in its shortest form.
+        UsageError: the path is not absolute, or not in its shortest form.
     """
     path = PurePosixPath(text)
     if not path.is_absolute() or ".." in path.parts or str(path) != text or text.startswith("//"):
@@ -678,7 +681,8 @@ def node_units(
         target: the absolute path of the keystore where the units run.
         user: who runs the nodes.
         command: the program of the nodes; by default a file with the path of the enclave.
-        sros: the program sros there, which verifies an enclave before its node starts; "" for none.
+        sros: the path of sros on that machine, which verifies an enclave before the node starts; ""
+            for no such check.
 
     Raises:
         KeystoreError: a process cannot run in an enclave.
@@ -705,8 +709,8 @@ def enclave_of_node(file: Path, command: Sequence[str]) -> str:
     """Return the enclave that a policy assigns to the node which a command starts.
 
     Raises:
-        UsageError: the command names no node, or names it only if its own name is a certain one,
-            or the policy has the node in no enclave or in several.
+        UsageError: the command names no node, or renames only nodes with a certain name; or the
+            policy has the node in no enclave or in several.
         PolicyError: the policy cannot be read.
     """
     from sros_tool.names import check_namespace, is_expression
@@ -762,7 +766,7 @@ def enclave_of_node(file: Path, command: Sequence[str]) -> str:
 def _unnamed_node_error(policy: Policy, command: Sequence[str]) -> UsageError:
     """Return the error for a command that does not name its node.
 
-    A rule for a node (``-r talker:a:=b``) does not tell that the process has this node.
+    A rule for a node (``-r talker:a:=b``) does not show that the process has this node.
     """
     from sros_tool.runtime.environment import nodes_with_rules, started_nodes
 
@@ -792,8 +796,8 @@ def _unknown_node_error(
 ) -> UsageError:
     """Return the error for a command that does not show which node its program starts.
 
-    ``nodes`` is what `sros_tool.runtime.environment.possible_nodes` returns; ``found`` are the
-    enclaves of these nodes.
+    ``nodes`` is the result of `sros_tool.runtime.environment.possible_nodes`, and ``enclave_paths``
+    has the enclaves of each of these nodes.
     """
     cases = [f"{_full_name(*node)} if its own name is {own}" for own, node in nodes.items() if own]
     other = f"else {_full_name(*nodes[''])}" if "" in nodes else "else it keeps its own name"
@@ -812,11 +816,11 @@ def other_node_notes(
 ) -> tuple[Note, ...]:
     """Return a note if a command gives its nodes a name that the enclave's permissions lack.
 
-    A command without a namespace counts as one for "/", if it certainly starts nodes.  If its rules
-    depend on the node's own name, a note is returned only if none of the possible names is in the
-    permissions. If the ledger lacks the permissions, sros knows only nodes that offer their
-    standard services: then it returns a note only if the permissions have the name in another
-    namespace.
+    A command without a namespace counts as one for "/", if it certainly starts nodes.  If the
+    remapping rules depend on the node's own name, a note is returned only if none of the possible
+    names is in the permissions. If the ledger lacks the permissions, only nodes that offer their
+    standard services are known: then a note is returned only if the permissions have the name in
+    another namespace.
     """
     from sros_tool.keystore.rights import RecordedRights
     from sros_tool.policy.rights import nodes_from_text, nodes_of_rights
@@ -844,8 +848,8 @@ def _other_node_note(
 ) -> Note | None:
     """Return a note if a node is not among ``known``, the nodes of an enclave.
 
-    "" stands for any namespace or name.  If ``known`` may not be all nodes of the enclave, there is
-    a note only if a known node has this name in another namespace.
+    "" stands for any namespace or name.  Unless ``all_known`` is set, the enclave may have more
+    nodes: then a note is returned only if a known node has this name in another namespace.
     """
     from sros_tool.names import is_expression
     from sros_tool.policy.patterns import overlap

@@ -65,7 +65,7 @@ class KeystoreError(SrosError):
 
 
 class IndexDamagedError(SrosError):
-    """The index of a ledger, or a line of it, is not what the head of the ledger states."""
+    """The index of a ledger, or a line of the ledger, differs from what the ledger head states."""
 
 
 class UnavailableError(SrosError):

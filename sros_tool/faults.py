@@ -9,22 +9,22 @@ from __future__ import annotations
 import re
 from enum import Enum
 
-_RCL = "rcl 9 (security.c) and the RMWs of ROS 2 Jazzy."
-_TESTED = "Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; tested."
+_SOURCE_RCL = "rcl 9 (security.c) and the RMWs of ROS 2 Jazzy."
+_SOURCE_TESTS = "Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; tested."
 _CLOCK_BEHIND = "Often the clock of the robot is behind."
 
-_RESTORE = "Restore {path} from a backup."
-_RENEW = "Renew the enclave: `sros renew {root} {enclave}`."
+_RESTORE_FILE = "Restore {path} from a backup."
+_RENEW_ENCLAVE = "Renew the enclave: `sros renew {root} {enclave}`."
 _NEW_KEY = "Give the enclave another key: `sros renew {root} {enclave} --new-key`."
-_CLOCK = (
+_SET_CLOCK = (
     "Set the clock of this host; if the clock is right, sign again: `sros renew {root} {enclave}`."
 )
-_CLOCK_OF_CRL = (
+_SET_CLOCK_FOR_CRL = (
     "Set the clock of this host; if the clock is right, sign the list again: `sros crl {root} "
     "--refresh`, and export it to the robots again."
 )
-_SIGN = "Sign the permissions again: `sros create_permission {root} {enclave} POLICY`."
-_COMPLETE = "Create the missing file: `sros create_enclave {root} {enclave}`."
+_SIGN_PERMISSIONS = "Sign the permissions again: `sros create_permission {root} {enclave} POLICY`."
+_CREATE_MISSING_FILE = "Create the missing file: `sros create_enclave {root} {enclave}`."
 REPLACE = (
     "Replace the file: `rm {path} && sros create_enclave {root} {enclave}` links the keystore's "
     "file, or issues the file again."
@@ -33,7 +33,7 @@ _SET_DOMAIN = (
     "Set ROS_DOMAIN_ID to a domain of the keystore: `sros env {root} {enclave} --domain ID` prints "
     "the variables."
 )
-_DOMAIN = (
+_SET_OR_ADD_DOMAIN = (
     f"{_SET_DOMAIN} To add a domain, name all domains in `sros update_keystore {{root}} --domain "
     "IDS --allow-looser`."
 )
@@ -44,28 +44,30 @@ REFUSE_STRANGERS = (
 )
 """The command after which a keystore admits no process without an identity."""
 
-_IN_EXPORT = {
-    _CLOCK: "Set the clock of this host; if the clock is right, sign again in the keystore that "
-    "has the CA keys: `sros renew {root} {enclave}`. Then export the enclave again.",
-    _CLOCK_OF_CRL: "Set the clock of this host; if the clock is right, sign the list again in the "
-    "keystore that has the CA keys: `sros crl {root} --refresh`. Then export the enclave again.",
-    _DOMAIN: f"{_SET_DOMAIN} To add a domain, name all domains in the {ORIGINAL_KEYSTORE}: `sros "
-    "update_keystore KEYSTORE --domain IDS --allow-looser`. Then export the enclave again.",
+_REMEDIES_IN_EXPORT = {
+    _SET_CLOCK: "Set the clock of this host; if the clock is right, sign again in the keystore "
+    "that has the CA keys: `sros renew {root} {enclave}`. Then export the enclave again.",
+    _SET_CLOCK_FOR_CRL: "Set the clock of this host; if the clock is right, sign the list again "
+    "in the keystore that has the CA keys: `sros crl {root} --refresh`. Then export the enclave "
+    "again.",
+    _SET_OR_ADD_DOMAIN: f"{_SET_DOMAIN} To add a domain, name all domains in the "
+    f"{ORIGINAL_KEYSTORE}: `sros update_keystore KEYSTORE --domain IDS "
+    "--allow-looser`. Then export the enclave again.",
 }
 """Remedies for an export, which has no CA keys, that differ from the remedies for a keystore."""
-_GOVERNANCE = (
+_REPAIR_GOVERNANCE = (
     "Every enclave depends on it: restore {root}/enclaves/governance.p7s from a backup, or read "
     "{root}/enclaves/governance.xml and sign it again: `openssl smime -sign -text -in "
     "{root}/enclaves/governance.xml -out {root}/enclaves/governance.p7s -signer "
     "{root}/public/permissions_ca.cert.pem -inkey {root}/private/permissions_ca.key.pem`."
 )
-_RIGHT_IN_KEYSTORE = (_SIGN, _COMPLETE, REPLACE, _GOVERNANCE)
+_INTACT_IN_KEYSTORE = (_SIGN_PERMISSIONS, _CREATE_MISSING_FILE, REPLACE, _REPAIR_GOVERNANCE)
 """Remedies for faults that an export mostly has alone: files that were edited, damaged or lost."""
-_AUTHORITY = (
+_REPLACE_CA = (
     "Replace the CA and the files that expired: `sros rotate_ca {root} --finish && sros renew "
     "{root} --all-expiring 30d`; then restart all processes together."
 )
-_CRL = "Sign the list again: `sros crl {root} --refresh`, and export it to the robots again."
+_SIGN_CRL = "Sign the list again: `sros crl {root} --refresh`, and export it to the robots again."
 _AUTHORITY_FILES = ("identity_ca.cert.pem", "permissions_ca.cert.pem")
 
 
@@ -83,24 +85,24 @@ class Fault(Enum):
         "a file that an enclave needs is missing",
         "The node fails, or without Enforce runs unsecured; Fast DDS says \"couldn't find all "
         'security files!" and never names the file.',
-        _RCL,
-        _COMPLETE,
-        {"permissions.p7s": _SIGN},
+        _SOURCE_RCL,
+        _CREATE_MISSING_FILE,
+        {"permissions.p7s": _SIGN_PERMISSIONS},
     )
     LINK_DANGLING = (
         "link-dangling",
         "a file of an enclave is a broken link",
         "DDS treats it as missing. This happens when an enclave is copied without the files that "
         "it links to; `sros distribute_key` exports files in place of links.",
-        _RCL,
-        _COMPLETE,
-        {"permissions.p7s": _SIGN},
+        _SOURCE_RCL,
+        _CREATE_MISSING_FILE,
+        {"permissions.p7s": _SIGN_PERMISSIONS},
     )
     FILE_UNREADABLE = (
         "file-unreadable",
         "a file of an enclave cannot be read",
         "DDS cannot read it either.",
-        _RCL,
+        _SOURCE_RCL,
         "Give the user that runs the node permission to read the file.",
     )
     FILE_NO_FILE = (
@@ -108,20 +110,20 @@ class Fault(Enum):
         "a folder or a pipe in place of a file of an enclave",
         "DDS cannot read it. If a file to be mounted into a container does not exist, some "
         "container programs make a folder with its name.",
-        _RCL,
-        f"Remove the folder or pipe, and put the file there. {_RESTORE}",
+        _SOURCE_RCL,
+        f"Remove the folder or pipe, and put the file there. {_RESTORE_FILE}",
     )
     FILE_EMPTY = (
         "file-empty",
         "a file of an enclave is empty",
         "The content was lost, perhaps because the disk was full.",
-        _RCL,
+        _SOURCE_RCL,
         REPLACE,
         {
-            "governance.p7s": _GOVERNANCE,
+            "governance.p7s": _REPAIR_GOVERNANCE,
             "key.pem": _NEW_KEY,
-            "permissions.p7s": _SIGN,
-            **dict.fromkeys(_AUTHORITY_FILES, _RESTORE),
+            "permissions.p7s": _SIGN_PERMISSIONS,
+            **dict.fromkeys(_AUTHORITY_FILES, _RESTORE_FILE),
         },
     )
     CERTIFICATE_MALFORMED = (
@@ -130,21 +132,21 @@ class Fault(Enum):
         "Every vendor refuses it.",
         "RFC 5280; RFC 7468 (PEM).",
         REPLACE,
-        dict.fromkeys(_AUTHORITY_FILES, _RESTORE),
+        dict.fromkeys(_AUTHORITY_FILES, _RESTORE_FILE),
     )
     CERTIFICATE_EXPIRED = (
         "certificate-expired",
         "the certificate of an enclave has expired",
         "Fast DDS refuses it with an empty reason, Cyclone DDS with code 200.",
-        _TESTED,
-        _RENEW,
+        _SOURCE_TESTS,
+        _RENEW_ENCLAVE,
     )
     CERTIFICATE_NOT_YET_VALID = (
         "certificate-not-yet-valid",
         "the certificate of an enclave is not valid yet",
         f"Fast DDS refuses it with an empty reason. {_CLOCK_BEHIND}",
-        _TESTED,
-        _CLOCK,
+        _SOURCE_TESTS,
+        _SET_CLOCK,
     )
     CERTIFICATE_ISSUER = (
         "certificate-issuer",
@@ -158,21 +160,21 @@ class Fault(Enum):
         "a CA that an enclave trusts has expired",
         "Nothing that it issued or signed is accepted any more (Fast DDS: Error '10' verifying "
         "CA certificate), but Cyclone DDS 11 still accepts documents of a permissions CA.",
-        _TESTED,
-        _AUTHORITY,
+        _SOURCE_TESTS,
+        _REPLACE_CA,
     )
     CA_NOT_YET_VALID = (
         "ca-not-yet-valid",
         "a CA that an enclave trusts is not valid yet",
         f"Nothing that it issued or signed is accepted. {_CLOCK_BEHIND}",
-        _TESTED,
+        _SOURCE_TESTS,
         "Set the clock of this host.",
     )
     KEY_MALFORMED = (
         "key-malformed",
         "a private key that cannot be read",
         'Fast DDS says "Error obtaining private key".',
-        _TESTED,
+        _SOURCE_TESTS,
         _NEW_KEY,
     )
     KEY_ENCRYPTED = (
@@ -213,14 +215,14 @@ class Fault(Enum):
         "a revocation list that cannot be read",
         "With Fast DDS the node does not start, and its log has an empty reason.",
         "Fast DDS 2.6 to 3.6 (PKIDH.cpp); tested.",
-        _CRL,
+        _SIGN_CRL,
     )
     CRL_ISSUER = (
         "crl-issuer",
         "a revocation list of another CA",
         "No certificate can be verified with it, so every participant is refused.",
         "RFC 5280, 6.3.3; Fast DDS 2.6 to 3.6; tested.",
-        _CRL,
+        _SIGN_CRL,
     )
     CRL_USAGE = (
         "crl-usage",
@@ -240,21 +242,21 @@ class Fault(Enum):
         "an unknown critical extension.",
         "RFC 5280, 5.2; OpenSSL 3 (x_crl.c, x509_vfy.c); Fast DDS 2.9.1, Cyclone DDS 0.10.2; "
         "tested.",
-        _CRL,
+        _SIGN_CRL,
     )
     CRL_NOT_YET_VALID = (
         "crl-not-yet-valid",
         "a revocation list that is not valid yet",
         f"Every participant is refused. {_CLOCK_BEHIND}",
         "RFC 5280, 5.1.2.4; Fast DDS 2.14.5.",
-        _CLOCK_OF_CRL,
+        _SET_CLOCK_FOR_CRL,
     )
     CRL_EXPIRED = (
         "crl-expired",
         "a revocation list that has expired",
         "Every participant is refused, and Fast DDS does not report it.",
         "RFC 5280, 5.1.2.5; Fast DDS 2.6 to 3.6; tested.",
-        _CRL,
+        _SIGN_CRL,
     )
     CRL_LEFT_OUT = (
         "crl-left-out",
@@ -263,7 +265,7 @@ class Fault(Enum):
         "`sros run` refuses the enclave. If a file to be mounted into a container does not exist, "
         "some container programs make a folder with its name.",
         "rmw_dds_common of ROS 2 Jazzy (security.cpp).",
-        f"Move {{path}} away. {_CRL}",
+        f"Move {{path}} away. {_SIGN_CRL}",
     )
     REVOKED = (
         "revoked",
@@ -278,8 +280,8 @@ class Fault(Enum):
         "a document that is not signed",
         'Fast DDS says "Input data has not PKCS7 S/MIME format".',
         "DDS-Security 1.1, 9.4.1.1; tested.",
-        _SIGN,
-        {"governance.p7s": _GOVERNANCE},
+        _SIGN_PERMISSIONS,
+        {"governance.p7s": _REPAIR_GOVERNANCE},
     )
     SIGNATURE = (
         "signature",
@@ -288,8 +290,8 @@ class Fault(Enum):
         "DDS: PKCS7 data verification failed). With a single CA, an enclave may have signed its "
         "own permissions, which DDS accepts.",
         "DDS-Security 1.1, 9.4.1.1; Fast DDS 2.14.5; CVE-2023-24011 for Cyclone DDS 0.10.2.",
-        _SIGN,
-        {"governance.p7s": _GOVERNANCE},
+        _SIGN_PERMISSIONS,
+        {"governance.p7s": _REPAIR_GOVERNANCE},
     )
     SIGNER_NO_CA = (
         "signer-no-ca",
@@ -301,21 +303,21 @@ class Fault(Enum):
         "Unless you signed the document on purpose, treat the signer's key as stolen: `sros revoke "
         "{root} {enclave}`. If one CA is for identities and documents, use separate CAs, as "
         "the remedy of keystore.one-authority says.",
-        {"governance.p7s": f"Find out who signed the governance. {_GOVERNANCE}"},
+        {"governance.p7s": f"Find out who signed the governance. {_REPAIR_GOVERNANCE}"},
     )
     GOVERNANCE_MALFORMED = (
         "governance-malformed",
         "a governance document that cannot be read",
         'The node fails (Fast DDS: "Malformed governance file").',
         "DDS-Security 1.1, 9.4.1.2 and omg_shared_ca_governance.xsd.",
-        _GOVERNANCE,
+        _REPAIR_GOVERNANCE,
     )
     PERMISSIONS_MALFORMED = (
         "permissions-malformed",
         "a permissions document that cannot be read",
         'The node fails (Fast DDS: "Malformed permissions file"; Cyclone DDS: code 137, 138).',
         "DDS-Security 1.1, 9.4.1.3 and omg_shared_ca_permissions.xsd.",
-        _SIGN,
+        _SIGN_PERMISSIONS,
     )
     GOVERNANCE_DOMAIN = (
         "governance-domain",
@@ -323,22 +325,22 @@ class Fault(Enum):
         'The node dies with "Not found topic access rule for topic ros_discovery_info" (Fast '
         'DDS) or "Could not find domain in governance" (Cyclone DDS, code 141).',
         "DDS-Security 1.1, 9.4.1.2; tested.",
-        _DOMAIN,
+        _SET_OR_ADD_DOMAIN,
     )
     PERMISSIONS_EXPIRED = (
         "permissions-expired",
         "permissions that have expired",
         'Fast DDS says "Not found the identity subject name in permissions file", Cyclone DDS '
         "code 147.",
-        _TESTED,
-        _RENEW,
+        _SOURCE_TESTS,
+        _RENEW_ENCLAVE,
     )
     PERMISSIONS_NOT_YET_VALID = (
         "permissions-not-yet-valid",
         "permissions that are not valid yet",
         f'Fast DDS says "Not found the identity subject name in permissions file". {_CLOCK_BEHIND}',
-        _TESTED,
-        _CLOCK,
+        _SOURCE_TESTS,
+        _SET_CLOCK,
     )
     PERMISSIONS_SUBJECT = (
         "permissions-subject",
@@ -347,7 +349,7 @@ class Fault(Enum):
         "or of another enclave, were put in place.",
         'DDS-Security 1.1, 9.4.1.3; Fast DDS ("Not found the identity subject name"), Cyclone '
         "DDS code 146.",
-        _SIGN,
+        _SIGN_PERMISSIONS,
     )
     PERMISSIONS_DOMAIN = (
         "permissions-domain",
@@ -356,7 +358,7 @@ class Fault(Enum):
         "start.",
         "DDS-Security 1.1, 9.4.1.3; tested.",
         "Set ROS_DOMAIN_ID to a domain that the permissions name, or sign them for this domain. "
-        f"{_SIGN}",
+        f"{_SIGN_PERMISSIONS}",
     )
     CERTIFICATE_FILE = (
         "certificate-file",
@@ -461,9 +463,9 @@ class Fault(Enum):
         text = self.remedy_in(file)
         if "`" not in text:
             return text
-        if text in _IN_EXPORT:
-            return _IN_EXPORT[text]
-        if text in _RIGHT_IN_KEYSTORE:
+        if text in _REMEDIES_IN_EXPORT:
+            return _REMEDIES_IN_EXPORT[text]
+        if text in _INTACT_IN_KEYSTORE:
             return (
                 f"Export the enclave again from the {ORIGINAL_KEYSTORE}: `sros distribute_key "
                 "{root} {enclave} TARGET --force`. Only if `sros check {root}` finds the same "
@@ -473,10 +475,10 @@ class Fault(Enum):
 
 
 def remedy_in_original_keystore(remedy: str) -> str:
-    """Return the remedy for an export: to do ``remedy`` in the keystore with the CA keys.
+    """Return the remedy for an export: do ``remedy`` in the original keystore, then export again.
 
-    A remedy with more steps after the export is returned whole, with a sentence that names the
-    keystore.
+    If ``remedy`` itself says to export and to do more afterwards, the result is ``remedy``, with a
+    sentence on which keystore is meant.
     """
     if "export the enclave again" in remedy.lower().removesuffix("export the enclave again."):
         return f"{remedy} KEYSTORE is the {ORIGINAL_KEYSTORE}."

@@ -37,7 +37,7 @@ def staged_file(
         like: a file to copy the permission bits and, if permitted, the owner from.
 
     Raises:
-        OSError: the file cannot be written; what is at ``target`` stays.
+        OSError: the file cannot be written; the earlier file at ``target`` stays.
     """
     with Folder(target.parent) as folder:
         prefix = f".{target.name[:200]}.sros-"
@@ -95,7 +95,7 @@ def write_new_file(
 
     Raises:
         FileExistsError: ``path`` exists already, perhaps as a link that leads nowhere.
-        OSError: the file cannot be written; nothing is left of it.
+        OSError: the file cannot be written; no part of the file is left.
     """
     with Folder(path.parent) as folder:
         handle = folder.create(path.name, 0o600)
@@ -114,7 +114,7 @@ def write_new_file(
 
 @contextlib.contextmanager
 def new_files(root: Path, files: Mapping[str, bytes]) -> Iterator[Folder]:
-    """Write new files below the folder ``root``; if the body fails, nothing is left of them.
+    """Write new files below the folder ``root``; remove the new files if the ``with`` body fails.
 
     Args:
         root: an existing folder, which is yielded.
@@ -183,18 +183,22 @@ def replace_file(path: Path, data: bytes) -> None:
         OSError: the file cannot be written; the old content stays.
     """
     target, follows_links = _follow_own_links(path)
-    state = _state(path, follow=follows_links)
+    state = _file_state(path, follow=follows_links)
     if (
         state
         and follows_links
         and not stat.S_ISREG(state.st_mode)
         and not stat.S_ISDIR(state.st_mode)
     ):
-        if stat.S_ISFIFO(state.st_mode) and not _trusted(state) and _is_shared(target.parent):
+        if (
+            stat.S_ISFIFO(state.st_mode)
+            and not _is_of_trusted_user(state)
+            and _is_shared(target.parent)
+        ):
             raise PermissionError(errno.EACCES, "it is a pipe of another user", str(path))
         _write_to(path, state, data)
         return
-    keep = state and follows_links and (_trusted(state) or not _is_shared(target.parent))
+    keep = state and follows_links and (_is_of_trusted_user(state) or not _is_shared(target.parent))
     with staged_file(target, data, mode=0o666, like=state if keep else None) as put_in_place:
         put_in_place()
     done = "replaced" if state else "wrote"
@@ -213,25 +217,28 @@ def _write_to(path: Path, state: os.stat_result, data: bytes) -> None:
 
 
 def _follow_own_links(path: Path) -> tuple[Path, bool]:
-    """Resolve links of this user or root; return the target, and whether no other link was met."""
+    """Follow links of this user or root; return the path reached, and whether it is not a link.
+
+    A link of another user is not followed.
+    """
     for _ in range(_MOST_LINKS):
-        state = _state(path, follow=False)
+        state = _file_state(path, follow=False)
         if not state or not stat.S_ISLNK(state.st_mode):
             return path, True
-        if not _trusted(state):
+        if not _is_of_trusted_user(state):
             return path, False
         path = path.parent / path.readlink()
     raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), str(path))
 
 
-def _state(path: Path, *, follow: bool) -> os.stat_result | None:
+def _file_state(path: Path, *, follow: bool) -> os.stat_result | None:
     try:
         return path.stat(follow_symlinks=follow)
     except FileNotFoundError:
         return None
 
 
-def _trusted(state: os.stat_result) -> bool:
+def _is_of_trusted_user(state: os.stat_result) -> bool:
     return state.st_uid in (0, os.geteuid())
 
 
@@ -291,19 +298,19 @@ def parse_toml(text: str, longest: int = _LONGEST_DOCUMENT) -> dict[str, Any]:
 _PACKAGE = Path(__file__).resolve().parent
 
 
-def _shipped(name: str) -> Path:
+def _shipped_folder(name: str) -> Path:
     inside = _PACKAGE / name
     return inside if inside.is_dir() else _PACKAGE.parent / name
 
 
 def policies_dir() -> Path:
     """Return the folder of the example policies and the common files that they include."""
-    return _shipped("policies")
+    return _shipped_folder("policies")
 
 
 def templates_dir() -> Path:
     """Return the folder of the keystore templates, one TOML file each."""
-    return _shipped("keystore_templates")
+    return _shipped_folder("keystore_templates")
 
 
 def unpacked_dds_dir() -> Path:

@@ -24,9 +24,9 @@ from sros_tool.errors import KeystoreError
 if TYPE_CHECKING:
     import ctypes
 
-_FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC
-_NEW_FILE = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
-_OLD_FILE = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+_FOLDER_FLAGS = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC
+_NEW_FILE_FLAGS = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
+_OLD_FILE_FLAGS = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
 _MOST_OPEN = 64
 _MOST_BYTES = 128 * 1024 * 1024
 _RENAME_EXCHANGE = 2
@@ -46,10 +46,10 @@ class Folder:
     def __init__(self, path: Path, *, for_owner: bool = False) -> None:
         """Open the folder at ``path``, which may itself be a symbolic link: the user named it.
 
-        With ``for_owner``, what root makes in it belongs to the owner of the folder.
+        With ``for_owner``, files that root makes in the folder belong to the owner of the folder.
         """
         self.path = path
-        self._handles = {"": os.open(path, _FOLDER)}
+        self._handles = {"": os.open(path, _FOLDER_FLAGS)}
         state = os.fstat(self._handles[""])
         self._owner = (state.st_uid, state.st_gid)
         self._hand_over = for_owner and os.geteuid() == 0 and self._owner != (0, os.getegid())
@@ -136,7 +136,7 @@ class Folder:
         """Open ``path`` for reading, whatever its file type; return the file object."""
         parent, name = self._folder_and_name(path)
         with self._adding_path_to_errors(path):
-            return open(os.open(name, _OLD_FILE, dir_fd=parent), "rb")
+            return open(os.open(name, _OLD_FILE_FLAGS, dir_fd=parent), "rb")
 
     def read_inside(self, path: str) -> bytes:
         """Return the content of a file, as `read` does, also through links that stay in the folder.
@@ -173,7 +173,7 @@ class Folder:
         """
         parent, name = self._folder_and_name(path)
         with self._adding_path_to_errors(path):
-            handle = os.open(name, _NEW_FILE, mode, dir_fd=parent)
+            handle = os.open(name, _NEW_FILE_FLAGS, mode, dir_fd=parent)
             if self._hand_over:
                 os.fchown(handle, *self._owner)
         return handle
@@ -203,7 +203,7 @@ class Folder:
         except FileExistsError:
             parent, name = self._folder_and_name(path)
             with self._adding_path_to_errors(path):
-                return os.open(name, _OLD_FILE, dir_fd=parent)
+                return os.open(name, _OLD_FILE_FLAGS, dir_fd=parent)
 
     def symlink(self, target: str, path: str) -> None:
         """Make the symbolic link ``path`` with the text ``target``."""
@@ -222,12 +222,12 @@ class Folder:
     def close_to_others(self, path: str) -> None:
         """Remove all permissions of group and others from a file or folder (chmod go=).
 
-        It stays as it is if it has another owner than this folder, or another hard link, which may
-        be outside of this folder.
+        A file with another owner than this folder, or with another hard link, stays unchanged: the
+        link may be outside of this folder.
         """
         parent, name = self._folder_and_name(path)
         with self._adding_path_to_errors(path):
-            handle = os.open(name, _OLD_FILE, dir_fd=parent)
+            handle = os.open(name, _OLD_FILE_FLAGS, dir_fd=parent)
             try:
                 state = os.fstat(handle)
                 if state.st_uid == self._owner[0] and _has_one_name(state):
@@ -263,20 +263,20 @@ class Folder:
 
     def replace(self, source: str, target: str) -> None:
         """Rename ``source`` to ``target``; replace an existing file or link."""
-        source_handle, name, target_handle, new = self._two_places(source, target)
+        source_handle, name, target_handle, new = self._two_folders_and_names(source, target)
         with self._adding_path_to_errors(target):
             os.replace(name, new, src_dir_fd=source_handle, dst_dir_fd=target_handle)
 
     def rename(self, source: str, target: str) -> None:
         """Rename the folder ``source`` to ``target``, which is missing or an empty folder."""
-        source_handle, name, target_handle, new = self._two_places(source, target)
+        source_handle, name, target_handle, new = self._two_folders_and_names(source, target)
         with self._adding_path_to_errors(target):
             os.rename(name, new, src_dir_fd=source_handle, dst_dir_fd=target_handle)
         self.forget(source)
 
     def link(self, source: str, target: str) -> None:
         """Make ``target`` a second name (a hard link) of the file ``source``."""
-        source_handle, name, target_handle, new = self._two_places(source, target)
+        source_handle, name, target_handle, new = self._two_folders_and_names(source, target)
         with self._adding_path_to_errors(target):
             os.link(
                 name, new, src_dir_fd=source_handle, dst_dir_fd=target_handle, follow_symlinks=False
@@ -288,7 +288,7 @@ class Folder:
         Return False, without a change, if the kernel, the C library or the file system does not
         support it.
         """
-        return exchange(*self._two_places(first, second))
+        return exchange(*self._two_folders_and_names(first, second))
 
     def unlink(self, path: str, *, missing_ok: bool = False) -> None:
         """Remove the file or link at ``path``."""
@@ -334,7 +334,7 @@ class Folder:
             return handle
         parent, name = self._find(path)
         try:
-            handle = os.open(name, _FOLDER | os.O_NOFOLLOW, dir_fd=parent)
+            handle = os.open(name, _FOLDER_FLAGS | os.O_NOFOLLOW, dir_fd=parent)
         except OSError as error:
             if error.errno in (errno.ELOOP, errno.ENOTDIR):
                 link = self.link_target(path) is not None
@@ -350,7 +350,9 @@ class Folder:
             self.forget()
         return self._find(path)
 
-    def _two_places(self, first_path: str, second_path: str) -> tuple[int, str, int, str]:
+    def _two_folders_and_names(
+        self, first_path: str, second_path: str
+    ) -> tuple[int, str, int, str]:
         """Return `_folder_and_name` of two paths, whose folders stay open together."""
         return (*self._folder_and_name(first_path), *self._find(second_path))
 
@@ -388,7 +390,7 @@ def make_folders(path: Path) -> list[Path]:
     """Make the folder at ``path`` and its parents; return the folders that were made, inner first.
 
     Raises:
-        OSError: one of them cannot be made; nothing is left of the others.
+        OSError: a folder cannot be made; the folders that were made before are removed.
     """
     paths: list[Path] = []
     missing = [folder for folder in (path, *path.parents) if not folder.exists()]
@@ -404,7 +406,7 @@ def make_folders(path: Path) -> list[Path]:
 
 
 def remove_folders(paths: list[Path]) -> None:
-    """Remove each folder that is empty, in this order."""
+    """Remove the folders in ``paths`` that are empty, in the given order."""
     for path in paths:
         with contextlib.suppress(OSError):
             path.rmdir()

@@ -1,9 +1,9 @@
 """A launch action of ROS 2 that starts each node in the enclave that its policy names.
 
 In Python ``SecuredNodes(keystore="keystore", policy="policy.xml")`` from this module, in XML
-``<secured_nodes keystore="keystore" policy="policy.xml"/>``, before the nodes: it applies to the
-nodes that follow in its launch file and group, also in included files.  ``ros2 launch --secured
-KEYSTORE POLICY_FILE`` puts it before a launch file.
+``<secured_nodes keystore="keystore" policy="policy.xml"/>``, before the nodes: the action applies
+to the nodes that follow in the same launch file and group, also in included files.  ``ros2 launch
+--secured KEYSTORE POLICY_FILE`` puts it before a launch file.
 
 This is the only module that imports ``launch``, and only ``launch`` and ``ros2 launch`` import it,
 by the entry points ``launch.frontend.launch_extension`` and ``ros2launch.option``.
@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 
 _PREFIX, _FILTER = "launch-prefix", "launch-prefix-filter"
 """Launch configurations: a prefix, and a pattern of the commands that get it."""
-_RUN = [sys.executable, "-P", "-m", "sros_tool", "run"]
-_prepare = Executable.prepare
+_RUN_COMMAND = [sys.executable, "-P", "-m", "sros_tool", "run"]
+_prepare_without_label = Executable.prepare
 
 
 def _prepare_labeled(self: Any, context: LaunchContext, action: Action) -> None:
@@ -38,9 +38,9 @@ def _prepare_labeled(self: Any, context: LaunchContext, action: Action) -> None:
 
     Launch labels a process by the first word of its command line, the prefix included.
     """
-    _prepare(self, context, action)
+    _prepare_without_label(self, context, action)
     command = self.final_cmd
-    if self.name is None and command[: len(_RUN)] == _RUN:
+    if self.name is None and command[: len(_RUN_COMMAND)] == _RUN_COMMAND:
         number = self.final_name.rpartition("-")[2]
         program_name = Path(command[command.index("--") + 1]).name
         self._Executable__final_name = f"{program_name}-{number}"
@@ -50,10 +50,11 @@ def _prepare_labeled(self: Any, context: LaunchContext, action: Action) -> None:
 class SecuredNodes(Action):  # type: ignore[misc]  # launch has no types where it is missing
     """Launch action that starts every later process with ``sros run --policy``, in its enclave.
 
-    It sets the prefix of commands, in front of an existing prefix such as a debugger's.  Processes
-    with a prefix of their own get variables with which no node starts.  Launch itself has a node if
-    it talks to other nodes, such as lifecycle nodes and composable nodes: this node starts in
-    ``enclave``, by default the enclave in which the policy has the node ``launch_ros_*``.
+    The action sets the prefix of commands, in front of an existing prefix such as that of a
+    debugger.  Processes with a prefix of their own get environment variables with which no node
+    starts.  Launch itself has a node if it talks to other nodes, such as lifecycle nodes and
+    composable nodes: this node starts in ``enclave``, by default the enclave in which the policy
+    has the node ``launch_ros_*``.
     """
 
     def __init__(
@@ -95,7 +96,7 @@ class SecuredNodes(Action):  # type: ignore[misc]  # launch has no types where i
                 f"secured_nodes cannot be used with {_FILTER}: the processes that it leaves out "
                 "would be in no enclave. Leave the filter out."
             )
-        secured = _secured_launch_actions(Path(keystore), Path(policy), enclave)
+        secured = _launch_node_environment(Path(keystore), Path(policy), enclave)
         if secured:
             from launch_ros.ros_adapters import get_ros_adapter
 
@@ -108,14 +109,14 @@ class SecuredNodes(Action):  # type: ignore[misc]  # launch has no types where i
                 context.environment.update(before)
         context.environment.update(REFUSING)
         root, file = (str(Path(path).absolute()) for path in (keystore, policy))
-        run_command = [*_RUN, root, "--policy", file, "--"]
+        run_command = [*_RUN_COMMAND, root, "--policy", file, "--"]
         prefix = context.launch_configurations.get(_PREFIX, "")
         context.launch_configurations[_PREFIX] = f"{shlex.join(run_command)} {prefix}".rstrip()
         # Set here, so that merely loading this module changes nothing.
         Executable.prepare = _prepare_labeled
 
 
-def _secured_launch_actions(
+def _launch_node_environment(
     keystore: Path, policy: Path, enclave: str
 ) -> EnclaveEnvironment | None:
     """Return the environment of the node of launch, or None if it has no enclave.
@@ -167,7 +168,7 @@ class SecuredOption:
             raise RuntimeError("--secured cannot be used with --launch-prefix.")
 
     def prelaunch(self, description: LaunchDescription, args: Namespace) -> tuple[Any]:
-        """Return the launch description, with `SecuredNodes` in front if it was asked for."""
+        """Return the launch description, with `SecuredNodes` in front if the option was given."""
         if args.secured:
             keystore, policy = args.secured
             secured = SecuredNodes(keystore=keystore, policy=policy)

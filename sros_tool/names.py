@@ -48,7 +48,7 @@ def node_of_service(service: str) -> str:
 
 
 def nodes_served(rights: Iterable[tuple[str, str]]) -> tuple[str, ...]:
-    """Return the full names of the nodes whose standard services these (right, name) offer."""
+    """Return the full names of the nodes whose standard services ``rights`` (right, name) serve."""
     nodes = {node_of_service(name) for right, name in rights if right == "reply"}
     return tuple(sorted(nodes - {""}))
 
@@ -97,7 +97,7 @@ _TOKEN = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")
 _EXPRESSION = re.compile(
     r"(?:~(?=/|\Z))?(?:[A-Za-z0-9_/*?]|\[!?[A-Za-z0-9_/]+(?:-[A-Za-z0-9_]+)*\])*\Z"
 )
-_RANGE = re.compile(r"(.)-(.)")
+_SET_RANGE = re.compile(r"(.)-(.)")
 _MAX_NAMESPACE = 245
 """Maximum length of a node's namespace, in characters (RMW_NAMESPACE_MAX_LENGTH)."""
 _MAX_NODE_NAME = 255
@@ -115,7 +115,7 @@ def distribution_problem(name: str) -> str:
 def has_type_descriptions(distribution: str) -> bool:
     """Return whether nodes of a ROS 2 distribution offer ``~/get_type_description``.
 
-    They do since Iron (its update of July 2023: rcl 6.0.3, rclcpp 21.0.2, rclpy 4.1.2), and in a
+    Nodes do since Iron (its update of July 2023: rcl 6.0.3, rclcpp 21.0.2, rclpy 4.1.2), and in a
     distribution that sros does not know.
     """
     known = DISTRIBUTIONS
@@ -207,7 +207,7 @@ def expression_problem(text: str) -> str:
         return "DDS vendors interpret [^...] and [:class:] differently; write [!...] or [abc]."
     if not _EXPRESSION.match(text):
         return "It contains a character that is not allowed in ROS names."
-    if any(first > last for first, last in _RANGE.findall(text)):
+    if any(first > last for first, last in _SET_RANGE.findall(text)):
         return "It contains a range of characters that runs backwards."
     if "//" in text:
         return "It contains '//'."
@@ -317,12 +317,12 @@ GOAL = f"{ACTION_SEPARATOR}send_goal"
 SERVICE_ENDS = {"rq": "Request", "rr": "Reply"}
 """Prefix and suffix of the DDS topics of a service: requests and replies."""
 
-_TOPIC = ("rt", "")
+_TOPIC_AFFIXES = ("rt", "")
 _REQUESTS, _REPLIES = SERVICE_ENDS.items()
 _Ends = tuple[tuple[str, str], ...]
 TOPIC_ENDS: dict[str, tuple[_Ends, _Ends]] = {
-    "publish": ((_TOPIC,), ()),
-    "subscribe": ((), (_TOPIC,)),
+    "publish": ((_TOPIC_AFFIXES,), ()),
+    "subscribe": ((), (_TOPIC_AFFIXES,)),
     "request": ((_REQUESTS,), (_REPLIES,)),
     "reply": ((_REPLIES,), (_REQUESTS,)),
 }

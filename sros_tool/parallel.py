@@ -1,7 +1,8 @@
 """Run a function over slices of a list in forked workers.
 
 Signing is limited by the CPU, and forked workers share all data that the parent read and checked.
-They also share its lock on the keystore: the lock is held until the last worker has exited.
+The workers also share the parent's lock on the keystore: the lock is held until the last worker has
+exited.
 """
 
 from __future__ import annotations
@@ -159,8 +160,8 @@ def _fork(
 ) -> None:
     """Fork a worker, and add its process id and the pipe for its result to ``workers``.
 
-    Signals are blocked meanwhile: a signal between the two steps would leave a worker running that
-    ``workers`` does not list.
+    Signals are blocked during both steps: a signal between the two steps would leave a worker
+    running that ``workers`` does not list.
     """
     import pickle
 
@@ -207,7 +208,7 @@ def end_with_parent() -> None:
 def end_with_starter() -> Callable[[], None]:
     """Return a function for a child process to call first.
 
-    It makes the kernel kill the child when this process ends.
+    The function makes the kernel kill the child when this process ends.
     """
     import ctypes  # noqa: F401 - here, because a lock may be held when the child is forked
 
@@ -221,7 +222,7 @@ def end_with_starter() -> Callable[[], None]:
     return follow
 
 
-def _end_text(exit_code: int) -> str:
+def _exit_text(exit_code: int) -> str:
     """Return how a worker ended; an ``exit_code`` below 0 is a signal."""
     if exit_code >= 0:
         return f"It exited with status {exit_code}."
@@ -236,7 +237,7 @@ def _collect(worker: int, pipe: int) -> Result:  # type: ignore[type-var]
     if not message:
         raise SrosError(
             "a worker process died",
-            _end_text(os.waitstatus_to_exitcode(status)),
+            _exit_text(os.waitstatus_to_exitcode(status)),
             "Try again.",
         )
     import pickle

@@ -47,7 +47,7 @@ class Metric:
 
 
 class KeystoreMetrics(NamedTuple):
-    """The metrics of a keystore. With ``-o FILE`` they are written there as text, too."""
+    """The metrics of a keystore. ``-o FILE`` also writes the metrics to a file, as text."""
 
     keystore: NamedKeystore
     metrics: Sequence[Metric]
@@ -59,7 +59,7 @@ class KeystoreMetrics(NamedTuple):
 
 
 def render_metrics(metrics: Iterable[Metric]) -> str:
-    """Return metrics as text, each with its help and its type; those without samples are left out.
+    """Return metrics as text with help and type; metrics without samples are left out.
 
     Labels can hold names of files.  Characters that cannot be printed, and bytes that are not
     UTF-8, become visible escapes, because readers refuse the whole text for a single such byte.
@@ -69,7 +69,7 @@ def render_metrics(metrics: Iterable[Metric]) -> str:
     for metric in metrics:
         series: dict[str, int | float] = {}
         for sample in metric.samples:
-            series.setdefault(_series(metric.name, sample.labels), sample.value)
+            series.setdefault(_series_text(metric.name, sample.labels), sample.value)
         if not series:
             continue
         lines += [f"# HELP {metric.name} {_escaped(metric.help)}", f"# TYPE {metric.name} gauge"]
@@ -77,7 +77,7 @@ def render_metrics(metrics: Iterable[Metric]) -> str:
     return "".join(f"{line}\n" for line in lines)
 
 
-def _series(name: str, labels: Mapping[str, str]) -> str:
+def _series_text(name: str, labels: Mapping[str, str]) -> str:
     pairs = ",".join(f'{label}="{_quoted(value)}"' for label, value in labels.items())
     return f"{name}{{{pairs}}}" if pairs else name
 

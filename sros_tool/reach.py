@@ -42,8 +42,8 @@ class Unguarded:
     """DDS topics that need no right in one direction (publish or subscribe).
 
     ``topic`` is an expression; ``without`` are expressions of earlier rules that protect a part of
-    these topics.  ``domains`` are the ROS domains where that is so; None stands for every domain.
-    With ``join_needs_right``, only enclaves with a right in a domain can join it.
+    these topics.  ``domains`` are the ROS domains in which no right is needed; None stands for
+    every domain. With ``join_needs_right``, only enclaves with a right in a domain can join it.
     """
 
     direction: str
@@ -158,7 +158,7 @@ class _Access:
 class _Direction:
     """The accesses of all enclaves in one direction: either all writers or all readers.
 
-    They are indexed by exact topic, or by the text before the first wildcard.
+    The accesses are indexed by exact topic, or by the text before the first wildcard.
     """
 
     def __init__(self, ends: Iterable[_Access]) -> None:
@@ -177,7 +177,8 @@ class _Direction:
     def possibly_overlapping(self, topic: str) -> Iterator[_Access]:
         """Yield the accesses whose topics may overlap ``topic``, which can be a wildcard.
 
-        Only the text before the first wildcard is compared, so some of them do not overlap.
+        Only the text before the first wildcard is compared, so some of the accesses do not overlap
+        ``topic``.
         """
         prefix = literal_prefix(topic)
         if prefix == topic:
@@ -199,7 +200,7 @@ def _starting(ordered: list[str], prefix: str) -> Iterator[str]:
         yield ordered[index]
 
 
-_Followed = set[tuple[str, tuple[str, ...], str, DomainSet | None]]
+_FollowedTopics = set[tuple[str, tuple[str, ...], str, DomainSet | None]]
 
 
 class Network:
@@ -209,8 +210,8 @@ class Network:
     are topics (ROS names) to ignore, ``questions`` are services (names or wildcards) whose requests
     are ignored.  All enclaves in ``everybody`` may use the ``unguarded`` topics, independently of
     their rights, in the domains that they can join.  ``links`` are the links between several Zenoh
-    routers: enclaves at different routers are connected only by what these routers pass on to each
-    other.
+    routers: enclaves at different routers are connected only by the names that these routers pass
+    on to each other.
     """
 
     def __init__(
@@ -258,10 +259,10 @@ class Network:
     def links(self, enclave: str, known: Container[str]) -> Iterator[tuple[str, Callable[[], Hop]]]:
         """Yield each enclave that ``enclave`` can influence directly, with a function for the hop.
 
-        The function searches for the hop's name, which takes long.  Enclaves that are ``known`` by
-        then are left out.
+        The function searches for the name of the hop, which takes long.  Enclaves that are
+        ``known`` by then are left out.
         """
-        for writer, reader in self._meeting(enclave, True, set(), known):
+        for writer, reader in self._access_pairs(enclave, True, set(), known):
             if reader.enclave != enclave and self._carries_a_topic(writer, reader):
                 yield reader.enclave, partial(self._hop_between, writer, reader)
 
@@ -282,16 +283,16 @@ class Network:
         return Reach(enclave, self.influenced_by({enclave}), self.influencers_of({enclave}))
 
     def influenced_by(self, enclaves: Collection[str]) -> dict[str, HopPath]:
-        """Return all others that these enclaves can influence, each with a shortest path."""
+        """Return the other enclaves that ``enclaves`` can influence, each with a shortest path."""
         return self._search(enclaves, True)
 
     def influencers_of(self, enclaves: Collection[str]) -> dict[str, HopPath]:
-        """Return all others that can influence these enclaves, each with a shortest path."""
+        """Return the other enclaves that can influence ``enclaves``, each with a shortest path."""
         return self._search(enclaves, False)
 
     def _search(self, start_enclaves: Collection[str], forward: bool) -> dict[str, HopPath]:
         paths: dict[str, HopPath] = dict.fromkeys(sorted(start_enclaves), ())
-        followed: _Followed = set()
+        followed: _FollowedTopics = set()
         queue = deque(paths)
         while queue:
             enclave = queue.popleft()
@@ -303,19 +304,19 @@ class Network:
         return {enclave: path for enclave, path in paths.items() if path}
 
     def _steps(
-        self, enclave: str, forward: bool, followed: _Followed, known: Container[str]
+        self, enclave: str, forward: bool, followed: _FollowedTopics, known: Container[str]
     ) -> Iterator[Hop]:
         """Yield the hops from an enclave (``forward``) or to an enclave, except ``known`` enclaves.
 
         ``followed`` are the topics whose hops were yielded earlier, and so lead to ``known``
         enclaves only.  The topics of this enclave are added to them.
         """
-        for writer, reader in self._meeting(enclave, forward, followed, known):
+        for writer, reader in self._access_pairs(enclave, forward, followed, known):
             if name := self._carried_topic(writer, reader):
                 yield _hop(writer, reader, name)
 
-    def _meeting(
-        self, enclave: str, forward: bool, followed: _Followed, known: Container[str]
+    def _access_pairs(
+        self, enclave: str, forward: bool, followed: _FollowedTopics, known: Container[str]
     ) -> Iterator[tuple[_Access, _Access]]:
         """Yield the accesses of writers and readers that `_steps` has to compare."""
         directions = ("publish", "subscribe") if forward else ("subscribe", "publish")
@@ -463,7 +464,7 @@ def _ros_part(topic: str, prefix: str, end: str) -> str:
     return ""
 
 
-def _in_ros_terms(topic: str) -> tuple[str, str, str]:
+def _ros_kind_right_name(topic: str) -> tuple[str, str, str]:
     """Return kind, right of the writer, and ROS name for a DDS topic or expression."""
     kind, right, end = _WRITER_RIGHTS.get(topic[:2], ("", "", ""))
     name = _ros_part(topic, topic[:2], end) if kind else ""
@@ -476,6 +477,6 @@ def _in_ros_terms(topic: str) -> tuple[str, str, str]:
 
 
 def _hop(writer: _Access, reader: _Access, topic: str) -> Hop:
-    kind, right, name = _in_ros_terms(topic)
-    ends = (_in_ros_terms(end.topic)[2] for end in (writer, reader))
+    kind, right, name = _ros_kind_right_name(topic)
+    ends = (_ros_kind_right_name(end.topic)[2] for end in (writer, reader))
     return Hop(writer.enclave, reader.enclave, kind, right, name, *ends)

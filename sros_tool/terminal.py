@@ -12,13 +12,15 @@ from collections.abc import Callable
 from functools import cache
 from typing import NamedTuple
 
-_CONTROLS = [
+_CONTROL_CODES = [
     *(code for code in range(0x20) if chr(code) not in "\n\t"),
     *range(0x7F, 0xA0),  # DEL, and C1, which holds CSI as one character
     *(0x061C, 0x200E, 0x200F, *range(0x202A, 0x202F), *range(0x2066, 0x206A)),  # bidirectional
     *(0x2028, 0x2029),  # ends of lines
 ]
-_BYTES = range(0xDC80, 0xDD00)  # bytes of names that are not UTF-8; 0x9B is CSI to some terminals
+_UNDECODED_BYTES = range(
+    0xDC80, 0xDD00
+)  # bytes of names that are not UTF-8; 0x9B is CSI to some terminals
 _COLORS = {
     "error": "red",
     "warning": "yellow",
@@ -60,14 +62,16 @@ def log_step(level: str, module: str, text: str, *args: object) -> None:
 
 @cache
 def _escapes() -> dict[int, str]:
-    escapes = {code: f"\\x{code:02x}" if code < 0x100 else f"\\u{code:04x}" for code in _CONTROLS}
+    escapes = {
+        code: f"\\x{code:02x}" if code < 0x100 else f"\\u{code:04x}" for code in _CONTROL_CODES
+    }
     escapes |= {code: f"\\u{code:04x}" for code in (*range(0xD800, 0xE000), 0xFFFE, 0xFFFF)}
-    return escapes | {code: f"\\x{code - 0xDC00:02x}" for code in _BYTES}
+    return escapes | {code: f"\\x{code - 0xDC00:02x}" for code in _UNDECODED_BYTES}
 
 
 @cache
 def _json_escapes() -> dict[int, str]:
-    return {code: f"\\u{code:04x}" for code in (*_CONTROLS, *range(0xD800, 0xE000))}
+    return {code: f"\\u{code:04x}" for code in (*_CONTROL_CODES, *range(0xD800, 0xE000))}
 
 
 def visible_json(document: str) -> str:
@@ -77,12 +81,12 @@ def visible_json(document: str) -> str:
 
 def echo(*parts: str | Colored, err: bool = False) -> None:
     """Print one line, on standard error with ``err``."""
-    _print(parts, visible_line, err=err)
+    _print_parts(parts, visible_line, err=err)
 
 
 def echo_lines(*parts: str | Colored, err: bool = False) -> None:
-    """Print several lines that sros split itself, on standard error with ``err``."""
-    _print(parts, visible, err=err)
+    """Print several lines, in which only sros added line feeds, on standard error with ``err``."""
+    _print_parts(parts, visible, err=err)
 
 
 def echo_document(document: str | bytes) -> None:
@@ -119,7 +123,9 @@ def ask_secret(name: str, *, confirm: bool) -> str:
     return str(answer)
 
 
-def _print(parts: tuple[str | Colored, ...], shown: Callable[[str], str], *, err: bool) -> None:
+def _print_parts(
+    parts: tuple[str | Colored, ...], shown: Callable[[str], str], *, err: bool
+) -> None:
     import click
 
     texts = (

@@ -49,8 +49,8 @@ def permissions_for(
     The allow rule also has ``ros_discovery_info``, which every ROS 2 participant publishes and
     subscribes: no participant starts without that right.
 
-    A large document lists no name that a wildcard of the same list matches anyway.  A smaller one
-    has every name of the policy, so that it can be read next to it.
+    A large document lists no name that a wildcard of the same list matches anyway.  A smaller
+    document has every name of the policy, so that people can compare both.
     """
     allowed, denied = _Topics(), _Topics()
     for profile in enclave.all_profiles():
@@ -94,10 +94,12 @@ class _Topics:
         self.subscribe = needed_expressions(self.subscribe)
 
     def rule(self, *, allow: bool, domains: DomainSet) -> Rule:
-        return Rule(allow, domains, _criteria(self.publish), _criteria(self.subscribe))
+        return Rule(
+            allow, domains, _sorted_criteria(self.publish), _sorted_criteria(self.subscribe)
+        )
 
 
-def _criteria(topics: set[str]) -> tuple[Criteria, ...]:
+def _sorted_criteria(topics: set[str]) -> tuple[Criteria, ...]:
     return (Criteria(tuple(sorted(topics))),) if topics else ()
 
 
@@ -130,7 +132,7 @@ def governance_for(protection: DomainProtection, domains: DomainSet) -> Governan
             DomainRule(
                 domains=domains,
                 topic_access_rules=tuple(rules),
-                **_values(protection, DomainRule),
+                **_rule_attributes(protection, DomainRule),
             ),
         )
     )
@@ -140,7 +142,7 @@ def hidden_protections(protection: DomainProtection) -> list[tuple[str, str]]:
     """Return pairs of protected names ("topic /camera/*") where the second hides the first.
 
     The protection of the first name never applies, because another rule decides on each of its DDS
-    topics.  Narrow rules come first, so this is a rule for the same topics.
+    topics.  Narrow rules come first, so the two rules are for the same topics.
     """
     protections = []
     earlier: list[tuple[str, str]] = []
@@ -157,7 +159,10 @@ def hidden_protections(protection: DomainProtection) -> list[tuple[str, str]]:
 
 
 def protected_topics(kind: str, name: str) -> list[str]:
-    """Return the DDS topics of a topic, service or action, of both sides; ``kind`` is plural."""
+    """Return the DDS topics, in both directions, of a topic, service or action.
+
+    ``kind`` is "topics", "services" or "actions".
+    """
     expressions: dict[str, None] = {}
     for right in RIGHTS[kind]:
         names = dds_names(right, expand(name, "/", ""))
@@ -166,10 +171,10 @@ def protected_topics(kind: str, name: str) -> list[str]:
 
 
 def _topic_rule(expression: str, protection: TopicProtection) -> TopicRule:
-    return TopicRule(topic_expression=expression, **_values(protection, TopicRule))
+    return TopicRule(topic_expression=expression, **_rule_attributes(protection, TopicRule))
 
 
-def _values(
+def _rule_attributes(
     protection: DomainProtection | TopicProtection, rule: type[DomainRule | TopicRule]
 ) -> dict[str, Any]:
     """Map the name of each attribute of a rule to its value in ``protection``.
@@ -220,7 +225,7 @@ def protection_for(governance: Governance) -> DomainProtection | None:
     by_protection: dict[TopicProtection, list[str]] = {}
     for topic_rule in narrow:
         if topic_rule is not None:
-            values = TopicProtection(**_terms(topic_rule))
+            values = TopicProtection(**_protection_fields(topic_rule))
             by_protection.setdefault(values, []).append(topic_rule.topic_expression)
     named = []
     for values, expressions in by_protection.items():
@@ -238,14 +243,16 @@ def protection_for(governance: Governance) -> DomainProtection | None:
         )
     )
     protection = DomainProtection(
-        **_terms(rule), default=TopicProtection(**_terms(last)), named=tuple(named)
+        **_protection_fields(rule),
+        default=TopicProtection(**_protection_fields(last)),
+        named=tuple(named),
     )
     governance_again = governance_for(protection, governance.domains().closed())
     return protection if governance_again == governance else None
 
 
-def _terms(rule: DomainRule | TopicRule) -> dict[str, Any]:
-    """Map the fields of a protection to the values of a rule: the reverse of `_values`."""
+def _protection_fields(rule: DomainRule | TopicRule) -> dict[str, Any]:
+    """Map the fields of a protection to the values of a rule: the reverse of `_rule_attributes`."""
     from sros_tool.policy.model import Level
 
     chosen = {attribute: getattr(rule, attribute.name) for attribute in attributes(type(rule))}
@@ -344,9 +351,10 @@ def _all_topics(criteria: Iterable[Criteria]) -> dict[str, bool]:
 
 
 def _candidates(publish: Iterable[str], subscribe: Iterable[str]) -> Iterable[tuple[str, str, str]]:
-    """Yield kind, right and name of the actions, then the services, of the request topics.
+    """Yield (kind, right, name) of actions, then services, to which the topics may belong.
 
-    The caller checks that the other topics of the action or service are in the rule, too.
+    Actions and services are recognized by their request topics. The caller checks that the other
+    topics of the action or service are in the rule, too.
     """
     requests_out, requests_in = (
         [name for name, _ in map(service_of, requests) if name]

@@ -25,29 +25,32 @@ _FIRST_YEAR = 1950
 _EPOCH = datetime.fromtimestamp(0, UTC)
 
 _DURATION = re.compile(r"(\d{1,10})([smhdwy])\Z", re.ASCII)
-_SECONDS = {"s": 1, "m": 60, "h": 3600, "d": 86400, "w": 604800, "y": 365 * 86400}
-_LONGEST = 100 * _SECONDS["y"]
+_SECONDS_PER_UNIT = {"s": 1, "m": 60, "h": 3600, "d": 86400, "w": 604800, "y": 365 * 86400}
+_LONGEST_DURATION = 100 * _SECONDS_PER_UNIT["y"]
 
 
 def time_of_file(seconds: float) -> datetime:
-    """Return a file's time in UTC; if `datetime` has no such year, its last moment, or 1970."""
+    """Return the time of a file in UTC.
+
+    A time that `datetime` cannot express becomes its last moment, or 1970 if it is negative.
+    """
     try:
         return datetime.fromtimestamp(seconds, UTC)
     except (ValueError, OverflowError, OSError):
         return datetime.max.replace(tzinfo=UTC) if seconds > 0 else _EPOCH
 
 
-_SOON = timedelta(days=30)
+_SOON_BEFORE_EXPIRY = timedelta(days=30)
 """How long before it expires a document counts as expiring soon, unless its validity is short."""
 AUTHORITY_SOON = timedelta(days=90)
 """How long before its expiry a CA counts as expiring soon: its replacement takes several stages."""
 
 
-def soon_limit(lifetime: timedelta, longest: timedelta = _SOON) -> timedelta:
-    """Return how long before it expires a document with this lifetime counts as expiring soon.
+def soon_limit(lifetime: timedelta, longest: timedelta = _SOON_BEFORE_EXPIRY) -> timedelta:
+    """Return the remaining time below which a document counts as expiring soon.
 
-    This is ``longest``, or a third of the lifetime if that is shorter, in whole days if possible,
-    so that nothing is renewed each day.
+    This is ``longest``, or a third of the document's ``lifetime`` if that is shorter, in whole days
+    if possible, so that nothing is renewed each day.
     """
     limit = min(longest, lifetime / 3)
     unit = timedelta(days=1) if limit >= timedelta(days=1) else timedelta(seconds=1)
@@ -76,15 +79,15 @@ class Window:
         """Return whether ``moment`` is within the window."""
         return self.not_before <= moment <= self.not_after
 
-    def expires_soon_from(self, longest: timedelta = _SOON) -> datetime:
+    def expires_soon_from(self, longest: timedelta = _SOON_BEFORE_EXPIRY) -> datetime:
         """Return the time from which the window counts as expiring soon; see `soon_limit`."""
         return self.not_after - soon_limit(self.lifetime(), longest)
 
     def lifetime(self, made_at: datetime | None = None) -> timedelta:
         """Return how long a document with this validity is valid after it was made.
 
-        ``made_at`` is when it was made, or when its file arrived here; a time long before the
-        validity is ignored.  Without ``made_at``, the document counts as made by sros, that is,
+        ``made_at`` is when the document was made, or when its file arrived here; a time long before
+        the validity is ignored.  Without ``made_at``, the document counts as made by sros, that is,
         `BACKDATE` after its validity begins; documents of other programs may be valid only from
         ``made_at`` on.
         """
@@ -102,7 +105,8 @@ class Window:
     def can_be_kept(self, new: Window, now: datetime) -> bool:
         """Return whether a document with this validity can be kept instead of a ``new`` one.
 
-        It can while more than a third of ``new`` is left, and if it does not expire after ``new``.
+        The document can be kept while more than a third of ``new`` is left, and if the document
+        does not expire after ``new``.
         """
         return (
             self.not_before <= max(now, new.not_before)
@@ -164,15 +168,15 @@ def parse_span(text: str) -> Span:
     without a zone are in UTC.  Raises `UsageError` for any other text.
     """
     first, slash, last = text.strip().partition("/")
-    start = _moment(first, text) if slash else None
+    start = _parse_moment(first, text) if slash else None
     rest = last if slash else first
     if _DURATION.match(rest):
         length = parse_duration(rest)
         return Lifespan(start=start, length=length) if start else length
-    return Lifespan(start=start, end=_moment(rest, text))
+    return Lifespan(start=start, end=_parse_moment(rest, text))
 
 
-def _moment(text: str, range_text: str) -> datetime:
+def _parse_moment(text: str, range_text: str) -> datetime:
     try:
         return parse_iso(text).replace(microsecond=0)
     except (ValueError, OverflowError) as error:
@@ -198,8 +202,8 @@ def parse_duration(text: str) -> timedelta:
     """
     match = _DURATION.match(text.strip())
     if match:
-        seconds = int(match[1]) * _SECONDS[match[2]]
-        if 0 < seconds <= _LONGEST:
+        seconds = int(match[1]) * _SECONDS_PER_UNIT[match[2]]
+        if 0 < seconds <= _LONGEST_DURATION:
             return timedelta(seconds=seconds)
     raise UsageError(
         f"{text!r} is not a duration",

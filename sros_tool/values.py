@@ -14,8 +14,8 @@ from typing import Annotated, Any, Literal, NamedTuple, TypeVar
 from sros_tool.errors import Note
 from sros_tool.validity import iso
 
-_Value = TypeVar("_Value")
-_SHOWN: dict[type, ShownKeys | None] = {}
+_Class = TypeVar("_Class")
+_SHOWN_KEYS: dict[type, ShownKeys | None] = {}
 """Class → the keys of its JSON object; None for a class that is not written as an object."""
 
 
@@ -136,7 +136,7 @@ def shows(
     optional: tuple[str, ...] = (),
     null_if_empty: tuple[str, ...] = (),
     spread: tuple[str, ...] = (),
-) -> Callable[[type[_Value]], type[_Value]]:
+) -> Callable[[type[_Class]], type[_Class]]:
     """Return a class decorator that chooses the keys of an object's JSON, as `as_plain` makes it.
 
     Args:
@@ -146,8 +146,10 @@ def shows(
         spread: attributes whose own keys are put into this object; None adds no key.
     """
 
-    def decorate(kind: type[_Value]) -> type[_Value]:
-        _SHOWN[kind] = ShownKeys(names or _public_fields(kind), optional, null_if_empty, spread)
+    def decorate(kind: type[_Class]) -> type[_Class]:
+        _SHOWN_KEYS[kind] = ShownKeys(
+            names or _public_fields(kind), optional, null_if_empty, spread
+        )
         return kind
 
     return decorate
@@ -155,10 +157,10 @@ def shows(
 
 def shown(kind: type) -> ShownKeys | None:
     """Return the keys of a class's JSON object; None if its values are not JSON objects."""
-    if kind not in _SHOWN:
+    if kind not in _SHOWN_KEYS:
         names = _public_fields(kind)
-        _SHOWN[kind] = ShownKeys(names) if names else None
-    return _SHOWN[kind]
+        _SHOWN_KEYS[kind] = ShownKeys(names) if names else None
+    return _SHOWN_KEYS[kind]
 
 
 class Words(tuple[str, ...]):

@@ -22,7 +22,7 @@ def first_few(
 
 
 def shortened(value: object) -> str:
-    """Return the form of a value in Python, of which 80 characters are shown at most."""
+    """Return ``repr(value)``, cut after 80 characters."""
     text = repr(value)
     return text if len(text) <= 80 else f"{text[:80]}..."
 

@@ -84,7 +84,8 @@ def read_file(
 def _read_open(path: Path, max_bytes: int) -> tuple[os.stat_result, bytes]:
     """Return the fstat(2) of a file, and its first ``max_bytes`` + 1 bytes.
 
-    The content is empty if it is not a regular file, which happens if somebody just replaced it.
+    The content is empty for anything but a regular file, such as a pipe that just replaced the
+    file.
     """
     handle = _handle_at_once(path)
     try:
@@ -109,7 +110,7 @@ def _handle_at_once(path: Path) -> int:
     return os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
 
 
-_UTF_8 = ("UTF-8", "UTF8", "US-ASCII", "ASCII")
+_UTF_8_NAMES = ("UTF-8", "UTF8", "US-ASCII", "ASCII")
 
 
 def parse(
@@ -146,9 +147,9 @@ def parse(
         )
     encoding = root.getroottree().docinfo.encoding or "UTF-8"
     # The library libxml2 before 2.14 returns the declared encoding.
-    if b"\0" in data and encoding.upper() in _UTF_8:
+    if b"\0" in data and encoding.upper() in _UTF_8_NAMES:
         encoding = "UTF-16"
-    if as_bytes and encoding.upper() not in _UTF_8:
+    if as_bytes and encoding.upper() not in _UTF_8_NAMES:
         raise DocumentError(
             f"{name} is not in UTF-8",
             f"It has the encoding {encoding}, but DDS vendors read all documents as UTF-8, and "
@@ -190,16 +191,16 @@ def tag_of(element: etree._Element) -> str:
 # `xml.sax.saxutils` has these, too, but imports an HTTP client: a fifth of a node's start.
 
 
-_NOT_XML = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ud800-\udfff\ufffe\uffff]")
+_NOT_IN_XML = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ud800-\udfff\ufffe\uffff]")
 
 
 def escape(text: str) -> str:
     """Escape a text for use as the content of an XML element.
 
     Raises:
-        DocumentError: it has a character that no XML document can have.
+        DocumentError: the text has a character that no XML document can have.
     """
-    if match := _NOT_XML.search(text):
+    if match := _NOT_IN_XML.search(text):
         raise DocumentError(
             f"{text!a} cannot be written in XML",
             f"It has the character U+{ord(match[0]):04X}, which no XML document can have.",

@@ -488,7 +488,7 @@ def test_an_output_to_a_pipe_does_not_follow_a_link_that_took_its_place(
         looked = given.stat()
         given.unlink()
         given.symlink_to(outside / "shadow")
-        monkeypatch.setattr("sros_tool.files._state", lambda _path, follow: looked)
+        monkeypatch.setattr("sros_tool.files._file_state", lambda _path, follow: looked)
         return found
 
     monkeypatch.setattr("sros_tool.files._follow_own_links", followed)

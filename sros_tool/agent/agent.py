@@ -99,7 +99,7 @@ from sros_tool.validity import elapsed, iso, time_of_file
 from sros_tool.wording import counted, first_few
 from sros_tool.xml import read_bytes
 
-_TOLERANCE = timedelta(minutes=2)
+_CLOCK_TOLERANCE = timedelta(minutes=2)
 _LOOK_SECONDS = 0.2
 _TRUST_FILES = tuple(
     file
@@ -108,10 +108,10 @@ _TRUST_FILES = tuple(
 )
 """Files of an enclave that decide whom it trusts: CAs and revocation list."""
 _REPLACED_LIST = "replaced.crl.pem"
-_REPLACED_FOR = timedelta(days=30)
+_KEEP_REPLACED_LIST = timedelta(days=30)
 """How long the agent sends a revocation list after a release replaced it by a shorter one.
 """
-_REPAIRED_FOR = timedelta(days=1)
+_REPORT_REPAIRS = timedelta(days=1)
 """How long the agent reports that it replaced files which differed from the release."""
 _BRING_KEY = (
     " A release has no keys: bring the key with `sros distribute_key KEYSTORE --robot {} DIR "
@@ -119,14 +119,14 @@ _BRING_KEY = (
     "computer off if it was replaced; otherwise make a new key, as for new hardware "
     "(docs/howto/one_robot.md)."
 )
-_FULL = (errno.ENOSPC, errno.EDQUOT)
-_Answer = TypeVar("_Answer")
+_DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
+_ServerAnswer = TypeVar("_ServerAnswer")
 _MOST_CERTIFICATES = 8
 """Maximum number of client certificates that the agent tries if a web server refuses them."""
 
 
 class RefusedError(UnavailableError):
-    """A message that the web server does not take, perhaps because of the client's certificate."""
+    """The web server does not take a message, perhaps because of the client's certificate."""
 
 
 class Round(NamedTuple):
@@ -201,7 +201,7 @@ class _Round:
 
     def run(self) -> Round:
         now, before = self._machine.now, self._state
-        self._attempt(lambda: recover_keystore(self._folder))
+        self._try_part(lambda: recover_keystore(self._folder))
         boot = self._machine.boot()
         # Only two known ids prove a start of the machine; otherwise, restarts stay due.
         has_started = bool(before.boot and boot and before.boot != boot)
@@ -219,14 +219,14 @@ class _Round:
         # Verified documents prove that ``before.latest`` has passed, whatever the clock shows.
         certain = max(now, before.latest) if before.latest else now
         readable_keys = exposed_keys(self._folder, now)
-        recent = {key: at for key, at in before.exposed.items() if abs(now - at) < _REPAIRED_FOR}
+        recent = {key: at for key, at in before.exposed.items() if abs(now - at) < _REPORT_REPAIRS}
         # Remembered now, because installing closes the keys of changed enclaves to others.
         exposed = recent | dict.fromkeys(readable_keys, now)
         self._state = replace(self._state, exposed=exposed)
         installation, fetched = self._fetch_and_install(certain)
         self._note_unreleased_enclaves()
         repaired = self._state.repaired_at
-        if repaired and abs(now - repaired) < _REPAIRED_FOR:
+        if repaired and abs(now - repaired) < _REPORT_REPAIRS:
             self._problems.append(self._state.repaired)
         self._note_removed(now)
         names = self._enclaves()
@@ -240,7 +240,7 @@ class _Round:
         # With a wrong clock, nodes would not accept their certificates.
         if clock is not RobotClock.BEHIND:
             restarted = self._restart(names, opened)
-        processes = self._look_after(restarted, names)
+        processes = self._examine_restarted(restarted, names)
         self._problems += [f"{problem}." for problem in processes.problems]
         due = enclaves_to_restart(self._state.due, processes.states, complete=processes.complete)
         unseen = tuple(name for name in due if processes.states[name] is RunningFiles.NOT_SEEN)
@@ -254,8 +254,8 @@ class _Round:
             unseen=unseen,
             list_due=list_due,
             restarted=again,
-            replaced=_of(due, self._state.replaced),
-            list_replaced=_of(list_due, self._state.list_replaced),
+            replaced=_moments_of(due, self._state.replaced),
+            list_replaced=_moments_of(list_due, self._state.list_replaced),
         )
         asked = self._renewals(names)
         arrived = self._confirm(names, opened, processes, clock, asked)
@@ -263,7 +263,7 @@ class _Round:
         self._state = replace(
             self._state, fetched=now if fetched else self._state.fetched, problems=problems
         )
-        self._save()
+        self._save_state()
         return Round(
             self._state.release,
             self._state.accepted,
@@ -279,32 +279,32 @@ class _Round:
 
     # ── parts of a round ───────────────────────────────────────────────────────────────────
 
-    def _attempt(self, work: Callable[[], None]) -> bool:
-        """Do ``work``; return whether it succeeded, and note the problem if not."""
+    def _try_part(self, work: Callable[[], None]) -> bool:
+        """Call ``work``; return whether it succeeded, and add a problem to the round if not."""
         try:
             work()
         except SrosError as error:
-            self._problems.append(_sentence(error))
+            self._problems.append(_error_sentence(error))
         except OSError as error:
-            self._problems.append(self._refused(error))
+            self._problems.append(self._write_error_text(error))
         else:
             return True
         return False
 
-    def _refused(self, error: OSError) -> str:
+    def _write_error_text(self, error: OSError) -> str:
         where = f" '{os.fsdecode(error.filename)}'" if error.filename else ""
         text = f"The operating system refuses{where}: {error.strerror or error}."
-        if error.errno in _FULL:
+        if error.errno in _DISK_FULL:
             return f"{text} Make room on the disk of '{self._folder}'; the agent then continues."
         return text
 
-    def _save(self) -> None:
-        if not self._attempt(lambda: write_state(self._folder, self._state)):
+    def _save_state(self) -> None:
+        if not self._try_part(lambda: write_state(self._folder, self._state)):
             mark_outdated(self._folder)
 
     def _clock(self, proven_time: datetime | None) -> RobotClock:
         now = self._machine.now
-        if proven_time and now + _TOLERANCE < proven_time:
+        if proven_time and now + _CLOCK_TOLERANCE < proven_time:
             documents_made = (
                 "verified documents were made at"
                 if self._state.latest
@@ -319,9 +319,9 @@ class _Round:
         return self._machine.clock()
 
     def _proven_moment(self) -> datetime | None:
-        """Return a time that has certainly passed, or None.
+        """Return the latest moment that verified documents prove to be past, or None.
 
-        It is the latest time that was verified, else the earliest start of a certificate.
+        Without a verified document, this is the earliest start of a certificate.
         """
         if self._state.latest:
             return self._state.latest
@@ -333,7 +333,7 @@ class _Round:
         return min(begins, default=None)
 
     def _fetch_and_install(self, certain_time: datetime) -> tuple[Installation, bool]:
-        """Fetch and install a release; return what changed, and whether the source was reached."""
+        """Fetch and install a release; return the changes, and whether the source was reached."""
         settings, state = self._settings, self._state
         changed_files = self._changed_files()
 
@@ -349,9 +349,9 @@ class _Round:
             )
 
         try:
-            release = self._as_an_enclave(settings.source, fetch)
+            release = self._ask_as_enclave(settings.source, fetch)
         except FetchError as error:
-            self._problems.append(_sentence(error))
+            self._problems.append(_error_sentence(error))
             if error.problem is FetchProblem.EXPIRED:
                 self._problems.append(
                     f"The clock of this robot shows {iso(self._machine.now)}; if the time is "
@@ -360,10 +360,10 @@ class _Round:
                 )
             return Installation(), False
         except SrosError as error:
-            self._problems.append(_sentence(error))
+            self._problems.append(_error_sentence(error))
             return Installation(), False
         except OSError as error:
-            self._problems.append(self._refused(error))
+            self._problems.append(self._write_error_text(error))
             return Installation(), False
         if release is None:
             self._is_in_step = True
@@ -381,9 +381,9 @@ class _Round:
     def _changed_files(self) -> tuple[str, ...] | None:
         """Return the paths of files that are missing, or differ from the installed release.
 
-        The release removes enclaves that it does not have: their certificates are included, too,
-        except those of `_newer_enclaves`.  None if no release is installed with all its enclaves,
-        or its seal cannot be read.
+        Certificates of enclaves that the release lacks, and so removes, are included, except those
+        of `_newer_enclaves`. The result is None if no release is installed with all its enclaves,
+        or if the seal of the release cannot be read.
         """
         state = self._state
         if not state.accepted or state.release != state.accepted:
@@ -449,7 +449,7 @@ class _Round:
                 )
 
     def _note_repaired(self, release: int, paths: Sequence[str]) -> None:
-        """Remember that files were replaced: every message of the next day says so."""
+        """Report in every message of the next day that files were replaced."""
         if paths:
             now = self._machine.now
             text = (
@@ -460,9 +460,9 @@ class _Round:
             self._state = replace(self._state, repaired=text, repaired_at=now)
 
     def _note_removed(self, now: datetime) -> None:
-        """Report for a day the enclaves that the installed release did not have."""
+        """Report for a day the enclaves that were removed because the release lacks them."""
         recent = {
-            name: at for name, at in self._state.removed.items() if abs(now - at) < _REPAIRED_FOR
+            name: at for name, at in self._state.removed.items() if abs(now - at) < _REPORT_REPAIRS
         }
         self._state = replace(self._state, removed=recent)
         if recent:
@@ -474,7 +474,7 @@ class _Round:
             )
 
     def _note_closed_keys(self, exposed: Mapping[str, datetime], now: datetime) -> None:
-        """Report the keys that others could read until the agent closed them, for a day."""
+        """Report for a day the keys that other users could read until the agent closed them."""
         closed = {
             key: exposed[key]
             for key in exposed.keys() - exposed_keys(self._folder, now)
@@ -491,7 +491,7 @@ class _Round:
 
     def _install(self, release: Release, certain_time: datetime) -> Installation:
         settings, state = self._settings, self._state
-        if release.number == state.accepted and self._differs_from_accepted(release):
+        if release.number == state.accepted and self._differs_from_accepted_release(release):
             self._problems.append(
                 f"The published release has the number {release.number} {OF_SAME_NUMBER}: the "
                 "keystore comes from a backup, or somebody else publishes. Nothing was changed. On "
@@ -519,10 +519,10 @@ class _Round:
                 before=before,
             )
         except SrosError as error:
-            self._problems.append(_sentence(error))
+            self._problems.append(_error_sentence(error))
             return Installation()
         except OSError as error:
-            self._problems.append(self._refused(error))
+            self._problems.append(self._write_error_text(error))
             return Installation()
         for name, why in installation.kept.items():
             remedy = _BRING_KEY.format(settings.robot) if concerns_key(why) else ""
@@ -532,7 +532,7 @@ class _Round:
                 f"{name} was removed: release {release.number} lacks this enclave. Stop its "
                 "processes."
             )
-        self._attempt(lambda: write_seal(self._folder, release.seal))
+        self._try_part(lambda: write_seal(self._folder, release.seal))
         latest = max(filter(None, (state.latest, installation.latest)), default=None)
         self._state = replace(
             self._state,
@@ -540,7 +540,7 @@ class _Round:
             accepted=release.number,
             latest=latest,
         )
-        self._save()
+        self._save_state()
         self._is_in_step = not installation.kept
         self._drop_replaced_list(names)
         _drop_installed_keys(self._folder, keys)
@@ -549,17 +549,19 @@ class _Round:
     def _time_to_be_valid_at(self, release: Release, certain_time: datetime) -> datetime:
         """Return the time at which a release has to be valid.
 
-        If documents prove that the clock is behind, the keystore's time at the release counts
-        instead; a clock that may be right is never overruled.
+        This is the time of the clock, unless documents prove that the clock is behind: then it is
+        the time at which the keystore made the release.
         """
-        made = release_time(release) if self._machine.now < certain_time - _TOLERANCE else None
+        made = (
+            release_time(release) if self._machine.now < certain_time - _CLOCK_TOLERANCE else None
+        )
         return max(certain_time, made) if made else certain_time
 
-    def _differs_from_accepted(self, release: Release) -> bool:
+    def _differs_from_accepted_release(self, release: Release) -> bool:
         """Return whether the accepted release with the same number has other files.
 
-        If the disk had no room for the seal of the accepted release, the kept seal is an earlier
-        one.
+        The result is also False if the stored seal is of an earlier release, because the disk had
+        no room for the seal of the accepted release.
         """
         seal = read_seal(self._folder)
         with suppress(SrosError):
@@ -579,7 +581,7 @@ class _Round:
         )
 
     def _record_due(self, names: Sequence[str]) -> None:
-        """Record restarts before the change, so that the agent knows them if it is killed."""
+        """Record restarts before the change that needs them, in case the agent is killed."""
         state, moments = self._state, dict.fromkeys(names, _since_boot())
         self._state = replace(
             state,
@@ -587,10 +589,10 @@ class _Round:
             replaced={**state.replaced, **moments},
             list_replaced={**state.list_replaced, **moments},
         )
-        self._save()
+        self._save_state()
 
     def _note_due(self, changed: Iterable[str], names: Iterable[str]) -> None:
-        """Note the restarts that are due, also after others changed files."""
+        """Note the restarts that are due, also because of files that others changed."""
         before, files = self._state.files, self._digests(names)
         changed = {*changed}
         new_files, moment = {*changed}, _since_boot()
@@ -602,7 +604,7 @@ class _Round:
             before_all, _, before_trust = before.get(name, "").partition(" ")
             all_files, _, trust = digests.partition(" ")
             if before_trust != trust:
-                list_since[name] = self._time()
+                list_since[name] = self._current_time()
             if before_all != all_files:
                 new_files.add(name)
                 due.add(name)
@@ -614,8 +616,8 @@ class _Round:
             due=tuple(sorted(due)),
             restarted=tuple(name for name in self._state.restarted if name not in new_files),
             list_due=tuple(sorted(list_due)),
-            replaced=_of(due, {**self._state.replaced, **dict.fromkeys(changed, moment)}),
-            list_replaced=_of(list_due, list_replaced),
+            replaced=_moments_of(due, {**self._state.replaced, **dict.fromkeys(changed, moment)}),
+            list_replaced=_moments_of(list_due, list_replaced),
             list_since={name: list_since[name] for name in files if name in list_since},
             files=files,
         )
@@ -664,7 +666,7 @@ class _Round:
             return ()
         # Restart only units whose processes were seen with earlier files, or may have earlier
         # files.
-        processes = self._look(names)
+        processes = self._examine_processes(names)
         routers = [
             name for name in names if (enclave_path(self._folder, name) / ROUTER_FILE).exists()
         ]
@@ -690,19 +692,26 @@ class _Round:
         self._state = replace(self._state, restarted=restarted)
         return [name for name in done.enclaves if states[name] is not RunningFiles.NOT_SEEN]
 
-    def _look_after(self, restarted: Sequence[str], names: Iterable[str]) -> EnclaveProcesses:
+    def _examine_restarted(
+        self, restarted: Sequence[str], names: Iterable[str]
+    ) -> EnclaveProcesses:
         """Examine the processes until the processes of restarted units have loaded new files."""
         end = time.monotonic() + self._machine.patience
         while True:
-            processes = self._look(names)
+            processes = self._examine_processes(names)
             starting = (processes.states.get(name) is RunningFiles.NOT_SEEN for name in restarted)
             if not any(starting) or time.monotonic() > end:
                 return processes
             time.sleep(_LOOK_SECONDS)
 
-    def _look(self, names: Iterable[str]) -> EnclaveProcesses:
+    def _examine_processes(self, names: Iterable[str]) -> EnclaveProcesses:
         """Examine the processes at the current time."""
-        machine, state, now, since_boot = self._machine, self._state, self._time(), _since_boot()
+        machine, state, now, since_boot = (
+            self._machine,
+            self._state,
+            self._current_time(),
+            _since_boot(),
+        )
 
         def on_the_clock(moments: Mapping[str, float]) -> dict[str, datetime]:
             return {
@@ -722,7 +731,7 @@ class _Round:
             list_replaced=on_the_clock(state.list_replaced),
         )
 
-    def _time(self) -> datetime:
+    def _current_time(self) -> datetime:
         """Return the current time, which is later than the start of the round."""
         passed = timedelta(seconds=_since_boot() - self._began)
         return self._machine.now + passed
@@ -752,7 +761,7 @@ class _Round:
         now = self._machine.now.replace(microsecond=0)
         sequence = self._state.next_sequence(now)
         self._state = replace(self._state, sequence=sequence)
-        self._save()
+        self._save_state()
         confirmation = make_confirmation(
             self._folder,
             self._settings.robot,
@@ -771,7 +780,7 @@ class _Round:
             crl_restart=None if crl_restart == restart else crl_restart,
             sequence=sequence,
             release=self._state.release,
-            expiry={name: _expiry(opened_enclaves.get(name)) for name in names},
+            expiry={name: _enclave_expiry(opened_enclaves.get(name)) for name in names},
             running=processes.loaded_from_any_folder(),
             clock=clock,
             problems=shortened_problems(self._problems),
@@ -779,7 +788,7 @@ class _Round:
             crl=self._list_to_send(names),
             seal=self._seal_to_send(),
         )
-        message = self._signed(confirmation, (asked.signer,) if asked.signer else names)
+        message = self._signed_message(confirmation, (asked.signer,) if asked.signer else names)
         if not message:
             return False
         settings = self._settings
@@ -793,7 +802,7 @@ class _Round:
                 tls_ca=Path(settings.tls_ca) if settings.tls_ca else None,
             )
 
-        arrived = self._attempt(lambda: self._as_an_enclave(settings.inbox, deliver))
+        arrived = self._try_part(lambda: self._ask_as_enclave(settings.inbox, deliver))
         if arrived:
             self._state = replace(self._state, sent=now)
         return arrived
@@ -814,7 +823,7 @@ class _Round:
         with suppress(SrosError, OSError):
             path = agent_folder(self._folder) / _REPLACED_LIST
             since = time_of_file(path.stat().st_mtime)
-            if abs(self._machine.now - since) < _REPLACED_FOR:
+            if abs(self._machine.now - since) < _KEEP_REPLACED_LIST:
                 return read_bytes(path, "revocation list", max_bytes=LONGEST_LIST).decode()
         return None
 
@@ -826,12 +835,12 @@ class _Round:
         """
         if text and not self._replaced_list():
             path = agent_folder(self._folder) / _REPLACED_LIST
-            self._attempt(lambda: replace_file(path, text.encode()))
+            self._try_part(lambda: replace_file(path, text.encode()))
 
     def _drop_replaced_list(self, names: Iterable[str]) -> None:
         """Remove the kept revocation list if the current list revokes the same certificates."""
         kept, present = self._replaced_list(), self._revocation_lists(names)
-        if kept and present and _revoked(kept) <= _revoked(present):
+        if kept and present and _revoked_serials(kept) <= _revoked_serials(present):
             with suppress(OSError):
                 remove_file(agent_folder(self._folder) / _REPLACED_LIST)
 
@@ -861,10 +870,10 @@ class _Round:
         return text
 
     def _unreadable(self, name: str, error: Exception) -> None:
-        text = self._refused(error) if isinstance(error, OSError) else str(error)
+        text = self._write_error_text(error) if isinstance(error, OSError) else str(error)
         self._problems.append(f"the confirmation leaves out {name}: {text}")
 
-    def _signed(self, confirmation: Confirmation, names: Sequence[str]) -> bytes:
+    def _signed_message(self, confirmation: Confirmation, names: Sequence[str]) -> bytes:
         """Return the message, signed by the enclave whose certificate is valid longest.
 
         Return b"" if no enclave can sign.
@@ -891,15 +900,15 @@ class _Round:
         )
         return b""
 
-    def _as_an_enclave(
-        self, place: str, ask: Callable[[ClientCertificate | None], _Answer]
-    ) -> _Answer:
+    def _ask_as_enclave(
+        self, place: str, ask: Callable[[ClientCertificate | None], _ServerAnswer]
+    ) -> _ServerAnswer:
         """Return the answer of a server to the first enclave whose certificate it accepts.
 
         Some certificates may already be revoked while their successors wait to be fetched.
 
         Raises:
-            SrosError, OSError: what ``ask`` raised, for the last enclave if all were refused.
+            SrosError, OSError: the error of ``ask``, for the last enclave if all were refused.
         """
         certificates: Sequence[ClientCertificate | None] = [None]
         if place.startswith("https://"):
@@ -934,7 +943,7 @@ def _since_boot() -> float:
     return time.clock_gettime(time.CLOCK_BOOTTIME)
 
 
-def _of(names: Collection[str], moments: Mapping[str, float]) -> dict[str, float]:
+def _moments_of(names: Collection[str], moments: Mapping[str, float]) -> dict[str, float]:
     return {name: moment for name, moment in moments.items() if name in names}
 
 
@@ -955,22 +964,24 @@ def _sha256(folder: Folder, path: str) -> str:
 
 
 def _trust_digest(folder: Folder, path: str) -> str:
-    """Return the digest of a file; of a revocation list that a CA of the enclave signed, only of
-    what it revokes.
+    """Return the digest by which a change of a trust file is noticed.
+
+    For a revocation list that a CA of the enclave signed, the digest is only of the revoked serial
+    numbers; otherwise it is of the whole file.
     """
     place, _, file = path.rpartition("/")
     with suppress(SrosError, OSError):
         data = folder.read_inside(path) if file == CRL_FILE else b""
         signed = newest_list(data, folder.read_inside(f"{place}/{IDENTITY_CA_FILE}"))
         if signed is not None and len(read_lists(data, "here")) == 1:
-            revoked = sorted(_revoked(data.decode()))
+            revoked = sorted(_revoked_serials(data.decode()))
             return hashlib.sha256(
                 f"{signed.issuer.public_bytes()!r} {revoked}".encode()
             ).hexdigest()
     return _sha256(folder, path)
 
 
-def _revoked(text: str) -> frozenset[int]:
+def _revoked_serials(text: str) -> frozenset[int]:
     """Return the serial numbers in revocation lists (PEM); none if one cannot be read."""
     with suppress(SrosError):
         lists = load_crls(text.encode(), "here")
@@ -978,7 +989,7 @@ def _revoked(text: str) -> frozenset[int]:
     return frozenset()
 
 
-def _expiry(enclave: InstalledEnclave | None) -> EnclaveExpiry:
+def _enclave_expiry(enclave: InstalledEnclave | None) -> EnclaveExpiry:
     if enclave is None:
         return EnclaveExpiry(None, None)
     certificate = enclave.state.certificate
@@ -988,7 +999,7 @@ def _expiry(enclave: InstalledEnclave | None) -> EnclaveExpiry:
     return EnclaveExpiry(None, enclave.permissions_until())
 
 
-def _sentence(error: SrosError) -> str:
+def _error_sentence(error: SrosError) -> str:
     text = str(error)
     begun = text if text.startswith("http") else text[:1].upper() + text[1:]
     return begun + ("" if text.endswith(".") else ".")
@@ -1009,7 +1020,7 @@ def send(
         robot: the name of this robot.
         message: the signed message.
         client_certificate: certificate and key for TLS.
-        tls_ca: CA certificates (PEM) of the server; None: those of the system.
+        tls_ca: CA certificates (PEM) of the server; None: the CAs of the system.
 
     Raises:
         UnavailableError: the inbox cannot be reached, or does not take the message; `RefusedError`
@@ -1061,7 +1072,7 @@ def _write_message(inbox: Path, robot: str, message: bytes) -> None:
         ) from error
 
 
-_NEW_KEYS = "new-keys"
+_NEW_KEYS_FOLDER = "new-keys"
 
 
 _NEW_KEY_AFTER = 0.6
@@ -1072,7 +1083,7 @@ _NEW_KEY_AFTER = 0.6
 """
 
 
-def _is_due(keystore: OpenedKeystore, name: str, now: datetime, *, new_key: bool) -> bool:
+def _is_renewal_due(keystore: OpenedKeystore, name: str, now: datetime, *, new_key: bool) -> bool:
     """Return whether the robot asks for the renewal of an enclave.
 
     A file is written only when it changes, so its modification time is when the robot got the
@@ -1107,9 +1118,8 @@ def _enclave_key(folder: Path, name: str, secrets: Secrets) -> PrivateKey:
 class Renewals(NamedTuple):
     """The signing requests (PEM) for a message, and who has to sign it.
 
-    Only the enclave itself can vouch for its new key, with its current one.  So a message has the
-    request of only one enclave that asks with a new key, ``signer``; every hour, it is another
-    enclave's turn.
+    Only the enclave itself can vouch for its new key, with its current one.  So a message has at
+    most one request for a new key, from the enclave ``signer``, which changes every hour.
     """
 
     requests: tuple[str, ...]
@@ -1134,7 +1144,7 @@ def _renewals(
     for name in names:
         is_new = new_key and (enclave_path(folder, name) / KEY_FILE).exists()
         try:
-            is_due = _is_due(keystore, name, now, new_key=is_new)
+            is_due = _is_renewal_due(keystore, name, now, new_key=is_new)
             if not is_due or len(requests) == MOST_REQUESTS - 1:
                 continue
             if is_new:
@@ -1155,7 +1165,7 @@ def _renewals(
 
 def _key_file(name: str) -> str:
     """Return the path, in the agent's folder, of the new key of an enclave."""
-    return f"{_NEW_KEYS}/{hashlib.sha256(name.encode()).hexdigest()[:32]}.pem"
+    return f"{_NEW_KEYS_FOLDER}/{hashlib.sha256(name.encode()).hexdigest()[:32]}.pem"
 
 
 def _waiting_key(folder: Path, name: str) -> PrivateKey:
@@ -1170,8 +1180,8 @@ def _waiting_key(folder: Path, name: str) -> PrivateKey:
     if os.path.lexists(path):
         return load_key(read_bytes(path, "private key"), f"of enclave {name}")
     with Folder(agents_folder) as opened:
-        if not opened.is_folder(_NEW_KEYS):
-            opened.mkdir(_NEW_KEYS, 0o700)
+        if not opened.is_folder(_NEW_KEYS_FOLDER):
+            opened.mkdir(_NEW_KEYS_FOLDER, 0o700)
     key = generate_key()
     with staged_file(path, key_pem(key)) as put_in_place:
         put_in_place()
@@ -1190,7 +1200,7 @@ def _waiting_keys(folder: Path, names: Iterable[str]) -> dict[str, PrivateKey]:
 
 
 def _drop_installed_keys(folder: Path, keys: Mapping[str, PrivateKey]) -> None:
-    """Remove the new keys that are installed."""
+    """Remove the waiting copies of new keys that were installed."""
     for name, key in keys.items():
         with suppress(SrosError, OSError):
             path = enclave_path(folder, name) / KEY_FILE

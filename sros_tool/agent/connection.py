@@ -12,14 +12,14 @@ from typing import Self
 
 _MOST_SECONDS = 300.0
 """Longest time in seconds that all requests of one visit may take together."""
-_SILENCE = 30.0
+_MOST_SILENT_SECONDS = 30.0
 """Longest wait for the next byte of a server, in seconds."""
 REFUSALS = frozenset({400, 401, 495, 496})
 """Status with which web servers answer to a client whose certificate they refuse (nginx: 400)."""
 
 
 def ended_tls(error: BaseException | None) -> bool:
-    """Return whether a server ended TLS, as it does if it refuses the client's certificate.
+    """Return whether a server ended TLS, as by a refusal of the client's certificate.
 
     With TLS 1.3 this may be an alert, or only the end of the connection.
     """
@@ -35,7 +35,7 @@ class GuardedConnection(http.client.HTTPConnection):
 
     def __init__(self, host: str, port: int, context: ssl.SSLContext | None) -> None:
         """Prepare to connect; ``context`` is None for a connection without TLS."""
-        super().__init__(host, port, timeout=_SILENCE)
+        super().__init__(host, port, timeout=_MOST_SILENT_SECONDS)
         self._context = context
         self._guard: socket.socket | None = None
         self._timer = threading.Timer(_MOST_SECONDS, self._cut_off)
@@ -53,7 +53,7 @@ class GuardedConnection(http.client.HTTPConnection):
     def connect(self) -> None:
         """Connect, and agree on TLS if there is a context."""
         self._end_guard()
-        plain = socket.create_connection((self.host, self.port), _SILENCE)
+        plain = socket.create_connection((self.host, self.port), _MOST_SILENT_SECONDS)
         self._guard = plain.dup()
         self.sock = plain
         if self.is_cut_off:  # the time was over during the handshake

@@ -1,7 +1,7 @@
 """Fetching the release of this robot from a publishing folder, by The Update Framework (TUF).
 
-The folder is an untrusted place: a web server, a bucket, a CDN or a USB stick.  `tuf` verifies
-its metadata from the pinned root on, and so refuses what is old, mixed, withheld or not signed.
+The folder is an untrusted place: a web server, a bucket, a CDN or a USB stick.  `tuf` verifies its
+metadata from the pinned root on, and so refuses files that are old, mixed, withheld or not signed.
 Whether the permissions CA sealed the release is verified where it is installed.
 """
 
@@ -46,9 +46,9 @@ _METADATA = "metadata"
 """The folder in the agent's folder with the trusted metadata, which `tuf` keeps."""
 _PINNED_ROOT = "root.json"
 """The file in the agent's folder with the root metadata that `pin_root` trusted first."""
-_FETCHED = "release.tar.gz"
+_FETCHED_ARCHIVE = "release.tar.gz"
 """The file in the agent's folder with the release that was transferred last."""
-_NOT_LATER = "not-later.tar.gz"
+_REFUSED_ARCHIVE = "not-later.tar.gz"
 """The file in the agent's folder with a release that is not later than the installed one."""
 _MOST_METADATA = 8 * 1024 * 1024
 
@@ -116,7 +116,7 @@ def pin_root(agent_folder: Path, data: bytes, *, now: datetime) -> str:
         raise FetchError(
             FetchProblem.NOT_SIGNED,
             "the file is not the root metadata of a publishing folder",
-            f"{_sentence(error)}",
+            f"{_error_sentence(error)}",
             "Use the root.json that `sros fleet publish` wrote into PUB/metadata.",
         ) from error
     if root.signed.is_expired(now):
@@ -145,8 +145,8 @@ def fetch_release(
 ) -> Release | None:
     """Return the release that is published for ``robot``; None if it is the installed one.
 
-    Another release with the number of the installed one is returned, too.  The release is not
-    verified against the CAs of the robot: callers have to verify its seal, with
+    A different release with the same number as the installed release is returned, too.  The release
+    is not verified against the CAs of the robot: callers have to verify its seal, with
     `sros_tool.keystore.delivery.release.seal_problem`.  A release that was fetched before is not
     transferred again.  Only one process at a time may use the same ``state``.
 
@@ -157,7 +157,7 @@ def fetch_release(
         now: the current time, which decides whether metadata has expired.
         installed: the number of the installed release; 0 if none is.
         client_certificate: certificate and key for TLS.
-        tls_ca: CA certificates (PEM) of the server; None: those of the system.
+        tls_ca: CA certificates (PEM) of the server; None: the CAs of the system.
 
     Raises:
         FetchError: there is no such release that can be trusted; its ``problem`` says why.
@@ -174,21 +174,21 @@ def fetch_release(
         with transport.connection:
             updater = _updater(state, transport, now)
             target = updater.get_targetinfo(release_target(robot))
-            number = _number(target, source, robot)
+            number = _release_number(target, source, robot)
             if target is None:
                 return None
-            path = state / _FETCHED
+            path = state / _FETCHED_ARCHIVE
             is_here = updater.find_cached_target(target, str(path)) is not None
             if number == installed and is_here:
                 return None
             if not is_here and number <= installed and path.exists():
-                path = state / _NOT_LATER
+                path = state / _REFUSED_ARCHIVE
                 is_here = updater.find_cached_target(target, str(path)) is not None
             if not is_here:
                 updater.download_target(target, str(path))
     except (DownloadError, RepositoryError, OSError, ValueError) as error:
         raise _fetch_error(error, source, now) from error
-    return _read(path, robot, number)
+    return _read_archive(path, robot, number)
 
 
 def _transport(
@@ -203,7 +203,7 @@ def _transport(
             raise FetchError(
                 FetchProblem.UNREACHABLE,
                 "the certificates for TLS cannot be used",
-                _sentence(error),
+                _error_sentence(error),
                 "Check the certificate, the key and the CAs in the agent's settings.",
             ) from error
     if "://" in source:
@@ -230,7 +230,7 @@ def _updater(state: Path, transport: HttpTransport | FolderTransport, now: datet
     with Folder(state) as folder:
         if not folder.is_folder(_METADATA):
             folder.mkdir(_METADATA, 0o700)
-    _drop_endless(state)
+    _remove_unreadable(state)
     updater = Updater(
         str(state / _METADATA),
         f"{transport.base}/metadata/",
@@ -244,9 +244,9 @@ def _updater(state: Path, transport: HttpTransport | FolderTransport, now: datet
     return updater
 
 
-def _drop_endless(state: Path) -> None:
+def _remove_unreadable(state: Path) -> None:
     """Remove pipes, devices and huge files, which the client of TUF would read without end."""
-    for path in (state / _FETCHED, *(state / _METADATA).rglob("*")):
+    for path in (state / _FETCHED_ARCHIVE, *(state / _METADATA).rglob("*")):
         with suppress(OSError):
             state_of_file = path.stat()
             is_file = (
@@ -256,7 +256,7 @@ def _drop_endless(state: Path) -> None:
                 remove_file(path)
 
 
-def _number(target: TargetFile | None, source: str, robot: str) -> int:
+def _release_number(target: TargetFile | None, source: str, robot: str) -> int:
     """Return the number of the release that the metadata describes.
 
     Raises:
@@ -284,7 +284,7 @@ def _number(target: TargetFile | None, source: str, robot: str) -> int:
     return number
 
 
-def _read(path: Path, robot: str, number: int) -> Release:
+def _read_archive(path: Path, robot: str, number: int) -> Release:
     """Return the release in the verified archive at ``path``, which has to be this robot's."""
     try:
         release = read_release(read_bytes(path, "release", max_bytes=OF_ONE_ROBOT.packed))
@@ -305,14 +305,14 @@ def _read(path: Path, robot: str, number: int) -> Release:
     return release
 
 
-_CLOCK = "set the clock of this robot, if it is wrong"
+_SET_CLOCK = "set the clock of this robot, if it is wrong"
 
 
 def _fetch_error(error: Exception, source: str, now: datetime) -> FetchError:
     """Return the `FetchError` for an error of the TUF client."""
     from tuf.api import exceptions
 
-    why = _sentence(error)
+    why = _error_sentence(error)
     if isinstance(error, exceptions.ExpiredMetadataError):
         needs = " KEYSTORE PUB --root-key FILE" if "root.json" in why else ""
         return FetchError(
@@ -320,7 +320,7 @@ def _fetch_error(error: Exception, source: str, now: datetime) -> FetchError:
             f"{EXPIRED_METADATA[:1].lower()}{EXPIRED_METADATA[1:]}{source} has expired",
             f"{why} The clock here shows {iso(now)}. Either nothing is published any more, or "
             f"{source} has an old copy of the files, or somebody withholds the new files.",
-            f"On the keystore machine, run `sros fleet publish{needs}`; {_CLOCK}.",
+            f"On the keystore machine, run `sros fleet publish{needs}`; {_SET_CLOCK}.",
         )
     if isinstance(error, exceptions.BadVersionNumberError):
         return FetchError(
@@ -361,7 +361,7 @@ def _fetch_error(error: Exception, source: str, now: datetime) -> FetchError:
     )
 
 
-def _sentence(error: Exception) -> str:
+def _error_sentence(error: Exception) -> str:
     """Return an error as a sentence."""
     text = str(error)
     if isinstance(error, OSError) and error.strerror:

@@ -69,14 +69,14 @@ from sros_tool.pki.keys import PrivateKey, PublicKey, key_pem, load_key
 from sros_tool.validity import iso
 from sros_tool.wording import enumerated
 
-_OPTIONAL = (*OPTIONAL_FILES, *ZENOH_FILES)
-_OF_ENCLAVE = (*sorted(RELEASE_FILES), *KEY_FILES, REQUEST, SEAL)
+_OPTIONAL_RELEASE_FILES = (*OPTIONAL_FILES, *ZENOH_FILES)
+_ENCLAVE_FILES = (*sorted(RELEASE_FILES), *KEY_FILES, REQUEST, SEAL)
 """The files that are removed together with their enclave."""
-_FULL = (errno.ENOSPC, errno.EDQUOT)
+_DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
 class Installation(NamedTuple):
-    """The outcome for the enclaves of a release; unchanged enclaves are in none of the fields."""
+    """The outcome for the enclaves of a release; no field has an unchanged enclave."""
 
     changed: tuple[str, ...] = ()
     """Enclaves of which a file changed."""
@@ -93,7 +93,7 @@ class Installation(NamedTuple):
 
 @dataclass(slots=True)
 class _Change:
-    """What changes in an enclave: new contents by path, and paths of files to remove."""
+    """The changes of an enclave's files: new contents by path, and paths to remove."""
 
     write: dict[str, bytes] = field(default_factory=dict)
     remove: list[str] = field(default_factory=list)
@@ -125,12 +125,12 @@ def install_release(
         pinned: SHA-256 of permissions CAs that count as trusted, too.
         new_keys: keys that wait for their certificate, by enclave.
         keep: enclaves that stay although the release does not have them.
-        before: is called before the change with the enclaves whose processes have to be restarted
-            for it.
+        before: called before the files change, with the enclaves whose processes will have to be
+            restarted.
 
     Raises:
-        KeystoreError: the release as a whole is not for this folder, or is older than what is here;
-            nothing was changed.
+        KeystoreError: the release as a whole is not for this folder, or is older than the files
+            here; nothing was changed.
         OSError: nothing could be written, for example because the disk is full; the revocation
             lists were installed if there was room for them.
     """
@@ -146,24 +146,26 @@ def install_release(
         kept: dict[str, str] = {}
         for name, files in sorted(enclaves.items()):
             try:
-                changes[name] = _change(opened, name, files, (new_keys or {}).get(name), now)
+                changes[name] = _enclave_change(
+                    opened, name, files, (new_keys or {}).get(name), now
+                )
             except (SrosError, OSError) as error:
-                kept[name] = _reason(error)
-                changes[name] = _list_alone(opened, name, files, now)
+                kept[name] = _error_clause(error)
+                changes[name] = _revocation_list_change(opened, name, files, now)
         removed = []
         for name in present:
             if name in enclaves or name in keep or _waits_for_answer(opened, name):
                 continue
             try:
-                changes[name] = _removal(opened, name)
+                changes[name] = _enclave_removal(opened, name)
                 removed.append(name)
             except (SrosError, OSError) as error:
-                kept[name] = _reason(error)
+                kept[name] = _error_clause(error)
         changes = {name: change for name, change in changes.items() if change}
         ran = [name for name in changes if name in enclaves and _had_certificate(opened, name)]
     if changes:
         before(ran)
-        failed = _apply(folder, changes)
+        failed = _apply_changes(folder, changes)
         kept |= failed
         changes = {name: change for name, change in changes.items() if name not in failed}
     return Installation(
@@ -202,7 +204,7 @@ def _check_release(
             "Nothing was changed.",
             "Check whether this robot has the right name (`sros agent init --robot`).",
         )
-    trusted = [*_trusted(folder, present), *_pinned(release, pinned)]
+    trusted = [*_trusted_authorities(folder, present), *_pinned_authorities(release, pinned)]
     if not trusted:
         raise KeystoreError(
             f"'{folder}' trusts no permissions CA yet",
@@ -241,10 +243,10 @@ def _check_release(
 
 def trusts_any(folder: Path) -> bool:
     """Return whether an enclave in a security folder has a permissions CA."""
-    return any(_trusted(folder, search_enclaves(folder)[0]))
+    return any(_trusted_authorities(folder, search_enclaves(folder)[0]))
 
 
-def _trusted(folder: Path, present: Iterable[str]) -> Iterator[x509.Certificate]:
+def _trusted_authorities(folder: Path, present: Iterable[str]) -> Iterator[x509.Certificate]:
     """Yield the permissions CAs of the enclaves; a file that cannot be read counts as missing."""
     read_files = set()
     with Folder(folder) as opened:
@@ -256,7 +258,7 @@ def _trusted(folder: Path, present: Iterable[str]) -> Iterator[x509.Certificate]
                     yield from load_certificates(data, f"of {name}")
 
 
-def _pinned(release: Release, pinned: frozenset[str]) -> Iterator[x509.Certificate]:
+def _pinned_authorities(release: Release, pinned: frozenset[str]) -> Iterator[x509.Certificate]:
     """Yield the permissions CAs in a release whose SHA-256 is in ``pinned``."""
     for files in release.enclaves().values() if pinned else ():
         with suppress(SrosError):
@@ -269,8 +271,8 @@ def _check_lists(name: str, files: Mapping[str, bytes], present: Mapping[str, by
     """Raise `KeystoreError` if a revocation list in the release is older than the list here.
 
     ``files`` are the files of an enclave in the release, ``present`` its files here that may
-    contain lists. The owner of the folder can write anything into it, so only lists count that are
-    signed by a CA which the release trusts.
+    contain lists. The owner of the folder can write anything into it, so only lists that a CA in
+    the release signed count.
     """
     if older := older_list(present, files):
         here, new = older
@@ -318,14 +320,14 @@ def _newest_validity_start(enclaves: Iterable[Mapping[str, bytes]]) -> datetime 
 # ── an enclave ─────────────────────────────────────────────────────────────────────────────
 
 
-def _change(
+def _enclave_change(
     folder: Folder,
     name: str,
     files: Mapping[str, bytes],
     new_key: PrivateKey | None,
     now: datetime,
 ) -> _Change:
-    """Return what changes in an enclave, after trying its new files with its key.
+    """Return the changes of an enclave's files, after trying the new files with the key.
 
     Raises:
         SrosError: the new files cannot be used, or the current ones cannot be replaced.
@@ -337,20 +339,20 @@ def _change(
     takes_new = new_key is not None and new_key.public_key() == certified.public_key()
     key = new_key.public_key() if new_key and takes_new else _present_key(folder, name, files)
     state, problems = evaluate_delivered(name, files, key, now=now)
-    problems += _weak(state)
+    problems += _weakness_clauses(state)
     if problems:
         raise KeystoreError("its new files cannot be used", "; ".join(problems))
     _check_not_older(folder, place, state, now)
     change = _Change()
     for file, data in files.items():
-        if _content(folder, f"{place}/{file}") != data:
+        if _read_file(folder, f"{place}/{file}") != data:
             change.write[f"{place}/{file}"] = data
     if new_key and takes_new:
         change.write[f"{place}/{KEY_FILE}"] = key_pem(new_key)
         change.write[f"{place}/{REQUEST}"] = make_request(new_key, name)
     change.remove = [
         f"{place}/{file}"
-        for file in _OPTIONAL
+        for file in _OPTIONAL_RELEASE_FILES
         if file not in files and folder.state(f"{place}/{file}")
     ]
     return change
@@ -389,7 +391,7 @@ def _check_not_older(folder: Folder, place: str, sent: OpenedEnclave, now: datet
                 validity_of(present.certificate).not_before,
                 validity_of(sent.certificate).not_before,
             ),
-            ("grant", _begin_of_grant(present), _begin_of_grant(sent)),
+            ("grant", _grant_start(present), _grant_start(sent)),
         )
         if here and there and here > there
     ]
@@ -401,13 +403,13 @@ def _check_not_older(folder: Folder, place: str, sent: OpenedEnclave, now: datet
         )
 
 
-def _begin_of_grant(state: OpenedEnclave) -> datetime | None:
+def _grant_start(state: OpenedEnclave) -> datetime | None:
     with suppress(SrosError):
         return state.grant.validity.not_before if state.grant else None
     return None
 
 
-def _weak(state: OpenedEnclave) -> list[str]:
+def _weakness_clauses(state: OpenedEnclave) -> list[str]:
     return [f"{file}: {text}" for file, text in weaknesses(state)]
 
 
@@ -422,12 +424,12 @@ def _present_key(folder: Folder, name: str, files: Mapping[str, bytes]) -> Publi
         OSError: a file cannot be read.
     """
     place = enclave_folder(name)
-    if (data := _content(folder, f"{place}/{KEY_FILE}")) is not None:
+    if (data := _read_file(folder, f"{place}/{KEY_FILE}")) is not None:
         return load_key(data, f"of enclave {name}").public_key()
     if KEY_URI_FILE in files or folder.state(f"{place}/{KEY_URI_FILE}"):
-        if (data := _content(folder, f"{place}/{REQUEST}")) is not None:
+        if (data := _read_file(folder, f"{place}/{REQUEST}")) is not None:
             return load_request(data, f"of enclave {name}").public_key
-        pem = _content(folder, f"{place}/{CERTIFICATE_FILE}") or files.get(CERTIFICATE_FILE, b"")
+        pem = _read_file(folder, f"{place}/{CERTIFICATE_FILE}") or files.get(CERTIFICATE_FILE, b"")
         return load_certificates(pem, CERTIFICATE_FILE)[0].public_key()  # type: ignore[return-value]
     raise KeystoreError(
         f"the key of enclave {name} {KEY_NOT_HERE}",
@@ -438,7 +440,7 @@ def _present_key(folder: Folder, name: str, files: Mapping[str, bytes]) -> Publi
 
 
 def _check_place(folder: Folder, place: str) -> None:
-    """Raise `KeystoreError` unless the folder of an enclave, if it exists, can be changed."""
+    """Raise `KeystoreError` if the folder of an enclave exists and cannot be changed."""
     parts = place.split("/")
     for length in range(1, len(parts) + 1):
         path = "/".join(parts[:length])
@@ -446,13 +448,13 @@ def _check_place(folder: Folder, place: str) -> None:
             return
         if not os.access(folder.path / path, os.W_OK | os.X_OK):
             raise KeystoreError(f"'{folder.path / path}' cannot be changed by this user")
-    for file in _OF_ENCLAVE:
+    for file in _ENCLAVE_FILES:
         mode = folder.mode(f"{place}/{file}")
         if mode and not (stat.S_ISREG(mode) or stat.S_ISLNK(mode)):
             raise KeystoreError(f"'{folder.path / place / file}' is not a file")
 
 
-def _content(folder: Folder, path: str) -> bytes | None:
+def _read_file(folder: Folder, path: str) -> bytes | None:
     """Return the content of a file; None if it does not exist, or is a link that leads nowhere.
 
     Raises:
@@ -467,7 +469,9 @@ def _content(folder: Folder, path: str) -> bytes | None:
         return None
 
 
-def _list_alone(folder: Folder, name: str, files: Mapping[str, bytes], now: datetime) -> _Change:
+def _revocation_list_change(
+    folder: Folder, name: str, files: Mapping[str, bytes], now: datetime
+) -> _Change:
     """Return the change that gives an enclave only its new revocation list, if the list fits it.
 
     The enclave must trust the same identity CAs as before, and have a certificate; the list must be
@@ -477,11 +481,11 @@ def _list_alone(folder: Folder, name: str, files: Mapping[str, bytes], now: date
     with suppress(SrosError, OSError):
         _check_place(folder, place)
         authorities = files.get(IDENTITY_CA_FILE, b"")
-        same_cas = _content(folder, f"{place}/{IDENTITY_CA_FILE}") == authorities
+        same_cas = _read_file(folder, f"{place}/{IDENTITY_CA_FILE}") == authorities
         path, sent = f"{place}/{CRL_FILE}", files.get(CRL_FILE, b"")
         newest = newest_list(sent, authorities)
         expiry = next_update(newest) if newest is not None else None
-        fits = same_cas and _had_certificate(folder, name) and _content(folder, path) != sent
+        fits = same_cas and _had_certificate(folder, name) and _read_file(folder, path) != sent
         valid = (
             newest is not None and last_update(newest) <= now and (expiry is None or now < expiry)
         )
@@ -490,7 +494,7 @@ def _list_alone(folder: Folder, name: str, files: Mapping[str, bytes], now: date
     return change
 
 
-def _removal(folder: Folder, name: str) -> _Change:
+def _enclave_removal(folder: Folder, name: str) -> _Change:
     """Return the removal of an enclave's files.
 
     Raises:
@@ -498,7 +502,7 @@ def _removal(folder: Folder, name: str) -> _Change:
     """
     place = enclave_folder(name)
     _check_place(folder, place)
-    paths = (f"{place}/{file}" for file in _OF_ENCLAVE)
+    paths = (f"{place}/{file}" for file in _ENCLAVE_FILES)
     return _Change(remove=[path for path in paths if folder.state(path)])
 
 
@@ -520,7 +524,7 @@ def _had_certificate(folder: Folder, name: str) -> bool:
 # ── writing ────────────────────────────────────────────────────────────────────────────────
 
 
-def _apply(folder: Path, changes: Mapping[str, _Change]) -> dict[str, str]:
+def _apply_changes(folder: Path, changes: Mapping[str, _Change]) -> dict[str, str]:
     """Make all changes at once; if that fails, change each enclave by itself, whole or not at all.
 
     Return the enclaves that could not be changed, and why.
@@ -532,18 +536,18 @@ def _apply(folder: Path, changes: Mapping[str, _Change]) -> dict[str, str]:
         _commit(folder, changes.values())
         return {}
     except (SrosError, OSError) as error:
-        if isinstance(error, OSError) and error.errno in _FULL:
+        if isinstance(error, OSError) and error.errno in _DISK_FULL:
             _commit_lists(folder, changes.values())
             raise
         first = error
     if len(changes) == 1:
-        return {name: _reason(first) for name in changes}
+        return {name: _error_clause(first) for name in changes}
     failed = {}
     for name, change in changes.items():
         try:
             _commit(folder, [change])
         except (SrosError, OSError) as error:
-            failed[name] = _reason(error)
+            failed[name] = _error_clause(error)
     return failed
 
 
@@ -569,7 +573,7 @@ def _commit_lists(folder: Path, changes: Iterable[_Change]) -> None:
             _commit(folder, lists)
 
 
-def _reason(error: SrosError | OSError) -> str:
+def _error_clause(error: SrosError | OSError) -> str:
     """Return an error as a clause."""
     if isinstance(error, SrosError):
         return f"{error.what}: {error.clause}" if error.why else error.what

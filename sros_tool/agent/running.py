@@ -96,23 +96,24 @@ def look_at_processes(
     replaced: Mapping[str, datetime] = MappingProxyType({}),
     list_replaced: Mapping[str, datetime] = MappingProxyType({}),
 ) -> EnclaveProcesses:
-    """Return what runs in the enclaves ``names`` of ``folder``; ``look`` reads the processes.
+    """Return the processes that run in the enclaves ``names`` of ``folder``.
 
-    ``replaced`` maps enclaves to when their files were replaced, ``list_replaced`` to when their
-    trust files (CAs and revocation list) were.  Both are by the clock of ``now``, because the clock
-    may have been set since files got their times.
+    ``look`` reads the processes of the machine. ``replaced`` maps enclaves to the time when their
+    files were replaced, and ``list_replaced`` to the time when their trust files (CAs and
+    revocation list) were replaced. Both times are by the clock of ``now``: the times of the files
+    may be by a clock that was set since.
     """
     running = (look or ProcessTable().look)(now)
-    own_processes = [process for process in running.processes if _is_of(process, folder)]
+    own_processes = [process for process in running.processes if _runs_in_folder(process, folder)]
     readers = [process for process in own_processes if _can_read_key(process, folder)]
 
     def is_outdated(process: Process, enclave: ProcessEnclave) -> bool:
-        return _is_older(process, replaced) or any(newer_files(process, enclave))
+        return _started_before(process, replaced) or any(newer_files(process, enclave))
 
     def lacks_list(process: Process, enclave: ProcessEnclave) -> bool:
         since = list_since.get(_enclave_of(process))
         has_list = bool(since and since < process.started)
-        return _is_older(process, list_replaced) or may_lack_list(
+        return _started_before(process, list_replaced) or may_lack_list(
             process, enclave, has_list=has_list
         )
 
@@ -122,7 +123,7 @@ def look_at_processes(
     other_processes = [
         process
         for process in running.processes
-        if _enclave_of(process) in states and not _is_of(process, folder)
+        if _enclave_of(process) in states and not _runs_in_folder(process, folder)
     ]
     elsewhere = [process for process in other_processes if _folder_is_known(process)]
     environment = {ENABLE: "true", KEYSTORE: str(folder)}
@@ -176,7 +177,7 @@ def _folder_is_known(process: Process) -> bool:
     return bool(process.enclave and (process.enclave.folders or not process.enclave.problem))
 
 
-def _is_of(process: Process, folder: Path) -> bool:
+def _runs_in_folder(process: Process, folder: Path) -> bool:
     enclave = process.enclave
     if enclave is None:
         return False
@@ -186,7 +187,7 @@ def _is_of(process: Process, folder: Path) -> bool:
     return named and not _folder_is_known(process)
 
 
-def _is_older(process: Process, moments: Mapping[str, datetime]) -> bool:
+def _started_before(process: Process, moments: Mapping[str, datetime]) -> bool:
     moment = moments.get(_enclave_of(process))
     return moment is not None and process.started < moment
 
@@ -194,8 +195,8 @@ def _is_older(process: Process, moments: Mapping[str, datetime]) -> bool:
 def _can_read_key(process: Process, folder: Path) -> bool:
     """Return whether a process is of a user who can read the key of its enclave in ``folder``.
 
-    The files that the process sees do not show it: any user can mount others over them, for its own
-    processes.
+    The files that the process sees prove nothing: any user can mount other files over them for its
+    own processes.
     """
     if process.user in (0, folder.stat().st_uid):
         return True
@@ -247,8 +248,7 @@ def enclaves_to_restart(
 
 
 def _robot_dds(running: RunningProcesses) -> RobotDds:
-    """Return the DDS libraries that processes of this machine have loaded, or that are
-    installed."""
+    """Return the DDS libraries that processes have loaded, or that are installed."""
     loaded = [library for process in running.processes for library in process.dds]
     place_by_library = dict.fromkeys(installed_dds(), Seen.INSTALLED)
     place_by_library |= dict.fromkeys(
@@ -266,7 +266,7 @@ def _robot_dds(running: RunningProcesses) -> RobotDds:
 # ── the clock ──────────────────────────────────────────────────────────────────────────────
 
 _UNSYNCHRONIZED = 5  # TIME_ERROR
-_SIZE_OF_TIMEX = 512  # larger than the struct timex of any system
+_TIMEX_BYTES = 512  # larger than the struct timex of any system
 
 
 def kernel_clock() -> RobotClock:
@@ -274,7 +274,7 @@ def kernel_clock() -> RobotClock:
     try:
         library = ctypes.CDLL(None, use_errno=True)
         # With a zeroed struct, adjtimex changes nothing.
-        state = library.adjtimex(ctypes.create_string_buffer(_SIZE_OF_TIMEX))
+        state = library.adjtimex(ctypes.create_string_buffer(_TIMEX_BYTES))
     except (OSError, AttributeError):
         return RobotClock.UNKNOWN
     if state < 0:
@@ -286,7 +286,7 @@ def kernel_clock() -> RobotClock:
 
 
 class Systemd:
-    """The command that restarts units, and lists those that are active."""
+    """The command that restarts units, and lists active units."""
 
     def __init__(self, command: Sequence[str]) -> None:
         self._command = command
@@ -307,7 +307,7 @@ class Systemd:
         """Restart a unit.
 
         Raises:
-            UnavailableError: it does not restart; the error says why.
+            UnavailableError: the unit does not restart; the error says why.
         """
         self._run("restart", unit, seconds=_RESTART_SECONDS)
 
@@ -378,8 +378,8 @@ def restart_units(
 ) -> Restarts:
     """Restart the units of enclaves, one after the other.
 
-    A unit of an enclave in ``unusable``, which maps names to reasons, is left running: it would not
-    start again.
+    A unit of an enclave in ``unusable``, which maps names to reasons, is left running, because its
+    processes would not start again.
     """
     restarted: list[str] = []
     problems: list[str] = []

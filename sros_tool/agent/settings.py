@@ -24,7 +24,7 @@ from sros_tool.owners import other_writers, replaceable_on_the_way, user_name
 from sros_tool.xml import read_bytes
 
 SETTINGS_FILE = "agent.toml"
-_UNIT = re.compile(r"[A-Za-z0-9:_.\\@-]{1,250}\.(?:service|target)\Z")
+_UNIT_NAME = re.compile(r"[A-Za-z0-9:_.\\@-]{1,250}\.(?:service|target)\Z")
 _DIGEST = re.compile(r"[0-9a-f]{64}\Z")
 _SOURCE = re.compile(r"(?:https?://[!-~]+|/.*)\Z")
 
@@ -42,9 +42,9 @@ class AgentSettings:
 
     ``source`` and ``inbox`` are URLs (https, http) or absolute paths of folders.  ``authorities``
     are the SHA-256 of permissions CAs that are trusted in addition to the CAs in the folder.
-    ``tls_ca`` is a file with the CAs of the servers, or "" for those of the system.  With
-    ``new_key``, the agent makes a new key for each renewal.  With ``restart``, it restarts units:
-    ``units``, and those of `sros units` that are active; ``restart_if`` is a command that exits
+    ``tls_ca`` is a file with the CAs of the servers, or "" for the CAs of the system.  With
+    ``new_key``, the agent makes a new key for each renewal.  With ``restart``, the agent restarts
+    units: ``units``, and active units from `sros units`; ``restart_if`` is a command that exits
     with 0 if a restart is possible now, and ``systemctl`` the command that restarts a unit.
     """
 
@@ -110,7 +110,7 @@ def write_settings(folder: Path, settings: AgentSettings) -> None:
     """Write the settings of the agent of ``folder``, which has an agent's folder.
 
     Raises:
-        OSError: they cannot be written; earlier settings stay.
+        OSError: the settings cannot be written; earlier settings stay.
     """
     replace_file(agent_folder(folder) / SETTINGS_FILE, render_settings(settings))
 
@@ -119,40 +119,40 @@ def render_settings(settings: AgentSettings) -> bytes:
     """Return settings as a TOML document, which `read_settings` reads."""
     lines = [
         "# The agent of this robot (`sros agent`); docs/fetching.md describes each key.",
-        f"robot = {_text(settings.robot)}",
-        f"from = {_text(settings.source)}",
-        f"inbox = {_text(settings.inbox)}",
+        f"robot = {_toml_text(settings.robot)}",
+        f"from = {_toml_text(settings.source)}",
+        f"inbox = {_toml_text(settings.inbox)}",
     ]
     if settings.authorities:
-        lines.append(f"authorities = {_list(settings.authorities)}")
+        lines.append(f"authorities = {_toml_list(settings.authorities)}")
     if settings.tls_ca:
-        lines.append(f"tls_ca = {_text(settings.tls_ca)}")
+        lines.append(f"tls_ca = {_toml_text(settings.tls_ca)}")
     lines += [
-        f"new_key = {_truth(settings.new_key)}",
-        f"restart = {_truth(settings.restart)}",
+        f"new_key = {_toml_boolean(settings.new_key)}",
+        f"restart = {_toml_boolean(settings.restart)}",
     ]
     if settings.restart_if:
-        lines.append(f"restart_if = {_list(settings.restart_if)}")
-    lines.append(f"systemctl = {_list(settings.systemctl)}")
+        lines.append(f"restart_if = {_toml_list(settings.restart_if)}")
+    lines.append(f"systemctl = {_toml_list(settings.systemctl)}")
     for unit in settings.units:
         lines += [
             "",
             "[[unit]]",
-            f"name = {_text(unit.name)}",
-            f"enclaves = {_list(unit.enclaves)}",
+            f"name = {_toml_text(unit.name)}",
+            f"enclaves = {_toml_list(unit.enclaves)}",
         ]
     return ("\n".join(lines) + "\n").encode()
 
 
-def _text(text: str) -> str:
+def _toml_text(text: str) -> str:
     return json.dumps(text, ensure_ascii=True).replace("\\/", "/")
 
 
-def _list(texts: Sequence[str]) -> str:
-    return f"[{', '.join(map(_text, texts))}]"
+def _toml_list(texts: Sequence[str]) -> str:
+    return f"[{', '.join(map(_toml_text, texts))}]"
 
 
-def _truth(value: bool) -> str:
+def _toml_boolean(value: bool) -> str:
     return "true" if value else "false"
 
 
@@ -160,8 +160,8 @@ def read_settings(folder: Path) -> AgentSettings:
     """Return the settings of the agent of ``folder``.
 
     Raises:
-        KeystoreError: there are none, or others can change them.
-        DocumentError: they are malformed.
+        KeystoreError: there are no settings, or other users can change them.
+        DocumentError: the settings are malformed.
     """
     path = agent_folder(folder) / SETTINGS_FILE
     if not path.exists():
@@ -175,9 +175,9 @@ def read_settings(folder: Path) -> AgentSettings:
     return settings_from(read_toml(read_bytes(path, "agent's settings"), shown_path), shown_path)
 
 
-_TEXTS = {"robot": "robot", "from": "source", "inbox": "inbox", "tls_ca": "tls_ca"}
-_TRUTHS = {"new_key", "restart"}
-_LISTS = {"authorities", "restart_if", "systemctl"}
+_TEXT_KEYS = {"robot": "robot", "from": "source", "inbox": "inbox", "tls_ca": "tls_ca"}
+_BOOLEAN_KEYS = {"new_key", "restart"}
+_LIST_KEYS = {"authorities", "restart_if", "systemctl"}
 
 
 def settings_from(value: Mapping[str, Any], label: str) -> AgentSettings:
@@ -188,11 +188,11 @@ def settings_from(value: Mapping[str, Any], label: str) -> AgentSettings:
     """
     fields: dict[str, Any] = {}
     for key, entry in value.items():
-        if key in _TEXTS and isinstance(entry, str):
-            fields[_TEXTS[key]] = entry
-        elif key in _TRUTHS and isinstance(entry, bool):
+        if key in _TEXT_KEYS and isinstance(entry, str):
+            fields[_TEXT_KEYS[key]] = entry
+        elif key in _BOOLEAN_KEYS and isinstance(entry, bool):
             fields[key] = entry
-        elif key in _LISTS and _is_texts(entry):
+        elif key in _LIST_KEYS and _is_list_of_texts(entry):
             fields[key] = tuple(entry)
         elif key == "unit" and isinstance(entry, list):
             fields["units"] = tuple(_unit(unit, label) for unit in entry)
@@ -200,7 +200,7 @@ def settings_from(value: Mapping[str, Any], label: str) -> AgentSettings:
             raise _invalid_settings_error(
                 label, f"{key} is not a known key, or its value has the wrong form"
             )
-    if missing := [key for key in ("robot", "from", "inbox") if _TEXTS[key] not in fields]:
+    if missing := [key for key in ("robot", "from", "inbox") if _TEXT_KEYS[key] not in fields]:
         raise _invalid_settings_error(label, f"it lacks {', '.join(missing)}")
     settings = AgentSettings(**fields)
     if problem := name_problem(settings.robot):
@@ -225,11 +225,11 @@ def _unit(value: Any, label: str) -> Unit:
     if not isinstance(value, dict) or value.keys() != {"name", "enclaves"}:
         raise _invalid_settings_error(label, "a unit has the keys name and enclaves")
     name, enclaves = value["name"], value["enclaves"]
-    if not isinstance(name, str) or not _UNIT.match(name):
+    if not isinstance(name, str) or not _UNIT_NAME.match(name):
         raise _invalid_settings_error(
             label, f"{name!r} is not the name of a service or target of systemd"
         )
-    if not _is_texts(enclaves):
+    if not _is_list_of_texts(enclaves):
         raise _invalid_settings_error(label, f"the enclaves of {name} are not a list of names")
     try:
         return Unit(name, tuple(map(check_enclave_name, enclaves)))
@@ -237,7 +237,7 @@ def _unit(value: Any, label: str) -> Unit:
         raise _invalid_settings_error(label, str(error)) from error
 
 
-def _is_texts(value: object) -> bool:
+def _is_list_of_texts(value: object) -> bool:
     return isinstance(value, list) and all(isinstance(entry, str) for entry in value)
 
 

@@ -35,33 +35,34 @@ from sros_tool.validity import parse_iso
 from sros_tool.values import DryRun, FileChanges, Notes, as_plain, parse_json
 from sros_tool.xml import read_bytes
 
-_STATE = "state.json"
-_LOCK = "lock"
+_STATE_FILE = "state.json"
+_LOCK_FILE = "lock"
 _FORMAT = 1
 _LONGEST_UPTIME = 1e10  # seconds
 
 
 @dataclass(frozen=True, slots=True)
 class AgentState:
-    """What an agent remembers.
+    """The state that an agent keeps between its rounds.
 
     ``release`` is the number of the release that is installed with all its enclaves, and
     ``accepted`` the highest number that was verified: an older release is refused.  ``sequence`` is
     the number of the last message.  ``latest`` is the latest moment that has certainly passed:
     verified documents begin to be valid then.  ``due`` are the enclaves whose processes were not
-    yet seen with the installed files, since the start ``boot`` of the machine (see `boot_id`); of
-    those in ``unseen``, no process was seen.  ``restarted`` are the enclaves in ``due`` whose units
-    were restarted since.  ``list_due`` are the enclaves whose processes may lack the revocation
-    list.  ``files`` maps enclaves to two digests at the end of the last round, as text: of all
-    files, and of the files that decide whom the enclave trusts.  A change of a digest, whoever
-    wrote the files, makes a restart due; ``list_since`` maps enclaves to the time since when the
-    second digest is the same.  ``fetched`` and ``sent`` are when the source and the inbox were last
-    reached. ``replaced`` and ``list_replaced`` map enclaves of `due` and `list_due` to when the
-    agent last replaced their files, in seconds since the start of the machine: no setting of its
-    clock changes that.  ``repaired`` is a sentence on files that were not those of the release and
-    were replaced, at ``repaired_at``.  ``exposed`` maps paths of private keys that others could
-    read, until the agent closed them, to the time of that round; ``removed`` maps enclaves that the
-    installed release did not have to the time of the round that removed them.
+    yet seen with the installed files, since the start ``boot`` of the machine (see `boot_id`);
+    ``unseen`` are the enclaves in ``due`` of which no process was seen.  ``restarted`` are the
+    enclaves in ``due`` whose units were restarted since.  ``list_due`` are the enclaves whose
+    processes may lack the revocation list.  ``files`` maps enclaves to two digests at the end of
+    the last round, as text: of all files, and of the files that decide whom the enclave trusts.  A
+    change of a digest, whoever wrote the files, makes a restart due; ``list_since`` maps enclaves
+    to the time since when the second digest is the same.  ``fetched`` and ``sent`` are when the
+    source and the inbox were last reached. ``replaced`` and ``list_replaced`` map enclaves of `due`
+    and `list_due` to when the agent last replaced their files, in seconds since the start of the
+    machine: setting the clock does not change these times.  ``repaired`` is a sentence on files
+    that differed from the release and were replaced at ``repaired_at``.  ``exposed`` maps paths of
+    private keys that other users could read to the time of the round in which the agent closed
+    them; ``removed`` maps enclaves that the installed release did not have to the time of the round
+    that removed them.
     """
 
     release: int = 0
@@ -88,17 +89,17 @@ class AgentState:
     def next_sequence(self, now: datetime) -> int:
         """Return the sequence number of the next message: higher than all earlier ones.
 
-        It follows the clock, so that the keystore accepts the messages of a robot whose disk was
-        restored.
+        The number follows the clock, so that the keystore accepts the messages of a robot whose
+        disk was restored.
         """
         return max(self.sequence, int(now.timestamp())) + 1
 
 
 def read_state(folder: Path) -> AgentState:
-    """Return what the agent of ``folder`` remembers; from a damaged file, as much as possible."""
+    """Return the state of the agent of ``folder``; of a damaged file, the readable part."""
     state = AgentState()
     with suppress(SrosError, OSError, ValueError, TypeError, KeyError):
-        path = agent_folder(folder) / _STATE
+        path = agent_folder(folder) / _STATE_FILE
         state = _state_from(parse_json(read_bytes(path, "agent's state")))
     seal = read_seal(folder)
     with suppress(SrosError):
@@ -121,50 +122,50 @@ def _state_from(value: Any) -> AgentState:
             raise ValueError(number)
     for moment in ("latest", "fetched", "sent", "repaired_at"):
         if value.get(moment) is not None:
-            value[moment] = parse_iso(_text(value[moment]))
-    value["boot"] = _text(value["boot"])
-    value["repaired"] = _text(value.get("repaired", ""))
+            value[moment] = parse_iso(_checked_text(value[moment]))
+    value["boot"] = _checked_text(value["boot"])
+    value["repaired"] = _checked_text(value.get("repaired", ""))
     value = {"list_due": value["due"], "restarted": [], **value}
     for names in ("due", "unseen", "restarted", "list_due"):
-        value[names] = tuple(check_enclave_name(_text(name)) for name in value[names])
+        value[names] = tuple(check_enclave_name(_checked_text(name)) for name in value[names])
     value["files"] = {
-        check_enclave_name(_text(name)): _text(text)
+        check_enclave_name(_checked_text(name)): _checked_text(text)
         for name, text in dict(value.get("files", {})).items()
     }
     for moments in ("exposed", "removed", "list_since"):
         value[moments] = {
-            _text(path): parse_iso(_text(moment))
+            _checked_text(path): parse_iso(_checked_text(moment))
             for path, moment in dict(value.get(moments, {})).items()
         }
     for seconds in ("replaced", "list_replaced"):
         value[seconds] = {
-            check_enclave_name(_text(name)): _uptime(moment)
+            check_enclave_name(_checked_text(name)): _checked_uptime(moment)
             for name, moment in dict(value.get(seconds, {})).items()
         }
-    value["problems"] = tuple(map(_text, value["problems"]))
+    value["problems"] = tuple(map(_checked_text, value["problems"]))
     return AgentState(**value)
 
 
-def _uptime(value: Any) -> float:
+def _checked_uptime(value: Any) -> float:
     if not isinstance(value, int | float) or not 0 <= value <= _LONGEST_UPTIME:
         raise ValueError(f"{value!r} is not a number of seconds since the start of a machine")
     return float(value)
 
 
-def _text(value: Any) -> str:
+def _checked_text(value: Any) -> str:
     if not isinstance(value, str):
         raise TypeError(f"{value!r} is not text")
     return value
 
 
 def write_state(folder: Path, state: AgentState) -> None:
-    """Write what the agent of ``folder`` remembers.
+    """Write the state of the agent of ``folder``.
 
     Raises:
-        OSError: it cannot be written; the earlier state stays.
+        OSError: the state cannot be written; the earlier state stays.
     """
     text = json.dumps({"format": _FORMAT, **as_plain(state)}, indent=1)
-    with staged_file(agent_folder(folder) / _STATE, text.encode() + b"\n") as put_in_place:
+    with staged_file(agent_folder(folder) / _STATE_FILE, text.encode() + b"\n") as put_in_place:
         put_in_place()
 
 
@@ -175,13 +176,13 @@ def mark_outdated(folder: Path) -> None:
     of the state shows that it is outdated.
     """
     with suppress(OSError), Folder(agent_folder(folder)) as opened:
-        opened.set_time(_STATE, 0)
+        opened.set_time(_STATE_FILE, 0)
 
 
 def _outdated_sentences(folder: Path) -> Iterator[str]:
     """Yield a sentence if the last round could not write its state."""
     with suppress(OSError):
-        if (agent_folder(folder) / _STATE).stat().st_mtime == 0:
+        if (agent_folder(folder) / _STATE_FILE).stat().st_mtime == 0:
             yield (
                 f"The last round could not write to '{agent_folder(folder)}', so its result is not "
                 "known. Make room on the disk."
@@ -199,7 +200,7 @@ def write_seal(folder: Path, seal: bytes) -> None:
     """Keep the seal of the release that is accepted.
 
     Raises:
-        OSError: it cannot be written; the earlier seal stays.
+        OSError: the seal cannot be written; the earlier seal stays.
     """
     if read_seal(folder) != seal:
         with staged_file(agent_folder(folder) / RELEASE_SEAL, seal, mode=0o644) as put_in_place:
@@ -211,10 +212,10 @@ def agent_lock(folder: Path) -> Iterator[None]:
     """Let only one agent at a time work in ``folder``.
 
     Raises:
-        KeystoreError: another agent works in it.
+        KeystoreError: another agent works in ``folder``.
     """
     with Folder(agent_folder(folder)) as opened:
-        handle = opened.open_private(_LOCK)
+        handle = opened.open_private(_LOCK_FILE)
         try:
             try:
                 fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -277,9 +278,9 @@ class AgentStatus(NamedTuple):
 
 
 def agent_status(folder: Path, *, now: datetime, oldest: timedelta) -> AgentStatus:
-    """Return what the agent of ``folder`` last did, and what is wrong with the files now.
+    """Return the result of the agent's last round, and the present problems of the files.
 
-    ``oldest`` is how long ago source and inbox may at most have been reached.
+    If the source or the inbox was last reached longer than ``oldest`` ago, this is a problem.
 
     Raises:
         SrosError: the folder has no agent, or its settings are malformed.
@@ -289,7 +290,11 @@ def agent_status(folder: Path, *, now: datetime, oldest: timedelta) -> AgentStat
         moment is not None and abs(now - moment) <= oldest for moment in (state.fetched, state.sent)
     )
     whole = 0 < state.release == state.accepted
-    problems = (*_outdated_sentences(folder), *state.problems, *_seen_now(folder, state, now))
+    problems = (
+        *_outdated_sentences(folder),
+        *state.problems,
+        *_present_problems(folder, state, now),
+    )
     return AgentStatus(
         folder,
         settings.robot,
@@ -306,8 +311,8 @@ def agent_status(folder: Path, *, now: datetime, oldest: timedelta) -> AgentStat
     )
 
 
-def _seen_now(folder: Path, state: AgentState, now: datetime) -> Iterator[str]:
-    """Yield sentences on what is wrong with the files now, except what the last round reported."""
+def _present_problems(folder: Path, state: AgentState, now: datetime) -> Iterator[str]:
+    """Yield sentences on present problems of the files that the last round did not report."""
     names = [n for n in enclave_names(folder) if not waits_for_answer(enclave_path(folder, n))]
     for name in sorted(state.files.keys() - {*names}):
         yield f"{name} had a certificate in the last round of the agent, and has none now."

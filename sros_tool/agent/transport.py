@@ -27,7 +27,7 @@ from sros_tool.agent.connection import GuardedConnection
 from sros_tool.errors import SrosError, UsageError
 from sros_tool.folders import Folder
 
-_BLOCK = 1 << 16
+_BLOCK_BYTES = 1 << 16
 
 
 class FolderTransport(FetcherInterface):
@@ -64,7 +64,7 @@ class FolderTransport(FetcherInterface):
 class HttpTransport(FetcherInterface):
     """Gets the files of a publishing folder from a web server, over one connection.
 
-    Its ``connection`` has to be entered, and is cut off after some minutes.
+    The ``connection`` has to be entered, and is cut off after some minutes.
     """
 
     def __init__(
@@ -79,7 +79,7 @@ class HttpTransport(FetcherInterface):
         Args:
             url: ``http://HOST[:PORT][/PATH]`` or ``https://…``.
             certificate: files (PEM) of the client's certificate and its key.
-            tls_ca: file (PEM) of the server's CAs; None: those of the system.
+            tls_ca: file (PEM) of the server's CAs; None: the CAs of the system.
 
         Raises:
             UsageError: ``url`` has another form.
@@ -116,24 +116,27 @@ class HttpTransport(FetcherInterface):
         path = f"{self._path}{url.removeprefix(self.base)}"
         response = None
         try:
-            response = self._answer(path)
+            response = self._response(path)
             if response.status != http.client.OK:
                 text = f"it answers {response.status} for {path}"
                 raise DownloadHTTPError(text, response.status)
-            while block := response.read1(_BLOCK):
+            while block := response.read1(_BLOCK_BYTES):
                 yield block
         except (OSError, http.client.HTTPException) as error:
             if self.connection.is_cut_off:
                 raise SlowRetrievalError(f"{path} takes too long") from error
-            raise DownloadError(_reason(error)) from error
+            raise DownloadError(_error_clause(error)) from error
         finally:
             if response is None or not response.isclosed():
                 self.connection.end()
         if self.connection.is_cut_off:  # the answer may be incomplete
             raise SlowRetrievalError(f"{path} takes too long")
 
-    def _answer(self, path: str) -> http.client.HTTPResponse:
-        """Send the request; once more if the server has closed the kept connection meanwhile."""
+    def _response(self, path: str) -> http.client.HTTPResponse:
+        """Send the request and return the response.
+
+        If the server has closed the connection since the last request, the request is sent again.
+        """
         kept = self.connection.sock is not None
         try:
             return self._request(path)
@@ -148,7 +151,7 @@ class HttpTransport(FetcherInterface):
         return self.connection.getresponse()
 
 
-def _reason(error: Exception) -> str:
+def _error_clause(error: Exception) -> str:
     """Return why a server could not be asked, as a clause."""
     if isinstance(error, ssl.SSLCertVerificationError):
         return f"its certificate is not valid: {error.verify_message}"

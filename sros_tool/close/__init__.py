@@ -1,4 +1,4 @@
-"""Closing an open robot: watching it, preparing and applying its security, the proof, the way back.
+"""Closing an open robot: watching, preparing and applying security, proving it, undoing it.
 
 The steps are verbs of sros, which the caller runs (`Shell`); nothing is printed here.
 """

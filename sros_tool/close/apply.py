@@ -41,7 +41,7 @@ _SYSTEMD = Path("/etc/systemd/system")
 _RESTART_SECONDS = 30.0
 """How long processes that sros restarted may take until they run in their enclaves, or open."""
 
-_STEADY = timedelta(seconds=2)
+_STABLE_FOR = timedelta(seconds=2)
 """How long a process that sros restarted open has to run: many end while they start."""
 
 
@@ -105,7 +105,9 @@ def undo(robot: LocalRobot, *, dry_run: bool) -> CloseState:
     _restart_units(robot, observed, units, dry_run=dry_run)
     started = [process for process in observed.processes if process.unit in units and process.pid]
     if started and not dry_run:
-        running = wait_until(robot, lambda seen: not [*_not_open(seen, started)], _RESTART_SECONDS)
+        running = wait_until(
+            robot, lambda seen: not [*_processes_not_open(seen, started)], _RESTART_SECONDS
+        )
     changes = [FileChange("remove", str(path)) for path in drop_ins]
     policy = _readable_policy(robot)
     state = current_state(robot, policy)._replace(dry_run=dry_run, changes=changes)
@@ -116,17 +118,17 @@ def undo(robot: LocalRobot, *, dry_run: bool) -> CloseState:
     problems = [
         *remaining.commands_to_open(),
         *(() if dry_run else remaining.secured_units()),
-        *(() if dry_run else _not_open(running, started)),
+        *(() if dry_run else _processes_not_open(running, started)),
         *remaining.secured_guests(),
         *remaining.unknown_processes(),
     ]
     return state._replace(problems=problems)
 
 
-def _not_open(running: RunningRobot, started: Sequence[ClosedProcess]) -> Iterator[str]:
+def _processes_not_open(running: RunningRobot, started: Sequence[ClosedProcess]) -> Iterator[str]:
     """Yield the processes of restarted units that run neither open nor in their enclaves."""
     secured = {enclave.name for _, enclave in running.secured_everywhere}
-    since = running.robot.shell.now() - _STEADY
+    since = running.robot.shell.now() - _STABLE_FOR
     for process in started:
         if process.enclave not in secured and not running.runs_open(process, since):
             yield (
@@ -145,7 +147,7 @@ def _readable_policy(robot: LocalRobot) -> Policy | None:
 
 
 class _RemainingProcesses:
-    """The processes after the units were restarted: what is left to open by hand.
+    """The processes that are left to open by hand after the units were restarted.
 
     ``observed`` are the processes that the robot has, and ``running`` the processes of the machine.
     """
@@ -161,7 +163,7 @@ class _RemainingProcesses:
         self._started_by_hand = [*chain.from_iterable(by_hand.values())]
 
     def commands_to_open(self) -> Iterator[str]:
-        """Yield how to restart processes in enclaves without security, except those of units."""
+        """Yield commands that restart secured processes open, except processes of units."""
         closed = [process for process in self._started_by_hand if process.enclave in self._secured]
         counts = Counter(process.enclave for process in closed)
         started_by: dict[str, dict[str, None]] = {}
@@ -200,13 +202,15 @@ class _RemainingProcesses:
             names, old_name = nodes.names_in(process.enclave)
             under = f", under its old name {old_name}" if old_name else ""
             state = "does not run; "
-            if labels := [other.label for other in unknown if _is_like(other, process, names)]:
+            if labels := [
+                other.label for other in unknown if _may_be_process(other, process, names)
+            ]:
                 state = f"runs open by another command ({labels[0]}); if this is another program, "
             command = process.open_command(self._robot.domain)
             self._robot.shell.say(f"{process.enclave} {state}start it open{under}: {command}")
 
     def secured_guests(self) -> Iterator[str]:
-        """Yield processes that run in an enclave of the export in which none was observed."""
+        """Yield processes in enclaves of the export for which no process was observed."""
         known = {process.enclave for process in self._observed.processes}
         for enclave in sorted(self._secured.keys() - known):
             guest = self._secured[enclave]
@@ -239,10 +243,10 @@ class _RemainingProcesses:
             self._robot.shell.say(f"{why}{remedy}")
 
 
-def _is_like(process: Process, observed: ClosedProcess, nodes: Collection[str]) -> bool:
-    """Return whether a process may be an observed one that was started with another command.
+def _may_be_process(process: Process, observed: ClosedProcess, nodes: Collection[str]) -> bool:
+    """Return whether a process may be the ``observed`` process, started by another command.
 
-    ``nodes`` are the full names of the observed process's nodes.
+    ``nodes`` are the full names of the nodes of ``observed``.
     """
     if node := node_argument(process.program[1]):
         return expand("~", *node) in nodes
@@ -276,9 +280,10 @@ def _restart_units(
     changed: bool = False,
     dry_run: bool,
 ) -> None:
-    """Let systemd read its units again if some are restarted or changed.  Raises `SrosError`.
+    """Restart ``units``, after systemd has read its units again.  Raises `SrosError`.
 
-    Units whose processes ended by themselves are restarted only if they run.
+    Units whose processes ended by themselves are restarted only if they run. With ``changed``,
+    systemd reads its units again even if no unit is restarted.
     """
     idle = {process.unit for process in observed.processes if not (process.pid or process.alike)}
     verbs = {"restart": units - idle, "try-restart": units & idle}

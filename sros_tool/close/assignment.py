@@ -42,8 +42,8 @@ def assign(
     """Return the enclave of each process, by the nodes of the process in the graph.
 
     Processes of other domains or networks are left out.  ``process_ids`` maps participants of
-    Cyclone DDS to the process ids that they state; ``origins`` has what started each process, and
-    with None, that is read from the running processes.
+    Cyclone DDS to the process ids that they state; ``origins`` maps processes to their origins; by
+    default, the origins are read from the running processes.
     """
     # A process may have run several programs: the last one counts.
     by_pid = {process.pid: process for process in running}
@@ -57,7 +57,7 @@ def assign(
     by_enclave: dict[str, list[ObservedNode]] = {}
     for node in nodes:
         by_enclave.setdefault(node.enclaves[0], []).append(node)
-    claims = _claims(candidates, by_enclave, process_ids or {})
+    claims = _assignments_by_evidence(candidates, by_enclave, process_ids or {})
     units = Counter(
         {process.program[0]: origins[process.pid].unit for process in candidates}.values()
     )
@@ -71,7 +71,7 @@ def assign(
     counts = Counter(closed.enclave for closed in assigned)
     return ObservedProcesses(
         domain,
-        processes=sorted(_with_shares(assigned)),
+        processes=sorted(_with_shared_programs(assigned)),
         unknown=[process_text(process) for process in candidates if process.pid not in known],
         elsewhere=sorted(
             enclave
@@ -81,7 +81,7 @@ def assign(
     )
 
 
-def _with_shares(assigned: Sequence[ClosedProcess]) -> Iterator[ClosedProcess]:
+def _with_shared_programs(assigned: Sequence[ClosedProcess]) -> Iterator[ClosedProcess]:
     """Yield processes with the other enclaves whose processes the same program starts."""
     enclaves: dict[int, set[str]] = {}
     for process in assigned:
@@ -90,18 +90,18 @@ def _with_shares(assigned: Sequence[ClosedProcess]) -> Iterator[ClosedProcess]:
         yield process._replace(shares=sorted(enclaves[process.pid] - {process.enclave}))
 
 
-def _claims(
+def _assignments_by_evidence(
     processes: Sequence[Process],
     by_enclave: Mapping[str, Sequence[ObservedNode]],
     process_ids: Mapping[str, int],
 ) -> list[tuple[Process, str, str]]:
-    """Return processes with their enclaves and how they are known, by the surest sign first.
+    """Return (process, enclave, kind of evidence) for processes, by the most reliable evidence.
 
-    If more processes have a sign of an enclave than the enclave has participants, the sign is
-    ignored.
+    If more processes have the same evidence for an enclave than the enclave has participants, this
+    evidence is ignored.
     """
     claims = [(process, ROUTER, "program") for process in processes if process.is_router]
-    for known_by, shows_node in _KNOWN_BY.items():
+    for known_by, shows_node in _EVIDENCE_CHECKS.items():
         unassigned = sorted(by_enclave.keys() - {enclave for _, enclave, _ in claims})
         if known_by == "elimination" and len(unassigned) > 1:
             continue
@@ -119,7 +119,9 @@ def _claims(
     return claims
 
 
-def _shows_its_id(process: Process, node: ObservedNode, process_ids: Mapping[str, int]) -> bool:
+def _states_process_id(
+    process: Process, node: ObservedNode, process_ids: Mapping[str, int]
+) -> bool:
     """Return whether a node's participant has or states the process id."""
     pid = process.own_pid or process.pid
     if not node.participant.startswith(FAST_DDS):
@@ -129,7 +131,7 @@ def _shows_its_id(process: Process, node: ObservedNode, process_ids: Mapping[str
     return is_fast and node.participant[8:12] == f"{low:02x}{high:02x}"
 
 
-def _is_named(process: Process, node: ObservedNode, _process_ids: object) -> bool:
+def _is_named_by_command(process: Process, node: ObservedNode, _process_ids: object) -> bool:
     """Return whether the command gives the node its name and namespace."""
     return node_argument(process.command) == (node.ns, node.name)
 
@@ -139,9 +141,9 @@ def _has_program_named_alike(process: Process, node: ObservedNode, _process_ids:
     return program_of(process.command).removesuffix(".py") == node.name
 
 
-_KNOWN_BY: dict[str, Callable[[Process, ObservedNode, Mapping[str, int]], bool]] = {
-    "process id": _shows_its_id,
-    "node name": _is_named,
+_EVIDENCE_CHECKS: dict[str, Callable[[Process, ObservedNode, Mapping[str, int]], bool]] = {
+    "process id": _states_process_id,
+    "node name": _is_named_by_command,
     "program": _has_program_named_alike,
     "elimination": lambda _process, _node, _process_ids: True,
 }
@@ -174,8 +176,8 @@ def ended_processes(
     """Return the processes that ended while sros watched, with the nodes that they ran.
 
     If an enclave had several commands, its processes are left out, because one of them may be
-    another program that took the node's name.  ``observed`` are the processes that stayed; the unit
-    of such a process started none of the ended ones.
+    another program that took the node's name.  ``observed`` are the processes that still run; their
+    units are taken to have started none of the ended processes.
     """
     origins = {process.pid: origin for process, origin in ran}
     units_in_use = observed.units

@@ -43,7 +43,7 @@ from sros_tool.runtime.variables import ENCLAVE
 from sros_tool.values import FileChange
 from sros_tool.wording import counted, enumerated, first_few
 
-_NOT_FOR_GIT = """\
+_GITIGNORE_TEXT = """\
 # What `sros close` makes for this machine, and private keys.
 /keystore/
 /export/
@@ -77,7 +77,7 @@ class CommandStep(NamedTuple):
 
 
 def prepare(robot: LocalRobot, duration: str | None, *, partial: bool, dry_run: bool) -> CloseState:
-    """Do the steps whose results are not there yet, and write how each process is started.
+    """Run the steps whose results are missing, and write how each process is started.
 
     Raises:
         SrosError: the robot cannot be watched, or the keystore was brought to another machine.
@@ -94,7 +94,7 @@ def prepare(robot: LocalRobot, duration: str | None, *, partial: bool, dry_run: 
     if robot.export.exists() and robot.observation_file.exists():
         with suppress(SrosError):  # the steps report the error
             denied_before = _denied_access(robot)
-    done, problems, is_stopped = _do_steps(robot, duration, partial=partial, dry_run=dry_run)
+    done, problems, is_stopped = _run_steps(robot, duration, partial=partial, dry_run=dry_run)
     ignored = [] if dry_run else _ignore_in_git(robot)
     removed = [] if dry_run or is_stopped else _remove_enclaves(robot)
     if not (dry_run or is_stopped):
@@ -119,7 +119,7 @@ def prepare(robot: LocalRobot, duration: str | None, *, partial: bool, dry_run: 
 
 
 def _check_folder(robot: LocalRobot) -> None:
-    """Raise `UsageError` without the keystore of an export; say if the folder has other files."""
+    """Raise `UsageError` if there is an export but no keystore; note other files in the folder."""
     if robot.export.exists() and not robot.keystore.exists():
         raise UsageError(
             f"the keystore '{robot.keystore}' is not there, and '{robot.export}' was exported "
@@ -138,14 +138,15 @@ def _ignore_in_git(robot: LocalRobot) -> list[FileChange]:
     file = robot.folder / ".gitignore"
     if os.path.lexists(file):
         return []
-    replace_file(file, _NOT_FOR_GIT.encode())
+    replace_file(file, _GITIGNORE_TEXT.encode())
     return [FileChange("create", str(file))]
 
 
 def _remember_later_processes(robot: LocalRobot) -> None:
-    """Remember processes with the commands of later starts, and print which; not before a watch.
+    """Write changed commands of processes, and new processes, into the folder, and show them.
 
-    An enclave that neither the keystore nor the policy has any more belongs to no other machine.
+    Enclaves that neither the keystore nor the policy has any more are removed from the enclaves of
+    other machines. Before a watch, nothing is done.
     """
     if robot.observed is None:
         return
@@ -186,15 +187,15 @@ def _with_renamed_enclaves(robot: LocalRobot, observed: ObservedProcesses) -> Ob
 
 
 def _denied_access(robot: LocalRobot) -> list[str]:
-    """Return, as sentences, what the keystore denies to the observed nodes."""
+    """Return sentences on the access that observed nodes need and the keystore denies."""
     nodes = ObservedNodes(robot)
     return [str(right) for right in nodes.denied_rights(nodes.expected())]
 
 
-def _do_steps(
+def _run_steps(
     robot: LocalRobot, duration: str | None, *, partial: bool, dry_run: bool
 ) -> tuple[list[CloseStep], list[str], bool]:
-    """Do the steps; return their states, the problems, and whether a problem stopped the rest."""
+    """Run the steps; return their states, the problems, and whether a problem stopped the rest."""
     done: list[CloseStep] = []
     problems: list[str] = []
     is_stopped = False
@@ -206,7 +207,7 @@ def _do_steps(
                 _, output, messages = robot.shell.run((*step.words, "--dry-run"), False)
                 robot.shell.say_lines(messages if output else "")
         elif state == "open" and not is_stopped:
-            state, step_problems = _do(robot, step)
+            state, step_problems = _run_step(robot, step)
             problems += step_problems
             is_stopped = step.guards and state == "findings"
         done.append(CloseStep(step.command, state))
@@ -218,9 +219,9 @@ def _do_steps(
 
 
 def steps(robot: LocalRobot, duration: str | None) -> Iterator[CommandStep]:
-    """Yield the steps; with a ``duration``, the robot is watched even if it was before.
+    """Yield the steps; with a ``duration``, the robot is watched even if it was watched before.
 
-    The enclaves to export are known when the steps before are done.
+    The enclaves to export are known when the earlier steps are done.
     """
     policy, keystore, needed = str(robot.policy), str(robot.keystore), str(robot.requirements)
     domain = ("--domain", str(robot.domain))
@@ -247,8 +248,8 @@ def steps(robot: LocalRobot, duration: str | None) -> Iterator[CommandStep]:
     yield CommandStep(("view", policy, *created, "-o", str(robot.page), "--force"))
 
 
-def _do(robot: LocalRobot, step: CommandStep) -> tuple[str, list[str]]:
-    """Do a step; return its state, and why the robot is not closed yet.
+def _run_step(robot: LocalRobot, step: CommandStep) -> tuple[str, list[str]]:
+    """Run a step; return its state, and the reasons why the robot is not closed yet.
 
     Raises:
         SrosError: the robot cannot be watched.
@@ -318,7 +319,7 @@ def _remove_enclaves(robot: LocalRobot) -> list[FileChange]:
 
 
 def _problems_of(robot: LocalRobot, state: CloseState, *, partial: bool) -> Iterator[str]:
-    """Yield what keeps the robot from running closed, with what to do."""
+    """Yield the problems that keep the robot from running closed, with their remedies."""
     yield from _keystore_problems(robot)
     for name in sorted(robot.not_here & state.secured.keys()):
         yield f"{name} belongs to another machine, and a process runs in it here: stop it"
@@ -335,7 +336,7 @@ def _problems_of(robot: LocalRobot, state: CloseState, *, partial: bool) -> Iter
 
 
 def _keystore_problems(robot: LocalRobot) -> Iterator[str]:
-    """Yield the enclaves of the keystore that the policy does not have."""
+    """Yield a text if the keystore has enclaves that the policy does not have."""
     known = {OBSERVER, ROUTER, *robot.not_here, *robot.policy_enclaves()}
     for name in list_enclaves(robot.keystore):
         if name not in known:

@@ -97,7 +97,7 @@ class ClosedProcess(NamedTuple):
 
     @property
     def pids_text(self) -> str:
-        """The id of the process, or the ids that fit equally, as text; "" if it does not run."""
+        """The id of the process, or the ids that fit equally, as text; "" if none runs."""
         if self.alike:
             return (
                 f"one of the processes {enumerated([*map(str, self.alike)])} (sros cannot tell "
@@ -158,7 +158,7 @@ class ClosedProcess(NamedTuple):
         return self._replace(pid=next(iter(pids), 0), known_by=known_by, alike=())
 
     def is_absent(self, running: RunningProcesses) -> bool:
-        """Return whether its unit runs no such process: the process failed, or was stopped."""
+        """Return whether the process's unit runs without it: the process failed, or was stopped."""
         may_run = running.hidden or self.pid in {process.pid for process in running.unseen}
         runs = any(map(self.fits, running.processes))
         return bool(self.unit and self.pid) and not (may_run or runs)
@@ -313,7 +313,8 @@ class ObservedProcesses(NamedTuple):
     def started_in(self, process: ClosedProcess) -> str:
         """Return the enclave in which the command of a process is started.
 
-        It differs from the enclave of the process if the program itself chooses that enclave.
+        This enclave differs from the enclave of the process if the program itself chooses the
+        latter.
         """
         enclaves = {process.enclave, *process.shares}
         return min(
@@ -366,7 +367,7 @@ _Value = TypeVar("_Value")
 
 
 def read_document(path: Path, parse: Callable[[Any], _Value], kind: str, remedy: str) -> _Value:
-    """Return what ``parse`` makes of the JSON value in a file of a robot's folder.
+    """Read a JSON file of a robot's folder; return the result of ``parse`` for its value.
 
     Raises:
         DocumentError: The file cannot be read, or is not ``kind``, such as "an observation".

@@ -55,12 +55,12 @@ from sros_tool.runtime.environment import ROS_ARGS, named_enclave
 from sros_tool.runtime.variables import ENCLAVE
 from sros_tool.wording import counted, enumerated, first_few
 
-_STARTED = "every process was started in its enclave"
+_CLAIM_STARTED = "every process was started in its enclave"
 
 _START_SECONDS = 3.0
 """How long processes that were restarted by hand may take until they run in their enclaves."""
 
-_TRIES = 3
+_MOST_TRIES = 3
 """How often the observer looks until the nodes do what they did on the open robot."""
 
 
@@ -83,14 +83,16 @@ def proofs_of(robot: LocalRobot, state: CloseState, patience: float) -> list[Pro
         return [_proof_of_files(robot, expired)]
     expected = {process.enclave for process in state.observed.processes} | {*state.new}
     if not expected:
-        return [Proof(_STARTED, False, "no process of the robot is known")]
+        return [Proof(_CLAIM_STARTED, False, "no process of the robot is known")]
     running = wait_until(robot, lambda seen: seen.current_enclaves >= expected, patience)
     missing = sorted(expected - running.current_enclaves)
     running_now = {enclave.name for _, enclave in running.secured}
     needed = {*missing}.difference(robot.without) | running_now.intersection(missing)
     if needed or expected == {*missing}:
         observed = state.observed.with_current_pids(running.processes, robot.export)
-        return [Proof(_STARTED, False, _why_missing(running, sorted(needed) or missing, observed))]
+        return [
+            Proof(_CLAIM_STARTED, False, _why_missing(running, sorted(needed) or missing, observed))
+        ]
     nodes, not_here = ObservedNodes(robot), robot.not_here
     # A laptop may be away; a computer whose nodes were seen has to be seen again.
     may_be_away = not_here - {node.enclaves[0] for node in nodes.compared(()).nodes}
@@ -109,7 +111,7 @@ def proofs_of(robot: LocalRobot, state: CloseState, patience: float) -> list[Pro
 
 
 def _proof_of_files(robot: LocalRobot, expired: Sequence[str]) -> Proof:
-    """Ask `check` about the files that the processes use, such as a key that others read.
+    """Prove that `check` finds no error in the files that the processes use.
 
     The enclaves ``expired`` of the export have expired.
     """
@@ -147,7 +149,7 @@ def _expired_enclaves(robot: LocalRobot, root: Path) -> list[str]:
 
 
 def _expired_text(robot: LocalRobot, expired: Sequence[str]) -> str:
-    """Return that enclaves of the export have expired, and how to renew those that need it."""
+    """Return text on expired enclaves of the export, and on how to renew them."""
     text = f"the files of {first_few(expired, MOST_NAMES)} have expired; "
     if not robot.keystore.exists():
         return (
@@ -218,9 +220,10 @@ def _demands_more_enclaves(robot: LocalRobot) -> bool:
 
 
 def _proof_of_silence(robot: LocalRobot, before: Observation, *, hears: bool) -> Proof:
-    """Look for nodes as an open listener, which saw all nodes before the robot was closed.
+    """Prove that an open listener sees no node of the robot.
 
-    Seeing none means something only if the observer ``hears`` the robot in its enclave now.
+    Before the robot was closed, the listener saw the nodes ``before``. Seeing none now proves
+    something only if the observer ``hears`` the robot in its enclave.
     """
     words = ("generate_policy", str(robot.folder / "open.xml"), "--domain", str(robot.domain))
     try:
@@ -238,7 +241,7 @@ def _proof_of_silence(robot: LocalRobot, before: Observation, *, hears: bool) ->
 
 
 def _proof_of_processes(running: RunningRobot, number: int) -> Proof:
-    """Look for open processes, and for processes with findings.
+    """Prove that no process runs open, and that none has findings.
 
     ``number`` enclaves have a process with the current files.
     """
@@ -257,14 +260,14 @@ def _proof_of_processes(running: RunningRobot, number: int) -> Proof:
     wrong = [finding for finding in findings if finding.id != PROCESS_NOT_SEEN.id]
     if findings:
         worst = (wrong or findings)[0]
-        return Proof(_STARTED, False if wrong else None, f"{worst.subject}: {worst.text}")
-    guests = "".join(f"; {guest}" for guest in _guests(running))
+        return Proof(_CLAIM_STARTED, False if wrong else None, f"{worst.subject}: {worst.text}")
+    guests = "".join(f"; {guest}" for guest in _unexpected_processes(running))
     summary = f"{counted(number, 'enclave')}, and no open process in domain {robot.domain}"
-    return Proof(_STARTED, True, f"{summary}{guests}")
+    return Proof(_CLAIM_STARTED, True, f"{summary}{guests}")
 
 
 def _process_findings(running: RunningRobot) -> list[Finding]:
-    """Return what `check runtime` finds in the robot's domain, run in the observer's enclave."""
+    """Return the findings of `check runtime` in the robot's domain and the observer's enclave."""
     robot = running.robot
     robot.shell.say(
         f'$ eval "$(sros env {shlex.quote(str(robot.export))} {OBSERVER})"; sros check runtime'
@@ -276,7 +279,7 @@ def _process_findings(running: RunningRobot) -> list[Finding]:
     return [finding for finding in findings if finding.severity > NOTE]
 
 
-def _guests(running: RunningRobot) -> Iterator[str]:
+def _unexpected_processes(running: RunningRobot) -> Iterator[str]:
     """Yield processes in enclaves of other folders, and open processes in other domains."""
     known_pids = {process.pid for process, _ in running.secured}
     in_domain = running.in_domain
@@ -291,7 +294,7 @@ def _guests(running: RunningRobot) -> Iterator[str]:
 
 
 def _why_missing(running: RunningRobot, missing: Sequence[str], observed: ObservedProcesses) -> str:
-    """Return which enclaves have no process or an open one, and why others do not count."""
+    """Return which enclaves have no process or an open one, and why other ones do not count."""
     robot = running.robot
     outdated = {name: found for name, found in running.not_current.items() if name in missing}
     causes = {
@@ -329,7 +332,7 @@ def _why_missing(running: RunningRobot, missing: Sequence[str], observed: Observ
 
 
 def _proof_of_talk(running: RunningRobot, nodes: ObservedNodes, away: Collection[str]) -> Proof:
-    """Compare the nodes that an observer in an enclave sees now with those of the open robot.
+    """Prove that an observer in an enclave sees the same nodes as on the open robot.
 
     Processes of the enclaves ``away`` do not run; ``running`` are the processes of the other
     enclaves at the beginning of the proof.
@@ -338,7 +341,7 @@ def _proof_of_talk(running: RunningRobot, nodes: ObservedNodes, away: Collection
     words = ["audit", str(robot.rights_source), "--keystore", str(robot.export)]
     words += ["--enclave", OBSERVER, "--domain", str(robot.domain), "--json"]
     words += ["--partial"] * bool(away)
-    for _ in range(_TRIES):  # nodes may still be starting
+    for _ in range(_MOST_TRIES):  # nodes may still be starting
         try:
             status, audited = robot.shell.read_json(words)
         except UnavailableError as error:
@@ -361,7 +364,7 @@ def _proof_of_talk(running: RunningRobot, nodes: ObservedNodes, away: Collection
 
 
 def _remedy(robot: LocalRobot, difference: str) -> str:
-    """Return a clause on what to do about a kind of difference; "" if its names say it."""
+    """Return the remedy for a kind of difference, as a clause; "" if the kind needs no remedy."""
     policy, restart = f"'{robot.policy}'", f"run `{robot.close_command}`, and restart these nodes"
     remedies = {
         "denied": f"if a node needs this, add it to its profile in {policy}, and {restart}; if a "
@@ -376,9 +379,9 @@ def _remedy(robot: LocalRobot, difference: str) -> str:
 
 
 class _TalkComparison:
-    """The nodes of the open robot, compared with what an observer in an enclave audited now.
+    """A comparison of the nodes of the open robot with those that an observer audited now.
 
-    ``audited`` is the JSON of `sros audit`; the others are as in `_proof_of_talk`.
+    ``audited`` is the JSON of `sros audit`; the other arguments are as in `_proof_of_talk`.
     """
 
     def __init__(
@@ -429,7 +432,7 @@ class _TalkComparison:
         }
 
     def summary(self) -> str:
-        """Return what was compared, what the policy denies now, and which nodes are new."""
+        """Return text on the comparison, on rights that the policy denies now, and on new nodes."""
         before = self._nodes.compared(self._away)
         endpoints = len({*_endpoints_of(before.nodes)})
         text = f"{nodes_text(before.nodes)} with {endpoints} endpoints as before (types are not "
@@ -457,7 +460,7 @@ class _TalkComparison:
 
 
 def _without_counterpart(robot: LocalRobot, denied: Sequence[Right]) -> list[str]:
-    """Return clauses on the rights that nobody answers now that the rights ``denied`` are gone."""
+    """Return clauses on rights without a counterpart now that the rights ``denied`` are gone."""
     now = load_rights(robot.rights_source).rights
     before = [
         right

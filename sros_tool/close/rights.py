@@ -1,4 +1,4 @@
-"""The rights of a closed robot: who may do what, and the requirements that more rights break."""
+"""The rights of a closed robot: who may use a name, and requirements that more rights break."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ _MOST_LINES = 20
 def access_lines(policy: Policy, folder: Path) -> list[str]:
     """Return a line for each name in a policy: its senders and its receivers.
 
-    Names are left out if all their uses are those of every node (the common parts).  Names that
+    Names are left out if they are only used as every node uses them (the common parts).  Names that
     move the robot come first, with all of their senders.
     """
-    sides = _sides(policy, folder)
+    sides = _users_by_name(policy, folder)
     kinds = [*RIGHTS]
     names_in_order = sorted(
         sides,
@@ -54,8 +54,11 @@ def access_lines(policy: Policy, folder: Path) -> list[str]:
     ]
 
 
-class _Side(NamedTuple):
-    """The enclaves that may use a name, or, if none may use a whole wildcard, a part of it."""
+class _Users(NamedTuple):
+    """The enclaves that may use a name; ``in_part`` may use only some names of a wildcard.
+
+    ``in_part`` is empty if an enclave may use the whole wildcard.
+    """
 
     enclaves: Sequence[str]
     in_part: Sequence[str]
@@ -72,7 +75,7 @@ class _Side(NamedTuple):
         return shown if self.enclaves else f"in part {shown}"
 
 
-def _sides(policy: Policy, folder: Path) -> Mapping[tuple[str, str], Sequence[_Side]]:
+def _users_by_name(policy: Policy, folder: Path) -> Mapping[tuple[str, str], Sequence[_Users]]:
     """Map kinds and names to the enclaves that may use them, by the rights of the kind."""
     rights = policy_rights(policy)
     rules, enclaves = Rules(rights), sorted({right.enclave for right in rights})
@@ -87,7 +90,7 @@ def _sides(policy: Policy, folder: Path) -> Mapping[tuple[str, str], Sequence[_S
         is_allowed = Right(enclave, ALLOW, right, name) in expressions
         return is_allowed and not rules.cover(Right(enclave, DENY, right, name))
 
-    def side(right: str, name: str) -> _Side:
+    def side(right: str, name: str) -> _Users:
         users = [enclave for enclave in enclaves if may(enclave, right, name)]
         in_part = {
             other.enclave
@@ -96,7 +99,7 @@ def _sides(policy: Policy, folder: Path) -> Mapping[tuple[str, str], Sequence[_S
             and overlap(other.name, name)
             and may(other.enclave, right, other.name)
         }
-        return _Side(users, sorted(in_part))
+        return _Users(users, sorted(in_part))
 
     return {
         (kind, name): [side(right, name) for right in RIGHTS[kind]]

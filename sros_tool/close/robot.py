@@ -1,4 +1,4 @@
-"""The robot of this machine, the folder into which it is closed, and what is remembered of it."""
+"""The robot of this machine, the folder into which it is closed, and its observed processes."""
 
 from __future__ import annotations
 
@@ -41,10 +41,10 @@ MOST_NAMES = 3
 
 
 class Shell(NamedTuple):
-    """What closing a robot needs of the command line.
+    """The functions and values of the command line that closing a robot needs.
 
-    ``run`` runs a verb of sros, and returns its status, its output and its messages, unless its
-    second argument lets it show these itself.  ``say`` shows progress.
+    ``run`` runs a verb of sros, and returns its status, its output and its messages; if its second
+    argument is True, the verb prints output and messages itself.  ``say`` shows progress.
     """
 
     run: Callable[[Sequence[str], bool], tuple[int, str, str]]
@@ -87,8 +87,8 @@ class LocalRobot:
     """The robot of this machine, with the folder into which it is closed.
 
     Raises:
-        SrosError: others can change what is in the folder, which says what systemd starts, or a
-            file in it is broken.
+        SrosError: other users can change the files in the folder, which say what systemd starts; or
+            a file in the folder is broken.
     """
 
     def __init__(
@@ -128,7 +128,7 @@ class LocalRobot:
             )
 
     def _check_writers(self) -> None:
-        """Raise `SrosError` if others can change what is in the folder.
+        """Raise `SrosError` if other users can change the files in the folder.
 
         Whoever runs sros by sudo is trusted, as root is.
         """
@@ -151,10 +151,10 @@ class LocalRobot:
     def locked(self) -> Iterator[None]:
         """Let only one run at a time write into the folder, which is made if it is missing.
 
-        A folder that is made and stays empty is removed again.
+        A new folder that stays empty is removed again.
 
         Raises:
-            UnavailableError: another run writes into it.
+            UnavailableError: another run writes into the folder.
         """
         made = make_folders(self.folder)
         handle = os.open(self.folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
@@ -218,12 +218,12 @@ class LocalRobot:
         replace_file(self.processes_file, content.encode())
 
     def check_elsewhere(self) -> None:
-        """Raise `UsageError` if neither the policy nor the keystore has an enclave elsewhere."""
+        """Raise `UsageError` if --elsewhere names an enclave that the robot does not have."""
         known = (self.keystore_enclaves() - {OBSERVER}) | self.policy_enclaves()
         check_enclaves(self.named_elsewhere, known, "--elsewhere")
 
     def check_rmw(self) -> None:
-        """Raise `UsageError` if the robot was watched on Zenoh, or on DDS, and the shell is not."""
+        """Raise `UsageError` if only one of watch and shell is on Zenoh, and the other on DDS."""
         rmws = {process.rmw for process in self.processes.processes}
         is_on_zenoh, shell_is = RMW_ZENOH in rmws, self.shell.environment.get(RMW) == RMW_ZENOH
         if rmws and is_on_zenoh != shell_is:

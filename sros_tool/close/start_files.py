@@ -27,7 +27,7 @@ DROP_IN = "sros-close.conf"
 
 
 def write_start_files(robot: LocalRobot, state: CloseState) -> list[FileChange]:
-    """Write the files that start each process with security; return what changed."""
+    """Write the files that start each process with security; return the changes."""
     observed = state.observed
     environments = {
         process.enclave: robot.variables(process.enclave, process.rmw)
@@ -96,7 +96,7 @@ def drop_in_heading(robot: LocalRobot) -> str:
 
 
 def _commands_text(robot: LocalRobot, state: CloseState) -> str:
-    """Return the commands that start processes by hand: first those that are due now."""
+    """Return the commands that start processes by hand: first the commands that are due now."""
     folder, due = robot.folder.absolute(), state.pending_by_hand
     commands = state.observed.commands_by_hand(folder)
     rest = {command: commands[command] for command in commands if command not in due}

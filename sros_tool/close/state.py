@@ -102,8 +102,8 @@ class RunningRobot:
         """Return whether a process like the observed one runs without security.
 
         With ``since``, the process must have run since that moment.  If the observed process
-        belongs to a unit, the other one has to belong to this unit: any user can start one with the
-        same command.
+        belongs to a unit, the open process has to belong to the same unit, because any user can
+        start a process with the same command.
         """
         return any(
             process.fits(other)
@@ -130,7 +130,8 @@ class RunningRobot:
         """Map each enclave with a process that is not closed to this process, and the reason.
 
         The reason is text before "the processes of X".  A process of a user who cannot read the
-        files only claims to run in an enclave: it counts if the enclave has no other process.
+        files only claims to run in an enclave: such a process counts only if the enclave has no
+        other process.
         """
         by_enclave: dict[str, list[SecuredProcess]] = {}
         for secured in self.secured:
@@ -177,7 +178,7 @@ class RunningRobot:
         return f"{warning}{newer} changed, or got another mode, after the start of"
 
     def with_later_processes(self, observed: ObservedProcesses) -> ObservedProcesses:
-        """Return observed processes with the commands of later starts, and those of other enclaves.
+        """Return observed processes with their later commands, and with processes of new enclaves.
 
         Only processes of users who can read the enclaves count, because sros proposes to run their
         commands.
@@ -188,7 +189,7 @@ class RunningRobot:
             if self.may_use_files(process):
                 running.setdefault(enclave.name, []).append(process)
         as_started = [
-            _as_started(process, running.get(process.enclave, ()))
+            _with_running_command(process, running.get(process.enclave, ()))
             if known[process.enclave] == 1
             else process
             for process in observed.processes
@@ -234,11 +235,11 @@ def secured_process(process: Process, enclave: str) -> ClosedProcess:
     return known._replace(command=command_without_enclave(known.command, enclave))
 
 
-def _as_started(observed: ClosedProcess, running: Sequence[Process]) -> ClosedProcess:
+def _with_running_command(observed: ClosedProcess, running: Sequence[Process]) -> ClosedProcess:
     """Return an observed process with the command of the only program that runs in its enclave.
 
-    A program of `ros2`, such as `ros2 topic echo`, takes no node's place; nor does anything take
-    that of a process that something else starts: a unit, a launch, a container, another process.
+    A program of `ros2`, such as `ros2 topic echo`, does not count. The command also stays if a
+    unit, a launch, a container or another process starts the observed process.
     """
     started_by = observed.unit or observed.launch or observed.container or observed.shares
     programs = {process.program: process for process in running}
@@ -285,7 +286,7 @@ class Proof(NamedTuple):
     def is_accepted_by_partial(self) -> bool:
         """Whether ``--partial`` accepts that the claim could not be tested.
 
-        It never accepts that for the claims that need an observer of the running robot.
+        ``--partial`` never accepts this for claims that need an observer of the running robot.
         """
         return self.holds is None and self.claim not in (TALK, SILENCE)
 
@@ -332,7 +333,7 @@ class CloseState(NamedTuple):
     changes: FileChanges
 
     def is_proved(self, *, partial: bool) -> bool:
-        """Return whether the proof holds; ``partial`` accepts what could not be examined."""
+        """Return whether the proof holds; ``partial`` accepts claims that could not be tested."""
         claims = [
             proof.holds or (partial and proof.is_accepted_by_partial) for proof in self.proofs
         ]
@@ -340,7 +341,7 @@ class CloseState(NamedTuple):
 
     @property
     def is_signed(self) -> bool:
-        """Whether all steps were done, so that the signed permissions are those of the policy."""
+        """Whether all steps were done, so that signed permissions and policy agree."""
         return all(step.state != "open" for step in self.steps)
 
     @property
@@ -361,7 +362,7 @@ class CloseState(NamedTuple):
     def pending_by_hand(self) -> Mapping[str, Sequence[ClosedProcess]]:
         """The commands to run by hand for the enclaves in ``pending``, with their processes.
 
-        Processes that only need the new revocation list come last, after those with a new key
+        Processes that only need the new revocation list come last, after processes with a new key
         or new rights.
         """
         by_hand = self.observed.commands_by_hand(self.folder.absolute())
@@ -432,7 +433,7 @@ def current_state(robot: LocalRobot, policy: Policy | None) -> CloseState:
 
 
 def _file_times(folder: Path) -> Sequence[float]:
-    """Return when the files in a folder, and those that links in it name, changed last."""
+    """Return the last change of the files in a folder, and of files to which links there lead."""
     return [file.stat().st_mtime for file in folder.glob("*") if file.is_file()]
 
 

@@ -1,4 +1,4 @@
-"""Watch an open robot: its nodes, their processes, and what started them."""
+"""Watch an open robot: its nodes, their processes, and the origins of the processes."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def check_watchable(robot: LocalRobot) -> None:
 def watch(robot: LocalRobot, words: Sequence[str]) -> list[str]:
     """Watch the robot by a verb, and write its nodes and processes into the folder.
 
-    Return, as sentences, which nodes have no enclave, and which observed rights the existing policy
+    Return sentences on nodes without an enclave, and on observed rights that the existing policy
     lacks.
 
     Raises:
@@ -104,8 +104,8 @@ def watch(robot: LocalRobot, words: Sequence[str]) -> list[str]:
     in_enclaves = ObservedNodes(robot, all_nodes).in_their_enclaves()
     nodes = [node for node in in_enclaves if not is_tool(node)]
     observed = _observed_processes(running, nodes, learned["ended"], started)
-    _remember(robot, document, observed)
-    _say_variables(running, observed)
+    _write_observation(robot, document, observed)
+    _show_variables(running, observed)
     number = counted(len(observed.processes), "process", "processes")
     robot.shell.say(f"saw {nodes_text(nodes)}, and {number} of this machine")
     if others := running.in_other_domains():
@@ -120,7 +120,7 @@ def watch(robot: LocalRobot, words: Sequence[str]) -> list[str]:
 
 @contextmanager
 def _recorded_processes(robot: LocalRobot) -> Iterator[_StartedProcesses]:
-    """Record all processes that run during the context, and what started them."""
+    """Record all processes that run during the ``with`` body, and the origins of the processes."""
     table, is_over = ProcessTable(), threading.Event()
     started: _StartedProcesses = {}
 
@@ -148,7 +148,7 @@ def _recorded_processes(robot: LocalRobot) -> Iterator[_StartedProcesses]:
         looking.join()
 
 
-def _remember(robot: LocalRobot, document: str, observed: ObservedProcesses) -> None:
+def _write_observation(robot: LocalRobot, document: str, observed: ObservedProcesses) -> None:
     """Write the observation, and the processes, including earlier ones that do not run now.
 
     Raises:
@@ -166,7 +166,7 @@ def _remember(robot: LocalRobot, document: str, observed: ObservedProcesses) -> 
 
 
 def _without_enclave_text(robot: LocalRobot, names: Sequence[str]) -> str:
-    """Return, as a sentence, which nodes the graph shows without an enclave."""
+    """Return a sentence that names the nodes which the graph shows without an enclave."""
     return (
         f"{first_few(names, MOST_NAMES)}: the participant has the identifier of a secured "
         f"process, so '{robot.policy}' has no rights for this node. If the node is of the robot, "
@@ -198,7 +198,7 @@ def _observed_processes(
     return observed._replace(processes=with_units, ended=sorted(ended))
 
 
-def _say_variables(running: RunningRobot, observed: ObservedProcesses) -> None:
+def _show_variables(running: RunningRobot, observed: ObservedProcesses) -> None:
     """Print variables of the processes that neither their commands nor this shell set."""
     robot, rmws = running.robot, {process.pid: process.rmw for process in observed.processes}
     by_variables: dict[tuple[str, ...], list[str]] = {}
@@ -217,9 +217,9 @@ def _say_variables(running: RunningRobot, observed: ObservedProcesses) -> None:
 
 
 def _lacking_text(robot: LocalRobot, nodes: Sequence[ObservedNode]) -> str:
-    """Return, as a sentence, which rights of nodes the policy lacks; "" if it lacks none.
+    """Return a sentence on rights of nodes that the policy lacks; "" if the policy has all.
 
-    Writes the rights that the nodes use as a policy of its own.
+    The rights that the nodes use are written into a separate policy file.
     """
     from sros_tool.graph.learn import draft, learn, write  # only after another watch
 
@@ -250,9 +250,9 @@ def _lacking_text(robot: LocalRobot, nodes: Sequence[ObservedNode]) -> str:
 def _likely_meanings(
     lacking: Iterable[Right], used: Collection[Right], policy: Collection[Right]
 ) -> Iterator[str]:
-    """Yield clauses on names of a policy that probably correspond to names that it lacks.
+    """Yield clauses on names of a policy that probably correspond to names that the policy lacks.
 
-    ``used`` are the rights that the nodes use, and ``policy`` those of the policy.
+    ``used`` are the rights that the nodes use, and ``policy`` the rights in the policy.
     """
     for right in lacking:
         allowed = (

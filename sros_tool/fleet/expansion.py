@@ -49,7 +49,7 @@ class FleetPolicy(Mapping[str, Enclave]):
         Args:
             policy: a policy that was read with its placeholders.
             fleet: the robots.
-            robots: leave out all enclaves but those of these robots; none: leave out nothing.
+            robots: keep only the enclaves of these robots; empty keeps all enclaves.
 
         Raises:
             PolicyError: a path is not valid for a robot, two enclaves have the same path, or a
@@ -174,7 +174,7 @@ class FleetPolicy(Mapping[str, Enclave]):
         return "".join(map(str, fill(parts_of(text), robot.name, robot.namespace)))
 
     def _group(self, group: Group, robot: Robot | None, maximum: int) -> Group:
-        """Return the group with its names filled in for a robot; it can end up empty.
+        """Return the group with its names filled in for a robot; the result can have no names.
 
         Once it has more than ``maximum`` names, the rest is left out.
         """
@@ -216,9 +216,9 @@ class FleetPolicy(Mapping[str, Enclave]):
 
 
 def check_choice(policies: Sequence[FleetPolicy], fleet: Fleet, robots: Collection[str]) -> None:
-    """Raise `PolicyError` if the choice of ``robots`` leaves out one of them, or its enclaves.
+    """Raise `PolicyError` if the policies lack a chosen robot, or some of its enclaves.
 
-    ``policies`` are all policies of the fleet, expanded for these robots alone.
+    ``policies`` are all policies of the fleet, expanded for the chosen ``robots`` alone.
     """
     owners = {policy.stated(path)[1] for policy in policies for path in policy}
     patterns = [pattern for policy in policies for pattern in policy.patterns]
@@ -291,7 +291,7 @@ def _duplicate_path_error(path: str, enclave: Enclave, other: Enclave) -> Policy
 # ── what is left to a fleet ───────────────────────────────────────────────────────────────────
 
 
-_NAMESPACE = "{namespace"
+_NAMESPACE_PLACEHOLDER = "{namespace"
 
 
 def with_absolute_names(policy: Policy) -> Policy:
@@ -299,20 +299,22 @@ def with_absolute_names(policy: Policy) -> Policy:
 
     A namespace begins with "/", so such names are absolute; with the "/" they also look so.
     """
-    return _renamed(policy, lambda name: f"/{name}" if name.startswith(_NAMESPACE) else name)
+    return _with_changed_names(
+        policy, lambda name: f"/{name}" if name.startswith(_NAMESPACE_PLACEHOLDER) else name
+    )
 
 
 def as_written(text: str) -> str:
     """Return names in a text as the policy file has them: the reverse of `with_absolute_names`."""
-    return text.replace(f"/{_NAMESPACE}", _NAMESPACE)
+    return text.replace(f"/{_NAMESPACE_PLACEHOLDER}", _NAMESPACE_PLACEHOLDER)
 
 
 def with_names_as_written(policy: Policy) -> Policy:
     """Return the policy with names as its file has them: the reverse of `with_absolute_names`."""
-    return _renamed(policy, as_written)
+    return _with_changed_names(policy, as_written)
 
 
-def _renamed(policy: Policy, change: Callable[[str], str]) -> Policy:
+def _with_changed_names(policy: Policy, change: Callable[[str], str]) -> Policy:
     def renamed(profile: Profile) -> Profile:
         groups = (replace(group, names=tuple(map(change, group.names))) for group in profile.groups)
         return replace(profile, ns=change(profile.ns), groups=tuple(groups))
@@ -329,7 +331,7 @@ def with_placeholders(policy: FleetPolicy, observed: Iterable[Right]) -> frozens
     expanded: set[Right] = set()
     for path, rights in _rights_by_enclave(observed).items():
         if path in policy:
-            expanded.update(_as_stated(policy, path, split_actions(rights)))
+            expanded.update(_rights_as_stated(policy, path, split_actions(rights)))
         else:
             expanded.update(rights)
     return frozenset(expanded)
@@ -391,7 +393,7 @@ def _rights_by_enclave(observed: Iterable[Right]) -> dict[str, list[Right]]:
     return by_enclave
 
 
-def _as_stated(policy: FleetPolicy, path: str, observed: Iterable[Right]) -> Iterator[Right]:
+def _rights_as_stated(policy: FleetPolicy, path: str, observed: Iterable[Right]) -> Iterator[Right]:
     """Yield the observed rights of an enclave as the policy states them.
 
     A right to an action is yielded as rights to its parts.
@@ -455,7 +457,7 @@ def _forms_with_placeholders(name: str, robot: Robot | None) -> Iterator[str]:
             return "/".join(of_robot if part == robot.name else part for part in text.split("/"))
 
         relative = name.removeprefix(robot.namespace.rstrip("/"))
-        inside = f"/{_NAMESPACE}}}{with_named_placeholder(relative)}"
+        inside = f"/{_NAMESPACE_PLACEHOLDER}}}{with_named_placeholder(relative)}"
         if robot.namespace != "/" and name.startswith(f"{robot.namespace}/"):
             yield inside
         yield with_named_placeholder(name)

@@ -44,7 +44,7 @@ from sros_tool.xml import read_bytes
 MAX_BYTES = 4 * 1024 * 1024
 _MOST_GROUPS = 32  # groups of one robot
 _MOST_CROSSING = 1_000
-_VALUES: Mapping[str, Callable[[str], str]] = {
+_VALUE_CHECKS: Mapping[str, Callable[[str], str]] = {
     "namespace": namespace_problem,
     "address": address_problem,
     "user": user_problem,
@@ -54,8 +54,8 @@ _VALUES: Mapping[str, Callable[[str], str]] = {
     "renewal_grace": grace_problem,
 }
 """Settings of a robot that are text, each with a function that returns why a value is invalid."""
-_OF_GROUP = ("domain", *_VALUES, "crossing")
-_OF_ROBOT = "{robot}"
+_GROUP_KEYS = ("domain", *_VALUE_CHECKS, "crossing")
+_ROBOT_PLACEHOLDER = "{robot}"
 """The placeholder for a robot's name in the settings of a group."""
 
 
@@ -70,10 +70,10 @@ def read_fleet(path: Path) -> Fleet:
         UnavailableError: an inventory in YAML is named, and PyYAML is not installed.
     """
     data, ending = read_bytes(path, "fleet file", max_bytes=MAX_BYTES), path.suffix.lower()
-    if ending in _OF_INVENTORIES:
+    if ending in _INVENTORY_SUFFIXES:
         shown_path = f"the inventory '{path}'"
-        table = _fleet_table(data, shown_path, is_json=ending == ".json" or _is_json(data))
-        return _Reader(shown_path, _SHOWN).fleet(table)
+        table = _table_from_inventory(data, shown_path, is_json=ending == ".json" or _is_json(data))
+        return _Reader(shown_path, _SHOWN_KEYS).fleet(table)
     try:
         return parse_fleet(data, f"the fleet file '{path}'")
     except DocumentError as error:
@@ -96,14 +96,14 @@ def read_connections(path: Path) -> dict[str, str]:
         SrosError: as `read_fleet`.
     """
     data, ending = read_bytes(path, "fleet file", max_bytes=MAX_BYTES), path.suffix.lower()
-    if ending not in _OF_INVENTORIES:
+    if ending not in _INVENTORY_SUFFIXES:
         return {}
-    return _connections(
+    return _connection_settings(
         data, f"the inventory '{path}'", is_json=ending == ".json" or _is_json(data)
     )
 
 
-_OF_INVENTORIES = (".yml", ".yaml", ".json")
+_INVENTORY_SUFFIXES = (".yml", ".yaml", ".json")
 _INI_HOST = re.compile(rb"^[A-Za-z0-9_.-]+[ \t]*(?:$|[ \t][A-Za-z_]+=)", re.MULTILINE)
 """Matches a host line of an INI inventory: a host name, perhaps with variables after it."""
 
@@ -112,13 +112,13 @@ def parse_fleet(data: bytes, label: str) -> Fleet:
     """Return the fleet in a TOML document; ``label`` names it in errors.
 
     Raises:
-        DocumentError: it is not TOML, or a value in it is not valid.
+        DocumentError: the document is not TOML, or a value in it is not valid.
     """
     return _Reader(label).fleet(read_toml(data, label, longest=MAX_BYTES))
 
 
 class _Reader:
-    """Reader of a fleet file; ``words`` maps its keys to the words of messages (`_SHOWN`)."""
+    """Reader of a fleet file; ``words`` maps its keys to the words of messages (`_SHOWN_KEYS`)."""
 
     def __init__(self, label: str, words: Mapping[str, str] = MappingProxyType({})) -> None:
         self._what = label
@@ -133,7 +133,7 @@ class _Reader:
         if len(robots) > MAX_ROBOTS:
             raise self._error(f"it has more than {MAX_ROBOTS} robots", "", "Divide the fleet.")
         for name, values in groups.items():
-            self._check_keys(values, _OF_GROUP, f"groups.{name}")
+            self._check_keys(values, _GROUP_KEYS, f"groups.{name}")
             self._read_values(values, {key: f"groups.{name}.{key}" for key in values}, "r")
         enclaves = self._read_texts(table, "enclaves", "", MAX_PATTERNS)
         routers = table.get("routers", ROUTERS)
@@ -160,8 +160,8 @@ class _Reader:
     def _read_robot(
         self, name: str, values: Mapping[str, Any], groups: Mapping[str, Mapping[str, Any]]
     ) -> Robot:
-        at = f"{self._word('robots')}.{name}"
-        self._check_keys(values, ("groups", *_OF_GROUP), at)
+        at = f"{self._shown_key('robots')}.{name}"
+        self._check_keys(values, ("groups", *_GROUP_KEYS), at)
         member = tuple(sorted(set(self._read_texts(values, "groups", at, _MOST_GROUPS))))
         for group in member:
             if problem := name_problem(group):
@@ -180,7 +180,7 @@ class _Reader:
                 stated_values[key], origin[key] = value, group_key
         own_values = {key: value for key, value in values.items() if key != "groups"}
         stated_values = self._read_values(stated_values, origin, name) | self._read_values(
-            own_values, {key: f"{at}.{self._word(key)}" for key in own_values}
+            own_values, {key: f"{at}.{self._shown_key(key)}" for key in own_values}
         )
         usual = {"namespace": f"/{name}", "address": name, "user": "", "domain": None}
         robot = Robot(name, groups=member, **(usual | stated_values))
@@ -202,25 +202,25 @@ class _Reader:
                 checked[key] = value
                 continue
             if key == "crossing":
-                checked[key] = self._crossing(value, places[key], name)
+                checked[key] = self._read_crossing(value, places[key], name)
                 continue
             if not isinstance(value, str):
                 raise self._invalid_value_error(places[key], value, "It is not a text.")
-            checked[key] = value.replace(_OF_ROBOT, name) if name else value
-            if problem := _VALUES[key](checked[key]):
+            checked[key] = value.replace(_ROBOT_PLACEHOLDER, name) if name else value
+            if problem := _VALUE_CHECKS[key](checked[key]):
                 raise self._invalid_value_error(places[key], value, problem)
         return checked
 
-    def _crossing(self, names: Any, place: str, robot: str) -> tuple[str, ...]:
+    def _read_crossing(self, names: Any, place: str, robot: str) -> tuple[str, ...]:
         at, _, key = place.rpartition(".")
         filled = []
         for name in self._read_texts({key: names}, key, at, _MOST_CROSSING):
-            filled.append(name.replace(_OF_ROBOT, robot) if robot else name)
+            filled.append(name.replace(_ROBOT_PLACEHOLDER, robot) if robot else name)
             if problem := crossing_problem(filled[-1]):
                 raise self._invalid_value_error(place, name, problem)
         return tuple(filled)
 
-    def _word(self, key: str) -> str:
+    def _shown_key(self, key: str) -> str:
         return self._words.get(key, key)
 
     def _read_tables(self, table: Mapping[str, Any], key: str) -> Mapping[str, Mapping[str, Any]]:
@@ -250,7 +250,7 @@ class _Reader:
         known = tuple(keys)
         for key in table:
             if key not in known:
-                where = f"{at}.{_key(key)}" if at else _key(key)
+                where = f"{at}.{_toml_key(key)}" if at else _toml_key(key)
                 raise self._error(f"{where} is not a known key", f"There are {', '.join(known)}.")
 
     def _invalid_value_error(self, at: str, value: object, problem: str) -> DocumentError:
@@ -260,7 +260,7 @@ class _Reader:
         return DocumentError(f"{self._what}: {problem}", why, remedy)
 
 
-def _key(text: str) -> str:
+def _toml_key(text: str) -> str:
     return text if text.isidentifier() and len(text) <= 80 else shortened(text)
 
 
@@ -269,10 +269,10 @@ def _key(text: str) -> str:
 
 def render_fleet(fleet: Fleet) -> str:
     """Return the fleet as TOML text, from which `parse_fleet` returns an equal fleet."""
-    return "".join(f"{line}\n" for line in _lines(fleet))
+    return "".join(f"{line}\n" for line in _toml_lines(fleet))
 
 
-def _lines(fleet: Fleet) -> Iterator[str]:
+def _toml_lines(fleet: Fleet) -> Iterator[str]:
     if fleet.enclaves:
         yield "enclaves = ["
         yield from (f"  {json.dumps(pattern)}," for pattern in fleet.enclaves)
@@ -305,19 +305,19 @@ _VARIABLES = {
     "renewal_grace": "sros_renewal_grace",
 }
 """Robot setting → the Ansible host variable that has it."""
-_ROBOT = "sros_robot"
-_SHOWN = {"robots": "hosts", **_VARIABLES}
+_ROBOT_VARIABLE = "sros_robot"
+_SHOWN_KEYS = {"robots": "hosts", **_VARIABLES}
 """Word in a fleet file → word in an inventory, for messages."""
 
-_OF_ALL = ("all", "ungrouped", "_meta")
+_BUILT_IN_GROUPS = ("all", "ungrouped", "_meta")
 _MOST_DEPTH = 64
 _MOST_STEPS = 200_000  # a host is counted once for each of its groups
-_WRITE_OUT = (
+_WRITE_INVENTORY = (
     "Write it out with `ansible-inventory -i FILE --list > hosts.json`, and name hosts.json."
 )
 
 
-def _fleet_table(data: bytes, label: str, *, is_json: bool) -> dict[str, Any]:
+def _table_from_inventory(data: bytes, label: str, *, is_json: bool) -> dict[str, Any]:
     """Convert an inventory into the tables of an equivalent fleet file.
 
     Args:
@@ -326,21 +326,21 @@ def _fleet_table(data: bytes, label: str, *, is_json: bool) -> dict[str, Any]:
         is_json: whether it is JSON; otherwise it is YAML.
 
     Raises:
-        DocumentError: it is not an inventory, or one that only Ansible can read.
+        DocumentError: ``data`` is not an inventory, or is an inventory that only Ansible can read.
         UnavailableError: PyYAML is not installed.
     """
-    return _Inventory(_loaded(data, label, is_json=is_json), label).table()
+    return _Inventory(_load_inventory(data, label, is_json=is_json), label).table()
 
 
-def _connections(data: bytes, label: str, *, is_json: bool) -> dict[str, str]:
+def _connection_settings(data: bytes, label: str, *, is_json: bool) -> dict[str, str]:
     """Return the settings of an inventory that decide how Ansible connects and delivers, by key.
 
-    The settings of the fleet itself are left out (`_fleet_table`).  If a group has variables, its
-    members are added, too.  If a value is a template, all values are returned.  Parameters and
-    errors are those of `_fleet_table`.
+    The settings of the fleet itself are left out (`_table_from_inventory`).  If a group has
+    variables, the members of the group are added, too.  If a value is a template, all values are
+    returned.  Parameters and errors are those of `_table_from_inventory`.
     """
-    values = dict(_values_below(_loaded(data, label, is_json=is_json)))
-    known = {*_VARIABLES.values(), _ROBOT}
+    values = dict(_values_below(_load_inventory(data, label, is_json=is_json)))
+    known = {*_VARIABLES.values(), _ROBOT_VARIABLE}
     kept = {
         path: text
         for path, text in values.items()
@@ -367,7 +367,7 @@ def _values_below(top: Mapping[str, Any]) -> Iterator[tuple[tuple[str, ...], str
             yield path, str(value)
 
 
-def _loaded(data: bytes, label: str, *, is_json: bool) -> Mapping[str, Any]:
+def _load_inventory(data: bytes, label: str, *, is_json: bool) -> Mapping[str, Any]:
     if is_json:
         try:
             value = parse_json(data)
@@ -379,7 +379,7 @@ def _loaded(data: bytes, label: str, *, is_json: bool) -> Mapping[str, Any]:
         raise DocumentError(
             f"{label} is not an inventory in YAML or JSON",
             "Its top level is not a mapping of groups; sros does not read INI inventories.",
-            _WRITE_OUT,
+            _WRITE_INVENTORY,
         )
     return value
 
@@ -405,7 +405,7 @@ def _load_yaml(data: bytes, label: str) -> Any:
                 raise DocumentError(
                     f"{label} has an alias (*NAME), or is nested too deeply",
                     f"It is at {str(event.start_mark).strip()}.",
-                    _WRITE_OUT,
+                    _WRITE_INVENTORY,
                 )
         return yaml.load(data, Loader=loader)  # noqa: S506 - a safe loader
     except (yaml.YAMLError, ValueError) as error:
@@ -413,7 +413,7 @@ def _load_yaml(data: bytes, label: str) -> Any:
         raise DocumentError(
             f"{label} is not valid YAML with only text, numbers, lists and mappings",
             f"{why}.",
-            _WRITE_OUT,
+            _WRITE_INVENTORY,
         ) from error
 
 
@@ -436,15 +436,15 @@ class _Inventory:
         self._top = groups
 
     def table(self) -> dict[str, Any]:
-        for name in self._names(self._top):
-            self._read(name, self._top[name], (), {})
+        for name in self._top_level_groups(self._top):
+            self._read_group(name, self._top[name], (), {})
         return {
             "groups": {name: {} for name in sorted(self._groups) if not name_problem(name)},
             "robots": dict(self._robots()),
         }
 
-    def _names(self, groups: Mapping[str, Any]) -> Iterator[str]:
-        """Yield the top-level groups: those that are in no other group."""
+    def _top_level_groups(self, groups: Mapping[str, Any]) -> Iterator[str]:
+        """Yield the top-level groups, which are in no other group."""
         inside: set[str] = set()
         for group in groups.values():
             children = group.get("children") if isinstance(group, dict) else None
@@ -455,11 +455,11 @@ class _Inventory:
             if name != "_meta" and (name not in inside or name == "all"):
                 yield name
 
-    def _read(
+    def _read_group(
         self, name: str, group: Any, parent_groups: tuple[str, ...], variables: _Variables
     ) -> None:
         """Read a group; it inherits ``variables`` from the ``parent_groups`` that contain it."""
-        self._step()
+        self._count_step()
         if name in parent_groups or len(parent_groups) > _MOST_DEPTH:
             raise self._error(f"the group {name} contains itself, or is in too many other groups")
         if not isinstance(group, dict):
@@ -470,31 +470,33 @@ class _Inventory:
             **variables,
             **{key: (len(parent_groups), value) for key, value in set_here.items()},
         }
-        if name not in _OF_ALL:
+        if name not in _BUILT_IN_GROUPS:
             self._groups.setdefault(name, set())
         hosts = group.get("hosts") or {}
         if isinstance(hosts, list):
             hosts = dict.fromkeys(map(str, hosts))
         for host, own in self._mapping(hosts, f"{name}.hosts").items():
-            self._host(host, own, inside, variables)
+            self._read_host(host, own, inside, variables)
         children = group.get("children") or {}
         if isinstance(children, list):  # of `ansible-inventory --list`: groups at the top
             children = {group: self._top.get(group) for group in map(str, children)}
         for child, value in self._mapping(children, f"{name}.children").items():
-            self._read(child, value, inside, variables)
+            self._read_group(child, value, inside, variables)
 
-    def _step(self) -> None:
+    def _count_step(self) -> None:
         self._steps += 1
         if self._steps > _MOST_STEPS:
             raise self._error(f"its groups have more than {_MOST_STEPS} hosts and groups in all")
 
-    def _host(self, host: object, own: Any, groups: tuple[str, ...], variables: _Variables) -> None:
-        self._step()
+    def _read_host(
+        self, host: object, own: Any, groups: tuple[str, ...], variables: _Variables
+    ) -> None:
+        self._count_step()
         if not isinstance(host, str) or "[" in host:
             raise self._error(
                 f"the host {host!r} is not a plain name",
                 "A range such as r[1:50] is only read by Ansible.",
-                _WRITE_OUT,
+                _WRITE_INVENTORY,
             )
         values = self._own.setdefault(host, self._check_keys(self._of_list.get(host), host))
         values |= self._check_keys(own, host)
@@ -508,13 +510,15 @@ class _Inventory:
                 unclear.discard(key)
                 inherited[key] = depth, value
         for group in groups:
-            if group not in _OF_ALL:
+            if group not in _BUILT_IN_GROUPS:
                 self._groups[group].add(host)
 
     def _check_keys(self, value: Any, at: object) -> dict[str, Any]:
         """Return the variables that a fleet uses; other variables are left out."""
         values = self._mapping(value, at)
-        return {key: values[key] for key in (*_VARIABLES.values(), _ROBOT) if key in values}
+        return {
+            key: values[key] for key in (*_VARIABLES.values(), _ROBOT_VARIABLE) if key in values
+        }
 
     def _variables_of(self, host: str) -> dict[str, Any]:
         own = self._own[host]
@@ -535,19 +539,19 @@ class _Inventory:
         named: dict[str, str] = {}
         for host in self._own:
             values = self._variables_of(host)
-            name = values.get(_ROBOT, host)
+            name = values.get(_ROBOT_VARIABLE, host)
             if not isinstance(name, str) or (problem := name_problem(name)):
                 text = problem if isinstance(name, str) else "It is not a text."
                 raise self._error(
                     f"the host {host!r} cannot be a robot by the name {name!r}",
                     text,
-                    f"Give it the variable {_ROBOT}, such as {_ROBOT}: r7.",
+                    f"Give it the variable {_ROBOT_VARIABLE}, such as {_ROBOT_VARIABLE}: r7.",
                 )
             if name in named:
                 raise self._error(
                     f"the hosts {named[name]!r} and {host!r} are both the robot {name}",
                     "",
-                    f"Give them different values of {_ROBOT}.",
+                    f"Give them different values of {_ROBOT_VARIABLE}.",
                 )
             named[name] = host
             robot = {key: values[word] for key, word in _VARIABLES.items() if word in values}
@@ -598,7 +602,7 @@ def _variables(robot: Robot) -> dict[str, Any]:
         for key, variable in _VARIABLES.items()
         if settings[key] not in (None, "", [])
     }
-    return {_ROBOT: robot.name, **shown}
+    return {_ROBOT_VARIABLE: robot.name, **shown}
 
 
 def _is_json(data: bytes) -> bool:

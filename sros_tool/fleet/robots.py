@@ -44,7 +44,7 @@ _MAX_NAME = 64
 _MAX_HOST = 253
 """Longest host name (RFC 1035)."""
 
-_OF_ANSIBLE = frozenset({"all", "ungrouped", "_meta", "localhost"})
+_ANSIBLE_GROUPS = frozenset({"all", "ungrouped", "_meta", "localhost"})
 """Names that Ansible reserves in an inventory; "localhost" is the machine that runs Ansible."""
 
 _TOKEN = re.compile(r"[A-Za-z_][A-Za-z0-9_]*", re.ASCII)
@@ -59,10 +59,10 @@ class Robot(NamedTuple):
     host name or IP address, ``user`` the account there ("": the default of ssh).  ``groups`` are
     sorted.  ``router`` is the address (``HOST:PORT``) at which sessions and other routers connect
     to its Zenoh router, or "" if it has none; ``crossing`` are the names that may pass between that
-    router and others, if not all may.  ``distribution`` is its ROS 2 distribution ("": those of
-    the keystore).  ``renewal`` is `RENEWAL_ALLOWED` if `sros fleet collect` may sign its requests
-    for renewal; ``renewal_grace`` is a duration, such as ``30d``, for which a certificate is still
-    accepted with such a request after its expiry ("": none).
+    router and others, if not all may.  ``distribution`` is its ROS 2 distribution ("": the
+    distributions of the keystore).  ``renewal`` is `RENEWAL_ALLOWED` if `sros fleet collect` may
+    sign its requests for renewal; ``renewal_grace`` is a duration, such as ``30d``, for which a
+    certificate is still accepted with such a request after its expiry ("": none).
     """
 
     name: str
@@ -122,7 +122,7 @@ class Fleet:
         """Return the robot with this name.
 
         Raises:
-            DocumentError: there is none; the error has similar names.
+            DocumentError: there is no such robot; the error has similar names.
         """
         if name in self.robots:
             return self.robots[name]
@@ -179,7 +179,7 @@ def name_problem(name: str) -> str:
             "A name is one part of a ROS name: letters, digits and underscores, and no digit at "
             "its start, such as r7."
         )
-    if name in _OF_ANSIBLE:
+    if name in _ANSIBLE_GROUPS:
         return "In an Ansible inventory this name means something else."
     return ""
 
@@ -216,7 +216,7 @@ def user_problem(user: str) -> str:
 
 
 def renewal_problem(renewal: str) -> str:
-    """Return why ``renewal`` does not say whether renewals are allowed; "" if it does."""
+    """Return why ``renewal`` is not a valid value, as a sentence; "" if it is."""
     known = (RENEWAL_ALLOWED, _RENEWAL_REFUSED)
     return "" if renewal in known else f"It is neither {known[0]} nor {known[1]}."
 
@@ -230,12 +230,12 @@ def grace_problem(grace: str) -> str:
     return ""
 
 
-_PART = r"[A-Za-z_][A-Za-z0-9_]*"
+_PATH_PART = r"[A-Za-z_][A-Za-z0-9_]*"
 MAX_ENCLAVES = 1_000_000
 MAX_PATTERNS = 1_000
 """Maximum number of enclaves, and of paths with a placeholder, of one fleet."""
 
-_VALUES = {"robot": _PART, "namespace": f"(?:/{_PART})*"}
+_PLACEHOLDER_PATTERNS = {"robot": _PATH_PART, "namespace": f"(?:/{_PATH_PART})*"}
 
 
 def pattern_problem(path: str) -> str:
@@ -289,7 +289,7 @@ def size_problem(fleet: Fleet) -> str:
 def robot_of(fleet: Fleet, enclave: str) -> Robot | None:
     """Return the robot that an enclave belongs to; None for an enclave of no robot."""
     for pattern in _fitting_patterns(fleet, enclave):
-        for robot in _candidates(fleet, pattern, enclave):
+        for robot in _possible_robots(fleet, pattern, enclave):
             inside = group_of(pattern.parts) in ("", *robot.groups)
             if inside and path_for(pattern.parts, robot) == enclave:
                 return robot
@@ -299,8 +299,8 @@ def robot_of(fleet: Fleet, enclave: str) -> Robot | None:
 def former_robot_of(fleet: Fleet, enclave: str) -> str:
     """Return the robot that an enclave belonged to before it left the fleet or its group, or "".
 
-    The result is "" for an enclave of a robot, and if its path names no robot.  If a path has only
-    a namespace, only robots that are still in the fleet can be found.
+    The result is "" if a robot still has the enclave, and if the path names no robot.  If a path
+    has only a namespace, only robots that are still in the fleet can be found.
     """
     if robot_of(fleet, enclave):
         return ""
@@ -309,7 +309,7 @@ def former_robot_of(fleet: Fleet, enclave: str) -> str:
         name = match.groupdict().get("robot", "") if match else ""
         if name and name not in fleet.robots:
             return name
-        for robot in _candidates(fleet, pattern, enclave):
+        for robot in _possible_robots(fleet, pattern, enclave):
             if path_for(pattern.parts, robot) == enclave:
                 return robot.name
     return ""
@@ -330,7 +330,7 @@ def unrecorded_enclaves(
     fleet: Fleet, names: Iterable[str], robots: Collection[str]
 ) -> dict[str, Unrecorded]:
     """Map each robot to the enclaves, out of ``names``, that are `Unrecorded` for it."""
-    folders = _folders(fleet)
+    folders = _robots_by_folder(fleet)
     below: dict[str, list[str]] = {robot: [] for robot in robots}
     naming: dict[str, list[str]] = {robot: [] for robot in robots}
     for name in names:
@@ -358,10 +358,12 @@ def _path_and_folders_above(name: str) -> Iterator[str]:
 
 def folders_of_robots(fleet: Fleet, robots: Collection[str]) -> tuple[str, ...]:
     """Return the sorted enclave folders, such as ``/r3``, that any of the robots has."""
-    return tuple(sorted(path for path, of in _folders(fleet).items() if not of.isdisjoint(robots)))
+    return tuple(
+        sorted(path for path, of in _robots_by_folder(fleet).items() if not of.isdisjoint(robots))
+    )
 
 
-def _folders(fleet: Fleet) -> Mapping[str, frozenset[str]]:
+def _robots_by_folder(fleet: Fleet) -> Mapping[str, frozenset[str]]:
     """Map enclave folders of robots, such as ``/r3``, to the names of the robots (usually one).
 
     A folder is a path of the fleet up to the part with the first placeholder.
@@ -391,7 +393,7 @@ def _beginning_of_path(path: Parts) -> Parts:
 
 def _fitting_patterns(fleet: Fleet, enclave: str) -> Iterator[_Pattern]:
     """Yield the patterns whose end matches the end of an enclave's path."""
-    patterns = _patterns(fleet.enclaves)
+    patterns = _patterns_by_end(fleet.enclaves)
     end = len(enclave)
     while end >= 0:
         yield from patterns.get(enclave[end:], ())
@@ -404,18 +406,18 @@ class _Pattern(NamedTuple):
 
 
 @lru_cache(maxsize=8)
-def _patterns(paths: tuple[str, ...]) -> Mapping[str, list[_Pattern]]:
+def _patterns_by_end(paths: tuple[str, ...]) -> Mapping[str, list[_Pattern]]:
     """Group the patterns by the path parts after their last placeholder."""
     patterns: dict[str, list[_Pattern]] = {}
     for path in paths:
         parts = parts_of(path)
         last = parts[-1] if isinstance(parts[-1], str) else ""
         key = last[last.find("/") :] if "/" in last else ""
-        patterns.setdefault(key, []).append(_Pattern(parts, _expression(parts)))
+        patterns.setdefault(key, []).append(_Pattern(parts, _path_expression(parts)))
     return patterns
 
 
-def _expression(parts: Parts) -> re.Pattern[str]:
+def _path_expression(parts: Parts) -> re.Pattern[str]:
     text, named_parts = "", set()
     for part in parts:
         if isinstance(part, str):
@@ -424,11 +426,11 @@ def _expression(parts: Parts) -> re.Pattern[str]:
             text += f"(?P={part.value})"
         else:
             named_parts.add(part.value)
-            text += f"(?P<{part.value}>{_VALUES[part.value]})"
+            text += f"(?P<{part.value}>{_PLACEHOLDER_PATTERNS[part.value]})"
     return re.compile(text, re.ASCII)
 
 
-def _candidates(fleet: Fleet, pattern: _Pattern, enclave: str) -> Iterator[Robot]:
+def _possible_robots(fleet: Fleet, pattern: _Pattern, enclave: str) -> Iterator[Robot]:
     match = pattern.expression.fullmatch(enclave)
     if not match:
         return
@@ -443,7 +445,7 @@ def _candidates(fleet: Fleet, pattern: _Pattern, enclave: str) -> Iterator[Robot
 # ── names of many robots as one ───────────────────────────────────────────────────────────────
 
 
-_SHOWN = 20  # maximum number of robots that a line names; --json has all
+_MOST_SHOWN = 20  # maximum number of robots that a line names; --json has all
 _MOST_TARGETS = 5  # if more pairs of robots share a text, they become one line
 
 
@@ -452,7 +454,7 @@ def folded(fleet: Fleet | None, lines: Iterable[tuple[str, str]]) -> Iterator[st
 
     That line has placeholders for the robot's name and namespace, and lists the robots at its end.
     The robot of a line is the robot of the enclave, or, for an enclave of no robot, the only robot
-    that the text names.  Lines that differ only in the one *other* robot that they name share a
+    that the text names.  Lines that name one *other* robot, and differ only in that robot, share a
     line with ``{other}``; many lines that differ in both robots become one line with the number of
     pairs.
 
@@ -478,9 +480,10 @@ def grouped_by_robot(
 ) -> dict[tuple[_Kind, bool], dict[str, list[_Item]]]:
     """Group items that differ only in one robot: kind -> robot -> items.
 
-    Each item has its possible kinds, with the robot in which it differs from others of the kind;
-    it is put into the kind with the most robots.  An item also has kinds, marked by True, for items
-    that differ in other robots as well: such a kind is used if it joins more than ``most`` groups.
+    An item has pairs of a possible kind and the robot in which the item differs from others of that
+    kind; the item is put into the kind with the most robots.  The second pairs of an item are for
+    items that differ in other robots as well: such a kind, marked by True in the result, is used if
+    it joins more than ``most`` groups.
     """
     robots: dict[_Kind, set[str]] = defaultdict(set)
     read = list(items)
@@ -588,4 +591,4 @@ def _robots_text(fleet: Fleet, names: Sequence[str], folding: _Folding) -> str:
     for group, members in fleet.groups.items():
         if set(names) == set(members) - {own}:
             return f"the {count if own in members else f'{len(names)} robots'} of {group}"
-    return f"{count}: {first_few(names, _SHOWN)}"
+    return f"{count}: {first_few(names, _MOST_SHOWN)}"

@@ -1,4 +1,4 @@
-"""Comparison of two governances, or two settings of keystores: what becomes looser or tighter."""
+"""Comparison of two governances, or two settings: the changes that allow more or less."""
 
 from __future__ import annotations
 
@@ -59,12 +59,12 @@ _PROPERTIES: dict[ProtectionKind, frozenset[str]] = {
 }
 """Maps a protection kind to the properties it gives messages (DDS-Security 1.1, 9.4.1.2.3)."""
 
-_LOSS = {
+_LOSS_TEXTS = {
     "secrecy": "no longer encrypted",
     "integrity": "no longer signed",
     "origin": "no longer proven to come from one writer",
 }
-_GAIN = {
+_GAIN_TEXTS = {
     "secrecy": "encrypted",
     "integrity": "signed",
     "origin": "proven to come from one writer",
@@ -130,7 +130,9 @@ def _governance_changes(old: Governance, new: Governance) -> Iterator[SettingCha
         if domains.ranges:
             yield SettingChange(effect, "domain", str(before), str(after), meaning.format(domains))
     pairs = dict.fromkeys(
-        (_rule_of(old, domain), _rule_of(new, domain)) for domain in before if domain in after
+        (_rule_for_domain(old, domain), _rule_for_domain(new, domain))
+        for domain in before
+        if domain in after
     )
     for old_rule, new_rule in pairs:
         yield from attribute_changes(old_rule, new_rule, "protection", "")
@@ -149,7 +151,7 @@ def _remaining_domains(domains: DomainSet, removed_domains: DomainSet) -> Domain
     return DomainSet.of(*((domain, domain) for domain in domains if domain not in removed_domains))
 
 
-def _rule_of(governance: Governance, domain: int) -> DomainRule:
+def _rule_for_domain(governance: Governance, domain: int) -> DomainRule:
     return next(rule for rule in governance.domain_access_rules if domain in rule.domains.closed())
 
 
@@ -172,7 +174,9 @@ def _topic_pairs(
     before_of, after_of = _first_covering_rule(old), _first_covering_rule(new)
     for expression in expressions:
         before, after = before_of(expression), after_of(expression)
-        if (before is None) != (after is None) or (before and after and not _equal(before, after)):
+        if (before is None) != (after is None) or (
+            before and after and not _protect_alike(before, after)
+        ):
             yield expression, before, after
 
 
@@ -194,7 +198,7 @@ def _first_covering_rule(domain: DomainRule) -> Callable[[str], TopicRule | None
     return rule_for
 
 
-def _equal(first: TopicRule, second: TopicRule) -> bool:
+def _protect_alike(first: TopicRule, second: TopicRule) -> bool:
     return all(
         getattr(first, attribute.name) == getattr(second, attribute.name)
         for attribute in attributes(TopicRule)
@@ -234,7 +238,11 @@ def attribute_changes(
         before, after = getattr(old, attribute.name), getattr(new, attribute.name)
         if before == after:
             continue
-        key, before_text, after_text = f"{prefix}.{attribute.term}", _text(before), _text(after)
+        key, before_text, after_text = (
+            f"{prefix}.{attribute.term}",
+            _value_text(before),
+            _value_text(after),
+        )
         if attribute.is_flag:
             effect = Effect.LOOSER if after == attribute.open else Effect.TIGHTER
             meaning = _FLAG_WORDS[attribute.name][effect is Effect.TIGHTER].format(name)
@@ -244,15 +252,15 @@ def attribute_changes(
         lost = _PROPERTIES[before] - _PROPERTIES[after]
         gained = _PROPERTIES[after] - _PROPERTIES[before]
         for effect, properties, words in (
-            (Effect.LOOSER, lost, _LOSS),
-            (Effect.TIGHTER, gained, _GAIN),
+            (Effect.LOOSER, lost, _LOSS_TEXTS),
+            (Effect.TIGHTER, gained, _GAIN_TEXTS),
         ):
             if properties:
                 meaning = " and ".join(text for word, text in words.items() if word in properties)
                 yield SettingChange(effect, key, before_text, after_text, f"{subject}: {meaning}")
 
 
-def _text(value: bool | ProtectionKind) -> str:
+def _value_text(value: bool | ProtectionKind) -> str:
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 
@@ -285,7 +293,7 @@ def mismatch(old: Governance, new: Governance) -> Mismatch:
     """Return the communication that fails between processes with ``old`` and with ``new``."""
     domains = [domain for domain in old.domains().closed() if domain in new.domains().closed()]
     names: dict[str, None] = {}
-    pairs = dict.fromkeys((_rule_of(old, d), _rule_of(new, d)) for d in domains)
+    pairs = dict.fromkeys((_rule_for_domain(old, d), _rule_for_domain(new, d)) for d in domains)
     for old_rule, new_rule in pairs:
         if any(getattr(old_rule, kind) != getattr(new_rule, kind) for kind in _MUST_AGREE):
             return Mismatch(everything=True)
@@ -320,7 +328,7 @@ def _settings_changes(old: Template, new: Template, now: datetime) -> Iterator[S
             meaning = f"{setting} expire {'later' if longer else 'earlier'}"
             yield SettingChange(effect, key, span_text(before), span_text(after), meaning)
     yield from _short_lived_changes(old, new)
-    for key, name, open_value, words in _CHOICES:
+    for key, name, open_value, words in _CHOICE_EFFECTS:
         before, after = getattr(old, name), getattr(new, name)
         if before != after:
             effect = Effect.LOOSER if after == open_value else Effect.TIGHTER
@@ -395,7 +403,7 @@ def _zenoh_changes(old: ZenohNetwork | None, new: ZenohNetwork | None) -> Iterat
             yield SettingChange(Effect.LATER, f"zenoh.{key}", first, second, meaning)
 
 
-_CHOICES = (
+_CHOICE_EFFECTS = (
     (
         "certificates.unique_subject",
         "unique_subject",

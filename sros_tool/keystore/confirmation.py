@@ -1,7 +1,7 @@
 """Confirmations of robots: the digests of a robot's enclave files, and its DDS.
 
 A confirmation proves nothing, because whoever controls the robot can write anything into it.  So
-sros reads confirmations as hostile input, only compares them with what the keystore knows, and
+sros reads confirmations as hostile input, only compares them with the records of the keystore, and
 never opens a path from a confirmation.  `sros_tool/schemas/confirmation.json` describes the format.
 """
 
@@ -68,8 +68,8 @@ CONFIRMED_FILES = (
 """Names of the enclave files that a confirmation lists: all exported files except the key."""
 _CERTIFICATE_FILES = (CERTIFICATE_FILE, IDENTITY_CA_FILE, PERMISSIONS_CA_FILE)
 
-_KEYS = {"format", "robot", "time", "files"}
-_OF_AGENT = (
+_REQUIRED_KEYS = {"format", "robot", "time", "files"}
+_AGENT_KEYS = (
     "boot",
     "crl_restart",
     "sequence",
@@ -83,7 +83,7 @@ _OF_AGENT = (
     "seal",
 )
 """Keys that only `sros agent` writes, except ``crl_restart`` and ``problems``."""
-_OPTIONAL_KEYS = {"certificates", "restart", "dds", *_OF_AGENT}
+_OPTIONAL_KEYS = {"certificates", "restart", "dds", *_AGENT_KEYS}
 _CLOCK_TOLERANCE = timedelta(minutes=1)
 _MOST_BOOTS = 8
 _MOST_CERTIFICATES = 32  # maximum number in a file
@@ -102,14 +102,16 @@ _LIBRARY_VERSION = re.compile(r"\d{1,6}\.\d{1,6}\.\d{1,6}\Z", re.ASCII)
 _LIBRARY_PATH = re.compile(r"/[\w.+/ ?-]{1,199}\Z")
 """Matches library paths of plain characters, which are only shown, never opened."""
 _DIGEST = re.compile(r"[0-9a-f]{64}\Z")
-_MOMENT = re.compile(r"[0-9]{4}-[0-9]{2}-[0-9]{2}T[0-9]{2}:[0-9]{2}:[0-9]{2}Z\Z")
-_REQUEST = re.compile(
+_MOMENT_TEXT = re.compile(r"[0-9]{4}-[0-9]{2}-[0-9]{2}T[0-9]{2}:[0-9]{2}:[0-9]{2}Z\Z")
+_REQUEST_PEM = re.compile(
     r"-----BEGIN CERTIFICATE REQUEST-----\n[A-Za-z0-9+/=\n]+-----END CERTIFICATE REQUEST-----\n\Z"
 )
-_LISTS = re.compile(
+_CRL_PEM = re.compile(
     r"(?:-----BEGIN X509 CRL-----\n[A-Za-z0-9+/=\n]+-----END X509 CRL-----\n){1,8}\Z"
 )
-_PEM = re.compile(rb"-----BEGIN CERTIFICATE-----([A-Za-z0-9+/=\s]*)-----END CERTIFICATE-----")
+_CERTIFICATE_PEM = re.compile(
+    rb"-----BEGIN CERTIFICATE-----([A-Za-z0-9+/=\s]*)-----END CERTIFICATE-----"
+)
 
 
 class Seen(StrEnum):
@@ -314,13 +316,16 @@ def make_confirmation(
 
 
 def shortened_dds(dds: RobotDds) -> RobotDds:
-    """Return a DDS as in confirmations: libraries beyond the limit count as unseen processes."""
+    """Return a DDS with at most the libraries that a confirmation may state.
+
+    The libraries beyond the limit count as unseen processes.
+    """
     more = max(len(dds.libraries) - _MOST_LIBRARIES, 0)
     return RobotDds(dds.libraries[:_MOST_LIBRARIES], min(dds.unseen + more, _MOST_UNSEEN))
 
 
 def shortened_problems(problems: Iterable[str]) -> tuple[str, ...]:
-    """Return problems as in confirmations, limited in length and number."""
+    """Return problems with the length and the number that confirmations allow."""
     texts = []
     for problem in dict.fromkeys(problems):
         text = "".join(character if character.isprintable() else "?" for character in problem)
@@ -345,7 +350,7 @@ def _confirmed_files(root: Path, folder: Folder, name: str) -> dict[str, bytes]:
 def certificate_digests(data: bytes) -> tuple[str, ...]:
     """Return the SHA-256 of the certificates (DER) in a PEM file, leaving out damaged ones."""
     digests = []
-    for block in _PEM.finditer(data):
+    for block in _CERTIFICATE_PEM.finditer(data):
         try:
             digests.append(hashlib.sha256(binascii.a2b_base64(block[1])).hexdigest())
         except binascii.Error:
@@ -358,7 +363,7 @@ def render_confirmation(confirmation: Confirmation) -> bytes:
 
     Equal confirmations give equal bytes.
     """
-    return _json(_value_of(confirmation))
+    return _as_json_line(_value_of(confirmation))
 
 
 def _value_of(confirmation: Confirmation) -> dict[str, Any]:
@@ -375,13 +380,13 @@ def _value_of(confirmation: Confirmation) -> dict[str, Any]:
         **({"dds": as_plain(dds)} if dds else {}),
         **{
             key: as_plain(value)
-            for key in _OF_AGENT
+            for key in _AGENT_KEYS
             if (value := getattr(confirmation, key)) is not None
         },
     }
 
 
-def _json(value: Mapping[str, Any]) -> bytes:
+def _as_json_line(value: Mapping[str, Any]) -> bytes:
     return json.dumps(value, indent=1).encode() + b"\n"
 
 
@@ -417,10 +422,10 @@ class LastMessage(NamedTuple):
     """When a message last came from an earlier start of the computer than the message before."""
 
     def successor(self, boot: str | None, now: datetime) -> tuple[tuple[str, ...], datetime | None]:
-        """Return the next ``boots`` and ``alternated``, after a message from the start ``boot``.
+        """Return ``boots`` and ``alternated`` for the next record, after a message from ``boot``.
 
-        A computer's start does not come back after another one, so if it does, there are two
-        computers.
+        ``boot`` is the digest of a start of the computer.  A computer never returns to an earlier
+        start: if an earlier ``boot`` comes back after another one, two computers send messages.
         """
         if boot is None or boot in self.boots[:1]:
             return self.boots, self.alternated
@@ -559,7 +564,7 @@ def store_confirmation(keystore: OpenedKeystore, received: ReceivedConfirmation)
         **({"message": as_plain(message)} if message else {}),
         "confirmation": _value_of(received.confirmation),
     }
-    with staged_file(keystore.root / path, _json(value), mode=0o644) as put_in_place:
+    with staged_file(keystore.root / path, _as_json_line(value), mode=0o644) as put_in_place:
         put_in_place()
     return path
 
@@ -592,7 +597,7 @@ def store_refusals(
         }
         for robot, why in sorted(reasons.items())
     }
-    with staged_file(keystore.root / REFUSED, _json(value), mode=0o644) as put_in_place:
+    with staged_file(keystore.root / REFUSED, _as_json_line(value), mode=0o644) as put_in_place:
         put_in_place()
 
 
@@ -642,18 +647,18 @@ def last_confirmation(keystore: OpenedKeystore, robot: str) -> ReceivedConfirmat
         if confirmation.robot != robot:
             raise _FormError(f"it is the confirmation of {confirmation.robot}")
         message = _message_from(value["message"]) if "message" in value else None
-        return ReceivedConfirmation(confirmation, _moment(value["received"]), message)
+        return ReceivedConfirmation(confirmation, _moment_from(value["received"]), message)
 
 
 # The readers of the parts of a confirmation; each raises `_FormError` for another form.
 
-_AGAIN = "Make the confirmation again on the robot."
+_CONFIRM_AGAIN = "Make the confirmation again on the robot."
 
 
 class _FormError(ValueError):
     """A part of a confirmation does not have its form; the text is a clause."""
 
-    def __init__(self, why: str, remedy: str = _AGAIN) -> None:
+    def __init__(self, why: str, remedy: str = _CONFIRM_AGAIN) -> None:
         super().__init__(why)
         self.remedy = remedy
 
@@ -685,7 +690,7 @@ def _message_from(value: Any) -> LastMessage:
     if not isinstance(boots, list) or not all(map(_is_digest, boots)):
         raise _FormError('"boots" of its message are not SHA-256 digests')
     enclave = _enclave_from(value["enclave"])
-    moment = None if alternated is None else _moment(alternated)
+    moment = None if alternated is None else _moment_from(alternated)
     return LastMessage(sequence, sha256, enclave, tuple(boots), moment)
 
 
@@ -694,22 +699,22 @@ def _confirmation_from(value: Any) -> Confirmation:
         raise _FormError("it is not a JSON object")
     if value.get("format") != _FORMAT or type(value["format"]) is not int:
         raise _FormError(f"its format is not {_FORMAT}", "Use an sros of the same version.")
-    if unknown := sorted(value.keys() - _KEYS - _OPTIONAL_KEYS):
+    if unknown := sorted(value.keys() - _REQUIRED_KEYS - _OPTIONAL_KEYS):
         raise _FormError(
             f"it has the unknown key {_shortened(unknown[0])}; if the robot has a later release of "
             "sros, update sros here first",
         )
-    if missing := sorted(_KEYS - value.keys()):
+    if missing := sorted(_REQUIRED_KEYS - value.keys()):
         raise _FormError(f"it lacks {', '.join(missing)}")
     robot = value["robot"]
     if not isinstance(robot, str) or name_problem(robot):
         raise _FormError(f"{_shortened(robot)} is not the name of a robot")
     files = {
         path: _digest_from(digest, f"the digest of {path}")
-        for path, digest in _entries(value, "files")
+        for path, digest in _file_entries(value, "files")
     }
     certificates = {}
-    for path, digests in _entries({"certificates": {}, **value}, "certificates"):
+    for path, digests in _file_entries({"certificates": {}, **value}, "certificates"):
         if path not in files or path.rpartition("/")[2] not in _CERTIFICATE_FILES:
             raise _FormError(f"it lists certificates of {path}, which is not a certificate file")
         is_short_list = isinstance(digests, list) and len(digests) <= _MOST_CERTIFICATES
@@ -718,8 +723,8 @@ def _confirmation_from(value: Any) -> Confirmation:
         certificates[path] = tuple(digests)
     dds = _dds_from(value["dds"]) if "dds" in value else None
     restart = _restart_from(value["restart"]) if "restart" in value else None
-    time = _moment(value["time"])
-    agent = {key: _AGENT_READERS[key](value[key]) for key in _OF_AGENT if key in value}
+    time = _moment_from(value["time"])
+    agent = {key: _AGENT_READERS[key](value[key]) for key in _AGENT_KEYS if key in value}
     return Confirmation(robot, time, files, certificates, dds, restart, **agent)
 
 
@@ -765,7 +770,8 @@ def _expiry_from(value: Any) -> dict[str, EnclaveExpiry]:
         if not isinstance(times, dict) or times.keys() != set(EnclaveExpiry._fields):
             raise _FormError('the keys of an expiry are not "certificate" and "permissions"')
         moments = (
-            None if times[file] is None else _moment(times[file]) for file in EnclaveExpiry._fields
+            None if times[file] is None else _moment_from(times[file])
+            for file in EnclaveExpiry._fields
         )
         expiry[_enclave_from(name)] = EnclaveExpiry(*moments)
     return expiry
@@ -799,7 +805,9 @@ def _problems_from(value: Any) -> tuple[str, ...]:
 def _requests_from(value: Any) -> tuple[str, ...]:
     requests = _list_from(value, MOST_REQUESTS, "requests")
     for text in requests:
-        if not (isinstance(text, str) and len(text) <= _LONGEST_REQUEST and _REQUEST.match(text)):
+        if not (
+            isinstance(text, str) and len(text) <= _LONGEST_REQUEST and _REQUEST_PEM.match(text)
+        ):
             raise _FormError("one of its requests is not exactly one signing request in PEM")
     return tuple(requests)
 
@@ -811,7 +819,7 @@ def _list_from(value: Any, most: int, what: str) -> list[Any]:
 
 
 def _crl_from(value: Any) -> str:
-    if not (isinstance(value, str) and len(value) <= LONGEST_LIST and _LISTS.match(value)):
+    if not (isinstance(value, str) and len(value) <= LONGEST_LIST and _CRL_PEM.match(value)):
         raise _FormError("its crl is not a few revocation lists in PEM")
     return value
 
@@ -865,10 +873,10 @@ def _library_from(value: Any) -> RobotLibrary:
     return RobotLibrary(product, version, path, Seen(seen))
 
 
-def _entries(value: Mapping[str, Any], key: str) -> Iterator[tuple[str, Any]]:
+def _file_entries(value: Mapping[str, Any], key: str) -> Iterator[tuple[str, Any]]:
     """Yield the (path, value) pairs of the JSON object at ``key``.
 
-    Every path is that of an enclave file that belongs in confirmations.
+    Every path names an enclave file that belongs in confirmations.
     """
     entries = value[key]
     if not isinstance(entries, dict):
@@ -894,8 +902,8 @@ def _is_digest(value: object) -> bool:
     return isinstance(value, str) and bool(_DIGEST.match(value))
 
 
-def _moment(text: object) -> datetime:
-    if isinstance(text, str) and _MOMENT.match(text):
+def _moment_from(text: object) -> datetime:
+    if isinstance(text, str) and _MOMENT_TEXT.match(text):
         try:
             return parse_iso(text)
         except ValueError:

@@ -77,7 +77,7 @@ from sros_tool.zenoh.configuration import (
 )
 from sros_tool.zenoh.document import parse_configuration
 
-_OF_ZENOH = (".json5", ".json", ".yaml", ".yml")
+_ZENOH_SUFFIXES = (".json5", ".json", ".yaml", ".yml")
 
 NamedPath = Annotated[Path, "PATH, as given on the command line."]
 Problems = Annotated[Sequence[str], "Problems that keep a process from running in the enclave."]
@@ -609,7 +609,7 @@ def _describe_file(
         return _describe_configuration(path, signed.text, signature, now)
     if data.lstrip()[:1] == b"<":
         return _describe_document(path, data, _NOT_SIGNED, now)
-    if path.suffix in _OF_ZENOH or data.lstrip()[:1] == b"{":
+    if path.suffix in _ZENOH_SUFFIXES or data.lstrip()[:1] == b"{":
         return _describe_configuration(
             path, data, _describe_signature_next_to(path, data, now, authority, files), now
         )
@@ -670,7 +670,7 @@ def _describe_keystore(keystore: OpenedKeystore, now: datetime) -> DescribedKeys
 def _unknown_authorities(
     keystore: OpenedKeystore, role: str, names: Iterable[str], now: datetime
 ) -> Iterator[str]:
-    """Yield the CAs that the ledger does not record, and those only in an enclave's file, as text.
+    """Yield text on CAs that the ledger does not record, or that only an enclave's file has.
 
     Raises:
         SrosError: the ledger or the CA file of the keystore cannot be read.
@@ -741,7 +741,7 @@ def _facts_in_keystore(evaluation: EvaluatedEnclave, state: OpenedEnclave) -> En
 
 
 def _enclave_facts(evaluation: EvaluatedEnclave) -> EnclaveFacts:
-    """Describe the files of an enclave; ``problems`` are those that matter on this machine."""
+    """Describe the files of an enclave; ``problems`` has the problems on this machine."""
     state = evaluation.state
     domains, problems = state.domains(), list(evaluation.problems_here)
     identity, identity_sha256 = _subject_and_digest(state.identity_ca)
@@ -906,7 +906,7 @@ def _rights_by_kind(rights: Iterable[tuple[str, str, str]]) -> RightNames:
 # ── Zenoh configurations ──────────────────────────────────────────────────────────────────
 
 
-_ABOUT_THE_CONTENT = (
+_CONTENT_FAULTS = (
     ZenohFault.OTHER_DOCUMENT,
     ZenohFault.MALFORMED,
     ZenohFault.OUT_OF_DATE,
@@ -951,8 +951,9 @@ def _describe_configuration(
 def _describe_remote_rights(configuration: Configuration) -> list[RemoteFacts]:
     """Return the rights that a configuration gives to remote enclaves.
 
-    In client mode, the remote enclave is the router.  Its rules mirror those of the client: it may
-    send what the client may receive.  So its entry shows the rights of the client's own enclave.
+    In client mode, the remote enclave is the router.  The rules for the router mirror the rules of
+    the client: the router may send what the client may receive.  So its entry shows the rights of
+    the client's own enclave.
     """
     is_client = configuration.mode is Mode.CLIENT
     remotes = []
@@ -984,14 +985,14 @@ def _content_problems(path: Path, now: datetime) -> list[str]:
     return [
         str(problem)
         for problem in (opened.problems if opened else ())
-        if problem.fault in _ABOUT_THE_CONTENT
+        if problem.fault in _CONTENT_FAULTS
         and problem.fault not in reported
         and problem.file in (*names[0], CERTIFICATE_FILE)
     ]
 
 
-_ISSUED = (CERTIFICATE_FILE, PERMISSIONS_FILE)
-_PEM = re.compile(rb"-----BEGIN ([A-Z0-9 ]+)-----(.*?)-----END \1-----\n?", re.DOTALL)
+_ISSUED_FILES = (CERTIFICATE_FILE, PERMISSIONS_FILE)
+_PEM_BLOCK = re.compile(rb"-----BEGIN ([A-Z0-9 ]+)-----(.*?)-----END \1-----\n?", re.DOTALL)
 
 
 # ── the history ────────────────────────────────────────────────────────────────────────────
@@ -1047,9 +1048,9 @@ class History(NamedTuple):
 
 def history(keystore: OpenedKeystore, *, now: datetime) -> History:
     """Return the entries of a keystore's ledger, with the present state of the recorded items."""
-    issued = _files(keystore, _active_paths(keystore))
-    revoked_files = _files(keystore, _revoked_paths(keystore))
-    retired = _files(keystore, _retired_paths(keystore))
+    issued = _paths_by_digest(keystore, _active_paths(keystore))
+    revoked_files = _paths_by_digest(keystore, _revoked_paths(keystore))
+    retired = _paths_by_digest(keystore, _retired_paths(keystore))
     ledger = keystore.ledger
     entries = ledger.entries
     # Lists do not tell everything: a new CA begins with an empty list, and expired certificates are
@@ -1057,7 +1058,7 @@ def history(keystore: OpenedKeystore, *, now: datetime) -> History:
     revoked = {entry.serial for entry in entries if entry.what == "revocation"}
     revoked |= {f"{entry.serial:x}" for crl in keystore.revocation_lists for entry in crl.revoked}
     moment = iso(now)
-    settings = _files(keystore, iter((SETTINGS, FLEET)))
+    settings = _paths_by_digest(keystore, iter((SETTINGS, FLEET)))
 
     def status(entry: Entry) -> HistoryStatus:
         if entry.what == GAP:
@@ -1108,12 +1109,12 @@ def _active_paths(keystore: OpenedKeystore) -> Iterator[str]:
     yield from (f"{PUBLIC}/{path.name}" for path in authorities)
     yield from (GOVERNANCE_P7S, CRL)
     for name in list_enclaves(keystore.root):
-        yield from (f"{enclave_folder(name)}/{file}" for file in _ISSUED)
+        yield from (f"{enclave_folder(name)}/{file}" for file in _ISSUED_FILES)
 
 
 def _revoked_paths(keystore: OpenedKeystore) -> Iterator[str]:
     for path in revoked_certificates(keystore.root):
-        yield from (f"{REVOKED}/{path.parent.name}/{file}" for file in _ISSUED)
+        yield from (f"{REVOKED}/{path.parent.name}/{file}" for file in _ISSUED_FILES)
 
 
 def _retired_paths(keystore: OpenedKeystore) -> Iterator[str]:
@@ -1121,18 +1122,18 @@ def _retired_paths(keystore: OpenedKeystore) -> Iterator[str]:
     yield from (f"{RETIRED}/{path.name}" for path in authorities)
 
 
-def _files(keystore: OpenedKeystore, paths: Iterator[str]) -> dict[str, list[str]]:
+def _paths_by_digest(keystore: OpenedKeystore, paths: Iterator[str]) -> dict[str, list[str]]:
     """Map the digests that the ledger uses to the ``paths`` of files with this digest."""
     paths_by_digest: dict[str, list[str]] = {}
     for path in paths:
         file = keystore.root / path
         if file.is_file() and not file.is_symlink():
-            for digest in _digests(file):
+            for digest in _ledger_digests(file):
                 paths_by_digest.setdefault(digest, []).append(path)
     return paths_by_digest
 
 
-def _digests(path: Path) -> list[str]:
+def _ledger_digests(path: Path) -> list[str]:
     """Return the digests that the ledger uses for a file: several for a CA file of several CAs.
 
     The digest of a certificate is the SHA-256 of its DER; for other files, it is the SHA-256 of the
@@ -1142,7 +1143,7 @@ def _digests(path: Path) -> list[str]:
     if not path.name.endswith("cert.pem"):
         return [hashlib.sha256(data).hexdigest()]
     digests = []
-    for part in _PEM.finditer(data):
+    for part in _PEM_BLOCK.finditer(data):
         content = part[0]
         if part[1] == b"CERTIFICATE":
             try:

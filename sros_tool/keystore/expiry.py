@@ -77,7 +77,7 @@ class Lifetime(NamedTuple):
             validities = self.certificate, self.permissions
             return any(validity.expires_soon_from() < now for validity in validities)
         return any(
-            _elapsed(validity, now, made) >= threshold.elapsed
+            _elapsed_fraction(validity, now, made) >= threshold.elapsed
             for validity, made in ((self.certificate, self.came), (self.permissions, None))
         )
 
@@ -289,6 +289,6 @@ def describe_lifetime(lifetime: Lifetime, now: datetime) -> str:
     return f"{lifetime.name}  {first} {word} {iso(lifetime.expires())}"
 
 
-def _elapsed(validity: Window, now: datetime, made_at: datetime | None) -> float:
+def _elapsed_fraction(validity: Window, now: datetime, made_at: datetime | None) -> float:
     """Return the elapsed fraction of a validity without its back-dating; above 1 after expiry."""
     return 1 - (validity.not_after - now) / validity.lifetime(made_at)

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from sros_tool.keystore.transaction import Transaction
     from sros_tool.zenoh.configuration import ZenohNetwork
 
-_COMMENT = """\
+_FLEET_COMMENT = """\
 # The robots of this keystore; sros wrote them from a fleet file, and knows by them which enclave
 # belongs to which robot. To change them, edit that file and run `sros generate_artifacts --fleet`.
 """
@@ -46,7 +46,7 @@ FLEET_REMEDY = (
     "policies of the fleet: `sros generate_artifacts -k KEYSTORE -p POLICY_FILE --fleet "
     "FLEET_FILE`."
 )
-_SHOWN = 5
+_MOST_SHOWN = 5
 
 
 def load_fleet(keystore: OpenedKeystore) -> Fleet | None:
@@ -57,8 +57,8 @@ def load_fleet(keystore: OpenedKeystore) -> Fleet | None:
     """
 
     def read() -> Fleet | None:
-        data = _read(keystore)
-        return None if data is None else _parse(keystore.root, data)
+        data = _read_fleet_file(keystore)
+        return None if data is None else _parse_fleet_file(keystore.root, data)
 
     return keystore.once("fleet", read)
 
@@ -125,8 +125,8 @@ def fleet_before_change(keystore: OpenedKeystore) -> Fleet | None:
 
 
 def edited_fleet(keystore: OpenedKeystore, ledger: Ledger) -> str:
-    """Return how the fleet file differs from what sros wrote, as a clause; "" if it does not."""
-    return _edit_text(ledger, _read(keystore))
+    """Return a clause on manual edits of the fleet file; "" if there are none."""
+    return _edit_text(ledger, _read_fleet_file(keystore))
 
 
 def _edit_text(ledger: Ledger, data: bytes | None) -> str:
@@ -143,7 +143,7 @@ def _edit_text(ledger: Ledger, data: bytes | None) -> str:
     return "" if is_unedited else f"is not the file that sros wrote at {last.time}"
 
 
-def _read(keystore: OpenedKeystore) -> bytes | None:
+def _read_fleet_file(keystore: OpenedKeystore) -> bytes | None:
     path = keystore.root / FLEET
     if not os.path.lexists(path):
         return None
@@ -152,7 +152,7 @@ def _read(keystore: OpenedKeystore) -> bytes | None:
     return keystore.files.read(path, "fleet file", max_bytes=MAX_BYTES)
 
 
-def _parse(root: Path, data: bytes) -> Fleet:
+def _parse_fleet_file(root: Path, data: bytes) -> Fleet:
     from sros_tool.fleet.fleet_file import parse_fleet  # most keystores have no fleet
 
     return parse_fleet(data, f"the fleet file '{root / FLEET}'")
@@ -183,7 +183,7 @@ def enclaves_of_robot(keystore: OpenedKeystore, fleet: Fleet, robot: Robot) -> t
 
 
 def publish_command(root: Path) -> str:
-    """Return the command that brings new files to robots that fetch; "" if none was published."""
+    """Return the command that brings new files to robots that fetch; "" before a publication."""
     return f"`sros fleet publish {quote(str(root))} PUB`" if (root / FLEET_ROOT).exists() else ""
 
 
@@ -198,8 +198,8 @@ def unrecorded_notes(
     found = unrecorded_enclaves(fleet, names, robots.keys()) if fleet else {}
     for robot, (below, _) in found.items():
         if below:
-            text = f"{first_few(below, _SHOWN)}: of no robot, because no policy for the fleet had "
-            text += f"the path with a placeholder: `--robot {robot}` does not choose such an "
+            text = f"{first_few(below, _MOST_SHOWN)}: of no robot, because no policy for the fleet "
+            text += f"had the path with a placeholder: `--robot {robot}` does not choose such an "
             text += "enclave, no release has it, and an agent removes it. To make it an enclave of "
             text += f"the robot: `sros generate_artifacts -k {quote(str(keystore.root))} -p POLICY "
             text += f"--fleet FILE --robot {robot}`, with a policy that has {{robot}} in the path."
@@ -215,7 +215,7 @@ def deliver_first(root: Path) -> str:
 
 
 class EnclaveDomains(NamedTuple):
-    """The ROS domains of enclaves: those of the enclave's robot, or else the keystore's."""
+    """The ROS domains of enclaves: the domains of the robot, or else of the keystore."""
 
     keystore: DomainSet
     fleet: Fleet | None = None
@@ -248,18 +248,18 @@ class EnclaveDomains(NamedTuple):
 def with_routers_of_robots(
     network: ZenohNetwork, before: Fleet | None, fleet: Fleet, gone_enclaves: Collection[str] = ()
 ) -> ZenohNetwork:
-    """Return a network with the routers of ``fleet`` in place of those of the fleet ``before``.
+    """Return a network with the routers of ``fleet`` instead of the routers of ``before``.
 
-    The addresses at which a router listens are kept.  Routers whose enclaves are in
-    ``gone_enclaves`` are left out.
+    ``before`` is the previous fleet. The addresses at which a router listens are kept. Routers
+    whose enclaves are in ``gone_enclaves`` are left out.
     """
     from sros_tool.zenoh.configuration import ZenohRouter  # most fleets name no routers
 
     known = {router.name: router for router in network.routers}
-    for name in _routers(before) if before else ():
+    for name in _robots_by_router(before) if before else ():
         known.pop(name, None)
     listening = {router.name: router.listen for router in network.routers}
-    for name, robot in _routers(fleet).items():
+    for name, robot in _robots_by_router(fleet).items():
         if name not in gone_enclaves:
             own = [enclave for enclave in enclaves_of(fleet, robot) if enclave != name]
             folder = fleet.routers.rpartition("/")[0]
@@ -274,10 +274,10 @@ def with_routers_of_robots(
 
 def robot_of_router(fleet: Fleet | None, name: str) -> Robot | None:
     """Return the robot whose Zenoh router is in the enclave ``name``, or None."""
-    return _routers(fleet).get(name) if fleet else None
+    return _robots_by_router(fleet).get(name) if fleet else None
 
 
-def _routers(fleet: Fleet) -> dict[str, Robot]:
+def _robots_by_router(fleet: Fleet) -> dict[str, Robot]:
     """Map the enclave of each robot's Zenoh router to the robot."""
     return {router_of(fleet, robot): robot for robot in fleet.robots.values() if robot.router}
 
@@ -294,9 +294,9 @@ def write_fleet(
 ) -> tuple[Fleet, tuple[Entry, ...]]:
     """Stage ``fleet`` as the keystore's fleet, and return it as staged, with ledger entries.
 
-    The staged fleet has the enclave paths of ``fleet``, those in ``patterns``, and those of the
-    keystore's present fleet unless somebody edited its file.  If nothing differs from the present
-    fleet, nothing is staged.
+    The staged fleet has the enclave paths of ``fleet``, the paths in ``patterns``, and the paths of
+    the keystore's present fleet unless somebody edited the fleet file.  If nothing differs from the
+    present fleet, nothing is staged.
     """
     from sros_tool.fleet.fleet_file import render_fleet
 
@@ -312,8 +312,8 @@ def write_fleet(
             "Divide the fleet between keystores.",
         )
     _refuse_shared(fleet)
-    document = (_COMMENT + render_fleet(fleet)).encode()
-    if not _edit_text(ledger, document) and _read(keystore):
+    document = (_FLEET_COMMENT + render_fleet(fleet)).encode()
+    if not _edit_text(ledger, document) and _read_fleet_file(keystore):
         return fleet, ()
     transaction.write(FLEET, document)
     digest = hashlib.sha256(document).hexdigest()
@@ -330,7 +330,7 @@ def _refuse_shared(fleet: Fleet) -> None:
                     f"the enclave {name} would belong to two robots, {owners[name]} and "
                     f"{robot.name}",
                     "The keystore has enclaves with the paths "
-                    f"{', '.join(fleet.enclaves[:_SHOWN])}, "
+                    f"{', '.join(fleet.enclaves[:_MOST_SHOWN])}, "
                     "perhaps from an earlier policy. An export for one of the robots would have "
                     "the "
                     "key of the other.",
@@ -388,7 +388,7 @@ def left_enclave_notes(keystore: OpenedKeystore, before: Fleet, after: Fleet) ->
         enclaves.update(enclave for enclave in earlier[name].below if not robot_of(after, enclave))
         why = "has other enclave paths now" if name in after.robots else "is no longer in the fleet"
         stay = "stays" if len(enclaves) == 1 else "stay"
-        shown = first_few(sorted(enclaves), _SHOWN)
+        shown = first_few(sorted(enclaves), _MOST_SHOWN)
         yield Note(
             "fleet.left-enclaves",
             f"the robot {name} {why}: {shown} {stay} valid. To take them back, run `sros revoke "

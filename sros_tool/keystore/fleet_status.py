@@ -1,7 +1,7 @@
 """The deployment status of a fleet: the robots' last confirmations, compared with the keystore.
 
-A robot should have the files that an export would contain now.  Other files are looked up in the
-ledger, which tells when an earlier file was issued, and to which enclave a foreign file belongs.
+A robot should have the files that an export would contain now.  The ledger shows when any other
+file was issued, and to which enclave the file belongs.
 """
 
 from __future__ import annotations
@@ -116,9 +116,9 @@ class State(StrEnum):
     """A file that belongs to another robot, or to an enclave without a robot."""
 
 
-_BADNESS = {state: place for place, state in enumerate(State)}
+_RANK_OF_STATE = {state: place for place, state in enumerate(State)}
 
-_KINDS = {
+_KINDS_BY_FILE = {
     CERTIFICATE_FILE: "certificate",
     PERMISSIONS_FILE: "permissions",
     GOVERNANCE_FILE: "governance",
@@ -126,22 +126,22 @@ _KINDS = {
     IDENTITY_CA_FILE: "identity_ca",
     PERMISSIONS_CA_FILE: "permissions_ca",
 }
-_ZENOH = "zenoh"
-FileKind = Annotated[str, Words((*_KINDS.values(), _ZENOH))]
-_AUTHORITIES = ("identity_ca", "permissions_ca")
-_EXPIRING = ("certificate", "permissions", "crl")
+_ZENOH_KIND = "zenoh"
+FileKind = Annotated[str, Words((*_KINDS_BY_FILE.values(), _ZENOH_KIND))]
+_AUTHORITY_KINDS = ("identity_ca", "permissions_ca")
+_EXPIRING_KINDS = ("certificate", "permissions", "crl")
 """Kinds of files whose expiry the ledger records."""
-_SIGNED = ("permissions", "governance")
-_ISSUED = {"identity": ("certificate",), "permissions": _SIGNED}
+_SIGNED_KINDS = ("permissions", "governance")
+_KINDS_BY_ROLE = {"identity": ("certificate",), "permissions": _SIGNED_KINDS}
 """Maps the role of a CA to the kinds of files that the CA issues."""
-_LONGEST_SILENCE = timedelta(days=1)
+_OFFLINE_AFTER = timedelta(days=1)
 """Default age of the last message from which a robot that fetches counts as offline."""
-_SILENCE = timedelta(minutes=30)
+_FETCH_EXPECTED_WITHIN = timedelta(minutes=30)
 """Age of a fetching robot's last message from which sros says to check whether the robot is on.
 
 By default, robots fetch every five minutes.
 """
-_TO_DO = {
+_TASKS_BY_STATE = {
     State.RESTART: "restart",
     State.OFFLINE: "find out why",
     State.BROKEN: "sros check",
@@ -152,13 +152,13 @@ _TO_DO = {
     State.ANOTHER: "find out why",
 }
 """Maps a state of a robot to the remedy, if the state alone decides it."""
-_SUSPICIOUS = (State.LATER, State.UNKNOWN, State.ANOTHER)
+_SUSPICIOUS_STATES = (State.LATER, State.UNKNOWN, State.ANOTHER)
 """States of a robot whose cause has to be found before anything is delivered to the robot."""
 
 
 def _kind_of(path: str) -> str:
     """Return the kind of a file, such as ``permissions``; ``zenoh`` for all Zenoh files."""
-    return _KINDS.get(path.rpartition("/")[2], _ZENOH)
+    return _KINDS_BY_FILE.get(path.rpartition("/")[2], _ZENOH_KIND)
 
 
 @shows(
@@ -283,7 +283,7 @@ class RobotStatus:
     keystore is older than its robots; null if the keystore has no list, or the robot has no
     enclave. `sros agent` and plays know the processes that lack only new permissions, governance or
     certificates of their own; for other robots, any restart that is due counts."""
-    expiry: Mapping[Annotated[str, Words(_EXPIRING)], datetime]
+    expiry: Mapping[Annotated[str, Words(_EXPIRING_KINDS)], datetime]
     """The first expiry of the files that the robot confirmed, by kind, in UTC, from the ledger."""
     dds: RobotDds | None
     """The DDS of the robot by its last confirmation; null if the confirmation does not tell."""
@@ -352,7 +352,7 @@ class RobotStatus:
 
     def offline(self) -> RobotStatus:
         """Return the status of the robot after it was silent for too long."""
-        state = max(self.state, State.OFFLINE, key=_BADNESS.__getitem__)
+        state = max(self.state, State.OFFLINE, key=_RANK_OF_STATE.__getitem__)
         return replace(self.without_list(), state=state)
 
     def expired(self, now: datetime) -> RobotStatus:
@@ -362,7 +362,7 @@ class RobotStatus:
         status = self
         if (end := self.expiry.get("crl")) and end <= now:
             status = self.without_list()
-        return replace(status, state=max(self.state, State.EXPIRED, key=_BADNESS.__getitem__))
+        return replace(status, state=max(self.state, State.EXPIRED, key=_RANK_OF_STATE.__getitem__))
 
     def without_list(self) -> RobotStatus:
         """Return the status of a robot on which the last list may not be in force."""
@@ -384,12 +384,12 @@ class RobotStatus:
             return look if self.problems else ""
         if self.is_ahead and (self.release or 0) > (self.published or 0):
             return "publish"
-        if self.lacks_ca and self.state not in (State.BROKEN, *_SUSPICIOUS):
+        if self.lacks_ca and self.state not in (State.BROKEN, *_SUSPICIOUS_STATES):
             return "deliver"
         if self.state is State.RESTART and self.reads_copy:
             return "look at its `from`"  # the state says the restart
-        if self.state in _TO_DO and not self.is_ahead:
-            return _TO_DO[self.state]
+        if self.state in _TASKS_BY_STATE and not self.is_ahead:
+            return _TASKS_BY_STATE[self.state]
         if self.state is State.UNUSABLE:
             return "deliver" if self.lacks_key else "look into it"
         if self.state is State.EXPIRED and not self.pending:
@@ -402,7 +402,7 @@ class RobotStatus:
             return "look at its `from`"
         if (self.published or 0) == (self.release or 0):
             return "find out why" if self.is_published else "publish"
-        is_silent = self.received is None or now - self.received > _SILENCE
+        is_silent = self.received is None or now - self.received > _FETCH_EXPECTED_WITHIN
         if self.is_locked_out(now):
             return "deliver" if is_silent else "wait, else deliver"
         if is_silent:
@@ -569,7 +569,7 @@ class FleetStatus:
             if robot.enclaves
             and (last_heard := robot.last_heard)
             and (max_age or robot.fetches)
-            and now - last_heard > (max_age or _LONGEST_SILENCE)
+            and now - last_heard > (max_age or _OFFLINE_AFTER)
         )
         robots = (
             robot.offline() if robot.robot in overdue else robot.expired(now)
@@ -602,7 +602,7 @@ def fleet_status(keystore: OpenedKeystore, names: Sequence[str] = ()) -> FleetSt
     unassigned = 0 if names else len(existing) - sum(len(robot.enclaves) for robot in compared)
     unrecorded = unrecorded_enclaves(fleet, existing, {robot.name for robot in robots})
     statuses = tuple(
-        _status(robot, records, stages, unrecorded[robot.robot.name]) for robot in compared
+        _robot_status(robot, records, stages, unrecorded[robot.robot.name]) for robot in compared
     )
     if older := records.age_clause:  # there may be a later list that the keystore lacks
         statuses = tuple(status.without_list() for status in statuses)
@@ -634,11 +634,11 @@ def fleet_status(keystore: OpenedKeystore, names: Sequence[str] = ()) -> FleetSt
 class _Difference(NamedTuple):
     """A confirmed file that differs from the keystore.
 
-    ``confirmed`` is the SHA-256 of the robot's file, or "" if the robot has none; ``kept`` is that
-    of the keystore's file.  ``certificates`` are the SHA-256 of the certificates in the robot's
-    file, ``present`` those in the keystore's.  ``exported`` says whether an export has a file at
-    this path; None if the file in the keystore cannot be read.  ``is_own`` says whether the path
-    belongs to an enclave of the robot.
+    ``confirmed`` is the SHA-256 of the robot's file, or "" if the robot has no file; ``kept`` is
+    the SHA-256 of the keystore's file.  ``certificates`` are the SHA-256 of the certificates in the
+    robot's file, and ``present`` the SHA-256 of the certificates in the keystore's file.
+    ``exported`` says whether an export has a file at this path; None if the file in the keystore
+    cannot be read.  ``is_own`` says whether the path belongs to an enclave of the robot.
     """
 
     path: str
@@ -688,7 +688,7 @@ class _ComparedRobot(NamedTuple):
         return 0 < number == len(there) and all(map(is_equal, others))
 
     def running(self) -> Mapping[str, RunningFiles] | None:
-        """Return what the processes of the robot's enclaves have loaded; None if not reported."""
+        """Return the files that processes of each enclave have loaded; None if not reported."""
         if self.confirmed is None or self.confirmed.running is None:
             return None
         running = self.confirmed.running
@@ -724,12 +724,12 @@ def _compare_robots(
     def work(part: Sequence[Robot]) -> list[_ComparedRobot]:
         with Folder(keystore.root) as folder:
             files = _KeystoreFiles(folder)
-            return [_compare(keystore, fleet, robot, files) for robot in part]
+            return [_compare_robot(keystore, fleet, robot, files) for robot in part]
 
     return [compared for _, part in map_slices(robots, work) for compared in part]
 
 
-def _compare(
+def _compare_robot(
     keystore: OpenedKeystore, fleet: Fleet, robot: Robot, keystore_files: _KeystoreFiles
 ) -> _ComparedRobot:
     enclaves = enclaves_of_robot(keystore, fleet, robot)
@@ -745,8 +745,8 @@ def _compare(
     confirmed = received.confirmation
     current: Counter[str] = Counter()
     different: list[_Difference] = []
-    authorities: dict[str, set[tuple[str, ...]]] = {kind: set() for kind in _AUTHORITIES}
-    expiring: dict[str, set[str]] = {kind: set() for kind in _EXPIRING}
+    authorities: dict[str, set[tuple[str, ...]]] = {kind: set() for kind in _AUTHORITY_KINDS}
+    expiring: dict[str, set[str]] = {kind: set() for kind in _EXPIRING_KINDS}
     unmatched_paths = set(confirmed.files)
     for name in enclaves:
         for path, file in keystore_files.files_of(name).items():
@@ -848,7 +848,7 @@ class _KeystoreFiles:
             data = read_content(path)
         except (SrosError, OSError):
             return None
-        has_certificates = _kind_of(path) in (*_AUTHORITIES, "certificate")
+        has_certificates = _kind_of(path) in (*_AUTHORITY_KINDS, "certificate")
         certificates = certificate_digests(data) if has_certificates else ()
         return _KeystoreFile(hashlib.sha256(data).hexdigest(), certificates)
 
@@ -920,7 +920,7 @@ class _KeystoreRecords:
         for robot in compared_robots:
             wanted_digests.update(*robot.expiring.values())
             wanted_digests.update(
-                file.kept for file in robot.different if _kind_of(file.path) in _SIGNED
+                file.kept for file in robot.different if _kind_of(file.path) in _SIGNED_KINDS
             )
             if robot.different:
                 wanted_digests.update((stages.sealing_ca, stages.identity_ca))
@@ -943,7 +943,7 @@ class _KeystoreRecords:
         self._unrecorded = unrecorded_enclaves(fleet, self._revoked, robots)
 
     def _add_listed(self) -> None:
-        """Add what only a revocation list revokes, for example a list copied from a robot."""
+        """Add revocations that are only on a revocation list, such as one copied from a robot."""
         reason_by_serial = {
             f"{entry.serial:x}": entry.reason
             for crl in self._keystore.revocation_lists
@@ -963,8 +963,9 @@ class _KeystoreRecords:
     def is_list_equal(self, file: _Difference) -> bool:
         """Return whether an earlier revocation list revokes all that the current list revokes.
 
-        Each list has all revocations so far.  So a list that was signed after the last revocation
-        in the ledger is equal, provided that the ledger has all revocations on the current list.
+        Each list has all revocations so far.  So an earlier list that was signed after the last
+        revocation in the ledger revokes the same certificates, provided that the ledger has all
+        revocations on the current list.
         """
         return bool(file.exported and file.is_own) and file.confirmed in self._equal_lists
 
@@ -1052,9 +1053,9 @@ class _KeystoreRecords:
     def locked_out_from(self, compared_robot: _ComparedRobot) -> datetime | None:
         """Return when a web server with the current CA and list begins to refuse a robot.
 
-        This is the last expiry of the robot's certificates.  Revoked certificates do not count, nor
-        certificates of replaced identity CAs; if there are no others, the time is long ago.  The
-        result is None if the time is not known.
+        This is the last expiry of the robot's certificates.  Revoked certificates and certificates
+        of replaced identity CAs do not count; if the robot has no other certificates, the result is
+        a time long ago.  The result is None if the time is not known.
         """
         long_ago = datetime.min.replace(tzinfo=UTC)
         authority = self._issued.get(self._stages.identity_ca)
@@ -1088,7 +1089,7 @@ class _KeystoreRecords:
             return False
         released_at = self._releases.get(published)
         return (confirmed.release or 0) < published and bool(
-            released_at and last_heard - released_at > _SILENCE
+            released_at and last_heard - released_at > _FETCH_EXPECTED_WITHIN
         )
 
     @property
@@ -1188,12 +1189,12 @@ class _KeystoreRecords:
         )
 
     def _is_edited(self, difference: _Difference, kind: str) -> bool:
-        """Return whether the keystore's file is not the one that was issued or signed."""
+        """Return whether the keystore's file differs from the file that was issued or signed."""
         if not difference.exported:
             return False
-        if kind in (*_AUTHORITIES, "certificate"):
+        if kind in (*_AUTHORITY_KINDS, "certificate"):
             return not difference.present
-        if kind not in _SIGNED or difference.kept in self._issued:
+        if kind not in _SIGNED_KINDS or difference.kept in self._issued:
             return False
         with suppress(SrosError):
             data = self._keystore.read(difference.path, "document")
@@ -1204,16 +1205,15 @@ class _KeystoreRecords:
     def _identify(self, difference: _Difference, kind: str, name: str) -> tuple[State, str, str]:
         """Return a file's state, the time when it was issued, and the enclave to which it belongs.
 
-        The time is "" if it is not known.  The enclave is "" unless it is another one than
-        ``name``.
+        The time is "" if it is not known.  The enclave is "" if it is ``name``.
         """
         if difference.exported is None or self._is_edited(difference, kind):
             return State.BROKEN, "", ""
         if not difference.confirmed:
             return State.MISSING, "", ""
-        if kind == _ZENOH:
+        if kind == _ZENOH_KIND:
             return State.DIFFERENT, "", ""
-        if kind in _AUTHORITIES:
+        if kind in _AUTHORITY_KINDS:
             entries = [self._issued.get(entry) for entry in difference.certificates]
             if not entries or not all(entry and entry.what == "ca" for entry in entries):
                 return State.UNKNOWN, "", ""
@@ -1231,7 +1231,7 @@ class _KeystoreRecords:
         return State.EARLIER, entry.time, ""
 
 
-def _status(
+def _robot_status(
     compared_robot: _ComparedRobot,
     records: _KeystoreRecords,
     stages: _Stages,
@@ -1248,7 +1248,7 @@ def _status(
     if revoked and not compared_robot.enclaves:
         state = State.REVOKED  # such a robot should have no files, whatever it reports
     elif different:
-        state = max((file.state for file in different), key=_BADNESS.__getitem__)
+        state = max((file.state for file in different), key=_RANK_OF_STATE.__getitem__)
     elif not compared_robot.enclaves:
         state = State.NONE
     elif compared_robot.received is None:
@@ -1257,18 +1257,18 @@ def _status(
         state = State.RESTART if restart else State.CURRENT
     received, confirmed = compared_robot.received, compared_robot.confirmed
     if compared_robot.enclaves and any(map(is_unusable, (confirmed and confirmed.problems) or ())):
-        state = max(state, State.UNUSABLE, key=_BADNESS.__getitem__)
+        state = max(state, State.UNUSABLE, key=_RANK_OF_STATE.__getitem__)
     is_later = bool(
         compared_robot.enclaves
         and confirmed
         and records.is_later(compared_robot.robot.name, confirmed.release or 0)
     )
     if is_later:
-        state = max(state, State.LATER, key=_BADNESS.__getitem__)
+        state = max(state, State.LATER, key=_RANK_OF_STATE.__getitem__)
     refusal = records.refusals.get(compared_robot.robot.name) if compared_robot.enclaves else None
     is_refused = bool(refusal and (received is None or received.time <= refusal.time))
     if refusal and is_refused:
-        state = max(state, State.REFUSED, key=_BADNESS.__getitem__)
+        state = max(state, State.REFUSED, key=_RANK_OF_STATE.__getitem__)
         refusal_note = f"its last message was refused since {iso(refusal.time)}: {refusal.why}"
         compared_robot = compared_robot._replace(notes=(*compared_robot.notes, refusal_note))
     is_ahead = bool(
@@ -1315,7 +1315,7 @@ def _status(
         confirmed.release if confirmed else None,
         records.published.get(compared_robot.robot.name),
         stages.of(compared_robot),
-        {kind: counts[kind] for kind in (*_KINDS.values(), _ZENOH) if kind in counts},
+        {kind: counts[kind] for kind in (*_KINDS_BY_FILE.values(), _ZENOH_KIND) if kind in counts},
         different,
         restart,
         compared_robot.running(),
@@ -1369,7 +1369,7 @@ class _Stages:
         }
         awaited = {f"{role}_ca" for role in replaced_roles}
         if rotation.stage is RotationStage.REISSUE:
-            awaited.update(kind for role in replaced_roles for kind in _ISSUED[role])
+            awaited.update(kind for role in replaced_roles for kind in _KINDS_BY_ROLE[role])
         self.awaited = frozenset(awaited)
         self._new: dict[str, str] = {}
         self._of_kind: dict[str, tuple[tuple[str, ...], str]] = {}
@@ -1437,7 +1437,7 @@ def fleet_metrics(
 ) -> tuple[Metric, ...]:
     """Return the Prometheus metrics of a fleet; ``now`` is the time of the comparison.
 
-    ``advisories`` are the known vulnerabilities; None for those that ship with sros.
+    ``advisories`` are the known vulnerabilities; None for the vulnerabilities that ship with sros.
     """
     place = {"keystore": str(status.keystore.absolute())}
     robots = [({**place, "robot": robot.robot}, robot) for robot in status.robots]

@@ -46,10 +46,10 @@ from sros_tool.validity import iso, parse_iso
 
 
 def other_enclave(keystore: OpenedKeystore, name: str, certificate: x509.Certificate) -> str:
-    """Return the enclave that the certificate of the enclave ``name`` belongs to, if another.
+    """Return the enclave for which the certificate in the folder of ``name`` was issued, or "".
 
-    The result is "" if the certificate belongs to ``name`` itself, or comes from another PKI, whose
-    names no vendor compares with the folder.
+    The result is "" if the certificate was issued for ``name`` itself, or comes from another PKI,
+    whose names no vendor compares with the folder.
     """
     common_name = common_name_of(certificate.subject)
     certified = f"/{common_name.removeprefix('/')}"
@@ -114,14 +114,13 @@ def restored_at(keystore: OpenedKeystore) -> str:
 def _since_trusted(
     keystore: OpenedKeystore, entries: Sequence[Entry], role: str = IDENTITY
 ) -> Sequence[Entry]:
-    """Return the entries from the first record of a key that a CA trusted in ``role`` has.
+    """Return the entries since the ledger first recorded a key of a trusted ``role`` CA.
 
-    ``entries`` come from reading the ledger, and include all CAs.  All entries are returned if
-    there is no trusted CA; if a trusted CA was recorded only when it was renewed or replaced,
-    because the earlier ledger was lost; or if CAs are recorded without keys, as by earlier
-    versions.
+    ``entries`` come from reading the ledger, and include all CAs. All entries are returned if there
+    is no trusted CA; if a trusted CA was recorded only when it was renewed or replaced, because the
+    earlier ledger was lost; or if CAs are recorded without keys, as by earlier versions.
     """
-    trusted = {_digest_of(ca) for ca in keystore.authority(role)}
+    trusted = {_key_digest_of(ca) for ca in keystore.authority(role)}
     authorities = [
         place
         for place, entry in enumerate(entries)
@@ -137,8 +136,8 @@ def _since_trusted(
 def revoked_issues(keystore: OpenedKeystore, listed: Collection[str] = ()) -> Iterator[Entry]:
     """Yield the entries of revoked certificates, and of the permissions of their enclaves.
 
-    Only certificates of CAs that are trusted now count, without those with serial numbers in
-    ``listed``.  The entry of a certificate is that of its issue, or else that of its revocation.
+    Only certificates of CAs that are trusted now count, except certificates with a serial number in
+    ``listed``.  The entry of a certificate records its issue, or else its revocation.
     """
     serials = {f"{serial:x}" for serial in revoked_serials(keystore)}.difference(listed)
     recorded = keystore.ledger_file.with_values("serial", serials).entries if serials else ()
@@ -230,8 +229,8 @@ def _known_authorities(keystore: OpenedKeystore, role: str) -> frozenset[str] | 
 def _may_be_of_trusted(keystore: OpenedKeystore, entry: Entry) -> bool:
     """Return whether a trusted CA may have issued a certificate that was recorded after the CA.
 
-    Until the stage reissue of a rotation, the previous CA goes on to issue.  The revoked
-    certificate's file shows the issuer, if the file exists and is the recorded one.
+    Until the stage reissue of a rotation, the previous CA goes on to issue.  The file of the
+    revoked certificate shows the issuer, if the file exists and has the recorded digest.
     """
     file = keystore.identity_file
     with suppress(SrosError):
@@ -283,10 +282,10 @@ class IssuedEarlier:
     def certificates_until(self, replaced: Entry, signed_for: str | None) -> datetime:
         """Return until when the ``replaced`` certificate and earlier ones of its enclave work.
 
-        A certificate works only as long as permissions in the ledger fit it.  But if it has the
-        subject ``signed_for`` of the enclave's new certificate, or a subject without a unique part,
-        which Cyclone DDS finds in other subjects, it works until it expires.  If ``signed_for`` is
-        None, certificates need no permissions.
+        A certificate works only as long as permissions in the ledger fit it.  But a certificate
+        works until it expires if its subject is ``signed_for``, the subject of the enclave's new
+        certificate, or if its subject has no unique part, because Cyclone DDS finds such a subject
+        in other subjects.  If ``signed_for`` is None, certificates need no permissions.
         """
         last: defaultdict[str, str] = defaultdict(str)
         for entry in self._permissions[replaced.enclave]:
@@ -325,7 +324,7 @@ class KnownKeys:
         return [entry for entry in entries if entry.what == "revocation"]
 
     @cached_property
-    def _revoked(self) -> Mapping[str, str]:
+    def _revoked_keys(self) -> Mapping[str, str]:
         """Maps the digests of revoked keys to descriptions of the revoked certificates."""
         recorded = [entry for entry in self._revocations if entry.key]
         descriptions = {
@@ -361,7 +360,7 @@ class KnownKeys:
         return serials | {entry.serial for entry in lists if entry.reason != SUPERSEDED}
 
     @cached_property
-    def _unrecorded(self) -> frozenset[int]:
+    def _unrecorded_serials(self) -> frozenset[int]:
         """The serial numbers that are only on lists (copied or published), as after a restore."""
         from sros_tool.keystore.delivery.published import later_revoked_serials
 
@@ -432,11 +431,11 @@ class KnownKeys:
                 )
 
     @cached_property
-    def _enclaves(self) -> Mapping[str, Sequence[str]]:
+    def _enclaves_by_key(self) -> Mapping[str, Sequence[str]]:
         """Maps the digest of each key to the enclaves that have the key."""
 
         def read(names: Sequence[str]) -> list[tuple[str, str]]:
-            return [(key, name) for name in names for key in _digests(self._keystore, name)]
+            return [(key, name) for name in names for key in _key_digests(self._keystore, name)]
 
         enclaves_by_key: dict[str, list[str]] = defaultdict(list)
         for _, part in map_slices(self._keystore.names, read):
@@ -446,7 +445,7 @@ class KnownKeys:
 
     def is_revoked(self, key: str) -> bool:
         """Return whether the key with the digest ``key`` was revoked."""
-        return key in self._revoked
+        return key in self._revoked_keys
 
     def refuse_revoked(
         self,
@@ -460,17 +459,18 @@ class KnownKeys:
         """Raise `KeystoreError` if ``key`` was revoked; ``holder`` names its holder in the error.
 
         ``certificate`` is the current certificate for the key: a backup may have restored a revoked
-        certificate.  With ``publish_first``, what only published lists revoke has the remedy to
-        publish with --restored, which is refused until CAs that were replaced are replaced again.
+        certificate.  With ``publish_first``, if only published lists revoke the key, the remedy is
+        to publish with --restored.  Callers leave it out while CAs have to be replaced again,
+        because publishing is refused until then.
         """
-        revoked = self._revoked.get(key_digest(key))
+        revoked = self._revoked_keys.get(key_digest(key))
         if certificate and certificate.serial_number in self._revoked_serials:
             revoked = _key_and_description(certificate)[1]
         if revoked:
             raise KeystoreError(
                 f"the key of {holder} was revoked", f"It is the key of {revoked}.", remedy
             )
-        if certificate and certificate.serial_number in self._unrecorded:
+        if certificate and certificate.serial_number in self._unrecorded_serials:
             from sros_tool.keystore.delivery.published import (
                 may_have_later_releases,
                 read_published,
@@ -504,13 +504,13 @@ class KnownKeys:
             shared = {
                 name: others
                 for name in names
-                for key in _digests(self._keystore, name)
+                for key in _key_digests(self._keystore, name)
                 if (others := [holder for holder in self._holders(key) if holder != name])
             }
         else:
             shared = {
                 name: others
-                for enclaves in self._enclaves.values()
+                for enclaves in self._enclaves_by_key.values()
                 if len(enclaves) > 1
                 for name in enclaves
                 if (others := [enclave for enclave in enclaves if enclave != name])
@@ -533,25 +533,25 @@ class KnownKeys:
         that still have it.  A key that somebody copied to another enclave is not found here, but by
         `sros check`, which reads the files of all enclaves.
         """
-        if "_enclaves" in self.__dict__ or not self._keystore.ledger_file.is_indexed:
-            return self._enclaves.get(key, ())
+        if "_enclaves_by_key" in self.__dict__ or not self._keystore.ledger_file.is_indexed:
+            return self._enclaves_by_key.get(key, ())
         # Earlier versions of sros recorded certificates without their keys.
         entries = self._keystore.ledger_file.with_values("key", (key, "")).entries
         recorded = {e.enclave for e in entries if e.what == "certificate" and e.key in ("", key)}
-        return [name for name in sorted(recorded) if key in _digests(self._keystore, name)]
+        return [name for name in sorted(recorded) if key in _key_digests(self._keystore, name)]
 
 
 def _key_and_description(certificate: x509.Certificate) -> tuple[str, str]:
     """Return the digest of a certificate's key, and a description of the certificate."""
     subject = subject_text(certificate.subject)
-    return _digest_of(certificate), f"certificate {certificate.serial_number:x} of {subject}"
+    return _key_digest_of(certificate), f"certificate {certificate.serial_number:x} of {subject}"
 
 
-def _digest_of(certificate: x509.Certificate) -> str:
+def _key_digest_of(certificate: x509.Certificate) -> str:
     return key_digest(certificate.public_key())  # type: ignore[arg-type]
 
 
-def _digests(keystore: OpenedKeystore, name: str) -> Iterator[str]:
+def _key_digests(keystore: OpenedKeystore, name: str) -> Iterator[str]:
     """Yield the digest of an enclave's key, from its certificate, key file or request.
 
     Yields nothing if all these files are missing, or if the file is damaged.
@@ -559,7 +559,7 @@ def _digests(keystore: OpenedKeystore, name: str) -> Iterator[str]:
     folder = keystore.folder(name)
     try:
         if (folder / CERTIFICATE_FILE).exists():
-            yield _digest_of(keystore.certificate_of(name))
+            yield _key_digest_of(keystore.certificate_of(name))
         elif (path := folder / KEY_FILE).exists():
             key = load_key(keystore.read(path, "private key"), f"'{path}'")
             yield key_digest(key.public_key())

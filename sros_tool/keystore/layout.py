@@ -198,8 +198,8 @@ These versions belong to ROS 2 Crystal to Eloquent.
 """
 
 _TOP_FILES = frozenset((SETTINGS, FLEET, FLEET_ROOT, PUBLISHED, LEDGER, LEDGER_HEAD, ROTATION))
-_OF_IDENTITY = (CERTIFICATE_FILE, KEY_FILE)
-_OF_ENCLAVE = (CERTIFICATE_FILE, *KEY_FILES)
+_IDENTITY_FILES = (CERTIFICATE_FILE, KEY_FILE)
+_ENCLAVE_MARKS = (CERTIFICATE_FILE, *KEY_FILES)
 _FILE_TYPES = (".pem", ".p7s", ".p11", ".xml", ".json5")
 _TOP_FOLDERS = frozenset((ENCLAVES, PUBLIC, PRIVATE, REVOKED, RETIRED))
 
@@ -269,7 +269,7 @@ _SIGN_POLICY = re.compile(r"un `sros generate_artifacts -k [^`]+ -p POLICY_FILE`
 def remedy_in_closed_robot(root: Path, remedy: str) -> str:
     """Return a remedy for ``root``; in a closed robot's folder, `sros close` signs and exports.
 
-    Only if the CA keys are still in that folder; otherwise the remedy is returned as it is.
+    If the CA keys are no longer in that folder, the remedy is returned unchanged.
     """
     robot = folder_of_closed_robot(root)
     if not (robot and is_original_keystore(robot / CLOSED_KEYSTORE)):
@@ -291,7 +291,7 @@ def folder_of_closed_robot(root: Path) -> Path | None:
 
 
 def how_to_learn_beside(robot: Path, domain: int = 0) -> str:
-    """Return clauses on how to learn the rights of a process, while the other ones stay closed.
+    """Return clauses on how to learn the rights of one process while all others stay closed.
 
     ``robot`` is a folder of `sros close`, and ``domain`` the ROS domain. Only open nodes are seen.
     """
@@ -322,7 +322,7 @@ def how_to_add_domains(root: Path, domains: str) -> str:
 
 def is_enclave(folder: Path) -> bool:
     """Return whether ``folder`` has a certificate or a key of an enclave."""
-    return any(os.path.lexists(f"{folder}/{file}") for file in _OF_ENCLAVE)
+    return any(os.path.lexists(f"{folder}/{file}") for file in _ENCLAVE_MARKS)
 
 
 def key_on_robot(folder: Path) -> bool:
@@ -382,26 +382,28 @@ def _search(
 ) -> tuple[tuple[str, ...], tuple[UnreadPath, ...]]:
     """Return the result of `search_enclaves` for the folder ``start`` below ``top``."""
     unread: list[UnreadPath] = []
-    names = _names_in(top, _walk(start, unread, hidden=hidden))
+    names = _names_in(top, _walk_folders(start, unread, hidden=hidden))
     return names, tuple(unread)
 
 
-_Walked: TypeAlias = tuple[str, list[str]]
+_WalkedFolder: TypeAlias = tuple[str, list[str]]
 """A folder, and the names of the files in it."""
 
 
-def _names_in(top: str, folders: Iterable[_Walked]) -> tuple[str, ...]:
+def _names_in(top: str, folders: Iterable[_WalkedFolder]) -> tuple[str, ...]:
     """Return the sorted names of the enclaves among folders below ``top``, their common folder."""
     return tuple(
         sorted(
             folder[len(top) :].replace(os.sep, "/") or "/"
             for folder, files in folders
-            if any(file in files for file in _OF_ENCLAVE)
+            if any(file in files for file in _ENCLAVE_MARKS)
         )
     )
 
 
-def _walk(top: str, unread: list[UnreadPath], *, hidden: bool = False) -> Iterator[_Walked]:
+def _walk_folders(
+    top: str, unread: list[UnreadPath], *, hidden: bool = False
+) -> Iterator[_WalkedFolder]:
     """Yield each folder below ``top``, with its files; add unreadable folders to ``unread``.
 
     With ``hidden``, folders whose names begin with a dot are included.
@@ -423,7 +425,7 @@ def _walk(top: str, unread: list[UnreadPath], *, hidden: bool = False) -> Iterat
                 # A link named like a file is not an enclave: what is wrong with it concerns the
                 # folder around it.
                 of_file = name.endswith(_FILE_TYPES)
-                if (of_file and name not in _OF_IDENTITY) or not _is_folder(entry):
+                if (of_file and name not in _IDENTITY_FILES) or not _is_folder(entry):
                     files.append(name)
                 elif not of_file and (hidden or name[0] != ".") and not _is_inside(entry.path, top):
                     unread.append(UnreadPath(entry.path, _FOLDER_ELSEWHERE))
@@ -482,7 +484,7 @@ def has_zenoh_files(root: Path, *, hidden: bool = False) -> bool:
     """
     return any(
         is_enclave(Path(folder)) and Path(folder, file).is_file()
-        for folder, files in _walk(os.fspath(root / ENCLAVES), [], hidden=hidden)
+        for folder, files in _walk_folders(os.fspath(root / ENCLAVES), [], hidden=hidden)
         for file in ZENOH_SIGNED.keys() & files
     )
 
@@ -498,7 +500,7 @@ def readable_enclaves(root: Path) -> tuple[str, ...]:
     """
     top = os.fspath(root / ENCLAVES)
     unread: list[UnreadPath] = []
-    names = _names_in(top, _noting_unreadable(_walk(top, unread), unread))
+    names = _names_in(top, _noting_unreadable(_walk_folders(top, unread), unread))
     _refuse_unreadable(root, unread)
     return names
 
@@ -506,7 +508,7 @@ def readable_enclaves(root: Path) -> tuple[str, ...]:
 def check_readable(root: Path, names: Sequence[str]) -> None:
     """Raise `KeystoreError` if this user cannot read every file of the enclaves ``names``."""
     unread: list[UnreadPath] = []
-    walks = (_walk(os.fspath(enclave_path(root, name)), unread) for name in names)
+    walks = (_walk_folders(os.fspath(enclave_path(root, name)), unread) for name in names)
     # A walk begins with the folder of the enclave itself.
     folders = chain.from_iterable(islice(walk, 1) for walk in walks)
     for _ in _noting_unreadable(folders, unread):
@@ -514,7 +516,9 @@ def check_readable(root: Path, names: Sequence[str]) -> None:
     _refuse_unreadable(root, unread)
 
 
-def _noting_unreadable(folders: Iterable[_Walked], unread: list[UnreadPath]) -> Iterator[_Walked]:
+def _noting_unreadable(
+    folders: Iterable[_WalkedFolder], unread: list[UnreadPath]
+) -> Iterator[_WalkedFolder]:
     """Yield ``folders``, and add the files in them that cannot be read to ``unread``."""
     for folder, files in folders:
         for name in files:
@@ -575,8 +579,9 @@ def hidden_enclaves(root: Path, among: Iterable[str] | None = None) -> tuple[str
     """Return the sorted names of the enclaves in hidden folders, which `enclave_names` leaves out.
 
     ``among`` are the names from a search with ``hidden``; if None, the search is done here.  Two
-    kinds of folders are left out: those of an interrupted transaction, and those that Kubernetes
-    makes next to the link ``..data`` where it mounts a Secret with an enclave's own files.
+    kinds of folders are left out: folders of an interrupted transaction, and folders that
+    Kubernetes makes next to the link ``..data`` where it mounts a Secret with an enclave's own
+    files.
     """
     names = search_enclaves(root, hidden=True)[0] if among is None else among
     folders = {name: enclave_path(root, name) for name in names if "/." in name}
@@ -691,7 +696,7 @@ def locate_enclave(folder: Path) -> tuple[Path, str]:
 
     Raises:
         DocumentError: ``folder`` is not below a folder named ``enclaves``.
-        KeystoreError: ``folder`` is that of a node in a keystore of ROS 2 Eloquent or earlier.
+        KeystoreError: ``folder`` belongs to a node in a keystore of ROS 2 Eloquent or earlier.
     """
     absolute = Path(os.path.abspath(folder))  # noqa: PTH100 - must not follow links
     for above in (absolute, *absolute.parents):

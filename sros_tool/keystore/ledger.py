@@ -159,7 +159,7 @@ class Ledger(NamedTuple):
     lines: int = 0
 
     def next_number(self) -> int:
-        """Return the number for a new answer, higher than those of all earlier answers."""
+        """Return the number for a new answer, higher than the numbers of all earlier answers."""
         return max([self.lines, *(entry.number for entry in self.entries)]) + 1
 
 
@@ -174,42 +174,42 @@ class _Fault(NamedTuple):
 _MOST_BYTES = 4 * 1024**3
 _MOST_LINES = 8_000_000
 _LONGEST_LINE = 4 * 1024**2
-_END_BYTES = 64 * 1024
-_BLOCK = 1024**2
-_TEXTS = tuple(name for name in Entry._fields if name != "number")
+_LAST_LINES_BYTES = 64 * 1024
+_BLOCK_BYTES = 1024**2
+_TEXT_FIELDS = tuple(name for name in Entry._fields if name != "number")
 _SERIAL = re.compile(r"[0-9a-f]{1,40}")
-_MOST_BITS = 159
+_MOST_SERIAL_BITS = 159
 """Largest length of a serial number, in bits (RFC 5280, 4.1.2.2)."""
 _MOST_NUMBER = 10**12
-_MOST_KEPT = 16 * 1024 * 1024
-_SEALED_FROM = 16 * 1024 * 1024
+_MOST_CACHED_BYTES = 16 * 1024 * 1024
+_SEAL_FROM_BYTES = 16 * 1024 * 1024
 """Size in bytes from which a part is sealed, because each change copies the last part."""
-_LINE_BYTES = 450
+_USUAL_LINE_BYTES = 450
 """Usual length of a line, in bytes."""
-_HEAD = re.compile(
+_HEAD_TEXT = re.compile(
     rb"sros ledger [12]\nlines ([0-9]{1,12})\nsha256 ([0-9a-f]{64})\n(?:index ([0-9a-f]{64})\n)?"
 )
-_INDEXED_FROM = 2000
+_INDEX_FROM_LINES = 2000
 """Number of lines from which a ledger has an index; a shorter ledger is quickly read as a whole."""
 _LINES_PER_LOOKUP = 5
 """Number of lines that take as long to read as one look-up in the index takes."""
-_VALUES = {
+_VALUE_PATTERNS = {
     "serial": r'"(?P<serial>[0-7][0-9a-f]{39}|[0-9a-f]{1,39})"',
     "number": r"([1-9][0-9]{0,11})",
 }
-_TEXT = r'"([^"\\\x00-\x1f]+)"'
-_WRITTEN = re.compile(
+_TEXT_PATTERN = r'"([^"\\\x00-\x1f]+)"'
+_WRITTEN_LINE = re.compile(
     r"\{"
     + r"".join(
-        f'{"," if index else ""}"{name}":{_VALUES.get(name, _TEXT)}'
+        f'{"," if index else ""}"{name}":{_VALUE_PATTERNS.get(name, _TEXT_PATTERN)}'
         if name in ("time", "what")
-        else f'(?:,"{name}":{_VALUES.get(name, _TEXT)})?'
+        else f'(?:,"{name}":{_VALUE_PATTERNS.get(name, _TEXT_PATTERN)})?'
         for index, name in enumerate(Entry._fields)
     )
     + r"\}"
 )
-"""Matches a line as `_line` writes it, without escaped characters; each field is a group."""
-_quoted = json.encoder.encode_basestring_ascii
+"""Matches a line as `_json_line` writes it, without escaped characters; each field is a group."""
+_json_text = json.encoder.encode_basestring_ascii
 
 
 # ── entries ────────────────────────────────────────────────────────────────────────────────
@@ -298,13 +298,13 @@ class _Reading(NamedTuple):
     sound: bool = True
 
 
-_EVERY = b""
-_NONE = b"\n"
-"""Values of ``needed_text``: every line contains ``_EVERY``, no line contains ``_NONE``."""
-_GAP, _CA = b'"what":"gap"', b'"what":"ca"'
+_IN_EVERY_LINE = b""
+_IN_NO_LINE = b"\n"
+"""Values of ``needed_text``: a text that is in every line, and a text that is in no line."""
+_GAP_TEXT, _CA_TEXT = b'"what":"gap"', b'"what":"ca"'
 
 
-class _Files(NamedTuple):
+class _OpenedFiles(NamedTuple):
     """The ledger and its head, as they were at the same moment.
 
     ``state`` is None if there is no ledger.  ``lines`` is the content of the file; None if the file
@@ -343,7 +343,7 @@ class LedgerFile:
         self._read_first = read_content
         self._authorities = authorities
         self._follow_link = follow_link
-        self._files: _Files | None = None
+        self._files: _OpenedFiles | None = None
         self._readings: dict[bytes, _Reading] = {}
         self._recorded: Sequence[str] | None = None
         self._entries: dict[bytes, Entry] = {}
@@ -355,7 +355,7 @@ class LedgerFile:
         Raises:
             KeystoreError: the file cannot be read at all.
         """
-        return self._reading(_EVERY).ledger
+        return self._reading(_IN_EVERY_LINE).ledger
 
     def with_field(self, name: str, value: str) -> Ledger:
         """Return the ledger with at least the entries whose field ``name`` has the value ``value``.
@@ -366,9 +366,9 @@ class LedgerFile:
         Raises:
             KeystoreError: the file cannot be read at all.
         """
-        if _EVERY in self._readings:
-            return self._readings[_EVERY].ledger
-        return self._reading(f'"{name}":{_quoted(value)}'.encode(), [(name, value)]).ledger
+        if _IN_EVERY_LINE in self._readings:
+            return self._readings[_IN_EVERY_LINE].ledger
+        return self._reading(f'"{name}":{_json_text(value)}'.encode(), [(name, value)]).ledger
 
     def with_values(self, name: str, values: Collection[str]) -> Ledger:
         """Return the ledger with at least the entries whose field ``name`` has one of ``values``.
@@ -383,7 +383,7 @@ class LedgerFile:
         if index is None or (many and self.is_complete):
             return self.ledger()
         terms = [(name, value) for value in values]
-        return self._reading_with(_EVERY, terms).ledger
+        return self._reading_with(_IN_EVERY_LINE, terms).ledger
 
     def next_number(self) -> int:
         """Return the number for a new answer, as `Ledger.next_number` does."""
@@ -404,7 +404,7 @@ class LedgerFile:
         return self._recorded
 
     def recorded_with(self, *parts: str) -> Collection[str] | None:
-        """Return `recorded_enclaves`, unsorted, only those with one of ``parts`` in their names."""
+        """Return the `recorded_enclaves` with one of ``parts`` in their names, unsorted."""
         index = self._opened().ledger_index
         try:
             return index.names(parts) if index else None
@@ -421,14 +421,14 @@ class LedgerFile:
         """Whether no sealed part is missing, so that all lines can be read."""
         return all((self.root / ledger_part(n)).exists() for n in range(1, self._opened().part))
 
-    def _opened(self) -> _Files:
+    def _opened(self) -> _OpenedFiles:
         if self._files is None:
             self._files = self._read()
         return self._files
 
     def reading_for_append(self) -> _Reading:
         """Return a reading with the values needed for adding lines; ``ledger`` may lack entries."""
-        return self._readings.get(_EVERY) or self._reading(_NONE, ())
+        return self._readings.get(_IN_EVERY_LINE) or self._reading(_IN_NO_LINE, ())
 
     def index_with(self, new: int, reading: _Reading) -> IndexUpdate | None:
         """Return the update of the index for ``new`` additional lines; None if there is no index.
@@ -436,7 +436,7 @@ class LedgerFile:
         ``reading`` comes from `reading_for_append`.  A ledger with a fault gets no index, because
         only reading all lines shows which entries are certain.
         """
-        if reading.ledger.lines + new < _INDEXED_FROM or not reading.sound:
+        if reading.ledger.lines + new < _INDEX_FROM_LINES or not reading.sound:
             return None
         from sros_tool.keystore.ledger_index import IndexUpdate
 
@@ -471,13 +471,13 @@ class LedgerFile:
     def last_time(self) -> datetime | None:
         """Return the time of the last entries, in UTC; None if there is no entry.
 
-        This is the latest time since the last revocation list.  So a later entry with a wrong time
-        does not hide a clock that is behind, and a new list corrects a time from when the clock was
-        ahead.
+        This is the latest time since the last revocation list.  So an entry with a wrong time does
+        not hide a clock that is behind, and a new list corrects times that a clock ahead of time
+        wrote.
         """
         times = []
         for line in reversed(self._opened().last_lines):
-            if entry := _parse(line):
+            if entry := _parse_line(line):
                 with suppress(ValueError):
                     times.append(parse_iso(entry.time))
                 if entry.what == "crl":
@@ -490,9 +490,9 @@ class LedgerFile:
             yield self._files.lines
             return
         with self._open() or io.BytesIO() as file:
-            yield from iter(lambda: file.read(_BLOCK), b"")
+            yield from iter(lambda: file.read(_BLOCK_BYTES), b"")
 
-    def _reading(self, needed_text: bytes, terms: _Terms | None = None) -> _Reading:
+    def _reading(self, needed_text: bytes, terms: _FieldValues | None = None) -> _Reading:
         """Return the ledger; chained lines without ``needed_text`` are verified, not parsed.
 
         ``terms`` are the field values by which the index finds these lines; None if the index
@@ -502,7 +502,7 @@ class LedgerFile:
             self._readings[needed_text] = self._reading_with(needed_text, terms)
         return self._readings[needed_text]
 
-    def _reading_with(self, needed_text: bytes, terms: _Terms | None) -> _Reading:
+    def _reading_with(self, needed_text: bytes, terms: _FieldValues | None) -> _Reading:
         while True:
             known = self._files
             files = known or self._read()
@@ -533,7 +533,7 @@ class LedgerFile:
                 folder.unlink(LEDGER_INDEX, missing_ok=True)
         return may_restore
 
-    def _read(self) -> _Files:
+    def _read(self) -> _OpenedFiles:
         files = self._read_once()
         while files.later and not self._is_unchanged(
             files
@@ -541,24 +541,26 @@ class LedgerFile:
             files = self._read_once()
         return files
 
-    def _read_once(self) -> _Files:
+    def _read_once(self) -> _OpenedFiles:
         head = self._read_head(self._read_first)
         self._read_first = read_bytes
         file = self._open()
         if file is None:
-            return _Files(head, None, b"", later=self._later_than(0))
+            return _OpenedFiles(head, None, b"", later=self._later_than(0))
         with file:
             state = os.fstat(file.fileno())
             before = _sealed_before(file)
             part = before.number + 1 if before else 1
-            start = max(0, state.st_size - _END_BYTES)
-            last = tuple(os.pread(file.fileno(), _END_BYTES, start).split(b"\n"))[bool(start) :]
+            start = max(0, state.st_size - _LAST_LINES_BYTES)
+            last = tuple(os.pread(file.fileno(), _LAST_LINES_BYTES, start).split(b"\n"))[
+                bool(start) :
+            ]
             later = self._later_than(part, state)
             if head and (index := self._index(file, head)):
-                return _Files(head, state, None, index, part, later, last)
-            kept = state.st_size <= _MOST_KEPT and not before
+                return _OpenedFiles(head, state, None, index, part, later, last)
+            kept = state.st_size <= _MOST_CACHED_BYTES and not before
             lines = file.read() if kept else None
-            return _Files(head, state, lines, None, part, later, last)
+            return _OpenedFiles(head, state, lines, None, part, later, last)
 
     def _index(self, file: BinaryIO, head: _Head) -> LedgerIndex | None:
         """Return the index that the head states; None if no index fits the end of this ledger.
@@ -566,7 +568,7 @@ class LedgerFile:
         A process that has locked the keystore makes a missing index, or one of another version of
         sros, again.
         """
-        is_long = head.lines >= _INDEXED_FROM
+        is_long = head.lines >= _INDEX_FROM_LINES
         if not head.index_root and (self._follow_link or not is_long):
             return None
         from sros_tool.keystore.ledger_index import LedgerIndex
@@ -583,7 +585,7 @@ class LedgerFile:
         file.seek(0)
         return index if ends_so else None
 
-    def _indexed_lines(self, files: _Files, terms: _Terms | None) -> _Lines | None:
+    def _indexed_lines(self, files: _OpenedFiles, terms: _FieldValues | None) -> _ReadLines | None:
         """Return the lines that the index finds; None if it is missing or cannot find ``terms``.
 
         Raises:
@@ -604,7 +606,9 @@ class LedgerFile:
                     self._entries[posting.digest] = _entry_at(posting, index, file)
         entries = tuple(self._entries[posting.digest] for posting in postings)
         numbers = [posting.number for posting in postings]
-        return _Lines(entries, numbers, (), head.lines, 0, True, head.last, head.last, ended=True)
+        return _ReadLines(
+            entries, numbers, (), head.lines, 0, True, head.last, head.last, ended=True
+        )
 
     def _read_head(self, read_content: Callable[[Path, str], bytes]) -> _Head | None:
         """Return the head of the ledger; None if there is none."""
@@ -614,15 +618,15 @@ class LedgerFile:
         try:
             signed = smime.parse(read_content(path, "signed head of the ledger"))
             if authorities := self._authorities():
-                _verify(signed, authorities)
-            stated = _HEAD.fullmatch(signed.text)
+                _check_signer(signed, authorities)
+            stated = _HEAD_TEXT.fullmatch(signed.text)
         except SrosError as error:
             return _Head(fault=f"{LEDGER_HEAD} does not sign the end of the ledger: {error.what}")
         if not stated:
             return _Head(fault=f"{LEDGER_HEAD} is not the signed end of a ledger")
         return _Head(int(stated[1]), stated[2].decode(), index_root=(stated[3] or b"").decode())
 
-    def _is_unchanged(self, files: _Files) -> bool:
+    def _is_unchanged(self, files: _OpenedFiles) -> bool:
         """Return whether the ledger and the head on disk are unchanged since they were read."""
         state = None
         with suppress(OSError):
@@ -633,7 +637,7 @@ class LedgerFile:
             is_same = os.path.samestat(state, files.state)
         return is_same and self._read_head(read_bytes) == files.head
 
-    def _lines(self, files: _Files, needed_text: bytes) -> _Lines:
+    def _lines(self, files: _OpenedFiles, needed_text: bytes) -> _ReadLines:
         stated = files.head.lines if files.head else 0
         if files.lines is not None:
             read = _read_remembered_lines(
@@ -703,17 +707,17 @@ class LedgerFile:
         def indexed() -> Iterator[bytes]:
             for line in self._every_line(last_part, index.seal):
                 text = line.removesuffix(b"\n")
-                if entry := _parse(text):
+                if entry := _parse_line(text):
                     index.add(entry, text)
                 yield line
 
         stated = head.lines if head else 0
-        read = _read_lines(indexed(), _NONE, stated, _MOST_LINES, _MOST_BYTES)
+        read = _read_lines(indexed(), _IN_NO_LINE, stated, _MOST_LINES, _MOST_BYTES)
         if read is None or read.faults or read.unchained:
             return index, False
         return index, not _head_fault(head, read.lines, read.signed, is_chained=read.chained)
 
-    def _compared_with_head(self, files: _Files, read: _Lines) -> _Reading:
+    def _compared_with_head(self, files: _OpenedFiles, read: _ReadLines) -> _Reading:
         if not read.lines:
             return self._without_lines(file_exists=files.state is not None)
         entries, numbers, faults = read.entries, read.numbers, [*read.faults]
@@ -748,13 +752,13 @@ class LedgerFile:
         path = self.root / name
         try:
             if self._follow_link:
-                return _checked_file(open_at_once(path))
+                return _check_regular(open_at_once(path))
             from sros_tool.folders import Folder  # reading alone does not import modules that write
 
             with Folder(self.root) as folder:
                 target = folder.link_target(name) or ""
                 file = target if SEALED_LEDGER.fullmatch(target) else name
-                return _checked_file(folder.open(file))
+                return _check_regular(folder.open(file))
         except FileNotFoundError:
             return None
         except (OSError, SrosError) as error:
@@ -782,7 +786,8 @@ class LedgerFile:
     def _later_than(self, part: int, last: os.stat_result | None = None) -> str:
         """Return the name of a part of the ledger after the part ``last``; "" if there is none.
 
-        ``part`` is the number of the last part.  Its file can also have another name, or be a copy.
+        ``part`` is the number of the last part.  The file of the last part can also have another
+        name, or be a copy.
         """
         if not self.root.exists():
             return ""
@@ -821,7 +826,7 @@ def _sealed_before(file: BinaryIO) -> Entry | None:
     """Return the first entry in ``file`` if it records the sealed part before, or None."""
     line = file.readline(_LONGEST_LINE)
     file.seek(0)
-    entry = _parse(line.removesuffix(b"\n")) if b'"what":"sealed"' in line else None
+    entry = _parse_line(line.removesuffix(b"\n")) if b'"what":"sealed"' in line else None
     return entry if entry and entry.what == SEALED else None
 
 
@@ -836,13 +841,13 @@ def _entry_at(posting: Posting, index: LedgerIndex, last_part: BinaryIO) -> Entr
         line = index.line(posting.number)
     else:
         line = os.pread(last_part.fileno(), posting.length, posting.offset - state.sealed_size)
-    entry = _parse(line)
+    entry = _parse_line(line)
     if hashlib.sha256(line).digest() != posting.digest or entry is None:
         raise IndexDamagedError(f"line {posting.number} was changed")
     return entry
 
 
-_Terms: TypeAlias = Collection[tuple[str, str]]
+_FieldValues: TypeAlias = Collection[tuple[str, str]]
 """Names of an entry's fields, each with a value."""
 
 
@@ -852,10 +857,10 @@ def _last_line(file: BinaryIO, size: int) -> str:
         return ""
     file.seek(max(0, size - _LONGEST_LINE))
     before, ended, after_last = file.read().rpartition(b"\n")
-    return _digest(before.rpartition(b"\n")[2]) if ended and not after_last else ""
+    return _sha256(before.rpartition(b"\n")[2]) if ended and not after_last else ""
 
 
-class _Lines(NamedTuple):
+class _ReadLines(NamedTuple):
     """The entries in a ledger with the ``numbers`` of their lines, and the faults of the chain.
 
     ``unchained`` is the number of lines before the chain, ``lines`` the number of all lines.
@@ -876,7 +881,7 @@ class _Lines(NamedTuple):
 
 def _read_lines(
     lines: Iterable[bytes], needed_text: bytes, stated: int, maximum: int, most_bytes: int
-) -> _Lines | None:
+) -> _ReadLines | None:
     """Return the lines of a ledger; None if they are more than ``maximum``, or ``most_bytes`` long.
 
     ``stated`` is the number of lines that the head states; ``needed_text`` is as in `LedgerFile`.
@@ -903,11 +908,11 @@ def _read_lines(
             and not damaged
             and needed_text not in text
             and text.endswith(b'","previous":"%b"}' % last.encode())
-            and _GAP not in text
-            and _CA not in text
+            and _GAP_TEXT not in text
+            and _CA_TEXT not in text
         ):
             pass  # either unchanged since the head was signed, or a later line does not fit
-        elif (entry := _parse(text)) is None:
+        elif (entry := _parse_line(text)) is None:
             damaged += 1
         else:
             if damaged:
@@ -924,7 +929,7 @@ def _read_lines(
             damaged = 0
             entries.append(entry)
             numbers.append(number)
-        before, last = text, _digest(text)
+        before, last = text, _sha256(text)
         if number == stated:
             signed = last
     if damaged:
@@ -936,13 +941,13 @@ def _read_lines(
     previous = last if chained else all_before.hexdigest()
     ended = line.endswith(b"\n") or not number
     read = tuple(entries)
-    return _Lines(read, numbers, faults, number, unchained, chained, signed, previous, ended)
+    return _ReadLines(read, numbers, faults, number, unchained, chained, signed, previous, ended)
 
 
 @lru_cache(maxsize=4)  # a verb asks several times
 def _read_remembered_lines(
     data: bytes, needed_text: bytes, stated: int, maximum: int, most_bytes: int
-) -> _Lines | None:
+) -> _ReadLines | None:
     return _read_lines(_lines_in(io.BytesIO(data)), needed_text, stated, maximum, most_bytes)
 
 
@@ -953,7 +958,7 @@ def _not_entries_fault(last: int, count: int) -> _Fault:
     return _Fault(last, f"lines {last - count + 1} to {last} are not entries")
 
 
-def _checked_file(file: BinaryIO) -> BinaryIO:
+def _check_regular(file: BinaryIO) -> BinaryIO:
     """Return ``file``; close it and raise OSError if it is too large or not a regular file."""
     state, error = os.fstat(file.fileno()), None
     if not stat.S_ISREG(state.st_mode):
@@ -979,11 +984,11 @@ def _too_large_error(path: Path) -> KeystoreError:
     )
 
 
-def _parse(line: bytes) -> Entry | None:
+def _parse_line(line: bytes) -> Entry | None:
     """Return the ledger entry in a line; None if there is none."""
-    match = _WRITTEN.fullmatch(line.decode()) if line.isascii() else None
+    match = _WRITTEN_LINE.fullmatch(line.decode()) if line.isascii() else None
     if not match or (match["serial"] and not match["serial"].strip("0")):
-        return _parse_any(line)
+        return _parse_any_line(line)
     (time, kind, enclave, subject, serial, sha256, begin, end, policy, reason, key) = match.groups(
         ""
     )[:11]
@@ -1008,26 +1013,26 @@ def _parse(line: bytes) -> Entry | None:
     )
 
 
-def _parse_any(line: bytes) -> Entry | None:
-    """Return the entry in a line that `_line` did not write in this form; None if there is none."""
+def _parse_any_line(line: bytes) -> Entry | None:
+    """Return the entry in a line of JSON in any form; None if the line is not an entry."""
     if not line.startswith(b"{"):
         return None
     try:
         entry = Entry(**json.loads(line))
     except (ValueError, TypeError, RecursionError):
         return None
-    if not all(isinstance(getattr(entry, name), str) for name in _TEXTS):
+    if not all(isinstance(getattr(entry, name), str) for name in _TEXT_FIELDS):
         return None
     if type(entry.number) is not int or not 0 <= entry.number < _MOST_NUMBER:
         return None
     if entry.serial:
         valid = _SERIAL.fullmatch(entry.serial)
-        if not valid or not 0 < int(entry.serial, 16).bit_length() <= _MOST_BITS:
+        if not valid or not 0 < int(entry.serial, 16).bit_length() <= _MOST_SERIAL_BITS:
             return None
     return entry
 
 
-def _digest(data: bytes) -> str:
+def _sha256(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()
 
 
@@ -1080,7 +1085,7 @@ def _head_fault(head: _Head | None, lines: int, signed: str, *, is_chained: bool
     return None
 
 
-def _verify(signed: smime.SignedDocument, authorities: Sequence[x509.Certificate]) -> None:
+def _check_signer(signed: smime.SignedDocument, authorities: Sequence[x509.Certificate]) -> None:
     """Raise `PkiError` unless one of the CAs signed the document."""
     for authority in authorities:
         with suppress(PkiError):
@@ -1111,7 +1116,7 @@ def append(
         index = file.index_with(len(gaps) + len(entries), present)
     links = _NewLines(chain(gaps, entries), present.previous, index)
     number, size = file.last_part()
-    seals = index is not None and size + _LINE_BYTES * len(entries) >= _SEALED_FROM
+    seals = index is not None and size + _USUAL_LINE_BYTES * len(entries) >= _SEAL_FROM_BYTES
     named = transaction.target_after(LEDGER) or ""
     is_part = seals or SEALED_LEDGER.fullmatch(named)
     digest = hashlib.sha256()
@@ -1165,19 +1170,19 @@ class _NewLines:
 
     def __iter__(self) -> Iterator[bytes]:
         for entry in self._entries:
-            line = _line(entry, self.previous)
-            self.previous = _digest(line)
+            line = _json_line(entry, self.previous)
+            self.previous = _sha256(line)
             self.count += 1
             if self._index:
                 self._index.add(entry, line)
             yield line + b"\n"
 
 
-def _line(entry: Entry, previous: str) -> bytes:
+def _json_line(entry: Entry, previous: str) -> bytes:
     """Return an entry as compact JSON; ``previous`` is the digest of the previous line."""
     filled = ((name, getattr(entry, name)) for name in Entry._fields[:-1])
     parts = [
-        f'"{name}":{_quoted(value) if isinstance(value, str) else value}'
+        f'"{name}":{_json_text(value) if isinstance(value, str) else value}'
         for name, value in filled
         if value
     ]

@@ -1,7 +1,7 @@
 """The index of a long ledger: it finds the lines about an enclave, a key or a document.
 
-The index is an SQLite file next to the ledger.  With it, a change of one enclave need not read what
-was recorded about all others.  The index is only a cache, and trusted as little as any other file:
+The index is an SQLite file next to the ledger.  With it, a change of one enclave need not read the
+lines about all other enclaves.  The index is only a cache, and trusted as little as any other file:
 the signed head of the ledger states its `root`, the digest of its whole content, and every part
 that is read is compared with the root.  An index that is missing, damaged, forged, or of another
 state of the ledger is not used, and is made again from the ledger when the keystore is next
@@ -33,14 +33,14 @@ from sros_tool.errors import IndexDamagedError, SrosError
 from sros_tool.keystore.layout import LEDGER_INDEX
 from sros_tool.pki.crl import SUPERSEDED
 
-_NEW = f"{LEDGER_INDEX}.new"
+_NEW_INDEX = f"{LEDGER_INDEX}.new"
 _BUCKETS = 4096
-_POSTING = struct.Struct(">16sIQI32s")
-_DIGEST = 32
-_EMPTY = hashlib.sha256().digest() * 2
+_POSTING_FORMAT = struct.Struct(">16sIQI32s")
+_DIGEST_BYTES = 32
+_EMPTY_BUCKET_DIGESTS = hashlib.sha256().digest() * 2
 """The digests of the names and of the postings of an empty bucket."""
-_FIELDS = ("enclave", "serial", "sha256", "key")
-_FREQUENT = ("certificate", "permissions")
+_INDEXED_FIELDS = ("enclave", "serial", "sha256", "key")
+_UNINDEXED_KINDS = ("certificate", "permissions")
 """Kinds of entries that each make up half of a ledger, so that no index helps to find them."""
 _SCHEMA = (
     "CREATE TABLE buckets (bucket INTEGER PRIMARY KEY, names BLOB NOT NULL, "
@@ -50,11 +50,11 @@ _SCHEMA = (
     "last TEXT NOT NULL, sealed INTEGER NOT NULL, sealed_size INTEGER NOT NULL, "
     "digests BLOB NOT NULL)",
 )
-_STATE = "SELECT * FROM state WHERE length(digests) = ?"
+_STATE_QUERY = "SELECT * FROM state WHERE length(digests) = ?"
 _STATE_TYPES = [int, int, int, str, int, int, bytes]
-_LARGEST = 128 << 20
+_LARGEST_BUCKET = 128 << 20
 """Size of the largest bucket, in bytes."""
-_SETTINGS = ("trusted_schema = OFF", "cell_size_check = ON", "mmap_size = 0")
+_PRAGMAS = ("trusted_schema = OFF", "cell_size_check = ON", "mmap_size = 0")
 
 
 class Posting(NamedTuple):
@@ -112,7 +112,7 @@ class IndexedEntry(Protocol):
 
 def is_indexed(name: str, value: str) -> bool:
     """Return whether an index finds the lines whose field ``name`` has this value."""
-    return name in _FIELDS or (name == "what" and value not in _FREQUENT)
+    return name in _INDEXED_FIELDS or (name == "what" and value not in _UNINDEXED_KINDS)
 
 
 def _term(name: str, value: str) -> bytes:
@@ -128,17 +128,17 @@ def _joined_terms(names: Iterable[str]) -> bytes:
     return "\n".join(sorted(names)).encode("utf-8", "surrogatepass")
 
 
-def _split(names: bytes) -> list[str]:
+def _split_names(names: bytes) -> list[str]:
     return names.decode("utf-8", "surrogatepass").split("\n") if names else []
 
 
 def _terms(entry: IndexedEntry) -> Iterator[bytes]:
-    for name in _FIELDS:
+    for name in _INDEXED_FIELDS:
         value = getattr(entry, name)
         # Earlier versions recorded no keys; their certificates are found by the empty key.
         if value or (name == "key" and entry.what == "certificate"):
             yield _term(name, value)
-    if entry.what not in _FREQUENT:
+    if entry.what not in _UNINDEXED_KINDS:
         yield _term("what", entry.what)
 
 
@@ -154,7 +154,7 @@ class LedgerIndex:
 
     @classmethod
     def open(cls, root: Path, lines: int, last: str, stated: str) -> Self | None:
-        """Return the index of the keystore ``root``; None if the head states another one.
+        """Return the index of the keystore ``root``; None if the head states another index.
 
         The head states the number of ``lines``, the digest of the ``last`` line and the root of the
         index.
@@ -163,7 +163,9 @@ class LedgerIndex:
         try:
             _check_file(path)
             with closing(_connect(path, "ro")) as connection:
-                row = connection.execute(_STATE, (_BUCKETS * len(_EMPTY),)).fetchone()
+                row = connection.execute(
+                    _STATE_QUERY, (_BUCKETS * len(_EMPTY_BUCKET_DIGESTS),)
+                ).fetchone()
         except (OSError, sqlite3.Error, ValueError, SrosError):
             return None
         if not row or [type(value) for value in row] != _STATE_TYPES:
@@ -188,8 +190,8 @@ class LedgerIndex:
         postings = self._postings_in(_bucket_of(term))
         at = postings.find(term)
         while at >= 0:
-            if at % _POSTING.size == 0:
-                _, *where = _POSTING.unpack_from(postings, at)
+            if at % _POSTING_FORMAT.size == 0:
+                _, *where = _POSTING_FORMAT.unpack_from(postings, at)
                 yield Posting(*where)
             at = postings.find(term, at + 1)
 
@@ -215,10 +217,12 @@ class LedgerIndex:
         stored_buckets = dict(self._rows("SELECT bucket, names FROM buckets"))
         buckets = [self._checked_bucket(stored_buckets.get(i, b""), 2 * i) for i in range(_BUCKETS)]
         if not parts:
-            return _split(b"\n".join(filter(None, buckets)))
+            return _split_names(b"\n".join(filter(None, buckets)))
         texts = [part.encode("utf-8", "surrogatepass") for part in parts]
         hits = [data for data in buckets if any(text in data for text in texts)]
-        return [name for name in _split(b"\n".join(hits)) if any(part in name for part in parts)]
+        return [
+            name for name in _split_names(b"\n".join(hits)) if any(part in name for part in parts)
+        ]
 
     def bucket(self, bucket: int) -> tuple[bytes, bytes]:
         """Return the names and the postings in a bucket, verified.
@@ -242,7 +246,7 @@ class LedgerIndex:
 
     def _checked_bucket(self, data: Any, number: int) -> bytes:
         """Return the content of the bucket ``number``, after comparing it with its digest."""
-        digest = self._digests[number * _DIGEST : (number + 1) * _DIGEST]
+        digest = self._digests[number * _DIGEST_BYTES : (number + 1) * _DIGEST_BYTES]
         if type(data) is not bytes or hashlib.sha256(data).digest() != digest:
             raise IndexDamagedError(f"'{self._path}' does not match the head of the ledger")
         return data
@@ -278,7 +282,7 @@ class IndexUpdate:
         lines, size, number, *_ = self.state
         digest = hashlib.sha256(line)
         for term in _terms(entry):
-            posting = _POSTING.pack(term, lines + 1, size, len(line), digest.digest())
+            posting = _POSTING_FORMAT.pack(term, lines + 1, size, len(line), digest.digest())
             self._added.setdefault(_bucket_of(term), bytearray()).extend(posting)
         if entry.what == "certificate":
             self._names[entry.enclave] = True
@@ -303,18 +307,20 @@ class IndexUpdate:
         Raises:
             IndexDamagedError: the present index has changed since the head was signed.
         """
-        digests = bytearray(self._base.digests if self._base else _EMPTY * _BUCKETS)
+        digests = bytearray(self._base.digests if self._base else _EMPTY_BUCKET_DIGESTS * _BUCKETS)
         changed: dict[int, dict[str, bool]] = {bucket: {} for bucket in self._added}
         for name, is_there in self._names.items():
             changed[_bucket_of(_term("enclave", name))][name] = is_there
         for bucket, names in changed.items():
             before, postings = self._base.bucket(bucket) if self._base else (b"", b"")
-            left = {name for name in _split(before) if names.get(name, True)}
+            left = {name for name in _split_names(before) if names.get(name, True)}
             left.update(name for name, is_there in names.items() if is_there)
             parts = _joined_terms(left), postings + self._added.pop(bucket)
             self._buckets[bucket] = parts
             digest = b"".join(hashlib.sha256(part).digest() for part in parts)
-            digests[bucket * len(_EMPTY) : (bucket + 1) * len(_EMPTY)] = digest
+            digests[
+                bucket * len(_EMPTY_BUCKET_DIGESTS) : (bucket + 1) * len(_EMPTY_BUCKET_DIGESTS)
+            ] = digest
         self._digests = bytes(digests)
         return self.state.root(self._digests)
 
@@ -345,12 +351,12 @@ class IndexUpdate:
         from sros_tool.folders import Folder  # reading alone does not import modules that write
 
         with Folder(self._folder) as folder:
-            folder.unlink(_NEW, missing_ok=True)
-            folder.write(_NEW, b"", 0o600)
-            _remove_journals(self._folder, _NEW)
-            with closing(_connect(self._folder / _NEW, "rw", is_new=True)) as connection:
+            folder.unlink(_NEW_INDEX, missing_ok=True)
+            folder.write(_NEW_INDEX, b"", 0o600)
+            _remove_journals(self._folder, _NEW_INDEX)
+            with closing(_connect(self._folder / _NEW_INDEX, "rw", is_new=True)) as connection:
                 self._write(connection)
-            folder.replace(_NEW, LEDGER_INDEX)
+            folder.replace(_NEW_INDEX, LEDGER_INDEX)
 
     def _write(self, connection: sqlite3.Connection) -> None:
         with connection:
@@ -408,8 +414,8 @@ def _connect(path: Path, mode: str, *, is_new: bool = False) -> sqlite3.Connecti
     place = f"file:{quote(os.path.abspath(path))}?mode={mode}{immutable}"  # noqa: PTH100
     connection = sqlite3.connect(place, uri=True, timeout=0)
     try:
-        connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _LARGEST)
-        for setting in (*_SETTINGS, "journal_mode = MEMORY", "synchronous = OFF"):
+        connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _LARGEST_BUCKET)
+        for setting in (*_PRAGMAS, "journal_mode = MEMORY", "synchronous = OFF"):
             connection.execute(f"PRAGMA {setting}")
         if is_new:
             for table in _SCHEMA:

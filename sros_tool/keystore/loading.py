@@ -56,11 +56,11 @@ from sros_tool.pki.pem import read_as_text
 
 Certificates = tuple[x509.Certificate, ...]
 
-_SIDES = (
+_FILES_BY_CA = (
     (IDENTITY_CA_FILE, CERTIFICATE_FILE),
     (PERMISSIONS_CA_FILE, GOVERNANCE_FILE, PERMISSIONS_FILE),
 )
-_OF_LISTS = {
+_FAULTS_BY_OBSTACLE = {
     Obstacle.MISSING: Fault.CRL_ISSUER,
     Obstacle.USAGE: Fault.CRL_USAGE,
     Obstacle.SCOPE: Fault.CRL_PARTIAL,
@@ -77,15 +77,15 @@ _VENDOR_SPECIFIC = frozenset(
         Fault.CERTIFICATE_ISSUER,
         Fault.SIGNATURE,
         Fault.CRL_MALFORMED,
-        *_OF_LISTS.values(),
+        *_FAULTS_BY_OBSTACLE.values(),
     }
 )
 """Faults in an `OpenedEnclave` for which only some vendors refuse the enclave."""
-_UNREADABLE = (Fault.NOT_SIGNED, Fault.CERTIFICATE_MALFORMED)
+_UNREADABLE_FAULTS = (Fault.NOT_SIGNED, Fault.CERTIFICATE_MALFORMED)
 CRASHES = (Fault.CA_CRASH, Fault.CERTIFICATE_CRASH)
 """Faults that crash a process."""
-_READ_FIRST = (IDENTITY_CA_FILE, CRL_FILE, CERTIFICATE_FILE)
-_ON_READING = (
+_FILES_READ_FIRST = (IDENTITY_CA_FILE, CRL_FILE, CERTIFICATE_FILE)
+_FAULTS_ON_READING = (
     Fault.FILE_UNREADABLE,
     Fault.FILE_EMPTY,
     Fault.CERTIFICATE_MALFORMED,
@@ -94,14 +94,14 @@ _ON_READING = (
     *CRASHES,
 )
 """Faults that a process finds before it verifies a chain."""
-_OF_CA = (Fault.SIGNATURE_HASH, Fault.CA_CHAIN)
-"""Faults in the file of a CA that a process finds together with ``_ON_READING``."""
+_CA_FAULTS_ON_READING = (Fault.SIGNATURE_HASH, Fault.CA_CHAIN)
+"""Faults in the file of a CA that a process finds together with ``_FAULTS_ON_READING``."""
 
 
 def leaves_open(problems: Iterable[Problem]) -> bool:
     """Return whether a process with these problems starts without security, except with Enforce.
 
-    It does if the RMW does not find a file that every enclave needs.
+    The process does so if the RMW does not find a file that every enclave needs.
     """
     return any(
         problem.fault is Fault.KEY_ON_TOKEN
@@ -128,11 +128,11 @@ def vendor_problems(
     known = {
         problem.file
         for problem in kept
-        if problem.file == CERTIFICATE_FILE or problem.fault in _UNREADABLE
+        if problem.file == CERTIFICATE_FILE or problem.fault in _UNREADABLE_FAULTS
     }
     faults = [
         fault
-        for fault in sorted(_faults(traits, state, moment), key=_check_order)
+        for fault in sorted(_vendor_faults(traits, state, moment), key=_check_order)
         if fault.file not in known or fault.fault in CRASHES
     ]
     if not faults:
@@ -140,7 +140,7 @@ def vendor_problems(
     kept += [fault for fault in faults if _is_of_list(fault)]
     specific = [problem for problem in specific if not _is_of_list(problem)]
     faults = [fault for fault in faults if not _is_of_list(fault)]
-    for side in _SIDES:
+    for side in _FILES_BY_CA:
         of_side = [fault for fault in faults if fault.file in side]
         files = {problem.file for problem in of_side}
         if files & {*side[:2]}:  # a fault of a CA counts for the first file that needs the CA
@@ -159,11 +159,15 @@ def _check_order(problem: Problem) -> int:
     """Return the sort key of a problem, by the order in which a process finds problems."""
     if problem.fault in BEFORE_DDS:
         return 0
-    early = (*_ON_READING, *_OF_CA) if problem.file == IDENTITY_CA_FILE else _ON_READING
-    if problem.file in _READ_FIRST and problem.fault in early:
-        return 1 + _READ_FIRST.index(problem.file)
+    early = (
+        (*_FAULTS_ON_READING, *_CA_FAULTS_ON_READING)
+        if problem.file == IDENTITY_CA_FILE
+        else _FAULTS_ON_READING
+    )
+    if problem.file in _FILES_READ_FIRST and problem.fault in early:
+        return 1 + _FILES_READ_FIRST.index(problem.file)
     later = (
-        (*_READ_FIRST, KEY_FILE, KEY_URI_FILE),
+        (*_FILES_READ_FIRST, KEY_FILE, KEY_URI_FILE),
         (PERMISSIONS_CA_FILE,),
         (GOVERNANCE_FILE,),
         (PERMISSIONS_FILE,),
@@ -172,7 +176,7 @@ def _check_order(problem: Problem) -> int:
 
 
 def _is_of_list(problem: Problem) -> bool:
-    return problem.fault is Fault.CRL_MALFORMED or problem.fault in _OF_LISTS.values()
+    return problem.fault is Fault.CRL_MALFORMED or problem.fault in _FAULTS_BY_OBSTACLE.values()
 
 
 def _is_vendor_specific(problem: Problem, state: OpenedEnclave) -> bool:
@@ -197,7 +201,7 @@ class _Trust(NamedTuple):
 
 
 @lru_cache(maxsize=16)  # for a few keystores and all vendors
-def _trust(
+def _read_trust(
     traits: VendorTraits,
     identity_ca: bytes | None,
     permissions_ca: bytes | None,
@@ -208,9 +212,9 @@ def _trust(
     for file, data in ((IDENTITY_CA_FILE, identity_ca), (PERMISSIONS_CA_FILE, permissions_ca)):
         if data is not None:
             try:
-                read[file] = _certificates(traits, data, file)
+                read[file] = _read_certificates(traits, data, file)
             except PkiError as error:
-                unreadable.append(_unreadable(traits, data, file, error))
+                unreadable.append(_unreadable_problem(traits, data, file, error))
     refused = [
         Problem(file, *fault)
         for file, certificates in read.items()
@@ -225,22 +229,24 @@ def _trust(
     )
 
 
-def _unreadable(traits: VendorTraits, data: bytes, file: str, error: PkiError) -> Problem:
-    cut = ", because it has a zero byte" if _content(traits, data) != data else ""
+def _unreadable_problem(traits: VendorTraits, data: bytes, file: str, error: PkiError) -> Problem:
+    cut = ", because it has a zero byte" if _read_part(traits, data) != data else ""
     return Problem(file, f"{error.clause}{cut}", Fault.CERTIFICATE_FILE)
 
 
-def _faults(traits: VendorTraits, state: OpenedEnclave, moment: datetime) -> Iterator[Problem]:
+def _vendor_faults(
+    traits: VendorTraits, state: OpenedEnclave, moment: datetime
+) -> Iterator[Problem]:
     files = state.files
     shared = (files.get(IDENTITY_CA_FILE), files.get(PERMISSIONS_CA_FILE))
-    trust = _trust(traits, *shared, moment)
+    trust = _read_trust(traits, *shared, moment)
     yield from trust.unreadable
     identity: Certificates = ()
     if CERTIFICATE_FILE in files:
         try:
-            identity = _certificates(traits, files[CERTIFICATE_FILE], CERTIFICATE_FILE)
+            identity = _read_certificates(traits, files[CERTIFICATE_FILE], CERTIFICATE_FILE)
         except PkiError as error:
-            yield _unreadable(traits, files[CERTIFICATE_FILE], CERTIFICATE_FILE, error)
+            yield _unreadable_problem(traits, files[CERTIFICATE_FILE], CERTIFICATE_FILE, error)
     yield from trust.refused
     if trust.authorities and identity:
         yield from _identity_faults(traits, identity[0], state, trust.authorities, moment)
@@ -253,18 +259,18 @@ def _faults(traits: VendorTraits, state: OpenedEnclave, moment: datetime) -> Ite
         yield Problem(PERMISSIONS_FILE, f"{text}handshake may never finish", Fault.DOCUMENT_SIZE)
 
 
-def _content(traits: VendorTraits, data: bytes) -> bytes:
+def _read_part(traits: VendorTraits, data: bytes) -> bytes:
     """Return the part that a vendor reads of a file with certificates or lists."""
     return read_as_text(data) if traits.reads_files_as_text else data
 
 
-def _certificates(traits: VendorTraits, data: bytes, file: str) -> Certificates:
+def _read_certificates(traits: VendorTraits, data: bytes, file: str) -> Certificates:
     """Return the certificates that a vendor reads from a file.
 
     Raises:
         PkiError: the vendor cannot read the file.
     """
-    data = _content(traits, data)
+    data = _read_part(traits, data)
     if not traits.reads_trusted_certificates and (
         traits.reads_first_authority or file == CERTIFICATE_FILE
     ):
@@ -341,7 +347,7 @@ def authority_refusals(
 
 
 def refusals_text(refusals: Mapping[Vendor, str]) -> str:
-    """Return clauses on the vendors that refuse a CA, with reasons, and on the others."""
+    """Return clauses on vendors that refuse a CA, with reasons, and on vendors that accept it."""
     by_text: dict[str, list[str]] = {}
     for vendor, text in refusals.items():
         by_text.setdefault(text, []).append(vendor.title)
@@ -400,10 +406,10 @@ def _trusted_certificates(traits: VendorTraits, certificates: Certificates) -> C
 
 
 def _hash_fits(traits: VendorTraits, certificate: x509.Certificate) -> bool:
-    return traits.hashes is Hashes.ANY or certificate.signature_algorithm_oid in _SHA256
+    return traits.hashes is Hashes.ANY or certificate.signature_algorithm_oid in _SHA256_ALGORITHMS
 
 
-_SHA256 = {
+_SHA256_ALGORITHMS = {
     SignatureAlgorithmOID.ECDSA_WITH_SHA256,
     SignatureAlgorithmOID.RSA_WITH_SHA256,
     SignatureAlgorithmOID.RSA_WITH_SHA1,
@@ -437,12 +443,12 @@ def _identity_faults(
     for file, holder in with_keys:
         pss = is_for_pss(holder)
         if not _key_fits(traits, holder.public_key(), pss=pss):
-            text = f"it has a key of {algorithm(holder.public_key())}{_ALONE * pss}"
+            text = f"it has a key of {algorithm(holder.public_key())}{_PSS_CLAUSE * pss}"
             yield Problem(file, text, Fault.KEY_ALGORITHM)
     if (key := state.public_key) is not None and traits.keys is Keys.SMALL:
         pss = isinstance(key, rsa.RSAPublicKey) and is_key_for_pss(state.files[KEY_FILE])
         if not _key_fits(traits, key, pss=pss):
-            text = f"it is a key of {algorithm(key)}{_ALONE * pss}"
+            text = f"it is a key of {algorithm(key)}{_PSS_CLAUSE * pss}"
             yield Problem(KEY_FILE, text, Fault.KEY_ALGORITHM)
     if traits.crashes_on_empty_subject and not any(certificate.subject.rdns):
         text = "its subject is empty, which crashes the process"
@@ -455,7 +461,7 @@ def _identity_faults(
         yield Problem(CERTIFICATE_FILE, fault, Fault.CERTIFICATE_ISSUER)
 
 
-_ALONE = " for RSA-PSS alone"
+_PSS_CLAUSE = " for RSA-PSS alone"
 _LONGEST_TIMER = timedelta(microseconds=2**63 / 1000)  # what 64 bits of nanoseconds can hold
 
 
@@ -473,11 +479,11 @@ def _list_faults(
             file = IDENTITY_CA_FILE
             lists += [
                 (revocation_list, file)
-                for revocation_list in _lists(_content(traits, state.files[file]), file)
+                for revocation_list in _cached_lists(_read_part(traits, state.files[file]), file)
             ]
         file = CRL_FILE
         if file in state.files:
-            lists.append((_list(_content(traits, state.files[file]), file), file))
+            lists.append((_cached_list(_read_part(traits, state.files[file]), file), file))
     except PkiError as error:
         text = error.clause
         if file == IDENTITY_CA_FILE:
@@ -499,14 +505,14 @@ def _list_faults(
     if refusal.obstacle is Obstacle.REVOKED:
         yield Problem(CERTIFICATE_FILE, f"it is revoked by {file}", Fault.REVOKED)
         return
-    text, kind = refusal.text, _OF_LISTS[refusal.obstacle]
+    text, kind = refusal.text, _FAULTS_BY_OBSTACLE[refusal.obstacle]
     if refusal.obstacle is Obstacle.MISSING and (partial := refusal_of(crl)):
         text, kind = partial, Fault.CRL_PARTIAL
     yield Problem(file, f"{text}, so DDS refuses every participant", kind)
 
 
-_lists = lru_cache(maxsize=16)(read_lists)
-_list = lru_cache(maxsize=16)(read_list)
+_cached_lists = lru_cache(maxsize=16)(read_lists)
+_cached_list = lru_cache(maxsize=16)(read_list)
 
 
 def _key_fits(traits: VendorTraits, key: object, *, pss: bool = False) -> bool:

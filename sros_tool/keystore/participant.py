@@ -57,7 +57,7 @@ from sros_tool.policy.model import Enclave
 
 # ── enclaves as DDS loads them ─────────────────────────────────────────────────────────────
 
-_VENDOR_DECIDES = frozenset(
+_VENDOR_SPECIFIC_FAULTS = frozenset(
     {
         Fault.GOVERNANCE_DOMAIN,
         Fault.GOVERNANCE_MALFORMED,
@@ -69,9 +69,9 @@ _VENDOR_DECIDES = frozenset(
     }
 )
 """Faults of documents on which each vendor decides by its own rules."""
-_NO_KEY = (Fault.FILE_MISSING, KEY_FILE)
+_MISSING_KEY = (Fault.FILE_MISSING, KEY_FILE)
 
-_PLANNED = timedelta(days=365)
+_PLANNED_VALIDITY = timedelta(days=365)
 """The assumed validity of permissions for a policy that is not yet signed."""
 
 
@@ -121,7 +121,7 @@ class LoadedEnclave(NamedTuple):
 
     def expiries(self) -> tuple[tuple[str, datetime], ...]:
         """Return the files that expire, except the permissions, with the times of their expiry."""
-        return tuple(_expiries(self.state, self.folder)) if self.state and self.folder else ()
+        return tuple(_file_expiries(self.state, self.folder)) if self.state and self.folder else ()
 
     @property
     def as_here(self) -> LoadedEnclave:
@@ -135,8 +135,8 @@ class LoadedEnclave(NamedTuple):
         return tuple(
             problem
             for problem in vendor_problems(traits, self.state, self.at)
-            if problem.fault not in _VENDOR_DECIDES
-            and not (self.key_elsewhere and (problem.fault, problem.file) == _NO_KEY)
+            if problem.fault not in _VENDOR_SPECIFIC_FAULTS
+            and not (self.key_elsewhere and (problem.fault, problem.file) == _MISSING_KEY)
         )
 
 
@@ -171,14 +171,14 @@ def loaded_enclave(
 ) -> LoadedEnclave:
     """Return the enclave that DDS would load from a folder that was opened at ``moment``."""
     governance, permissions = (
-        _document(state, file) for file in (GOVERNANCE_FILE, PERMISSIONS_FILE)
+        _signed_document(state, file) for file in (GOVERNANCE_FILE, PERMISSIONS_FILE)
     )
     return LoadedEnclave(
         name,
         subject_text(state.certificate.subject) if state.certificate else "",
         governance,
         permissions,
-        state.domains() or _domains(governance),
+        state.domains() or _governance_domains(governance),
         state.files.get(PERMISSIONS_FILE, b""),
         folder,
         state,
@@ -201,7 +201,7 @@ def plan_enclave(policy: Enclave, governance: Governance, *, moment: datetime) -
     subject = f"CN={policy.path}"
     domains = governance.domains().closed()
     permissions = permissions_for(
-        policy, subject=subject, validity=window(moment, _PLANNED), domains=domains
+        policy, subject=subject, validity=window(moment, _PLANNED_VALIDITY), domains=domains
     )
     # Permissions that all vendors read alike are passed on without rendering and reading them.
     plain = is_plain_permissions(permissions)
@@ -217,19 +217,19 @@ def plan_enclave(policy: Enclave, governance: Governance, *, moment: datetime) -
     )
 
 
-def _document(state: OpenedEnclave, file: str) -> bytes:
+def _signed_document(state: OpenedEnclave, file: str) -> bytes:
     with suppress(SrosError):
         return state.signed(file).document
     return b""
 
 
-def _domains(governance: bytes) -> DomainSet | None:
+def _governance_domains(governance: bytes) -> DomainSet | None:
     with suppress(SrosError):
         return parse_governance(governance).domains().closed()
     return None
 
 
-def _expiries(state: OpenedEnclave, folder: Path) -> Iterator[tuple[str, datetime]]:
+def _file_expiries(state: OpenedEnclave, folder: Path) -> Iterator[tuple[str, datetime]]:
     certificates = {
         "cert.pem": state.certificate,
         "identity_ca.cert.pem": state.identity_ca,
@@ -249,7 +249,7 @@ def _expiries(state: OpenedEnclave, folder: Path) -> Iterator[tuple[str, datetim
 
 # ── the participant of a vendor ────────────────────────────────────────────────────────────
 
-_ONLY_PEERS_NOTICE = {
+_FAULTS_SEEN_BY_PEERS = {
     *((vendor, Fault.KEY_MISMATCH) for vendor in CYCLONE_DDS),
     *((vendor, Fault.KEY_ALGORITHM) for vendor in FAST_DDS),
     *((vendor, Fault.DOCUMENT_SIZE) for vendor in FAST_DDS),
@@ -294,7 +294,7 @@ class RefusalCause(NamedTuple):
     hits_peers: bool = False
 
 
-_OF_GOVERNANCE = {
+_GOVERNANCE_REASONS = {
     *(Fault.GOVERNANCE_MALFORMED.id, "domain-not-in-governance", "no-topic-rule"),
     "unauthenticated-with-rtps-protection",
 }
@@ -326,7 +326,7 @@ class VendorParticipant:
         self.permissions: Permissions | None = None
         self.permissions_document = enclave.permissions
         self.problems = enclave.problems(vendor.traits)
-        made = self._make(enclave, context)
+        made = self._decide_join(enclave, context)
         self.access = made if isinstance(made, Access) else None
         """The access control of the process; None if it does not run, or no peer accepts it."""
         self.refusal = made if isinstance(made, Decision) else None
@@ -356,11 +356,11 @@ class VendorParticipant:
             )  # every ROS 2 node opens this topic
         if stopped is None:
             return ()
-        file = GOVERNANCE_FILE if stopped.reason in _OF_GOVERNANCE else PERMISSIONS_FILE
+        file = GOVERNANCE_FILE if stopped.reason in _GOVERNANCE_REASONS else PERMISSIONS_FILE
         text = f"{file}: {stopped.clause}"
         return (RefusalCause(stopped.outcome, stopped.reason, file, text, stopped.hits_peers),)
 
-    def _make(self, enclave: LoadedEnclave, context: JoinContext) -> Access | Decision:
+    def _decide_join(self, enclave: LoadedEnclave, context: JoinContext) -> Access | Decision:
         """Return the access control of the vendor's process, or the decision that stops it."""
         late: Decision | None = None
         governed = _governed_as(
@@ -369,7 +369,7 @@ class VendorParticipant:
         noticed = [
             problem
             for problem in self.problems
-            if (self.vendor, problem.fault) not in _ONLY_PEERS_NOTICE
+            if (self.vendor, problem.fault) not in _FAULTS_SEEN_BY_PEERS
         ]
         if noticed and not _crashes_before(noticed[0], governed):
             first = noticed[0]
@@ -483,7 +483,7 @@ def accepted_state(
         for problem in state.problems
         if (problem.file == KEY_FILE and problem.fault is Fault.FILE_MISSING)
         or problem.fault is Fault.CRL_LEFT_OUT
-        or (problem.fault in _VENDOR_DECIDES and not sound)
+        or (problem.fault in _VENDOR_SPECIFIC_FAULTS and not sound)
         or all(problem in participant.problems for participant in participants)
         or (problem.fault is Fault.SIGNATURE and not _signed_by_ca(state, problem.file))
     )
@@ -502,7 +502,7 @@ def accepted_state(
 def _with_acceptance(
     state: OpenedEnclave, problem: Problem, participants: Sequence[VendorParticipant]
 ) -> Problem:
-    """Return a problem of a signature with a text that names the vendors that accept it anyway."""
+    """Return a problem of a signature, whose text names the vendors that accept the signature."""
     titles: dict[bool, list[str]] = {True: [], False: []}
     for participant in participants:
         titles[problem not in participant.problems].append(participant.vendor.title)
@@ -518,7 +518,7 @@ def _with_acceptance(
 
 
 def _signers(state: OpenedEnclave, file: str) -> set[x509.Certificate | None]:
-    """Return the certificates of a document's signers; None stands for one that is missing."""
+    """Return the certificates of a document's signers; None stands for a missing certificate."""
     with suppress(SrosError):
         signed = state.signed(file)
         data = state.files.get(PERMISSIONS_CA_FILE, b"")
@@ -528,7 +528,7 @@ def _signers(state: OpenedEnclave, file: str) -> set[x509.Certificate | None]:
 
 
 def _signed_by_ca(state: OpenedEnclave, file: str) -> bool:
-    """Return whether the certificates of all signers of a document are those of CAs."""
+    """Return whether all signers of a document have CA certificates."""
     signers = _signers(state, file)
     return bool(signers) and all(signer is not None and _is_ca(signer) for signer in signers)
 

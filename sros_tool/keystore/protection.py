@@ -57,7 +57,7 @@ def contradictions(
 def with_stated(
     protection: DomainProtection, stated_protections: Sequence[StatedProtection]
 ) -> DomainProtection:
-    """Return ``protection``, raised to what policies state, but never lowered.
+    """Return ``protection``, raised to the levels that policies state, but never lowered.
 
     Raises:
         PolicyError: statements contradict each other; or a wildcard in the settings matches only
@@ -71,7 +71,7 @@ def with_stated(
             "wildcard protects all names that it matches.",
             "State the same protection in both places, or only one protection.",
         )
-    raised = _Raising(protection)
+    raised = _RaisedProtection(protection)
     for stated_protection in {
         (stated_protection.kind, stated_protection.name, stated_protection.level): stated_protection
         for stated_protection in stated_protections
@@ -86,7 +86,7 @@ def with_stated(
 def governance_with_stated(
     protection: DomainProtection, stated_protections: Sequence[StatedProtection], domain: int = 0
 ) -> Governance:
-    """Return the governance for ``protection`` in a domain, raised as by `with_stated`.
+    """Return the governance for ``protection`` in a domain, raised as `with_stated` does.
 
     Raises:
         PolicyError: as `with_stated`.
@@ -101,7 +101,7 @@ def governance_for_all(protection: DomainProtection) -> Governance:
     return governance_for(protection, DomainSet.of((0, 0)))
 
 
-class _Raising:
+class _RaisedProtection:
     """The protection of a keystore while it is raised by the statements of policies."""
 
     def __init__(self, protection: DomainProtection) -> None:
@@ -124,7 +124,7 @@ class _Raising:
         topics = protected_topics(protection.kind, protection.name)
         deciding = {topic: self._deciding_entry(topic, protection) for topic in topics}
         if len({self._value(number) for number in deciding.values()}) > 1:
-            for part in _parts(protection):
+            for part in _parts_of_action(protection):
                 self.state(part)
             return
         base = self._value(deciding[topics[0]])
@@ -196,7 +196,7 @@ class _Raising:
         return replace(protection, metadata=Level.SIGN)
 
 
-def _parts(protection: StatedProtection) -> Iterator[StatedProtection]:
+def _parts_of_action(protection: StatedProtection) -> Iterator[StatedProtection]:
     """Yield the services and topics of an action."""
     for right, end in ACTION_PARTS["call"]:
         yield replace(protection, kind=KIND_OF[right], name=protection.name + end)

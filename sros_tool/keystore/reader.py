@@ -137,16 +137,16 @@ class FilesReadOnce:
     @property
     def full(self) -> bool:
         """Whether the cache accepts no further files."""
-        return self._size > _MOST_KEPT
+        return self._size > _MOST_CACHED_BYTES
 
     def _read(self, path: Path, label: str, max_bytes: int) -> bytes:
         with suppress(OSError, ValueError):  # `read_file` reports what is wrong with a path
-            data = self._by_file.get(_identity(path.stat()))
+            data = self._by_file.get(_file_identity(path.stat()))
             if data is not None and len(data) <= max_bytes:
                 return data
         state, data = read_file(path, label, max_bytes=max_bytes)
         if not self.full:
-            self._by_file[_identity(state)] = data
+            self._by_file[_file_identity(state)] = data
             self._size += len(data)
         return data
 
@@ -169,10 +169,10 @@ class FilesReadOnce:
         return known
 
 
-_MOST_KEPT = 16 * 1024 * 1024
+_MOST_CACHED_BYTES = 16 * 1024 * 1024
 
 
-def _identity(state: os.stat_result) -> tuple[int, int, int, int]:
+def _file_identity(state: os.stat_result) -> tuple[int, int, int, int]:
     return state.st_dev, state.st_ino, state.st_size, state.st_mtime_ns
 
 
@@ -227,18 +227,18 @@ class OpenedKeystore:
     def once(self, key: Hashable, read: Callable[[], _Parsed]) -> _Parsed:
         """Return the result of ``read()``, which is called only once for each ``key``.
 
-        If it raised an exception, the exception is raised again.  The result for an enclave is not
-        kept once `files` is full.
+        If ``read()`` raised an exception, the exception is raised again.  The result for an enclave
+        is not kept once `files` is full.
         """
         if key not in self._parts:
-            if self.files.full and isinstance(key, tuple) and key[0] in _OF_ENCLAVES:
+            if self.files.full and isinstance(key, tuple) and key[0] in _ENCLAVE_PART_KEYS:
                 return read()
             try:
                 self._parts[key] = read()
             except (SrosError, OSError) as error:
-                self._parts[key] = _Failure(error)
+                self._parts[key] = _ReadFailure(error)
         part = self._parts[key]
-        if isinstance(part, _Failure):
+        if isinstance(part, _ReadFailure):
             raise part.error.with_traceback(None)
         return part  # type: ignore[return-value]
 
@@ -544,10 +544,10 @@ class OpenedKeystore:
         )
 
 
-_OF_ENCLAVES = ("enclave", "identity", "grant", "certificate")
+_ENCLAVE_PART_KEYS = ("enclave", "identity", "grant", "certificate")
 
 
-class _Failure(NamedTuple):
+class _ReadFailure(NamedTuple):
     """Why a part of a keystore cannot be read."""
 
     error: SrosError | OSError
@@ -764,8 +764,8 @@ _EXPIRY_OF_CA = (Fault.CA_EXPIRED, Fault.CA_NOT_YET_VALID)
 _EXPIRY_OF_PERMISSIONS = (Fault.PERMISSIONS_EXPIRED, Fault.PERMISSIONS_NOT_YET_VALID)
 
 _IDENTITY_FILES = (IDENTITY_CA_FILE, CERTIFICATE_FILE, KEY_FILE)
-_ENCRYPTED = re.compile(rb"ENCRYPTED")
-_SIGNED = re.compile(rb"(?i)multipart/signed|application/(?:x-)?pkcs7-mime")
+_ENCRYPTED_MARK = re.compile(rb"ENCRYPTED")
+_SIGNED_MESSAGE_TYPE = re.compile(rb"(?i)multipart/signed|application/(?:x-)?pkcs7-mime")
 
 # The enclaves of a keystore share some files, which are parsed only once.
 _parse_governance = lru_cache(maxsize=8)(parse_governance)
@@ -952,7 +952,7 @@ class _EnclaveFiles:
         try:
             public_key = load_any_key(key, KEY_FILE).public_key()
         except SrosError as error:
-            fault = Fault.KEY_ENCRYPTED if _ENCRYPTED.search(key) else Fault.KEY_MALFORMED
+            fault = Fault.KEY_ENCRYPTED if _ENCRYPTED_MARK.search(key) else Fault.KEY_MALFORMED
             self._add(KEY_FILE, error.clause, fault)
             return None
         if certificate and certificate.public_key() != public_key:
@@ -1042,7 +1042,9 @@ class _EnclaveFiles:
                 signed.verify(authority)
             return signed.document
         except SrosError as error:
-            fault = Fault.SIGNATURE if _SIGNED.search(data[:1000]) else Fault.NOT_SIGNED
+            fault = (
+                Fault.SIGNATURE if _SIGNED_MESSAGE_TYPE.search(data[:1000]) else Fault.NOT_SIGNED
+            )
             self._add(name, str(error), fault)
             return None
 
@@ -1106,14 +1108,14 @@ def read_consistently(
     def read_again(opened: Opened, *arguments: Arguments.args, **named: Arguments.kwargs) -> Result:
         root = opened.root if isinstance(opened, OpenedKeystore) else opened
         for _ in range(_MOST_READS - 1):
-            before = _state(root)
+            before = _ledger_state(root)
             try:
                 result = read(opened, *arguments, **named)
             except SrosError:
-                if _state(root) == before:
+                if _ledger_state(root) == before:
                     raise
             else:
-                if _state(root) == before:
+                if _ledger_state(root) == before:
                     return result
             if isinstance(opened, OpenedKeystore):
                 opened.forget()
@@ -1122,7 +1124,7 @@ def read_consistently(
     return read_again  # type: ignore[return-value]  # mypy knows the name of the first argument
 
 
-def _state(root: Path) -> object:
+def _ledger_state(root: Path) -> object:
     """Return a value that differs after each change of a keystore.
 
     The value identifies the file of the ledger.

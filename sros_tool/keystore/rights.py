@@ -1,8 +1,8 @@
 """The rights that a policy, permissions, an enclave, a keystore or a Zenoh configuration gives.
 
-The rights of enclaves and keystores are read from ``permissions.p7s``, the file that DDS loads.
-Its signature is verified with the permissions CA next to it.  A Zenoh configuration gives rights to
-other enclaves by its access control.
+The rights of enclaves and keystores are read from ``permissions.p7s``, the file that DDS loads. The
+signature of the file is verified with the permissions CA next to it.  A Zenoh configuration gives
+rights to other enclaves by its access control.
 """
 
 from __future__ import annotations
@@ -89,11 +89,11 @@ class RightsSource:
     verify, or because permissions are missing or malformed.  ``fleet`` is the fleet for which the
     source is, or None.  ``protections`` are a policy's statements about the protection of names;
     None for anything else.  ``documents`` are the permissions of enclaves.  ``enforcers`` are the
-    access control of each Zenoh process that checks others.  ``routers`` are the enclaves of a
-    keystore's routers, and ``links`` is what passes between several routers.  ``configurations``
-    are the Zenoh configurations that were read, including those of clients.  ``key_domains`` maps
-    their rights to the ROS domains in the keys; None stands for a wildcard.  ``policy`` is the
-    policy in a policy file.
+    access control of each Zenoh process that checks other processes.  ``routers`` are the enclaves
+    of a keystore's routers, and ``links`` describes the names that pass between several routers.
+    ``configurations`` are the Zenoh configurations that were read, including those of clients.
+    ``key_domains`` maps their rights to the ROS domains in the keys; None stands for a wildcard.
+    ``policy`` is the policy in a policy file.
     """
 
     path: Path
@@ -226,12 +226,12 @@ def rights_grouped_by_domains(
     return result
 
 
-_Divided = Iterator[tuple[DomainSet | None, Collection[Right]]]
+_RightsByDomains = Iterator[tuple[DomainSet | None, Collection[Right]]]
 
 
 def _divide_by_keys(
     rights: Collection[Right], domains_of: Mapping[Right, frozenset[int | None]]
-) -> _Divided:
+) -> _RightsByDomains:
     """Yield the rights of an enclave on Zenoh, divided by the ROS domains of their keys."""
     domains = {domain for right in rights for domain in domains_of[right]}
     for domain in domains:
@@ -239,9 +239,11 @@ def _divide_by_keys(
         yield None if domain is None else DomainSet.of((domain, domain)), group
 
 
-def _divide_by_rules(rights: Collection[Right], enclave: str, permissions: Permissions) -> _Divided:
+def _divide_by_rules(
+    rights: Collection[Right], enclave: str, permissions: Permissions
+) -> _RightsByDomains:
     """Yield the rights of an enclave, divided by the ROS domains of the rules of its grant."""
-    grant = _first_of_each(permissions).get(enclave, permissions.grants[0])
+    grant = _first_grants(permissions).get(enclave, permissions.grants[0])
     listed = [rule.domains.closed() for rule in grant.rules]
     if len(set(listed)) == 1:
         yield listed[0], rights
@@ -258,8 +260,8 @@ def _divide_by_rules(rights: Collection[Right], enclave: str, permissions: Permi
 def load_zenoh_rights(keystore: OpenedKeystore, *, hidden: bool = False) -> RightsSource:
     """Return the rights that all Zenoh configurations of a keystore together give its enclaves.
 
-    These are the configurations of routers, and those of peers, which also connect without the
-    router.  ``hidden`` is as in `load_rights`.
+    The configurations of routers count, and those of peers, which also connect without a router.
+    ``hidden`` is as in `load_rights`.
 
     Raises:
         KeystoreError: no router has a configuration, or there are several routers that are not
@@ -320,16 +322,16 @@ def load_zenoh_rights(keystore: OpenedKeystore, *, hidden: bool = False) -> Righ
         tuple(dict.fromkeys(note for source in sources for note in source.notes)),
         enforcers=tuple(item for source in sources for item in source.enforcers),
         routers=tuple(routers),
-        links=_links({source.path.parent: source for source in sources}, files, routers),
+        links=_router_links({source.path.parent: source for source in sources}, files, routers),
         configurations=configurations,
         key_domains=domains,
     )
 
 
-def _links(
+def _router_links(
     sources: Mapping[Path, RightsSource], files: Mapping[str, Path], routers: Sequence[str]
 ) -> RouterLinks | None:
-    """Return what passes between routers, and for each enclave the router with its rules.
+    """Return the links between routers: the names that pass, and the router of each enclave.
 
     ``files`` maps enclaves to their folders, and ``sources`` has the rights in the configurations
     there.
@@ -498,7 +500,7 @@ class _Reader:
         self.notes += [
             Note(note.id, f"{label}: {note.text}") for note in _left_out_notes(permissions.grants)
         ]
-        grants = _first_of_each(permissions)
+        grants = _first_grants(permissions)
         self.documents.update(dict.fromkeys(grants, permissions))
         rights = (right for name, grant in grants.items() for right in grant_rights(name, grant))
         return frozenset(rights), tuple(grants)
@@ -524,7 +526,7 @@ class _Reader:
         return load_certificate(self.files.read(path, "certificate"), f"'{path}'")
 
 
-def _first_of_each(permissions: Permissions) -> dict[str, Grant]:
+def _first_grants(permissions: Permissions) -> dict[str, Grant]:
     """Map each enclave to its first grant, the only grant that DDS reads."""
     grants: dict[str, Grant] = {}
     for grant in permissions.grants:
@@ -819,7 +821,7 @@ def _protection_differences(
     return sorted(differences, key=lambda line: (line[1].enclave, line[1].name, line[0] == "+"))
 
 
-_SIDES = {"-": "a", "+": "b"}
+_SIDE_OF_SIGN = {"-": "a", "+": "b"}
 
 
 def policy_difference(
@@ -831,13 +833,16 @@ def policy_difference(
         first_source,
         second_source,
         [
-            DifferentRight(_SIDES[sign], right, difference.rights.covered.get(right, ()))
+            DifferentRight(_SIDE_OF_SIGN[sign], right, difference.rights.covered.get(right, ()))
             for sign, right in difference.rights.lines()
         ],
-        [DifferentProtection(_SIDES[sign], stated) for sign, stated in difference.protections],
+        [
+            DifferentProtection(_SIDE_OF_SIGN[sign], stated)
+            for sign, stated in difference.protections
+        ],
         difference.unanswered,
         difference.domains,
-        [DifferentEnclave(_SIDES[sign], enclave) for sign, enclave in difference.enclaves],
+        [DifferentEnclave(_SIDE_OF_SIGN[sign], enclave) for sign, enclave in difference.enclaves],
         difference.governance_differs,
     )
 

@@ -71,13 +71,13 @@ def select_enclaves(
     robots: Sequence[str] = (),
     checked: bool = False,
 ) -> tuple[str, ...]:
-    """Return ``names``, then the enclaves that match ``patterns``, then those of ``robots``.
+    """Return ``names``, then the enclaves that match ``patterns``, then the enclaves of ``robots``.
 
     Each enclave is returned once.  In a pattern, ``*`` stands for any text, including "/", as in
     policies.  With ``checked``, ``robots`` are only accepted if nobody edited the fleet file.
 
     Raises:
-        KeystoreError: a pattern matches no enclave, or a robot has none.
+        KeystoreError: a pattern matches no enclave, or a robot has no enclave.
         DocumentError: the fleet of the keystore has no such robot; the error names similar robots.
     """
     keystore.check()
@@ -92,7 +92,7 @@ def select_enclaves(
                 f"See `sros list_enclaves {quote(str(root))}`.",
             )
         chosen |= dict.fromkeys(fitting)
-    return tuple(chosen | dict.fromkeys(_robots_enclaves(keystore, robots, checked, {})))
+    return tuple(chosen | dict.fromkeys(_enclaves_of_robots(keystore, robots, checked, {})))
 
 
 def select_to_revoke(
@@ -118,7 +118,7 @@ def select_to_revoke(
     if fleet := checked_fleet(keystore, by_name) if robots else None:
         possible = _possible_enclaves(keystore, fleet, robots)
         unrecorded = unrecorded_enclaves(fleet, possible, set(robots))
-    chosen |= dict.fromkeys(_robots_enclaves(keystore, robots, True, unrecorded))
+    chosen |= dict.fromkeys(_enclaves_of_robots(keystore, robots, True, unrecorded))
     below = [name for enclaves in unrecorded.values() for name in enclaves.below]
     left = {name for enclaves in unrecorded.values() for name in enclaves.naming} - chosen.keys()
     notes = [*_unrecorded_notes(keystore, sorted(below), sorted(left))]
@@ -128,9 +128,9 @@ def select_to_revoke(
 def _revocation_by_name(keystore: OpenedKeystore, robots: Sequence[str]) -> str:
     """Return sentences on how to revoke the enclaves of robots although the fleet was edited.
 
-    They name the enclaves that the edited file gives to the robots, and those with the robots'
-    names in their paths.  Both are only proposals, because whoever edited the file may be the
-    thief.
+    The sentences name the enclaves that the edited file gives to the robots, and the enclaves with
+    the robots' names in their paths.  Both lists are only proposals, because whoever edited the
+    file may be the thief.
     """
     root, fleet = quote(str(keystore.root)), None
     with suppress(SrosError):
@@ -202,7 +202,7 @@ def _other_computers_notes(
             for robot in in_namespace
             if robot.domain == domain and {*enclaves_of_robot(keystore, fleet, robot)} - {*revoked}
         )
-        if others := [*islice(valid, _SHOWN)]:
+        if others := [*islice(valid, _MOST_SHOWN)]:
             command = f"sros revoke {quote(str(keystore.root))} --robot {' --robot '.join(others)}"
             yield Note(
                 "fleet.same-namespace",
@@ -213,10 +213,10 @@ def _other_computers_notes(
 
 
 def _names_text(names: list[str]) -> str:
-    return first_few(names, _SHOWN)
+    return first_few(names, _MOST_SHOWN)
 
 
-def _robots_enclaves(
+def _enclaves_of_robots(
     keystore: OpenedKeystore,
     robots: Sequence[str],
     checked: bool,
@@ -269,7 +269,7 @@ def _enclaves_named_after(keystore: OpenedKeystore, robot: str) -> list[str]:
     return [name for name in keystore.names if robot in name.split("/")[1:]]
 
 
-_SHOWN = 5
+_MOST_SHOWN = 5
 """Maximum number of enclaves that an error names."""
 _SIMILARITY = 0.75
 """Lowest similarity (`difflib`) that counts as a typo: one of four letters differs."""
@@ -299,16 +299,18 @@ def missing_enclave_error(
             f"It is the namespace of {counted(len(below), 'enclave')}, such as {below[0]}.",
             f"Name one of them; a verb that takes several also has --match '{name}/*'.",
         )
-    uses = _uses(keystore, name, names)
+    uses = _enclaves_using(keystore, name, names)
     if of_node := uses.pop("node"):
         return KeystoreError(
             missing,
-            f"{name} is a node of {first_few(of_node, _SHOWN)}.",
+            f"{name} is a node of {first_few(of_node, _MOST_SHOWN)}.",
             f"Name the enclave: {of_node[0]}.",
         )
     kind = next(iter(uses), "")
     why = (
-        f"{name} is a {kind} in the permissions of {first_few(uses[kind], _SHOWN)}." if kind else ""
+        f"{name} is a {kind} in the permissions of {first_few(uses[kind], _MOST_SHOWN)}."
+        if kind
+        else ""
     )
     if meant := likely_names(name, existing_enclaves):
         return KeystoreError(missing, why, f"Perhaps you mean {' or '.join(meant)}.")
@@ -320,7 +322,7 @@ def missing_enclave_error(
         check_enclave_name(name)
     except InvalidNameError as error:
         return error
-    why = f"The keystore has {first_few(names, _SHOWN) or 'no enclave'}."
+    why = f"The keystore has {first_few(names, _MOST_SHOWN) or 'no enclave'}."
     if robot := folder_of_closed_robot(root):
         folder, policy = quote(str(robot)), quote(str(robot / CLOSED_POLICY))
         return KeystoreError(
@@ -338,7 +340,7 @@ def missing_enclave_error(
     return KeystoreError(missing, why, f"If it is not a typo, create it with {create}.")
 
 
-_DDS_TOPICS = {
+_PERMISSION_TEXTS = {
     "node": ">rr{}/get_parametersReply<",
     "topic": ">rt{}<",
     "service": ">rq{}Request<",
@@ -347,7 +349,9 @@ _DDS_TOPICS = {
 """Maps a kind of ROS name to the DDS topic in the permissions of enclaves that use the name."""
 
 
-def _uses(keystore: OpenedKeystore, name: str, names: Sequence[str]) -> dict[str, list[str]]:
+def _enclaves_using(
+    keystore: OpenedKeystore, name: str, names: Sequence[str]
+) -> dict[str, list[str]]:
     """Map each kind that ``name`` has in permissions to the enclaves that use it; always "node".
 
     A node belongs to the enclaves that may serve its parameters.
@@ -356,7 +360,7 @@ def _uses(keystore: OpenedKeystore, name: str, names: Sequence[str]) -> dict[str
     for enclave in names:
         with suppress(SrosError, OSError):
             document = keystore.read(keystore.folder(enclave) / PERMISSIONS_FILE, "permissions")
-            for kind, topic in _DDS_TOPICS.items():
+            for kind, topic in _PERMISSION_TEXTS.items():
                 if os.fsencode(topic.format(name)) in document:  # the name may not be UTF-8
                     uses.setdefault(kind, []).append(enclave)
     return uses
@@ -394,9 +398,9 @@ def _revoked_enclave_error(keystore: OpenedKeystore, entry: Entry) -> SrosError:
 def likely_names(name: str, existing_enclaves: Collection[str]) -> tuple[str, ...]:
     """Return at most three enclaves that a mistyped ``name`` may mean.
 
-    These are the enclaves whose names end with ``name``, because people leave out the namespace.
-    If there are none, they are the enclaves whose last part is similar, or else those whose full
-    name is similar.  Upper and lower case count as equal.
+    These are the enclaves whose names end with ``name``, because people leave out the namespace. If
+    there are none, the result is the enclaves whose last part is similar, or else the enclaves
+    whose full name is similar.  Upper and lower case count as equal.
     """
     end = "/" + name.strip("/").lower()
     if end == "/":

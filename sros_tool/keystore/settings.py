@@ -30,7 +30,7 @@ from sros_tool.wording import first_few
 if TYPE_CHECKING:
     from sros_tool.keystore.transaction import Transaction
 
-_COMMENT = """\
+_SETTINGS_COMMENT = """\
 # The settings of this keystore; sros uses them for each enclave that is added.
 # To change them, run `sros update_keystore`: it also signs the affected files again.
 """
@@ -39,7 +39,7 @@ _COMMENT = """\
 def write_settings(transaction: Transaction, template: Template, now: datetime) -> Entry:
     """Stage ``template`` as the settings of the keystore, and return the entry for the ledger."""
     text = render_template(template)
-    document = (_COMMENT + text).encode()
+    document = (_SETTINGS_COMMENT + text).encode()
     transaction.write(SETTINGS, document)
     digest = hashlib.sha256(document).hexdigest()
     return Entry(iso(now), "settings", sha256=digest, settings=text)
@@ -162,7 +162,7 @@ def present_settings(keystore: OpenedKeystore) -> PresentSettings:
     return PresentSettings(settings, written, governance, edits, without_settings, recorded)
 
 
-_SHOWN = 3
+_MOST_SHOWN = 3
 
 
 def edit_notes(keystore: OpenedKeystore, governance: Governance) -> tuple[Note, ...]:
@@ -173,7 +173,7 @@ def edit_notes(keystore: OpenedKeystore, governance: Governance) -> tuple[Note, 
     edits = found_edits(keystore, governance)
     if not edits:
         return ()
-    clauses = first_few(edits.clauses(), _SHOWN, "; ", "; and ")
+    clauses = first_few(edits.clauses(), _MOST_SHOWN, "; ", "; and ")
     text = f"{clauses}. Only files issued from now on may follow the edit, "
     text += f"and the signed governance does not: {edit_remedy(keystore.root)}"
     return (Note("keystore.edited", text),)
@@ -258,7 +258,7 @@ def _governance_edit(keystore: OpenedKeystore) -> str:
 def with_places(template: Template, places: Template) -> Template:
     """Return ``template`` with the places of the CA keys from the template ``places``.
 
-    If ``template`` has no Zenoh network, it also gets that of ``places``.
+    If ``template`` has no Zenoh network, the result has the network of ``places``.
     """
     return replace(
         template,

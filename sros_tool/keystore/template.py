@@ -46,8 +46,8 @@ CA_SERVICE_SCHEME = "issuer:"
 """The prefix of a key's place that stands for a CA service, such as issuer:NAME."""
 _LONGEST_AUTHORITY_NAME = 40  # in characters; a common name also has the role and a number
 _DATA_LEVELS = (Level.NONE, Level.SIGN, Level.ENCRYPT)
-_KINDS: dict[str, str] = {"topic": "topics", "service": "services", "action": "actions"}
-_TYPES: dict[type, str] = {str: "a string", bool: "a boolean", list: "a list"}
+_PLURAL_KINDS: dict[str, str] = {"topic": "topics", "service": "services", "action": "actions"}
+_TYPE_TEXTS: dict[type, str] = {str: "a string", bool: "a boolean", list: "a list"}
 
 
 class ShortLived(NamedTuple):
@@ -162,10 +162,10 @@ def parse_template(text: str, name: str) -> Template:
         tomllib.TOMLDecodeError: the text is not TOML.
         _TemplateError: a key is missing, unknown (it may be a typo), or has a wrong value.
     """
-    return _template(parse_toml(text), name)
+    return _template_from(parse_toml(text), name)
 
 
-def _template(values: object, name: str) -> Template:
+def _template_from(values: object, name: str) -> Template:
     table = _Table(values, "")
     authorities = table.table("authorities")
     certificates = table.table("certificates")
@@ -198,41 +198,41 @@ def render_template(template: Template) -> str:
     """Return the template as TOML, from which `parse_template` returns an equal template."""
     protection = template.protection
     lines = [
-        f"name = {_toml(template.name)}",
-        f"description = {_toml(template.description)}",
+        f"name = {_toml_value(template.name)}",
+        f"description = {_toml_value(template.description)}",
         *(
-            [f"distributions = [{', '.join(map(_toml, template.distributions))}]"]
+            [f"distributions = [{', '.join(map(_toml_value, template.distributions))}]"]
             if template.distributions
             else []
         ),
         "\n[authorities]",
         f'layout = "{"separate" if template.separate_authorities else "single"}"',
-        f"name = {_toml(template.authority_name)}",
-        f"validity = {_toml(span_text(template.authority_validity))}",
+        f"name = {_toml_value(template.authority_name)}",
+        f"validity = {_toml_value(span_text(template.authority_validity))}",
         *(
-            f"{name} = {_toml(place)}"
+            f"{name} = {_toml_value(place)}"
             for name in ("identity_key", "permissions_key")
             if (place := getattr(template, name))
         ),
         "\n[certificates]",
-        f"validity = {_toml(span_text(template.certificate_validity))}",
-        f"unique_subject = {_toml(template.unique_subject)}",
+        f"validity = {_toml_value(span_text(template.certificate_validity))}",
+        f"unique_subject = {_toml_value(template.unique_subject)}",
         "\n[permissions]",
-        f"validity = {_toml(span_text(template.permissions_validity))}",
-        f"default = {_toml(template.default_permissions)}",
+        f"validity = {_toml_value(span_text(template.permissions_validity))}",
+        f"default = {_toml_value(template.default_permissions)}",
         "\n[revocation]",
-        f"validity = {_toml(duration_text(template.revocation_validity))}",
+        f"validity = {_toml_value(duration_text(template.revocation_validity))}",
         "\n[protection]",
-        *(f"{name} = {_toml(getattr(protection, name))}" for name in _OF_DOMAIN),
+        *(f"{name} = {_toml_value(getattr(protection, name))}" for name in _DOMAIN_KEYS),
         "\n[protection.default]",
         *_topic_lines(protection.default),
     ]
     for short_lived in template.short_lived:
-        lines += ["\n[[enclaves]]", f"names = [{_toml(short_lived.name)}]"]
-        lines.append(f"validity = {_toml(duration_text(short_lived.validity))}")
-    items = {kind: item for item, kind in _KINDS.items()}
+        lines += ["\n[[enclaves]]", f"names = [{_toml_value(short_lived.name)}]"]
+        lines.append(f"validity = {_toml_value(duration_text(short_lived.validity))}")
+    items = {kind: item for item, kind in _PLURAL_KINDS.items()}
     for named in protection.named:
-        lines += [f"\n[[protection.{items[named.kind]}]]", f"names = [{_toml(named.name)}]"]
+        lines += [f"\n[[protection.{items[named.kind]}]]", f"names = [{_toml_value(named.name)}]"]
         lines += _topic_lines(named.protection)
     if template.zenoh:
         lines += ["\n[zenoh]", *_zenoh_lines(template.zenoh)]
@@ -333,20 +333,20 @@ def _read_crossing(table: _Table) -> Iterator[str]:
 
 
 def _zenoh_lines(network: ZenohNetwork) -> Iterator[str]:
-    yield f"router = {_toml(network.router)}"
+    yield f"router = {_toml_value(network.router)}"
     for key in ("endpoints", "listen"):
         if texts := getattr(network, key):
-            yield f"{key} = [{', '.join(map(_toml, texts))}]"
-    yield f"mode = {_toml(network.mode)}"
+            yield f"{key} = [{', '.join(map(_toml_value, texts))}]"
+    yield f"mode = {_toml_value(network.mode)}"
     if network.domains:
         yield f"domains = {list(network.domains)}"
     if network.crossing:
-        yield f"crossing = [{', '.join(map(_toml, network.crossing))}]"
+        yield f"crossing = [{', '.join(map(_toml_value, network.crossing))}]"
     for router in network.routers:
-        yield f"\n[zenoh.routers.{_toml(router.name)}]"
+        yield f"\n[zenoh.routers.{_toml_value(router.name)}]"
         for key in ("endpoints", "listen", "enclaves", "crossing"):
             if texts := getattr(router, key):
-                yield f"{key} = [{', '.join(map(_toml, texts))}]"
+                yield f"{key} = [{', '.join(map(_toml_value, texts))}]"
 
 
 def settings_values(template: Template) -> dict[str, str]:
@@ -430,7 +430,7 @@ def with_values(
             )
         inner[last] = _typed_value(key, value)
     try:
-        return _template(table, template.name)
+        return _template_from(table, template.name)
     except _TemplateError as error:
         raise UsageError(f"the settings would not be valid: {error}") from error
 
@@ -480,12 +480,12 @@ def _read_key_place(table: _Table, key: str) -> str:
 
 def _topic_lines(protection: TopicProtection) -> list[str]:
     return [
-        f"{field.name} = {_toml(getattr(protection, field.name))}"
+        f"{field.name} = {_toml_value(getattr(protection, field.name))}"
         for field in fields(TopicProtection)
     ]
 
 
-def _toml(value: str | bool) -> str:
+def _toml_value(value: str | bool) -> str:
     if isinstance(value, bool):
         return json.dumps(value)
     # A JSON string is a TOML basic string, except that TOML also requires an escape for one
@@ -493,7 +493,7 @@ def _toml(value: str | bool) -> str:
     return json.dumps(str(value), ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
-_OF_DOMAIN: dict[str, Any] = {
+_DOMAIN_KEYS: dict[str, Any] = {
     field.name: field.default
     for field in fields(DomainProtection)
     if field.name not in ("default", "named")
@@ -503,7 +503,7 @@ _OF_DOMAIN: dict[str, Any] = {
 
 def _read_protection(table: _Table) -> DomainProtection:
     values: dict[str, Any] = {}
-    for name, usual in _OF_DOMAIN.items():
+    for name, usual in _DOMAIN_KEYS.items():
         is_flag = isinstance(usual, bool)
         values[name] = table.flag(name, usual) if is_flag else table.level(name)
     domain = DomainProtection(**values)
@@ -514,7 +514,7 @@ def _read_protection(table: _Table) -> DomainProtection:
         )
     default = _read_topic_protection(table.table("default"), TopicProtection())
     named = []
-    for item, kind in _KINDS.items():
+    for item, kind in _PLURAL_KINDS.items():
         for entry in table.tables(item):
             names = entry.texts("names")
             for name in names:
@@ -556,7 +556,7 @@ class _Table:
         if value is None:
             raise _TemplateError(f"{self._at(key)} is missing")
         if not isinstance(value, kind):
-            raise _TemplateError(f"{self._at(key)} is {value!r}, not {_TYPES[kind]}")
+            raise _TemplateError(f"{self._at(key)} is {value!r}, not {_TYPE_TEXTS[kind]}")
         return value
 
     def _at(self, key: str) -> str:

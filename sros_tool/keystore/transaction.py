@@ -86,17 +86,17 @@ class Move(NamedTuple):
     to: str = ""
 
 
-_CLOSE = "close"
-_ADOPT = "adopt"
+_ACTION_CLOSE = "close"
+_ACTION_ADOPT = "adopt"
 
 
 @dataclass(frozen=True, slots=True)
 class Change:
     """A change of a file or link by a transaction.
 
-    ``action`` is "create", "replace" or "remove".  It is `_CLOSE` for a private key or a folder of
-    keys that other users could open before, and `_ADOPT` for a keystore of ros2/sros2 that gets
-    settings and a ledger.  ``path`` is relative to the keystore.
+    ``action`` is "create", "replace" or "remove".  The action is `_ACTION_CLOSE` for a private key
+    or a folder of keys that other users could open before, and `_ACTION_ADOPT` for a keystore of
+    ros2/sros2 that gets settings and a ledger.  ``path`` is relative to the keystore.
     """
 
     action: str
@@ -236,14 +236,14 @@ def _read_manifest(folder: Folder) -> tuple[Move, ...]:
         read = json.loads(folder.read(f"{STAGE}/{MANIFEST}"))
         if read["version"] not in (_EARLIER_VERSION, _VERSION):
             raise ValueError(f"its version is not {_VERSION}")
-        return tuple(_move(*move) for move in read["moves"])
+        return tuple(_checked_move(*move) for move in read["moves"])
     except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
         raise _damaged_stage_error(
             folder, f"Its list of files, {MANIFEST}, cannot be read: {error}."
         ) from error
 
 
-def _move(path: str, before: str | None, after: str | None, to: str = "") -> Move:
+def _checked_move(path: str, before: str | None, after: str | None, to: str = "") -> Move:
     for state in (before, after):
         if state is not None and not isinstance(state, str):
             raise ValueError(f"{state!r} is not the state of a path")
@@ -251,13 +251,17 @@ def _move(path: str, before: str | None, after: str | None, to: str = "") -> Mov
         raise ValueError(f"{path!r} is not a file of a keystore")
     if after and not _stays_inside(path, after):
         raise ValueError(f"the link {path!r} would lead out of the keystore, to {after!r}")
-    if to and not (_OF_ENCLAVE.fullmatch(path) and after is None and _MOVED.fullmatch(to)):
+    if to and not (
+        _ENCLAVE_CERTIFICATE_PATH.fullmatch(path)
+        and after is None
+        and _REVOKED_FOLDER_PATH.fullmatch(to)
+    ):
         raise ValueError(f"the folder of {path!r} would move to {to!r}")
     return Move(path, before, after, to)
 
 
-_OF_ENCLAVE = re.compile(rf"{ENCLAVES}/.+/{re.escape(CERTIFICATE_FILE)}")
-_MOVED = re.compile(rf"{REVOKED}/[0-9a-f]+")
+_ENCLAVE_CERTIFICATE_PATH = re.compile(rf"{ENCLAVES}/.+/{re.escape(CERTIFICATE_FILE)}")
+_REVOKED_FOLDER_PATH = re.compile(rf"{REVOKED}/[0-9a-f]+")
 
 
 def _stays_inside(path: str, target: str) -> bool:
@@ -266,7 +270,7 @@ def _stays_inside(path: str, target: str) -> bool:
     return not target.startswith("/") and not target_path.startswith("..")
 
 
-_KNOWN = re.compile(
+_STAGE_ENTRY = re.compile(
     rf"{_BEFORE}|{_AFTER}|{_ADDED}|{re.escape(MANIFEST)}|{_LIVE}(\.next)?|spare(\.\d+)?"
 )
 _STAGED_NAME = re.compile(r"[0-9a-f]{16}")
@@ -288,7 +292,7 @@ def _check_stage(folder: Folder) -> str | None:
     if folder.mode(STAGE) & 0o077:
         raise _foreign_stage_error(folder, "Other users may open it.")
     for name in folder.names(STAGE):
-        if not _KNOWN.fullmatch(name):
+        if not _STAGE_ENTRY.fullmatch(name):
             raise _damaged_stage_error(
                 folder, f"{name!r} is not part of the format of this version of sros."
             )
@@ -419,7 +423,7 @@ class Transaction:
         self._kept_bytes = 0
 
     @property
-    def _in(self) -> Folder:
+    def _target_folder(self) -> Folder:
         """The folder in which to write: the keystore, or a sibling folder for a new keystore."""
         if self._folder is None:
             self._folder = Folder(self.root, for_owner=True)
@@ -427,7 +431,7 @@ class Transaction:
 
     @property
     def _added(self) -> str:
-        """The path in `_in` for files in new folders; ends with "/"."""
+        """The path in `_target_folder` for files in new folders; ends with "/"."""
         return "" if self._new_root else f"{STAGE}/{_ADDED}/"
 
     def on_failure(self, undo: Callable[[], None]) -> None:
@@ -468,11 +472,11 @@ class Transaction:
                 self._make_sibling(parent)
             _LOG.info("began to create the keystore '%s'", self.root)
             return
-        self._lock = KeystoreLock(self._in)
+        self._lock = KeystoreLock(self._target_folder)
         self._lock.acquire()
-        _recover(self._in)
+        _recover(self._target_folder)
         for path in (STAGE, f"{STAGE}/{_ADDED}", f"{STAGE}/{_AFTER}"):
-            self._in.mkdir(path, 0o700)
+            self._target_folder.mkdir(path, 0o700)
         _LOG.info("began a transaction in the keystore '%s'", self.root)
 
     @cached_property
@@ -489,7 +493,7 @@ class Transaction:
     def _refuse_folder_of_stranger(self) -> None:
         """Refuse to write keys, as root, into a folder that another user may have prepared."""
         above = Path(os.path.realpath(self.root)).parent.stat()
-        owner = self._in.owner[0]
+        owner = self._target_folder.owner[0]
         if os.geteuid() == 0 and above.st_mode & stat.S_IWOTH and owner not in (0, above.st_uid):
             raise KeystoreError(
                 f"'{self.root}' belongs to user {owner}",
@@ -509,7 +513,7 @@ class Transaction:
                 with Folder(self.root.parent) as parent, contextlib.suppress(OSError):
                     parent.remove_tree(self._sibling)
             elif self._lock and self._lock.held:
-                _recover(self._in)
+                _recover(self._target_folder)
         finally:
             if self._lock:
                 self._lock.release()
@@ -532,7 +536,7 @@ class Transaction:
                     folder.close()
 
     def _remove_stale_siblings(self, parent: Folder) -> None:
-        """Remove what this user's killed processes left when they created this keystore."""
+        """Remove the sibling folders that killed processes of this user left for this keystore."""
         for name in parent.names():
             if not name.startswith(self._sibling_prefix):
                 continue
@@ -563,7 +567,7 @@ class Transaction:
         if staged is None:
             return
         try:
-            self._in.write_parts(staged, parts, 0o600 if private else 0o644)
+            self._target_folder.write_parts(staged, parts, 0o600 if private else 0o644)
         except OSError as error:
             error.filename = f"{self.root}/{path}"
             raise
@@ -575,7 +579,7 @@ class Transaction:
             KeystoreError: a link leads out of the keystore, so that the keystore's owner would get
                 a copy of a foreign file.
         """
-        return self._in.read_inside(path)
+        return self._target_folder.read_inside(path)
 
     def place_after(self, path: str) -> str:
         """Return the path to which links at ``path`` will lead, for `content_after`."""
@@ -596,11 +600,11 @@ class Transaction:
         that makes more files than it keeps in memory.
         """
         if not self.is_staged(place):
-            return _content(self.root / place)
+            return _read_file(self.root / place)
         if self.dry_run:
             kept = self._kept_content.get(place)
             return kept if isinstance(kept, bytes) else None
-        return _content(Path(self._stage_place(place)))
+        return _read_file(Path(self._stage_place(place)))
 
     def files_not_kept(self) -> list[str]:
         """Return the new files that `content_after` does not know because of a dry run's limit.
@@ -622,9 +626,9 @@ class Transaction:
         return target and target.removeprefix(_relocated_target(path, ""))
 
     def _stage_place(self, path: str) -> str:
-        exists = not self._new_root and self._in.is_folder(path.rpartition("/")[0])
+        exists = not self._new_root and self._target_folder.is_folder(path.rpartition("/")[0])
         staged = f"{STAGE}/{_AFTER}/{staged_name(path)}" if exists else f"{self._added}{path}"
-        return f"{self._in.path}/{staged}"
+        return f"{self._target_folder.path}/{staged}"
 
     def changed_folders(self) -> dict[str, set[str]]:
         """Map folders ("" is the keystore) to the names of their files that change.
@@ -643,7 +647,7 @@ class Transaction:
         staged = self._prepare(path, target)
         if staged is not None:
             flat = self._folders[path.rpartition("/")[0]]
-            self._in.symlink(_relocated_target(path, target) if flat else target, staged)
+            self._target_folder.symlink(_relocated_target(path, target) if flat else target, staged)
         else:
             self._kept_content[path] = target
 
@@ -677,7 +681,7 @@ class Transaction:
         self._moves.append(Move(f"{folder}/{CERTIFICATE_FILE}", "", None, to))
 
     def _prepare(self, path: str, after: str) -> str | None:
-        """Record a change of ``path``, and return the path of its staged file in `_in`.
+        """Record a change of ``path``, and return the path of its staged file in `_target_folder`.
 
         ``after`` is as in `Move`.  The result is None in a dry run.
         """
@@ -712,14 +716,14 @@ class Transaction:
 
     def _present_content(self, path: str) -> str | None:
         """Return the description of the present file at a path, in the form of `Move.before`."""
-        state = self._in.state(path)
+        state = self._target_folder.state(path)
         if state is None:
             return None
         if stat.S_ISDIR(state.st_mode):
             raise KeystoreError(
                 f"'{self.root}/{path}' is in the way", "It is a folder.", "Move it away."
             )
-        return self._in.link_target(path) or "" if stat.S_ISLNK(state.st_mode) else ""
+        return self._target_folder.link_target(path) or "" if stat.S_ISLNK(state.st_mode) else ""
 
     def _prepare_folder(self, path: str, *, wanted: bool = True) -> bool:
         """Return whether a folder exists in the keystore; if not, stage it if ``wanted``."""
@@ -728,7 +732,7 @@ class Transaction:
         exists = not self._new_root
         if path:
             above = self._prepare_folder(path.rpartition("/")[0], wanted=wanted)
-            exists = above and self._in.is_folder(path)
+            exists = above and self._target_folder.is_folder(path)
             if not wanted and not exists:
                 return False
             if not exists and not self.dry_run:
@@ -747,7 +751,7 @@ class Transaction:
 
     def _make_folder(self, path: str, mode: int) -> None:
         with contextlib.suppress(FileExistsError):  # made before, or by another worker
-            self._in.mkdir(path, mode)
+            self._target_folder.mkdir(path, mode)
 
     # ── by forked workers ───────────────────────────────────────────────────────────────
 
@@ -787,7 +791,7 @@ class Transaction:
     def note_adoption(self) -> None:
         """Add a change which says that the keystore gets its first settings and ledger."""
         self._adopts = True
-        self.changes.add(_ADOPT, "")
+        self.changes.add(_ACTION_ADOPT, "")
 
     # ── commit ─────────────────────────────────────────────────────────────────────────────
 
@@ -806,9 +810,9 @@ class Transaction:
             return
         if self.dry_run:
             for path in self._open_keys():
-                self.changes.add(_CLOSE, path)
+                self.changes.add(_ACTION_CLOSE, path)
             return
-        folder = self._in
+        folder = self._target_folder
         if self._new_root:
             folder.flush_file_system()
             self._put_keystore_in_place()
@@ -816,7 +820,7 @@ class Transaction:
             return
         _write_manifest(folder, self._moves)
         folder.flush_file_system(STAGE)
-        _bridge(folder, self._moves)
+        _replace_by_live_links(folder, self._moves)
         map_slices(sorted(self._linked), partial(_link_to_first_list, folder))
         _point_live(folder, _AFTER)
         self._undo.clear()
@@ -827,7 +831,7 @@ class Transaction:
             with contextlib.suppress(OSError):  # `check` reports what stays open
                 folder.close_to_others(path)
                 if not folder.mode(path) & 0o077:
-                    self.changes.add(_CLOSE, path)
+                    self.changes.add(_ACTION_CLOSE, path)
 
     def _open_keys(self) -> list[str]:
         """Return the keys that other users can open, except files that this transaction writes."""
@@ -848,7 +852,7 @@ class Transaction:
                 _LOG.debug("%s %s", change.action, change.path)
 
     def _put_keystore_in_place(self) -> None:
-        os.fchmod(self._in.handle(""), folder_mode(""))
+        os.fchmod(self._target_folder.handle(""), folder_mode(""))
         try:
             with Folder(self.root.parent) as parent:
                 parent.rename(self._sibling, self.root.name)
@@ -874,7 +878,7 @@ def _link_target(path: str) -> str | None:
         return None
 
 
-def _content(path: Path) -> bytes | None:
+def _read_file(path: Path) -> bytes | None:
     try:
         return read_bytes(path, "file")
     except SrosError:
@@ -915,13 +919,13 @@ def _is_open(path: str, kind: int) -> bool:
 # ── links through the stage ────────────────────────────────────────────────────────────────
 
 
-def _bridge(folder: Folder, moves: Sequence[Move]) -> None:
+def _replace_by_live_links(folder: Folder, moves: Sequence[Move]) -> None:
     """Replace each path with a link through ``live`` to its old content, now in ``before``."""
     if not moves:
         return
     folder.mkdir(f"{STAGE}/{_BEFORE}", 0o700)
     _point_live(folder, _BEFORE)
-    work = _Bridge(folder)
+    work = _LiveLinkWriter(folder)
     if _can_exchange(folder):
         map_slices(moves, work.exchange_with_links)
         return
@@ -940,7 +944,7 @@ def _can_exchange(folder: Folder) -> bool:
     return can
 
 
-class _Bridge:
+class _LiveLinkWriter:
     """Replaces the paths of some moves with links, in one of two ways.
 
     One way is `exchange_with_links`; the other is `keep`, followed by `replace_with_links`.
@@ -1002,7 +1006,7 @@ def _path_of_old_content(move: Move) -> str:
 
 
 _LOCK_SECONDS = 60.0
-_PAUSE = 0.02
+_LOCK_RETRY_SECONDS = 0.02
 
 
 class KeystoreLock:
@@ -1035,7 +1039,7 @@ class KeystoreLock:
         wait = _LOCK_SECONDS if wait is None else wait
         deadline = time.monotonic() + wait
         while not self._try() and time.monotonic() < deadline:
-            time.sleep(_PAUSE)
+            time.sleep(_LOCK_RETRY_SECONDS)
         if not self.held:
             raise KeystoreError(
                 f"{self._what} '{self._folder.path}' is busy",
@@ -1045,11 +1049,11 @@ class KeystoreLock:
         return self
 
     def _try(self) -> bool:
-        """Try to take the lock, and return whether this succeeded."""
+        """Take the lock if it is free; return whether this process now holds it."""
         try:
             with _signals_held_back():
                 handle = self._folder.open_private(LOCK)
-                if stat.S_ISREG(os.fstat(handle).st_mode) and _locked(handle):
+                if stat.S_ISREG(os.fstat(handle).st_mode) and _try_lock(handle):
                     if self._is_there(handle):
                         self._handle = handle
                         return True
@@ -1099,10 +1103,10 @@ def lock_new(folder: Folder) -> bool:
 
     The lock lasts until the folder is closed.
     """
-    return _locked(folder.handle(""))
+    return _try_lock(folder.handle(""))
 
 
-def _locked(handle: int) -> bool:
+def _try_lock(handle: int) -> bool:
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:

@@ -5,8 +5,8 @@ message next to it, and state the rights of the enclave's signed permissions.
 `sros_tool.keystore.lifecycle.change` writes the configurations.
 
 The permissions need not be written by sros.  Zenoh has no partitions, so only the default partition
-counts, in which ROS nodes open their topics.  In Zenoh, the rules have no order, so what an earlier
-rule decides is subtracted from later rules.  The result is compared with the decisions of each
+counts, in which ROS nodes open their topics.  In Zenoh, the rules have no order, so the topics of
+an earlier rule are subtracted from later rules.  The result is compared with the decisions of each
 vendor.  If two vendors differ, or if the order of the rules cannot be expressed, the permissions
 are refused.
 
@@ -138,7 +138,8 @@ class ZenohProblem:
 class OpenedZenoh:
     """The Zenoh configurations of an enclave by file name, and their problems.
 
-    ``files`` are the existing files; ``configurations`` are those that were read and verified.
+    ``files`` are the existing files; ``configurations`` are the configurations that were read and
+    verified.
     """
 
     files: tuple[str, ...]
@@ -170,7 +171,7 @@ def open_zenoh(folder: Path, name: str, state: OpenedEnclave) -> OpenedZenoh:
         text = "the enclave has neither this file nor router.json5"
         problems.append(ZenohProblem(SESSION_FILE, text, ZenohFault.MISSING))
     for file in present:
-        read = _read(folder, file, state)
+        read = _read_configuration(folder, file, state)
         if isinstance(read, ZenohProblem):
             problems.append(read)
             continue
@@ -206,7 +207,9 @@ def _exists(path: Path) -> bool:
     return path.exists() or path.is_symlink()
 
 
-def _read(folder: Path, file: str, state: OpenedEnclave) -> Configuration | ZenohProblem:
+def _read_configuration(
+    folder: Path, file: str, state: OpenedEnclave
+) -> Configuration | ZenohProblem:
     """Return a configuration that the permissions CA signed, or the problem with it."""
     signed_file = ZENOH_SIGNED[file]
     for needed, fault in ((file, ZenohFault.MISSING), (signed_file, ZenohFault.UNSIGNED)):
@@ -237,7 +240,7 @@ def _read(folder: Path, file: str, state: OpenedEnclave) -> Configuration | Zeno
 
 
 def _before_revocation_clause(configuration: Configuration, state: OpenedEnclave) -> str:
-    """Return a clause if a configuration's rights of others predate a revocation, or ""."""
+    """Return a clause if a configuration's rules for other enclaves predate a revocation, or ""."""
     data = state.files.get(CRL_FILE)
     if configuration.mode is Mode.CLIENT or data is None:
         return ""
@@ -348,7 +351,7 @@ _NO_CHANGE = ZenohChange()
 
 
 class Drift(StrEnum):
-    """The ways in which a configuration can differ from what the keystore should have."""
+    """The ways in which a configuration can differ from the needed configuration."""
 
     MISSING = "missing"
     DIFFERS = "differs"
@@ -542,7 +545,7 @@ def zenoh_documents(
             network.mode,
             listen,
             _tls_endpoints(network.router_of(name).endpoints),
-            _peers(name, router, between) if direct else (router,),
+            _rights_for_peers(name, router, between) if direct else (router,),
             revoked if direct else "",
         )
 
@@ -585,7 +588,9 @@ def _last_revocation(entries: Iterable[Entry] = (), lists: Iterable[RevocationLi
     return max(moments, default="")
 
 
-def _peers(name: str, router: RenderedRights, between: RightsBetween) -> list[RenderedRights]:
+def _rights_for_peers(
+    name: str, router: RenderedRights, between: RightsBetween
+) -> list[RenderedRights]:
     """Return the rights that a session gives to the router and to every other session, in order.
 
     Raises:
@@ -683,7 +688,7 @@ def _domains(
 # ── the rights of each enclave ─────────────────────────────────────────────────────────────
 
 
-_UNCERTAIN = re.compile(rb"[\x00\x80-\xff*?\[&]|<!|ALLOW")
+_NEEDS_PARSING = re.compile(rb"[\x00\x80-\xff*?\[&]|<!|ALLOW")
 """Matches text in permissions that may give a right to a name that is not in the text.
 
 This can be a wildcard, markup that splits or encodes a name, or a default that allows.
@@ -707,7 +712,7 @@ def enclaves_with_rights(keystore: OpenedKeystore, names: Collection[str]) -> se
             return True
         if any(text in message for text in texts):
             return True
-        return bool(_UNCERTAIN.search(message.replace(_XML_DECLARATION, b"", 1)))
+        return bool(_NEEDS_PARSING.search(message.replace(_XML_DECLARATION, b"", 1)))
 
     return {enclave for enclave in keystore.names if may_have_rights(enclave)}
 
@@ -796,7 +801,7 @@ class _RightsReader:
         remotes = {name: self._remote(name, rights) for name, rights in stated.items()}
         asked = [name for name in remotes if not self._only or name in self._only]
         for name in asked:
-            _prove(name, remotes[name], stated[name])
+            _check_rules_match(name, remotes[name], stated[name])
         routers = {
             name: render_rights(as_router(self._network.router_of(name).name, remotes[name]))
             for name in asked
@@ -881,12 +886,18 @@ _DECIDING_MESSAGES = {
     "reply": (Flow.EGRESS, Message.QUERY),
 }
 """Maps each right to its message, stated again on purpose, to find errors of the translation."""
-_ANNOUNCED = {"NN": "", "MP": "publish", "MS": "subscribe", "SC": "request", "SS": "reply"}
+_RIGHTS_BY_TOKEN_KIND = {
+    "NN": "",
+    "MP": "publish",
+    "MS": "subscribe",
+    "SC": "request",
+    "SS": "reply",
+}
 """Maps the kind of a graph token to the right that it announces; "" for a node."""
-_TOKEN = re.compile(r"@ros2_lv/([0-9]+)/\*/\*/\*/(..)/([^/]+)/[^/]+/[^/]+(?:/([^/]+)/\*\*)?")
+_GRAPH_TOKEN = re.compile(r"@ros2_lv/([0-9]+)/\*/\*/\*/(..)/([^/]+)/[^/]+/[^/]+(?:/([^/]+)/\*\*)?")
 
 
-def _prove(
+def _check_rules_match(
     enclave: str, remote: RemoteRights, stated_rights: Mapping[int, Sequence[StatedRight]]
 ) -> None:
     """Raise `PkiError` if rules and rights decide differently on a name.
@@ -906,7 +917,7 @@ def _prove(
         )
         return
     nodes = _example_nodes(enclave, control)
-    kinds = {right: kind for kind, right in _ANNOUNCED.items()}
+    kinds = {right: kind for kind, right in _RIGHTS_BY_TOKEN_KIND.items()}
 
     def is_announced(domain: int, right: str, name: str) -> bool:
         last = (name.replace("/", "%"), "type/hash/qos")
@@ -922,7 +933,7 @@ def _prove(
 
     for domain, rights in stated_rights.items():
         rules = Rules([stated_right.right for stated_right in rights])
-        names = {(e.right.kind, name) for e in rights for name in _examples(e.right.name)}
+        names = {(e.right.kind, name) for e in rights for name in _example_names(e.right.name)}
         for kind, name in names:
             for right in RIGHTS[kind]:
                 passes = passing[right].include(f"{domain}{name}/{ANY_TYPE}")
@@ -966,10 +977,12 @@ def _announced_names(tokens: KeyExpressions, enclave: str) -> set[tuple[str, str
     announced = set()
     for key in tokens.all:
         if not key.endswith("/@adv/**"):
-            token = _TOKEN.fullmatch(key)
+            token = _GRAPH_TOKEN.fullmatch(key)
             if not token or token[3] != enclave.replace("/", "%"):
                 return None
-            announced.add((token[1], _ANNOUNCED[token[2]], (token[4] or "").replace("%", "/")))
+            announced.add(
+                (token[1], _RIGHTS_BY_TOKEN_KIND[token[2]], (token[4] or "").replace("%", "/"))
+            )
     return announced
 
 
@@ -1003,7 +1016,7 @@ def _example_nodes(enclave: str, control: AccessControl) -> set[tuple[str, ...]]
     return {tuple(token.split("/")[6:9]) for token in tokens}
 
 
-def _examples(name: str) -> Iterable[str]:
+def _example_names(name: str) -> Iterable[str]:
     if not is_expression(name):
         return (name,)
     if not name.startswith("/") or "?" in name or "[" in name:
@@ -1052,11 +1065,11 @@ def signed_path(path: str) -> str:
 
 _ROS_VENDORS = (*TESTED, Vendor.CONNEXT)
 """The vendors of ROS 2, whose decisions must be the same; Connext stands for the standard."""
-_VERBS = (AccessVerb.PUBLISH, AccessVerb.SUBSCRIBE)
-_STATE_RIGHTS = "State the rights of the enclave in a policy, with `sros create_permission`."
-_TOPICS = "rt"
+_ACCESS_VERBS = (AccessVerb.PUBLISH, AccessVerb.SUBSCRIBE)
+_REMEDY_STATE_RIGHTS = "State the rights of the enclave in a policy, with `sros create_permission`."
+_TOPIC_PREFIX = "rt"
 """The prefix of ROS topics on DDS."""
-_PREFIXES = (_TOPICS, "rq", "rr")
+_ROS_PREFIXES = (_TOPIC_PREFIX, "rq", "rr")
 
 
 def grant_for_all(document: bytes, name: str, subject: str) -> Grant | None:
@@ -1100,7 +1113,7 @@ def _grant_for(
 
 
 def _joined_domains(grant: Grant, domains: Iterable[int]) -> tuple[int, ...]:
-    """Return those of ``domains`` that an enclave may join by its permissions."""
+    """Return the domains out of ``domains`` that an enclave may join by its permissions."""
     allowed = grant.domains()
     return tuple(domain for domain in domains if domain in allowed)
 
@@ -1123,7 +1136,7 @@ def rights_in_domain(enclave: str, grant: Grant, domain: int) -> tuple[StatedRig
         raise PolicyError(
             f"{source}: <default>ALLOW</default> cannot be expressed in Zenoh",
             "It allows by default, which some DDS vendors follow and others ignore.",
-            _STATE_RIGHTS,
+            _REMEDY_STATE_RIGHTS,
         )
     rules = [rule for rule in grant.rules if domain in rule.domains.closed()]
     if not _is_plain(grant):
@@ -1139,13 +1152,13 @@ def rights_in_domain(enclave: str, grant: Grant, domain: int) -> tuple[StatedRig
         }
         raw -= allow_all
     for right in sorted(raw):
-        if right.name.startswith(f"{_TOPICS}*"):
-            rights |= {right._replace(name=right.name.removeprefix(_TOPICS))}
+        if right.name.startswith(f"{_TOPIC_PREFIX}*"):
+            rights |= {right._replace(name=right.name.removeprefix(_TOPIC_PREFIX))}
         elif right.qualifier is not ALLOW or _overlaps_ros_names(right.name):
             raise PolicyError(
                 f"{source}: {right.describe()} cannot be expressed in Zenoh",
                 "It is a DDS name, and it is uncertain which ROS names it means.",
-                _STATE_RIGHTS,
+                _REMEDY_STATE_RIGHTS,
             )
     parted = (part for right in rights for part in parts(right))
     return tuple([StatedRight(right, source) for right in sorted(set(parted))])
@@ -1153,7 +1166,7 @@ def rights_in_domain(enclave: str, grant: Grant, domain: int) -> tuple[StatedRig
 
 def _overlaps_ros_names(topic: str) -> bool:
     """Return whether a DDS topic with wildcards also matches topics of ROS names."""
-    return is_expression(topic) and any(overlap(topic, f"{prefix}/*") for prefix in _PREFIXES)
+    return is_expression(topic) and any(overlap(topic, f"{prefix}/*") for prefix in _ROS_PREFIXES)
 
 
 # ── rules without an order ─────────────────────────────────────────────────────────────────
@@ -1190,7 +1203,7 @@ def _is_plain_topic(topic: str) -> bool:
     return "[" not in topic or not expression_problem(f"/{topic}")
 
 
-class _Ordered(NamedTuple):
+class _OrderedTopics(NamedTuple):
     """The topics that rules allow and deny, each with the position of its rule."""
 
     allowed: list[tuple[int, str]]
@@ -1205,8 +1218,8 @@ def _joined_if_unordered(rules: Sequence[Rule]) -> list[Rule]:
     """
     allowed: dict[AccessVerb, tuple[str, ...]] = {}
     denied: dict[AccessVerb, tuple[str, ...]] = {}
-    for verb in _VERBS:
-        ordered = _Ordered([], [])
+    for verb in _ACCESS_VERBS:
+        ordered = _OrderedTopics([], [])
         for position, rule in enumerate(rules):
             topics = [
                 (position, topic) for topic in _topics_in_default_partition(getattr(rule, verb))
@@ -1227,8 +1240,8 @@ def _joined_if_unordered(rules: Sequence[Rule]) -> list[Rule]:
         Rule(
             allow,
             DomainSet(()),
-            _criteria(topics[AccessVerb.PUBLISH]),
-            _criteria(topics[AccessVerb.SUBSCRIBE]),
+            _plain_criteria(topics[AccessVerb.PUBLISH]),
+            _plain_criteria(topics[AccessVerb.SUBSCRIBE]),
         )
         for allow, topics in ((False, denied), (True, allowed))
     ]
@@ -1240,7 +1253,7 @@ def _topics_in_default_partition(all_criteria: Iterable[Criteria]) -> Iterator[s
             yield from criteria.topics
 
 
-def _criteria(topics: tuple[str, ...]) -> tuple[Criteria, ...]:
+def _plain_criteria(topics: tuple[str, ...]) -> tuple[Criteria, ...]:
     return (Criteria(topics),) if topics else ()
 
 
@@ -1250,8 +1263,8 @@ def _joined_rules(rules: Iterable[Rule]) -> tuple[Rule, ...]:
     for allow in (False, True):
         of = [rule for rule in rules if rule.allow is allow]
         publish, subscribe = (
-            _criteria(tuple(topic for rule in of for topic in _topics(getattr(rule, verb))))
-            for verb in _VERBS
+            _plain_criteria(tuple(topic for rule in of for topic in _topics(getattr(rule, verb))))
+            for verb in _ACCESS_VERBS
         )
         if publish or subscribe:
             joined.append(Rule(allow, of[0].domains, publish, subscribe))
@@ -1266,7 +1279,7 @@ def _topics(all_criteria: Iterable[Criteria]) -> Iterator[str]:
 def _check_vendors(source: Source, grant: Grant, domain: int, rules: Sequence[Rule]) -> None:
     """Raise `PolicyError` unless every vendor decides like ``rules``, in which denials win."""
     decisions = {vendor: GrantedAccess(vendor.traits, grant, domain) for vendor in _ROS_VENDORS}
-    for verb in _VERBS:
+    for verb in _ACCESS_VERBS:
         denied, allowed = (
             names_of_expressions(Style.FNMATCH, _topics(getattr(rule, verb)))
             for rule in sorted(rules, key=lambda rule: rule.allow)
@@ -1307,7 +1320,7 @@ def _vendors_differ_error(
             f"{difference}, because DDS vendors do not "
             f"{'read its rules' if are_alike else 'decide'} alike",
             f"{differing[:1].upper()}{differing[1:]}.",
-            _STATE_RIGHTS,
+            _REMEDY_STATE_RIGHTS,
         )
     return PolicyError(
         f"{difference}, because the order of its rules matters",

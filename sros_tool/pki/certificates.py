@@ -59,9 +59,9 @@ _ENCODINGS = {
     0x1E: "utf-16-be",
 }
 """Maps an ASN.1 string type to the encoding in which OpenSSL reads it (a_strex.c, tag2nbyte)."""
-_ESCAPED = re.compile(r'[,+"\\<>;]|^[# ](?!\Z)| \Z')
-_UNIQUE = re.compile(r"[0-9a-f]{16}")
-_CONTROL = re.compile(r"[\x00-\x1f\x7f]")
+_ESCAPED_CHARACTERS = re.compile(r'[,+"\\<>;]|^[# ](?!\Z)| \Z')
+_UNIQUE_OU = re.compile(r"[0-9a-f]{16}")
+_CONTROL_CHARACTERS = re.compile(r"[\x00-\x1f\x7f]")
 
 _SIGNING_KEYS: dict[x509.ObjectIdentifier, type] = {
     SignatureAlgorithmOID.ED25519: ed25519.Ed25519PublicKey,
@@ -73,8 +73,8 @@ _SIGNING_KEYS: dict[x509.ObjectIdentifier, type] = {
     },
 }
 """Maps the OID of a signature algorithm to its kind of key; OpenSSL 3.0 has no ECDSA with SHA-3."""
-_NOT_A_CA = x509.BasicConstraints(ca=False, path_length=None)
-_A_CA = x509.BasicConstraints(ca=True, path_length=1)
+_LEAF_CONSTRAINTS = x509.BasicConstraints(ca=False, path_length=None)
+_CA_CONSTRAINTS = x509.BasicConstraints(ca=True, path_length=1)
 
 
 def common_name(text: str) -> x509.Name:
@@ -86,10 +86,11 @@ def enclave_subject(name: str, *, unique: bool) -> x509.Name:
     """Return the subject of an enclave's certificate: CN ``name``, and a random OU if ``unique``.
 
     The OU makes the subject different from the subjects of the enclave's earlier certificates, and
-    from those of enclaves whose names contain ``name`` (Cyclone DDS compares parts of subjects).
-    So permissions for those subjects do not fit the new certificate.  As RFC 4514 text, the subject
-    begins with the CN.  The subject of the root enclave ends with the CN, because Cyclone DDS
-    splits subjects at slashes, and refuses a subject with an empty part before another part.
+    from the subjects of enclaves whose names contain ``name`` (Cyclone DDS compares parts of
+    subjects). So permissions for those subjects do not fit the new certificate.  As RFC 4514 text,
+    the subject begins with the CN.  The subject of the root enclave ends with the CN, because
+    Cyclone DDS splits subjects at slashes, and refuses a subject with an empty part before another
+    part.
     """
     if not unique:
         return common_name(name)
@@ -103,7 +104,7 @@ def has_unique_part(subject: x509.Name) -> bool:
     if isinstance(subject, TolerantName):
         return len(subject.rdns) > 1
     units = subject.get_attributes_for_oid(NameOID.ORGANIZATIONAL_UNIT_NAME)
-    return any(_UNIQUE.fullmatch(str(unit.value)) for unit in units)
+    return any(_UNIQUE_OU.fullmatch(str(unit.value)) for unit in units)
 
 
 def issue_ca(key: PrivateKey, name: x509.Name, validity: Window) -> x509.Certificate:
@@ -116,7 +117,7 @@ def issue_ca(key: PrivateKey, name: x509.Name, validity: Window) -> x509.Certifi
     identifier = x509.SubjectKeyIdentifier.from_public_key(public)
     return (
         _builder(name, name, public, validity)
-        .add_extension(_A_CA, critical=True)
+        .add_extension(_CA_CONSTRAINTS, critical=True)
         .add_extension(_CA_USAGE, critical=True)
         .add_extension(identifier, critical=False)
         .add_extension(
@@ -153,7 +154,7 @@ class Issuer:
         """Return an end-entity certificate (not a CA), which expires no later than the CA."""
         return (
             _builder(subject, self._name, public, validity.intersection(self._validity))
-            .add_extension(_NOT_A_CA, critical=True)
+            .add_extension(_LEAF_CONSTRAINTS, critical=True)
             .add_extension(_LEAF_USAGE, critical=True)
             .add_extension(x509.SubjectKeyIdentifier.from_public_key(public), critical=False)
             .add_extension(self._authority_id, critical=False)
@@ -230,7 +231,7 @@ def _first_certificate(
 ) -> x509.Certificate:
     unreadable = f"the certificate {name} cannot be read"
     labels = pem_file.CERTIFICATES if trusted else pem_file.CERTIFICATES[:-1]
-    for block in _blocks(data, unreadable):
+    for block in _certificate_blocks(data, unreadable):
         if block.label in labels:
             return _certificate_in(block, unreadable, settings)
     why = f"It is not a PEM certificate: {pem_file.missing_block_reason(data, 'CERTIFICATE')}."
@@ -250,7 +251,7 @@ def load_certificates(
     load_certificate(data, name)
     unreadable = f"the certificates {name} cannot be read"
     certificates: list[x509.Certificate] = []
-    for block in list(_blocks(data, unreadable)):
+    for block in list(_certificate_blocks(data, unreadable)):
         if block.label in pem_file.CERTIFICATES:
             why = "A certificate after the first one is damaged." if certificates else _UNREADABLE
             of_block = settings if block.label == pem_file.CERTIFICATES[-1] else Settings.IGNORED
@@ -268,11 +269,11 @@ _RESTORE = "Restore it from a backup, or issue it again."
 _UNREADABLE = "It is not a PEM certificate, it is damaged, or its key algorithm is unknown."
 
 
-def _blocks(data: bytes, label: str) -> Iterator[pem_file.Block]:
+def _certificate_blocks(data: bytes, label: str) -> Iterator[pem_file.Block]:
     blocks, damage = _known_blocks(data)
     yield from blocks
     if damage:
-        raise PkiError(label, _sentence(damage), _RESTORE)
+        raise PkiError(label, _as_sentence(damage), _RESTORE)
 
 
 @lru_cache(maxsize=8)  # several readers ask for the certificate of an enclave, or for all of them
@@ -296,13 +297,13 @@ def _certificate_in(
         )
     with reading(unreadable, why, _RESTORE):
         certificate, remainder = der.split(block.content)
-        if not remainder or settings is Settings.IGNORED or _permits(remainder, settings):
+        if not remainder or settings is Settings.IGNORED or _permits_use(remainder, settings):
             return _load_der(certificate)
     why = "It is a TRUSTED CERTIFICATE that is not trusted for this use."
     raise PkiError(unreadable, why, "Write it with the label CERTIFICATE.")
 
 
-def _permits(trust_settings: bytes, settings: Settings) -> bool:
+def _permits_use(trust_settings: bytes, settings: Settings) -> bool:
     """Return whether the trust settings after a certificate allow its use (OpenSSL, obj_trust).
 
     Raises:
@@ -314,13 +315,13 @@ def _permits(trust_settings: bytes, settings: Settings) -> bool:
     parts = {part.tag: _purposes(part) for part in der.children(value.content)}
     if settings is Settings.READ:
         return True
-    uses = {_ANY_USE, _S_MIME} if settings is Settings.OF_DOCUMENTS else {_ANY_USE}
+    uses = {_OID_ANY_USE, _OID_S_MIME} if settings is Settings.OF_DOCUMENTS else {_OID_ANY_USE}
     trusted, rejected = parts.get(der.SEQUENCE), parts.get(der.CONTEXT_0)
     return not (rejected and rejected & uses) and (trusted is None or bool(trusted & uses))
 
 
-_ANY_USE = ExtendedKeyUsageOID.ANY_EXTENDED_KEY_USAGE.dotted_string
-_S_MIME = ExtendedKeyUsageOID.EMAIL_PROTECTION.dotted_string
+_OID_ANY_USE = ExtendedKeyUsageOID.ANY_EXTENDED_KEY_USAGE.dotted_string
+_OID_S_MIME = ExtendedKeyUsageOID.EMAIL_PROTECTION.dotted_string
 
 
 def _purposes(part: der.Value) -> set[str]:
@@ -329,7 +330,7 @@ def _purposes(part: der.Value) -> set[str]:
     return {der.decode_oid(purpose) for purpose in der.children(part.content)}
 
 
-def _sentence(clause: str) -> str:
+def _as_sentence(clause: str) -> str:
     return f"{clause[:1].upper()}{clause[1:]}."
 
 
@@ -344,7 +345,7 @@ def load_der_certificate(data: bytes) -> x509.Certificate:
 
 
 def _load_der(data: bytes) -> x509.Certificate:
-    known = len(data) < _USUAL_BYTES
+    known = len(data) < _MOST_CACHED_BYTES
     return _load_known_der(data) if known else _load_known_der.__wrapped__(data)
 
 
@@ -358,7 +359,7 @@ def _load_known_der(data: bytes) -> x509.Certificate:
     return _read_names(tolerant.read_certificate(data))
 
 
-_USUAL_BYTES = 16 * 1024
+_MOST_CACHED_BYTES = 16 * 1024
 
 
 def _read_in_full(certificate: x509.Certificate) -> x509.Certificate:
@@ -440,7 +441,7 @@ def likely_issued(certificate: x509.Certificate, authority: x509.Certificate) ->
 
 def is_for_pss(certificate: x509.Certificate) -> bool:
     """Return whether the key of a certificate is an RSA key for RSA-PSS alone (RFC 4055, 1.2)."""
-    return _key_algorithm(certificate)[0].content == _RSA_PSS
+    return _key_algorithm(certificate)[0].content == _OID_RSA_PSS
 
 
 def _normalized(certificate: x509.Certificate, part: bytes) -> bytes:
@@ -451,11 +452,11 @@ def _normalized(certificate: x509.Certificate, part: bytes) -> bytes:
 def has_explicit_curve(certificate: x509.Certificate) -> bool:
     """Return whether a certificate describes its elliptic curve by parameters instead of an OID."""
     kind, *parameters = _key_algorithm(certificate)
-    return kind.content == _EC and bool(parameters) and parameters[-1].tag == der.SEQUENCE
+    return kind.content == _OID_EC and bool(parameters) and parameters[-1].tag == der.SEQUENCE
 
 
-_RSA_PSS = der.encode_oid("1.2.840.113549.1.1.10")
-_EC = der.encode_oid("1.2.840.10045.2.1")
+_OID_RSA_PSS = der.encode_oid("1.2.840.113549.1.1.10")
+_OID_EC = der.encode_oid("1.2.840.10045.2.1")
 
 
 @lru_cache(maxsize=256)
@@ -472,7 +473,7 @@ def _key_algorithm(certificate: x509.Certificate) -> list[der.Value]:
 def _algorithms(certificate: x509.Certificate) -> tuple[der.Value, der.Value]:
     """Return the two fields for the signature algorithm: of the signed part, and of the whole.
 
-    OpenSSL compares the two fields when it verifies the signature.  It does not verify the
+    OpenSSL compares the two fields when it verifies the signature.  OpenSSL does not verify the
     signature of a self-signed CA (RFC 5280, 4.1.1.2).
     """
     certificate_value = der.first_value(
@@ -609,8 +610,8 @@ def _attribute_text(attribute: der.Value) -> str:
     encoding = _ENCODINGS.get(value.tag)
     if known is None or encoding is None:
         return f"{known or dotted}=#{value.whole.hex().upper()}"
-    text = _ESCAPED.sub(lambda found: f"\\{found[0]}", value.content.decode(encoding))
-    return f"{known}={_CONTROL.sub(lambda found: f'{chr(92)}{ord(found[0]):02X}', text)}"
+    text = _ESCAPED_CHARACTERS.sub(lambda found: f"\\{found[0]}", value.content.decode(encoding))
+    return f"{known}={_CONTROL_CHARACTERS.sub(lambda found: f'{chr(92)}{ord(found[0]):02X}', text)}"
 
 
 def parse_subject(text: str) -> x509.Name:
@@ -619,11 +620,11 @@ def parse_subject(text: str) -> x509.Name:
     Raises:
         ValueError: the text is not a distinguished name.
     """
-    return x509.Name.from_rfc4514_string(text, _oids())
+    return x509.Name.from_rfc4514_string(text, _oids_by_name())
 
 
 @cache
-def _oids() -> dict[str, x509.ObjectIdentifier]:
+def _oids_by_name() -> dict[str, x509.ObjectIdentifier]:
     return {name: x509.ObjectIdentifier(oid) for oid, name in short_names().items()}
 
 
@@ -656,7 +657,8 @@ _FIRST_BIT = 1 << (4 * IDENTITY_DIGITS - 1)
 def identity_of(subject: bytes) -> str:
     """Return the first 6 bytes (hexadecimal) of a secured participant's GUID.
 
-    They depend only on its ``subject`` name (DER).  Source: DDS-Security 1.1, 9.3.3.
+    The bytes depend only on the participant's ``subject`` name (DER).  Source: DDS-Security 1.1,
+    9.3.3.
     """
     digest = int(sha256(subject).hexdigest()[:IDENTITY_DIGITS], 16)
     return f"{_FIRST_BIT | digest >> 1:x}"
@@ -668,11 +670,11 @@ def identity_of(subject: bytes) -> str:
 # read from their DER, in a tenth of the time that reading a certificate in full takes.
 
 
-_EXTENSIONS = 0xA3
+_EXTENSIONS_TAG = 0xA3
 _LONGEST_SERIAL = 20
-_TIME = re.compile(r"\d{14}Z", re.ASCII)
-_NETSCAPE_TYPE = "2.16.840.1.113730.1.1"
-_EVALUATED = {
+_GENERALIZED_TIME = re.compile(r"\d{14}Z", re.ASCII)
+_OID_NETSCAPE_TYPE = "2.16.840.1.113730.1.1"
+_EVALUATED_EXTENSIONS = {
     der.encode_oid(oid)
     for oid in (
         ExtensionOID.AUTHORITY_KEY_IDENTIFIER.dotted_string,
@@ -683,15 +685,15 @@ _EVALUATED = {
         ExtensionOID.INHIBIT_ANY_POLICY.dotted_string,
         ExtensionOID.KEY_USAGE.dotted_string,
         ExtensionOID.POLICY_CONSTRAINTS.dotted_string,
-        _NETSCAPE_TYPE,
+        _OID_NETSCAPE_TYPE,
     )
 }
 """The extensions whose values OpenSSL evaluates, except for those that hold names."""
-_UNUSUAL = re.compile(rb"[^A-Za-z0-9/_]")
+_UNUSUAL_CHARACTERS = re.compile(rb"[^A-Za-z0-9/_]")
 
 
 class CertificateForm(NamedTuple):
-    """The parts of a certificate file that do not differ from one enclave to the next.
+    """The parts of a certificate file that are usually equal for all enclaves.
 
     Two files with equal ``common`` differ only in values of their own, such as the key.
     ``validity`` is the period in DER.
@@ -708,36 +710,36 @@ def read_form(data: bytes) -> CertificateForm | None:
         blocks = list(pem_file.blocks(data))
         first = next(block for block in blocks if block.label in pem_file.CERTIFICATES)
         around = tuple((block.label, block.headers) for block in blocks)
-        form = _form(first.content)
+        form = _certificate_form(first.content)
         return form._replace(common=(*around, *form.common))
     return None
 
 
 def holds_at(form: CertificateForm, now: datetime) -> bool | None:
     """Return whether a certificate is valid at ``now``; None if its dates cannot be read."""
-    times = _times(form.validity)
+    times = _validity_times(form.validity)
     return times and times[0] <= now.astimezone(UTC).strftime("%Y%m%d%H%M%SZ") <= times[1]
 
 
 @lru_cache(maxsize=256)  # certificates issued together share their dates
-def _times(validity: bytes) -> tuple[str, str] | None:
+def _validity_times(validity: bytes) -> tuple[str, str] | None:
     """Return the start and the end of a validity (DER), as GeneralizedTime (RFC 5280, 4.1.2.5)."""
     with suppress(PkiError, ValueError):
-        begin, end = map(_time, der.children(validity))
+        begin, end = map(_as_generalized_time, der.children(validity))
         return begin, end
     return None
 
 
-def _time(value: der.Value) -> str:
+def _as_generalized_time(value: der.Value) -> str:
     text = value.content.decode("ascii")
     if value.tag == der.UTC_TIME:
         text = f"{'20' if text < '50' else '19'}{text}"
-    if not _TIME.fullmatch(text):
+    if not _GENERALIZED_TIME.fullmatch(text):
         raise ValueError("not a time in UTC")
     return text
 
 
-def _form(certificate: bytes) -> CertificateForm:
+def _certificate_form(certificate: bytes) -> CertificateForm:
     (certificate_value,) = der.children(certificate)
     signed, signature_algorithm, _ = der.children(certificate_value.content)
     parts = der.children(signed.content)
@@ -763,17 +765,17 @@ def _form_of_name(name: bytes) -> tuple[object, ...]:
         for attribute in der.children(part.content):
             kind, value = der.children(attribute.content)
             kinds.append((kind.content, value.tag))
-            unusual.update(_UNUSUAL.findall(value.content))
+            unusual.update(_UNUSUAL_CHARACTERS.findall(value.content))
         kinds.append(None)
     return (*kinds, frozenset(unusual))
 
 
 def _form_of_extensions(part: der.Value) -> tuple[object, ...]:
-    if part.tag != _EXTENSIONS:
+    if part.tag != _EXTENSIONS_TAG:
         return (part.whole,)
     (extensions,) = der.children(part.content)
     return tuple(
-        child.whole if kind.content in _EVALUATED else (kind.content, len(rest) > 1)
+        child.whole if kind.content in _EVALUATED_EXTENSIONS else (kind.content, len(rest) > 1)
         for child in der.children(extensions.content)
         for kind, *rest in (der.children(child.content),)
     )
@@ -783,7 +785,7 @@ def _form_of_extensions(part: der.Value) -> tuple[object, ...]:
 
 _MAX_BYTES = 64 * 1024
 """Largest request that is read, in bytes."""
-_DIGESTS = (hashes.SHA256, hashes.SHA384, hashes.SHA512)
+_REQUEST_DIGESTS = (hashes.SHA256, hashes.SHA384, hashes.SHA512)
 
 
 class SigningRequest(NamedTuple):
@@ -843,7 +845,7 @@ def load_request(data: bytes, label: str) -> SigningRequest:
             f"A certificate for this key would prove nothing: {problem}.",
             "Create another key with `sros create_request`, in another folder or on another token.",
         )
-    if not isinstance(digest, _DIGESTS) or not _has_valid_signature(request):
+    if not isinstance(digest, _REQUEST_DIGESTS) or not _has_valid_signature(request):
         raise PkiError(
             f"the signature of the request {label} is not valid",
             "The sender did not prove possession of the key, or the request was changed "

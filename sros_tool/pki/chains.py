@@ -33,8 +33,8 @@ from sros_tool.pki.distinguished_names import canonical
 from sros_tool.pki.tolerant import UnknownKey, UnreadableName, is_unread
 from sros_tool.validity import iso
 
-_NETSCAPE_TYPE = ObjectIdentifier("2.16.840.1.113730.1.1")
-_CRITICAL = frozenset(
+_OID_NETSCAPE_TYPE = ObjectIdentifier("2.16.840.1.113730.1.1")
+_KNOWN_CRITICAL = frozenset(
     {
         ExtensionOID.BASIC_CONSTRAINTS,
         ExtensionOID.KEY_USAGE,
@@ -47,18 +47,18 @@ _CRITICAL = frozenset(
         ExtensionOID.NAME_CONSTRAINTS,
         ExtensionOID.CRL_DISTRIBUTION_POINTS,
         ExtensionOID.OCSP_NO_CHECK,
-        _NETSCAPE_TYPE,
+        _OID_NETSCAPE_TYPE,
     }
 )
 """The critical extensions that are accepted (X509_supported_extension); any other is refused."""
 _NO_USAGE = x509.KeyUsage(*[False] * 9)
-_PROXY = ObjectIdentifier("1.3.6.1.5.5.7.1.14")
-_NETWORKS = {
+_OID_PROXY = ObjectIdentifier("1.3.6.1.5.5.7.1.14")
+_NETWORK_EXTENSIONS = {
     ObjectIdentifier("1.3.6.1.5.5.7.1.7"): "sbgp-ipAddrBlock",
     ObjectIdentifier("1.3.6.1.5.5.7.1.8"): "sbgp-autonomousSysNum",
 }
 """The extensions for IP addresses and autonomous system numbers (RFC 3779)."""
-_INHERITED = tuple(
+_INHERITED_VALUES = tuple(
     map(
         bytes.fromhex,
         ("30083006040200010500", "30083006040200020500", "3004a0020500", "3004a1020500"),
@@ -66,14 +66,14 @@ _INHERITED = tuple(
 )
 """Values of the network extensions that mean "inherited from the CA"."""
 _SSL_CLIENT, _SMIME, _SMIME_CA, _ANY_NETSCAPE_CA = 0x80, 0x20, 0x02, 0x07
-_OF_POLICIES = {
+_POLICY_EXTENSIONS = {
     ExtensionOID.CERTIFICATE_POLICIES,
     ExtensionOID.POLICY_CONSTRAINTS,
     ExtensionOID.POLICY_MAPPINGS,
     ExtensionOID.INHIBIT_ANY_POLICY,
 }
-_DEEPEST = 100
-_WITH_EXTENSIONS = 3
+_LONGEST_CHAIN = 100
+_VERSION_3 = 3
 """X.509v3, the version of certificates with extensions (RFC 5280, 4.1.2.1)."""
 
 
@@ -179,10 +179,10 @@ def build_chain(
     chain = [start]
     only_others = 1  # the certificates at the start of the chain that are not trusted CAs
     ask_others = True
-    while len(chain) <= _DEEPEST:
+    while len(chain) <= _LONGEST_CHAIN:
         last = chain[-1]
         complete = _is_self_signed(last)
-        issuer = _issuer(last, authorities, moment)
+        issuer = _find_issuer(last, authorities, moment)
         if issuer is not None and not complete:
             chain.append(issuer)
         elif issuer is not None and len(chain) == only_others:
@@ -196,7 +196,9 @@ def build_chain(
                 return chain, ""
             continue
         below = (
-            None if complete or not ask_others else _issuer(last, other_certificates, moment, chain)
+            None
+            if complete or not ask_others
+            else _find_issuer(last, other_certificates, moment, chain)
         )
         if below is None:
             kind = "self-signed" if complete else "issuer"
@@ -211,7 +213,7 @@ def _is_self_signed(certificate: x509.Certificate) -> bool:
     return likely_issued(certificate, certificate)
 
 
-def _issuer(
+def _find_issuer(
     certificate: x509.Certificate,
     candidates: Sequence[x509.Certificate],
     moment: datetime,
@@ -219,7 +221,8 @@ def _issuer(
 ) -> x509.Certificate | None:
     """Return the issuer of ``certificate``, or None.
 
-    The first candidate that is valid at ``moment`` is chosen, otherwise the one that expires last.
+    The first candidate that is valid at ``moment`` is chosen, otherwise the candidate that expires
+    last.
     """
     certificates = [
         candidate
@@ -273,9 +276,13 @@ def _extension_faults(certificate: x509.Certificate) -> tuple[str, ...]:
     if _netscape_type(certificate) == -1:
         faults.append(f"the nsCertType of {name} cannot be read")
     for found in certificate.extensions:
-        if found.oid == _PROXY:
+        if found.oid == _OID_PROXY:
             faults.append(f"{name} has proxyCertInfo, so it is a proxy certificate")
-        elif found.critical and found.oid not in _CRITICAL and found.oid not in _NETWORKS:
+        elif (
+            found.critical
+            and found.oid not in _KNOWN_CRITICAL
+            and found.oid not in _NETWORK_EXTENSIONS
+        ):
             oid = found.oid.dotted_string
             faults.append(f"{name} has the unknown critical extension {oid}")
     return tuple(faults)
@@ -292,19 +299,19 @@ def _network_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
     Extensions with the value "inherited from the CA" restrict nothing.  But if the first
     certificate has such an extension, the trusted CA must not have that value.
     """
-    for oid, title in _NETWORKS.items():
+    for oid, title in _NETWORK_EXTENSIONS.items():
         values = [
             [part.value.public_bytes() for part in certificate.extensions if part.oid == oid]
             for certificate in chain
         ]
         for certificate, networks in zip(chain, values, strict=True):
-            if len(networks) > 1 or not set(networks) <= set(_INHERITED):
+            if len(networks) > 1 or not set(networks) <= set(_INHERITED_VALUES):
                 yield f"{subject_text(certificate.subject)} has {title}, which sros does not know"
         if values[0] and values[-1]:
             yield f"{subject_text(chain[-1].subject)} has {title} of another CA, and is trusted"
 
 
-class _Authority(Flag):
+class _CaStatus(Flag):
     """Whether OpenSSL accepts a certificate as a CA certificate (X509_check_ca)."""
 
     NO = 0
@@ -315,24 +322,26 @@ class _Authority(Flag):
 
 
 @lru_cache(maxsize=64)
-def _authority(certificate: x509.Certificate) -> _Authority:
+def _ca_status(certificate: x509.Certificate) -> _CaStatus:
     if not _may_sign_certificates(certificate):
-        return _Authority.NO
+        return _CaStatus.NO
     constraints = extension(certificate, x509.BasicConstraints)
     if constraints is not None:
-        return _Authority.YES if constraints.ca else _Authority.NO
+        return _CaStatus.YES if constraints.ca else _CaStatus.NO
     first_version = certificate.version is x509.Version.v1 and _is_self_signed(certificate)
     if first_version or extension(certificate, x509.KeyUsage) is not None:
-        return _Authority.OLD
+        return _CaStatus.OLD
     if (_netscape_type(certificate) or 0) & _ANY_NETSCAPE_CA:
-        return _Authority.OLD | _Authority.NETSCAPE
-    return _Authority.NO
+        return _CaStatus.OLD | _CaStatus.NETSCAPE
+    return _CaStatus.NO
 
 
 def _netscape_type(certificate: x509.Certificate) -> int | None:
     """Return the bits of the nsCertType extension; None without it, -1 if it is unreadable."""
     kinds = [
-        extension.value for extension in certificate.extensions if extension.oid == _NETSCAPE_TYPE
+        extension.value
+        for extension in certificate.extensions
+        if extension.oid == _OID_NETSCAPE_TYPE
     ]
     if not kinds:
         return None
@@ -345,7 +354,7 @@ def _netscape_type(certificate: x509.Certificate) -> int | None:
 
 def _authority_faults(chain: Sequence[x509.Certificate], checks: Checks) -> Iterator[str]:
     strict = Checks.STRICT in checks
-    if strict and _Authority.OLD in _authority(chain[0]):
+    if strict and _CaStatus.OLD in _ca_status(chain[0]):
         yield f"{subject_text(chain[0].subject)} has no basicConstraints, so it is not a CA"
     if len(chain) > 1:
         for certificate in filter(has_explicit_curve, chain):
@@ -355,9 +364,9 @@ def _authority_faults(chain: Sequence[x509.Certificate], checks: Checks) -> Iter
     for place, certificate in enumerate(chain):
         constraints = extension(certificate, x509.BasicConstraints)
         if place:
-            kind = _authority(certificate)
+            kind = _ca_status(certificate)
             root = place == len(chain) - 1
-            if not kind or (_Authority.OLD in kind and (strict or not root)):
+            if not kind or (_CaStatus.OLD in kind and (strict or not root)):
                 subject = subject_text(certificate.subject)
                 yield f"{subject} is not a CA: {_not_a_ca_clause(certificate)}"
         longest = constraints.path_length if constraints else None
@@ -399,7 +408,7 @@ def purpose_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
             continue
         needed = _SMIME_CA if certificate is not chain[0] else _SMIME | _SSL_CLIENT
         if not kinds & needed and (
-            certificate is chain[0] or _Authority.NETSCAPE in _authority(certificate)
+            certificate is chain[0] or _CaStatus.NETSCAPE in _ca_status(certificate)
         ):
             yield f"the nsCertType of {name} has no S/MIME, which signed documents need"
 
@@ -412,17 +421,14 @@ def _strict_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
         usage = extension(certificate, x509.KeyUsage)
         constraints = extension(certificate, x509.BasicConstraints)
         version = tolerant.version_of(certificate)
-        if version < _WITH_EXTENSIONS and list(certificate.extensions):
+        if version < _VERSION_3 and list(certificate.extensions):
             yield f"{name} has extensions, which its X.509 version does not allow"
         if constraints and constraints.ca:
-            if ExtensionOID.BASIC_CONSTRAINTS not in _critical(certificate):
+            if ExtensionOID.BASIC_CONSTRAINTS not in _critical_extensions(certificate):
                 yield f"the basicConstraints of {name} are not critical"
             if usage is None:
                 yield f"{name} is a CA without keyUsage"
-            if (
-                version >= _WITH_EXTENSIONS
-                and extension(certificate, x509.SubjectKeyIdentifier) is None
-            ):
+            if version >= _VERSION_3 and extension(certificate, x509.SubjectKeyIdentifier) is None:
                 yield f"{name} is a CA without subjectKeyIdentifier"
         elif usage and usage.key_cert_sign:
             yield f"{name} has keyCertSign but is not a CA"
@@ -434,9 +440,9 @@ def _strict_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
         names = extension(certificate, x509.SubjectAlternativeName)
         if names is not None and not list(names):
             yield f"the subjectAltName of {name} is empty"
-        if _IDENTIFIERS & _critical(certificate):
+        if _IDENTIFIERS & _critical_extensions(certificate):
             yield f"a key identifier of {name} is critical"
-        if version >= _WITH_EXTENSIONS and certificate is not chain[-1]:
+        if version >= _VERSION_3 and certificate is not chain[-1]:
             authority = extension(certificate, x509.AuthorityKeyIdentifier)
             if authority is None or authority.key_identifier is None:
                 yield f"{name} lacks an authorityKeyIdentifier"
@@ -445,7 +451,7 @@ def _strict_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
 _IDENTIFIERS = {ExtensionOID.SUBJECT_KEY_IDENTIFIER, ExtensionOID.AUTHORITY_KEY_IDENTIFIER}
 
 
-def _critical(certificate: x509.Certificate) -> set[ObjectIdentifier]:
+def _critical_extensions(certificate: x509.Certificate) -> set[ObjectIdentifier]:
     return {extension.oid for extension in certificate.extensions if extension.critical}
 
 
@@ -475,7 +481,7 @@ def _signature_faults(chain: Sequence[x509.Certificate], checks: Checks) -> Iter
             yield f"the signature of {subject_text(below.subject)} is not by the key of {name}"
 
 
-_ALWAYS_ASKED = {ExtensionOID.CERTIFICATE_POLICIES, ExtensionOID.POLICY_CONSTRAINTS}
+_DEMANDING_EXTENSIONS = {ExtensionOID.CERTIFICATE_POLICIES, ExtensionOID.POLICY_CONSTRAINTS}
 """The policy extensions that OpenSSL decodes even if no certificate names a policy."""
 
 
@@ -486,7 +492,8 @@ def _policy_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
     Also yield a fault if a certificate maps policies, which sros does not support.
     """
     if not any(
-        _OF_POLICIES & {extension.oid for extension in below.extensions} for below in chain[:-1]
+        _POLICY_EXTENSIONS & {extension.oid for extension in below.extensions}
+        for below in chain[:-1]
     ):
         return
     until_demanded = len(chain)
@@ -501,7 +508,7 @@ def _policy_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
         )
         if maps and policies is not None:
             yield f"{name} has policyMappings, which sros does not know"
-        asked = _OF_POLICIES if named else _ALWAYS_ASKED
+        asked = _POLICY_EXTENSIONS if named else _DEMANDING_EXTENSIONS
         if any(
             extension.oid in asked and is_unread(extension) for extension in certificate.extensions
         ):

@@ -1,4 +1,4 @@
-"""Certificate revocation lists (CRLs, RFC 5280, section 5), and what OpenSSL decides with them.
+"""Certificate revocation lists (CRLs, RFC 5280, section 5), and the decisions of OpenSSL with CRLs.
 
 DDS vendors need a list only of the CA that issued the certificate, not of the CAs above it
 (``X509_V_FLAG_CRL_CHECK`` without ``X509_V_FLAG_CRL_CHECK_ALL``).
@@ -40,7 +40,7 @@ from sros_tool.validity import iso, soon_limit
 
 CRL_MARK = b"-----BEGIN X509 CRL-----"
 """The first line of a PEM revocation list."""
-_LABEL = "X509 CRL"
+_PEM_LABEL = "X509 CRL"
 REASONS = tuple(
     flag.value
     for flag in x509.ReasonFlags
@@ -99,9 +99,9 @@ def sign_crl(
         issuer: the certificate of the CA.
         key: the private key of the CA.
         revoked: the entries.
-        number: the number of the list, larger than that of the list before.
+        number: the number of the list, larger than the number of the previous list.
         this_update: the time from which the list is valid.
-        next_update: the time at which it expires.
+        next_update: the time at which the list expires.
 
     Raises:
         PkiError: a serial number is negative, or has more than 159 bits.
@@ -182,7 +182,7 @@ def read_list(data: bytes, name: str) -> x509.CertificateRevocationList:
     """
     with _reading_list(name, data):
         blocks = pem.blocks(data)
-        return _read_block(next(block for block in blocks if block.label == _LABEL))
+        return _read_block(next(block for block in blocks if block.label == _PEM_LABEL))
 
 
 def read_lists(data: bytes, name: str) -> tuple[x509.CertificateRevocationList, ...]:
@@ -193,7 +193,7 @@ def read_lists(data: bytes, name: str) -> tuple[x509.CertificateRevocationList, 
     """
     with _reading_list(name, data):
         blocks = pem.blocks(data)
-        return tuple(_read_block(block) for block in blocks if block.label == _LABEL)
+        return tuple(_read_block(block) for block in blocks if block.label == _PEM_LABEL)
 
 
 def _reading_list(name: str, data: bytes) -> AbstractContextManager[None]:
@@ -209,11 +209,11 @@ def _reading_list(name: str, data: bytes) -> AbstractContextManager[None]:
 def _read_block(block: pem.Block) -> x509.CertificateRevocationList:
     if block.headers:
         raise ValueError("OpenSSL reads no list with PEM headers")
-    return _read(block.content)
+    return _load_list(block.content)
 
 
 @lru_cache(maxsize=8)
-def _read(content: bytes) -> x509.CertificateRevocationList:
+def _load_list(content: bytes) -> x509.CertificateRevocationList:
     data, _ = der.split(content)
     try:
         return _read_in_full(x509.load_der_x509_crl(data))
@@ -279,7 +279,7 @@ _READ_IF_CRITICAL = (
 )
 
 
-_OF_USERS = x509.IssuingDistributionPoint(
+_FOR_USER_CERTIFICATES = x509.IssuingDistributionPoint(
     full_name=None,
     relative_name=None,
     only_contains_user_certs=True,
@@ -301,7 +301,10 @@ def refusal_of(crl: x509.CertificateRevocationList) -> str:
             return f"it has the unknown critical extension {ext.oid.dotted_string}"
         if ext.oid == ExtensionOID.DELTA_CRL_INDICATOR:
             return "it is a delta CRL: only the changes to another list"
-        if isinstance(ext.value, x509.IssuingDistributionPoint) and ext.value != _OF_USERS:
+        if (
+            isinstance(ext.value, x509.IssuingDistributionPoint)
+            and ext.value != _FOR_USER_CERTIFICATES
+        ):
             return "it is not for all certificates of its CA"
     for entry in crl:
         for ext in entry.extensions:
@@ -312,7 +315,7 @@ def refusal_of(crl: x509.CertificateRevocationList) -> str:
 
 def signed_by(crl: x509.CertificateRevocationList, authority: x509.Certificate) -> bool:
     """Return whether ``authority`` issued and signed the revocation list."""
-    return same_name(crl.issuer, authority.subject) and _is_signed(_Content(crl), authority)
+    return same_name(crl.issuer, authority.subject) and _is_signed(_HashableList(crl), authority)
 
 
 def may_sign_lists(authority: x509.Certificate) -> bool:
@@ -346,7 +349,7 @@ class Revocations(NamedTuple):
 
 @lru_cache(maxsize=256)
 def newest_revocations(signer: bytes, *files: bytes) -> Revocations:
-    """Return what the newest list in ``files`` revokes, among the lists that ``signer`` signed.
+    """Return the revocations of the newest list in ``files`` that ``signer`` signed.
 
     ``signer`` is the certificate of a CA, as PEM.  An unreadable file counts as a file without
     lists.
@@ -379,7 +382,7 @@ def _revoked(entry: x509.RevokedCertificate) -> Revoked:
 
 Lists = Sequence[x509.CertificateRevocationList]
 
-_REASONS = frozenset(x509.ReasonFlags) - {
+_ALL_REASONS = frozenset(x509.ReasonFlags) - {
     x509.ReasonFlags.unspecified,
     x509.ReasonFlags.remove_from_crl,
 }
@@ -401,7 +404,8 @@ class Obstacle(Enum):
 class ListRefusal(NamedTuple):
     """The refusal of a certificate because of revocation lists.
 
-    It has the reason, the list (None if a list is missing), and a clause for messages.
+    ``obstacle`` is the reason, ``list`` the list (None if a list is missing), and ``text`` a clause
+    for messages.
     """
 
     obstacle: Obstacle
@@ -409,7 +413,7 @@ class ListRefusal(NamedTuple):
     text: str
 
 
-class _Score(NamedTuple):
+class _ListScore(NamedTuple):
     """How well a list fits a certificate; scores compare field by field, in this order.
 
     Source: OpenSSL 3, x509_vfy.c (get_crl_score).
@@ -448,7 +452,7 @@ def list_refusal(
         expiry = next_update(crl)
         assert expiry
         return ListRefusal(Obstacle.EXPIRED, crl, f"it expired at {iso(expiry)}")
-    if not _is_signed(_Content(crl), issuer):
+    if not _is_signed(_HashableList(crl), issuer):
         return ListRefusal(Obstacle.SIGNATURE, crl, f"it is not signed with the key of {name}")
     if not score.only_known:
         return ListRefusal(Obstacle.CRITICAL, crl, "it has an unknown critical extension")
@@ -462,7 +466,7 @@ def list_refusal(
 
 def _revokes(crl: x509.CertificateRevocationList, certificate: x509.Certificate) -> bool:
     """Return whether a list revokes a certificate; an entry with removeFromCRL revokes nothing."""
-    if not _entries(_Content(crl)).name_issuers:
+    if not _entry_extensions(_HashableList(crl)).name_issuers:
         return lists_as_revoked(crl, certificate.serial_number)
     issuers: list[x509.Name] | None = None
     for entry in crl:
@@ -482,12 +486,12 @@ def _revokes(crl: x509.CertificateRevocationList, certificate: x509.Certificate)
 
 def _best_list(
     chain: Sequence[x509.Certificate], lists: Lists, moment: datetime
-) -> tuple[x509.CertificateRevocationList, x509.Certificate, _Score] | None:
+) -> tuple[x509.CertificateRevocationList, x509.Certificate, _ListScore] | None:
     """Return the list that OpenSSL uses for ``chain[0]``, with its issuer and score, or None.
 
     OpenSSL uses the list with the highest score, and the newest list among equals (get_crl_sk).
     """
-    best: tuple[x509.CertificateRevocationList, x509.Certificate, _Score] | None = None
+    best: tuple[x509.CertificateRevocationList, x509.Certificate, _ListScore] | None = None
     for crl in lists:
         issuer = _issuer(chain, crl)
         point = extension(crl, x509.IssuingDistributionPoint)
@@ -495,8 +499,8 @@ def _best_list(
             continue
         if extension(crl, x509.DeltaCRLIndicator) or extension(crl, ContradictoryPoint):
             continue
-        score = _Score(
-            not _entries(_Content(crl)).has_unknown,
+        score = _ListScore(
+            not _entry_extensions(_HashableList(crl)).has_unknown,
             _is_in_scope(chain[0], crl, point),
             last_update(crl) <= moment and not _has_expired(crl, moment),
             issuer is chain[min(1, len(chain) - 1)],
@@ -544,20 +548,20 @@ def _identifies(identifier: x509.AuthorityKeyIdentifier, authority: x509.Certifi
     return not names or same_name(names[0], authority.issuer)
 
 
-class _Content:
+class _HashableList:
     """A hashable revocation list, so that caches work for all enclaves with the same list."""
 
     def __init__(self, crl: x509.CertificateRevocationList) -> None:
         self.crl = crl
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Content) and self.crl == other.crl
+        return isinstance(other, _HashableList) and self.crl == other.crl
 
     def __hash__(self) -> int:
         return hash(self.crl.signature)
 
 
-class _Entries(NamedTuple):
+class _EntryExtensions(NamedTuple):
     """Properties of the extensions of a list and of its entries.
 
     ``has_unknown``: the list or an entry has a critical extension that OpenSSL does not know.
@@ -569,7 +573,7 @@ class _Entries(NamedTuple):
 
 
 @lru_cache(maxsize=16)
-def _entries(content: _Content) -> _Entries:
+def _entry_extensions(content: _HashableList) -> _EntryExtensions:
     crl = content.crl
     unknown = any(ext.critical and ext.oid not in _READ_IF_CRITICAL for ext in crl.extensions)
     in_entry = any(
@@ -577,11 +581,11 @@ def _entries(content: _Content) -> _Entries:
         for entry in crl
         for ext in entry.extensions
     )
-    return _Entries(unknown or in_entry, names_issuers(crl))
+    return _EntryExtensions(unknown or in_entry, names_issuers(crl))
 
 
 @lru_cache(maxsize=16)
-def _is_signed(content: _Content, issuer: x509.Certificate) -> bool:
+def _is_signed(content: _HashableList, issuer: x509.Certificate) -> bool:
     return is_signed(content.crl, content.crl.tbs_certlist_bytes, issuer)
 
 
@@ -605,17 +609,19 @@ def _is_in_scope(
     if point.full_name is None and point.relative_name is None:
         return True
     places = extension(certificate, x509.CRLDistributionPoints)
-    return any(_same_place(place, point) for place in places or () if _is_in_place(place, crl))
+    return any(
+        _have_common_name(place, point) for place in places or () if _is_at_point(place, crl)
+    )
 
 
-def _is_in_place(place: x509.DistributionPoint, crl: x509.CertificateRevocationList) -> bool:
+def _is_at_point(place: x509.DistributionPoint, crl: x509.CertificateRevocationList) -> bool:
     if place.crl_issuer is None:
         return True
     names = [name.value for name in place.crl_issuer if isinstance(name, x509.DirectoryName)]
     return any(same_name(name, crl.issuer) for name in names)
 
 
-def _same_place(place: x509.DistributionPoint, point: x509.IssuingDistributionPoint) -> bool:
+def _have_common_name(place: x509.DistributionPoint, point: x509.IssuingDistributionPoint) -> bool:
     if place.full_name is None and place.relative_name is None:
         return True
     if place.full_name is not None and point.full_name is not None:
@@ -631,8 +637,8 @@ def _general_name(name: x509.GeneralName) -> object:
 def _covers_all_reasons(certificate: x509.Certificate, crl: x509.CertificateRevocationList) -> bool:
     """Return whether the distribution points of a certificate cover all reasons to revoke it."""
     for place in extension(certificate, x509.CRLDistributionPoints) or ():
-        if _is_in_place(place, crl):
-            return place.reasons is None or place.reasons >= _REASONS
+        if _is_at_point(place, crl):
+            return place.reasons is None or place.reasons >= _ALL_REASONS
     return True
 
 

@@ -15,7 +15,7 @@ from sros_tool.errors import PkiError
 BOOLEAN, INTEGER, BIT_STRING, OCTET_STRING, OID, SEQUENCE, SET = 1, 2, 3, 4, 6, 0x30, 0x31
 UTC_TIME, GENERALIZED_TIME = 0x17, 0x18
 CONTEXT_0, CONTEXT_1 = 0xA0, 0xA1
-_SUBIDENTIFIERS = re.compile(rb"(?:(?:[\x81-\xff][\x80-\xff]*)?[\x00-\x7f])+")
+_OID_CONTENT = re.compile(rb"(?:(?:[\x81-\xff][\x80-\xff]*)?[\x00-\x7f])+")
 
 
 class Value(NamedTuple):
@@ -71,7 +71,7 @@ def split(data: bytes) -> tuple[bytes, bytes]:
     Raises:
         PkiError: the value is truncated, or has a form that this reader does not support.
     """
-    end = _header(data, 0)[2] or _normalized(data, 0, 0)[1]
+    end = _read_header(data, 0)[2] or _normalized(data, 0, 0)[1]
     return data[:end], data[end:]
 
 
@@ -108,17 +108,17 @@ def first_part(data: bytes) -> bytes:
     Raises:
         PkiError: a value is truncated, or has a form that this reader does not support.
     """
-    begin = _header(data, 0)[1]
+    begin = _read_header(data, 0)[1]
     return data[begin : _normalized(data, begin, 1)[1]]
 
 
-_DEEPEST = 30
+_DEEPEST_NESTING = 30
 _CONSTRUCTED = 0x20
 _INDEFINITE = 0x80
 _END_OF_CONTENTS = b"\0\0"
 
 
-def _header(data: bytes, start: int) -> tuple[int, int, int | None]:
+def _read_header(data: bytes, start: int) -> tuple[int, int, int | None]:
     """Return the tag of the value at ``start``, and the offsets of the content's start and end.
 
     The end is None if two zero bytes mark the end of the content.
@@ -142,9 +142,9 @@ def _header(data: bytes, start: int) -> tuple[int, int, int | None]:
 
 def _normalized(data: bytes, start: int, depth: int) -> tuple[bytes, int]:
     """Return the value at ``start``, re-encoded with DER lengths, and the offset of its end."""
-    if depth > _DEEPEST:
+    if depth > _DEEPEST_NESTING:
         raise PkiError("a DER value has a form that is not supported")
-    tag, begin, end = _header(data, start)
+    tag, begin, end = _read_header(data, start)
     if not tag & _CONSTRUCTED and end is not None:
         content = data[begin:end]
         is_true = tag == BOOLEAN and len(content) == 1 and content != b"\0"
@@ -206,7 +206,7 @@ def decode_oid(value: Value) -> str:
         PkiError: the value is not an object identifier, or one that OpenSSL refuses
             (ossl_c2i_ASN1_OBJECT).
     """
-    if value.tag != OID or not _SUBIDENTIFIERS.fullmatch(value.content):
+    if value.tag != OID or not _OID_CONTENT.fullmatch(value.content):
         raise PkiError("a DER value is not an object identifier")
     numbers = [0]
     for octet in value.content:

@@ -54,13 +54,15 @@ def canonical_der(name: bytes) -> tuple[bytes, ...]:
     """Return a name, given in DER, in the form of `canonical`."""
     parts = der.children(der.first_value(name).content)
     return tuple(
-        b"".join(sorted(_attribute(attribute) for attribute in der.children(part.content)))
+        b"".join(
+            sorted(_canonical_attribute(attribute) for attribute in der.children(part.content))
+        )
         for part in parts
         if part.content
     )
 
 
-def _attribute(attribute: der.Value) -> bytes:
+def _canonical_attribute(attribute: der.Value) -> bytes:
     kind, value = der.children(attribute.content)
     encoding = _ENCODINGS.get(value.tag)
     if encoding is None:
@@ -88,7 +90,7 @@ def short_names() -> Mapping[str, str]:
 
 
 _BMP_STRING = 0x1E
-_IN_NAMES = (0x03, 0x0C, 0x12, 0x13, 0x14, 0x16, 0x1C, _BMP_STRING)
+_TYPES_IN_NAMES = (0x03, 0x0C, 0x12, 0x13, 0x14, 0x16, 0x1C, _BMP_STRING)
 """The ASN.1 types that OpenSSL reads in names (B_ASN1_PRINTABLE)."""
 
 
@@ -135,7 +137,7 @@ def read_name_der(name: bytes) -> None:
             oid, value = der.children(attribute.content)
             if (attribute.tag, oid.tag) != (der.SEQUENCE, der.OID):
                 raise ValueError("not the structure of a name")
-            if value.tag not in _IN_NAMES:
+            if value.tag not in _TYPES_IN_NAMES:
                 raise ValueError(f"a value of a name has the ASN.1 type {value.tag}")
             characters = value.content.decode("utf-16-be") if value.tag == _BMP_STRING else ""
             if max(characters, default="") > "\uffff":

@@ -68,18 +68,18 @@ def _encrypted(key: bytes, passphrase: str) -> bytes:
     padder, encryptor = PKCS7(128).padder(), Cipher(AES(secret), CBC(start)).encryptor()
     content = encryptor.update(padder.update(key) + padder.finalize()) + encryptor.finalize()
     numbers = map(der.encode_integer, (_N, _R, _P))
-    scrypt = _algorithm(
+    scrypt = _algorithm_identifier(
         _SCRYPT, der.encode(der.SEQUENCE, der.encode(der.OCTET_STRING, salt), *numbers)
     )
-    cipher = _algorithm(_AES_256_CBC, der.encode(der.OCTET_STRING, start))
-    scheme = _algorithm(_PBES2, der.encode(der.SEQUENCE, scrypt, cipher))
+    cipher = _algorithm_identifier(_AES_256_CBC, der.encode(der.OCTET_STRING, start))
+    scheme = _algorithm_identifier(_PBES2, der.encode(der.SEQUENCE, scrypt, cipher))
     encrypted_key = der.encode(der.SEQUENCE, scheme, der.encode(der.OCTET_STRING, content))
     lines = textwrap.wrap(base64.b64encode(encrypted_key).decode(), 64)
     kind = "ENCRYPTED PRIVATE KEY-----"
     return "\n".join((f"-----BEGIN {kind}", *lines, f"-----END {kind}", "")).encode()
 
 
-def _algorithm(oid: str, parameters: bytes) -> bytes:
+def _algorithm_identifier(oid: str, parameters: bytes) -> bytes:
     return der.encode(der.SEQUENCE, der.encode(der.OID, der.encode_oid(oid)), parameters)
 
 
@@ -117,7 +117,7 @@ def load_any_key(
         PkiError: as `load_key`, except for the kind of the key.
     """
     pem = _key_block(pem, name)
-    if _TRADITIONAL in pem or _ENCRYPTED.match(pem):
+    if _TRADITIONAL_HEADER in pem or _ENCRYPTED.match(pem):
         if passphrase is None:
             raise PkiError(
                 f"the private key {name} is protected by a passphrase",
@@ -140,12 +140,13 @@ def is_key_for_pss(pem: bytes) -> bool:
         block = next(pem_file.blocks(_key_block(pem, "")))
         _, identifier, *_ = der.children(der.first_value(block.content).content)
         return (
-            identifier.tag == der.SEQUENCE and der.first_value(identifier.content).content == _PSS
+            identifier.tag == der.SEQUENCE
+            and der.first_value(identifier.content).content == _OID_RSA_PSS
         )
     return False
 
 
-_PSS = der.encode_oid("1.2.840.113549.1.1.10")
+_OID_RSA_PSS = der.encode_oid("1.2.840.113549.1.1.10")
 
 
 def check_key(content: bytes, label: str = "") -> None:
@@ -156,7 +157,7 @@ def check_key(content: bytes, label: str = "") -> None:
     if der.first_part(data)[0] != der.INTEGER:
         raise ValueError("an encrypted key, which `cryptography` 41 would try to decrypt")
     key = serialization.load_der_private_key(data, None, unsafe_skip_rsa_key_validation=True)
-    if not isinstance(key, _KINDS.get(label, object)):
+    if not isinstance(key, _KEY_CLASSES.get(label, object)):
         raise ValueError("a key of another algorithm than its label says")
 
 
@@ -170,7 +171,7 @@ def _key_block(data: bytes, name: str) -> bytes:
     damaged = False
     try:
         for block in pem_file.blocks(data):
-            if len(block.content) > _MAX_BYTES and block.label in _ALL_LABELS:
+            if len(block.content) > _MAX_BYTES and block.label in _PRIVATE_KEY_LABELS:
                 raise PkiError(
                     f"the private key {name} is too large",
                     f"It has more than {_MAX_BYTES // 1024} KiB; an RSA key of 4096 bits has 4.",
@@ -182,7 +183,7 @@ def _key_block(data: bytes, name: str) -> bytes:
                     check_key(block.content, block.label)
                     break
                 damaged = True
-            elif block.label in _ALL_LABELS:
+            elif block.label in _PRIVATE_KEY_LABELS:
                 break
         else:
             raise _unreadable_key_error(
@@ -190,7 +191,7 @@ def _key_block(data: bytes, name: str) -> bytes:
             )
     except PkiError as error:
         raise error if error.why else _unreadable_key_error(name, error.what) from error
-    encrypted = block.headers.startswith(_TRADITIONAL)
+    encrypted = block.headers.startswith(_TRADITIONAL_HEADER)
     if block.headers and not encrypted:
         raise _unreadable_key_error(name, "it has other PEM headers than those of an encrypted key")
     label, der_key = block.label, block.content
@@ -210,13 +211,13 @@ def _key_block(data: bytes, name: str) -> bytes:
 
 KEY_LABELS = ("PRIVATE KEY", "RSA PRIVATE KEY", "EC PRIVATE KEY", "DSA PRIVATE KEY")
 """The PEM labels of unencrypted private keys; a header can still say that the key is encrypted."""
-_KINDS: dict[str, type] = {
+_KEY_CLASSES: dict[str, type] = {
     "RSA PRIVATE KEY": rsa.RSAPrivateKey,
     "EC PRIVATE KEY": ec.EllipticCurvePrivateKey,
     "DSA PRIVATE KEY": dsa.DSAPrivateKey,
 }
-_ALL_LABELS = (*KEY_LABELS, "ENCRYPTED PRIVATE KEY")
-_TRADITIONAL = b"Proc-Type: 4,ENCRYPTED"
+_PRIVATE_KEY_LABELS = (*KEY_LABELS, "ENCRYPTED PRIVATE KEY")
+_TRADITIONAL_HEADER = b"Proc-Type: 4,ENCRYPTED"
 _MAX_BYTES = 16 * 1024
 _MAX_RSA_BITS = 4096
 _MAX_ROUNDS = 2_000_000
@@ -260,7 +261,7 @@ def _check_derivation(pem: bytes, name: str) -> None:
         raise _unreadable_key_error(name)  # `cryptography` would panic
     for block in _ENCRYPTED.findall(pem):
         try:
-            scrypt, numbers = _derivation(block)
+            scrypt, numbers = _derivation_cost(block)
         except (ValueError, PkiError) as error:
             raise _unreadable_key_error(name) from error
         if scrypt:
@@ -278,7 +279,7 @@ def _check_derivation(pem: bytes, name: str) -> None:
             )
 
 
-def _derivation(block: bytes) -> tuple[bool, list[int]]:
+def _derivation_cost(block: bytes) -> tuple[bool, list[int]]:
     """Return whether the key of a PEM block is derived by scrypt, and the cost parameters.
 
     For scrypt, the parameters are N, r and p; for others, the number of rounds comes first.
@@ -292,7 +293,7 @@ def _derivation(block: bytes) -> tuple[bool, list[int]]:
 
 
 # For PBKDF2 with SHA-256, by the OWASP Password Storage Cheat Sheet (2025).
-_FEWEST_ROUNDS = 600_000
+_FEWEST_SAFE_ROUNDS = 600_000
 _LEAST_SCRYPT_WORK = 2**17  # N * r * p of `openssl pkcs8 -scrypt`
 
 
@@ -302,16 +303,16 @@ def few_rounds(pem: bytes) -> str:
     Source: RFC 8018, 4.2; OpenSSL 3.0, openssl-pkcs8 (2048 rounds) and PEM_write_bio_PrivateKey
     (one round of MD5).
     """
-    if _TRADITIONAL in pem:
+    if _TRADITIONAL_HEADER in pem:
         return "trying a passphrase takes one round of MD5"
     for block in _ENCRYPTED.findall(pem):
         try:
-            scrypt, numbers = _derivation(block)
+            scrypt, numbers = _derivation_cost(block)
         except (ValueError, PkiError):
             continue  # `load_key` reports it
         if scrypt and math.prod(numbers[:3]) < _LEAST_SCRYPT_WORK:
             return f"trying a passphrase takes scrypt with {', '.join(map(str, numbers[:3]))}"
-        if not scrypt and numbers and numbers[0] < _FEWEST_ROUNDS:
+        if not scrypt and numbers and numbers[0] < _FEWEST_SAFE_ROUNDS:
             return f"trying a passphrase takes {numbers[0]} rounds"
     return ""
 

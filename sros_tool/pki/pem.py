@@ -1,4 +1,4 @@
-"""PEM as OpenSSL 3, used by every DDS vendor, reads it (pem_lib.c); detection of file types.
+"""A reader of PEM that reads as OpenSSL 3, used by every DDS vendor (pem_lib.c); file types.
 
 OpenSSL is stricter than other programs, which RFC 7468 permits: a block begins and ends at the
 start of a line, and a damaged block hides all blocks after it.
@@ -17,21 +17,21 @@ from sros_tool.pki import der
 CERTIFICATES = ("CERTIFICATE", "X509 CERTIFICATE", "TRUSTED CERTIFICATE")
 """Labels of certificates; a block with the last label can also contain trust settings."""
 
-_PIECE = re.compile(rb"[^\n]{0,253}\n|[^\n]{1,254}")
+_LINE_PIECE = re.compile(rb"[^\n]{0,253}\n|[^\n]{1,254}")
 """Matches a line as OpenSSL reads it: a whole line, or the next 254 characters of a longer line."""
 _BEGIN = re.compile(rb"-----BEGIN (.*)-----", re.DOTALL)
 _END = b"-----END "
 _NOT_AT_START = re.compile(rb"[^\n]-----BEGIN ")
 _BASE64 = re.compile(rb"[A-Za-z0-9+/]*={0,2}")
-_ALONE = re.compile(
+_SINGLE_BLOCK = re.compile(
     rb"-----BEGIN ([A-Z0-9 ]{1,60})-----\n((?:[A-Za-z0-9+/]{1,76}\n)*[A-Za-z0-9+/]{1,76}={0,2}\n)"
     rb"-----END \1-----\n"
 )
 """Matches a file that consists of one block without headers, the common case."""
 _BLANKS = bytes(range(0x21))
-_BETWEEN = b" \t\r\n"
+_IGNORED_IN_BASE64 = b" \t\r\n"
 _BOM = b"\xef\xbb\xbf"
-_LONGEST = 64
+_LONGEST_LINE = 64
 
 
 class Block(NamedTuple):
@@ -50,11 +50,11 @@ def blocks(data: bytes) -> Iterator[Block]:
             first line of a block ends with a non-ASCII byte, which OpenSSL drops only on some
             processors.
     """
-    if single := _ALONE.fullmatch(data):
+    if single := _SINGLE_BLOCK.fullmatch(data):
         label = single[1].decode("ascii")
         yield Block(label, b"", _decoded(single[2], label))
         return
-    pieces = iter(_PIECE.findall(data))
+    pieces = iter(_LINE_PIECE.findall(data))
     start = True  # OpenSSL drops a byte order mark at the start of the file and after each block
     for piece in pieces:
         line = (piece.removeprefix(_BOM) if start else piece).rstrip(_BLANKS)
@@ -63,7 +63,7 @@ def blocks(data: bytes) -> Iterator[Block]:
         begin = _BEGIN.fullmatch(line)
         start = bool(begin)
         if begin:
-            yield _block(begin[1], pieces)
+            yield _read_block(begin[1], pieces)
         elif _BEGIN.match(line) and line[-1] > 0x7F:
             raise PkiError("one of its '-----BEGIN' lines ends with a byte beyond ASCII")
 
@@ -76,7 +76,7 @@ def read_as_text(data: bytes) -> bytes:
     if b"\0" not in data:
         return data
     lines: list[bytes] = []
-    for piece in _PIECE.findall(data):
+    for piece in _LINE_PIECE.findall(data):
         line, zero, _ = piece.partition(b"\0")
         if zero and not line:
             break
@@ -95,7 +95,7 @@ def missing_block_reason(data: bytes, label: str) -> str:
     return f"it is {kind}" if kind else f"it has no line '-----BEGIN {label}-----'"
 
 
-def _block(label: bytes, pieces: Iterator[bytes]) -> Block:
+def _read_block(label: bytes, pieces: Iterator[bytes]) -> Block:
     """Parse a block after its BEGIN line: optional headers and an empty line, then content."""
     name = label.decode("utf-8", "replace")[:80]
     parts: list[list[bytes]] = [[]]
@@ -111,11 +111,11 @@ def _block(label: bytes, pieces: Iterator[bytes]) -> Block:
                 parts.append([])
         elif line.startswith(_END):
             break
-        elif short or (len(parts) == 2 and len(line) > _LONGEST):
+        elif short or (len(parts) == 2 and len(line) > _LONGEST_LINE):
             raise PkiError(f"the block {name} in it has lines of different lengths")
         else:
             parts[-1].append(line)
-            short = len(parts) == 2 and len(line) < _LONGEST
+            short = len(parts) == 2 and len(line) < _LONGEST_LINE
         split = not piece.endswith(b"\n")
     else:
         raise PkiError(f"the block {name} in it is cut short")
@@ -128,7 +128,7 @@ def _block(label: bytes, pieces: Iterator[bytes]) -> Block:
 
 
 def _decoded(encoded: bytes, name: str) -> bytes:
-    text = encoded.partition(b"-")[0].translate(None, _BETWEEN)
+    text = encoded.partition(b"-")[0].translate(None, _IGNORED_IN_BASE64)
     if not text:
         raise PkiError(f"the block {name} in it is empty")
     if len(text) % 4 or not _BASE64.fullmatch(text):
@@ -143,7 +143,7 @@ SIGNED_MESSAGE = "an S/MIME signed message"
 XML = "XML that is not signed"
 _UTF_16 = "a text in UTF-16"
 
-_MARKS = (
+_KINDS_BY_BEGINNING = (
     (b"\xff\xfe", _UTF_16),
     (b"\xfe\xff", _UTF_16),
     (b"<\0", _UTF_16),
@@ -157,7 +157,7 @@ _MARKS = (
 """Maps the first bytes of a file to the kind of the file, as a noun with its article."""
 
 _LABEL = re.compile(rb"^-----BEGIN ([^\r\n]{1,60})-----[ \t\r]*$", re.MULTILINE)
-_OF_LABEL = {
+_KINDS_BY_LABEL = {
     "CERTIFICATE": "a certificate",
     "X509 CERTIFICATE": "a certificate",
     "TRUSTED CERTIFICATE": "a TRUSTED CERTIFICATE of OpenSSL",
@@ -173,7 +173,7 @@ _OF_LABEL = {
     "CMS": "CMS in PEM",
 }
 
-_OID_OF_MESSAGE = {
+_KINDS_BY_OID = {
     der.encode_oid("1.2.840.113549.1.7.2"): "PKCS#7 in DER",
     der.encode_oid("1.2.840.113549.1.7.3"): ENCRYPTED_MESSAGE,
     der.encode_oid("1.2.840.113549.1.7.6"): ENCRYPTED_MESSAGE,
@@ -184,15 +184,15 @@ _CERTIFICATE_IN_DER = "a certificate in DER, not in PEM (`openssl x509 -inform D
 _LIST_IN_DER = "a revocation list in DER, not in PEM (`openssl crl -inform DER` writes PEM)"
 _PKCS12 = "a PKCS#12 container (.p12, .pfx)"
 
-_HEADER = re.compile(rb"(?i)\s*(?:mime-version|content-type|content-transfer-encoding)[ \t]*:")
+_MIME_HEADER = re.compile(rb"(?i)\s*(?:mime-version|content-type|content-transfer-encoding)[ \t]*:")
 _BASE64_WITHOUT_PEM = re.compile(rb"[A-Za-z0-9+/\s]{40,}={0,2}\s*")
-_MOST = 4096
+_MOST_EXAMINED = 4096
 """Number of bytes at the start of a text that are examined."""
 
 
 def kind_of(data: bytes) -> str:
     """Return the kind of a file by its content, such as "a private key"; "" if it is unknown."""
-    for mark, kind in _MARKS:
+    for mark, kind in _KINDS_BY_BEGINNING:
         if data.startswith(mark):
             return kind
     if data[:1] == bytes((der.SEQUENCE,)) and (kind := _kind_of_der(data)):
@@ -200,28 +200,28 @@ def kind_of(data: bytes) -> str:
     text = data.removeprefix(b"\xef\xbb\xbf")
     if match := _LABEL.search(text):
         return _kind_of_label(match[1].decode("ascii", "replace"))
-    if _HEADER.match(text):
+    if _MIME_HEADER.match(text):
         return _kind_of_message(text)
     if text.lstrip()[:1] == b"<":
         return XML
     if not text.strip():
         return "a file with only blanks"
-    if _BASE64_WITHOUT_PEM.fullmatch(text[:_MOST]):
+    if _BASE64_WITHOUT_PEM.fullmatch(text[:_MOST_EXAMINED]):
         return "base64 without its lines '-----BEGIN' and '-----END'"
     return ""
 
 
 def _kind_of_label(label: str) -> str:
-    if label.endswith("PRIVATE KEY") and label not in _OF_LABEL:
+    if label.endswith("PRIVATE KEY") and label not in _KINDS_BY_LABEL:
         return "a private key"
-    return _OF_LABEL.get(label, f"a PEM file of the kind {label}")
+    return _KINDS_BY_LABEL.get(label, f"a PEM file of the kind {label}")
 
 
 def _kind_of_message(text: bytes) -> str:
     """Return the kind of a MIME message, by its headers."""
     if text[:1].isspace():
         return "a MIME message with an empty line before its headers, so that it has no headers"
-    head = text[:_MOST].lower()
+    head = text[:_MOST_EXAMINED].lower()
     if b"enveloped-data" in head or b"encrypted-data" in head:
         return ENCRYPTED_MESSAGE
     signed = b"multipart/signed" in head or b"pkcs7-mime" in head
@@ -235,7 +235,7 @@ def _kind_of_der(data: bytes) -> str:
         parts = der.children(der.first_value(der.normalized(whole)).content)
         tags = tuple(part.tag for part in parts)
         if tags[:1] == (der.OID,):
-            return _OID_OF_MESSAGE.get(parts[0].content, "a message in DER")
+            return _KINDS_BY_OID.get(parts[0].content, "a message in DER")
         if tags == (der.SEQUENCE, der.SEQUENCE, der.BIT_STRING):
             return _kind_of_signed(der.children(parts[0].content))
     except PkiError:

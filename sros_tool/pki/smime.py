@@ -39,31 +39,31 @@ _TEXT_HEADER = b"Content-Type: text/plain\r\n\r\n"
 
 # Accepted MIME headers: those that OpenSSL's reader (asn_mime.c) and RFC 2045 understand alike.
 # OpenSSL splits a longer line into several lines.
-_FOLD = re.compile(rb";[ \t]{0,9}\n[ \t]{1,9}(?=\S)")
-_FIELD = re.compile(rb"([A-Za-z][A-Za-z-]*):[ \t]{0,9}([!-~](?:[ -~]{0,900}[!-~])?)")
+_FOLDED_LINE = re.compile(rb";[ \t]{0,9}\n[ \t]{1,9}(?=\S)")
+_HEADER_FIELD = re.compile(rb"([A-Za-z][A-Za-z-]*):[ \t]{0,9}([!-~](?:[ -~]{0,900}[!-~])?)")
 _PARAMETER = rb"""; {0,9}([\w-]+)=("[ !#-'*-\[\]-~]+"|[\w'+,./:=?-]+)"""
-_TYPE = re.compile(rb"([\w-]+/[\w-]+)((?:" + _PARAMETER + rb")*)")
+_MEDIA_TYPE = re.compile(rb"([\w-]+/[\w-]+)((?:" + _PARAMETER + rb")*)")
 _PARAMETERS = re.compile(_PARAMETER)
 _BOUNDARY = re.compile(rb"[\w'+,./:=?-]{2,200}")  # OpenSSL ignores a boundary of one character
 _BASE64 = re.compile(
     rb"(?:(?:[A-Za-z0-9+/]{4}){1,19}\n)*"
     rb"(?:[A-Za-z0-9+/]{4}){0,18}[A-Za-z0-9+/]{2}(?:[A-Za-z0-9+/]{2}|[A-Za-z0-9+/]=|==)\n*"
 )
-_OPAQUE = (b"application/pkcs7-mime", b"application/x-pkcs7-mime")
-_SIGNATURE = (b"application/pkcs7-signature", b"application/x-pkcs7-signature")
+_OPAQUE_TYPES = (b"application/pkcs7-mime", b"application/x-pkcs7-mime")
+_SIGNATURE_TYPES = (b"application/pkcs7-signature", b"application/x-pkcs7-signature")
 
-_SHORT = 1024
-_PARTS = 4
+_MOST_CACHED_BYTES = 1024
+_MULTIPART_PIECES = 4
 """Number of pieces between MIME boundaries: a preamble, two parts, and an epilogue."""
-_SIGNED_DATA = der.encode_oid("1.2.840.113549.1.7.2")
-_DATA = der.encode_oid("1.2.840.113549.1.7.1")
-_CONTENT_TYPE = der.encode_oid("1.2.840.113549.1.9.3")
-_SIGNING_TIME = der.encode_oid("1.2.840.113549.1.9.5")
-_SMIME_CAPABILITIES = der.encode_oid("1.2.840.113549.1.9.15")
-_MESSAGE_DIGEST = der.encode_oid("1.2.840.113549.1.9.4")
-_NULL = 0x05
+_OID_SIGNED_DATA = der.encode_oid("1.2.840.113549.1.7.2")
+_OID_DATA = der.encode_oid("1.2.840.113549.1.7.1")
+_OID_CONTENT_TYPE = der.encode_oid("1.2.840.113549.1.9.3")
+_OID_SIGNING_TIME = der.encode_oid("1.2.840.113549.1.9.5")
+_OID_SMIME_CAPABILITIES = der.encode_oid("1.2.840.113549.1.9.15")
+_OID_MESSAGE_DIGEST = der.encode_oid("1.2.840.113549.1.9.4")
+_NULL_TAG = 0x05
 _ANY_VALUES = (
-    der.SEQUENCE, der.OCTET_STRING, der.UTC_TIME, der.GENERALIZED_TIME, _NULL
+    der.SEQUENCE, der.OCTET_STRING, der.UTC_TIME, der.GENERALIZED_TIME, _NULL_TAG
 )  # fmt: skip
 """Types of values in attributes and parameters that OpenSSL re-encodes without any change."""
 
@@ -98,7 +98,9 @@ def sign(document: bytes, certificate: x509.Certificate, key: PrivateKey) -> byt
 
     content = _TEXT_HEADER + document.replace(b"\r\n", b"\n").replace(b"\n", b"\r\n")
     boundary = b"----" + secrets.token_hex(16).upper().encode()
-    encoded = base64.encodebytes(_cms(content, certificate, key)).replace(b"\n", b"\r\n")
+    encoded = base64.encodebytes(_detached_signature(content, certificate, key)).replace(
+        b"\n", b"\r\n"
+    )
     return b"".join((
         b"MIME-Version: 1.0\r\n"
         b'Content-Type: multipart/signed; protocol="application/x-pkcs7-signature"; '
@@ -114,18 +116,18 @@ def sign(document: bytes, certificate: x509.Certificate, key: PrivateKey) -> byt
     ))  # fmt: skip
 
 
-def _cms(content: bytes, certificate: x509.Certificate, key: PrivateKey) -> bytes:
+def _detached_signature(content: bytes, certificate: x509.Certificate, key: PrivateKey) -> bytes:
     """Return a detached CMS signature of ``content`` in DER (RFC 5652, 5.1 and 5.3).
 
-    The form is that of `cryptography` from release 42 on; earlier releases write the S/MIME
+    The form is the same as by `cryptography` from release 42 on; earlier releases write the S/MIME
     capabilities in a form that differs from RFC 8551, 2.5.2.  The attributes are in the order of a
     DER set.
     """
     certificate_der, issuer_and_serial = _signer_parts(certificate)
     attributes = b"".join((
         _TYPE_OF_DATA,
-        _attribute(_SIGNING_TIME, der.encode(der.UTC_TIME, _now())),
-        _attribute(_MESSAGE_DIGEST, der.encode(der.OCTET_STRING, sha256(content).digest())),
+        _attribute(_OID_SIGNING_TIME, der.encode(der.UTC_TIME, _signing_time())),
+        _attribute(_OID_MESSAGE_DIGEST, der.encode(der.OCTET_STRING, sha256(content).digest())),
         _CAPABILITIES,
     ))  # fmt: skip
     signed = der.encode(der.SET, attributes)
@@ -146,15 +148,15 @@ def _cms(content: bytes, certificate: x509.Certificate, key: PrivateKey) -> byte
         der.SEQUENCE,
         der.encode_integer(1),
         der.encode(der.SET, _SHA256),
-        der.encode(der.SEQUENCE, der.encode(der.OID, _DATA)),
+        der.encode(der.SEQUENCE, der.encode(der.OID, _OID_DATA)),
         der.encode(der.CONTEXT_0, certificate_der),
         der.encode(der.SET, signer),
     )
     wrapped = der.encode(der.CONTEXT_0, signed_data)
-    return der.encode(der.SEQUENCE, der.encode(der.OID, _SIGNED_DATA), wrapped)
+    return der.encode(der.SEQUENCE, der.encode(der.OID, _OID_SIGNED_DATA), wrapped)
 
 
-def _now() -> bytes:
+def _signing_time() -> bytes:
     """Return the current time as a UTCTime, for the signing time, which no reader uses."""
     return time.strftime("%y%m%d%H%M%SZ", time.gmtime()).encode()
 
@@ -178,12 +180,12 @@ def _attribute(kind: bytes, value: bytes) -> bytes:
     return der.encode(der.SEQUENCE, der.encode(der.OID, kind), der.encode(der.SET, value))
 
 
-_SHA256 = _algorithm("2.16.840.1.101.3.4.2.1", der.encode(_NULL))
+_SHA256 = _algorithm("2.16.840.1.101.3.4.2.1", der.encode(_NULL_TAG))
 _ECDSA_SHA256 = _algorithm("1.2.840.10045.4.3.2")
-_RSA = _algorithm("1.2.840.113549.1.1.1", der.encode(_NULL))
-_TYPE_OF_DATA = _attribute(_CONTENT_TYPE, der.encode(der.OID, _DATA))
+_RSA = _algorithm("1.2.840.113549.1.1.1", der.encode(_NULL_TAG))
+_TYPE_OF_DATA = _attribute(_OID_CONTENT_TYPE, der.encode(der.OID, _OID_DATA))
 _AES_CBC = [_algorithm(f"2.16.840.1.101.3.4.1.{number}") for number in (42, 22, 2)]
-_CAPABILITIES = _attribute(_SMIME_CAPABILITIES, der.encode(der.SEQUENCE, *_AES_CBC))
+_CAPABILITIES = _attribute(_OID_SMIME_CAPABILITIES, der.encode(der.SEQUENCE, *_AES_CBC))
 """The S/MIME capabilities: AES-CBC with keys of 256, 192 and 128 bits."""
 
 
@@ -266,7 +268,7 @@ class SignedDocument(NamedTuple):
     @property
     def digest(self) -> str:
         """The name of the weakest hash algorithm among the signatures."""
-        return min((signature.digest for signature in self.signatures), key=_bits).name
+        return min((signature.digest for signature in self.signatures), key=_digest_bits).name
 
     def signer(self) -> x509.Certificate | None:
         """Return the first signer's certificate; None if the certificate is not embedded."""
@@ -308,7 +310,8 @@ class SignedDocument(NamedTuple):
     def weakness(self) -> str:
         """Return the weak hash of a signature as a clause, or "" if no hash is weak."""
         weak = any(
-            _bits(signature.digest) < _bits(hashes.SHA256()) for signature in self.signatures
+            _digest_bits(signature.digest) < _digest_bits(hashes.SHA256())
+            for signature in self.signatures
         )
         return f"it has a weak signature, with {self.digest.upper()}" if weak else ""
 
@@ -338,21 +341,21 @@ def _padding(signer: x509.Certificate, digest: hashes.HashAlgorithm) -> padding.
     return padding.PKCS1v15()
 
 
-def _bits(algorithm: hashes.HashAlgorithm) -> int:
+def _digest_bits(algorithm: hashes.HashAlgorithm) -> int:
     return 8 * algorithm.digest_size
 
 
 _Part = TypeVar("_Part", bytes, der.Value)
-_Read = TypeVar("_Read")
+_Result = TypeVar("_Result")
 
 
-def _cached(read: Callable[[_Part], _Read]) -> Callable[[_Part], _Read]:
+def _cached(read: Callable[[_Part], _Result]) -> Callable[[_Part], _Result]:
     """Cache a parser's results for short parts, which many files of a keystore share."""
     remembered = lru_cache(maxsize=64)(read)
 
-    def read_or_remember(part: _Part) -> _Read:
+    def read_or_remember(part: _Part) -> _Result:
         size = len(part if isinstance(part, bytes) else part.whole)
-        return remembered(part) if size <= _SHORT else read(part)
+        return remembered(part) if size <= _MOST_CACHED_BYTES else read(part)
 
     return read_or_remember
 
@@ -376,7 +379,7 @@ def parse_new(message: bytes) -> SignedDocument:
         raise PkiError("its signature is not a readable CMS signature") from error
 
 
-def _document(content: bytes) -> bytes:
+def _without_text_header(content: bytes) -> bytes:
     header, separator, document = content.partition(b"\r\n\r\n")
     kind, _ = _media_type(header.replace(b"\r\n", b"\n"))
     if not separator or kind != b"text/plain":
@@ -395,9 +398,11 @@ def _media_type(header: bytes) -> tuple[bytes, Mapping[bytes, bytes]]:
     The type is empty if the header has no type or several types, or if programs read one of the
     lines in different ways.
     """
-    fields = [_FIELD.fullmatch(line) for line in _FOLD.sub(b"; ", header).split(b"\n")]
+    fields = [
+        _HEADER_FIELD.fullmatch(line) for line in _FOLDED_LINE.sub(b"; ", header).split(b"\n")
+    ]
     named = [field[2] for field in fields if field and field[1].lower() == b"content-type"]
-    kind = _TYPE.fullmatch(named[0]) if len(named) == 1 and all(fields) else None
+    kind = _MEDIA_TYPE.fullmatch(named[0]) if len(named) == 1 and all(fields) else None
     if not kind:
         return b"", {}
     pairs = _PARAMETERS.findall(kind[2])
@@ -423,7 +428,7 @@ def _split(message: bytes) -> tuple[bytes | None, bytes]:
         # OpenSSL reads the byte order mark as part of the first header's name.
         head = head[len(_BOM) :]
     kind, parameters = _media_type(head)
-    if kind in _OPAQUE:
+    if kind in _OPAQUE_TYPES:
         return None, _decoded(body)
     boundary = parameters.get(b"boundary", b"")
     if kind != b"multipart/signed" or not _BOUNDARY.fullmatch(boundary):
@@ -435,14 +440,14 @@ def _split(message: bytes) -> tuple[bytes | None, bytes]:
     # Boundaries inside a line split, too: OpenSSL reads a long line in pieces, and each piece may
     # begin a part.
     parts = (b"\n" + body + b"\n").split(b"--" + boundary)
-    if len(parts) != _PARTS or not (
+    if len(parts) != _MULTIPART_PIECES or not (
         parts[0].endswith(b"\n")
         and all(part.startswith(b"\n") and part.endswith(b"\n") for part in parts[1:-1])
         and parts[-1].startswith(b"--\n")
     ):
         raise PkiError("it is not one signed part followed by one signature")
     header, _, encoded = parts[2][1:-1].partition(b"\n\n")
-    if _media_type(header)[0] not in _SIGNATURE or not encoded:
+    if _media_type(header)[0] not in _SIGNATURE_TYPES or not encoded:
         raise PkiError("it has no signature")
     return parts[1][1:-1].replace(b"\n", b"\r\n"), _decoded(encoded)
 
@@ -462,7 +467,7 @@ def _public_key(certificate: x509.Certificate) -> object:
     return certificate.public_key()
 
 
-def _parts(value: der.Value, *tags: int) -> list[der.Value]:
+def _checked_parts(value: der.Value, *tags: int) -> list[der.Value]:
     """Return the values in a constructed value; raise `ValueError` if their tags differ."""
     parts = der.children(value.content)
     if tuple(part.tag for part in parts) != tags:
@@ -470,7 +475,7 @@ def _parts(value: der.Value, *tags: int) -> list[der.Value]:
     return parts
 
 
-def _optional(values: list[der.Value], place: int, tag: int) -> list[der.Value]:
+def _take_optional(values: list[der.Value], place: int, tag: int) -> list[der.Value]:
     """Remove ``values[place]`` if it has the tag, and return it in a list; else return []."""
     return [values.pop(place)] if len(values) > place and values[place].tag == tag else []
 
@@ -496,19 +501,19 @@ def _parse_cms(signature: bytes, content: bytes | None) -> SignedDocument:
     SignedData.
     """
     (message,) = der.children(signature)
-    content_type, wrapped = _parts(message, der.OID, der.CONTEXT_0)
-    (signed_data,) = _parts(wrapped, der.SEQUENCE)
-    if message.tag != der.SEQUENCE or content_type.content != _SIGNED_DATA:
+    content_type, wrapped = _checked_parts(message, der.OID, der.CONTEXT_0)
+    (signed_data,) = _checked_parts(wrapped, der.SEQUENCE)
+    if message.tag != der.SEQUENCE or content_type.content != _OID_SIGNED_DATA:
         raise ValueError("not SignedData")
     fields = der.children(signed_data.content)
-    certificate_sets = _optional(fields, 3, der.CONTEXT_0)
-    lists = _optional(fields, 3, der.CONTEXT_1)
+    certificate_sets = _take_optional(fields, 3, der.CONTEXT_0)
+    lists = _take_optional(fields, 3, der.CONTEXT_1)
     if [value.tag for value in fields] != [der.INTEGER, der.SET, der.SEQUENCE, der.SET]:
         raise ValueError("not the fields of SignedData")
     version, digests, encapsulated, signers = fields
     der.integer(version)
     kind, *contained = der.children(encapsulated.content)
-    if (kind.tag, kind.content) != (der.OID, _DATA):
+    if (kind.tag, kind.content) != (der.OID, _OID_DATA):
         raise ValueError("not a signature of data")
     inside = [_octet_string(value) for value in contained]
     if len(inside) > 1 or (content is None and not inside):
@@ -530,14 +535,14 @@ def _parse_cms(signature: bytes, content: bytes | None) -> SignedDocument:
         raise ValueError("no signature, or a digest other than the announced one")
     return SignedDocument(
         content=content,
-        document=_document(content),
+        document=_without_text_header(content),
         certificates=tuple(map(_certificate, embedded)),
         signatures=signatures,
     )
 
 
 def _octet_string(octet_string: der.Value) -> bytes:
-    (octets,) = _parts(octet_string, der.OCTET_STRING)
+    (octets,) = _checked_parts(octet_string, der.OCTET_STRING)
     if octet_string.tag != der.CONTEXT_0:
         raise ValueError("no content")
     return octets.content
@@ -546,8 +551,8 @@ def _octet_string(octet_string: der.Value) -> bytes:
 def _signature(signer: der.Value) -> Signature:
     """Return the signature of a SignerInfo that names its signer by issuer and serial number."""
     info = der.children(signer.content)
-    attributes = _optional(info, 3, der.CONTEXT_0)
-    unsigned = _optional(info, 5, der.CONTEXT_1)
+    attributes = _take_optional(info, 3, der.CONTEXT_0)
+    unsigned = _take_optional(info, 5, der.CONTEXT_1)
     if signer.tag != der.SEQUENCE or [value.tag for value in info] != [
         *(der.INTEGER, der.SEQUENCE, der.SEQUENCE, der.SEQUENCE, der.OCTET_STRING)
     ]:
@@ -573,7 +578,7 @@ def _signature(signer: der.Value) -> Signature:
 
 @_cached
 def _issuer_and_serial(identifier: der.Value) -> tuple[tuple[bytes, ...], int]:
-    issuer, serial = _parts(identifier, der.SEQUENCE, der.INTEGER)
+    issuer, serial = _checked_parts(identifier, der.SEQUENCE, der.INTEGER)
     read_name_der(issuer.whole)
     return canonical_der(issuer.whole), der.integer(serial)
 
@@ -583,7 +588,7 @@ def _check_values(*values: der.Value) -> None:
     for value in values:
         if value.tag == der.OID:
             der.decode_oid(value)  # raises an error if OpenSSL refuses it
-        elif value.tag not in _ANY_VALUES or (value.tag == _NULL and value.content):
+        elif value.tag not in _ANY_VALUES or (value.tag == _NULL_TAG and value.content):
             raise ValueError("not a value of an attribute or parameter")
 
 
@@ -591,7 +596,7 @@ def _attributes(attributes: bytes) -> dict[bytes, der.Value]:
     """Map the types of attributes to first values, and check the form of all (RFC 5652, 11)."""
     by_kind: dict[bytes, der.Value] = {}
     for attribute in der.children(attributes):
-        name, values = _parts(attribute, der.OID, der.SET)
+        name, values = _checked_parts(attribute, der.OID, der.SET)
         (value,) = der.children(values.content)
         if attribute.tag != der.SEQUENCE:
             raise ValueError("not an attribute")
@@ -603,7 +608,7 @@ def _attributes(attributes: bytes) -> dict[bytes, der.Value]:
 def _message_digest(attributes: Mapping[bytes, der.Value]) -> bytes:
     if not attributes:
         return b""
-    digest = attributes.get(_MESSAGE_DIGEST)
+    digest = attributes.get(_OID_MESSAGE_DIGEST)
     if digest is None or digest.tag != der.OCTET_STRING:
         raise ValueError("no message digest")
     return digest.content

@@ -28,7 +28,7 @@ Secrets = Callable[[str], str]
 """A function that returns a secret for a prompt, such as "the PIN of the token X"."""
 
 
-def _module_of(parsed: TokenUri, *, named: bool) -> str:
+def _module_to_load(parsed: TokenUri, *, named: bool) -> str:
     """Return the path of the PKCS#11 library to load; ``named``: the user gave the URI.
 
     If the URI comes from elsewhere, for instance from the settings of a received keystore, the
@@ -45,7 +45,7 @@ def _module_of(parsed: TokenUri, *, named: bool) -> str:
         return str(real)
     if chosen_module:
         return chosen_module
-    if not parsed.module and (proxy := _proxy()):
+    if not parsed.module and (proxy := _find_proxy()):
         return proxy
     if parsed.module:
         raise UsageError(
@@ -61,7 +61,7 @@ def _module_of(parsed: TokenUri, *, named: bool) -> str:
     )
 
 
-def _proxy() -> str:
+def _find_proxy() -> str:
     """Return the path of p11-kit's proxy, a library that loads all registered ones; "" if missing.
 
     libp11, too, loads the proxy if no other library is named (Debian and Ubuntu,
@@ -94,7 +94,7 @@ class TokenKey(ec.EllipticCurvePrivateKey):
 
     @property
     def never_left(self) -> bool:
-        """Whether the token says that the key was made on the token and cannot be exported."""
+        """Whether the token states that the key was made there and cannot be exported."""
         if self._private is None:
             return True  # a planned key, perhaps without the package for tokens
         from pkcs11 import Attribute, PKCS11Error
@@ -145,7 +145,7 @@ class TokenKey(ec.EllipticCurvePrivateKey):
         )
 
     def signs_for(self, public: object) -> bool:
-        """Return whether ``public``, a certificate's key, verifies what the token signs."""
+        """Return whether ``public``, a certificate's key, verifies signatures of the token."""
         if not isinstance(public, ec.EllipticCurvePublicKey):
             return False
         message, algorithm = random.token_bytes(32), ec.ECDSA(hashes.SHA256())
@@ -195,7 +195,7 @@ def _holds_key(parsed: TokenUri, secrets: Secrets) -> bool:
     import pkcs11
 
     try:
-        session = _session(parsed, secrets, write=False)
+        session = _open_session(parsed, secrets, write=False)
         return any(True for _ in session.get_objects({pkcs11.Attribute.LABEL: parsed.object}))
     except (pkcs11.PKCS11Error, RuntimeError, OSError) as error:
         raise _unusable_token_error(parsed, error) from error
@@ -206,7 +206,7 @@ def open_token_key(uri: str, secrets: Secrets, *, named: bool) -> TokenKey:
 
     Arguments and errors are those of `holds_token_key`.
     """
-    return _open(_usable_uri(uri, named=named), secrets, create=False)
+    return _open_key(_usable_uri(uri, named=named), secrets, create=False)
 
 
 def create_token_key(uri: str, secrets: Secrets, *, named: bool) -> TokenKey:
@@ -215,7 +215,7 @@ def create_token_key(uri: str, secrets: Secrets, *, named: bool) -> TokenKey:
     Raises:
         PkiError: the token has a key with this label, or cannot be used.
     """
-    return _open(_usable_uri(uri, named=named), secrets, create=True)
+    return _open_key(_usable_uri(uri, named=named), secrets, create=True)
 
 
 def make_enclave_key(place: TokenUri, secrets: Secrets) -> TokenKey:
@@ -226,7 +226,7 @@ def make_enclave_key(place: TokenUri, secrets: Secrets) -> TokenKey:
         PkiError: the token cannot be used.
     """
     usable = _with_library(place, named=True)
-    return _open(usable, secrets, create=not _holds_key(usable, secrets))
+    return _open_key(usable, secrets, create=not _holds_key(usable, secrets))
 
 
 def open_enclave_key(place: TokenUri, secrets: Secrets) -> TokenKey:
@@ -236,7 +236,7 @@ def open_enclave_key(place: TokenUri, secrets: Secrets) -> TokenKey:
         UsageError: no library is named.
         PkiError: the token cannot be used.
     """
-    return _open(_with_library(place, named=False), secrets, create=False)
+    return _open_key(_with_library(place, named=False), secrets, create=False)
 
 
 def planned_key(place: TokenUri) -> TokenKey:
@@ -254,7 +254,7 @@ def _with_library(parsed: TokenUri, *, named: bool) -> TokenUri:
     Raises:
         UsageError, UnavailableError: tokens cannot be used on this machine.
     """
-    parsed = parsed._replace(module=_module_of(parsed, named=named))
+    parsed = parsed._replace(module=_module_to_load(parsed, named=named))
     if importlib.util.find_spec("pkcs11") is None:
         raise UnavailableError(
             "keys on PKCS#11 tokens need the Python package python-pkcs11",
@@ -264,14 +264,14 @@ def _with_library(parsed: TokenUri, *, named: bool) -> TokenUri:
     return parsed
 
 
-def _open(parsed: TokenUri, secrets: Secrets, *, create: bool) -> TokenKey:
+def _open_key(parsed: TokenUri, secrets: Secrets, *, create: bool) -> TokenKey:
     import pkcs11
     from pkcs11.util.ec import encode_ec_public_key
 
     try:
-        session = _session(parsed, secrets, write=create)
+        session = _open_session(parsed, secrets, write=create)
         if create:
-            _create(session, parsed)
+            _generate_key_pair(session, parsed)
         private = session.get_key(pkcs11.ObjectClass.PRIVATE_KEY, label=parsed.object)
         public = session.get_key(pkcs11.ObjectClass.PUBLIC_KEY, label=parsed.object)
         assert isinstance(public, pkcs11.PublicKey)
@@ -306,13 +306,13 @@ def _unusable_token_error(parsed: TokenUri, error: Exception) -> PkiError:
 _sessions: dict[tuple[str, str], tuple[Any, bool]] = {}
 
 
-def _session(parsed: TokenUri, secrets: Secrets, *, write: bool) -> Any:
+def _open_session(parsed: TokenUri, secrets: Secrets, *, write: bool) -> Any:
     import pkcs11
 
     place = (parsed.module, parsed.token)
     session, writable = _sessions.get(place, (None, False))
     if session is None or (write and not writable):
-        pin = _pin(parsed, secrets)
+        pin = _read_pin(parsed, secrets)
         if session is not None:
             session.close()
         token = pkcs11.lib(parsed.module).get_token(token_label=parsed.token)
@@ -321,7 +321,7 @@ def _session(parsed: TokenUri, secrets: Secrets, *, write: bool) -> Any:
     return session
 
 
-def _create(session: Any, parsed: TokenUri) -> None:
+def _generate_key_pair(session: Any, parsed: TokenUri) -> None:
     import pkcs11
     from pkcs11.util.ec import encode_named_curve_parameters
 
@@ -348,7 +348,7 @@ def _create(session: Any, parsed: TokenUri) -> None:
     )
 
 
-def _pin(parsed: TokenUri, secrets: Secrets) -> str:
+def _read_pin(parsed: TokenUri, secrets: Secrets) -> str:
     if parsed.pin_source:
         data = read_bytes(Path(parsed.pin_source), "file with the PIN")
         return data.decode(errors="replace").partition("\n")[0]
@@ -366,8 +366,11 @@ _PATH_ATTRIBUTES = frozenset(
     | {"token", "type"}
 )
 _QUERY_ATTRIBUTES = frozenset({"module-name", "module-path", "pin-source"})
-_OF_ENCLAVE = (frozenset({"token", "object", "type"}), frozenset({"module-path", "pin-source"}))
-_OF_FILE = (_OF_ENCLAVE[0], frozenset({"pin-source"}))
+_ENCLAVE_URI_ATTRIBUTES = (
+    frozenset({"token", "object", "type"}),
+    frozenset({"module-path", "pin-source"}),
+)
+_FILE_URI_ATTRIBUTES = (_ENCLAVE_URI_ATTRIBUTES[0], frozenset({"pin-source"}))
 _MOST_BYTES = 2000
 # In bytes: the limit of CK_TOKEN_INFO in PKCS#11, and a limit that leaves enough room.
 _LONGEST_TOKEN, _LONGEST_OBJECT = 32, 128
@@ -447,8 +450,8 @@ def parse_enclave_uri(uri: str, name: str) -> TokenUri:
         uri = f"{path};object={quote(name, safe='')}{query}{options}"
     parsed = parse_token_uri(uri)
     path, _, query = uri[len(_SCHEME) :].partition("?")
-    kind = _attributes(path.split(";"), _OF_ENCLAVE[0]).get("type", "private")
-    _attributes(query.split("&"), _OF_ENCLAVE[1])
+    kind = _attributes(path.split(";"), _ENCLAVE_URI_ATTRIBUTES[0]).get("type", "private")
+    _attributes(query.split("&"), _ENCLAVE_URI_ATTRIBUTES[1])
     too_long = (
         len(parsed.token.encode()) > _LONGEST_TOKEN or len(parsed.object.encode()) > _LONGEST_OBJECT
     )
@@ -491,7 +494,8 @@ def token_file(parsed: TokenUri) -> bytes:
     The line does not name the module: libp11 0.4.12 refuses this attribute, and takes the module
     from ``PKCS11_MODULE_PATH`` (libp11, eng_parse.c and eng_back.c).
     """
-    uri = f"{_SCHEME}token={_encoded(parsed.token)};object={_encoded(parsed.object)};type=private"
+    token, label = _percent_encoded(parsed.token), _percent_encoded(parsed.object)
+    uri = f"{_SCHEME}token={token};object={label};type=private"
     if parsed.pin_source:
         uri += f"?pin-source=file:{quote(parsed.pin_source, safe='/')}"
     return f"{uri}\n".encode()
@@ -514,8 +518,8 @@ def read_token_file(data: bytes) -> TokenUri:
     try:
         path, _, query = text[len(_SCHEME) :].partition("?")
         refuse_pin(text)
-        named = _attributes(path.split(";"), _OF_FILE[0])
-        _attributes(query.split("&"), _OF_FILE[1])
+        named = _attributes(path.split(";"), _FILE_URI_ATTRIBUTES[0])
+        _attributes(query.split("&"), _FILE_URI_ATTRIBUTES[1])
         if not (named.get("token") and named.get("object")):
             raise UsageError("it does not name both a token and an object")
         return parse_enclave_uri(text, "")
@@ -523,7 +527,7 @@ def read_token_file(data: bytes) -> TokenUri:
         raise PkiError(error.what, error.what) from error
 
 
-def _encoded(text: str) -> str:
+def _percent_encoded(text: str) -> str:
     return quote(text, safe="")
 
 

@@ -26,9 +26,9 @@ from sros_tool.errors import PkiError
 from sros_tool.pki import der
 from sros_tool.pki.distinguished_names import read_name_der, short_names
 
-_TIMES = {der.UTC_TIME: "%y%m%d%H%M%SZ", der.GENERALIZED_TIME: "%Y%m%d%H%M%SZ"}
+_TIME_FORMATS = {der.UTC_TIME: "%y%m%d%H%M%SZ", der.GENERALIZED_TIME: "%Y%m%d%H%M%SZ"}
 """The forms of dates that OpenSSL compares (X509_cmp_time), by type."""
-_DIGITS = {der.UTC_TIME: 12, der.GENERALIZED_TIME: 14}
+_TIME_DIGITS = {der.UTC_TIME: 12, der.GENERALIZED_TIME: 14}
 _FIRST_YEAR = 1950
 """The first year of a UTCTime (RFC 5280, 4.1.2.5.1)."""
 _CONTEXT_2 = 0x82
@@ -50,7 +50,7 @@ class UnknownKey:
         return self.data
 
 
-class _Part(NamedTuple):
+class _Attribute(NamedTuple):
     """An attribute of a distinguished name."""
 
     oid: ObjectIdentifier
@@ -69,14 +69,14 @@ class TolerantName:
         return self._data
 
     @property
-    def rdns(self) -> list[list[_Part]]:
+    def rdns(self) -> list[list[_Attribute]]:
         """The parts of the name (RDNs), each as a list of attributes."""
         rdns = []
         for rdn in der.children(der.first_value(self._data).content):
             pairs = [der.children(attribute.content) for attribute in der.children(rdn.content)]
             rdns.append(
                 [
-                    _Part(
+                    _Attribute(
                         ObjectIdentifier(der.decode_oid(kind)),
                         value.content.decode("utf-8", "replace"),
                     )
@@ -85,7 +85,7 @@ class TolerantName:
             )
         return rdns
 
-    def get_attributes_for_oid(self, oid: ObjectIdentifier) -> list[_Part]:
+    def get_attributes_for_oid(self, oid: ObjectIdentifier) -> list[_Attribute]:
         """Return the attributes of a type."""
         return [part for rdn in self.rdns for part in rdn if part.oid == oid]
 
@@ -122,14 +122,14 @@ class _Signed:
     def signature_hash_algorithm(self) -> hashes.HashAlgorithm | None:
         """The hash of the signature; None if the algorithm has none, or is not known."""
         with suppress(ValueError, UnsupportedAlgorithm):
-            return self._shell().signature_hash_algorithm
+            return self._minimal_certificate().signature_hash_algorithm
         return None
 
     @property
     def signature_algorithm_parameters(self) -> object:
         """The padding or curve of the signature; None if it is not known."""
         with suppress(ValueError, UnsupportedAlgorithm):
-            return self._shell().signature_algorithm_parameters
+            return self._minimal_certificate().signature_algorithm_parameters
         return None
 
     def public_bytes(self, encoding: serialization.Encoding) -> bytes:
@@ -147,7 +147,7 @@ class _Signed:
         digest.update(self._data)
         return digest.finalize()
 
-    def _shell(self) -> x509.Certificate:
+    def _minimal_certificate(self) -> x509.Certificate:
         return _certificate_with(algorithm=self._algorithm.whole)
 
     def _signed_bytes(self) -> bytes:
@@ -171,7 +171,7 @@ class _TolerantCertificate(_Signed):
         parts = self._parts
         number = 0
         if parts[0].tag == der.CONTEXT_0:
-            number = der.integer(_only(parts.pop(0)))
+            number = der.integer(_single_inside(parts.pop(0)))
         self.version = x509.Version.v1 if number == 0 else x509.Version.v3
         self.number = number + 1
         serial, algorithm, issuer, validity, subject, key, *rest = parts
@@ -191,10 +191,12 @@ class _TolerantCertificate(_Signed):
         for identifier in _UNIQUE_IDENTIFIERS:
             if rest and rest[0].tag == identifier:
                 rest.pop(0)
-        values = _sequence(_only(rest.pop(0))) if rest and rest[0].tag == _CONTEXT_3 else []
+        values = (
+            _sequence(_single_inside(rest.pop(0))) if rest and rest[0].tag == _CONTEXT_3 else []
+        )
         if rest:
             raise ValueError("its signed part has extra fields that a certificate does not have")
-        self.extensions = _read(values, _parse_in_certificate, _LOOSE_OF_CERTIFICATES)
+        self.extensions = _parse_extensions(values, _parse_in_certificate, _CERTIFICATE_READERS)
 
     @property
     def tbs_certificate_bytes(self) -> bytes:
@@ -228,19 +230,21 @@ class _TolerantList(_Signed):
         _algorithm(algorithm)
         self.issuer = _name(issuer.whole)
         dates = [_date(begin)]
-        while rest and rest[0].tag in _TIMES:
+        while rest and rest[0].tag in _TIME_FORMATS:
             dates.append(_date(rest.pop(0)))
         if len(dates) > 2 or None in dates:
             raise ValueError("its dates have a form that OpenSSL cannot compare")
         self.last_update_utc = dates[0]
         self.next_update_utc = dates[1] if len(dates) == 2 else None
         entries = _sequence(rest.pop(0)) if rest and rest[0].tag == der.SEQUENCE else []
-        values = _sequence(_only(rest.pop(0))) if rest and rest[0].tag == der.CONTEXT_0 else []
+        values = (
+            _sequence(_single_inside(rest.pop(0))) if rest and rest[0].tag == der.CONTEXT_0 else []
+        )
         if rest:
             raise ValueError(
                 "its signed part has extra fields that a revocation list does not have"
             )
-        self.extensions = _read(values, _parse_in_list, _LOOSE_OF_LISTS)
+        self.extensions = _parse_extensions(values, _parse_in_list, _LIST_READERS)
         self._entries = list(_entries(entries))
 
     @property
@@ -303,7 +307,7 @@ def unread_extension(certificate: x509.Certificate) -> str:
         (
             short_names().get(extension.oid.dotted_string, "")
             for extension in certificate.extensions
-            if extension.oid in _DECODED and is_unread(extension)
+            if extension.oid in _DECODED_EXTENSIONS and is_unread(extension)
         ),
         "",
     )
@@ -359,17 +363,22 @@ def _entries(values: list[der.Value]) -> Iterator[_TolerantEntry]:
     damaged = False
     for value in values:
         serial, date, *rest = _sequence(value)
-        extensions = _read(_sequence(rest[0]) if rest else [], _parse_in_entry, _LOOSE_OF_ENTRIES)
+        extensions = _parse_extensions(
+            _sequence(rest[0]) if rest else [], _parse_in_entry, _ENTRY_READERS
+        )
         if damaged:
             extensions = x509.Extensions([])
-        elif any(is_unread(e) and e.oid in _DECODED_OF_ENTRIES for e in extensions):
+        elif any(is_unread(e) and e.oid in _DECODED_ENTRY_EXTENSIONS for e in extensions):
             damaged = True
             extensions = x509.Extensions([])
         moment = _date(date) or datetime.min.replace(tzinfo=UTC)
         yield _TolerantEntry(der.integer(serial), moment, extensions)
 
 
-_DECODED_OF_ENTRIES = (CRLEntryExtensionOID.CERTIFICATE_ISSUER, CRLEntryExtensionOID.CRL_REASON)
+_DECODED_ENTRY_EXTENSIONS = (
+    CRLEntryExtensionOID.CERTIFICATE_ISSUER,
+    CRLEntryExtensionOID.CRL_REASON,
+)
 
 
 def _sequence(value: der.Value) -> list[der.Value]:
@@ -394,7 +403,7 @@ def _check_bits(value: der.Value) -> None:
         raise ValueError("not a BIT STRING")
 
 
-def _only(value: der.Value) -> der.Value:
+def _single_inside(value: der.Value) -> der.Value:
     """Return the single value inside an explicitly tagged value."""
     (inner,) = der.children(value.content)
     return inner
@@ -409,7 +418,7 @@ def _public_key(data: bytes) -> object:
 
 def _date(value: der.Value) -> datetime | None:
     """Parse a date in UTC; None for a date in a form that OpenSSL cannot compare."""
-    digits, form = _DIGITS.get(value.tag), _TIMES.get(value.tag)
+    digits, form = _TIME_DIGITS.get(value.tag), _TIME_FORMATS.get(value.tag)
     if digits is None or form is None:
         raise ValueError("not a date")
     text = value.content
@@ -421,7 +430,9 @@ def _date(value: der.Value) -> datetime | None:
         if value.tag == der.UTC_TIME:
             century = b"19" if int(text[:2]) >= _FIRST_YEAR % 100 else b"20"
             text = century + text
-        return datetime.strptime(text.decode(), _TIMES[der.GENERALIZED_TIME]).replace(tzinfo=UTC)
+        return datetime.strptime(text.decode(), _TIME_FORMATS[der.GENERALIZED_TIME]).replace(
+            tzinfo=UTC
+        )
     return None
 
 
@@ -433,7 +444,7 @@ _GENERAL_NAMES = (0xA0, 0x81, 0x82, 0xA3, 0xA4, 0xA5, 0x86, 0x87, 0x88)
 """The tags of the alternatives of a GeneralName (RFC 5280, 4.2.1.6)."""
 _USER, _CA, _INDIRECT, _ATTRIBUTES = 0x81, 0x82, 0x84, 0x85
 """The tags of the flags of an issuingDistributionPoint (RFC 5280, 5.2.5)."""
-_DECODED = frozenset(
+_DECODED_EXTENSIONS = frozenset(
     {
         ExtensionOID.BASIC_CONSTRAINTS,
         ExtensionOID.KEY_USAGE,
@@ -501,12 +512,14 @@ def is_unread(extension: x509.Extension[x509.ExtensionType]) -> bool:
     return isinstance(extension.value, x509.UnrecognizedExtension)
 
 
-_Strict = Callable[[bytes], x509.Extensions]
-_Loose = Callable[[bytes], x509.ExtensionType | None]
+_StrictReader = Callable[[bytes], x509.Extensions]
+_LooseReader = Callable[[bytes], x509.ExtensionType | None]
 
 
-def _read(
-    parts: Iterable[der.Value], strict: _Strict, loose: Mapping[ObjectIdentifier, _Loose]
+def _parse_extensions(
+    parts: Iterable[der.Value],
+    strict: _StrictReader,
+    loose: Mapping[ObjectIdentifier, _LooseReader],
 ) -> x509.Extensions:
     """Parse extensions in DER.
 
@@ -519,7 +532,7 @@ def _read(
     for oid, critical, content in known:
         value: x509.ExtensionType | None = x509.UnrecognizedExtension(oid, content)
         if count.count(oid) == 1:  # OpenSSL decodes no extension that occurs twice
-            value = _value(oid, content, strict, loose)
+            value = _extension_value(oid, content, strict, loose)
         if value is not None:
             extensions.append(x509.Extension(oid, critical, value))
     return x509.Extensions(extensions)
@@ -540,11 +553,11 @@ def _parts(extension: der.Value) -> tuple[ObjectIdentifier, bool, bytes]:
     return oid, any(value.content != b"\0" for value in flag), content.content
 
 
-def _value(
+def _extension_value(
     oid: ObjectIdentifier,
     content: bytes,
-    strict: _Strict,
-    loose: Mapping[ObjectIdentifier, _Loose],
+    strict: _StrictReader,
+    loose: Mapping[ObjectIdentifier, _LooseReader],
 ) -> x509.ExtensionType | None:
     """Return the value of an extension, decoded strictly or else by a looser reader.
 
@@ -552,7 +565,7 @@ def _value(
     value that neither reader can decode.
     """
     ways: list[Callable[[bytes], x509.ExtensionType | None]] = [
-        lambda data: strict(_encoded(oid, data))[0].value
+        lambda data: strict(_encoded_extension(oid, data))[0].value
     ]
     if oid in loose:
         ways.append(loose[oid])
@@ -564,7 +577,7 @@ def _value(
     return x509.UnrecognizedExtension(oid, content)
 
 
-def _encoded(oid: ObjectIdentifier, content: bytes) -> bytes:
+def _encoded_extension(oid: ObjectIdentifier, content: bytes) -> bytes:
     identifier = der.encode(der.OID, der.encode_oid(oid.dotted_string))
     return der.encode(der.SEQUENCE, identifier, der.encode(der.OCTET_STRING, content))
 
@@ -572,14 +585,14 @@ def _encoded(oid: ObjectIdentifier, content: bytes) -> bytes:
 # ── extensions that `cryptography` reads ───────────────────────────────────────────────────
 
 _ED25519 = der.encode(der.SEQUENCE, der.encode(der.OID, der.encode_oid("1.3.101.112")))
-_NOBODY = der.encode(der.SEQUENCE)
-_WHEN = der.encode(der.UTC_TIME, b"260101000000Z")
-_BITS = der.encode(der.BIT_STRING, b"\0" * 33)
-_ONE = der.encode_integer(1)
+_EMPTY_NAME = der.encode(der.SEQUENCE)
+_ANY_TIME = der.encode(der.UTC_TIME, b"260101000000Z")
+_ANY_BIT_STRING = der.encode(der.BIT_STRING, b"\0" * 33)
+_ANY_SERIAL = der.encode_integer(1)
 
 
 def _certificate_with(
-    *, algorithm: bytes = _ED25519, subject: bytes = _NOBODY, extension: bytes = b""
+    *, algorithm: bytes = _ED25519, subject: bytes = _EMPTY_NAME, extension: bytes = b""
 ) -> x509.Certificate:
     """Return a minimal certificate with the given parts (DER).
 
@@ -592,33 +605,39 @@ def _certificate_with(
     signed = der.encode(
         der.SEQUENCE,
         der.encode(der.CONTEXT_0, der.encode_integer(2)),
-        _ONE,
+        _ANY_SERIAL,
         algorithm,
-        _NOBODY,
-        der.encode(der.SEQUENCE, _WHEN, _WHEN),
+        _EMPTY_NAME,
+        der.encode(der.SEQUENCE, _ANY_TIME, _ANY_TIME),
         subject,
-        der.encode(der.SEQUENCE, _ED25519, _BITS),
+        der.encode(der.SEQUENCE, _ED25519, _ANY_BIT_STRING),
         extensions,
     )
-    return x509.load_der_x509_certificate(der.encode(der.SEQUENCE, signed, algorithm, _BITS))
+    return x509.load_der_x509_certificate(
+        der.encode(der.SEQUENCE, signed, algorithm, _ANY_BIT_STRING)
+    )
 
 
 def _parse_in_certificate(extension: bytes) -> x509.Extensions:
     return _certificate_with(extension=extension).extensions
 
 
-def _list(entry: bytes, extensions: bytes) -> x509.CertificateRevocationList:
-    signed = der.encode(der.SEQUENCE, _ONE, _ED25519, _NOBODY, _WHEN, entry, extensions)
-    return x509.load_der_x509_crl(der.encode(der.SEQUENCE, signed, _ED25519, _BITS))
+def _minimal_list(entry: bytes, extensions: bytes) -> x509.CertificateRevocationList:
+    signed = der.encode(
+        der.SEQUENCE, _ANY_SERIAL, _ED25519, _EMPTY_NAME, _ANY_TIME, entry, extensions
+    )
+    return x509.load_der_x509_crl(der.encode(der.SEQUENCE, signed, _ED25519, _ANY_BIT_STRING))
 
 
 def _parse_in_list(extension: bytes) -> x509.Extensions:
-    return _list(b"", der.encode(der.CONTEXT_0, der.encode(der.SEQUENCE, extension))).extensions
+    return _minimal_list(
+        b"", der.encode(der.CONTEXT_0, der.encode(der.SEQUENCE, extension))
+    ).extensions
 
 
 def _parse_in_entry(extension: bytes) -> x509.Extensions:
-    entry = der.encode(der.SEQUENCE, _ONE, _WHEN, der.encode(der.SEQUENCE, extension))
-    return next(iter(_list(der.encode(der.SEQUENCE, entry), b""))).extensions
+    entry = der.encode(der.SEQUENCE, _ANY_SERIAL, _ANY_TIME, der.encode(der.SEQUENCE, extension))
+    return next(iter(_minimal_list(der.encode(der.SEQUENCE, entry), b""))).extensions
 
 
 # ── extensions that `cryptography` refuses ─────────────────────────────────────────────────
@@ -626,7 +645,7 @@ def _parse_in_entry(extension: bytes) -> x509.Extensions:
 
 def _basic_constraints(content: bytes) -> _LooseConstraints:
     ca, length = False, None
-    parts = _inside(content)
+    parts = _values_inside(content)
     if parts and parts[0].tag == der.BOOLEAN:
         ca = parts.pop(0).content != b"\0"
     if parts and parts[0].tag == der.INTEGER:
@@ -670,24 +689,24 @@ def key_usage(*usages: str) -> x509.KeyUsage:
 
 
 def _extended_key_usage(content: bytes) -> x509.ExtendedKeyUsage:
-    parts = _inside(content)
+    parts = _values_inside(content)
     if any(part.tag != der.OID for part in parts):
         raise ValueError("not a purpose")
     return x509.ExtendedKeyUsage(ObjectIdentifier(der.decode_oid(p)) for p in parts)
 
 
 def _name_constraints(content: bytes) -> None:
-    if any(part.content for part in _inside(content)):
+    if any(part.content for part in _values_inside(content)):
         raise ValueError("not empty")
 
 
 def _policies(content: bytes) -> None:
-    if _inside(content):
+    if _values_inside(content):
         raise ValueError("not empty")
 
 
 def _alternative_names(content: bytes) -> x509.SubjectAlternativeName:
-    return x509.SubjectAlternativeName(_names(_inside(content)))
+    return x509.SubjectAlternativeName(_names(_values_inside(content)))
 
 
 def _names(values: Iterable[der.Value]) -> list[x509.GeneralName]:
@@ -698,7 +717,7 @@ def _names(values: Iterable[der.Value]) -> list[x509.GeneralName]:
         alone = der.encode(der.SEQUENCE, value.whole)
         try:
             (extension,) = _parse_in_certificate(
-                _encoded(ExtensionOID.SUBJECT_ALTERNATIVE_NAME, alone)
+                _encoded_extension(ExtensionOID.SUBJECT_ALTERNATIVE_NAME, alone)
             )
             assert isinstance(extension.value, x509.SubjectAlternativeName)
             names += extension.value
@@ -709,7 +728,7 @@ def _names(values: Iterable[der.Value]) -> list[x509.GeneralName]:
 
 def _authority_key_identifier(content: bytes) -> _LooseKeyIdentifier:
     key, issuer, serial = None, None, None
-    for part in _inside(content):
+    for part in _values_inside(content):
         if part.tag == 0x80 and issuer is None and serial is None:
             key = part.content
         elif part.tag == der.CONTEXT_1 and serial is None:
@@ -721,8 +740,8 @@ def _authority_key_identifier(content: bytes) -> _LooseKeyIdentifier:
     return _LooseKeyIdentifier(key, issuer, serial)
 
 
-def _point(content: bytes) -> x509.ExtensionType | None:
-    parts = {part.tag: part.content for part in _inside(content)}
+def _distribution_point(content: bytes) -> x509.ExtensionType | None:
+    parts = {part.tag: part.content for part in _values_inside(content)}
     if any(len(parts.get(tag, b"?")) != 1 for tag in (_USER, _CA, _INDIRECT, _ATTRIBUTES)):
         raise ValueError("not a flag")
     kinds = [tag for tag in (_USER, _CA, _ATTRIBUTES) if parts.get(tag, b"\0") != b"\0"]
@@ -733,21 +752,21 @@ def _point(content: bytes) -> x509.ExtensionType | None:
     return None
 
 
-def _reason(content: bytes) -> x509.CRLReason:
+def _crl_reason(content: bytes) -> x509.CRLReason:
     value = der.first_value(content)
     if value.tag != _ENUMERATED or not value.content:
         raise ValueError("not a reason")
     return x509.CRLReason(x509.ReasonFlags.unspecified)
 
 
-def _inside(content: bytes) -> list[der.Value]:
+def _values_inside(content: bytes) -> list[der.Value]:
     value = der.first_value(content)
     if value.tag != der.SEQUENCE:
         raise ValueError("not a SEQUENCE")
     return der.children(value.content)
 
 
-_LOOSE_OF_CERTIFICATES: dict[ObjectIdentifier, _Loose] = {
+_CERTIFICATE_READERS: dict[ObjectIdentifier, _LooseReader] = {
     ExtensionOID.BASIC_CONSTRAINTS: _basic_constraints,
     ExtensionOID.KEY_USAGE: _key_usage,
     ExtensionOID.EXTENDED_KEY_USAGE: _extended_key_usage,
@@ -756,8 +775,10 @@ _LOOSE_OF_CERTIFICATES: dict[ObjectIdentifier, _Loose] = {
     ExtensionOID.SUBJECT_ALTERNATIVE_NAME: _alternative_names,
     ExtensionOID.AUTHORITY_KEY_IDENTIFIER: _authority_key_identifier,
 }
-_LOOSE_OF_LISTS: dict[ObjectIdentifier, _Loose] = {
+_LIST_READERS: dict[ObjectIdentifier, _LooseReader] = {
     ExtensionOID.AUTHORITY_KEY_IDENTIFIER: _authority_key_identifier,
-    ExtensionOID.ISSUING_DISTRIBUTION_POINT: _point,
+    ExtensionOID.ISSUING_DISTRIBUTION_POINT: _distribution_point,
 }
-_LOOSE_OF_ENTRIES: dict[ObjectIdentifier, _Loose] = {CRLEntryExtensionOID.CRL_REASON: _reason}
+_ENTRY_READERS: dict[ObjectIdentifier, _LooseReader] = {
+    CRLEntryExtensionOID.CRL_REASON: _crl_reason
+}

@@ -507,7 +507,7 @@ def _witness_against_widest(
             within = NameSet.union(part.topics(name).every() for name in names)
             for enclave in enclaves:
                 own_topics = side.of[enclave]
-                around = own_topics.around()
+                around = own_topics.superset()
                 if around is not None and not around.automata:
                     continue
                 access = world.stated[enclave]
@@ -866,7 +866,7 @@ def _may_learn(world: World, enclave: str, excluded: Container[str]) -> bool:
 
     True may be wrong, but False is certain, and saves a search of the whole robot.
     """
-    around = world.side(False).of.get(enclave, NameSet()).around()
+    around = world.side(False).of.get(enclave, NameSet()).superset()
     if around is None or around.automata:
         return True
     return any(

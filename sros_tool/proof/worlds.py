@@ -18,7 +18,7 @@ from string import ascii_letters, digits
 from types import MappingProxyType
 from typing import NamedTuple
 
-from sros_tool.automata import Automaton, Letters, NameSet, SearchLimit, Surroundings
+from sros_tool.automata import Automaton, Letters, NameSet, SearchLimit, Superset
 from sros_tool.dds.decision.access import Access, AccessVerb
 from sros_tool.dds.decision.expressions import names_of
 from sros_tool.dds.decision.vendors import Style
@@ -85,7 +85,7 @@ def names_of_expression(expression: str) -> NameSet:
 @lru_cache(maxsize=65536)
 def _wild(expression: str) -> Automaton | None:
     """Return an automaton for an expression, or None if it has no wildcard."""
-    around = names_of_expression(expression).around()
+    around = names_of_expression(expression).superset()
     return next(iter(around.automata), None) if around else None
 
 
@@ -138,7 +138,7 @@ class Side:
         self._found: dict[str, Sequence[str]] = {}
         self._users_by_automaton: dict[Automaton, frozenset[str]] = {}
         for enclave, names in of.items():
-            around = names.around()
+            around = names.superset()
             if around is None:
                 self._any.append(enclave)
                 continue
@@ -276,11 +276,11 @@ Confirm = Callable[[str, bool, str], bool]
 class Written(NamedTuple):
     """The topics that an enclave may write; ``exact`` are the topics stated without wildcards.
 
-    ``around`` is the result of `NameSet.around` for the exact topics.
+    ``around`` is the result of `NameSet.superset` for the exact topics.
     """
 
     names: NameSet
-    around: Surroundings | None
+    around: Superset | None
     exact: tuple[str, ...]
 
 
@@ -484,7 +484,7 @@ class World:
         """
         if enclave not in self._written:
             names = self.side(True).of.get(enclave, NameSet()) - excluded_names
-            around = names.around()
+            around = names.superset()
             exact = tuple(topic for topic in around.exact if topic in names) if around else ()
             self._written[enclave] = Written(names, around, exact)
         return self._written[enclave]
@@ -663,7 +663,7 @@ def _topics(key: str, domain: int, begin: str) -> NameSet:
     name = key.removesuffix(_UNTYPED).removeprefix(space)
     if len(name) == len(key) - len(space) - len(_UNTYPED) and "*" not in name:
         return NameSet((f"{begin}{name}{end}",)) if name.startswith("/") else NameSet()
-    around = names_of_keys((key,)).around()
+    around = names_of_keys((key,)).superset()
     assert around
     inner = (automaton.between(space, _ANY_TYPE_CHUNKS) for automaton in around.automata)
     exact = (

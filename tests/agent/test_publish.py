@@ -880,7 +880,7 @@ def test_a_forged_timestamp_is_refused_without_unpacking_everything(
         archive = gzip.compress(bytes(2**20))
         (publisher.pub / f"targets/robots/{number:064x}.r1.tar.gz").write_bytes(archive)
     read: list[bytes] = []
-    monkeypatch.setattr(published, "_MEAN_SIZE", 1024)
+    monkeypatch.setattr(published, "_MEAN_ARCHIVE_BYTES", 1024)
     monkeypatch.setattr(published, "read_release", read.append)
     publication = fleet_status(OpenedKeystore(publisher.root)).publication
     assert publication and "metadata that this keystore did not write" in publication.refused

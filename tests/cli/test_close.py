@@ -190,10 +190,10 @@ def robot(beside_graph: Beside, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(preparation, "built_without_security", lambda *_: lacking.exists())
     monkeypatch.setattr(apply, "_SYSTEMD", tmp_path / "systemd")
     monkeypatch.setattr(apply, "_RESTART_SECONDS", 0.1)
-    monkeypatch.setattr(apply, "_STEADY", timedelta())
+    monkeypatch.setattr(apply, "_STABLE_FOR", timedelta())
     monkeypatch.setattr(proof, "_START_SECONDS", 0.1)
     monkeypatch.setattr(state, "_LOOK_SECONDS", 0.01)
-    monkeypatch.setattr(proof, "_TRIES", 1)
+    monkeypatch.setattr(proof, "_MOST_TRIES", 1)
     for name in ("ROS_DOMAIN_ID", "RMW_IMPLEMENTATION", "ROS_SECURITY_ENABLE"):
         monkeypatch.delenv(name, raising=False)
     (tmp_path / "systemd").mkdir()
@@ -1471,7 +1471,7 @@ def test_a_requirement_that_lost_its_right_is_told_before_a_review_fails(tmp_pat
     for name, told in (("x", False), ("gone", True)):
         needed = f'[[only]]\npublish = ["/{name}"]\nenclaves = ["/a"]\n'
         (tmp_path / "requirements.toml").write_text(needed)
-        preparation._do(robot, guard)
+        preparation._run_step(robot, guard)
         assert ("`sros review` refuses a requirement" in said[-1]) is told, said
 
 

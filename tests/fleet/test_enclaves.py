@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import pytest
 
 from sros_tool.fleet import robots
-from sros_tool.fleet.robots import Fleet, Robot, _candidates, enclaves_of, robot_of
+from sros_tool.fleet.robots import Fleet, Robot, _possible_robots, enclaves_of, robot_of
 
 ROBOTS = (
     Robot("r1", "/r1", groups=("carriers",)),
@@ -65,9 +65,9 @@ def test_the_robot_of_one_enclave_among_many_patterns_is_found_at_once(
 
     def counted(fleet: Fleet, pattern: robots._Pattern, enclave: str) -> Iterator[Robot]:
         tried.append(pattern)
-        return _candidates(fleet, pattern, enclave)
+        return _possible_robots(fleet, pattern, enclave)
 
-    monkeypatch.setattr(robots, "_candidates", counted)
+    monkeypatch.setattr(robots, "_possible_robots", counted)
     for i in range(1000):
         found = robot_of(many, f"/r{i}/node{999 - i}")
         assert found and found.name == f"r{i}"

@@ -215,7 +215,7 @@ def test_a_program_that_fails_changes_nothing(
     script: str, words: str, site: Path, install: Install, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if "sleep" in script:
-        monkeypatch.setattr(ca_service, "_SECONDS", 0.3)
+        monkeypatch.setattr(ca_service, "_MOST_SECONDS", 0.3)
     install(script)
     before = snapshot(site)
     with pytest.raises(KeystoreError, match=words):

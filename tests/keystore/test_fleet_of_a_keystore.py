@@ -115,14 +115,14 @@ def test_enclaves_that_are_left_are_found_in_one_pass(
 ) -> None:
     """Not every name is compared with every path."""
     looked = 0
-    candidates = robots._candidates
+    candidates = robots._possible_robots
 
     def counted(*arguments: Any) -> Iterator[Robot]:
         nonlocal looked
         looked += 1
         return candidates(*arguments)
 
-    monkeypatch.setattr(robots, "_candidates", counted)
+    monkeypatch.setattr(robots, "_possible_robots", counted)
     paths = [f"/e{number}/{{robot}}" for number in range(30)]
     before = Fleet.of([Robot("a", "/a"), Robot("b", "/b")], enclaves=["/{robot}", *paths])
     assert not list(left_enclave_notes(OpenedKeystore(made / "ks"), before, before))

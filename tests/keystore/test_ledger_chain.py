@@ -71,12 +71,12 @@ def _edit(lines: list[bytes]) -> list[bytes]:
 
 
 def _edit_and_chain_again(lines: list[bytes]) -> list[bytes]:
-    from sros_tool.keystore.ledger import _digest
+    from sros_tool.keystore.ledger import _sha256
 
     lines = _edit(lines)
     for index in range(FIRST, len(lines)):
         entry = json.loads(lines[index])
-        entry["previous"] = _digest(lines[index - 1])
+        entry["previous"] = _sha256(lines[index - 1])
         lines[index] = json.dumps(entry, separators=(",", ":")).encode()
     return lines
 

@@ -36,7 +36,7 @@ QUESTIONS = [("enclave", "/a"), ("what", "settings"), ("what", "revocation"), ("
 
 @pytest.fixture
 def root(keystore: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setattr(ledger_module, "_INDEXED_FROM", 1)
+    monkeypatch.setattr(ledger_module, "_INDEX_FROM_LINES", 1)
     monkeypatch.setattr(ledger_module, "_LINES_PER_LOOKUP", 0)
     renew(keystore, ["/a"], now=NOW)
     return keystore

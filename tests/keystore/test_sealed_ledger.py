@@ -39,9 +39,9 @@ CHECK = ("check", "keystore", "--fail-on", "error", "--exclude", "enclave.node-c
 
 def index_all(monkeypatch: pytest.MonkeyPatch) -> None:
     """Have also a short ledger indexed, and never one that is not long yet sealed."""
-    monkeypatch.setattr(ledger_module, "_INDEXED_FROM", 1)
+    monkeypatch.setattr(ledger_module, "_INDEX_FROM_LINES", 1)
     monkeypatch.setattr(ledger_module, "_LINES_PER_LOOKUP", 0)
-    monkeypatch.setattr(ledger_module, "_SEALED_FROM", 1 << 30)
+    monkeypatch.setattr(ledger_module, "_SEAL_FROM_BYTES", 1 << 30)
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +52,7 @@ def sealed(made_keystore: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
     with pytest.MonkeyPatch.context() as patched:
         index_all(patched)
         for sealed_from in (1, 1 << 30, 1, 1 << 30):
-            patched.setattr(ledger_module, "_SEALED_FROM", sealed_from)
+            patched.setattr(ledger_module, "_SEAL_FROM_BYTES", sealed_from)
             renew(root, ["/a"], now=NOW)
     return root
 
@@ -193,7 +193,7 @@ def test_a_part_that_was_not_sealed_is_noticed(case: str, number: int, root: Pat
 def test_death_at_every_step_of_sealing(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(ledger_module, "_SEALED_FROM", 1)
+    monkeypatch.setattr(ledger_module, "_SEAL_FROM_BYTES", 1)
 
     def change(keystore: Path) -> None:
         renew(keystore, ["/a"], now=NOW)
@@ -324,7 +324,7 @@ def test_what_an_earlier_ledger_lacks_is_not_forgotten(
     sign_request(root, make_request(generate_key(), "/other"), now=NOW)
 
     earlier = copy_of(root, tmp_path / "later")
-    monkeypatch.setattr(ledger_module, "_SEALED_FROM", 1)
+    monkeypatch.setattr(ledger_module, "_SEAL_FROM_BYTES", 1)
     create_enclaves(root, ["/c"], now=NOW)
     revoke(root, ["/c"], now=NOW)
     assert len(parts(root)) == 5
@@ -332,7 +332,7 @@ def test_what_an_earlier_ledger_lacks_is_not_forgotten(
     for later in (5, 4):
         before = snapshot(root)
         for sealed_from in (1, 1 << 30):
-            monkeypatch.setattr(ledger_module, "_SEALED_FROM", sealed_from)
+            monkeypatch.setattr(ledger_module, "_SEAL_FROM_BYTES", sealed_from)
             with pytest.raises(KeystoreError, match=f"{ledger_part(later)}' is a later part"):
                 create_enclaves(root, ["/d"], now=NOW)
         assert snapshot(root) == before

@@ -248,7 +248,7 @@ def ask_openssl(root: Path, names: Sequence[str], thieves: Sequence[Thief], now:
 def remember_digests(monkeypatch: pytest.MonkeyPatch) -> None:
     """What is in a file that nobody replaced since last month is known."""
     known: dict[Path, tuple[Signature, list[str]]] = {}
-    compute = history_of_keystores._digests
+    compute = history_of_keystores._ledger_digests
 
     def remembered(path: Path) -> list[str]:
         now = signature(path.parent, [path.name])
@@ -256,7 +256,7 @@ def remember_digests(monkeypatch: pytest.MonkeyPatch) -> None:
             known[path] = (now, compute(path))
         return known[path][1]
 
-    monkeypatch.setattr(history_of_keystores, "_digests", remembered)
+    monkeypatch.setattr(history_of_keystores, "_ledger_digests", remembered)
 
 
 def permit(root: Path, names: list[str], version: int, now: datetime) -> None:

@@ -581,7 +581,7 @@ def test_a_lock_file_that_was_removed_before_it_was_locked_is_no_lock(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The process that held the lock removes the file, and a third process makes another one."""
-    lock, file = transactions._locked, tmp_path / LOCK
+    lock, file = transactions._try_lock, tmp_path / LOCK
     removed: list[Path] = []
 
     def lose_the_first(handle: int) -> bool:
@@ -590,7 +590,7 @@ def test_a_lock_file_that_was_removed_before_it_was_locked_is_no_lock(
             file.unlink()
         return lock(handle)
 
-    monkeypatch.setattr(transactions, "_locked", lose_the_first)
+    monkeypatch.setattr(transactions, "_try_lock", lose_the_first)
     with Folder(tmp_path) as folder:
         held = KeystoreLock(folder).acquire()
         assert (removed, file.exists()) == ([file], True)

@@ -39,16 +39,16 @@ class ArchiveLimits(NamedTuple):
     members: int
 
 
-_HEADERS = (tarfile.XHDTYPE, tarfile.GNUTYPE_LONGNAME)
+_EXTENSION_HEADERS = (tarfile.XHDTYPE, tarfile.GNUTYPE_LONGNAME)
 """The types of headers that say more about the next entry."""
 _MOST_HEADER = 1024
 """Maximum size in bytes of such a header, which has room for a path."""
-_SPARSE = b"GNU.sparse."
+_SPARSE_KEY = b"GNU.sparse."
 """Begins the fields of a sparse file in the header of its entry."""
-_OF_ONE_ENCLAVE = ArchiveLimits(16 * 1024 * 1024, MAX_UNPACKED, 200)
+_LIMITS_OF_ONE_ENCLAVE = ArchiveLimits(16 * 1024 * 1024, MAX_UNPACKED, 200)
 OF_ONE_ROBOT = ArchiveLimits(64 * 1024 * 1024, 256 * 1024 * 1024, 20_000)
 """The limits of an archive with all enclaves of a robot."""
-_GZIP = 16 + zlib.MAX_WBITS
+_GZIP_WINDOW_BITS = 16 + zlib.MAX_WBITS
 
 
 def file_mode(path: str) -> int:
@@ -93,7 +93,7 @@ def listed_digests(files: Mapping[str, bytes]) -> bytes:
     return "\n".join([*sorted(digests), ""]).encode()
 
 
-def unpack(data: bytes, limits: ArchiveLimits = _OF_ONE_ENCLAVE) -> dict[str, bytes]:
+def unpack(data: bytes, limits: ArchiveLimits = _LIMITS_OF_ONE_ENCLAVE) -> dict[str, bytes]:
     """Map the paths in a ``.tar.gz`` archive to the content of the files; write nothing.
 
     The paths are not checked: the caller must do that.
@@ -104,10 +104,10 @@ def unpack(data: bytes, limits: ArchiveLimits = _OF_ONE_ENCLAVE) -> dict[str, by
     """
     try:
         plain = _unzip(data, limits)
-        if _SPARSE in plain:
+        if _SPARSE_KEY in plain:
             raise DocumentError("it contains a sparse file, which is not a regular file")
         with tarfile.open(fileobj=io.BytesIO(plain), mode="r:", tarinfo=_Entry) as tar:
-            return dict(_members(tar, limits.members))
+            return dict(_files_in(tar, limits.members))
     except (
         tarfile.TarError,
         zlib.error,
@@ -131,7 +131,7 @@ def stated_size(data: bytes) -> int:
 def _unzip(data: bytes, limits: ArchiveLimits) -> bytes:
     if len(data) > limits.packed:
         raise DocumentError(f"it is too large: more than {limits.packed // 1024**2} MiB")
-    stream = zlib.decompressobj(_GZIP)
+    stream = zlib.decompressobj(_GZIP_WINDOW_BITS)
     plain = stream.decompress(data, min(limits.unpacked, stated_size(data)) + 1)
     if len(plain) > limits.unpacked:
         raise DocumentError(f"it unpacks to more than {limits.unpacked // 1024**2} MiB")
@@ -154,17 +154,22 @@ class _Entry(tarfile.TarInfo):
         """Return the entry whose header is ``buf``.
 
         Raises:
-            DocumentError: it is no regular file or folder, or a header that is too long.
+            DocumentError: the entry is no regular file or folder, or is a header that is too long.
         """
         entry = super().frombuf(buf, encoding, errors)
-        if entry.type in _HEADERS and entry.size > _MOST_HEADER:
+        if entry.type in _EXTENSION_HEADERS and entry.size > _MOST_HEADER:
             raise DocumentError(f"it contains a header of {entry.size} bytes")
-        if entry.type not in (*_HEADERS, tarfile.REGTYPE, tarfile.AREGTYPE, tarfile.DIRTYPE):
+        if entry.type not in (
+            *_EXTENSION_HEADERS,
+            tarfile.REGTYPE,
+            tarfile.AREGTYPE,
+            tarfile.DIRTYPE,
+        ):
             raise DocumentError(f"it contains {entry.name!r}, which is not a regular file")
         return entry
 
 
-def _members(tar: tarfile.TarFile, maximum: int) -> Iterator[tuple[str, bytes]]:
+def _files_in(tar: tarfile.TarFile, maximum: int) -> Iterator[tuple[str, bytes]]:
     member_names: set[str] = set()
     for entry in tar:
         name = entry.name

@@ -84,7 +84,7 @@ from sros_tool.values import DryRun, FileChanges, NamedKeystore, Notes, Words
 from sros_tool.wording import first_few
 from sros_tool.xml import read_bytes
 
-_SHOWN = 5
+_MOST_SHOWN = 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +99,7 @@ class Export:
 
 @dataclass(frozen=True, slots=True)
 class ExportSelection:
-    """The enclaves to export, and those that the export has to leave out.
+    """The enclaves to export, and the enclaves that the export has to leave out.
 
     The enclaves in ``left_out`` match the selection, but their keys are on their robots.
     """
@@ -111,10 +111,10 @@ class ExportSelection:
 def with_keys_here(
     keystore: OpenedKeystore, names: Iterable[str], given: Collection[str], *, keyless: bool
 ) -> ExportSelection:
-    """Return the enclaves to export.
+    """Return the enclaves to export, and those left out because a robot has the key.
 
-    Unless ``keyless`` is set, enclaves whose keys are on their robots are left out.  Those that are
-    ``given`` by name stay, so that `distribute` refuses them.
+    With ``keyless``, no enclave is left out. Enclaves that are ``given`` by name are never left
+    out, so that `distribute` refuses them.
 
     Raises:
         KeystoreError: this is not a keystore, or the keys of all selected enclaves are on robots.
@@ -162,7 +162,7 @@ def distribute(
         return Export(target, tuple(names), changes, notes)
     refuse_archive_name(target, "Name an archive FILE.tar.gz, or a folder without such an ending.")
     changes = _write_folder(keystore, target, files, now=now, force=force, dry_run=dry_run)
-    notes += (*_readable_key_notes(target, names), *_notes(keystore, target, names))
+    notes += (*_readable_key_notes(target, names), *_other_enclave_notes(keystore, target, names))
     return Export(target, tuple(names), changes, notes)
 
 
@@ -172,7 +172,7 @@ def _key_notes(files: Mapping[str, bytes], keyless: bool) -> Iterator[Note]:
         their = "its private key" if len(keys) == 1 else "their private keys"
         yield Note(
             "export.keys-included",
-            f"the export has {first_few(list(map(enclave_of, keys)), _SHOWN)} with {their}: "
+            f"the export has {first_few(list(map(enclave_of, keys)), _MOST_SHOWN)} with {their}: "
             "--keyless leaves out nothing, it adds enclaves whose keys were made on their robots. "
             "Releases of `sros fleet publish` have no private key.",
         )
@@ -201,7 +201,9 @@ def _readable_key_notes(target: Path, names: Sequence[str]) -> Iterator[Note]:
                 )
 
 
-def _notes(keystore: OpenedKeystore, target: Path, names: Sequence[str]) -> Iterator[Note]:
+def _other_enclave_notes(
+    keystore: OpenedKeystore, target: Path, names: Sequence[str]
+) -> Iterator[Note]:
     """Yield notes on enclaves in ``target`` that the keystore lacks, or of other robots."""
     present, fleet = search_enclaves(target)[0], load_fleet(keystore)
     owners = {n: robot_of(fleet, n) if fleet else None for n in (*names, *present)}
@@ -221,8 +223,8 @@ def _notes(keystore: OpenedKeystore, target: Path, names: Sequence[str]) -> Iter
     for robot, enclaves in of_others.items():
         yield Note(
             "export.of-another-robot",
-            f"'{target}' also has {first_few(enclaves, _SHOWN)} of robot {robot}: whoever has the "
-            f"folder can act as {robot}. If they are not meant to be there, remove them: "
+            f"'{target}' also has {first_few(enclaves, _MOST_SHOWN)} of robot {robot}: whoever has "
+            f"the folder can act as {robot}. If they are not meant to be there, remove them: "
             f"`{_enclave_removal(target, enclaves, present)}`. If they were on another robot, give "
             f"{robot} new keys: `sros renew {quote(str(keystore.root))} --robot {quote(robot)} "
             "--new-key --revoke-old`.",
@@ -315,7 +317,7 @@ def released_enclave(keystore: OpenedKeystore, name: str, now: datetime) -> Rele
     evaluation = _evaluate_enclave(keystore, name, now)
     state = evaluation.state
     problems = state.problems_in_keystore
-    lasting = [str(problem) for problem in problems if problem.fault not in _OF_TIME]
+    lasting = [str(problem) for problem in problems if problem.fault not in _DATE_FAULTS]
     if lasting or (evaluation.problems and not problems):
         raise _refused_enclave_error(keystore, name, lasting or evaluation.problems)
     _check_zenoh(keystore, name, state)
@@ -333,7 +335,7 @@ def released_files(keystore: OpenedKeystore, name: str) -> dict[str, bytes]:
     Raises:
         KeystoreError: a file contains a private key.
     """
-    return _read_files(keystore, name, (file for file in _FILES if file not in KEY_FILES))
+    return _read_files(keystore, name, (file for file in _EXPORTED_FILES if file not in KEY_FILES))
 
 
 def _evaluated_until(files: Mapping[str, bytes], state: OpenedEnclave, now: datetime) -> datetime:
@@ -363,7 +365,7 @@ def _first_expiry(authorities: bytes) -> datetime:
     )
 
 
-_OF_TIME = frozenset(
+_DATE_FAULTS = frozenset(
     {
         Fault.CERTIFICATE_EXPIRED,
         Fault.CERTIFICATE_NOT_YET_VALID,
@@ -403,10 +405,10 @@ def _files_of(
     """
     _check_zenoh(keystore, name, evaluation.state)
     _check_not_ca_key(keystore.folder(name), evaluation.state)
-    return _read_files(keystore, name, _FILES)
+    return _read_files(keystore, name, _EXPORTED_FILES)
 
 
-_FILES = (*REQUIRED_FILES, KEY_URI_FILE, *OPTIONAL_FILES, *ZENOH_FILES)
+_EXPORTED_FILES = (*REQUIRED_FILES, KEY_URI_FILE, *OPTIONAL_FILES, *ZENOH_FILES)
 
 
 def _read_files(
@@ -428,7 +430,7 @@ def _read_files(
                 if role := ROLES_OF_FILES.get(file):
                     _check_authorities(keystore, role, keystore.root / path, files[path])
                 if file in (GOVERNANCE_FILE, PERMISSIONS_FILE):
-                    _check_last(keystore, name, keystore.root / path, files[path])
+                    _check_last_document(keystore, name, keystore.root / path, files[path])
     return files
 
 
@@ -458,7 +460,7 @@ def _check_authorities(keystore: OpenedKeystore, role: str, path: Path, data: by
         )
 
 
-def _check_last(keystore: OpenedKeystore, name: str, path: Path, data: bytes) -> None:
+def _check_last_document(keystore: OpenedKeystore, name: str, path: Path, data: bytes) -> None:
     """Raise `KeystoreError` if a signed document is not the last one that the ledger records.
 
     Documents that ros2/sros2 signed are not in the ledger, and are exported as they are.
@@ -625,7 +627,7 @@ def _write_archive(
                 "Nothing was changed.",
                 "Add --force to replace it, or choose another name.",
             )
-        check_rollback(keystore, target, _unpacked(target), files, now)
+        check_rollback(keystore, target, _unpack_archive(target), files, now)
     change = Change("replace" if target.exists() else "create", target.name)
     if not dry_run:
         with staged_file(target, data) as put_in_place:
@@ -633,7 +635,7 @@ def _write_archive(
     return (change,)
 
 
-def _unpacked(target: Path) -> Mapping[str, bytes]:
+def _unpack_archive(target: Path) -> Mapping[str, bytes]:
     """Map the paths in an archive to the content of its files.
 
     Raises:

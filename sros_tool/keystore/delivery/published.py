@@ -1,7 +1,7 @@
-"""What was published last for a fleet, as the keystore records it in ``published.json``.
+"""The record of the last publication for a fleet, in the keystore's ``published.json``.
 
-The file saves work, and has the last version numbers, so that the next ones are higher.  Robots do
-not depend on it.
+The file saves work, and has the last version numbers, which the next versions must exceed.  Robots
+do not depend on it.
 """
 
 from __future__ import annotations
@@ -28,19 +28,19 @@ from sros_tool.xml import read_bytes
 
 _FORMAT = 1
 _MOST_BYTES = 128 * 1024 * 1024
-_SMALL = 64 * 1024
+_MOST_TIMESTAMP_BYTES = 64 * 1024
 _ARCHIVES_OF_FLEET, _ARCHIVES_OF_ROBOT = 500, 50
 """Maximum number of archives in a publishing folder: for all robots, and in addition per robot.
 
 Replaced archives are kept for two days.
 """
-_MEAN_SIZE = 512 * 1024
+_MEAN_ARCHIVE_BYTES = 512 * 1024
 """Maximum mean size of these archives in bytes, unpacked."""
 MOST_NUMBER = 10**12 - 1
 """Highest number of a release that a seal can have, and highest version of metadata."""
 BEGIN_AGAIN = "Start again as after a theft of all keys: docs/fetching.md says how."
 """The remedy if somebody has used up the version numbers."""
-_TIMESTAMP = "metadata/timestamp.json"
+_TIMESTAMP_PATH = "metadata/timestamp.json"
 _DIGEST = re.compile(r"[0-9a-f]{64}\Z")
 
 
@@ -76,7 +76,7 @@ def check_count(value: object, maximum: int = MOST_NUMBER) -> int:
 
 
 class Evaluated(NamedTuple):
-    """Until when the files of a robot, which have no problems, need no new evaluation.
+    """The time until which a robot's files, found without problems, need no new evaluation.
 
     ``files`` is a digest of the files without revocation lists, and of the version of sros.
     """
@@ -91,11 +91,11 @@ class Evaluated(NamedTuple):
 
 
 class PublishedRobot(NamedTuple):
-    """What was published last for a robot, and from which files.
+    """The last published release of a robot, and digests of the files in the release.
 
     ``content`` is the SHA-256 of the list of the release's files.  ``files`` is a digest of the
-    inodes, sizes and times of these files in the keystore: if it is the same, nothing has changed
-    for the robot.
+    inodes, sizes and times of these files in the keystore: if this digest is the same, nothing has
+    changed for the robot.
     """
 
     release: PublishedRelease
@@ -106,14 +106,14 @@ class PublishedRobot(NamedTuple):
 
 @dataclass
 class Published:
-    """What was published last: by robot, and the versions of the metadata by name.
+    """The last publication: the releases by robot, and the versions of the metadata by name.
 
     ``superseded`` maps paths in the publishing folder that nothing names any more to the time when
-    that was first seen.  ``folder`` is the absolute path of the publishing folder, "" if unknown.
-    ``metadata`` has the paths there of the metadata to which the timestamp leads.  ``until`` is the
-    first expiry of the metadata: from then on, robots refuse it; ``root_until`` is the expiry of
-    the root metadata.  These three are empty or None if nothing was published, or by a release of
-    sros that did not record them.
+    sros first noticed this.  ``folder`` is the absolute path of the publishing folder, "" if
+    unknown. ``metadata`` has the paths there of the metadata to which the timestamp leads.
+    ``until`` is the first expiry of the metadata: from then on, robots refuse it; ``root_until`` is
+    the expiry of the root metadata.  These three are empty or None if nothing was published, or by
+    a release of sros that did not record them.
     """
 
     robots: dict[str, PublishedRobot] = field(default_factory=dict)
@@ -139,7 +139,7 @@ class Published:
 
         The result is also "" if the folder is not here, for example on a disk that is not mounted.
         """
-        paths = (_TIMESTAMP, *self.paths())
+        paths = (_TIMESTAMP_PATH, *self.paths())
         with suppress(OSError):
             if self.folder and Path(self.folder).is_dir():
                 return next((path for path in paths if not Path(self.folder, path).exists()), "")
@@ -147,7 +147,7 @@ class Published:
 
     def document(self, now: datetime) -> bytes:
         """Return the content of ``published.json``."""
-        robots = {name: _as_json(robot) for name, robot in sorted(self.robots.items())}
+        robots = {name: _robot_as_json(robot) for name, robot in sorted(self.robots.items())}
         superseded = {path: iso(time) for path, time in sorted(self.superseded.items())}
         value = {
             "format": _FORMAT,
@@ -162,7 +162,7 @@ class Published:
 
 
 def read_published(keystore: OpenedKeystore) -> Published:
-    """Return what was published last; an empty value if nothing was published.
+    """Return the record of the last publication; an empty record if nothing was published.
 
     Raises:
         DocumentError: the file is damaged.
@@ -173,7 +173,7 @@ def read_published(keystore: OpenedKeystore) -> Published:
         path = keystore.root / PUBLISHED
         value = parse_json(read_bytes(path, "list of what is published", max_bytes=_MOST_BYTES))
         return Published(
-            {name: _robot(robot_value) for name, robot_value in value["robots"].items()},
+            {name: _robot_from(robot_value) for name, robot_value in value["robots"].items()},
             {name: check_count(version) for name, version in value["versions"].items()},
             {path: parse_iso(time) for path, time in value["superseded"].items()},
             str(value.get("folder", "")),
@@ -190,16 +190,16 @@ def read_published(keystore: OpenedKeystore) -> Published:
 def may_have_later_releases(keystore: OpenedKeystore) -> bool:
     """Return whether the publishing folder has later metadata than the keystore recorded.
 
-    If so, the keystore was restored from a backup, or somebody else wrote the metadata, which this
-    function does not verify.
+    Later metadata shows that the keystore was restored from a backup, or that somebody else wrote
+    the metadata, which this function does not verify.
     """
     with suppress(SrosError, ValueError, OSError, KeyError, TypeError):
         known = read_published(keystore)
         if known.folder:
-            path = Path(known.folder) / _TIMESTAMP
-            version = parse_json(read_bytes(path, "timestamp", max_bytes=_SMALL))["signed"][
-                "version"
-            ]
+            path = Path(known.folder) / _TIMESTAMP_PATH
+            version = parse_json(read_bytes(path, "timestamp", max_bytes=_MOST_TIMESTAMP_BYTES))[
+                "signed"
+            ]["version"]
             return bool(version > known.versions.get("timestamp", 0))
     return False
 
@@ -243,8 +243,8 @@ def releases_in(folder: Path, robots: int) -> Iterator[Release]:
         except (SrosError, OSError):
             continue
         size += max(len(data), min(stated_size(data), OF_ONE_ROBOT.unpacked))
-        if size > most * _MEAN_SIZE:
-            excess = f"more than {most * _MEAN_SIZE // 1024**2} MiB, unpacked, of"
+        if size > most * _MEAN_ARCHIVE_BYTES:
+            excess = f"more than {most * _MEAN_ARCHIVE_BYTES // 1024**2} MiB, unpacked, of"
             break
         with suppress(SrosError):
             yield read_release(data)
@@ -267,14 +267,14 @@ def damaged_list_error(keystore: OpenedKeystore, why: str = "") -> DocumentError
     )
 
 
-def _robot(value: Mapping[str, Any]) -> PublishedRobot:
+def _robot_from(value: Mapping[str, Any]) -> PublishedRobot:
     release = PublishedRelease(value["number"], value["sha256"], value["length"]).checked()
     files, *times = value.get("evaluated", [""])
     evaluated = Evaluated(str(files), *map(parse_iso, times)) if times else None
     return PublishedRobot(release, str(value["content"]), str(value["files"]), evaluated)
 
 
-def _as_json(robot: PublishedRobot) -> dict[str, object]:
+def _robot_as_json(robot: PublishedRobot) -> dict[str, object]:
     value = {**robot.release._asdict(), "content": robot.content, "files": robot.files}
     if robot.evaluated is None:
         return value

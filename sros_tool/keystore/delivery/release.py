@@ -41,17 +41,17 @@ if TYPE_CHECKING:
 
 RELEASE_FILES = frozenset({*REQUIRED_FILES, *OPTIONAL_FILES, *ZENOH_FILES} - {KEY_FILE})
 """The files of an enclave that a release can have: neither ``key.pem`` nor ``key.p11``."""
-_SEALED = re.compile(rb"sros release 1\nrobot ([^\n]{1,255})\nnumber ([1-9][0-9]{0,11})\n")
+_SEAL_HEAD = re.compile(rb"sros release 1\nrobot ([^\n]{1,255})\nnumber ([1-9][0-9]{0,11})\n")
 
 
 @dataclass(frozen=True, slots=True)
 class Release:
-    """What the security folder of ``robot`` has to contain.
+    """A release: the files that the security folder of ``robot`` has to contain.
 
-    ``number`` is higher than those of all earlier releases of the robot.  ``files`` maps paths
-    (``enclaves/r1/base/cert.pem``) to contents, without private keys.  An enclave without files in
-    the release no longer belongs to the robot.  ``seal`` is the signed message with robot, number
-    and the digests of all files; `seal_problem` verifies it.
+    ``number`` is higher than the numbers of all earlier releases of the robot.  ``files`` maps
+    paths (``enclaves/r1/base/cert.pem``) to contents, without private keys.  An enclave without
+    files in the release no longer belongs to the robot.  ``seal`` is the signed message with robot,
+    number and the digests of all files; `seal_problem` verifies it.
     """
 
     robot: str
@@ -96,7 +96,7 @@ def seal_releases(
     releases: Sequence[tuple[str, int, Mapping[str, bytes]]], authority: Authority
 ) -> list[bytes]:
     """Return the seals (S/MIME) of releases, each given as (robot, number, files), in order."""
-    documents = [_text(robot, number, files) for robot, number, files in releases]
+    documents = [_seal_text(robot, number, files) for robot, number, files in releases]
     return authority.sign_all(documents, "the file list of a release")
 
 
@@ -122,7 +122,7 @@ def read_release(data: bytes) -> Release:
         for path in files:
             _enclave_and_file(path)
         sealed = sealed_robot(seal)
-        if smime.parse(seal).text != _text(sealed.robot, sealed.number, files):
+        if smime.parse(seal).text != _seal_text(sealed.robot, sealed.number, files):
             raise DocumentError("its files differ from the signed list")
     except SrosError as error:
         raise DocumentError(f"the release cannot be used: {error.what}", error.why) from error
@@ -135,7 +135,7 @@ def sealed_robot(seal: bytes) -> SealedRobot:
     Raises:
         DocumentError: the message is not the seal of a release.
     """
-    head = _SEALED.match(smime.parse(seal).text)
+    head = _SEAL_HEAD.match(smime.parse(seal).text)
     robot = head[1].decode("ascii", "replace") if head else ""
     if not head or name_problem(robot):
         raise DocumentError(f"{RELEASE_SEAL} is not the seal of a release")
@@ -151,12 +151,12 @@ def seal_problem(release: Release, authorities: Iterable[x509.Certificate]) -> s
         signed = smime.parse(release.seal)
     except SrosError as error:
         return str(error)
-    if signed.text != _text(release.robot, release.number, release.files):
+    if signed.text != _seal_text(release.robot, release.number, release.files):
         return "robot, number or files differ from the signed list"
     return signed.problem_for(authorities)
 
 
-def _text(robot: str, number: int, files: Mapping[str, bytes]) -> bytes:
+def _seal_text(robot: str, number: int, files: Mapping[str, bytes]) -> bytes:
     """Return the text of a seal."""
     head = f"sros release 1\nrobot {robot}\nnumber {number}\n"
     return head.encode() + listed_digests(files)

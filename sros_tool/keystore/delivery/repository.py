@@ -51,7 +51,7 @@ RENEWED_ALONE = frozenset({_TIMESTAMP, _SNAPSHOT})
 _METADATA = "metadata"
 """The folder of the metadata in a publishing folder."""
 _BINS = "robots"
-_ROBOTS_OF_A_BIN = 32
+_ROBOTS_PER_BIN = 32
 _MOST_BYTES = 8 * 1024 * 1024
 
 _Content = TypeVar("_Content", Root, Targets, Snapshot, Timestamp)
@@ -88,7 +88,7 @@ def replaced_key(role: str) -> str:
     )
 
 
-_NAME_ROOT = (
+_REMEDY_ROOT_KEY = (
     "Name the right file with --root-key. If a rotation of this key was killed, the right file is "
     "FILE.new, next to the earlier one."
 )
@@ -146,7 +146,7 @@ class Roots:
     def files(self) -> Iterator[tuple[str, bytes]]:
         """Yield the path in the publishing folder and the content of each version."""
         for version in self.versions:
-            yield f"{_METADATA}/{version.signed.version}.{_ROOT}.json", _bytes(version)
+            yield f"{_METADATA}/{version.signed.version}.{_ROOT}.json", _metadata_bytes(version)
 
     def add(
         self, signers: Mapping[str, CryptoSigner], keys: Sequence[CryptoSigner], expires: datetime
@@ -171,7 +171,7 @@ class Roots:
             raise KeystoreError(
                 f"'{path}' is not the {role} key with which this keystore publishes",
                 "Robots would refuse its signatures.",
-                _NAME_ROOT if role == _ROOT else replaced_key(role),
+                _REMEDY_ROOT_KEY if role == _ROOT else replaced_key(role),
             )
 
     def verify(
@@ -263,14 +263,15 @@ def read_present(folder: Path, roots: Roots) -> PresentMetadata:
             f"'{error.filename}' is missing, which robots fetch",
             "The keystore wrote the metadata that leads there.",
             "Copy the file back. If the keystore was restored from a backup, first follow "
-            f"docs/howto/keystore_is_lost.md. If the file is lost, {_without_metadata(folder)}.",
+            f"docs/howto/keystore_is_lost.md. If the file is lost, "
+            f"{_damaged_metadata_remedy(folder)}.",
         ) from error
     except OSError as error:
         raise KeystoreError(
             f"the metadata in '{folder}' cannot be read",
             f"'{error.filename}': {error.strerror}.",
             "Give the user who publishes access to the folder and its files. If a file is damaged, "
-            f"{_without_metadata(folder)}.",
+            f"{_damaged_metadata_remedy(folder)}.",
         ) from error
     except (RepositoryError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise _foreign_folder_error(folder, str(error)) from error
@@ -282,11 +283,11 @@ def _foreign_folder_error(folder: Path, why: str) -> KeystoreError:
         f"{why[:1].upper()}{why[1:].removesuffix('.')}.",
         "Name another folder. If the keystore was restored from a backup, first follow "
         "docs/howto/keystore_is_lost.md. If this keystore published to it before, and it is "
-        f"damaged, {_without_metadata(folder)}.",
+        f"damaged, {_damaged_metadata_remedy(folder)}.",
     )
 
 
-def _without_metadata(folder: Path) -> str:
+def _damaged_metadata_remedy(folder: Path) -> str:
     """Return the remedy for damaged metadata, as a clause."""
     return (
         f"remove '{folder / _METADATA}', and publish again with --new-folder of "
@@ -295,20 +296,20 @@ def _without_metadata(folder: Path) -> str:
 
 
 def _read_present(folder: Folder, roots: Roots) -> PresentMetadata:
-    timestamp = _read(folder, Timestamp, _TIMESTAMP)
+    timestamp = _read_metadata(folder, Timestamp, _TIMESTAMP)
     roots.verify(_TIMESTAMP, timestamp)
     described = timestamp.signed.snapshot_meta
-    snapshot = _read(folder, Snapshot, _SNAPSHOT, described.version)
+    snapshot = _read_metadata(folder, Snapshot, _SNAPSHOT, described.version)
     file = folder.read(f"{_METADATA}/{described.version}.{_SNAPSHOT}.json", max_bytes=_MOST_BYTES)
     described.verify_length_and_hashes(file)
     roots.verify(_SNAPSHOT, snapshot)
     meta = snapshot.signed.meta
-    targets = _read(folder, Targets, _TARGETS, meta[f"{_TARGETS}.json"].version)
+    targets = _read_metadata(folder, Targets, _TARGETS, meta[f"{_TARGETS}.json"].version)
     roots.verify(_TARGETS, targets)
     bins = {}
     roles = targets.signed.delegations and targets.signed.delegations.succinct_roles
     for name in roles.get_roles() if roles else ():
-        bins[name] = _read(folder, Targets, name, meta[f"{name}.json"].version)
+        bins[name] = _read_metadata(folder, Targets, name, meta[f"{name}.json"].version)
         _verify(targets.signed, name, bins[name])
     present = PresentMetadata(timestamp, snapshot, file, targets, bins)
     for version in present.versions().values():
@@ -317,7 +318,7 @@ def _read_present(folder: Folder, roots: Roots) -> PresentMetadata:
     return present
 
 
-def _read(
+def _read_metadata(
     folder: Folder, kind: type[_Content], role: str, version: int | None = None
 ) -> Metadata[_Content]:
     name = f"{role}.json" if version is None else f"{version}.{role}.json"
@@ -414,7 +415,7 @@ class MetadataComposer:
 
         The number only changes when four times as many bins are needed.
         """
-        bits = max(1, ceil(log2(max(1, robots / _ROBOTS_OF_A_BIN))))
+        bits = max(1, ceil(log2(max(1, robots / _ROBOTS_PER_BIN))))
         before = self._present.targets and self._present.targets.signed.delegations
         if before and before.succinct_roles:
             kept = before.succinct_roles.bit_length
@@ -431,7 +432,7 @@ class MetadataComposer:
         return lasts and signed.version == self.versions[name]
 
     def _can_be_kept(self, metadata: Metadata[_Content]) -> bool:
-        """Return whether top-level metadata can stay: it is current, and each signer signed it."""
+        """Return whether top-level metadata can stay: current, and signed by each signer."""
         signers = self._signers[metadata.signed.type]
         signed = all(signer.public_key.keyid in metadata.signatures for signer in signers)
         return signed and self._is_current(metadata.signed.type, metadata)
@@ -450,7 +451,7 @@ class MetadataComposer:
         for signer in signers:
             metadata.sign(signer, append=True)
         file = f"{name}.json" if name == _TIMESTAMP else f"{content.version}.{name}.json"
-        self._files.append((f"{_METADATA}/{file}", _bytes(metadata)))
+        self._files.append((f"{_METADATA}/{file}", _metadata_bytes(metadata)))
         self._expires[name] = content.expires
 
     def _add_snapshot(self) -> None:
@@ -469,5 +470,5 @@ class MetadataComposer:
         self._add(_TIMESTAMP, Timestamp(snapshot_meta=described), self._signers[_TIMESTAMP])
 
 
-def _bytes(metadata: Metadata[_Content]) -> bytes:
+def _metadata_bytes(metadata: Metadata[_Content]) -> bytes:
     return metadata.to_bytes(JSONSerializer(compact=True))

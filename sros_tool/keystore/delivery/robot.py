@@ -274,10 +274,10 @@ def _certificates(path: Path) -> tuple[x509.Certificate, ...]:
     return load_certificates(read_bytes(path, "certificate"), f"'{path}'")
 
 
-_OPTIONAL = (*OPTIONAL_FILES, *ZENOH_FILES)
-_REQUIRED = tuple(file for file in REQUIRED_FILES if file != KEY_FILE)
-_AGAIN = "Have the request signed again, and import the new answer."
-_SEALED = re.compile(rb"sros answer (?:1|2\nnumber ([1-9][0-9]{0,12}))\n")
+_OPTIONAL_ANSWER_FILES = (*OPTIONAL_FILES, *ZENOH_FILES)
+_REQUIRED_ANSWER_FILES = tuple(file for file in REQUIRED_FILES if file != KEY_FILE)
+_SIGN_REQUEST_AGAIN = "Have the request signed again, and import the new answer."
+_SEAL_HEAD = re.compile(rb"sros answer (?:1|2\nnumber ([1-9][0-9]{0,12}))\n")
 """Matches the first lines of a seal; earlier versions of sros wrote no number."""
 
 
@@ -324,9 +324,9 @@ def seal(files: dict[str, bytes], number: int, authority: Authority) -> bytes:
     return authority.sign(head + listed_digests(files), "the file list of the answer")
 
 
-def _number_of(message: bytes) -> int:
+def _answer_number(message: bytes) -> int:
     """Return the number in a seal; 0 if an earlier version of sros wrote no number."""
-    head = _SEALED.match(smime.parse(message).text)
+    head = _SEAL_HEAD.match(smime.parse(message).text)
     return int(head[1] or 0) if head else 0
 
 
@@ -344,16 +344,18 @@ def _read_answer(data: bytes) -> RequestAnswer:
             raise DocumentError("it is not the answer for one enclave")
         name = check_enclave_name(own[0].removeprefix(ENCLAVES).removesuffix("/cert.pem") or "/")
         folder = enclave_folder(name)
-        welcome = {f"{folder}/{file}" for file in (*_REQUIRED, *_OPTIONAL)}
+        welcome = {
+            f"{folder}/{file}" for file in (*_REQUIRED_ANSWER_FILES, *_OPTIONAL_ANSWER_FILES)
+        }
         if strange := sorted(files.keys() - welcome):
             raise DocumentError(f"it contains {strange[0]!r}, which does not belong to an answer")
-        if missing := [file for file in _REQUIRED if f"{folder}/{file}" not in files]:
+        if missing := [file for file in _REQUIRED_ANSWER_FILES if f"{folder}/{file}" not in files]:
             raise DocumentError(f"it lacks {', '.join(missing)}")
         if not signed:
             raise DocumentError(f"it lacks {SEAL}")
     except SrosError as error:
         raise DocumentError(
-            f"the answer cannot be used: {error.what}", error.why, _AGAIN
+            f"the answer cannot be used: {error.what}", error.why, _SIGN_REQUEST_AGAIN
         ) from error
     return RequestAnswer(name, files, signed)
 
@@ -371,11 +373,13 @@ def check_answer(answer: RequestAnswer, key: PublicKey, *, now: datetime) -> Ope
     """
     files = {path.rpartition("/")[2]: data for path, data in answer.files.items()}
     state, problems = evaluate_delivered(answer.name, files, key, now=now)
-    if state.permissions_ca and (problem := _broken_seal(answer, [state.permissions_ca])):
+    if state.permissions_ca and (problem := _answer_seal_problem(answer, [state.permissions_ca])):
         problems.append(f"{SEAL}: {problem}")
     if problems:
         raise PkiError(
-            f"the answer for enclave {answer.name} is not valid", "; ".join(problems) + ".", _AGAIN
+            f"the answer for enclave {answer.name} is not valid",
+            "; ".join(problems) + ".",
+            _SIGN_REQUEST_AGAIN,
         )
     if weak := "; ".join(f"{file}: {text}" for file, text in weaknesses(state)):
         raise PkiError(
@@ -415,13 +419,13 @@ def evaluate_delivered(
     return state, problems
 
 
-def _broken_seal(answer: RequestAnswer, authorities: Iterable[x509.Certificate]) -> str:
+def _answer_seal_problem(answer: RequestAnswer, authorities: Iterable[x509.Certificate]) -> str:
     """Return why no CA in ``authorities`` signed the file list of an answer; "" if one did."""
     try:
         signed = smime.parse(answer.seal)
     except SrosError as error:
         return str(error)
-    head = _SEALED.match(document := signed.text)
+    head = _SEAL_HEAD.match(document := signed.text)
     if not head or document[head.end() :] != listed_digests(answer.files):
         return "the files differ from the signed list"
     return signed.problem_for(authorities)
@@ -474,22 +478,24 @@ def import_answer(
         until = state.valid_until()
         assert until
         _check_pinned(answer, state.identity_ca, state.permissions_ca, pinned)
-        _check_key(folder, answer, key)
+        _check_enclave_key(folder, answer, key)
         known = _trusted_certificates(folder, "permissions_ca.cert.pem")
         if not force:
-            _check_known(folder, answer, known)
+            _check_known_authority(folder, answer, known)
             _check_newer(place, answer, state.certificate)
         seal_path = f"{enclave_folder(name)}/{SEAL}"
         for path, content in {**answer.files, seal_path: answer.seal}.items():
             present = folder / path
             if not present.is_file() or read_bytes(present, "file") != content:
                 transaction.write(path, content)
-        for file in _OPTIONAL:
+        for file in _OPTIONAL_ANSWER_FILES:
             if answer.file(file) is None and (place / file).exists():
                 transaction.remove(f"{enclave_folder(name)}/{file}")
         notes = (
             *_lost_revocation_notes(place, answer),
-            *refuse_stopping(transaction, now, allowed=allow_refusal, remedy=lambda: _AGAIN),
+            *refuse_stopping(
+                transaction, now, allowed=allow_refusal, remedy=lambda: _SIGN_REQUEST_AGAIN
+            ),
         )
         transaction.commit()
     changes = transaction.changes
@@ -534,7 +540,7 @@ def _check_pinned(
     )
 
 
-def _check_key(folder: Path, answer: RequestAnswer, key: PublicKey) -> None:
+def _check_enclave_key(folder: Path, answer: RequestAnswer, key: PublicKey) -> None:
     """Raise `KeystoreError` if the answer revokes ``key``, or if another enclave here has it."""
     remedy = f"Make a new key with `sros create_request {answer.name}` in another folder."
     path = folder / enclave_folder(answer.name) / "cert.pem"
@@ -552,12 +558,14 @@ def _check_key(folder: Path, answer: RequestAnswer, key: PublicKey) -> None:
             )
 
 
-def _check_known(folder: Path, answer: RequestAnswer, known: list[x509.Certificate]) -> None:
+def _check_known_authority(
+    folder: Path, answer: RequestAnswer, known: list[x509.Certificate]
+) -> None:
     """Raise `KeystoreError` unless a CA in ``known`` signed the answer.
 
     ``known`` are the permissions CAs that ``folder`` trusts; if empty, any CA is accepted.
     """
-    if known and (problem := _broken_seal(answer, known)):
+    if known and (problem := _answer_seal_problem(answer, known)):
         raise KeystoreError(
             f"the answer for enclave {answer.name} comes from another keystore",
             f"The permissions CA that '{folder}' trusts has not signed it: {problem.rstrip('.')}.",
@@ -607,7 +615,7 @@ def _check_newer(place: Path, answer: RequestAnswer, certificate: x509.Certifica
 def _lists_here_and_sent(
     place: Path, answer: RequestAnswer
 ) -> tuple[dict[str, bytes], dict[str, bytes]]:
-    """Return the files that may have revocation lists: those here, and those in the answer."""
+    """Return the files with revocation lists: the files here, and the files in the answer."""
     present = {f: read_bytes(place / f, "file") for f in LIST_FILES if (place / f).exists()}
     return present, {f: data for f in LIST_FILES if (data := answer.file(f)) is not None}
 
@@ -615,7 +623,7 @@ def _lists_here_and_sent(
 def _lost_revocation_notes(place: Path, answer: RequestAnswer) -> Iterator[Note]:
     """Yield a note if the answer's revocation list lacks certificates of the installed list.
 
-    They may have expired since.
+    Certificates that the list lacks may have expired since.
     """
     if lost := lost_serials(*_lists_here_and_sent(place, answer)):
         text = (
@@ -635,12 +643,13 @@ def _check_number(path: Path, answer: RequestAnswer, remedy: str) -> bool:
     Without numbers, the caller has to compare times.  ``path`` is the seal of the installed answer.
 
     Raises:
-        KeystoreError: the number of the new answer is not higher than that of the installed answer.
+        KeystoreError: the number of the new answer is not higher than the number of the installed
+            answer.
     """
     if not path.exists():
         return False
     present = read_bytes(path, "file list of the installed answer")
-    old, new = _number_of(present), _number_of(answer.seal)
+    old, new = _answer_number(present), _answer_number(answer.seal)
     if not old or present == answer.seal:
         return bool(old)
     if not new:

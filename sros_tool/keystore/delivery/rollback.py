@@ -1,4 +1,4 @@
-"""Whether files would take a robot back to earlier CAs, revocation lists or keys: a rollback.
+"""Detection of rollbacks: files that take a robot back to earlier CAs, revocation lists or keys.
 
 Signatures and numbers do not show a rollback: a keystore that was restored from a backup signs as
 before, and may meanwhile have given higher numbers than the lost one.  Files of another keystore
@@ -86,7 +86,7 @@ def older_list(
     ``present`` and ``sent`` map names of an enclave's files to content.  A sent list with the same
     number but other revocations also counts as older.
     """
-    for here, new in _lists(present, sent):
+    for here, new in _list_pairs(present, sent):
         if here != new and here.number >= new.number:
             return here, new
     return None
@@ -95,11 +95,11 @@ def older_list(
 def lost_serials(present: Mapping[str, bytes], sent: Mapping[str, bytes]) -> frozenset[int]:
     """Return the serial numbers on lists in the ``present`` files that lists in ``sent`` lack."""
     return frozenset[int]().union(
-        *(here.serials - new.serials for here, new in _lists(present, sent))
+        *(here.serials - new.serials for here, new in _list_pairs(present, sent))
     )
 
 
-def _lists(
+def _list_pairs(
     present: Mapping[str, bytes], sent: Mapping[str, bytes]
 ) -> Iterator[tuple[Revocations, Revocations]]:
     """Yield the lists of each CA that the ``sent`` files trust: in ``present``, and in ``sent``.
@@ -172,7 +172,7 @@ def check_rollback(
 def trusted_in(target: Path, files: Mapping[str, bytes]) -> dict[str, bytes]:
     """Map the paths of CA files and revocation lists in a folder to their content.
 
-    These are the files of all enclaves in the folder, and those at the places of ``files``.
+    These are the files of all enclaves in the folder, and the files at the paths of ``files``.
     """
     folders = {path.rpartition("/")[0] for path in files}
     if (target / ENCLAVES).is_dir():
@@ -180,7 +180,7 @@ def trusted_in(target: Path, files: Mapping[str, bytes]) -> dict[str, bytes]:
     paths = (
         f"{at}/{file}" for at in sorted(folders) for file in (*LIST_FILES, PERMISSIONS_CA_FILE)
     )
-    return {path: data for path in paths if (data := _content(target / path))}
+    return {path: data for path in paths if (data := _read_file(target / path))}
 
 
 def _removal_of(target: Path, paths: Iterable[str]) -> str:
@@ -272,9 +272,9 @@ def _lost_revocations(
 
     All lists in the folder count, because a new enclave does not have one yet, but only if a CA in
     ``files`` signed them.  The list of the same CA in ``files`` must have at least the same number.
-    It must also have every certificate of the list here, with two exceptions: certificates that
-    have expired by the ledger, and certificates of a CA service, which knows more certificates than
-    the ledger.
+    That list must also have every certificate of the list here, with two exceptions: certificates
+    that have expired by the ledger, and certificates of a CA service, which knows more certificates
+    than the ledger.
     """
     places: dict[bytes, list[str]] = defaultdict(list)
     for path, data in present.items():
@@ -324,7 +324,7 @@ def check_own_keys(target: Path, files: Mapping[str, bytes]) -> None:
         if (
             file != CERTIFICATE_FILE
             or f"{folder}/{KEY_FILE}" in files
-            or (token_file and token_file != _content(target / folder / KEY_URI_FILE))
+            or (token_file and token_file != _read_file(target / folder / KEY_URI_FILE))
         ):
             continue
         key: object = None
@@ -354,5 +354,5 @@ def public_key_of(place: Path, name: str) -> PublicKey:
     return request.public_key
 
 
-def _content(path: Path) -> bytes:
+def _read_file(path: Path) -> bytes:
     return read_bytes(path, "file") if path.is_file() else b""

@@ -151,10 +151,10 @@ def sign_request(
     name = check_enclave_name(request.name)
     stated = _stated_rights(policy, [name])
     if answer is not None:
-        _check_free(answer, force)
+        _check_answer_is_new(answer, force)
     change = KeystoreChange(root, **options)
     with change:
-        signer = _Signer(change, domain, stated)
+        signer = _RequestCertifier(change, domain, stated)
         issued = signer.certify(
             request, renew=renew, named=bool(only_enclaves) and not refuse_revoked
         )
@@ -163,7 +163,7 @@ def sign_request(
         number = change.keystore.ledger_file.next_number()
         sealed = seal(files, number, change.permissions)
         if not change.is_guess:
-            _check_result(RequestAnswer(name, files, sealed), request, change.moment)
+            _check_answer_usable(RequestAnswer(name, files, sealed), request, change.moment)
         archive = pack({SEAL: sealed, **files})
         change.entries.append(
             document_entry(change.now, "answer", sealed, enclave=name, number=number)
@@ -177,7 +177,7 @@ def sign_request(
     return signer.result([request], renew=renew, archive=archive)
 
 
-class _Stated(NamedTuple):
+class _StatedRights(NamedTuple):
     """The rights that a policy states for an enclave; None if the policy states none.
 
     ``path`` is the enclave's path in the policy if it has placeholders of a fleet, or else "".
@@ -187,16 +187,18 @@ class _Stated(NamedTuple):
     path: str = ""
 
 
-def _stated_rights(policy: Policy | FleetPolicy | None, names: Sequence[str]) -> dict[str, _Stated]:
+def _stated_rights(
+    policy: Policy | FleetPolicy | None, names: Sequence[str]
+) -> dict[str, _StatedRights]:
     """Map enclaves to the rights that a policy states for them.
 
     Raises:
         PolicyError: the policy lacks an enclave.
     """
     if policy is None:
-        return dict.fromkeys(names, _Stated())
+        return dict.fromkeys(names, _StatedRights())
     expanded = policy.policy() if isinstance(policy, FleetPolicy) else policy
-    stated = {name: _Stated(stated_enclave(expanded, name)) for name in names}
+    stated = {name: _StatedRights(stated_enclave(expanded, name)) for name in names}
     if isinstance(policy, FleetPolicy):
         paths = {name: policy.stated(name)[0].path for name in names}
         stated = {
@@ -253,7 +255,7 @@ def certify_requests(
             kept = tuple(
                 request.name for request in requests if _is_certified(change.keystore, request)
             )
-        signer = _Signer(change, domain, stated, replace_keys=replace_keys)
+        signer = _RequestCertifier(change, domain, stated, replace_keys=replace_keys)
         for request in requests:
             if request.name not in kept:
                 signer.certify(
@@ -269,7 +271,7 @@ def certify_requests(
 
 
 def _check_vouching(keystore: OpenedKeystore, vouching: Mapping[str, Collection[int]]) -> None:
-    """Raise `KeystoreError` if what vouches for a request was replaced or revoked since."""
+    """Raise `KeystoreError` if a certificate that vouches for a request was replaced or revoked."""
     revoked = revoked_serials(keystore) if vouching else frozenset()
     for name, serials in vouching.items():
         present = keystore.certificate_of(name) if keystore.has_enclave(name) else None
@@ -281,7 +283,7 @@ def _check_vouching(keystore: OpenedKeystore, vouching: Mapping[str, Collection[
             )
 
 
-_END = b"-----END CERTIFICATE REQUEST-----"
+_REQUEST_END = b"-----END CERTIFICATE REQUEST-----"
 
 
 def _split_requests(data: bytes) -> list[bytes]:
@@ -289,8 +291,8 @@ def _split_requests(data: bytes) -> list[bytes]:
 
     `load_request` reports parts that are not requests.
     """
-    *parts, rest = data.split(_END)
-    return [part + _END + b"\n" for part in parts] + ([rest] if rest.strip() else [])
+    *parts, rest = data.split(_REQUEST_END)
+    return [part + _REQUEST_END + b"\n" for part in parts] + ([rest] if rest.strip() else [])
 
 
 def _check_requested_enclaves(
@@ -337,14 +339,14 @@ def _is_certified(keystore: OpenedKeystore, request: SigningRequest) -> bool:
     return keystore.certificate_of(request.name).public_key() == request.public_key
 
 
-class _Signer:
+class _RequestCertifier:
     """The certification of requests within one change of a keystore."""
 
     def __init__(
         self,
         change: KeystoreChange,
         domain: int | None,
-        stated: Mapping[str, _Stated],
+        stated: Mapping[str, _StatedRights],
         *,
         replace_keys: bool = False,
     ) -> None:
@@ -397,11 +399,11 @@ class _Signer:
         change, root, name = self._change, self._root, request.name
         known, authority = change.known, change.permissions.certificate
         stated = self._stated_rights[name].enclave
-        _check_name(change.keystore, known, request, renew)
+        _check_requested_name(change.keystore, known, request, renew)
         if stated is not None:
             refuse_less_protected(change.keystore, change.governance, stated_protections([stated]))
         present = change.keystore.certificate_of(name) if renew else None
-        _check_key(request, known, present)
+        _check_requested_key(request, known, present)
         if not self._keep_only_key_of(request):
             _check_same_key(change.keystore, request, present)
         if not renew and not named and known.revoked_before([name]):
@@ -451,7 +453,7 @@ class _Signer:
             return False
         key = load_key(keystore.read(path, "private key"), f"'{path}'")
         if key.public_key() != request.public_key:
-            if not (self._replace_keys or _is_shown(self._change.known, request)):
+            if not (self._replace_keys or _was_certified_after_backup(self._change.known, request)):
                 return False
             self._change.transaction.remove(f"{enclave_folder(name)}/{KEY_FILE}")
             text = (
@@ -503,7 +505,7 @@ class _Signer:
         )
 
 
-def _check_free(answer: Path, force: bool) -> None:
+def _check_answer_is_new(answer: Path, force: bool) -> None:
     if answer.exists() and not answer.is_file():
         raise KeystoreError(
             f"'{answer}' is in the way",
@@ -518,13 +520,13 @@ def _check_free(answer: Path, force: bool) -> None:
         )
 
 
-def _is_shown(known: KnownKeys, request: SigningRequest) -> bool:
+def _was_certified_after_backup(known: KnownKeys, request: SigningRequest) -> bool:
     """Return whether a restored keystore certified the key of a request after its last backup."""
     key = key_digest(request.public_key)
     return any(entry.key == key for entry in known.shown_after_restore([request.name]))
 
 
-def _check_name(
+def _check_requested_name(
     keystore: OpenedKeystore, known: KnownKeys, request: SigningRequest, renew: bool
 ) -> None:
     name = request.name
@@ -532,7 +534,7 @@ def _check_name(
     if exists and not renew:
         intended = (
             "add --renew"
-            if _is_certified(keystore, request) or _is_shown(known, request)
+            if _is_certified(keystore, request) or _was_certified_after_backup(known, request)
             else "for example because the robot has new hardware, first "
             + _revocation_advice(keystore, name)
         )
@@ -549,7 +551,7 @@ def _check_name(
         )
 
 
-def _check_key(
+def _check_requested_key(
     request: SigningRequest, known_keys: KnownKeys, present_certificate: x509.Certificate | None
 ) -> None:
     """Raise `KeystoreError` if a request's key was revoked, or if another enclave has it.
@@ -595,7 +597,7 @@ def _revocation_advice(keystore: OpenedKeystore, name: str) -> str:
     )
 
 
-def _check_result(answer: RequestAnswer, request: SigningRequest, now: datetime) -> None:
+def _check_answer_usable(answer: RequestAnswer, request: SigningRequest, now: datetime) -> None:
     """Raise `KeystoreError` if the robot would reject the answer."""
     try:
         check_answer(answer, request.public_key, now=now)

@@ -5,7 +5,7 @@ each changed enclave as every tested vendor would load it, before and after the 
 accepts an enclave before the change and would refuse it afterwards, the vendor's nodes would not
 start again, so the change is refused.
 
-Of enclaves that are alike in everything that vendors look at, only one is evaluated.
+If several enclaves are alike in everything that vendors examine, only one of them is evaluated.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ from sros_tool.translate import permissions_for
 from sros_tool.validity import window
 from sros_tool.wording import enumerated, first_few
 
-_LOADED = (
+_LOADED_FILES = (
     IDENTITY_CA_FILE,
     PERMISSIONS_CA_FILE,
     CERTIFICATE_FILE,
@@ -79,15 +79,15 @@ _LOADED = (
     KEY_URI_FILE,
 )
 """The files that DDS loads, except the key, which only changes together with its certificate."""
-_NEEDED = _LOADED[:5]
+_REQUIRED_LOADED_FILES = _LOADED_FILES[:5]
 _CRL_NAME = CRL.rpartition("/")[2]
-_ONLY_IDENTITY = {IDENTITY_CA_FILE, _CRL_NAME}
+_SHARED_IDENTITY_FILES = {IDENTITY_CA_FILE, _CRL_NAME}
 """Shared files that do not affect the verification of governance and permissions."""
-_CHOSEN = {Fault.DOCUMENT_SIZE, Fault.KEY_ON_TOKEN}
+_ACCEPTED_FAULTS = {Fault.DOCUMENT_SIZE, Fault.KEY_ON_TOKEN}
 """Faults that follow from the user's own choices, and are only reported by notes."""
-_SHOWN = 5
-_EXAMPLE = "/example"
-_MOST_BROKEN = 20
+_MOST_SHOWN = 5
+_EXAMPLE_ENCLAVE = "/example"
+_MOST_TRIED = 20
 """Maximum number of enclaves of one kind that are tried until a vendor accepts one."""
 
 Files = dict[str, bytes]
@@ -141,7 +141,9 @@ def refuse_stopping(
     if refused := {vendor: why for vendor, why in stopped.items() if vendor not in allowed}:
         raise _refused_change_error(transaction.root, refused, remedy())
     old = _authority_without_list(files)
-    if old and (cut_off := [vendor for vendor in _READ_SEVERAL if vendor not in allowed]):
+    if old and (
+        cut_off := [vendor for vendor in _VENDORS_READING_ALL_CAS if vendor not in allowed]
+    ):
         raise _shut_out_error(transaction.root, old, cut_off, remedy())
     notes = [
         Note(
@@ -177,11 +179,11 @@ def _stopped_enclaves(
     """
     stopped: dict[Vendor, dict[str, list[str]]] = {}
     put_back: list[str] = []
-    for (_, own, _), names in _kinds(files, now).items():
+    for (_, own, _), names in _enclaves_by_kind(files, now).items():
         for tried, name in enumerate(names, 1):
             before, after = files.before(name), files.after(name)
             refused = refusals(name, after, now) if after else {}
-            is_last = tried == min(len(names), _MOST_BROKEN)
+            is_last = tried == min(len(names), _MOST_TRIED)
             # Today's acceptance matters if a vendor would refuse the enclave, or if another enclave
             # can still be tried.
             asked = before and (refused or not is_last)
@@ -225,12 +227,12 @@ def refusals(name: str, files: Files, now: datetime) -> dict[Vendor, str]:
         participant = VendorParticipant(vendor, enclave, JoinContext(domain, now))
         decision = participant.join()
         faults = {problem.fault for problem in participant.problems}
-        if not decision.outcome.ok and not (faults and faults <= _CHOSEN):
-            reasons[vendor] = _reason(participant, decision)
+        if not decision.outcome.ok and not (faults and faults <= _ACCEPTED_FAULTS):
+            reasons[vendor] = _refusal_reason(participant, decision)
     return reasons
 
 
-def _reason(participant: VendorParticipant, decision: Decision) -> str:
+def _refusal_reason(participant: VendorParticipant, decision: Decision) -> str:
     return str(participant.problems[0]).rstrip(".") if participant.problems else decision.clause
 
 
@@ -238,18 +240,22 @@ def _refused_change_error(
     root: Path, refused: Mapping[Vendor, _Refusals], remedy: str
 ) -> KeystoreError:
     names = tuple(sorted({name for refusals in refused.values() for name in refusals.enclaves}))
-    why = {vendor: "; ".join(refusals.reasons[:_SHOWN]) for vendor, refusals in refused.items()}
+    why = {
+        vendor: "; ".join(refusals.reasons[:_MOST_SHOWN]) for vendor, refusals in refused.items()
+    }
     whose = "its" if len(names) == 1 else "their"
     options = " ".join(f"--allow-refusal {word}" for word in words_of(refused))
     return KeystoreError(
         f"no node could start in {_names_text(names)} of '{root}'",
-        f"{_clauses(why, f'{whose} files after the change')}. Nothing was changed.",
+        f"{_refusal_clauses(why, f'{whose} files after the change')}. Nothing was changed.",
         f"{remedy or 'Replace the file that the error names.'} If no node runs on "
         f"{enumerated(joined_titles(vendor.title for vendor in refused))}, add {options}.",
     )
 
 
-_READ_SEVERAL = tuple(vendor for vendor in TESTED if not vendor.traits.reads_first_authority)
+_VENDORS_READING_ALL_CAS = tuple(
+    vendor for vendor in TESTED if not vendor.traits.reads_first_authority
+)
 
 
 def _authority_without_list(files: _FilesOfChange) -> x509.Certificate | None:
@@ -288,7 +294,7 @@ def _shut_out_error(
     )
 
 
-def _clauses(refused: Mapping[Vendor, str], label: str) -> str:
+def _refusal_clauses(refused: Mapping[Vendor, str], label: str) -> str:
     """Return a clause for each reason, such as "A and B refuse ``label`` (reason)"."""
     by_reason: dict[str, list[str]] = {}
     for vendor, reason in refused.items():
@@ -302,7 +308,7 @@ def _clauses(refused: Mapping[Vendor, str], label: str) -> str:
 
 
 def _names_text(names: Sequence[str]) -> str:
-    return first_few(names, _SHOWN)
+    return first_few(names, _MOST_SHOWN)
 
 
 # ── CAs that are imported ──────────────────────────────────────────────────────────────────
@@ -323,12 +329,12 @@ def imported_notes(
     Raises:
         KeystoreError: no vendor would accept an enclave of the keystore.
     """
-    files = _example(transaction, template, authorities, domains, now)
-    refused = refusals(_EXAMPLE, files, now)
+    files = _example_files(transaction, template, authorities, domains, now)
+    refused = refusals(_EXAMPLE_ENCLAVE, files, now)
     if len(refused) == len(TESTED):
         raise KeystoreError(
             f"no DDS vendor would accept an enclave of keystore '{transaction.root}'",
-            f"{_clauses(refused, 'it')}. Nothing was written.",
+            f"{_refusal_clauses(refused, 'it')}. Nothing was written.",
             "Name CAs that vendors accept, or let sros create the CAs.",
         )
     known = " ".join(note.text for note in authorities.notes)
@@ -336,9 +342,8 @@ def imported_notes(
     if new := {vendor: why for vendor, why in refused.items() if vendor.title not in known}:
         others = joined_titles(vendor.title for vendor in TESTED if vendor not in refused)
         verb = "accepts" if len(others) == 1 else "accept"
-        text = (
-            f"{_clauses(new, 'the enclaves of this keystore')}; {enumerated(others)} {verb} them."
-        )
+        refusing = _refusal_clauses(new, "the enclaves of this keystore")
+        text = f"{refusing}; {enumerated(others)} {verb} them."
         notes.append(Note("portable.imported-ca", text))
     identity = authorities.identity
     validity = validity_of(identity.certificate).intersection(
@@ -352,11 +357,11 @@ def imported_notes(
         this_update=validity.not_before,
         next_update=validity.not_after,
     )
-    listed = refusals(_EXAMPLE, files | {CRL_FILE: crl}, now)
+    listed = refusals(_EXAMPLE_ENCLAVE, files | {CRL_FILE: crl}, now)
     if later := {vendor: why for vendor, why in listed.items() if vendor not in refused}:
         text = (
             f"with a revocation list of this identity CA, no enclave would work any more: "
-            f"{_clauses(later, 'it')}. So `sros revoke` signs no list. To revoke enclaves, "
+            f"{_refusal_clauses(later, 'it')}. So `sros revoke` signs no list. To revoke enclaves, "
             "have the CA's certificate issued again with keyUsage cRLSign, or let sros make the "
             "identity CA."
         )
@@ -364,7 +369,7 @@ def imported_notes(
     return tuple(notes)
 
 
-def _example(
+def _example_files(
     transaction: Transaction,
     template: Template,
     authorities: Authorities,
@@ -380,12 +385,12 @@ def _example(
     }
     files[GOVERNANCE_FILE] = transaction.content_after(GOVERNANCE_P7S)
     validity = window(now, template.certificate_validity)
-    subject = enclave_subject(_EXAMPLE, unique=template.unique_subject)
+    subject = enclave_subject(_EXAMPLE_ENCLAVE, unique=template.unique_subject)
     certificate = authorities.identity.issuer().issue(
         subject, generate_key().public_key(), validity
     )
     signer = authorities.permissions
-    rights = default_rights(template, _EXAMPLE)
+    rights = default_rights(template, _EXAMPLE_ENCLAVE)
     validity = validity.intersection(validity_of(signer.certificate))
     permissions = permissions_for(
         rights,
@@ -464,10 +469,10 @@ class _FilesOfChange:
     def places_after(self, name: str) -> dict[str, str]:
         """Map an enclave's file names to the paths from which their content will be read."""
         folder = enclave_folder(name)
-        return {file: self._place_after(f"{folder}/{file}") for file in _LOADED}
+        return {file: self._place_after(f"{folder}/{file}") for file in _LOADED_FILES}
 
     def _place_after(self, path: str) -> str:
-        """Return the path to which ``path`` will lead; it may be a link to a shared file."""
+        """Return the path of the content of ``path``, which may be a link to a shared file."""
         target = self.transaction.target_after(path)
         if target is None:
             return path
@@ -481,7 +486,7 @@ class _FilesOfChange:
     def before(self, name: str) -> Files:
         """Return the present files of an enclave; empty if a required file is missing."""
         folder = enclave_folder(name)
-        return _if_complete({file: self.content(f"{folder}/{file}") for file in _LOADED})
+        return _if_complete({file: self.content(f"{folder}/{file}") for file in _LOADED_FILES})
 
     def after(self, name: str) -> Files:
         """Return an enclave's files after the transaction; empty if a required file is missing."""
@@ -504,15 +509,15 @@ class _FilesOfChange:
         return self._after[place]
 
 
-def _kinds(files: _FilesOfChange, now: datetime) -> dict[_Kind, list[str]]:
+def _enclaves_by_kind(files: _FilesOfChange, now: datetime) -> dict[_Kind, list[str]]:
     """Group the complete, changed enclaves by everything that vendors could treat differently."""
     changed, root = files.changed, files.transaction.root
     shared = changed.get(PUBLIC, set()) | changed.get(ENCLAVES, set()) & {GOVERNANCE_FILE}
-    documents = not shared <= _ONLY_IDENTITY
+    documents = not shared <= _SHARED_IDENTITY_FILES
     names = {
         f"/{folder.removeprefix(ENCLAVES).lstrip('/')}"
         for folder, changed_files in changed.items()
-        if folder.split("/", 1)[0] == ENCLAVES and not changed_files.isdisjoint(_LOADED)
+        if folder.split("/", 1)[0] == ENCLAVES and not changed_files.isdisjoint(_LOADED_FILES)
     }
     if shared == {_CRL_NAME} and (others := files.with_a_newer_list()) is not None:
         names.update(others)
@@ -523,8 +528,8 @@ def _kinds(files: _FilesOfChange, now: datetime) -> dict[_Kind, list[str]]:
     kinds: dict[_Kind, list[str]] = {}
     for name in sorted(names):
         folder = enclave_folder(name)
-        own = frozenset(changed.get(folder, ())).intersection(_LOADED)
-        if name not in present and own.issuperset(_NEEDED):
+        own = frozenset(changed.get(folder, ())).intersection(_LOADED_FILES)
+        if name not in present and own.issuperset(_REQUIRED_LOADED_FILES):
             # All of its files are made now, in the same way.
             kinds.setdefault(((), own, ()), []).append(name)
             continue
@@ -544,7 +549,7 @@ def _kinds(files: _FilesOfChange, now: datetime) -> dict[_Kind, list[str]]:
             looks = (
                 _certificate_kind(data, lists[crl], now),
                 _certificate_kind(before, frozenset(), now),
-                signed and _signers(files.content_after(places[PERMISSIONS_FILE])),
+                signed and _signature_properties(files.content_after(places[PERMISSIONS_FILE])),
             )
         kinds.setdefault((shared_places, own, looks), []).append(name)
     return kinds
@@ -552,13 +557,13 @@ def _kinds(files: _FilesOfChange, now: datetime) -> dict[_Kind, list[str]]:
 
 def _if_complete(files: Mapping[str, bytes | None]) -> Files:
     complete = {file: data for file, data in files.items() if data}
-    return complete if all(file in complete for file in _NEEDED) else {}
+    return complete if all(file in complete for file in _REQUIRED_LOADED_FILES) else {}
 
 
 def _certificate_kind(
     data: bytes, listed_serials: frozenset[int], now: datetime
 ) -> tuple[object, ...]:
-    """Return what vendors could treat differently in a certificate, except name and key."""
+    """Return the parts of a certificate, except name and key, that a vendor could refuse."""
     form = read_form(data)
     if form is None:
         return (data,)
@@ -583,7 +588,7 @@ def _refusable_parts_of_crl(crl: bytes) -> tuple[object, ...] | None:
         return None
 
 
-def _signers(message: bytes) -> tuple[object, ...] | None:
+def _signature_properties(message: bytes) -> tuple[object, ...] | None:
     """Return the certificates and the hash of a message's signature; None if unreadable."""
     try:
         signed = smime.parse(message)

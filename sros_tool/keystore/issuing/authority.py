@@ -307,7 +307,7 @@ def check_imported(
     """Return the CA to which ``key`` belongs, with its chain, after checks.
 
     ``data`` has the certificates of the CA and of its issuers as PEM, in any order; without a
-    ``key``, the first certificate is that of the CA.  Faults that only some DDS vendors refuse
+    ``key``, the first certificate belongs to the CA.  Faults that only some DDS vendors refuse
     become notes.
 
     Raises:
@@ -334,7 +334,7 @@ def check_imported(
             "Use a CA with EC prime256v1 or RSA 2048 keys, signed with SHA-256, or let sros create "
             "one.",
         )
-    chain = list(_chain(own[0], certificates, role))
+    chain = list(_chain_to_root(own[0], certificates, role))
     for authority in chain:
         _check_ca(authority, role, now)
     refusals = authority_refusals(role, tuple(chain), now)
@@ -346,11 +346,11 @@ def check_imported(
             "and keyUsage keyCertSign and digitalSignature.",
         )
     return ImportedAuthority(
-        own[0], b"".join(map(pem, chain)), tuple(_notes(role, chain, refusals))
+        own[0], b"".join(map(pem, chain)), tuple(_refusal_notes(role, chain, refusals))
     )
 
 
-def _chain(
+def _chain_to_root(
     start: x509.Certificate, certificates: list[x509.Certificate], role: str
 ) -> Iterator[x509.Certificate]:
     """Yield ``start`` and its issuers, up to the self-signed root."""
@@ -389,7 +389,7 @@ def _check_ca(certificate: x509.Certificate, role: str, now: datetime) -> None:
         )
 
 
-def _notes(
+def _refusal_notes(
     role: str, chain: list[x509.Certificate], refusals: Mapping[Vendor, str]
 ) -> Iterator[Note]:
     name = subject_text(chain[0].subject)

@@ -45,13 +45,13 @@ from sros_tool.pki.chains import denies_issuing
 from sros_tool.pki.keys import PublicKey, algorithm
 from sros_tool.validity import Window, iso
 
-_NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,39}", re.ASCII)
+_SERVICE_NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,39}", re.ASCII)
 _MOST_BYTES = 64 * 1024
-_MOST_SAID = 500
-_SECONDS = 60
-_LOOK = 0.02
+_MOST_ERROR_BYTES = 500
+_MOST_SECONDS = 60
+_POLL_SECONDS = 0.02
 """Seconds between two checks whether a program that closed its output has ended."""
-_AHEAD = timedelta(hours=1)
+_CLOCK_TOLERANCE = timedelta(hours=1)
 """How long after the start of a keystore's change a certificate may become valid.
 
 A service dates certificates by its own clock, at the time of issuing.
@@ -68,9 +68,9 @@ class CaServiceError(KeystoreError):
 
 @dataclass(frozen=True, slots=True)
 class CertificateRequest:
-    """A request to a CA service: the ``request`` (PEM), and what the certificate must have.
+    """A request to a CA service: the ``request`` (PEM), and the content that is required.
 
-    If the request is from a robot, ``subject`` may have more parts than the subject in it.
+    If the request is from a robot, ``subject`` may have more parts than the subject in ``request``.
     """
 
     enclave: str
@@ -82,7 +82,7 @@ class CertificateRequest:
 
 def check_ca_service(place: str) -> None:
     """Raise `UsageError` if ``place`` stands for a CA service with an invalid name."""
-    if is_ca_service(place) and not _NAME.fullmatch(place.removeprefix(CA_SERVICE_SCHEME)):
+    if is_ca_service(place) and not _SERVICE_NAME.fullmatch(place.removeprefix(CA_SERVICE_SCHEME)):
         raise UsageError(
             f"'{place}' is not the name of a CA service",
             "issuer:NAME stands for the program sros-issuer-NAME on the PATH; NAME has lower-case "
@@ -113,7 +113,7 @@ class CaService:
         answer = self._answer(request)
         try:
             certificate = load_certificate(answer, f"of {self.program}")
-            fault = _fault(certificate, request, authority, now)
+            fault = _certificate_problem(certificate, request, authority, now)
         except PkiError as error:
             fault = error.clause
         if fault:
@@ -122,7 +122,7 @@ class CaService:
         return certificate
 
     def _answer(self, asked: CertificateRequest) -> bytes:
-        """Return what the program writes to standard output."""
+        """Run the program, and return its standard output."""
         program = shutil.which(self.program)
         if program is None or not Path(program).is_absolute():
             raise self._error(asked, f"There is no program `{self.program}` on the PATH")
@@ -150,7 +150,7 @@ class CaService:
             answer, errors = _bounded_output(process)
         error_text = " ".join(errors.decode(errors="replace").split())
         if answer is None:
-            raise self._error(asked, f"`{self.program}` did not end within {_SECONDS} seconds")
+            raise self._error(asked, f"`{self.program}` did not end within {_MOST_SECONDS} seconds")
         if len(answer) > _MOST_BYTES:
             raise self._error(asked, f"`{self.program}` wrote more than {_MOST_BYTES} bytes")
         if process.returncode:
@@ -171,7 +171,7 @@ def _bounded_output(process: subprocess.Popen[bytes]) -> tuple[bytes | None, byt
     The output is None if the program does not end in time.  The program and its child processes are
     then ended in any case.
     """
-    end, answer, errors, ended = time.monotonic() + _SECONDS, b"", b"", False
+    end, answer, errors, ended = time.monotonic() + _MOST_SECONDS, b"", b"", False
     assert process.stdout and process.stderr
     with process.stdout as output, process.stderr as errors_pipe:
         ready = select.poll()
@@ -180,7 +180,7 @@ def _bounded_output(process: subprocess.Popen[bytes]) -> tuple[bytes | None, byt
         answers = True
         try:
             while len(answer) <= _MOST_BYTES and _seconds_left(end) and not ended:
-                for file, _ in ready.poll(_LOOK * 1000):
+                for file, _ in ready.poll(_POLL_SECONDS * 1000):
                     part = os.read(file, _MOST_BYTES)
                     if not part:
                         ready.unregister(file)
@@ -188,7 +188,7 @@ def _bounded_output(process: subprocess.Popen[bytes]) -> tuple[bytes | None, byt
                     elif file == output.fileno():
                         answer += part
                     else:
-                        errors = (errors + part)[-_MOST_SAID:]
+                        errors = (errors + part)[-_MOST_ERROR_BYTES:]
                 ended = not answers and process.poll() is not None
         finally:
             if not ended:
@@ -201,7 +201,7 @@ def _seconds_left(end: float) -> float:
     return max(0.0, end - time.monotonic())
 
 
-def _fault(
+def _certificate_problem(
     certificate: x509.Certificate,
     request: CertificateRequest,
     authority: x509.Certificate,
@@ -234,7 +234,7 @@ def _fault(
             "it is a CA certificate, or could be used as one: it has neither basicConstraints with "
             "CA:FALSE nor a keyUsage without keyCertSign"
         )
-    if not (validity.contains(now) or validity.contains(now + _AHEAD)):
+    if not (validity.contains(now) or validity.contains(now + _CLOCK_TOLERANCE)):
         return f"it is valid from {iso(validity.not_before)} to {iso(validity.not_after)}, not now"
     if validity.not_after > request.validity.not_after:
         return (

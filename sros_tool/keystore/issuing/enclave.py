@@ -82,7 +82,7 @@ from sros_tool.xml import read_bytes
 
 Result = TypeVar("Result")
 
-_NOTED_LOSS = 0.01
+_LEAST_NOTED_LOSS = 0.01
 
 
 # ── keys on tokens ─────────────────────────────────────────────────────────────────────────
@@ -312,7 +312,7 @@ class EnclaveWriter:
     def would_change_only_dates(
         self, rights: StatedRights, certificate: x509.Certificate, validity: Window, text: bytes
     ) -> bool:
-        """Return whether `write` would change only dates, while the present expiry is late enough.
+        """Return whether `write` would change only dates, and the present expiry is late enough.
 
         ``text`` is the present document, with LF line ends.  The expiry is late enough until two
         thirds of a new ``validity`` are over (`Window.can_be_kept`).
@@ -479,7 +479,7 @@ def _early_expiry(
     end = validity_of(authority).not_after
     lost = wanted_validity.not_after - end
     if lost <= max(
-        (wanted_validity.not_after - wanted_validity.not_before) * _NOTED_LOSS, timedelta(0)
+        (wanted_validity.not_after - wanted_validity.not_before) * _LEAST_NOTED_LOSS, timedelta(0)
     ):
         return None
     return Note(

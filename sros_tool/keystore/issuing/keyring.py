@@ -81,8 +81,8 @@ class Keyring:
 
         Raises:
             UsageError: the place is not valid, or names a service for the permissions CA.
-            KeystoreError: the service is named only by a keystore of another user, who could so
-                make it issue with the rights of this user.
+            KeystoreError: the service is named only by a keystore of another user, who could make
+                the service issue with the rights of this user.
         """
         place = self.place(role, template)
         if not is_ca_service(place):

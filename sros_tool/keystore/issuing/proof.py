@@ -38,7 +38,7 @@ from sros_tool.names import ROS_DISCOVERY_TOPIC, expand, is_expression
 from sros_tool.policy.model import ALLOW, Enclave
 from sros_tool.policy.patterns import common_name, matches, overlap
 
-_ASKED = (Vendor.STANDARD, Vendor.FAST)
+_COMPARED_VENDORS = (Vendor.STANDARD, Vendor.FAST)
 """The vendors that must decide as the policy does.
 
 On these documents, Fast DDS 2.9 decides as 2.14 does.  Cyclone DDS 0.10 is left out, because it
@@ -46,36 +46,38 @@ denies a topic in both directions if one direction is denied.  No document can a
 reports it (``portable.deny-blocks-topic``).
 """
 
-_SET = re.compile(r"\[!?[^\]]+\]")
+_CHARACTER_SET = re.compile(r"\[!?[^\]]+\]")
 _CHARACTERS = "nabcdefghijklmopqrstuvwxyz_/0123456789" + "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
-_OUT, _IN = "publish", "subscribe"
+_PUBLISH, _SUBSCRIBE = "publish", "subscribe"
 _ACTION_SERVICES = ("send_goal", "cancel_goal", "get_result")
 _ACTION_TOPICS = ("feedback", "status")
 
 
-def _service(client: bool, part: str = "") -> tuple[tuple[str, str, str], ...]:
+def _service_topics(client: bool, part: str = "") -> tuple[tuple[str, str, str], ...]:
     """Return (direction, prefix, suffix) of both DDS topics of a service.
 
     ``part`` stands between the name and the suffix, as in the services of an action.
     """
-    ask, answer = (_OUT, _IN) if client else (_IN, _OUT)
+    ask, answer = (_PUBLISH, _SUBSCRIBE) if client else (_SUBSCRIBE, _PUBLISH)
     return (ask, "rq", f"{part}Request"), (answer, "rr", f"{part}Reply")
 
 
-def _action(client: bool) -> tuple[tuple[str, str, str], ...]:
+def _action_topics(client: bool) -> tuple[tuple[str, str, str], ...]:
     """Return (direction, prefix, suffix) of all DDS topics of an action."""
-    direction = _IN if client else _OUT
-    services = (end for p in _ACTION_SERVICES for end in _service(client, f"/_action/{p}"))
-    return (*services, *((direction, "rt", f"/_action/{topic}") for topic in _ACTION_TOPICS))
+    direction = _SUBSCRIBE if client else _PUBLISH
+    services = (
+        end for p in _ACTION_SERVICES for end in _service_topics(client, f"/_action_topics/{p}")
+    )
+    return (*services, *((direction, "rt", f"/_action_topics/{topic}") for topic in _ACTION_TOPICS))
 
 
 _ENDPOINTS = {
-    "publish": ((_OUT, "rt", ""),),
-    "subscribe": ((_IN, "rt", ""),),
-    "request": _service(True),
-    "reply": _service(False),
-    "call": _action(True),
-    "execute": _action(False),
+    "publish": ((_PUBLISH, "rt", ""),),
+    "subscribe": ((_SUBSCRIBE, "rt", ""),),
+    "request": _service_topics(True),
+    "reply": _service_topics(False),
+    "call": _action_topics(True),
+    "execute": _action_topics(False),
 }
 
 
@@ -89,7 +91,7 @@ class ExpressionSets:
     @classmethod
     def none(cls) -> ExpressionSets:
         """Return the empty sets: no right and no denial."""
-        return cls({_OUT: set(), _IN: set()}, {_OUT: set(), _IN: set()})
+        return cls({_PUBLISH: set(), _SUBSCRIBE: set()}, {_PUBLISH: set(), _SUBSCRIBE: set()})
 
     def allow(self, verb: str, topic: str) -> bool:
         """Return whether a policy allows ``topic``: a rule allows it, and no rule denies it."""
@@ -111,7 +113,7 @@ class ExpressionSets:
     def paired_sets(self, other: ExpressionSets) -> Iterator[tuple[set[str], set[str]]]:
         """Yield pairs of sets of the same kind and direction: from ``self``, and from ``other``."""
         for own, theirs in ((self.allowed, other.allowed), (self.denied, other.denied)):
-            for verb in (_OUT, _IN):
+            for verb in (_PUBLISH, _SUBSCRIBE):
                 yield own[verb], theirs[verb]
 
     def all(self) -> Iterator[str]:
@@ -145,7 +147,7 @@ class Disagreement:
 def prove(policy: Enclave, permissions: Permissions, domains: DomainSet) -> None:
     """Raise `KeystoreError` unless ``permissions`` allow exactly what ``policy`` allows.
 
-    They must do so in all ``domains``.
+    The permissions must do so in all ``domains``.
     """
     stated = stated_expressions(policy)
     wildcards = {expression for expression in stated.all() if is_expression(expression)}
@@ -185,7 +187,7 @@ def matched_as_meant(expression: str) -> bool:
     return all(
         dds_matches(vendor.traits.style, expression, name) == matches(expression, name)
         for name in example_topics([expression])
-        for vendor in _ASKED
+        for vendor in _COMPARED_VENDORS
     )
 
 
@@ -195,7 +197,7 @@ def stated_expressions(policy: Enclave) -> ExpressionSets:
     The topic of ROS discovery is added.
     """
     expressions = ExpressionSets.none()
-    for verb in (_OUT, _IN):
+    for verb in (_PUBLISH, _SUBSCRIBE):
         expressions.allowed[verb].add(ROS_DISCOVERY_TOPIC)
     for profile in policy.all_profiles():
         ns, node = profile.ns, profile.node
@@ -223,7 +225,7 @@ def signed_expressions(permissions: Permissions, domains: DomainSet) -> Expressi
             return None
         allowing = rule.allow
         by_verb = expressions.allowed if allowing else expressions.denied
-        for verb, all_criteria in ((_OUT, rule.publish), (_IN, rule.subscribe)):
+        for verb, all_criteria in ((_PUBLISH, rule.publish), (_SUBSCRIBE, rule.subscribe)):
             for criteria in all_criteria:
                 if criteria.partitions or criteria.data_tags:
                     return None
@@ -238,7 +240,7 @@ def differences(
     policy: Enclave,
     permissions: Permissions,
     domains: DomainSet,
-    vendors: Iterable[Vendor] = _ASKED,
+    vendors: Iterable[Vendor] = _COMPARED_VENDORS,
 ) -> list[Disagreement]:
     """Return the topics on which a vendor's decision differs from the policy's.
 
@@ -247,7 +249,7 @@ def differences(
     permissions have.
     """
     stated = stated_expressions(policy)
-    expressions = {*stated.all(), *_topics(permissions)}
+    expressions = {*stated.all(), *_topics_in(permissions)}
     topics = set(example_topics(expressions))
     for expression in filter(is_expression, expressions):
         topics.update(example_topics([expression]))
@@ -261,7 +263,7 @@ def differences(
         for domain in _range_ends(domains):
             access = _access(vendor, permissions, domain)
             for topic in sorted(topics):
-                for verb in (_OUT, _IN):
+                for verb in (_PUBLISH, _SUBSCRIBE):
                     allowed = stated.allow(verb, topic)
                     outcome = access.decide(AccessVerb(verb), topic).outcome
                     if outcome.ok != allowed:
@@ -301,7 +303,7 @@ def _matching_name(expression: str) -> str | None:
 def _uniquely_matched_name(expression: str, known: list[str]) -> str | None:
     """Return a name that only ``expression`` matches; None if no simple name does."""
     for letter in ("never_mentioned", "n", "0", ""):
-        name = _SET.sub(_member_of_set, expression).replace("*", letter).replace("?", "n")
+        name = _CHARACTER_SET.sub(_member_of_set, expression).replace("*", letter).replace("?", "n")
         if matches(expression, name) and not any(
             matches(other_expression, name)
             for other_expression in known
@@ -345,7 +347,7 @@ def _everything_controlled(domain: int) -> Governance:
     return Governance((rule,))
 
 
-def _topics(permissions: Permissions) -> Iterator[str]:
+def _topics_in(permissions: Permissions) -> Iterator[str]:
     for grant in permissions.grants:
         for rule in grant.rules:
             for criteria in (*rule.publish, *rule.subscribe):

@@ -41,9 +41,9 @@ from sros_tool.validity import window
 from sros_tool.values import DryRun, FileChanges, Notes, shows
 from sros_tool.wording import first_few
 
-_SHOWN = 5
+_MOST_SHOWN = 5
 """Maximum number of robots that a note names."""
-_LINE = len("<topic></topic>\r\n")
+_BYTES_PER_LINE = len("<topic></topic>\r\n")
 
 
 class SizeEstimator:
@@ -76,12 +76,12 @@ def right_bytes(right: Right) -> int:
     A right takes one line for each DDS topic.  In smaller permissions, the lines are indented, too.
     """
     names = dds_names(right.right, right.name)
-    return sum(_LINE + len(name) for name in (*names.publish, *names.subscribe))
+    return sum(_BYTES_PER_LINE + len(name) for name in (*names.publish, *names.subscribe))
 
 
 # ── of a minimized policy ──────────────────────────────────────────────────────────────────
 
-_MARGIN = 256
+_SIZE_MARGIN = 256
 """Number of bytes kept free below the size limit, as lengths of CA names and signatures vary."""
 
 
@@ -191,8 +191,8 @@ def _node_basics() -> Sequence[Group]:
 def _robot_notes(unobserved: Mapping[str, Sequence[str]]) -> Iterator[Note]:
     for path, robots in unobserved.items():
         text = (
-            f"{path} was never observed for {first_few(robots, _SHOWN)}: rights that only these "
-            "robots use are removed, too."
+            f"{path} was never observed for {first_few(robots, _MOST_SHOWN)}: rights that only "
+            "these robots use are removed, too."
         )
         yield Note("minimize.robot-never-observed", text)
 
@@ -230,12 +230,12 @@ def _measured_enclaves(
         else:
             sizes = PermissionsBytes(size, estimator.signed_bytes(_longest_enclave(now, fleet)))
         proposals: tuple[WildcardProposal, ...] = ()
-        if sizes.after > MAX_SIGNED_BYTES - _MARGIN:
+        if sizes.after > MAX_SIGNED_BYTES - _SIZE_MARGIN:
             proposals = propose_wildcards(
                 after.path,
                 policy_rights(result.policy),
                 policy_rights(policy) | observed,
-                needed=sizes.after - MAX_SIGNED_BYTES + _MARGIN,
+                needed=sizes.after - MAX_SIGNED_BYTES + _SIZE_MARGIN,
                 size=right_bytes,
             )
         enclaves.append(MinimizedEnclave(use, sizes, proposals))

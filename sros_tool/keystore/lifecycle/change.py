@@ -104,7 +104,7 @@ class ChangeOptions(TypedDict, total=False):
     """Change nothing, and return the result that the change would have."""
 
 
-_NOTED = timedelta(days=1)
+_LEAST_NOTED_LOSS = timedelta(days=1)
 """How much earlier than requested a CA service's certificate may expire without a note."""
 
 
@@ -454,10 +454,12 @@ class KeystoreChange:
         drifts = drifted_configurations(self.keystore, wanted, authority, gone_enclaves)
         for drift in drifts:
             if drift.kind is Drift.STALE:
-                _remove(self.transaction, drift.path)
+                _remove_configuration(self.transaction, drift.path)
         changed = [drift for drift in drifts if drift.kind is not Drift.STALE]
         written = (
-            _stage(self.transaction, wanted.files, changed, self.permissions) if changed else {}
+            _stage_configurations(self.transaction, wanted.files, changed, self.permissions)
+            if changed
+            else {}
         )
         names = tuple(wanted.enclaves.values())
         self.zenoh = StagedZenoh(
@@ -468,7 +470,7 @@ class KeystoreChange:
             tuple(sorted({drift.enclave for drift in drifts if drift.kind is not Drift.UNSIGNED})),
             (
                 *_left_out_notes(wanted.left_out),
-                *_revoked_names(wanted.ledger, names, self.now, replaced),
+                *_revoked_name_notes(wanted.ledger, names, self.now, replaced),
             ),
         ).without(created)
         self.notes += self.zenoh.notes
@@ -546,7 +548,9 @@ class KeystoreChange:
                 "changed.",
             )
         asked = window(self.now, self.template.certificate_validity)
-        end = iso(asked.intersection(validity_of(self.identity.certificate)).not_after - _NOTED)
+        end = iso(
+            asked.intersection(validity_of(self.identity.certificate)).not_after - _LEAST_NOTED_LOSS
+        )
         usual = [e for e in issued if self.template.longest_validity(e.enclave) is None]
         if early := [entry for entry in usual if entry.not_after < end]:
             text = (
@@ -644,7 +648,7 @@ def _no_network_note(keystore: OpenedKeystore) -> Note:
     return Note("fleet.no-zenoh-network", text)
 
 
-_ADOPTED = "taken over"
+_REASON_TAKEN_OVER = "taken over"
 """The ``reason`` of ledger entries for files that existed before the ledger."""
 
 
@@ -676,19 +680,19 @@ def _entries_for_ros2_files(
 ) -> Iterator[Entry]:
     authorities = dict.fromkeys(keystore.ca_certificate(role) for role in ROLES)
     for authority in authorities:
-        yield certificate_entry(now, "ca", authority, reason=_ADOPTED)
+        yield certificate_entry(now, "ca", authority, reason=_REASON_TAKEN_OVER)
     with suppress(SrosError):  # the verb reports a missing one
         message = keystore.read(GOVERNANCE_P7S, "governance document")
-        yield document_entry(now, "governance", message)._replace(reason=_ADOPTED)
+        yield document_entry(now, "governance", message)._replace(reason=_REASON_TAKEN_OVER)
     for name in names:
         state = keystore.enclave(name, now=now)
         files = {problem.file for problem in state.problems_in_keystore}
         if state.certificate and "cert.pem" not in files:
-            yield certificate_entry(now, "certificate", state.certificate, name, _ADOPTED)
+            yield certificate_entry(now, "certificate", state.certificate, name, _REASON_TAKEN_OVER)
         message = state.files.get(PERMISSIONS_FILE, b"")
         if message and state.permissions_document and PERMISSIONS_FILE not in files:
             entry = document_entry(now, "permissions", message, enclave=name)
-            yield entry._replace(reason=_ADOPTED)
+            yield entry._replace(reason=_REASON_TAKEN_OVER)
 
 
 def _settings_of_ros2(
@@ -699,7 +703,7 @@ def _settings_of_ros2(
         yield write_settings(transaction, present.settings, now)
 
 
-def _stage(
+def _stage_configurations(
     transaction: Transaction,
     files: Mapping[str, bytes],
     changed: Sequence[DriftedConfiguration],
@@ -734,11 +738,11 @@ def remove_zenoh(transaction: Transaction) -> tuple[str, ...]:
     """Stage the removal of all Zenoh configurations of a keystore; return their enclaves."""
     stale = list(stale_files(transaction.root, (), transaction.enclaves))
     for drift in stale:
-        _remove(transaction, drift.path)
+        _remove_configuration(transaction, drift.path)
     return tuple(dict.fromkeys(drift.enclave for drift in stale))
 
 
-def _remove(transaction: Transaction, path: str) -> None:
+def _remove_configuration(transaction: Transaction, path: str) -> None:
     for file in (path, signed_path(path)):
         if (transaction.root / file).is_file():
             transaction.remove(file)
@@ -761,7 +765,7 @@ def _left_out_notes(left_out: Mapping[str, str]) -> Iterable[Note]:
         )
 
 
-def _revoked_names(
+def _revoked_name_notes(
     ledger: Ledger, names: Sequence[str], now: datetime, replaced: Collection[str]
 ) -> Iterable[Note]:
     """Yield a note on names of enclaves that revoked certificates also have, until they expire."""

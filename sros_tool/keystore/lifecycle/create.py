@@ -177,7 +177,7 @@ def create_keystore(
     """
     if not options.get("dry_run"):
         recover_keystore(root)
-    _check_free(root)
+    _check_not_keystore(root)
     with KeystoreChange(root, new_keystore=True, **options) as change:
         domains = domains or DomainSet.of((0, 0))
         _write_keystore(change, template, domains, imported_cas)
@@ -189,13 +189,13 @@ def create_keystore(
                 change.transaction, template, change.authorities, domains, change.now
             )
             if IDENTITY in imported_cas:
-                change.notes.append(_OWN_LIST)
+                change.notes.append(_OWN_LIST_NOTE)
         change.transaction.commit()
-    change.notes += _place_notes(root)
+    change.notes += _folder_owner_notes(root)
     return change.result(Creation, template=template, domains=domains, new_keystore=True)
 
 
-_OWN_LIST = Note(
+_OWN_LIST_NOTE = Note(
     "keystore.own-list",
     "this keystore has its own revocation list, which lacks the revocations of other keystores or "
     "programs with the same identity CA; their lists lack the revocations of this keystore",
@@ -279,8 +279,8 @@ def generate_artifacts(
     ``revoke_old`` also its certificate, as by `create_permission`.  Permissions that state the same
     rights and do not expire soon are kept (`EnclaveWriter.would_change_only_dates`).  With
     ``revoke_old``, this requires that no other permissions fit the certificate.  The protection of
-    each name is raised to what the policies demand.  If the keystore does not exist and ``create``
-    is given, it is created from that template.
+    each name is raised to the level that the policies demand.  If the keystore does not exist and
+    ``create`` is given, it is created from that template.
 
     All policies for a fleet must be for the same fleet, which the keystore records.  A new keystore
     is for the domains of the robots.
@@ -300,12 +300,12 @@ def generate_artifacts(
     new_keystore = create is not None and not is_keystore(root)
     if new_keystore:
         _check_typo(root)
-        _check_free(root)
+        _check_not_keystore(root)
     change = KeystoreChange(root, new_keystore=new_keystore, **options)
     if create is None or not new_keystore:
         with change:
             _prepare_change(change, domain, fleet, patterns, wanted, protections)
-            notes = _revoked_before(change, wanted, enclaves, fleet)
+            notes = _revoked_before_notes(change, wanted, enclaves, fleet)
             ended = dict(_expired_enclaves(change, wanted.keys() - {*enclaves}))
             notes = [*notes, *ended.values()]
             if ended:
@@ -328,7 +328,7 @@ def generate_artifacts(
         if fleet:
             change.write_fleet(fleet, patterns)
         write_enclaves(change, wanted, places=places, progress=progress)
-    change.notes += _place_notes(root)
+    change.notes += _folder_owner_notes(root)
     return creation(change, ())
 
 
@@ -378,7 +378,7 @@ def _domains_of(fleet: Fleet | None, domain: int | None) -> DomainSet:
     return DomainSet.of(*((number, number) for number in named))
 
 
-def _revoked_before(
+def _revoked_before_notes(
     change: KeystoreChange, wanted_names: Iterable[str], named: Collection[str], fleet: Fleet | None
 ) -> list[Note]:
     """Return a note for each revoked enclave that is created again because it is ``named``.
@@ -509,7 +509,7 @@ def _write_keystore(
 ) -> None:
     """Stage a new keystore: its CAs, its governance and its settings."""
 
-    _check_free(change.root)  # another process may have created it in the meantime
+    _check_not_keystore(change.root)  # another process may have created it in the meantime
     if template.zenoh:
         check_network(template.zenoh)
     for span in (template.certificate_validity, template.permissions_validity):
@@ -527,7 +527,7 @@ def _write_keystore(
     change.entries.append(write_settings(change.transaction, settings, change.now))
 
 
-def _check_free(root: Path) -> None:
+def _check_not_keystore(root: Path) -> None:
     """Raise `KeystoreError` if a new keystore cannot be created at ``root``."""
     if is_keystore(root):
         raise _already_exists_error(root)
@@ -559,7 +559,7 @@ def _check_free(root: Path) -> None:
         )
 
 
-def _place_notes(root: Path) -> Iterator[Note]:
+def _folder_owner_notes(root: Path) -> Iterator[Note]:
     """Yield a note if other users than this user and root can replace a new keystore."""
     trusted = frozenset({0, os.geteuid()})
     replaceable = list(replaceable_on_the_way(root, trusted))
@@ -583,7 +583,7 @@ def _already_exists_error(root: Path) -> KeystoreError:
 
 
 def _check_typo(root: Path) -> None:
-    """Raise an error if the name of a keystore looks like a mistyped name of one next to it."""
+    """Raise an error if a keystore's name looks like a typo of a sibling keystore's name."""
     for similar in similar_keystores(root):
         raise UsageError(
             f"'{root}' does not exist, and '{similar.name}' next to it is a keystore",
@@ -592,7 +592,7 @@ def _check_typo(root: Path) -> None:
         )
 
 
-_SHOWN = 5
+_MOST_SHOWN = 5
 
 
 def write_governance(
@@ -622,7 +622,7 @@ def _raise_protection(
     ``stated_protections`` is the protection of names that policies state.
 
     Raises:
-        PolicyError: the statements contradict each other, or the settings.
+        PolicyError: the statements contradict each other, or contradict the settings.
         KeystoreError: the keystore has no settings for the protection, or its files were edited by
             hand.
     """
@@ -654,8 +654,8 @@ def _raise_protection(
     changes = compare_governance(governance, after)
     text = (
         f"The governance of the keystore changes, because policies demand it: "
-        f"{first_few(demanded, _SHOWN)}. "
-        f"{'; '.join(dict.fromkeys(change.meaning for change in changes[:_SHOWN]))}."
+        f"{first_few(demanded, _MOST_SHOWN)}. "
+        f"{'; '.join(dict.fromkeys(change.meaning for change in changes[:_MOST_SHOWN]))}."
     )
     change.restart = change.names
     change.remarks += (
@@ -744,7 +744,7 @@ def exports_note(keystore: OpenedKeystore, names: Sequence[str]) -> Note:
     return Note("keystore.export-again", remedy_in_closed_robot(keystore.root, f"{text}."))
 
 
-_OF_KEY = {*KEY_FILES, REQUEST}
+_KEY_OR_REQUEST_FILES = {*KEY_FILES, REQUEST}
 
 
 def write_enclaves(
@@ -877,7 +877,7 @@ class _EnclaveMaker:
         notes = tuple(issued.notes())
         if isinstance(identity, NewIdentity) and isinstance(identity.new_key, TokenKey):
             notes += tuple(token_notes(identity.new_key))
-        if not present & _OF_KEY:
+        if not present & _KEY_OR_REQUEST_FILES:
             return _EnclaveOutcome("created", notes)
         if PERMISSIONS_FILE in present and rights:
             (grant,) = issued.permissions.grants
@@ -993,10 +993,10 @@ class _EnclaveMaker:
         """
         change, root = self._change, self._root
         folder = enclave_path(root, name)
-        if name in self._tokens.places and not existing_files.isdisjoint(_OF_KEY):
+        if name in self._tokens.places and not existing_files.isdisjoint(_KEY_OR_REQUEST_FILES):
             self._tokens.check_present(name, root)
         if CERTIFICATE_FILE in existing_files:
-            if not existing_files & _OF_KEY:
+            if not existing_files & _KEY_OR_REQUEST_FILES:
                 raise KeystoreError(
                     f"enclave {name} has a certificate but no key",
                     f"Its {KEY_FILE} is missing, and the certificate does not work with a new key.",
@@ -1073,7 +1073,7 @@ class _EnclaveMaker:
             )
         return KeystoreError(
             f"the certificates of {len(windows)} enclaves are not valid now: "
-            f"{first_few(list(windows), _SHOWN)}",
+            f"{first_few(list(windows), _MOST_SHOWN)}",
             f"That of {name} {dates}",
             f"Renew them with {command}.",
         )

@@ -27,7 +27,7 @@ from sros_tool.keystore.issuing.enclave import (
 )
 from sros_tool.keystore.layout import KEY_URI_FILE, enclave_path, has_key
 from sros_tool.keystore.lifecycle.change import Changed, ChangeOptions, KeystoreChange
-from sros_tool.keystore.lifecycle.replaced import Superseded, certificates_until, lacks_some
+from sros_tool.keystore.lifecycle.replaced import Superseded, certificates_until, may_lack_entries
 from sros_tool.keystore.rights import RecordedRights, SignedRights
 from sros_tool.keystore.selection import missing_enclave_error
 from sros_tool.names import check_enclave_name
@@ -87,7 +87,9 @@ def renew(
             short_lived = [
                 name for name in others if change.template.longest_validity(name) is not None
             ]
-            wanted |= dict.fromkeys(_due(change, {*others}.difference(short_lived), expiring))
+            wanted |= dict.fromkeys(
+                _due_enclave_names(change, {*others}.difference(short_lived), expiring)
+            )
             if short_lived:
                 text = f"short-lived, and renewed only if named: {first_few(short_lived, 3)}"
                 change.notes.append(Note("renew.short-lived", text))
@@ -128,7 +130,7 @@ def renew(
         change.record()
         lasting = () if change.revoked else replaced
         until = certificates_until(change.keystore, lasting, change.template)
-        may_work_longer = bool(lasting) and lacks_some(change.keystore)
+        may_work_longer = bool(lasting) and may_lack_entries(change.keystore)
         change.finish(command="renew with --revoke-old" if revoke_old else "")
     return change.result(
         Changed,
@@ -138,7 +140,9 @@ def renew(
     )
 
 
-def _due(change: KeystoreChange, names: Container[str], threshold: Threshold) -> Iterator[str]:
+def _due_enclave_names(
+    change: KeystoreChange, names: Container[str], threshold: Threshold
+) -> Iterator[str]:
     """Yield the enclaves among ``names`` that are due for renewal.
 
     Raises:
@@ -194,7 +198,7 @@ class _Renewer:
         return Superseded.record(name, state.certificate, issued.certificate, now)
 
     def _issuance(self, state: Credentials) -> Issuance:
-        """Return what to issue for an enclave, after verifying its present files."""
+        """Return the issuance for an enclave, after verifying the enclave's present files."""
         name = state.name
         rights = checked_rights(state, self._change.authorities, self._change.recorded)
         # If a unique subject made earlier permissions useless, they must not become useful again.

@@ -108,8 +108,8 @@ def earlier_permissions(
 ) -> EarlierPermissions | None:
     """Return the current permissions of an enclave; None if DDS would refuse them.
 
-    ``authority`` is the permissions CA.  ``certificate`` is that of the enclave, if it was already
-    read.
+    ``authority`` is the permissions CA.  ``certificate`` is the enclave's certificate, if the
+    caller has already read it.
     """
     with suppress(SrosError):
         certificate = certificate or keystore.certificate_of(name)
@@ -126,7 +126,7 @@ def replaced_rights(
     """Return the rights gained and lost when ``grant`` replaces ``earlier_permissions``.
 
     Other permissions of the enclave may work longer than ``earlier_permissions``; `with_ledger`
-    adds this.
+    adds their expiry.
     """
     difference = compare(grant_rights(name, earlier_permissions.grant), grant_rights(name, grant))
     lost: list[Right] = []
@@ -184,9 +184,9 @@ def _enclaves_naming(keystore: OpenedKeystore, names: Collection[str]) -> list[s
 
     The files are searched for the text of the names, so that most need not be parsed.
     """
-    if len(names) > _FEW_NAMES or any(map(is_expression, names)):
+    if len(names) > _MOST_SEARCHED_NAMES or any(map(is_expression, names)):
         return list(keystore.names)
-    texts = re.compile(b"|".join([_WILDCARD, *(re.escape(name.encode()) for name in names)]))
+    texts = re.compile(b"|".join([_WILDCARD_BYTES, *(re.escape(name.encode()) for name in names)]))
     return [
         enclave
         for enclave in keystore.names
@@ -194,8 +194,8 @@ def _enclaves_naming(keystore: OpenedKeystore, names: Collection[str]) -> list[s
     ]
 
 
-_FEW_NAMES = 20
-_WILDCARD = rb"[*\[&]|\?(?!xml |>)"
+_MOST_SEARCHED_NAMES = 20
+_WILDCARD_BYTES = rb"[*\[&]|\?(?!xml |>)"
 """A character in permissions that may belong to a wildcard, or to an escape."""
 
 
@@ -210,7 +210,7 @@ def with_ledger(
     if not replaced_rights:
         return ()
     issued = IssuedEarlier(keystore, {rights.enclave for rights in replaced_rights})
-    may_work_longer = lacks_some(keystore)
+    may_work_longer = may_lack_entries(keystore)
     return tuple(
         replace(
             rights,
@@ -251,7 +251,7 @@ def certificates_until(
     return max(ends, default=None)
 
 
-def lacks_some(keystore: OpenedKeystore) -> bool:
+def may_lack_entries(keystore: OpenedKeystore) -> bool:
     """Return whether the ledger may lack certificates and permissions that the keystore issued.
 
     If so, the keystore is older than its robots, or was restored from a backup.

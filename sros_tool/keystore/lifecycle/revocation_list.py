@@ -80,7 +80,7 @@ from sros_tool.validity import BACKDATE, Window, iso
 class LostRecords:
     """Lists and certificates that a keystore issued but has lost, as after restoring a backup.
 
-    An identity CA of the keystore signed these ``lists`` and ``certificates``, so they are
+    An identity CA of the keystore signed these ``lists`` and ``certificates``, so both are
     authentic wherever they come from.  ``certificates`` maps serial numbers (hexadecimal) to ledger
     entries.
     """
@@ -135,8 +135,9 @@ class LostRecords:
     def add(self, document: bytes) -> bool:
         """Add the lists in a PEM file that the keystore has to know; return whether there are any.
 
-        The file may have certificates, too.  Such a list revokes other certificates, or is not
-        earlier than the keystore's list, so that robots would refuse the keystore's next list.
+        The file may have certificates, too.  A list counts if it revokes certificates that the
+        keystore's list lacks, or if it is not earlier than the keystore's list, because robots
+        would then refuse the keystore's next list.
         """
         sha256 = hashlib.sha256(document).digest()
         if sha256 in self._seen:
@@ -200,7 +201,7 @@ def sign_list(
     return SignedList(document, end, entry)
 
 
-def _carried_over(
+def _entries_to_repeat(
     old: RevocationList | None, expiries: Mapping[int, str], now: datetime
 ) -> list[Revoked]:
     """Return the entries of the ``old`` list that the next list must repeat.
@@ -262,8 +263,8 @@ class RevocationListSigner:
         """Return the enclaves that already have the list; None if some may lack it.
 
         If the ledger has an index and a first list was signed, these are the enclaves in the
-        ledger, because each enclave that is made later gets the list.  In a rotation, files of all
-        enclaves may have to change.
+        ledger, because every enclave that is created later gets the list.  In a rotation, files of
+        all enclaves may have to change.
         """
         if not self.present or read_rotation(self._keystore).stage is not RotationStage.NONE:
             return None
@@ -365,7 +366,10 @@ class RevocationListSigner:
         return certificates
 
     def _recorded_as_moved(self, listed_serials: Collection[int]) -> Container[str]:
-        """Return ``listed_serials``, and those in ``revoked`` that the ledger certainly has."""
+        """Return the serial numbers of certificates that need not be read in ``revoked``.
+
+        These are ``listed_serials``, and certificates in the folder that the ledger certainly has.
+        """
         known = {f"{serial:x}" for serial in listed_serials}
         ledger = self._keystore.ledger_file
         if not ledger.is_indexed:
@@ -374,7 +378,7 @@ class RevocationListSigner:
         certain = ledger.with_values("serial", [path.parent.name for path in others]).certain
         return known | {entry.serial for entry in certain if entry.what == "certificate"}
 
-    def _note_lack(self) -> None:
+    def _note_missing_certificates(self) -> None:
         """Add a remark if the ledger may lack earlier certificates of the revoked enclaves."""
         if not self._last:
             return
@@ -453,13 +457,13 @@ class RevocationListSigner:
         signed = self._sign(self._authority, self.present, new_entries, expiries, least)
         self._transaction.write(CRL, signed.document)
         signed_lists = [signed]
-        if second := self._sign_second(
+        if second := self._sign_list_of_second_ca(
             new_entries, names, expiries, incomplete=incomplete, least=least
         ):
             signed_lists.append(second)
         if self.recipients() is None:
             _link_everywhere(self._transaction, names)
-        self._note_lack()
+        self._note_missing_certificates()
         return min(signed.end for signed in signed_lists), [
             *revocations,
             *(signed.entry for signed in signed_lists),
@@ -473,7 +477,7 @@ class RevocationListSigner:
         expiries: Mapping[int, str],
         least: int,
     ) -> SignedList:
-        kept = _carried_over(old, expiries, self._now)
+        kept = _entries_to_repeat(old, expiries, self._now)
         listed = {entry.serial for entry in kept}
         kept += [entry for entry in new_entries if entry.serial not in listed]
         if authority.service:
@@ -499,8 +503,8 @@ class RevocationListSigner:
         """Return the CA service's list, after verifying it.
 
         Raises:
-            KeystoreError: the list is missing, the identity CA did not sign it, it is not later
-                than the present list, it is not valid now, or it does not revoke all ``serials``.
+            KeystoreError: the list is missing, or is not signed by the identity CA, not later than
+                the present list, or not valid now, or does not revoke all ``serials``.
         """
         numbers = ", ".join(sorted(f"{serial:x}" for serial in serials)) or "nothing"
         remedy = (
@@ -537,9 +541,9 @@ class RevocationListSigner:
     def _lost_revocations(self, expiries: Mapping[int, str]) -> list[Revoked]:
         """Return the revocations that the present list lacks.
 
-        If the present list is the last one, these are only the revocations because of which
-        `unlisted_revocations` refuses an export, because a list need not have certificates of
-        replaced CAs.
+        If the present list is the last list, only the revocations are returned for which
+        `unlisted_revocations` refuses an export: the list need not have certificates of replaced
+        CAs.
         """
         entries = self._keystore.ledger_file.with_values("what", ("revocation", "crl")).entries
         count = max(
@@ -567,7 +571,7 @@ class RevocationListSigner:
 
     # ── the second CA during a rotation ────────────────────────────────────────────────────
 
-    def _sign_second(
+    def _sign_list_of_second_ca(
         self,
         new_entries: Sequence[Revoked],
         names: Sequence[str],

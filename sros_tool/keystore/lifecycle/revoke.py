@@ -38,7 +38,7 @@ from sros_tool.pki.crl import REASONS, SUPERSEDED, load_crls, signed_by
 from sros_tool.validity import iso
 from sros_tool.wording import counted, first_few
 
-_FILES = (
+_MOVED_FILES = (
     *REQUIRED_FILES,
     KEY_URI_FILE,
     *OPTIONAL_FILES,
@@ -46,8 +46,8 @@ _FILES = (
     "permissions.xml",
     REQUEST,
 )
-_PRIVATE = "key.pem"
-_SHOWN = 5
+_PRIVATE_FILE = "key.pem"
+_MOST_SHOWN = 5
 REVOKED_AGAIN = "fleet.revocations-restored"
 """The id of the note that `restored_note` returns."""
 REPLACED_AFTER_BACKUP = "fleet.replaced-after-backup"
@@ -88,12 +88,12 @@ def revoke(
     """Revoke the certificates of enclaves and move their files to ``revoked`` in the keystore.
 
     All certificates of an enclave that have not expired are revoked, because an attacker with the
-    key could also use an earlier certificate.  They are found in the enclave's folder, the ledger
-    and the folder ``revoked``; if the ledger may lack certificates, a remark says so.  The other
-    enclaves get ``crl.pem``, a link to the list.  During a rotation of the identity CA, both CAs
-    sign a list; if the key of the old CA is missing, ``until_retired`` accepts that Fast DDS trusts
-    the old CA's certificates until this CA is retired.  If the identity CA is a CA service, ``crl``
-    is the list (PEM) that the service signed.
+    key could also use an earlier certificate.  The certificates are found in the enclave's folder,
+    the ledger and the folder ``revoked``; if the ledger may lack certificates, a remark says so.
+    The other enclaves get ``crl.pem``, a link to the list.  During a rotation of the identity CA,
+    both CAs sign a list; if the key of the old CA is missing, ``until_retired`` accepts that Fast
+    DDS trusts the old CA's certificates until this CA is retired.  If the identity CA is a CA
+    service, ``crl`` is the list (PEM) that the service signed.
 
     Raises:
         KeystoreError: an enclave does not exist, the identity CA did not issue its certificate, the
@@ -154,9 +154,9 @@ def _later_keys_notes(
         yield Note(
             "revoke.later-keys",
             f"the keystore was restored from a backup, and learned later keys of "
-            f"{first_few(sorted(names), _SHOWN)} only after that, such as keys of new hardware. "
-            f"They {would} revoked, too, and are not certified again: create new keys on the "
-            "robot. docs/howto/keystore_is_lost.md says how to revoke only the earlier keys.",
+            f"{first_few(sorted(names), _MOST_SHOWN)} only after that, such as keys of new "
+            f"hardware. They {would} revoked, too, and are not certified again: create new keys on "
+            "the robot. docs/howto/keystore_is_lost.md says how to revoke only the earlier keys.",
         )
 
 
@@ -288,12 +288,12 @@ def _vouched_since(
     issued: Mapping[str, Entry],
     later_keys: Iterable[str],
 ) -> Iterator[Entry]:
-    """Yield the certificates of other keys that enclaves with ``issued`` certificates got since.
+    """Yield later certificates for keys that a revoked key vouched for.
 
-    The keystore certified them after the date on which a lost list revoked an ``issued``
-    certificate, whose key vouched for the first of them (`sros_tool.keystore.delivery.collect`).
-    Left out are keys in the keystore, and those that were certified before the keystore was lost,
-    such as ``later_keys``, which its ledger lacks.
+    The keystore issued these certificates after the date on which a lost list revoked an ``issued``
+    certificate of the same enclave.  The key of that certificate vouched for the first of the later
+    keys (`sros_tool.keystore.delivery.collect`). Keys in the keystore are left out, and keys that
+    were certified before the keystore was lost, such as ``later_keys``, which the ledger lacks.
     """
     dates = {f"{e.serial:x}": iso(e.date) for crl in forgotten_lists.lists for e in crl.revoked}
     since: dict[str, str] = {}
@@ -338,7 +338,7 @@ def _replaced_notes(change: KeystoreChange, replaced: Mapping[str, bool]) -> Ite
     if commands:
         yield Note(
             REPLACED_AFTER_BACKUP,
-            f"after the backup, the certificates of {first_few(tuple(replaced), _SHOWN)} were "
+            f"after the backup, the certificates of {first_few(tuple(replaced), _MOST_SHOWN)} were "
             "replaced and revoked, and the keystore has only the revoked certificates: give these "
             f"enclaves new certificates with {' and '.join(commands)}.",
         )
@@ -372,8 +372,9 @@ def _unknown_note(change: KeystoreChange, unknown: Mapping[str, Entry]) -> Note:
     valid = sorted({entry.enclave for entry in unknown.values() if entry.serial not in revoked})
     if missing := [name for name in valid if not change.keystore.has_enclave(name)]:
         text += (
-            f". The keystore lacks {first_few(missing, _SHOWN)}, whose certificates stay valid: "
-            "create these enclaves again and revoke them, or replace the CA with `sros rotate_ca`"
+            f". The keystore lacks {first_few(missing, _MOST_SHOWN)}, whose certificates stay "
+            "valid: create these enclaves again and revoke them, or replace the CA with "
+            "`sros rotate_ca`"
         )
     return Note("fleet.certificates-restored", f"{text}.")
 
@@ -386,7 +387,7 @@ def restored_note(restored: Changed, lists_from: str) -> Note:
         f"was restored from a backup, or is a copy. Everything on the list {verb}"
     )
     if again_revoked := restored.names("revoked"):
-        text += f", with {first_few(again_revoked, _SHOWN)}"
+        text += f", with {first_few(again_revoked, _MOST_SHOWN)}"
     return Note(REVOKED_AGAIN, f"{text}.")
 
 
@@ -488,19 +489,19 @@ def _move_to_revoked(change: KeystoreChange, name: str) -> Entry:
     target = f"{REVOKED}/{certificate.serial_number:x}"
     with os.scandir(transaction.root / folder) as entries:
         by_name = {entry.name: entry for entry in entries}
-    links = [file for file in _FILES if file in by_name and by_name[file].is_symlink()]
-    files = [file for file in _FILES if file in by_name and file not in links]
+    links = [file for file in _MOVED_FILES if file in by_name and by_name[file].is_symlink()]
+    files = [file for file in _MOVED_FILES if file in by_name and file not in links]
     if (
         name != "/"
         and CERTIFICATE_FILE in files
         and len(files) + len(links) == len(by_name)
         and all(by_name[file].is_file() for file in files)
-        and not (_PRIVATE in files and by_name[_PRIVATE].stat().st_mode & 0o077)
+        and not (_PRIVATE_FILE in files and by_name[_PRIVATE_FILE].stat().st_mode & 0o077)
         and not os.path.lexists(transaction.root / target)
     ):
         transaction.move_folder(folder, target, files, links)
         return certificate_entry(change.now, "certificate", certificate, name)
-    for file in _FILES:
+    for file in _MOVED_FILES:
         path = f"{folder}/{file}"
         if name == "/" and file == "governance.p7s":
             continue  # the folder of the enclave / has the governance of the keystore
@@ -510,6 +511,6 @@ def _move_to_revoked(change: KeystoreChange, name: str) -> Entry:
             known = file == CERTIFICATE_FILE
             place = transaction.root / path
             data = change.keystore.read(place, file) if known else transaction.read(path)
-            transaction.write(f"{target}/{file}", data, private=file == _PRIVATE)
+            transaction.write(f"{target}/{file}", data, private=file == _PRIVATE_FILE)
         transaction.remove(path)
     return certificate_entry(change.now, "certificate", certificate, name)

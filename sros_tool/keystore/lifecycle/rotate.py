@@ -98,7 +98,7 @@ from sros_tool.pki.token import is_token_uri
 from sros_tool.validity import Span, Window, span_text, window
 from sros_tool.wording import first_few
 
-_SHOWN = 10
+_MOST_SHOWN = 10
 """Maximum number of robots that an error names."""
 _ENCLAVES_SHOWN = 5
 
@@ -185,7 +185,7 @@ def rotate_ca(
             change.finish()
         elif delete_old_key:
             _refuse_late_deletion(change.keystore, rotation.stage)
-    return _step(
+    return _step_result(
         change,
         stage=stage,
         files=tuple(replacement.file for replacement in rotator.replacements),
@@ -194,7 +194,7 @@ def rotate_ca(
     )
 
 
-def _step(change: KeystoreChange, **more: Any) -> RotationStep:
+def _step_result(change: KeystoreChange, **more: Any) -> RotationStep:
     """Return the result of a step, with all enclaves reissued, or all kept."""
     reissued = any(
         change_of_file.path.endswith(f"/{CERTIFICATE_FILE}")
@@ -256,7 +256,7 @@ def _refuse_late_deletion(keystore: OpenedKeystore, stage: RotationStage) -> Non
     if kept:
         raise UsageError(
             "no stage is left to do, so no key is deleted",
-            f"Keys of replaced CAs: {first_few(kept, _SHOWN)}.",
+            f"Keys of replaced CAs: {first_few(kept, _MOST_SHOWN)}.",
             "Delete them yourself, or leave out --delete-old-key.",
         )
 
@@ -268,7 +268,7 @@ def _cut_off_error(
     robots: Sequence[str],
     roles: Sequence[str],
 ) -> KeystoreError:
-    where, names = quote(str(keystore.root)), first_few(robots, _SHOWN)
+    where, names = quote(str(keystore.root)), first_few(robots, _MOST_SHOWN)
     if _leaves_out_stages(rotation, to):
         files = {replacement.file for replacement in rotation.replacements}
         seals = files != {"identity_ca"} if files else [*roles] != [IDENTITY]
@@ -420,7 +420,7 @@ def renew_identity_ca(
         change.entries.append(certificate_entry(change.now, "ca", new, reason=SAME_KEY))
         change.record(signer)
         change.finish()
-    return _step(change, stage=RotationStage.NONE, files=("identity_ca",))
+    return _step_result(change, stage=RotationStage.NONE, files=("identity_ca",))
 
 
 def _renewed_by_service(
@@ -1024,7 +1024,8 @@ def _existing_ca(
     """Return the certificate of an existing CA, such as one that a backup lacks.
 
     Raises:
-        PkiError: the certificate cannot be that of a CA, or ``key`` does not belong to it.
+        PkiError: the certificate cannot belong to a CA, or ``key`` does not belong to the
+            certificate.
         KeystoreError: the CA has a chain, or is a permissions CA with another name than ``name``.
     """
     imported = [check_imported(role, data, key, change.now) for role in roles]

@@ -139,7 +139,7 @@ def read_rotation(keystore: OpenedKeystore) -> Rotation:
         return Rotation()
     try:
         read = parse_json(keystore.read(path, "file of the rotation"))
-        replacements = tuple(_replacement(replacement) for replacement in read["replacements"])
+        replacements = tuple(_replacement_from(replacement) for replacement in read["replacements"])
         rotation = Rotation(RotationStage(read["stage"]), replacements)
         for replacement in replacements:
             issuing = (
@@ -157,7 +157,7 @@ def read_rotation(keystore: OpenedKeystore) -> Rotation:
     return rotation
 
 
-def _replacement(values: dict[str, str]) -> Replacement:
+def _replacement_from(values: dict[str, str]) -> Replacement:
     """Return the replacement that a JSON object describes.
 
     Raises:
@@ -188,7 +188,7 @@ def rotation_status(keystore: OpenedKeystore, *, now: datetime) -> RotationStatu
     states = []
     for file, roles in keystore.authority_files.items():
         certificates = keystore.certificates_of(file)
-        counts = _count(keystore, roles[0], certificates)
+        counts = _count_enclaves(keystore, roles[0], certificates)
         for index, certificate in enumerate(certificates):
             replaced = by_file.get(file)
             state = "issuing" if index == 0 else "old"
@@ -214,7 +214,7 @@ def rotation_status(keystore: OpenedKeystore, *, now: datetime) -> RotationStatu
     return RotationStatus(keystore.root, rotation, tuple(states), len(names), tuple(remarks))
 
 
-def _count(
+def _count_enclaves(
     keystore: OpenedKeystore, role: str, authorities: tuple[x509.Certificate, ...]
 ) -> Counter[int]:
     """Count the enclaves of each CA, by its index in ``authorities``.
@@ -301,7 +301,7 @@ def _restart_remarks(keystore: OpenedKeystore, rotation: Rotation) -> list[str]:
 
 
 def crls_confusable(old: x509.Certificate, new: x509.Certificate) -> bool:
-    """Return whether OpenSSL may mistake the revocation list of one CA for that of the other.
+    """Return whether OpenSSL may mistake the revocation list of one CA for the list of the other.
 
     OpenSSL finds a list by name and key identifier.  If both CAs have the same name and the old CA
     has no key identifier, Fast DDS 2.9.1 uses the wrong list, and no process starts (tested).

@@ -4,8 +4,8 @@ There are two stages, so that a running robot passes the first one without inter
 ``credentials``, enclaves get certificates and permissions by the new settings; processes with old
 and new files communicate.  In ``governance``, the signed governance and the domains change; with
 most differences, processes with the old governance cannot communicate with processes with the new
-one.  Each stage is a transaction.  No progress is recorded: the stages that remain are those that
-would still change something.
+one.  Each stage is a transaction.  No progress is recorded: a stage remains if it would still
+change something.
 """
 
 from __future__ import annotations
@@ -306,7 +306,7 @@ def update_keystore(
         )
         pending = _pending_stages(present, goal)
         done = pending[:1] if next_stage else pending
-        step = goal if done == pending else _first_step(present, goal)
+        step = goal if done == pending else _first_goal(present, goal)
         change.template, change.governance = present.settings, present.governance
         change.open_authorities()
         if revoke_old and not pending:
@@ -342,7 +342,7 @@ class _Goal:
         return governance_for(self.settings.protection, self.domains)
 
 
-def _first_step(present_settings: PresentSettings, goal: _Goal) -> _Goal:
+def _first_goal(present_settings: PresentSettings, goal: _Goal) -> _Goal:
     """Return the goal of the first stage, CREDENTIALS: ``goal`` with the present protection.
 
     The present name, description, distributions and domains also stay.
@@ -380,19 +380,19 @@ def _signed_payloads(before: DomainProtection, after: DomainProtection) -> list[
     return [Note("governance.signed-payload", text)]
 
 
-_ONLY_STATED = ("name", "description", "distributions")
+_DESCRIPTIVE_KEYS = ("name", "description", "distributions")
 """Settings on which no file depends."""
 
 
 def _pending_stages(present_settings: PresentSettings, goal: _Goal) -> tuple[UpdateStage, ...]:
     """Return the stages that change something, in order."""
     stages = []
-    before, after = present_settings.settings, _first_step(present_settings, goal).settings
+    before, after = present_settings.settings, _first_goal(present_settings, goal).settings
     if before != after:
         stages.append(UpdateStage.CREDENTIALS)
     if goal.governance() != present_settings.governance or present_settings.edits.governance:
         stages.append(UpdateStage.GOVERNANCE)
-    named = any(getattr(before, key) != getattr(goal.settings, key) for key in _ONLY_STATED)
+    named = any(getattr(before, key) != getattr(goal.settings, key) for key in _DESCRIPTIVE_KEYS)
     if not stages and (named or present_settings.edits or present_settings.written is None):
         stages.append(UpdateStage.CREDENTIALS)
     return tuple(stages)
@@ -471,7 +471,7 @@ class _Updater:
         if UpdateStage.GOVERNANCE in done:
             write_governance(change, governance, names=names)
         if done:
-            self._part_authorities()
+            self._separate_ca_files()
             change.entries.append(write_settings(change.transaction, after, change.now))
         superseded = [document.old for document in reissued if document.old]
         revoked = self._revoke_old and bool(superseded)
@@ -635,7 +635,7 @@ class _Updater:
 
     # ── authorities ────────────────────────────────────────────────────────────────────────
 
-    def _part_authorities(self) -> None:
+    def _separate_ca_files(self) -> None:
         """Stage a separate file for each CA if one file has both; DDS loads the same content."""
         settings, files = self._goal.settings, self._change.keystore.authority_files
         if not settings.separate_authorities or len(files) > 1:
@@ -708,7 +708,7 @@ class _Updater:
 
 
 def trust_records(root: Path, **options: Unpack[ChangeOptions]) -> KeystoreUpdate:
-    """Record permissions again that sros 0.1 recorded without a chain of ledger lines.
+    """Record again the permissions that sros 0.1 recorded without a chain of ledger lines.
 
     Permissions are recorded only if the permissions CA signed them and they are the last ones of
     their enclave in the ledger.  If any enclave has other permissions, nothing is written.
