@@ -804,7 +804,7 @@ class _Publication:
             f"nothing in '{self._folder}' shows what was revoked, or which rights were taken away, "
             f"after {since}: a robot that was stolen after that gets releases, and is trusted. "
             f"Unless you have done so, run `sros fleet collect {where} INBOX`, which revokes again "
-            f"what messages of robots show, revoke again what else was stolen (`sros revoke "
+            "what messages of robots show, revoke again what else was stolen (`sros revoke "
             f"{where} --robot NAME`), sign the present policy (`sros generate_artifacts`), and "
             "publish again.",
         )
