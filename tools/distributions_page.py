@@ -19,8 +19,8 @@ from tools.steps import CHECKOUT
 _NAMES = ("title", "product", "tested")
 """The traits that are no rules."""
 
-_RELEASES = re.compile(r" \((?:Fast DDS|Cyclone|\d)[^)]*\)(?=\.$)")
-"""The releases at the end of a sentence, which the page names for themselves."""
+_RELEASES = re.compile(r" \((?:Fast DDS|Cyclone|\d)[^)]*\)(?=\.$)|; None: [^.]*(?=\.$)")
+"""The releases, or the meaning of None, at the end of a sentence: the page has its own words."""
 
 _HEAD = re.compile(r".*?\n## DDS and rules of each distribution\n", re.DOTALL)
 """The part of the page that is written by hand."""
@@ -44,9 +44,10 @@ def distributions_page() -> str:
         "latest as of November 2026; sros assumes that all patch versions of a release decide "
         "alike. For a release that is *not tested*, sros uses the rules of another release, and "
         "does not see how the two releases differ.",
-        "Rules that are not the same in all tested releases:",
+        "These rules are not the same in all tested releases:",
         table_text("rule", "where it holds", rows=_rules()),
-        "What an update changes is reported as:",
+        "`sros check --upgrade-to` reports what an update changes, and `sros check` reports what "
+        "differs between the distributions of a keystore:",
         table_text("finding", "severity", "what it says", rows=_findings()),
     ]
     return "\n\n".join(parts) + "\n"

@@ -237,6 +237,6 @@ def _print_restart(
     if zenoh and zenoh.files and set(zenoh.restart) != set(names):
         text += f"; on Zenoh: {shown_names(zenoh.restart) or 'none'}"
     if exported and (published := publish_command(root)):
-        text += f"; robots that fetch: {published} first"
+        text += f"; for robots that fetch, first run {published}"
     text += "; if processes run from an export, export their enclaves again first" * exported
     echo(remedy_in_closed_robot(root, text), err=True)

@@ -144,7 +144,7 @@ class LocalRobot:
                 raise SrosError(
                     f"others can change '{path}'",
                     f"'{place}': {why}.",
-                    "Close the robot into a folder that only you and root can change.",
+                    "Give `sros close` a folder that only you and root can change.",
                 )
 
     @contextmanager

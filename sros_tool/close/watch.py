@@ -210,9 +210,9 @@ def _show_variables(running: RunningRobot, observed: ObservedProcesses) -> None:
             by_variables.setdefault(names, []).append(process.label)
     for names, labels in by_variables.items():
         robot.shell.say(
-            "variables that this shell does not have, and that the start commands in "
-            f"{robot.commands_file} do not set: {first_few(names, MOST_NAMES)}; they are set for "
-            f"{enumerated(labels)}"
+            f"{enumerated(labels)} {'run' if len(labels) > 1 else 'runs'} with variables that this "
+            f"shell does not have, and that the start commands in {robot.commands_file} do not "
+            f"set: {first_few(names, MOST_NAMES)}"
         )
 
 

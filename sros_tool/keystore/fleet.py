@@ -198,18 +198,22 @@ def unrecorded_notes(
     found = unrecorded_enclaves(fleet, names, robots.keys()) if fleet else {}
     for robot, (below, _) in found.items():
         if below:
-            text = f"{first_few(below, _MOST_SHOWN)}: of no robot, because no policy for the fleet "
-            text += f"had the path with a placeholder: `--robot {robot}` does not choose such an "
-            text += "enclave, no release has it, and an agent removes it. To make it an enclave of "
-            text += f"the robot: `sros generate_artifacts -k {quote(str(keystore.root))} -p POLICY "
-            text += f"--fleet FILE --robot {robot}`, with a policy that has {{robot}} in the path."
-            yield Note("fleet.unrecorded", text)
+            belong, them = ("belong", "them") if len(below) > 1 else ("belongs", "it")
+            yield Note(
+                "fleet.unrecorded",
+                f"{first_few(below, _MOST_SHOWN)} {belong} to no robot, because no policy of the "
+                f"fleet has a path with {{robot}} for {them}. `--robot {robot}` does not select "
+                "such an enclave, no release includes it, and an agent removes it. To make it an "
+                "enclave of the robot, run `sros generate_artifacts -k "
+                f"{quote(str(keystore.root))} -p POLICY --fleet FILE --robot {robot}` with a "
+                f"policy that has {{robot}} in the path.",
+            )
 
 
 def deliver_first(root: Path) -> str:
     """Return a sentence on how to deliver new files to robots before restarting processes."""
     published = publish_command(root)
-    before = f"Publish them first, for robots that fetch: {published}. " if published else ""
+    before = f"For robots that fetch, first publish the files: {published}. " if published else ""
     text = "If processes run from an export, export the enclaves again first."
     return f"{before}{remedy_in_closed_robot(root, text)}"
 

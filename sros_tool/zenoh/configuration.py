@@ -134,7 +134,7 @@ class ZenohNetwork:
                     f"the routers {first.name} and {second.name} cannot connect to each other",
                     "The endpoints of each router name its own host, or the router listens only on "
                     "its own host.",
-                    "Name an endpoint by which another host reaches one of them.",
+                    "For one of the two routers, name an endpoint that other hosts can reach.",
                 )
         return connections
 

@@ -143,7 +143,11 @@ def test_files_that_expire_soon_are_one_finding(tmp_path: Path) -> None:
     found = keystore_findings(OpenedKeystore(root), Circumstances(NOW + timedelta(days=160)))
     (soon,) = (group for group in group_by_cause(found) if group[0].id == "enclave.ends-soon")
     cause = soon[0].cause
-    assert len(soon) == 2 and cause and "2 files of 2 enclaves, the first of /a" in cause.text
+    assert (
+        len(soon) == 2
+        and cause
+        and "2 files of 2 enclaves; the file that expires first belongs to /a" in cause.text
+    )
     assert f"`sros renew {root} --all-expiring soon`" in cause.remedy
     assert "export" in cause.remedy and "publish" not in cause.remedy
 

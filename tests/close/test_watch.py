@@ -24,7 +24,6 @@ def test_variables_that_a_command_does_not_set_are_named() -> None:
     robot = SimpleNamespace(shell=shell, commands_file="commands.txt")
     running: Any = SimpleNamespace(robot=robot, processes=RunningProcesses(talkers))
     watch._show_variables(running, ObservedProcesses(0, closed))
-    assert len(shown) == 1 and shown[0].startswith("variables that this shell does not have")
-    assert shown[0].endswith(
-        "not set: GAIN; they are set for process 1 (talk) and process 2 (talk)"
-    )
+    processes = "process 1 (talk) and process 2 (talk) run with variables that this shell does not"
+    assert len(shown) == 1 and shown[0].startswith(processes)
+    assert shown[0].endswith("do not set: GAIN")

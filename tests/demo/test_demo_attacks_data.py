@@ -71,7 +71,7 @@ def test_every_closed_door_opens_without_its_defense() -> None:
 )
 def test_the_page_lists_the_attacks_that_work(title: str, scenario: Scenario, count: int) -> None:
     page = (CHECKOUT / "docs/attacks.md").read_text()
-    _, _, text = page.partition(f"Attacks that are known to work{title}:\n")
+    _, _, text = page.partition(f"These attacks are known to work{title}:\n")
     listed = re.findall(r"^\| (.+?) \|", text.strip().partition("\n\n")[0], re.MULTILINE)[2:]
     assert listed == [
         row.name for row in scenario.rows if row.open_because and not row.defence_removed

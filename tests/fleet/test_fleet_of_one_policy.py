@@ -291,7 +291,7 @@ def test_a_new_node_comes_to_one_robot_first(made: Path, tmp_path: Path) -> None
         ("distribute_key", bare, "/r7/lamp", "lamp"),
     ):
         said = sros(*verb, cwd=folder).ok().err
-        assert "note [fleet.unrecorded]: /r7/lamp: of no robot" in said, verb
+        assert "note [fleet.unrecorded]: /r7/lamp belongs to no robot" in said, verb
         assert "robots that fetch" not in said
 
 

@@ -399,8 +399,8 @@ def _with_cause_of_expiry(findings: Sequence[Finding], keystore: OpenedKeystore)
         soon,
         keystore,
         EXPIRES_SOON.title.replace("a certificate", "certificates"),
-        f"{counted(len(soon), 'file')} of {counted(enclaves, 'enclave')}, the first of "
-        f"{first.subject}: {first.text}. {EXPIRES_SOON.why}",
+        f"{counted(len(soon), 'file')} of {counted(enclaves, 'enclave')}; the file that expires "
+        f"first belongs to {first.subject}: {first.text}. {EXPIRES_SOON.why}",
         f"Run `{renewal_command(keystore.root)}`, then "
         f"{published or 'export the enclaves again'}, and restart their processes.",
     )

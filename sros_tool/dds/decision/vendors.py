@@ -139,14 +139,14 @@ class VendorTraits:
     reader: DocumentReader = DocumentReader.STANDARD
     style: Style = Style.FNMATCH
     governance_both_ways: bool = False
-    """A topic rule also applies if the topic's name is a pattern that matches its expression."""
+    """A rule also applies if the topic's name is a pattern that matches the rule's expression."""
     trims_texts: bool = False
     """Spaces around the text of an XML element are ignored."""
     subjects: Subjects = Subjects.EXACT
     escapes_subjects: bool = False
     r"""Characters of a subject beyond ASCII are compared as escapes (``\C3\B6``)."""
     longest_subject: int | None = None
-    """Bytes of a certificate's subject that are compared, from its beginning; None: all."""
+    """Number of bytes at the beginning of a certificate's subject that are compared; None: all."""
     drops_expired: bool = False
     """Running participants lose each other when the certificate of one of them expires.
 
@@ -190,7 +190,7 @@ class VendorTraits:
     The first rule that names the topic decides, for publishing or for subscribing.
     """
     asks_both_directions: bool = False
-    """Creating a topic needs a right to publish or subscribe; for each, its first rule decides."""
+    """A topic is created if its first rule to publish, or its first to subscribe, allows this."""
     always_needs_allow_rule: bool = False
     """A participant without allow rules never starts, even if joining is not controlled."""
     needs_domain_rule: bool = True
