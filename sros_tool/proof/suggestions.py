@@ -141,6 +141,16 @@ class _Stated:
         """Return the names without wildcards that a right is stated for, sorted."""
         return sorted(name for of, name in self.users if of == right)
 
+    def with_counterpart(self) -> set[str]:
+        """Return the enclaves that state a right to a name that another enclave's right serves."""
+        return {
+            enclave
+            for (right, name), enclaves in self.users.items()
+            if name not in _OF_EVERY_NODE
+            for enclave in enclaves
+            if self.users.get((PEER_RIGHT[right], name), set()) - {enclave}
+        }
+
 
 def _candidates(stated_rights: _Stated, worlds: Sequence[World]) -> Iterator[Requirement]:
     for right in _SENDING_RIGHTS:
@@ -152,8 +162,10 @@ def _candidates(stated_rights: _Stated, worlds: Sequence[World]) -> Iterator[Req
             yield Protected(source=_NOWHERE, names=((kind, "/*"),), level=Level.ENCRYPT)
     for right in ("publish", "request", "call"):
         wild = tuple(sorted(stated_rights.wild[right]))
+        # All enclaves as "/*", which moves with a namespace as the exception does; "*" would still
+        # be the whole robot, so that a package would restrict other parts of its user's robot.
         yield Widest(
-            source=_NOWHERE, rights=((right, wild),), enclaves=("*", EXCEPT + _ENCLAVES_OF_PEOPLE)
+            source=_NOWHERE, rights=((right, wild),), enclaves=("/*", EXCEPT + _ENCLAVES_OF_PEOPLE)
         )
 
 
@@ -175,8 +187,16 @@ def _few_holders(stated_rights: _Stated, right: str) -> Iterator[Only]:
 
 
 def _unused_services(stated_rights: _Stated) -> Iterator[Nobody]:
-    """Yield requirements that nobody may call unused services that change nodes."""
-    last = {name.rpartition("/")[2] for name in stated_rights.names("reply") if name.count("/") > 1}
+    """Yield requirements that nobody may call unused services that change nodes.
+
+    An enclave without a counterpart, such as the enclave of a package, has its users elsewhere.
+    """
+    partners = stated_rights.with_counterpart()
+    last = {
+        name.rpartition("/")[2]
+        for name in stated_rights.names("reply")
+        if name.count("/") > 1 and stated_rights.users["reply", name] & partners
+    }
     for service in sorted(last.difference(READING_SERVICES)):
         yield Nobody(source=_NOWHERE, rights=(("request", (f"*/{service}",)),))
 

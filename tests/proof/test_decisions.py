@@ -15,8 +15,8 @@ from sros_tool.keystore.template import load_template
 from sros_tool.policy.document import read_policy
 from sros_tool.proof import decide as decisions
 from sros_tool.proof.findings import Decided, decide_all, requirement_findings, short_text
-from sros_tool.proof.requirements import Only, Protected, parse_requirements
-from sros_tool.proof.suggestions import suggest
+from sros_tool.proof.requirements import Nobody, Only, Protected, Widest, parse_requirements
+from sros_tool.proof.suggestions import render_requirements, suggest
 from sros_tool.proof.system import System, load_system, policy_system
 from tests.support.harness import policy_text, sros
 
@@ -315,6 +315,26 @@ def test_who_moves_the_robot_is_proposed_for_any_number() -> None:
         "# not proposed: only some may publish /cmd_vel (stated for 5 enclaves, but others may by "
         "a wildcard, or a DENY is there)"
     ]
+
+
+def test_what_is_proposed_for_a_package_blames_no_other_part_of_the_robot() -> None:
+    """The users of a package's services are elsewhere, and so are the robot's operators."""
+    gripper = may("publish", "width") + may("reply", "~/release", "~/set_parameters")
+    package, operator = robot({"/gripper": gripper}), {"/operator/look": may("subscribe", "/*")}
+    proposed = suggest(package.rights, package.worlds).requirements
+    assert [each for each in proposed if isinstance(each, Nobody)] == []
+    served = robot({"/gripper": gripper, "/user": may("subscribe", "width")})
+    assert any(isinstance(each, Nobody) for each in suggest(served.rights, served.worlds)[0])
+    only_wildcards = [each for each in proposed if isinstance(each, Widest)]
+    text = render_requirements(only_wildcards, "gripper.xml").encode()
+    widest = parse_requirements(text, "r.toml", namespaces=["/left"])
+    wild = may("publish", "/left/*")
+    others = operator | {"/operator/drive": wild, "/planner": wild}
+    assert decide_all(widest, robot({"/left/gripper": gripper, **others})).violations == ()
+    assert decide_all(widest, robot({"/left/gripper": wild, **others})).violations
+    of_robot = parse_requirements(text, "r.toml")
+    blamed = decide_all(of_robot, robot({"/gripper": gripper, **others})).violations
+    assert len(blamed) == 1, "in the namespace /, still for all enclaves except the operators"
 
 
 ENCRYPTED = '[[protected]]\ntopics = ["/scan"]\nlevel = "encrypt"\n'

@@ -209,7 +209,7 @@ def test_proposals_have_no_name_that_the_file_could_not_have() -> None:
     text = render_requirements(suggest(rights, [world]).requirements, 'a "file"\n')
     found = parse_requirements(text.encode(), "r.toml")
     assert [demand(each) for each in found][:1] == ["only /e may publish /ok"]
-    assert "* (but not /operator/*) may use wildcards only to publish /fine*" in map(demand, found)
+    assert "/* (but not /operator/*) may use wildcards only to publish /fine*" in map(demand, found)
     assert "\x1b" not in text
 
 
