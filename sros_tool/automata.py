@@ -132,7 +132,10 @@ class Automaton:
 
     @lru_cache(maxsize=4096)  # noqa: B019 - few automata, and each is compared by its hash
     def between(self, begin: str, end: str) -> Automaton:
-        """Return an automaton for each ``x`` such that this one accepts begin + ``x`` + end."""
+        """Return an automaton for the texts that can stand between ``begin`` and ``end`` here.
+
+        It accepts ``x`` if this automaton accepts ``begin`` + ``x`` + ``end``.
+        """
         starts = self._reached_places(frozenset((0,)), begin)
         stops = frozenset(
             at for at in range(self.size) if self._reached_places(frozenset((at,)), end) & self.ends
@@ -143,7 +146,7 @@ class Automaton:
         return Automaton((*dict.fromkeys(first), *edges), frozenset(ends))
 
     def surrounded(self, begin: str, end: str) -> Automaton:
-        """Return an automaton for ``begin`` + name + ``end``, for each name accepted here."""
+        """Return an automaton for ``begin`` + name + ``end``, for each name this one accepts."""
         size, more = self.size, len(begin)
         edges = [(i, Letters.of(letter), i + 1) for i, letter in enumerate(begin)]
         edges += [(at + more, letters, to + more) for at, letters, to in self.edges]
@@ -258,7 +261,7 @@ class Automaton:
         return self.prefix, self.suffix, repr(self.edges)
 
     def may_meet(self, other: Automaton) -> bool:
-        """Return False if the prefixes or suffixes show that both automata share no name."""
+        """Return False if the prefixes or suffixes show that no name is accepted by both."""
         return _can_overlap(self.prefix, other.prefix) and _can_overlap(
             self.suffix[::-1], other.suffix[::-1]
         )
@@ -647,7 +650,7 @@ class Superset:
 
 
 def _superset_of(node: _Node, rank: Callable[[Superset], tuple[int, int]]) -> Superset | None:
-    """Return a simple set with all names of ``node``, or None; of several, the first in rank."""
+    """Return a simple set with all names of ``node``, or None; of several, the first by rank."""
     match node:
         case _Union():
             return Superset(node.exact, node.automata)
@@ -964,7 +967,7 @@ class _Machine:
         )
 
     def acceptance_test(self, positions: int) -> _Test:
-        """Return a test whether an automaton of a set accepts the text read so far."""
+        """Return a function that says whether an automaton of a set accepts at ``positions``."""
         return lambda leaf: any(positions & self._ends[automaton] for automaton in leaf.automata)
 
     def longer_acceptance_test(self, positions: int) -> _Test:

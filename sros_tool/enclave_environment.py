@@ -348,10 +348,10 @@ def _check_release(environment: Mapping[str, str]) -> None:
     """Raise `UsageError` if the rmw_zenoh of this machine is too old for an enclave's files."""
     from sros_tool.runtime.environment import RMW_ZENOH
     from sros_tool.runtime.rmw import package_version
-    from sros_tool.zenoh.releases import release_of, too_old_because, version_text
+    from sros_tool.zenoh.releases import release_of, version_text, why_too_old
 
     version = package_version(RMW_ZENOH, environment)
-    if version and (why := too_old_because(version)):
+    if version and (why := why_too_old(version)):
         raise UsageError(
             f"{RMW_ZENOH} {version_text(version)} cannot run in an enclave",
             why,

@@ -255,7 +255,7 @@ class Folder:
         os.utime(name, ns=(old.st_atime_ns, old.st_mtime_ns), dir_fd=parent, follow_symlinks=False)
 
     def set_time(self, path: str, seconds: int) -> None:
-        """Set the time of the file ``path``, in seconds since 1970, which a full disk allows."""
+        """Set the modification time of a file, in seconds since 1970; a full disk allows this."""
         parent, name = self._folder_and_name(path)
         os.utime(name, (seconds, seconds), dir_fd=parent, follow_symlinks=False)
 

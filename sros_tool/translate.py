@@ -287,7 +287,7 @@ def ros_rights(rule: Rule) -> tuple[RosRight, ...]:
     publish = _all_topics(rule.publish)
     subscribe = _all_topics(rule.subscribe)
     rights: list[RosRight] = []
-    for kind, right, name in _candidates(publish, subscribe):
+    for kind, right, name in _possible_actions_and_services(publish, subscribe):
         names = dds_names(right, name)
         if all(map(publish.get, names.publish)) and all(map(subscribe.get, names.subscribe)):
             continue  # these topics already belong to an action
@@ -350,7 +350,9 @@ def _all_topics(criteria: Iterable[Criteria]) -> dict[str, bool]:
     return dict.fromkeys((topic for criterion in criteria for topic in criterion.topics), False)
 
 
-def _candidates(publish: Iterable[str], subscribe: Iterable[str]) -> Iterable[tuple[str, str, str]]:
+def _possible_actions_and_services(
+    publish: Iterable[str], subscribe: Iterable[str]
+) -> Iterable[tuple[str, str, str]]:
     """Yield (kind, right, name) of actions, then services, to which the topics may belong.
 
     Actions and services are recognized by their request topics. The caller checks that the other

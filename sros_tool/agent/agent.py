@@ -126,7 +126,7 @@ _MOST_CERTIFICATES = 8
 
 
 class RefusedError(UnavailableError):
-    """The web server does not take a message, perhaps because of the client's certificate."""
+    """The web server refuses a message, perhaps because it refuses the client's certificate."""
 
 
 class Round(NamedTuple):
@@ -449,7 +449,7 @@ class _Round:
                 )
 
     def _note_repaired(self, release: int, paths: Sequence[str]) -> None:
-        """Report in every message of the next day that files were replaced."""
+        """Keep a report that files were repaired, which every message of the next day contains."""
         if paths:
             now = self._machine.now
             text = (
@@ -592,7 +592,11 @@ class _Round:
         self._save_state()
 
     def _note_due(self, changed: Iterable[str], names: Iterable[str]) -> None:
-        """Note the restarts that are due, also because of files that others changed."""
+        """Note that processes have to be restarted because files of their enclaves changed.
+
+        ``changed`` are the enclaves whose files the agent changed.  Changes by others are found by
+        the digests of the files.
+        """
         before, files = self._state.files, self._digests(names)
         changed = {*changed}
         new_files, moment = {*changed}, _since_boot()
@@ -925,7 +929,10 @@ class _Round:
         return ask(last)
 
     def _client_certificates(self) -> list[ClientCertificate]:
-        """Return the certificates and keys for TLS that expire last, the last first."""
+        """Return the enclaves' certificates and keys for TLS, sorted by expiry, the latest first.
+
+        At most `_MOST_CERTIFICATES` are returned.
+        """
         certificates_by_expiry: list[tuple[datetime, ClientCertificate]] = []
         for name in self._enclaves():
             place = enclave_path(self._folder, name)
@@ -1087,8 +1094,8 @@ def _is_renewal_due(keystore: OpenedKeystore, name: str, now: datetime, *, new_k
     """Return whether the robot asks for the renewal of an enclave.
 
     A file is written only when it changes, so its modification time is when the robot got the
-    certificate.  With ``new_key``, permissions count, too: with them, the keystore machine would
-    renew the certificate of the present key.
+    certificate.  With ``new_key``, the expiry of the permissions counts, too: otherwise, when the
+    permissions are due, the keystore machine would renew the certificate with the present key.
 
     Raises:
         SrosError: the certificate cannot be read.
@@ -1169,7 +1176,7 @@ def _key_file(name: str) -> str:
 
 
 def _waiting_key(folder: Path, name: str) -> PrivateKey:
-    """Return the new key of an enclave that waits for its certificate, made if there is none.
+    """Return an enclave's new key, which waits for its certificate; make the key if it is missing.
 
     Raises:
         SrosError: the key cannot be read.

@@ -19,7 +19,7 @@ REFUSALS = frozenset({400, 401, 495, 496})
 
 
 def ended_tls(error: BaseException | None) -> bool:
-    """Return whether a server ended TLS, as by a refusal of the client's certificate.
+    """Return whether an error says that the server ended TLS, perhaps to refuse the certificate.
 
     With TLS 1.3 this may be an alert, or only the end of the connection.
     """

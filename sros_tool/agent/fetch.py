@@ -54,7 +54,7 @@ _MOST_METADATA = 8 * 1024 * 1024
 
 
 class FetchProblem(StrEnum):
-    """Why no release could be fetched."""
+    """The reasons why no release could be fetched."""
 
     UNREACHABLE = "unreachable"
     """The source does not answer, or lacks a file."""

@@ -562,7 +562,7 @@ def _commit(folder: Path, changes: Iterable[_Change]) -> None:
 
 
 def _commit_lists(folder: Path, changes: Iterable[_Change]) -> None:
-    """Write the new revocation lists of enclaves whose identity CAs stay, if there is room."""
+    """Write the new revocation lists of enclaves whose identity CAs stay, if the disk has room."""
     lists = []
     for change in changes:
         crls = {path: data for path, data in change.write.items() if path.endswith(f"/{CRL_FILE}")}

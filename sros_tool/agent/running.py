@@ -216,7 +216,11 @@ def _states(
     is_outdated: Callable[[Process, ProcessEnclave], bool],
     readers: Collection[Process],
 ) -> dict[str, RunningFiles]:
-    """Map enclaves to the files that processes loaded; only ``readers`` of the key are current."""
+    """Map each enclave to which files its processes loaded: earlier, current, or not seen.
+
+    Only ``readers``, processes that can read the key of their enclave, count as having loaded the
+    current files.
+    """
     states = dict.fromkeys(names, RunningFiles.NOT_SEEN)
     for process in processes:
         name, enclave = _enclave_of(process), process.enclave

@@ -27,7 +27,7 @@ from sros_tool.keystore.layout import (
     PERMISSIONS,
     ca_key,
     is_keystore,
-    refuse_earlier,
+    refuse_flat_keystore,
     search_enclaves,
 )
 from sros_tool.keystore.reader import OpenedKeystore
@@ -48,7 +48,7 @@ from sros_tool.zenoh.document import (
     UnreadConfigurationError,
     parse_configuration,
 )
-from sros_tool.zenoh.releases import too_old_because, version_text
+from sros_tool.zenoh.releases import version_text, why_too_old
 
 _RCL = "rcl 9 (rcl/src/rcl/security.c); tested with ROS 2 Jazzy."
 _NAME_IT = (
@@ -233,7 +233,7 @@ def variable_findings(
         missing = "does not exist" if not root.exists() else "has no enclaves folder with content"
         remedy = ""
         try:
-            refuse_earlier(root)
+            refuse_flat_keystore(root)
         except KeystoreError as error:
             missing, remedy = f"is not read. {error.why}".rstrip("."), error.remedy
         yield KEYSTORE_NOT_FOUND.found(KEYSTORE, f"'{root}' {missing}", remedy=remedy)
@@ -408,10 +408,7 @@ _NEEDED = {
 
 
 def secured_by(environment: Mapping[str, str], folder: Path) -> Iterator[str]:
-    """Yield clauses on settings that secure the nodes started in an environment and a folder.
-
-    Settings that sros cannot read count as well, because they may secure nodes.
-    """
+    """Yield clauses on settings that secure nodes started with an environment, in a folder."""
     if environment.get(ENABLE) == "true":
         yield f"{ENABLE} is set"
     if is_zenoh(environment):
@@ -496,7 +493,7 @@ def zenoh_environment_findings(environment: Mapping[str, str]) -> Iterator[Findi
     if not is_zenoh(environment):
         return
     version = package_version(RMW_ZENOH, environment)
-    if version and (why := too_old_because(version)):
+    if version and (why := why_too_old(version)):
         yield TOO_OLD.found(RMW_ZENOH, f"{RMW_ZENOH} {version_text(version)} is installed. {why}")
     if environment.get(ENABLE) == "true" and not environment.get(SESSION_URI):
         yield NO_SESSION_FILE.found(SESSION_URI, f"{SESSION_URI} is not set")
@@ -534,7 +531,7 @@ def _is_readable(path: Path) -> bool:
         return False
 
 
-def enforces_nothing(environment: Mapping[str, str], variable: str) -> str:
+def why_no_access_control(environment: Mapping[str, str], variable: str) -> str:
     """Return why a process of rmw_zenoh has no access control, as a clause, or "".
 
     The result is also "" if the configuration file is unreadable, which another finding reports.
@@ -545,11 +542,11 @@ def enforces_nothing(environment: Mapping[str, str], variable: str) -> str:
         return f"{variable} is not set"
     with suppress(SrosError):  # a finding says what is wrong with the file
         data = read_bytes(Path(text), "Zenoh configuration")
-        return open_because(data, text, environment.get(OVERRIDE, ""))
+        return why_configuration_is_open(data, text, environment.get(OVERRIDE, ""))
     return ""
 
 
-def open_because(data: bytes, name: str, override: str) -> str:
+def why_configuration_is_open(data: bytes, name: str, override: str) -> str:
     """Return why a configuration has no access control, as a clause; "" if it has access control.
 
     ``name`` is the name of the configuration file, ``override`` is the value of

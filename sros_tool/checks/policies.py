@@ -964,7 +964,7 @@ def _check_root_enclave(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
     if root is None:
         return
     nodes = {expand("~", profile.ns, profile.node) for profile in root.all_profiles()}
-    text = within_root(policy_rights(checked_policy.policy))
+    text = clause_on_enclaves_within_root(policy_rights(checked_policy.policy))
     if not text and len(nodes) > 1:
         text = f"/ has the rights of {len(nodes)} nodes"
     elif not text and not are_basic(policy_rights(Policy((root,)))):
@@ -975,7 +975,7 @@ def _check_root_enclave(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
         yield ROOT_ENCLAVE.found("/", text, root.source.file, root.source.line)
 
 
-def within_root(rights: Collection[Right]) -> str:
+def clause_on_enclaves_within_root(rights: Collection[Right]) -> str:
     """Return a clause on the enclaves whose rights the enclave / also has; "" without any.
 
     Rights that every node needs do not count.
@@ -1384,7 +1384,8 @@ def _check_zenoh(enclaves: Iterable[Enclave]) -> Iterator[Finding]:
 def _shared_namespaces(fleet: Fleet, enclaves: Iterable[Enclave]) -> Iterator[str]:
     """Yield a clause for each namespace that several robots on one ROS domain share.
 
-    The computers of one robot may: a group has them and nobody else, and no node runs on two.
+    The computers of one robot may share a namespace: they are a group of their own, and no node
+    runs on two of them.
     """
     robots = {
         namespace: [fleet.robots[name] for name in names]

@@ -20,11 +20,11 @@ from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 from sros_tool.checks.environment import (
     OWN_CONFIGURATION,
     PROCESS_OPEN,
-    enforces_nothing,
     is_zenoh,
-    open_because,
     set_without_enable,
     value_text,
+    why_configuration_is_open,
+    why_no_access_control,
 )
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind
 from sros_tool.checks.vulnerabilities import vulnerability_metrics
@@ -178,12 +178,12 @@ def _file_findings(
         return
     newer = list(newer_files(process, enclave))
     # If the order is unknown, the process most likely loaded the newer files.
-    changed = () if order_unknown(process) else newer
+    changed = () if why_order_is_unknown(process) else newer
     loaded = _loaded_files(enclave, changed, process, ledgers)
     if revoked := loaded.revoked:
         yield PROCESS_REVOKED.found(process.label, f"the certificate of {name} was {revoked}")
     elif not enclave.is_there or len(enclave.lacking) == len(_required_files(enclave)):
-        if not _unsecured_because(process):
+        if not _why_unsecured(process):
             text = f"{name} in '{plain(enclave.keystore, _LONGEST_PATH)}' has no files"
             unknown = f"; {loaded.unknown}" if loaded.unknown else ""
             yield PROCESS_WITHOUT_FILES.found(process.label, f"{text}{unknown}")
@@ -212,12 +212,12 @@ def _file_findings(
 
 def _changed_text(process: Process, files: str) -> str:
     """Return a clause that files changed, or may have changed, since a process started."""
-    if why := order_unknown(process):
+    if why := why_order_is_unknown(process):
         return f"{why}, so it is not known whether {files} changed after its start"
     return f"it started at {iso(process.started)}; {files} changed later"
 
 
-def order_unknown(process: Process) -> str:
+def why_order_is_unknown(process: Process) -> str:
     """Return why times of files do not show changes since the start of a process; "" if they do."""
     advanced = process.clock_advanced
     return f"the clock was set forward by {elapsed(advanced)} while it ran" if advanced else ""
@@ -452,7 +452,7 @@ def _parse_zone(text: str, otherwise: tzinfo) -> tzinfo:
         return UTC
 
 
-def _unsecured_because(process: Process) -> str:
+def _why_unsecured(process: Process) -> str:
     """Return why a process that requests security runs unsecured, as a clause, or ""."""
     environment, enclave = process.environment, process.enclave
     if environment.get(STRATEGY) == "Enforce" or (enclave and enclave.problem):
@@ -631,7 +631,7 @@ def _security_of(process: Process) -> Security:
         if process.configuration and process.configuration.problem:
             return Security.UNKNOWN
         try:
-            if _zenoh_opening(process):
+            if _why_zenoh_is_open(process):
                 return Security.OPEN
             return Security.UNKNOWN if [*_zenoh_changes(process)] else Security.SECURED
         except SrosError:
@@ -640,7 +640,7 @@ def _security_of(process: Process) -> Security:
         return Security.OPEN
     if process.enclave and process.enclave.problem:
         return Security.UNKNOWN
-    return Security.OPEN if _unsecured_because(process) else Security.SECURED
+    return Security.OPEN if _why_unsecured(process) else Security.SECURED
 
 
 def process_findings(
@@ -726,7 +726,7 @@ def _daemon_findings(process: Process, wanted: Mapping[str, str]) -> Iterator[Fi
 def _unsecured_findings(process: Process) -> Iterator[Finding]:
     if process.is_zenoh or process.environment.get(STRATEGY) == "Enforce":
         return
-    if why := _unsecured_because(process):
+    if why := _why_unsecured(process):
         text = f"running without security, as {STRATEGY} is not 'Enforce': {why}"
         yield PROCESS_RUNS_UNSECURED.found(process.label, text)
     elif process.enclave and not process.enclave.problem:
@@ -739,7 +739,7 @@ def _shown_variables(environment: Mapping[str, str]) -> Mapping[str, str]:
     return {name: plain(value) for name, value in environment.items() if name == STRATEGY}
 
 
-def _zenoh_opening(process: Process) -> str:
+def _why_zenoh_is_open(process: Process) -> str:
     """Return why a process of rmw_zenoh has no access control, as a clause, or "".
 
     Raises:
@@ -749,7 +749,7 @@ def _zenoh_opening(process: Process) -> str:
     text = process.environment.get(variable, "")
     if process.configuration is None:
         return f"{variable} is not set"
-    return open_because(
+    return why_configuration_is_open(
         process.configuration.data, _plain_path(text), process.environment.get(OVERRIDE, "")
     )
 
@@ -827,7 +827,7 @@ def zenoh_findings(process: Process) -> Iterator[Finding]:
         yield ZENOH_UNREAD.found(process.label, f"{named} is not there any more")
         return
     try:
-        why = _zenoh_opening(process)
+        why = _why_zenoh_is_open(process)
         changes = "; ".join(_zenoh_changes(process))
     except SrosError as error:
         yield ZENOH_UNREAD.found(process.label, _plain_path(str(error)))
@@ -850,13 +850,13 @@ def _is_open(environment: Mapping[str, str]) -> bool:
     """Return whether DDS Security is off and rmw_zenoh has no session file either."""
     if environment.get(ENABLE) == "true":
         return False
-    return not is_zenoh(environment) or bool(enforces_nothing(environment, SESSION_URI))
+    return not is_zenoh(environment) or bool(why_no_access_control(environment, SESSION_URI))
 
 
 def _unsecured_node_findings(
     environment: Mapping[str, str], nodes: Sequence[Process], *, finding_per_node: bool
 ) -> Iterator[Finding]:
-    """Yield findings about running open nodes; a single finding if no security is requested."""
+    """Yield findings about running open nodes; only one if the environment requests no security."""
     asks = environment.get(ENABLE) not in (None, "", "false") or set_without_enable(environment)
     if asks or not _is_open(environment):
         for node in nodes:

@@ -144,7 +144,7 @@ class FindingChange:
         return f"{head}: {finding.kind.title} [{finding.id}]: {finding.text}"
 
 
-class FindingNews:
+class PreviousFindings:
     """The findings of the last check, for comparison with those of the next check."""
 
     def __init__(self) -> None:

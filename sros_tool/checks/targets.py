@@ -19,7 +19,7 @@ from sros_tool.keystore.layout import (
     is_enclave,
     is_keystore,
     locate_enclave,
-    refuse_earlier,
+    refuse_flat_keystore,
 )
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.xml import read_bytes
@@ -118,7 +118,7 @@ def _policies_at(path: Path) -> list[Path]:
             )
     if policies := list(files_of_policies(path)):
         return policies
-    refuse_earlier(path)
+    refuse_flat_keystore(path)
     raise DocumentError(
         f"'{path}' is neither a keystore nor an enclave, and holds no policy",
         "It has no enclaves folder with content, no cert.pem, and no XML file that begins "

@@ -253,7 +253,7 @@ def _unclear_text(advisories: Sequence[Advisory]) -> str:
 
 
 def _remedy(kind: FindingKind, library: MappedLibrary) -> str:
-    """Return the library to upgrade, with the package's name if the path shows it.
+    """Return a remedy that names the library to upgrade, and its package if the path shows it.
 
     "" stands for the remedy of the kind.
     """

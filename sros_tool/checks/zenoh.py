@@ -529,7 +529,7 @@ class AllowedName(NamedTuple):
 
 
 class KeyRight(NamedTuple):
-    """A right and a key."""
+    """A right to a Zenoh key."""
 
     right: Verb
     key: str
@@ -537,7 +537,7 @@ class KeyRight(NamedTuple):
 
 
 class SubjectRights(NamedTuple):
-    """A subject of access control."""
+    """The rights of a subject of access control."""
 
     id: str | None
     """Id of the subject; null without access control."""

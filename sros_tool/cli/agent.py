@@ -161,7 +161,7 @@ def _init(
     )
     from sros_tool.agent.state import InitializedAgent, read_state, write_state
     from sros_tool.files import parse_toml
-    from sros_tool.keystore.delivery.robot import read_pin
+    from sros_tool.keystore.delivery.robot import read_pinned_cas
 
     if not folder.is_dir():
         raise UsageError(
@@ -182,7 +182,7 @@ def _init(
         robot,
         _absolute_source(source),
         _absolute_source(inbox),
-        authorities=tuple(sorted({pin for text in authorities for pin in read_pin(text)})),
+        authorities=tuple(sorted({pin for text in authorities for pin in read_pinned_cas(text)})),
         tls_ca=str(tls_ca.absolute()) if tls_ca else "",
         new_key=new_key,
         restart=restart,

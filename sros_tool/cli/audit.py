@@ -261,7 +261,7 @@ def _write_patch(audited: Audit, patch: Path | None, *, dry_run: bool) -> str:
 
 
 def _advice_to_add_by_hand(sources: Sequence[Path], fleet: Fleet, audited: Audit) -> str:
-    """Return where to add the missing rights to policies with placeholders, "" without them."""
+    """Return where to add the missing rights if policies have placeholders; "" if none has any."""
     from sros_tool.fleet.expansion import FleetPolicy
     from sros_tool.policy.document import join_policies, read_policy
 

@@ -958,11 +958,11 @@ def _watch_processes(
 ) -> None:
     """Report changes of the findings about processes, until SIGINT or SIGTERM."""
     from sros_tool.checks.processes import process_findings
-    from sros_tool.checks.runtime import FindingNews
+    from sros_tool.checks.runtime import PreviousFindings
     from sros_tool.checks.vulnerabilities import vulnerability_findings
     from sros_tool.runtime.processes import ProcessTable
 
-    table, news, zone = ProcessTable(), FindingNews(), local_zone(environment)
+    table, news, zone = ProcessTable(), PreviousFindings(), local_zone(environment)
     judged: tuple[RunningProcesses, datetime] | None = None
     # A blocked signal is received only by the wait below, so that it interrupts no output.
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _ENDING)

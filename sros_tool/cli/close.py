@@ -295,7 +295,7 @@ def _renaming_advice(closed: CloseState, policy: Policy) -> str:
 
 
 def _show_end(robot: LocalRobot, closed: CloseState, *, apply: bool, holds: bool) -> None:
-    """Print the answer, its reasons, and what to do next."""
+    """Print whether the robot is closed, the reasons, and what to do next."""
     from sros_tool.close.preparation import rmws_without_security
 
     folder, observed = shlex.quote(str(robot.folder)), closed.observed

@@ -1126,7 +1126,7 @@ class _ProgressLine:
             redraw("")
 
     def go_on(self) -> None:
-        """Draw again."""
+        """Draw the line again after a pause."""
         signal.setitimer(signal.ITIMER_REAL, _FIRST, _EVERY)
 
     def end(self) -> None:

@@ -523,9 +523,9 @@ def import_verb(
       $ sros import request.answer.tar.gz robot --ca e15ab4af9ee8c94bd8a5e4c6c1...
       $ sros run robot /arm/camera -- ros2 run camera driver
     """
-    from sros_tool.keystore.delivery.robot import import_answer, read_pin, shown_import
+    from sros_tool.keystore.delivery.robot import import_answer, read_pinned_cas, shown_import
 
-    pinned = read_pin(pin) if pin is not None else frozenset[str]()
+    pinned = read_pinned_cas(pin) if pin is not None else frozenset[str]()
     data = read_named(answer, "answer")
     done = import_answer(
         folder,

@@ -369,7 +369,7 @@ def explain(
         print_json(explanation)
     else:
         _echo_answer(lines)
-    print_notes([*_policy_alone(opened, asked, policy), *explanation.notes])
+    print_notes([*_notes_on_policy_alone(opened, asked, policy), *explanation.notes])
     return 0 if explanation.allowed else 1
 
 
@@ -482,7 +482,7 @@ def _stated_distribution(keystore: OpenedKeystore | None, enclave: str) -> Distr
     return None
 
 
-def _policy_alone(
+def _notes_on_policy_alone(
     keystore: OpenedKeystore | None, asked_enclave: AskedEnclave, policy: Path | None
 ) -> list[Note]:
     """Return a note if a policy was explained without the keystore of $ROS_SECURITY_KEYSTORE."""

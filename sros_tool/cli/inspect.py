@@ -38,8 +38,8 @@ if TYPE_CHECKING:
         DescribedToken,
         EnclaveFacts,
         GrantFacts,
-        ListFacts,
         RemoteFacts,
+        RevocationListFacts,
         RightNames,
         SignatureFacts,
         TokenPlace,
@@ -324,7 +324,7 @@ def _revocation_list_lines(described_list: DescribedList) -> Iterator[str]:
         yield f"  {serial}"
 
 
-def _list_text(crl: ListFacts) -> str:
+def _list_text(crl: RevocationListFacts) -> str:
     valid = "" if crl.valid_now else ": NOT VALID NOW"
     return (
         f"revocation list {crl.number} of {crl.issuer}, until {iso(crl.not_after)}{valid}, "

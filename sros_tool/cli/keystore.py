@@ -949,7 +949,7 @@ def _issued_lines(update: KeystoreUpdate) -> Iterator[str]:
 
 
 def _replaced_lines(update: KeystoreUpdate) -> Iterator[str]:
-    """Yield until when replaced certificates and permissions work, and how to revoke them."""
+    """Yield lines that say how long replaced files still work, and how to revoke them."""
     from sros_tool.validity import iso
 
     if update.works_until:

@@ -140,7 +140,10 @@ def renew(
 
 
 def _replaced_lines(result: Changed, *, has_new_keys: bool) -> Iterator[str]:
-    """Yield until when replaced certificates work, and what exports and running processes need."""
+    """Yield lines that say how long replaced certificates still work, and what to do next.
+
+    Next, exports may have to be made again, and running processes be restarted.
+    """
     from sros_tool.keystore.fleet import publish_command
     from sros_tool.keystore.layout import remedy_in_closed_robot
     from sros_tool.validity import iso
@@ -591,7 +594,7 @@ def _print_step(
     step: RotationStep, status: RotationStatus, *, together: bool, same_key: bool
 ) -> None:
     from sros_tool.keystore.expiry import ONE_BY_ONE
-    from sros_tool.keystore.fleet import deliver_first
+    from sros_tool.keystore.fleet import deliver_first_sentence
 
     if not step.changes:
         done = (
@@ -614,7 +617,7 @@ def _print_step(
     echo(f"{done}{_DONE[step.stage]}: {', '.join(step.files)}")
     if step.stage == "retire":
         how = "Restart all processes together." if together else f"All vendors: {ONE_BY_ONE}"
-        echo(f"{how} {deliver_first(step.root)}", err=True)
+        echo(f"{how} {deliver_first_sentence(step.root)}", err=True)
     for remark in status.remarks:
         echo(remark, err=True)
 

@@ -441,7 +441,7 @@ def generate_policy(
     from sros_tool.files import policies_dir
     from sros_tool.graph.learn import (
         NamedEnclaves,
-        News,
+        ReportedRights,
         common_parts,
         draft,
         first_subjects,
@@ -452,7 +452,7 @@ def generate_policy(
     from sros_tool.graph.learn import enclave_per_node as name_enclaves
 
     common = common_parts(file.parent, policies_dir())
-    news = News(common)
+    news = ReportedRights(common)
 
     def named(observation: Observation) -> NamedEnclaves:
         return name_enclaves(observation) if enclave_per_node else NamedEnclaves(observation, ())

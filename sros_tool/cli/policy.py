@@ -288,7 +288,7 @@ def diff_policy(
         compare_sources,
         load_rights,
         policy_difference,
-        without_added,
+        without_enclaves_of_sros,
     )
 
     check_one_format()
@@ -299,7 +299,7 @@ def diff_policy(
     with progress("reading"):
         fleets = fleets_of(fleet_files)
         first, second = load_rights(a, fleets[0]), load_rights(b, fleets[-1])
-    first, second = without_added(first, second), without_added(second, first)
+    first, second = without_enclaves_of_sros(first, second), without_enclaves_of_sros(second, first)
     compared = compare_sources(first, second, governance=True)
     difference, protections = compared.rights, compared.protections
     if form == "json":

@@ -362,7 +362,7 @@ class _Outputs:
             raise UsageError("two options name the same file to write")
 
     def write(self, result: Review, request: ReviewRequest) -> None:
-        """Write the result."""
+        """Write the result of the review to the output files."""
         self._write(_markdown(result, request), _findings(result, request))
 
     def write_unfinished(self) -> None:
@@ -433,8 +433,8 @@ def _sentence(result: Review, step: ReviewStep) -> str:
     from sros_tool.proof.review import (
         AccessChange,
         DroppedRequirements,
-        Facts,
         RightsChange,
+        StepFindings,
     )
 
     place = f" {result.place}" if result.place and step.kind.startswith("requirements") else ""
@@ -466,7 +466,7 @@ def _sentence(result: Review, step: ReviewStep) -> str:
             left_out = expiry.short_lived_text()
             left_out = f"; not counted: {left_out}" if left_out else ""
             return f"{len(due)} of {count} enclaves need to be renewed{unread}{left_out}"
-        case Facts() as facts:
+        case StepFindings() as facts:
             lines = facts.lines
             further = f", and {len(lines) - 1} more" if len(lines) > 1 else ""
             return f"'{lines[0][1]}' {lines[0][0]}{further}"
@@ -511,7 +511,7 @@ def _step_findings(result: Review, step: ReviewStep, request: ReviewRequest) -> 
         UNDECIDED,
     )
     from sros_tool.keystore.expiry import ExpiryCheck, describe_lifetime
-    from sros_tool.proof.review import AccessChange, DroppedRequirements, Facts, RightsChange
+    from sros_tool.proof.review import AccessChange, DroppedRequirements, RightsChange, StepFindings
 
     named = (request.policies, request.requirements, request.keystores)
     whole = (paths[0] for paths in named if paths and " ".join(paths) == step.subject)
@@ -530,7 +530,7 @@ def _step_findings(result: Review, step: ReviewStep, request: ReviewRequest) -> 
                 yield EXPIRY.found(lifetime.name, describe_lifetime(lifetime, request.at), path)
             for enclave in unreadable:
                 yield UNDECIDED.found(enclave.name, str(enclave.error), path)
-        case Facts(failing=failing):
+        case StepFindings(failing=failing):
             kinds = {"files": NOT_REVIEWED, "keystore": PRIVATE_KEY}
             for text, name in failing:
                 is_file = step.kind in kinds
@@ -588,10 +588,10 @@ def _lines_to_read(step: ReviewStep) -> list[str]:
         folded_differences,
         unanswered_lines,
     )
-    from sros_tool.proof.review import AccessChange, DroppedRequirements, Facts, RightsChange
+    from sros_tool.proof.review import AccessChange, DroppedRequirements, RightsChange, StepFindings
 
     match step.content:
-        case Facts() as facts if len(facts.lines) > 1:
+        case StepFindings() as facts if len(facts.lines) > 1:
             return [f"'{name}' {text}" for text, name in facts.lines]
         case AccessChange(before=before, after=after, growth=growth, dropped=dropped):
             return [*added_lines(before, after, growth), *dropped_lines(after, dropped)]
@@ -703,8 +703,8 @@ def _detail(result: Review, step: ReviewStep, request: ReviewRequest) -> str:
     from sros_tool.proof.review import (
         AccessChange,
         DroppedRequirements,
-        Facts,
         RightsChange,
+        StepFindings,
     )
 
     def findings(chosen_findings: ChosenFindings) -> str:
@@ -732,7 +732,7 @@ def _detail(result: Review, step: ReviewStep, request: ReviewRequest) -> str:
             lines = [describe_lifetime(lifetime, request.at) for lifetime in due]
             lines += [f"{enclave.name}  unknown: {enclave.error}" for enclave in unreadable]
             return renewal_markdown(lines, "", "as asked") if lines else ""
-        case Facts() as facts:
+        case StepFindings() as facts:
             facts_with_names = (f"{code(name)} {code(text)}" for text, name in facts.lines)
             return f"### {_TITLES[step.kind]}\n\n{bounded_list(facts_with_names, 6000, shown_by)}"
     return ""

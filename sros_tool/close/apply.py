@@ -119,7 +119,7 @@ def undo(robot: LocalRobot, *, dry_run: bool) -> CloseState:
         *remaining.commands_to_open(),
         *(() if dry_run else remaining.secured_units()),
         *(() if dry_run else _processes_not_open(running, started)),
-        *remaining.secured_guests(),
+        *remaining.secured_in_unobserved_enclaves(),
         *remaining.unknown_processes(),
     ]
     return state._replace(problems=problems)
@@ -209,7 +209,7 @@ class _RemainingProcesses:
             command = process.open_command(self._robot.domain)
             self._robot.shell.say(f"{process.enclave} {state}start it open{under}: {command}")
 
-    def secured_guests(self) -> Iterator[str]:
+    def secured_in_unobserved_enclaves(self) -> Iterator[str]:
         """Yield processes in enclaves of the export for which no process was observed."""
         known = {process.enclave for process in self._observed.processes}
         for enclave in sorted(self._secured.keys() - known):
@@ -254,7 +254,7 @@ def _may_be_process(process: Process, observed: ClosedProcess, nodes: Collection
 
 
 def _drop_ins_of(robot: LocalRobot, observed: ObservedProcesses) -> list[Path]:
-    """Return the drop-ins of this folder; raise `SrosError` at one of another folder."""
+    """Return the drop-ins for this folder; raise `SrosError` if another folder has one."""
     drop_ins = [
         path
         for path in sorted(_SYSTEMD.glob(f"*.d/{DROP_IN}"))

@@ -32,7 +32,7 @@ from sros_tool.wording import counted
 
 
 class MovedEndpoint(NamedTuple):
-    """An endpoint of a renamed node that has another name now."""
+    """An endpoint whose name changed because its node was renamed."""
 
     old_node: str
     new_node: str
@@ -103,8 +103,13 @@ class ObservedNodes:
                 nodes.append(node)
         return make_observation(nodes)
 
-    def compared(self, away: Collection[str], current: Observation | None = None) -> Observation:
-        """Return the expected nodes that have a profile and whose enclave is not ``away``."""
+    def nodes_to_compare(
+        self, away: Collection[str], current: Observation | None = None
+    ) -> Observation:
+        """Return the expected nodes with a profile, except those of the enclaves ``away``.
+
+        No process of the enclaves ``away`` runs here.
+        """
         nodes, _ = self.divide_by_profile(self.expected(current).nodes)
         return make_observation(node for node in nodes if node.enclaves[0] not in away)
 

@@ -30,7 +30,7 @@ from sros_tool.keystore.layout import (
     KEY_FILES,
     enclave_folder,
     enclave_path,
-    how_to_learn_beside,
+    how_to_learn_one_process,
     list_enclaves,
 )
 from sros_tool.keystore.reader import OpenedKeystore
@@ -400,7 +400,7 @@ def _unknown_process_problems(robot: LocalRobot, state: CloseState) -> Iterator[
                 start = observed.command_of_new(robot.export.absolute(), "ENCLAVE")
                 advice += f"stop what belongs in {first_few(idle, MOST_NAMES)}, and start it "
                 advice += f"there: {start}; "
-            learn = how_to_learn_beside(robot.folder, robot.domain)
+            learn = how_to_learn_one_process(robot.folder, robot.domain)
             advice += f"to give another process its own enclave, {learn}"
         yield (
             f"sros saw no node of {counted(len(observed.unknown), 'process', 'processes')}: "

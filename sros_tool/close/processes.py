@@ -228,7 +228,11 @@ def run_words(export: Path, enclave: str, rmw: str) -> Sequence[str]:
 
 
 def launch_words(folder: Path, before: Sequence[str], after: Sequence[str]) -> Sequence[str]:
-    """Return a command of ``ros2 launch`` whose processes run in the enclaves of a closed robot."""
+    """Return a ``ros2 launch`` command whose processes run in the enclaves of a closed robot.
+
+    ``before`` are the words of the command before the option that secures the processes, ``after``
+    the words after it.
+    """
     secured = ("--secured", str(folder / "export"), str(folder / "policy.xml"))
     return (*before, *secured, *after)
 

@@ -95,7 +95,7 @@ def proofs_of(robot: LocalRobot, state: CloseState, patience: float) -> list[Pro
         ]
     nodes, not_here = ObservedNodes(robot), robot.not_here
     # A laptop may be away; a computer whose nodes were seen has to be seen again.
-    may_be_away = not_here - {node.enclaves[0] for node in nodes.compared(()).nodes}
+    may_be_away = not_here - {node.enclaves[0] for node in nodes.nodes_to_compare(()).nodes}
     away = {*missing} | may_be_away | not_here.intersection(robot.without)
     proof = _proof_of_processes(running, len(expected) - len(missing))
     absence = "not seen" if running.processes.unseen or running.processes.hidden else "not running"
@@ -106,7 +106,7 @@ def proofs_of(robot: LocalRobot, state: CloseState, patience: float) -> list[Pro
     if talk.fails and (present := sorted(not_here - away)):
         options = " ".join(f"--without {name}" for name in present)
         talk = talk._replace(reason=f"{talk.reason}; if they may be away, add {options}")
-    silence = _proof_of_silence(robot, nodes.compared(away), hears=talk.holds is not None)
+    silence = _proof_of_silence(robot, nodes.nodes_to_compare(away), hears=talk.holds is not None)
     return [proof, _proof_of_files(robot, expired), *_proof_of_requirements(robot), talk, silence]
 
 
@@ -399,7 +399,10 @@ class _TalkComparison:
         """Return the differences from the open robot, by kind, such as "not seen"."""
         ended, nodes = _ended_since(self._running), self._nodes
         unseen = [node for node in self._audited["unseen"] if node["enclave"] not in self._away]
-        before, expected = nodes.compared(self._away, self.current), nodes.expected(self.current)
+        before, expected = (
+            nodes.nodes_to_compare(self._away, self.current),
+            nodes.expected(self.current),
+        )
         moved, enclaves = nodes.moved_endpoints(self.current), nodes.policy_enclaves
         observed = [
             node for node in nodes.in_their_enclaves() if enclaves.issuperset(node.enclaves)
@@ -433,7 +436,7 @@ class _TalkComparison:
 
     def summary(self) -> str:
         """Return text on the comparison, on rights that the policy denies now, and on new nodes."""
-        before = self._nodes.compared(self._away)
+        before = self._nodes.nodes_to_compare(self._away)
         endpoints = len({*_endpoints_of(before.nodes)})
         text = f"{nodes_text(before.nodes)} with {endpoints} endpoints as before (types are not "
         text += "compared)"

@@ -10,7 +10,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
-from sros_tool.checks.processes import newer_files, order_unknown, zenoh_findings
+from sros_tool.checks.processes import newer_files, why_order_is_unknown, zenoh_findings
 from sros_tool.close.processes import (
     ROUTER,
     ClosedProcess,
@@ -171,7 +171,7 @@ class RunningRobot:
             f"KEYSTORE {enclave.name} --new-key --revoke-old`, otherwise chmod 600; "
         )
         warning = readable if mode & 0o077 else ""
-        if clock := order_unknown(process):
+        if clock := why_order_is_unknown(process):
             return f"{warning}{clock}, and {newer} may have changed after the start of"
         if names == [CRL_FILE]:
             return f"{warning}{_ACCEPTS_REVOKED}"
@@ -433,7 +433,7 @@ def current_state(robot: LocalRobot, policy: Policy | None) -> CloseState:
 
 
 def _file_times(folder: Path) -> Sequence[float]:
-    """Return the last change of the files in a folder, and of files to which links there lead."""
+    """Return when each file in a folder, and each target of a link there, last changed."""
     return [file.stat().st_mtime for file in folder.glob("*") if file.is_file()]
 
 

@@ -40,7 +40,7 @@ from sros_tool.demo.scenarios.model import (
     Row,
     RowStatus,
     Scenario,
-    is_of_nodes,
+    is_name_of_demo_nodes,
 )
 from sros_tool.errors import KeystoreError, SrosError
 from sros_tool.faults import Fault
@@ -606,7 +606,9 @@ def _application_topics(grant: Grant) -> Iterator[str]:
     """
     for topic in _topics_to_publish(grant):
         name = service_of(topic)[0] or topic.removeprefix("rt")
-        if not (is_of_nodes(name) or topic.startswith("rt/_") or ACTION_SEPARATOR in topic):
+        if not (
+            is_name_of_demo_nodes(name) or topic.startswith("rt/_") or ACTION_SEPARATOR in topic
+        ):
             yield topic
 
 

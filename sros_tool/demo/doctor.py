@@ -315,7 +315,7 @@ class _PrivateDataRemover:
     """Removes private data from texts: secrets, keys, tokens, hosts, users, and paths."""
 
     def __init__(self, environment: Mapping[str, str], secrets: Iterable[str]) -> None:
-        user = pwd.getpwuid(getuid()) if _has_entry() else None
+        user = pwd.getpwuid(getuid()) if _is_user_known() else None
         values = {value for name, value in environment.items() if _SECRET_NAME.search(name)}
         words = dict.fromkeys((*values, *secrets), "SECRET")
         homes = (environment.get("HOME", ""), user.pw_dir if user else "", str(Path.home()))
@@ -347,7 +347,7 @@ class _PrivateDataRemover:
         return path if path.startswith(_SYSTEM) and ".." not in path else "PATH"
 
 
-def _has_entry() -> bool:
+def _is_user_known() -> bool:
     """Return whether the user is in the user database; in containers some users are not."""
     try:
         pwd.getpwuid(getuid())

@@ -531,7 +531,7 @@ def _revocation_not_delivered(copy: KeystoreCopy, part: str) -> None:
 
 
 def identity_copied_by_another_user(copy: KeystoreCopy) -> None:
-    """Remove the talker's files that another user of the machine cannot read.
+    """Copy the talker's identity as another user: only files that this user can read remain.
 
     Raises:
         UnavailableError: this process does not run as root.
@@ -580,7 +580,7 @@ def _read_as_nobody(root: Path, files: list[str]) -> list[bytes | None]:
 
 
 def files_readable_for_all(copy: KeystoreCopy) -> None:
-    """Make all files world-readable, then copy the talker as another user."""
+    """Make all files world-readable, then copy the talker's identity, acting as another user."""
     for path in [copy.root, *copy.root.rglob("*")]:
         if not path.is_symlink():
             path.chmod(0o755 if path.is_dir() else 0o644)

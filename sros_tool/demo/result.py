@@ -908,7 +908,11 @@ def _attack_lines(
         "| --- | --- | --- | --- | --- |",
     ]
     for row in closed:
-        texts = (_twin_text(twin) for twin in rows_without_defense if twin.attack == row.attack)
+        texts = (
+            _result_without_defense(twin)
+            for twin in rows_without_defense
+            if twin.attack == row.attack
+        )
         twins = "; ".join(dict.fromkeys(texts))
         lines.append(f"| {_cells(row)} | {row.mechanism} | {twins} |")
     if open_:
@@ -921,7 +925,7 @@ def _attack_lines(
     return [*lines, ""]
 
 
-def _twin_text(row: RowResult) -> str:
+def _result_without_defense(row: RowResult) -> str:
     """Return the result without the defense, such as ``heard with the right key``."""
     if row.defence_removed.startswith("the wrong "):
         # Here, the defense that was removed is a fault of the attacker's own files.

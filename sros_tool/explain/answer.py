@@ -196,11 +196,11 @@ _COMMANDING_SERVICES = ("send_goal", "cancel_goal")
 
 
 def acting_parts(question: Question) -> dict[str, Question]:
-    """Map the parts of an action that act on the other side to questions about these parts.
+    """Map the parts of an action that influence its other side to questions about these parts.
 
-    Whoever may send goals commands the server, without the right to call the whole action; whoever
-    may reply or publish for the server informs the clients.  Empty if the question is not about an
-    action.
+    An enclave that may only send or cancel goals can already command the server, without the right
+    to call the whole action.  An enclave that may only reply or publish for the server can already
+    inform the clients.  Empty if the question is not about an action.
     """
     if question.type != "action":
         return {}

@@ -42,11 +42,13 @@ def note_on_earlier_permissions(
     try:
         issued = IssuedEarlier(keystore, denied)
     except SrosError as error:
-        yield _unknown(keystore, "explain.earlier-permissions", error.what, error.remedy)
+        yield _note_on_unknown_answer(
+            keystore, "explain.earlier-permissions", error.what, error.remedy
+        )
         return
     if gaps := issued.ledger.gaps:
         reason = f"{LEDGER}: {first_few(gaps, 1)}"
-        yield _unknown(keystore, "explain.earlier-permissions", reason)
+        yield _note_on_unknown_answer(keystore, "explain.earlier-permissions", reason)
     for name in denied:
         permissions = issued.permissions(name)
         for earlier, end in permissions:
@@ -79,14 +81,14 @@ def note_on_revoked_enclaves(
     try:
         if not keystore.has(LEDGER):  # an export, or a keystore of ros2/sros2, has no list here
             if keystore.revocation_list:
-                yield _unknown(keystore, kind, f"{LEDGER} is missing")
+                yield _note_on_unknown_answer(keystore, kind, f"{LEDGER} is missing")
             return
         if gaps := keystore.ledger_with("what", "revocation").gaps:
-            yield _unknown(keystore, kind, f"{LEDGER}: {first_few(gaps, 1)}")
+            yield _note_on_unknown_answer(keystore, kind, f"{LEDGER}: {first_few(gaps, 1)}")
         revoked = tuple(_revoked_with_right(keystore, question, vendor, asking))
         removed = removed_enclaves(keystore, asking.at)
     except SrosError as error:
-        yield _unknown(keystore, kind, error.what, error.remedy)
+        yield _note_on_unknown_answer(keystore, kind, error.what, error.remedy)
         return
     root = quote(str(keystore.root))
     if removed:
@@ -223,7 +225,9 @@ _UNKNOWN = {
 }
 
 
-def _unknown(keystore: OpenedKeystore, kind: str, reason: str, remedy: str = "") -> Note:
+def _note_on_unknown_answer(
+    keystore: OpenedKeystore, kind: str, reason: str, remedy: str = ""
+) -> Note:
     """Return a note which says that the answer is not known, for what reason, and what to do."""
     remedy = remedy or f"`sros check {quote(str(keystore.root))}` says what to do."
     return Note(kind, f"{_UNKNOWN[kind]} is not known: {reason}. {remedy}")

@@ -726,7 +726,7 @@ class _Examiner:
         answer = self._answer(enclave, meaning.vendor or Vendor.FAST, ask("join"))
         causes = list(self._causes(enclave, answer, meaning.faults))
         if meaning.id == "service" and not causes:
-            return replace(plain, enclave=enclave.name, found=_nodes(answer), checked=True)
+            return replace(plain, enclave=enclave.name, found=_nodes_clause(answer), checked=True)
         causes = causes or list(self._wrong_domain_cause(enclave, answer, first))
         remedies = list(dict.fromkeys(remedy for _, remedy in causes if remedy))
         remedies += [remedy_of] * (meaning in STARTS)
@@ -1139,7 +1139,7 @@ _EVERY_NODE = "the rights that every node needs: parameter services, /rosout, /p
 _TOPICS_OF_EVERY_NODE = ("rt/rosout", "rt/parameter_events")
 
 
-def _nodes(answer: Answer) -> tuple[str, ...]:
+def _nodes_clause(answer: Answer) -> tuple[str, ...]:
     """Return a tuple with a clause on the nodes that an enclave's permissions name; or ()."""
     nodes = _served_names(answer)
     if nodes:

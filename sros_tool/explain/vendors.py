@@ -397,7 +397,7 @@ def _note_on_fitting_permissions(evaluator: Evaluator, answer: Answer) -> Iterat
 
 
 def _fitting_holders(evaluator: Evaluator) -> Iterator[Evaluator]:
-    """Yield evaluators of enclaves whose permissions also fit the certificate of another enclave.
+    """Yield evaluators of other enclaves whose permissions also fit this enclave's certificate.
 
     Reads only enclaves whose paths have all parts of the enclave's path.
     """
@@ -456,7 +456,7 @@ def _runs_on_zenoh(keystore: OpenedKeystore, name: str) -> bool:
 
 
 class OpenedParts(NamedTuple):
-    """Whether processes without an identity have a right, or else its `acting_parts`."""
+    """The access of processes without an identity: a whole right, or else its `acting_parts`."""
 
     whole: bool = False
     parts: tuple[str, ...] = ()
@@ -733,7 +733,10 @@ class VendorOfKeystore(NamedTuple):
         return tuple(o for o in self._with_holders(outcomes) if o.enclave in asked)
 
     def _with_holders(self, outcomes: Sequence[VendorOutcome]) -> tuple[VendorOutcome, ...]:
-        """Return the outcomes; denials name allowed enclaves whose permissions fit."""
+        """Return the outcomes; each denial names allowed enclaves whose permissions fit, too.
+
+        They fit the certificate of the denied enclave.
+        """
         certified = {o.enclave: o.subject for o in outcomes if o.subject and not o.allowed}
         granted = {o.enclave: [o.granted] for o in outcomes if o.granted}
         vendors = {self.vendor, *(self.stated(o.enclave) or self.vendor for o in outcomes)}

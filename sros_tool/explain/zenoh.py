@@ -93,7 +93,7 @@ _TLS_FILES = (CERTIFICATE_FILE, KEY_FILE, IDENTITY_CA_FILE)
 
 
 class _Outcome(StrEnum):
-    """The fate of an enclave's messages."""
+    """The outcome for an enclave's messages on Zenoh."""
 
     ALLOWED = "allowed"
     DROPPED = "dropped"
@@ -422,7 +422,7 @@ class ZenohEvaluator:
         return replace(answer, in_part=tuple(passing))
 
     def _acts(self, enclave: str, part: Question, brief: bool) -> bool:
-        """Return whether the data of a part of an action pass; a call needs only the request."""
+        """Return whether Zenoh passes the data of an action's part; of a call, only the request."""
         answer = self.answer(enclave, part, reach=False, brief=brief)
         needed = [c for c in answer.checks if part.word == "reply" or c.message != Message.REPLY]
         return bool(needed) and all(check.allowed for check in needed)

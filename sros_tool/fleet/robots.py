@@ -262,7 +262,7 @@ def path_for(parts: Parts, robot: Robot) -> str:
 
 
 def router_of(fleet: Fleet, robot: Robot) -> str:
-    """Return the path of the enclave of a robot's Zenoh router, if it has one."""
+    """Return the path of the enclave for a robot's Zenoh router, whether or not it has one."""
     return path_for(parts_of(fleet.routers), robot)
 
 

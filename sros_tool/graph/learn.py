@@ -264,7 +264,7 @@ def _is_place(ns: str, name: str) -> bool:
     return plain and not node_name_problem(name) and not is_expression(name)
 
 
-class Folded(NamedTuple):
+class EndpointRights(NamedTuple):
     """The ROS rights that a node needs for a set of DDS endpoints.
 
     ``halves`` are service endpoints without the matching request or reply endpoint; ``foreign`` are
@@ -279,7 +279,7 @@ class Folded(NamedTuple):
 _ANY_DOMAIN = DomainSet.of((0, 0))
 
 
-def rights_of_endpoints(endpoints: Iterable[Endpoint]) -> Folded:
+def rights_of_endpoints(endpoints: Iterable[Endpoint]) -> EndpointRights:
     """Return the ROS rights that a node needs for these DDS endpoints.
 
     The topics of a service or an action become a single right if none of them is missing.
@@ -294,7 +294,7 @@ def rights_of_endpoints(endpoints: Iterable[Endpoint]) -> Folded:
             halves.add(Endpoint(right.name, right.right))
         else:
             foreign.add(Endpoint(right.name, right.right))
-    return Folded(frozenset(rights), frozenset(halves), frozenset(foreign))
+    return EndpointRights(frozenset(rights), frozenset(halves), frozenset(foreign))
 
 
 def _criteria(endpoints: Iterable[Endpoint], direction: str) -> tuple[Criteria, ...]:
@@ -574,7 +574,7 @@ def first_subjects(subjects: Sequence[str], separator: str = ", ") -> str:
 _EVERY_NODE = "common/node.xml"
 
 
-class News:
+class ReportedRights:
     """The nodes and rights that were reported so far, except rights that every node needs."""
 
     def __init__(self, common: CommonParts) -> None:

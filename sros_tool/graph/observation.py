@@ -309,7 +309,7 @@ class _Observer:
 
 
 def send(report: Any, value: object) -> None:
-    """Write a line of the report."""
+    """Write ``value`` as a line of JSON to the observer's output."""
     report.write(json.dumps(value) + "\n")
 
 

@@ -447,7 +447,7 @@ class ReceivedConfirmation:
     time: datetime
     message: LastMessage | None = None
 
-    def two_computers(self) -> str:
+    def two_computers_sentence(self) -> str:
         """Return a sentence if messages of the last day came from two computers, or ""."""
         alternated = self.message.alternated if self.message else None
         if alternated is None or self.time - alternated > timedelta(days=1):

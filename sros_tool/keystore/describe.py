@@ -40,7 +40,7 @@ from sros_tool.keystore.layout import (
     list_enclaves,
     locate_enclave,
     permissions_ca_for,
-    refuse_earlier,
+    refuse_flat_keystore,
     revoked_certificates,
     search_enclaves,
 )
@@ -111,7 +111,7 @@ class CertificateFacts(NamedTuple):
     """Whether the certificate is valid now."""
 
 
-class ListFacts(NamedTuple):
+class RevocationListFacts(NamedTuple):
     """A revocation list; once it has expired, DDS refuses all certificates of its CA."""
 
     issuer: str
@@ -136,7 +136,7 @@ class CertificateFile(NamedTuple):
     """The first certificate."""
     further: Sequence[CertificateFacts] | None
     """The other certificates in the file: the chain, or the other CA during a rotation."""
-    crl: ListFacts | None
+    crl: RevocationListFacts | None
     """The revocation list in the file; left out if there is none."""
 
 
@@ -427,7 +427,7 @@ class DescribedList(NamedTuple):
     """A revocation list."""
 
     path: NamedPath
-    facts: ListFacts
+    facts: RevocationListFacts
     """Content of the list."""
     kind: Annotated[Literal["revocation list"], "What PATH is."] = "revocation list"
 
@@ -565,7 +565,7 @@ def describe(
                 _facts_in_keystore(evaluation, state) if elsewhere else _enclave_facts(evaluation)
             )
             return DescribedEnclave(path, state.key_on_robot, facts, _describe_zenoh(path, now))
-        refuse_earlier(path)
+        refuse_flat_keystore(path)
         raise DocumentError(
             f"'{path}' is neither a keystore nor an enclave",
             "It has no enclaves folder, and neither cert.pem nor permissions.p7s.",
@@ -804,8 +804,8 @@ def _describe_certificates(data: bytes, name: str, now: datetime) -> Certificate
     return CertificateFile(first, further or None, crl)
 
 
-def _describe_revocation_list(crl: RevocationList, now: datetime) -> ListFacts:
-    return ListFacts(
+def _describe_revocation_list(crl: RevocationList, now: datetime) -> RevocationListFacts:
+    return RevocationListFacts(
         issuer=subject_text(crl.list.issuer),
         number=crl.number,
         not_before=crl.this_update,

@@ -101,7 +101,7 @@ def checked_fleet(keystore: OpenedKeystore, without_it: Callable[[], str] = str)
     Raises:
         KeystoreError: the fleet file is not the file that sros wrote last.
     """
-    if problem := edited_fleet(keystore, keystore.ledger_with("what", "fleet")):
+    if problem := fleet_edits_clause(keystore, keystore.ledger_with("what", "fleet")):
         raise KeystoreError(
             f"'{keystore.root / FLEET}' {problem}",
             "It decides which enclaves belong to a robot, and which domains they may join.",
@@ -119,12 +119,12 @@ def fleet_before_change(keystore: OpenedKeystore) -> Fleet | None:
     try:
         return load_fleet(keystore)
     except SrosError:
-        if edited_fleet(keystore, keystore.ledger_with("what", "fleet")):
+        if fleet_edits_clause(keystore, keystore.ledger_with("what", "fleet")):
             return None
         raise
 
 
-def edited_fleet(keystore: OpenedKeystore, ledger: Ledger) -> str:
+def fleet_edits_clause(keystore: OpenedKeystore, ledger: Ledger) -> str:
     """Return a clause on manual edits of the fleet file; "" if there are none."""
     return _edit_text(ledger, _read_fleet_file(keystore))
 
@@ -210,7 +210,7 @@ def unrecorded_notes(
             )
 
 
-def deliver_first(root: Path) -> str:
+def deliver_first_sentence(root: Path) -> str:
     """Return a sentence on how to deliver new files to robots before restarting processes."""
     published = publish_command(root)
     before = f"For robots that fetch, first publish the files: {published}. " if published else ""
@@ -305,7 +305,7 @@ def write_fleet(
     from sros_tool.fleet.fleet_file import render_fleet
 
     ledger = keystore.ledger_with("what", "fleet")
-    before = None if edited_fleet(keystore, ledger) else load_fleet(keystore)
+    before = None if fleet_edits_clause(keystore, ledger) else load_fleet(keystore)
     known = (before.enclaves if before else (), fleet.enclaves, patterns)
     paths = dict.fromkeys(sorted(path for paths in known for path in paths))
     fleet = fleet.with_enclaves(tuple(paths))

@@ -47,7 +47,7 @@ from sros_tool.keystore.confirmation import (
     shows_old_copy,
 )
 from sros_tool.keystore.delivery.published import read_published
-from sros_tool.keystore.fleet import edited_fleet, enclaves_of_robot, recorded_fleet
+from sros_tool.keystore.fleet import enclaves_of_robot, fleet_edits_clause, recorded_fleet
 from sros_tool.keystore.known_keys import restored_at
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
@@ -63,7 +63,7 @@ from sros_tool.keystore.layout import (
     enclave_folder,
     enclave_path,
 )
-from sros_tool.keystore.ledger import SAME_KEY, Entry, behind_clause
+from sros_tool.keystore.ledger import SAME_KEY, Entry, clock_behind_clause
 from sros_tool.keystore.lifecycle.rotation import RotationStage, read_rotation
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.parallel import map_slices
@@ -579,8 +579,8 @@ class FleetStatus:
         is_accepted = publication is None or publication.is_in_order
         to_do = tuple(robot.with_to_do(now, is_accepted=is_accepted) for robot in robots)
         received = max((robot.received for robot in self.robots if robot.received), default=None)
-        clock = behind_clause(now, self.recorded, "the last entry of the ledger")
-        clock = clock or behind_clause(now, received, "the last confirmation")
+        clock = clock_behind_clause(now, self.recorded, "the last entry of the ledger")
+        clock = clock or clock_behind_clause(now, received, "the last confirmation")
         if clock:  # the ages of the confirmations are not known
             to_do = tuple(robot.without_list() for robot in to_do)
         return replace(self, robots=to_do, overdue=overdue, clock=clock, publication=publication)
@@ -616,7 +616,7 @@ def fleet_status(keystore: OpenedKeystore, names: Sequence[str] = ()) -> FleetSt
         statuses,
         unassigned,
         older=older,
-        edited=edited_fleet(keystore, keystore.ledger_with("what", "fleet")),
+        edited=fleet_edits_clause(keystore, keystore.ledger_with("what", "fleet")),
         revoked_until=records.revoked_until(may_trust_replaced=may_trust_replaced)
         if is_any_revoked
         else None,
@@ -672,7 +672,9 @@ class _ComparedRobot(NamedTuple):
         """The confirmation; None if the robot has sent none."""
         return self.received.confirmation if self.received else None
 
-    def has_all(self, kind: str, is_equal: Callable[[_Difference], bool] = lambda _: False) -> bool:
+    def has_current_files(
+        self, kind: str, is_equal: Callable[[_Difference], bool] = lambda _: False
+    ) -> bool:
         """Return whether all files of a kind are current, or equal by ``is_equal``.
 
         Enclaves that the robot does not have yet do not count, because no process can run in them.
@@ -1284,7 +1286,11 @@ def _robot_status(
         )
         compared_robot = compared_robot._replace(notes=(*compared_robot.notes, ahead_note))
     problems = confirmed.problems if confirmed else None
-    if two_computers := received.two_computers() if received and compared_robot.enclaves else "":
+    if (
+        two_computers := received.two_computers_sentence()
+        if received and compared_robot.enclaves
+        else ""
+    ):
         problems = (*(problems or ()), two_computers)
     # In addition to the state that is shown.
     is_doubtful = bool(is_refused or is_later or two_computers)
@@ -1292,12 +1298,12 @@ def _robot_status(
         not is_doubtful
         and bool(compared_robot.enclaves)
         and received is not None
-        and compared_robot.has_all("identity_ca")
+        and compared_robot.has_current_files("identity_ca")
     )
     has_list = (
         records.has_list
         and has_authorities
-        and compared_robot.has_all("crl", records.is_list_equal)
+        and compared_robot.has_current_files("crl", records.is_list_equal)
     )
     is_restarted = compared_robot.crl_restart() == ()
     fetches = bool(received and received.message)

@@ -1,4 +1,4 @@
-"""The keys of a keystore's enclaves, revoked keys, and until when issued files work.
+"""The keys of a keystore's enclaves, revoked keys, and how long issued files work.
 
 A revocation list names certificates, so a new certificate for a revoked key would undo the
 revocation of the key.  Two enclaves with one key are one identity: each can act as the other.  Keys
@@ -134,7 +134,7 @@ def _since_trusted(
 
 
 def revoked_issues(keystore: OpenedKeystore, listed: Collection[str] = ()) -> Iterator[Entry]:
-    """Yield the entries of revoked certificates, and of the permissions of their enclaves.
+    """Yield the ledger entries of revoked certificates, and of the permissions of their enclaves.
 
     Only certificates of CAs that are trusted now count, except certificates with a serial number in
     ``listed``.  The entry of a certificate records its issue, or else its revocation.
@@ -275,12 +275,12 @@ class IssuedEarlier:
         ]
 
     def permissions_until(self, name: str) -> datetime | None:
-        """Return until when the last permissions of an enclave work; None if there are none."""
+        """Return when the last permissions of an enclave stop working; None if there are none."""
         last = max((until for _, until in self.permissions(name)), default="")
         return parse_iso(last) if last else None
 
     def certificates_until(self, replaced: Entry, signed_for: str | None) -> datetime:
-        """Return until when the ``replaced`` certificate and earlier ones of its enclave work.
+        """Return when ``replaced`` and all earlier certificates of its enclave stop working.
 
         A certificate works only as long as permissions in the ledger fit it.  But a certificate
         works until it expires if its subject is ``signed_for``, the subject of the enclave's new
@@ -395,7 +395,7 @@ class KnownKeys:
         return enclaves.intersection(names)
 
     def shown_after_restore(self, names: Collection[str]) -> Sequence[Entry]:
-        """Return the certificates of enclaves that the keystore issued after its last backup.
+        """Return the ledger entries of certificates that the keystore issued after its last backup.
 
         Messages of robots or published releases showed them to the restored keystore.
         """

@@ -290,7 +290,7 @@ def folder_of_closed_robot(root: Path) -> Path | None:
     return folder if made else None
 
 
-def how_to_learn_beside(robot: Path, domain: int = 0) -> str:
+def how_to_learn_one_process(robot: Path, domain: int = 0) -> str:
     """Return clauses on how to learn the rights of one process while all others stay closed.
 
     ``robot`` is a folder of `sros close`, and ``domain`` the ROS domain. Only open nodes are seen.
@@ -615,7 +615,7 @@ def list_enclaves(root: Path) -> tuple[str, ...]:
     return enclave_names(root)
 
 
-def refuse_earlier(root: Path) -> None:
+def refuse_flat_keystore(root: Path) -> None:
     """Raise `KeystoreError` if ``root`` is a flat keystore of ROS 2 Eloquent or earlier.
 
     A keystore in the present layout is not refused, even if it also has files of the flat layout.
@@ -634,7 +634,7 @@ def refuse_earlier(root: Path) -> None:
 def check_keystore(root: Path) -> None:
     """Raise `KeystoreError` if ``root`` is not a keystore."""
     if not is_keystore(root):
-        refuse_earlier(root)
+        refuse_flat_keystore(root)
         if root.is_file():
             raise KeystoreError(
                 f"'{root}' is not a valid keystore",
@@ -703,7 +703,7 @@ def locate_enclave(folder: Path) -> tuple[Path, str]:
         if above.name == ENCLAVES:
             return above.parent, f"/{'/'.join(absolute.relative_to(above).parts)}"
     for above in absolute.parents:
-        refuse_earlier(above)
+        refuse_flat_keystore(above)
     raise DocumentError(
         f"'{folder}' is not below a folder named {ENCLAVES}",
         "rcl finds an enclave by its path below that folder.",

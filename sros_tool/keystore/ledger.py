@@ -219,7 +219,7 @@ _CLOCK_TOLERANCE = timedelta(hours=1)
 """How far behind the clock may be before it counts as wrong."""
 
 
-def behind_clause(now: datetime, last: datetime | None, event: str) -> str:
+def clock_behind_clause(now: datetime, last: datetime | None, event: str) -> str:
     """Return how far the clock is behind the time ``last`` of ``event``, as a clause, or "".
 
     Small differences are ignored.
@@ -459,7 +459,7 @@ class LedgerFile:
 
     def clock_behind(self, now: datetime) -> str:
         """Return how far the clock is behind the last entries, as a clause; "" if it is not."""
-        return behind_clause(now, self.last_time(), "the last entry of the ledger")
+        return clock_behind_clause(now, self.last_time(), "the last entry of the ledger")
 
     def clock_notes(self, now: datetime) -> Iterator[Note]:
         """Yield a note if the clock is behind the ledger, so that expired files may seem valid."""
@@ -581,7 +581,7 @@ class LedgerFile:
                 made.save()
                 index = LedgerIndex.open(self.root, head.lines, head.last, root)
         last_size = index.state.size - index.state.sealed_size if index else 0
-        ends_so = index and _last_line(file, last_size) == head.last
+        ends_so = index and _last_line_digest(file, last_size) == head.last
         file.seek(0)
         return index if ends_so else None
 
@@ -851,7 +851,7 @@ _FieldValues: TypeAlias = Collection[tuple[str, str]]
 """Names of an entry's fields, each with a value."""
 
 
-def _last_line(file: BinaryIO, size: int) -> str:
+def _last_line_digest(file: BinaryIO, size: int) -> str:
     """Return the digest of the last line of a ledger of ``size`` bytes; "" if the size differs."""
     if os.fstat(file.fileno()).st_size != size:
         return ""

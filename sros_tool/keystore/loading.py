@@ -42,7 +42,7 @@ from sros_tool.keystore.layout import (
 from sros_tool.keystore.reader import OpenedEnclave, Problem
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import (
-    Settings,
+    TrustSettingsUse,
     is_for_pss,
     load_certificate,
     load_certificates,
@@ -132,11 +132,11 @@ def vendor_problems(
     }
     faults = [
         fault
-        for fault in sorted(_vendor_faults(traits, state, moment), key=_check_order)
+        for fault in sorted(_vendor_faults(traits, state, moment), key=_order_of_checks)
         if fault.file not in known or fault.fault in CRASHES
     ]
     if not faults:
-        return tuple(sorted(kept, key=_check_order))
+        return tuple(sorted(kept, key=_order_of_checks))
     kept += [fault for fault in faults if _is_of_list(fault)]
     specific = [problem for problem in specific if not _is_of_list(problem)]
     faults = [fault for fault in faults if not _is_of_list(fault)]
@@ -152,10 +152,10 @@ def vendor_problems(
         kept += [problem for problem in specific if problem.file in files] or of_side
     if not any(problem.fault is Fault.KEY_ALGORITHM for problem in kept):
         kept += [fault for fault in faults if fault.file == KEY_FILE]
-    return tuple(sorted(kept, key=_check_order))
+    return tuple(sorted(kept, key=_order_of_checks))
 
 
-def _check_order(problem: Problem) -> int:
+def _order_of_checks(problem: Problem) -> int:
     """Return the sort key of a problem, by the order in which a process finds problems."""
     if problem.fault in BEFORE_DDS:
         return 0
@@ -276,8 +276,12 @@ def _read_certificates(traits: VendorTraits, data: bytes, file: str) -> Certific
     ):
         return (load_certificate(data, file, trusted=False),)
     if file == CERTIFICATE_FILE:
-        return (load_certificate(data, file, settings=Settings.READ),)
-    of_file = Settings.OF_DOCUMENTS if file == PERMISSIONS_CA_FILE else Settings.OF_ANY_USE
+        return (load_certificate(data, file, settings=TrustSettingsUse.READ),)
+    of_file = (
+        TrustSettingsUse.OF_DOCUMENTS
+        if file == PERMISSIONS_CA_FILE
+        else TrustSettingsUse.OF_ANY_USE
+    )
     return load_certificates(data, file, settings=of_file)
 
 

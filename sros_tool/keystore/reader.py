@@ -179,7 +179,7 @@ def _file_identity(state: os.stat_result) -> tuple[int, int, int, int]:
 # ── a keystore ─────────────────────────────────────────────────────────────────────────────
 
 
-class _Part(Generic[_Parsed]):
+class _ReadOnceProperty(Generic[_Parsed]):
     """A property of a keystore that is read when it is first used, and then kept."""
 
     def __init__(self, read: Callable[[OpenedKeystore], _Parsed]) -> None:
@@ -187,10 +187,12 @@ class _Part(Generic[_Parsed]):
         self.__doc__ = read.__doc__
 
     @overload
-    def __get__(self, keystore: None, owner: object) -> _Part[_Parsed]: ...
+    def __get__(self, keystore: None, owner: object) -> _ReadOnceProperty[_Parsed]: ...
     @overload
     def __get__(self, keystore: OpenedKeystore, owner: object) -> _Parsed: ...
-    def __get__(self, keystore: OpenedKeystore | None, owner: object) -> _Part[_Parsed] | _Parsed:
+    def __get__(
+        self, keystore: OpenedKeystore | None, owner: object
+    ) -> _ReadOnceProperty[_Parsed] | _Parsed:
         if keystore is None:
             return self
         return keystore.once(self, lambda: self._read(keystore))
@@ -280,7 +282,7 @@ class OpenedKeystore:
         """
         return is_original_keystore(self.root) or self.has(GOVERNANCE_P7S)
 
-    @_Part
+    @_ReadOnceProperty
     def is_of_ros2(self) -> bool:
         """Whether ros2/sros2 made the keystore, and sros has not written to it yet.
 
@@ -300,7 +302,7 @@ class OpenedKeystore:
         except (SrosError, OSError, ValueError):
             return False
 
-    @_Part
+    @_ReadOnceProperty
     def names(self) -> tuple[str, ...]:
         """The sorted names of the enclaves.
 
@@ -309,12 +311,12 @@ class OpenedKeystore:
         """
         return enclave_names(self.root)
 
-    @_Part
+    @_ReadOnceProperty
     def settings(self) -> Template | None:
         """The settings; None for a keystore of ros2/sros2 and for an export."""
         return self.template if self.has(SETTINGS) else None
 
-    @_Part
+    @_ReadOnceProperty
     def template(self) -> Template:
         """The settings of the keystore; if it has none, the template for ros2/sros2."""
         from sros_tool.keystore.template import decode_template, load_template
@@ -329,7 +331,7 @@ class OpenedKeystore:
             f"{remedy}update_keystore {quote(str(self.root))} --discard-edits`.",
         )
 
-    @_Part
+    @_ReadOnceProperty
     def ledger_file(self) -> LedgerFile:
         """The file of the ledger, for reading some of its entries or adding entries."""
         return LedgerFile(
@@ -377,7 +379,7 @@ class OpenedKeystore:
             lambda: load_certificate(self.read(path, label), f"'{path}'"),
         )
 
-    @_Part
+    @_ReadOnceProperty
     def _trusted(self) -> list[x509.Certificate]:
         """The certificates of the CAs that the keystore trusts; unreadable files are left out."""
         trusted: list[x509.Certificate] = []
@@ -386,7 +388,7 @@ class OpenedKeystore:
                 trusted += self.authority(role)
         return trusted
 
-    @_Part
+    @_ReadOnceProperty
     def authority_files(self) -> Mapping[str, tuple[str, ...]]:
         """Maps the name of each CA file, without suffixes, to the roles of its CA.
 
@@ -435,7 +437,7 @@ class OpenedKeystore:
 
         return self.once(("list", file), read)
 
-    @_Part
+    @_ReadOnceProperty
     def revocation_list(self) -> RevocationList | None:
         """The revocation list of the issuing identity CA; None if there is none."""
         path = self.root / CRL
@@ -450,7 +452,7 @@ class OpenedKeystore:
         lists = (self.revocation_list, self.embedded_list(file) if file else None)
         return tuple(filter(None, lists))
 
-    @_Part
+    @_ReadOnceProperty
     def has_keys(self) -> bool:
         """Whether any enclave has its key or says where it is; a copy may have no keys."""
         return not self._lacks_keys and any(
@@ -461,7 +463,7 @@ class OpenedKeystore:
 
     # ── governance ──
 
-    @_Part
+    @_ReadOnceProperty
     def governance(self) -> Governance:
         """The governance that DDS loads, verified with the permissions CA of the keystore.
 
@@ -491,7 +493,7 @@ class OpenedKeystore:
                 error.remedy or f"Restore '{path}' from a backup; every enclave depends on it.",
             ) from error
 
-    @_Part
+    @_ReadOnceProperty
     def domains(self) -> DomainSet:
         """The ROS domains that the governance names."""
         return self.governance.domains().closed()
@@ -942,7 +944,7 @@ class _EnclaveFiles:
                 f"it was not issued by the identity CA of the enclave ({subject_text(ca.subject)}) "
                 f"but by {other_issuer_text(certificate, ca)}"
             )
-            if refusal := self._fault_with_all(certificate, authorities or b""):
+            if refusal := self._chain_problem(certificate, authorities or b""):
                 text += f"; with all CAs of the file, {refusal}"
             self._add(CERTIFICATE_FILE, text, Fault.CERTIFICATE_ISSUER)
         elif certificate and ca and authorities and not self._problems:
@@ -965,7 +967,7 @@ class _EnclaveFiles:
                 self._add(KEY_FILE, text, Fault.KEY_MISMATCH)
         return public_key
 
-    def _fault_with_all(self, certificate: x509.Certificate, authorities: bytes) -> str:
+    def _chain_problem(self, certificate: x509.Certificate, authorities: bytes) -> str:
         """Return why no chain to the CAs in a file is valid, as a clause; "" if a chain is valid.
 
         The result is also "" if the issuer of ``certificate`` is not in the file.

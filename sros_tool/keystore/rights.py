@@ -39,7 +39,7 @@ from sros_tool.keystore.layout import (
     folder_of_closed_robot,
     is_keystore,
     permissions_ca_for,
-    refuse_earlier,
+    refuse_flat_keystore,
     remedy_in_keystore,
 )
 from sros_tool.keystore.ledger import Entry, Ledger
@@ -155,7 +155,7 @@ def load_rights(
             return _keystore_rights(OpenedKeystore(path), hidden=hidden)
         if (path / PERMISSIONS_FILE).exists():
             return _document_rights(path, "enclave", path / PERMISSIONS_FILE)
-        refuse_earlier(path)
+        refuse_flat_keystore(path)
         if any(files_of_policies(path)):
             return _policy_rights(path, fleet)
         raise DocumentError(
@@ -733,7 +733,7 @@ def _governances(source: RightsSource) -> set[Governance]:
     }
 
 
-def without_added(source: RightsSource, other: RightsSource) -> RightsSource:
+def without_enclaves_of_sros(source: RightsSource, other: RightsSource) -> RightsSource:
     """Return a source without the enclaves that sros adds to a policy, unless ``other`` has them.
 
     These are the observer of a closed robot and, if ``other`` is a policy, the `_plain_routers`,

@@ -1,6 +1,7 @@
 """Selection of the enclaves on which a verb works: by name, by pattern, or by robot.
 
-The error for a missing enclave says whether it was revoked, or what its name may be a typo of.
+If an enclave is missing, the error says whether it was revoked, or which enclave has a similar
+name.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from sros_tool.keystore.layout import (
     SETTINGS,
     enclaves_below,
     folder_of_closed_robot,
-    how_to_learn_beside,
+    how_to_learn_one_process,
 )
 from sros_tool.keystore.ledger import Entry
 from sros_tool.keystore.reader import OpenedKeystore
@@ -329,7 +330,7 @@ def missing_enclave_error(
             missing,
             why,
             f"If it is not a typo, write its rights into {policy}, and run `sros close {folder}`. "
-            f"To learn them, {how_to_learn_beside(robot)}.",
+            f"To learn them, {how_to_learn_one_process(robot)}.",
         )
     if not keystore.is_original:
         where = f"`sros distribute_key KEYSTORE {quote(name)} {quote(str(root))}`"

@@ -662,7 +662,7 @@ class Transaction:
     def remove(self, path: str) -> None:
         """Stage the removal of a file or link, and of folders that become empty."""
         exists = self._prepare_folder(path.rpartition("/")[0], wanted=False)
-        before = self._present_content(path) if exists else None
+        before = self._present_description(path) if exists else None
         if before is None:
             raise KeystoreError(f"'{self.root}/{path}' does not exist")
         self._begin_change(path, "remove")
@@ -686,7 +686,7 @@ class Transaction:
         ``after`` is as in `Move`.  The result is None in a dry run.
         """
         exists = self._prepare_folder(path.rpartition("/")[0])
-        before = self._present_content(path) if exists else None
+        before = self._present_description(path) if exists else None
         self._begin_change(path, "create" if before is None else "replace")
         if exists:
             self._moves.append(Move(path, before, after))
@@ -714,7 +714,7 @@ class Transaction:
         folder, _, name = path.rpartition("/")
         return name == CRL_FILE and (folder.removeprefix(ENCLAVES) or "/") in self._linked
 
-    def _present_content(self, path: str) -> str | None:
+    def _present_description(self, path: str) -> str | None:
         """Return the description of the present file at a path, in the form of `Move.before`."""
         state = self._target_folder.state(path)
         if state is None:
@@ -809,7 +809,7 @@ class Transaction:
         if not self.changes:
             return
         if self.dry_run:
-            for path in self._open_keys():
+            for path in self._exposed_keys():
                 self.changes.add(_ACTION_CLOSE, path)
             return
         folder = self._target_folder
@@ -827,13 +827,13 @@ class Transaction:
         with contextlib.suppress(OSError, SrosError):  # already committed; `_end` tries again
             complete(folder, self._moves)
         self._finish()
-        for path in self._open_keys():
+        for path in self._exposed_keys():
             with contextlib.suppress(OSError):  # `check` reports what stays open
                 folder.close_to_others(path)
                 if not folder.mode(path) & 0o077:
                     self.changes.add(_ACTION_CLOSE, path)
 
-    def _open_keys(self) -> list[str]:
+    def _exposed_keys(self) -> list[str]:
         """Return the keys that other users can open, except files that this transaction writes."""
         if self._new_root:
             return []
@@ -841,7 +841,7 @@ class Transaction:
         # them.
         looks_at_all = self._adopts or "enclaves" in self.__dict__
         changed = None if looks_at_all else self.changed_folders()
-        return [path for path in _open_keys(self.root, changed) if not self.is_staged(path)]
+        return [path for path in _exposed_keys(self.root, changed) if not self.is_staged(path)]
 
     def _finish(self) -> None:
         for action in self._after:
@@ -885,7 +885,7 @@ def _read_file(path: Path) -> bytes | None:
         return None
 
 
-def _open_keys(root: Path, changed: Collection[str] | None = None) -> Iterator[str]:
+def _exposed_keys(root: Path, changed: Collection[str] | None = None) -> Iterator[str]:
     """Yield the paths of private keys, and top folders of keys, that other users can open.
 
     Of the folders of enclaves, only those in ``changed`` are examined; None means all folders.

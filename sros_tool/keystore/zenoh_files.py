@@ -177,7 +177,7 @@ def open_zenoh(folder: Path, name: str, state: OpenedEnclave) -> OpenedZenoh:
             continue
         configurations[file] = read
         if (text := _before_revocation_clause(read, state)) or (
-            text := _out_of_date(read, file, identity, state)
+            text := _out_of_date_clause(read, file, identity, state)
         ):
             problems.append(ZenohProblem(file, text, ZenohFault.OUT_OF_DATE))
     if configurations and certified != name:
@@ -255,7 +255,9 @@ def _before_revocation_clause(configuration: Configuration, state: OpenedEnclave
     )
 
 
-def _out_of_date(configuration: Configuration, file: str, name: str, state: OpenedEnclave) -> str:
+def _out_of_date_clause(
+    configuration: Configuration, file: str, name: str, state: OpenedEnclave
+) -> str:
     """Return how a configuration differs from its enclave's permissions, as a clause, or ""."""
     is_session = file == SESSION_FILE
     if is_session is (configuration.mode is Mode.ROUTER):

@@ -202,7 +202,7 @@ def pem(certificate: x509.Certificate) -> bytes:
     return certificate.public_bytes(serialization.Encoding.PEM)
 
 
-class Settings(Enum):
+class TrustSettingsUse(Enum):
     """How a program uses the trust settings of a ``TRUSTED CERTIFICATE`` (OpenSSL, X509_AUX)."""
 
     IGNORED = "nothing"
@@ -212,7 +212,11 @@ class Settings(Enum):
 
 
 def load_certificate(
-    data: bytes, name: str, *, trusted: bool = True, settings: Settings = Settings.IGNORED
+    data: bytes,
+    name: str,
+    *,
+    trusted: bool = True,
+    settings: TrustSettingsUse = TrustSettingsUse.IGNORED,
 ) -> x509.Certificate:
     """Return the first certificate of a PEM file; ``name`` names the file in errors.
 
@@ -227,7 +231,7 @@ def load_certificate(
 
 @lru_cache(maxsize=16)  # several readers load the certificate of an enclave, and the same few CAs
 def _first_certificate(
-    data: bytes, name: str, trusted: bool, settings: Settings
+    data: bytes, name: str, trusted: bool, settings: TrustSettingsUse
 ) -> x509.Certificate:
     unreadable = f"the certificate {name} cannot be read"
     labels = pem_file.CERTIFICATES if trusted else pem_file.CERTIFICATES[:-1]
@@ -240,7 +244,7 @@ def _first_certificate(
 
 @lru_cache(maxsize=16)
 def load_certificates(
-    data: bytes, name: str, *, settings: Settings = Settings.IGNORED
+    data: bytes, name: str, *, settings: TrustSettingsUse = TrustSettingsUse.IGNORED
 ) -> tuple[x509.Certificate, ...]:
     """Return all certificates of a PEM file, at least one; ``name`` names the file in errors.
 
@@ -254,7 +258,9 @@ def load_certificates(
     for block in list(_certificate_blocks(data, unreadable)):
         if block.label in pem_file.CERTIFICATES:
             why = "A certificate after the first one is damaged." if certificates else _UNREADABLE
-            of_block = settings if block.label == pem_file.CERTIFICATES[-1] else Settings.IGNORED
+            of_block = (
+                settings if block.label == pem_file.CERTIFICATES[-1] else TrustSettingsUse.IGNORED
+            )
             certificates.append(_certificate_in(block, unreadable, of_block, why))
         elif block.label == "X509 CRL":
             with reading(unreadable, "A revocation list in it is damaged.", _RESTORE):
@@ -270,14 +276,14 @@ _UNREADABLE = "It is not a PEM certificate, it is damaged, or its key algorithm 
 
 
 def _certificate_blocks(data: bytes, label: str) -> Iterator[pem_file.Block]:
-    blocks, damage = _known_blocks(data)
+    blocks, damage = _undamaged_blocks(data)
     yield from blocks
     if damage:
         raise PkiError(label, _as_sentence(damage), _RESTORE)
 
 
 @lru_cache(maxsize=8)  # several readers ask for the certificate of an enclave, or for all of them
-def _known_blocks(data: bytes) -> tuple[tuple[pem_file.Block, ...], str]:
+def _undamaged_blocks(data: bytes) -> tuple[tuple[pem_file.Block, ...], str]:
     """Return the PEM blocks before the first damaged one, and a clause about the damage, or ""."""
     blocks: list[pem_file.Block] = []
     try:
@@ -288,7 +294,7 @@ def _known_blocks(data: bytes) -> tuple[tuple[pem_file.Block, ...], str]:
 
 
 def _certificate_in(
-    block: pem_file.Block, unreadable: str, settings: Settings, why: str = _UNREADABLE
+    block: pem_file.Block, unreadable: str, settings: TrustSettingsUse, why: str = _UNREADABLE
 ) -> x509.Certificate:
     if block.headers:
         why = f"It has PEM headers ('{block.headers.splitlines()[0].decode('ascii', 'replace')}')."
@@ -297,13 +303,17 @@ def _certificate_in(
         )
     with reading(unreadable, why, _RESTORE):
         certificate, remainder = der.split(block.content)
-        if not remainder or settings is Settings.IGNORED or _permits_use(remainder, settings):
+        if (
+            not remainder
+            or settings is TrustSettingsUse.IGNORED
+            or _permits_use(remainder, settings)
+        ):
             return _load_der(certificate)
     why = "It is a TRUSTED CERTIFICATE that is not trusted for this use."
     raise PkiError(unreadable, why, "Write it with the label CERTIFICATE.")
 
 
-def _permits_use(trust_settings: bytes, settings: Settings) -> bool:
+def _permits_use(trust_settings: bytes, settings: TrustSettingsUse) -> bool:
     """Return whether the trust settings after a certificate allow its use (OpenSSL, obj_trust).
 
     Raises:
@@ -313,9 +323,11 @@ def _permits_use(trust_settings: bytes, settings: Settings) -> bool:
     if value.tag != der.SEQUENCE:
         raise ValueError("not settings of a certificate")
     parts = {part.tag: _purposes(part) for part in der.children(value.content)}
-    if settings is Settings.READ:
+    if settings is TrustSettingsUse.READ:
         return True
-    uses = {_OID_ANY_USE, _OID_S_MIME} if settings is Settings.OF_DOCUMENTS else {_OID_ANY_USE}
+    uses = (
+        {_OID_ANY_USE, _OID_S_MIME} if settings is TrustSettingsUse.OF_DOCUMENTS else {_OID_ANY_USE}
+    )
     trusted, rejected = parts.get(der.SEQUENCE), parts.get(der.CONTEXT_0)
     return not (rejected and rejected & uses) and (trusted is None or bool(trusted & uses))
 

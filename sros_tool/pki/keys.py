@@ -245,7 +245,7 @@ def _validated(key: rsa.RSAPrivateKey, name: str) -> rsa.RSAPrivateKey:
 
 
 _INITIAL_VALUE = re.compile(rb"^DEK-Info: *([^,\s]*),([0-9A-Fa-f]*)", re.MULTILINE)
-_HEX_DIGITS = {b"DES-CBC": 16, b"DES-EDE3-CBC": 16}
+_IV_LENGTH_IN_HEX_DIGITS = {b"DES-CBC": 16, b"DES-EDE3-CBC": 16}
 """Maps a cipher with 64-bit blocks to the hexadecimal digits of its initialization vector.
 
 Source: RFC 1421, 4.6.1.3.
@@ -257,7 +257,9 @@ def _check_derivation(pem: bytes, name: str) -> None:
 
     Source: RFC 5958, 3; RFC 8018, A; RFC 7914, 7.
     """
-    if (match := _INITIAL_VALUE.search(pem)) and len(match[2]) < _HEX_DIGITS.get(match[1], 32):
+    if (match := _INITIAL_VALUE.search(pem)) and len(match[2]) < _IV_LENGTH_IN_HEX_DIGITS.get(
+        match[1], 32
+    ):
         raise _unreadable_key_error(name)  # `cryptography` would panic
     for block in _ENCRYPTED.findall(pem):
         try:
@@ -297,7 +299,7 @@ _FEWEST_SAFE_ROUNDS = 600_000
 _LEAST_SCRYPT_WORK = 2**17  # N * r * p of `openssl pkcs8 -scrypt`
 
 
-def few_rounds(pem: bytes) -> str:
+def few_rounds_clause(pem: bytes) -> str:
     """Return a clause that says why an encrypted key's passphrase is quick to guess, or "".
 
     Source: RFC 8018, 4.2; OpenSSL 3.0, openssl-pkcs8 (2048 rounds) and PEM_write_bio_PrivateKey

@@ -584,7 +584,7 @@ def pin_file_problem(place: TokenUri) -> str:
     return ""
 
 
-def pin_line_break(place: TokenUri) -> str:
+def pin_line_break_clause(place: TokenUri) -> str:
     """Return a clause about the effect of a line break after the PIN; "" if there is none."""
     try:
         pin = read_bytes(Path(place.pin_source), "file with the PIN", max_bytes=_LONGEST_PIN)
@@ -612,5 +612,5 @@ def token_notes(key: TokenKey) -> Iterator[Note]:
 
 def pin_notes(place: TokenUri) -> Iterator[Note]:
     """Yield notes on a PIN file that Fast DDS cannot use, or that other users can read."""
-    for problem in filter(None, (pin_file_problem(place), pin_line_break(place))):
+    for problem in filter(None, (pin_file_problem(place), pin_line_break_clause(place))):
         yield Note("token.pin-file", f"{problem}.")

@@ -585,7 +585,9 @@ class _Reader:
                 etree.strip_tags(child, etree.ProcessingInstruction)
                 metadata = etree.tostring(child, encoding="unicode", with_tail=False)
             else:
-                profiles += _absolute(self._read_profile(*self._expect(child, at, "profile")))
+                profiles += _with_absolute_namespaces(
+                    self._read_profile(*self._expect(child, at, "profile"))
+                )
         if not profiles:
             raise PolicyError(
                 f"{self._place_text(element, place)}: <profiles> contains no <profile>"
@@ -839,7 +841,7 @@ def _meant_attribute(right: str, value: str) -> str:
     return " or ".join(f'{right}="{word}"' for word in words)
 
 
-def _absolute(profile: Profile) -> tuple[Profile, ...]:
+def _with_absolute_namespaces(profile: Profile) -> tuple[Profile, ...]:
     """Return equivalent profiles whose namespaces begin with "/".
 
     Every ROS name begins with "/". So a ``*`` at the beginning of a namespace matches either

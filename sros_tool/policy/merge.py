@@ -134,7 +134,7 @@ class _Planner:
                                 entry = here.setdefault((group.kind, fqn), _NewName(name, {}))
                                 entry.protect = entry.protect or group.protect
                                 entry.rights[right, qualifier] = None
-            self._contradictions += self._between_nodes(enclave)
+            self._contradictions += self._contradictions_between_nodes(enclave)
         entries = {
             place: tuple(sorted(_entries(place_names), key=_entry_order))
             for place, place_names in sorted(names.items(), key=lambda item: _place_order(item[0]))
@@ -163,7 +163,7 @@ class _Planner:
                 self._contradictions.append(Contradiction(denied, right, False))
         return not (self._file.cover(right) or self._file.cover(denial))
 
-    def _between_nodes(self, enclave: Enclave) -> Iterator[Contradiction]:
+    def _contradictions_between_nodes(self, enclave: Enclave) -> Iterator[Contradiction]:
         """Yield contradictions between nodes of an enclave, because a denial applies to all nodes.
 
         There is no contradiction if every node with the right states the same denial, as an
@@ -475,7 +475,7 @@ def merge_all(path: Path, policies: Iterable[Policy]) -> Merged:
 
 
 def _shared_enclaves(before: Policy, policies: Iterable[Policy], after: Policy) -> Iterator[str]:
-    """Yield a text on each enclave that gets nodes from policies without its present nodes.
+    """Yield a text on each enclave that gets nodes from policies which lack its present nodes.
 
     Nodes that have the same name in other namespaces are instances of a node, for which there is
     another note.

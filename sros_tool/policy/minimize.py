@@ -249,7 +249,7 @@ class _Narrowing:
         if not self._observed:
             return self._enclave, self._use_of({*self._stated}, ())
         kept = {right for right in self._stated if self._is_unchanged(right)}
-        wide = self._narrowed(kept)
+        wide = self._replaced_wildcards(kept)
         self._prove([*kept, *(right for wildcard in wide for right in wildcard.replacement)])
         replacements = {wildcard.rule: wildcard.replacement for wildcard in wide}
         return _narrowed_enclave(self._enclave, kept, replacements), self._use_of(kept, wide)
@@ -291,7 +291,7 @@ class _Narrowing:
             for used in self._use.overlapping(part)
         )
 
-    def _narrowed(self, kept_rights: set[Right]) -> tuple[WideRule, ...]:
+    def _replaced_wildcards(self, kept_rights: set[Right]) -> tuple[WideRule, ...]:
         """Return the wildcards to replace, with the rights that replace them."""
         wide = [
             rule for rule in self._stated if is_expression(rule.name) and rule not in kept_rights
@@ -400,11 +400,11 @@ def _narrowed_enclave(
     """
     pending = dict(replacements)
     return enclave.with_profiles(
-        lambda profile: _profile(enclave.path, profile, kept_rights, pending)
+        lambda profile: _narrowed_profile(enclave.path, profile, kept_rights, pending)
     )
 
 
-def _profile(
+def _narrowed_profile(
     path: str, profile: Profile, kept_rights: Set[Right], pending: dict[Right, Sequence[Right]]
 ) -> Profile:
     """Return the profile with its denials, ``kept_rights`` and the replacements of other rights.
@@ -489,7 +489,7 @@ def propose_wildcards(
     # nothing.
     listed = (right for right in allowed if not present.cover(right))
     candidates: dict[frozenset[Right], WildcardProposal] = {}
-    for rule, listed_rights in _candidates(listed).items():
+    for rule, listed_rights in _wildcard_candidates(listed).items():
         other = candidates.get(frozenset(listed_rights))
         # Of wildcards for the same names, the longest one allows the least.
         if other is None or len(rule.name) > len(other.rule.name):
@@ -516,7 +516,7 @@ def propose_wildcards(
     return tuple(chosen)
 
 
-def _candidates(rights: Iterable[Right]) -> dict[Right, list[Right]]:
+def _wildcard_candidates(rights: Iterable[Right]) -> dict[Right, list[Right]]:
     """Map possible wildcards to the rights that they replace: at least `_FEWEST` rights."""
     rights_by_wildcard: dict[Right, list[Right]] = defaultdict(list)
     for right in rights:

@@ -323,7 +323,11 @@ class Names:
         Each expression is listed once, under its part that the fewest other expressions have.
         """
         grams = [
-            {gram for run in _RUN.findall(_letters_of(expression)) for gram in _grams(run)}
+            {
+                gram
+                for run in _RUN.findall(_letters_of(expression))
+                for gram in _four_letter_parts(run)
+            }
             for expression in self._wild
         ]
         count = Counter(gram for expression_grams in grams for gram in expression_grams)
@@ -401,7 +405,7 @@ def _letters_of(expression: str) -> str:
     )
 
 
-def _grams(run: str) -> Iterator[str]:
+def _four_letter_parts(run: str) -> Iterator[str]:
     """Yield all parts of a text with four letters, or the whole text if it is shorter."""
     for i in range(max(len(run) - _GRAM, 0) + 1):
         yield run[i : i + _GRAM]

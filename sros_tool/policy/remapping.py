@@ -155,7 +155,7 @@ def has_new_name(rule: Remapping, names: Iterable[str], namespaces: Iterable[str
 
 
 def renamed_action_text(rule: Remapping) -> str:
-    """Return a sentence on nodes for which a rule renames an action, and on a way for others."""
+    """Return a sentence on ROS releases that cannot remap an action, and on what to do there."""
     parts = (
         f"-r {quote(str(rule._replace(old=rule.old + part, new=rule.new + part)))}"
         for _, part in ACTION_PARTS["call"]

@@ -294,9 +294,10 @@ class RightsDifference(NamedTuple):
 def renamed_enclaves(
     first_rights: Iterable[Right], second_rights: Iterable[Right]
 ) -> dict[str, str]:
-    """Map enclaves that are only in ``first_rights`` to enclaves of ``second_rights`` alike.
+    """Map enclaves that only ``first_rights`` have to their new names in ``second_rights``.
 
-    An enclave is left out if several other enclaves have the same rights.
+    An enclave counts as renamed if an enclave that only ``second_rights`` have has the same rights,
+    and if no other enclave has them.
     """
     before, after = (_rights_by_enclave(side) for side in (first_rights, second_rights))
     gone: dict[frozenset[Right], list[str]] = defaultdict(list)
@@ -592,7 +593,7 @@ def _allowed_pairs(
 
 
 def _name_or_wildcard(name: str) -> str:
-    """Return a name: of a part of an action the action's name, and of a wildcard "*"."""
+    """Return a name; for a part of an action, the action's name; for a wildcard, "*"."""
     return "*" if is_expression(name) else name.partition(ACTION_SEPARATOR)[0]
 
 

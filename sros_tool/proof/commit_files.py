@@ -504,7 +504,7 @@ def includes_files(content: bytes) -> bool:
     return not begin or begin.startswith((b"<", _EBCDIC))
 
 
-def users_of(parts: Iterable[str], files: Mapping[str, bytes]) -> set[str]:
+def files_including(parts: Iterable[str], files: Mapping[str, bytes]) -> set[str]:
     """Return the files that include one of ``parts``, directly or through other files."""
     includes = {
         path: {target for target, _ in _includes(path, data)} for path, data in files.items()

@@ -247,7 +247,7 @@ def robots_left_out(system: System, namespaces: Sequence[str]) -> list[Finding]:
     Requirements in the namespace ``/`` may be for every robot.
     """
     fleet = system.fleet() if {*namespaces} - {"/"} else None
-    above = {place for namespace in namespaces for place in _with_those_above(namespace)}
+    above = {place for namespace in namespaces for place in _with_parent_namespaces(namespace)}
     robots = fleet.robots.values() if fleet else ()
     others = sorted(robot.name for robot in robots if robot.namespace not in above)
     if not others:
@@ -286,7 +286,7 @@ def remappings_unused(
     ]
 
 
-def _with_those_above(namespace: str) -> Iterator[str]:
+def _with_parent_namespaces(namespace: str) -> Iterator[str]:
     """Yield a namespace and all its parent namespaces, except ``/``."""
     while namespace.strip("/"):
         yield namespace

@@ -364,7 +364,10 @@ def compare_access(base: AccessSource, head: AccessSource) -> Growth:
     limit = SearchLimit()
     scope = compared_enclaves((base.kind, base.scope), (head.kind, head.scope))
     partial = base.scope is not None or head.scope is not None
-    before, after = _completed(base, head), _completed(head, base)
+    before, after = (
+        _with_default_domains_and_governance(base, head),
+        _with_default_domains_and_governance(head, base),
+    )
     worlds = _worlds(before, after)
     added = tuple(_gains(before, after, worlds, scope, limit))
     lost = tuple(dict.fromkeys(_lost_protection(base, head, limit, rules=not added)))
@@ -1288,14 +1291,14 @@ def undenied_name(denied: Right, stated: Rules) -> str | None:
 # ── what a side does not state ─────────────────────────────────────────────────────────────
 
 
-def _completed(side: AccessSource, other: AccessSource) -> AccessSource:
-    """Return a side with defaults for domains and access control that the side does not state.
+def _with_default_domains_and_governance(side: AccessSource, other: AccessSource) -> AccessSource:
+    """Return a side, completed with default domains and a default governance if it states none.
 
     Enclaves of robots are for the domain of their robot.  A side without a governance gets access
     control of everything, in the domains of both sides.
     """
     domains = _domains_of_robots(side, other)
-    permissions = _certified_as(side, other)
+    permissions = _permissions_with_subjects(side, other)
     if domains:
         permissions = {
             name: _permissions_for_domain(certified, domains[name])
@@ -1316,7 +1319,9 @@ def _completed(side: AccessSource, other: AccessSource) -> AccessSource:
     return replace(side, permissions=permissions, governance=governance)
 
 
-def _certified_as(side: AccessSource, other: AccessSource) -> Mapping[str, Permissions]:
+def _permissions_with_subjects(
+    side: AccessSource, other: AccessSource
+) -> Mapping[str, Permissions]:
     """Return the permissions of a side; a policy gets the certificate subjects of the other side.
 
     If the other side is a keystore with unique subjects, enclaves that are only in the policy also

@@ -185,7 +185,7 @@ def _looser_later(
 
 
 def _certified_otherwise(old: AccessSource, new: AccessSource) -> Iterator[SettingChange]:
-    """Yield enclaves whose certificate has the name, or the key, of another enclave."""
+    """Yield a change for each enclave whose certificate has another enclave's name or key."""
     names = {enclave.key: enclave.name for enclave in old.certified.values()}
     for enclave, new_one in new.certified.items():
         before = names.get(new_one.key, enclave)
@@ -199,7 +199,7 @@ def _certified_otherwise(old: AccessSource, new: AccessSource) -> Iterator[Setti
 
 
 def _trusted_again(old: AccessSource, new: AccessSource) -> Iterator[SettingChange]:
-    """Yield the certificates that enclaves refuse in ``old`` but accept in ``new``."""
+    """Yield a change for each certificate that enclaves refuse in ``old`` but accept in ``new``."""
     if old.trusts is None or new.trusts is None:
         return
     all_revoked = frozenset(entry for trust in old.trusts.values() for entry in trust.revoked)
@@ -284,7 +284,7 @@ def _topics_by_protection(rule: DomainRule, style: Style) -> list[tuple[TopicRul
 def _dropped_statements(
     old: Iterable[StatedProtection], new: Iterable[StatedProtection], limit: SearchLimit
 ) -> Iterator[SettingChange]:
-    """Yield names for which ``new`` demands less protection than ``old``, or no protection."""
+    """Yield a change for each name for which ``new`` demands less protection than ``old``."""
     later = tuple(new)
     for protection in old:
         enough = [

@@ -482,7 +482,7 @@ class _Table:
     namespace: str = "/"
     remaps: Sequence[Remapping] = ()
 
-    def known(self, *keys: str) -> dict[str, Any]:
+    def common_arguments(self, *keys: str) -> dict[str, Any]:
         """Return the arguments that all requirements have.
 
         Raises:
@@ -771,16 +771,16 @@ def _filled_words(text: object, used_placeholders: Iterable[Placeholder], robot:
 
 
 def _only_from(table: _Table) -> Only:
-    common = table.known(*KIND_OF, "enclaves")
+    common = table.common_arguments(*KIND_OF, "enclaves")
     return Only(**common, rights=table.rights(), enclaves=table.enclaves("enclaves"))
 
 
 def _nobody_from(table: _Table) -> Nobody:
-    return Nobody(**table.known(*KIND_OF), rights=table.rights())
+    return Nobody(**table.common_arguments(*KIND_OF), rights=table.rights())
 
 
 def _must_from(table: _Table) -> Must:
-    common = table.known(*KIND_OF, "enclave")
+    common = table.common_arguments(*KIND_OF, "enclave")
     enclave = table.text("enclave")
     problem = expression_problem(enclave)
     if is_expression(enclave):
@@ -795,7 +795,7 @@ def _must_from(table: _Table) -> Must:
 
 
 def _at_most_from(table: _Table) -> AtMost:
-    common = table.known(*KIND_OF, "enclaves")
+    common = table.common_arguments(*KIND_OF, "enclaves")
     most = table.values.get("enclaves")
     if type(most) is not int or not 0 < most < 2**31:
         raise table.error(
@@ -807,18 +807,18 @@ def _at_most_from(table: _Table) -> AtMost:
 
 
 def _widest_from(table: _Table) -> Widest:
-    common = table.known(*KIND_OF, "enclaves")
+    common = table.common_arguments(*KIND_OF, "enclaves")
     return Widest(**common, rights=table.rights(least=0), enclaves=table.enclaves("enclaves"))
 
 
 def _nothing_but_from(table: _Table) -> NothingBut:
-    common = table.known(*KIND_OF, "enclaves")
+    common = table.common_arguments(*KIND_OF, "enclaves")
     return NothingBut(**common, rights=table.rights(least=0), enclaves=table.enclaves("enclaves"))
 
 
 def _not_both_from(table: _Table) -> NotBoth:
     rights: list[RightNames] = []
-    common = table.known("first", "second")
+    common = table.common_arguments("first", "second")
     for key in ("first", "second"):
         value = table.values.get(key)
         if not isinstance(value, dict) or not value or set(value) - set(KIND_OF):
@@ -835,7 +835,7 @@ def _not_both_from(table: _Table) -> NotBoth:
 
 
 def _protected_from(table: _Table) -> Protected:
-    common = table.known(*RIGHTS, "level")
+    common = table.common_arguments(*RIGHTS, "level")
     level = table.values.get("level")
     if not isinstance(level, str) or level not in _LEVELS:
         raise table.error(
@@ -848,7 +848,7 @@ def _protected_from(table: _Table) -> Protected:
 
 
 def _apart_from(table: _Table) -> Apart:
-    common = table.known("from", "to", "through")
+    common = table.common_arguments("from", "to", "through")
     through = table.enclaves("through") if "through" in table.values else ()
     return Apart(
         **common, sources=table.enclaves("from"), targets=table.enclaves("to"), through=through

@@ -59,7 +59,7 @@ from sros_tool.keystore.rights import (
     RightsSource,
     SourcesDifference,
     compare_sources,
-    without_added,
+    without_enclaves_of_sros,
 )
 from sros_tool.keystore.template import Template, load_template, read_template, template_names
 from sros_tool.names import expand
@@ -82,13 +82,13 @@ from sros_tool.proof.commit_files import (
     EXPORT_IGNORE,
     CommitFiles,
     converting_patterns,
+    files_including,
     includes_files,
     is_whole_policy,
     may_be_policy,
     may_match,
     same_root,
     used_whole,
-    users_of,
 )
 from sros_tool.proof.decide import restricted_enclaves
 from sros_tool.proof.findings import (
@@ -225,16 +225,19 @@ class DroppedRequirements:
 
 
 @dataclass(frozen=True, slots=True)
-class Facts:
-    """Facts as lines of text: pairs of a sentence and a name; ``named`` facts fail no step."""
+class StepFindings:
+    """The findings of a step as lines: pairs of a sentence and a name.
+
+    The step fails for ``failing`` findings, and only shows the findings in ``shown_only``.
+    """
 
     failing: tuple[tuple[str, str], ...]
-    named: tuple[tuple[str, str], ...] = ()
+    shown_only: tuple[tuple[str, str], ...] = ()
 
     @property
     def lines(self) -> tuple[tuple[str, str], ...]:
-        """The failing facts, followed by the facts that are only named."""
-        return self.failing + self.named
+        """The findings that make the step fail, followed by those that are only shown."""
+        return self.failing + self.shown_only
 
 
 Content = (
@@ -243,7 +246,7 @@ Content = (
     | RightsChange
     | DroppedRequirements
     | ExpiryCheck
-    | Facts
+    | StepFindings
     | SrosError
 )
 
@@ -501,7 +504,7 @@ class _Review:
             decided = _UNDECIDED, DocumentError(f"'{error.filename}': {error.strerror}")
         if decided:
             status, content = decided
-            only_named = isinstance(content, Facts) and not content.failing
+            only_named = isinstance(content, StepFindings) and not content.failing
             is_allowed = can_be_allowed and (self._allows(kind) or only_named)
             allowed = status == _FOUND and is_allowed
             yield ReviewStep(
@@ -612,7 +615,7 @@ class _Review:
                 if before.get(where) != (value := after.get(where)):
                     text = "is gone, which" if value is None else f"is {value}, which"
                     lines.append((f"{text} can change which keys Ansible delivers, and how", where))
-        return (_FOUND, Facts(tuple(lines))) if lines else None
+        return (_FOUND, StepFindings(tuple(lines))) if lines else None
 
     def _converted_step(self) -> tuple[int, Content] | None:
         """Return the step on reviewed files that git may change in a checkout or archive."""
@@ -639,7 +642,7 @@ class _Review:
                         does = "leave it out of an archive"
                     text = f"git may {does} ({attribute} in {path})"
                     lines.append((text, file))
-        return (_FOUND, Facts(tuple(lines))) if lines else None
+        return (_FOUND, StepFindings(tuple(lines))) if lines else None
 
     def _contents(
         self, ids: Iterable[str], largest: int = _MAX_SEARCHED_BYTES
@@ -677,7 +680,7 @@ class _Review:
         ]
         failing = tuple(line for line in lines if line[1] in entries)
         named = tuple(line for line in lines if line[1] not in entries)
-        return (_FOUND, Facts(failing, named)) if lines else None
+        return (_FOUND, StepFindings(failing, named)) if lines else None
 
     def _unreviewed_step(
         self, reviewed: Sequence[Path], fleet: Fleet | None
@@ -708,7 +711,7 @@ class _Review:
             lines.append((f"{text} --leave-out {place}", path))
         for path in self._used_in_part(changed, reviewed, fleet):
             lines.append(("changes and is used only in part: the rest is not reviewed", path))
-        for path in self._not_reviewed_users(changed):
+        for path in self._unreviewed_policies_including(changed):
             lines.append(("is not reviewed, and includes a file that changes", path))
         sizes = self.request.repository.sizes(names)
         for path, entry in changed:
@@ -722,7 +725,7 @@ class _Review:
         for path in self._policies_among(gone, self.base, known=False):
             new = names.get(dict(gone)[path].id)
             named.append((f"is renamed to '{new}'" if new else "is deleted", path))
-        facts = Facts(tuple(lines), tuple(named))
+        facts = StepFindings(tuple(lines), tuple(named))
         return (_FOUND if lines else _OK, facts) if facts.lines else None
 
     def _used_in_part(
@@ -770,7 +773,7 @@ class _Review:
                     continue
             yield path
 
-    def _not_reviewed_users(self, changed: Iterable[tuple[str, TreeEntry]]) -> list[str]:
+    def _unreviewed_policies_including(self, changed: Iterable[tuple[str, TreeEntry]]) -> list[str]:
         """Return policies that are not reviewed and include a file that changes.
 
         A policy includes only files in its own folder and below.  Where no reviewed policy has the
@@ -803,7 +806,7 @@ class _Review:
         contents_by_path = {
             path: contents[object_id] for path, object_id in ids.items() if object_id in contents
         }
-        users = users_of(parts, contents_by_path)
+        users = files_including(parts, contents_by_path)
         return sorted(e for e in users if e not in files and is_whole_policy(contents_by_path[e]))
 
     def _hidden_entry_clause(self, path: str, entry: TreeEntry) -> str:
@@ -953,7 +956,7 @@ class _Review:
                 self.base.policies(path, placeholders=base_fleet is not None)
             text = f"is new, so that all of its access is new; if it is renamed, {_BOTH_NAMES}"
             new = ((text, " ".join(self.request.policies)),)
-            return _FOUND, Facts(new)
+            return _FOUND, StepFindings(new)
         return self._compared_access(before(), head, moving())
 
     def _compared_access(
@@ -976,7 +979,10 @@ class _Review:
         first, second = before().as_rights(), after().as_rights()
         absolute = tuple(moved for moved in moving() if moved.written.startswith("/"))
         relative = tuple(moved for moved in moving() if not moved.written.startswith("/"))
-        first, second = without_added(first, second), without_added(second, first)
+        first, second = (
+            without_enclaves_of_sros(first, second),
+            without_enclaves_of_sros(second, first),
+        )
         compared = compare_sources(first, second)
         if not compared and not (absolute or relative):
             return None
@@ -1228,7 +1234,7 @@ class _Review:
             if before:
                 return self._compared_access(load_side(before), load_side(folder))
             new = (("is new, so that all of its access is new", path),)
-            return _FOUND, Facts(new)
+            return _FOUND, StepFindings(new)
 
         yield from self._step_result("keystore", path, findings)
         yield from self._step_result("signed", path, signed, only_with_result=bool(stated))

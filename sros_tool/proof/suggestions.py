@@ -202,7 +202,7 @@ def _unused_services(stated_rights: _Stated) -> Iterator[Nobody]:
 
 
 def _gate_requirements(world: World) -> Iterator[Apart]:
-    """Yield requirements that only one enclave may be a way to influence an enclave."""
+    """Yield requirements that all influence on an enclave passes through its only influencer."""
     for target, sources in sorted(influencers(world, SearchLimit()).items()):
         if len(sources) == 1:
             yield Apart(source=_NOWHERE, sources=("*",), targets=(target,), through=tuple(sources))

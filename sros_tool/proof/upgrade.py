@@ -259,7 +259,7 @@ def _upgrade_findings(
         for change in changes(files, old, new):
             kind = _KINDS[change.kind]
             yield kind.found(change.enclave, change.text, change.file, remedy=change.remedy)
-    yield from _nodes(files, before, after)
+    yield from _node_start_findings(files, before, after)
     if vendor in ("", _ZENOH):
         yield from _zenoh_findings(files, before, after)
 
@@ -507,8 +507,10 @@ def _untested_notes(before: Shipped, after: Shipped) -> Iterator[Finding]:
             yield NOT_MEASURED.found(f"ROS 2 {shipped.distribution.title}", text)
 
 
-def _nodes(files: DecidedFiles, before: Distribution, after: Distribution) -> Iterator[Finding]:
-    """Yield enclaves in which nodes start on only one of two distributions."""
+def _node_start_findings(
+    files: DecidedFiles, before: Distribution, after: Distribution
+) -> Iterator[Finding]:
+    """Yield a finding for enclaves in which nodes start on only one of two distributions."""
     if has_type_descriptions(before.name) or files.keystore is None:
         return
     for name, enclave in files.loaded_enclaves():

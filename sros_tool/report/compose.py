@@ -117,7 +117,7 @@ class PictureSource:
         )
 
     def moved_to_homes(self, homes: Mapping[str, str]) -> PictureSource:
-        """Return a copy in which rights and nodes of an enclave are moved to ``homes[enclave]``."""
+        """Return a copy with the rights and nodes of each enclave moved to ``homes[enclave]``."""
         nodes: dict[str, set[str]] = defaultdict(set)
         for path, names in self.nodes.items():
             nodes[homes.get(path, path)].update(names)
@@ -155,7 +155,7 @@ def overlay(
         sources = tuple(source.only_for(scope) for source in sources)
     rights = [source.rights for source in sources]
 
-    def marked_edges(known_names: Known) -> list[Edge]:
+    def marked_edges(known_names: KnownNames) -> list[Edge]:
         sides = [_edges_of(side_rights, known_names) for side_rights in rights]
         return _marked_rights(*sides, allowed_by=kind == "use")
 
@@ -233,7 +233,7 @@ def _picture(
     sources: Sequence[PictureSource],
     edges: Iterable[Edge],
     stated_rights: Mapping[Right, OverlaySide],
-    known_names: Known,
+    known_names: KnownNames,
     hosts: Mapping[str, str],
 ) -> Picture:
     edges = tuple(sorted(edges, key=edge_order))
@@ -308,7 +308,7 @@ def edge_order(edge: Edge) -> tuple[str, int, str, str, tuple[str, ...], str]:
 def _enclaves(
     sources: Sequence[PictureSource],
     stated_rights: Mapping[Right, OverlaySide],
-    known_names: Known,
+    known_names: KnownNames,
     hosts: Mapping[str, str],
 ) -> tuple[PicturedEnclave, ...]:
     described = {enclave.path: enclave for source in sources for enclave in source.enclaves}
@@ -474,14 +474,14 @@ class NamesOfRights:
 
 
 def _with_all_wildcards(
-    rights: Collection[Right], edges_of: Callable[[Known], list[Edge]]
-) -> tuple[Known, list[Edge]]:
+    rights: Collection[Right], edges_of: Callable[[KnownNames], list[Edge]]
+) -> tuple[KnownNames, list[Edge]]:
     """Return the names to draw, and edges to these names that show every wildcard.
 
     Edges to known names do not show a wildcard if all matched names are denied, or if the enclave
     also has rights to these exact names.  Such a wildcard is drawn as a name.
     """
-    known = Known(rights)
+    known = KnownNames(rights)
     edges = edges_of(known)
     by = {
         Right(edge.enclave, edge.qualifier, right, text)
@@ -498,12 +498,12 @@ def _with_all_wildcards(
         and (right.enclave, right.right, right.name) not in drawn
     ]
     if unseen:
-        known = Known(rights, unseen)
+        known = KnownNames(rights, unseen)
         edges = edges_of(known)
     return known, edges
 
 
-class Known:
+class KnownNames:
     """The exact names of topics, services and actions that appear in rights.
 
     ``wildcards`` are rights whose wildcards are drawn as names, even if known names match.
@@ -595,7 +595,7 @@ _RIGHTS_IN = {right: {part for part, _ in whole} for right, whole in _WHOLE.item
 _Found = dict[Qualifier, set[str]]
 
 
-def _edges_of(rights: Collection[Right], known_names: Known) -> list[Edge]:
+def _edges_of(rights: Collection[Right], known_names: KnownNames) -> list[Edge]:
     """Return an edge from each right or denial to each matching name, unsorted.
 
     A wildcard that matches no known name, or would be invisible, is drawn as a name.

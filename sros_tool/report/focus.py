@@ -51,7 +51,7 @@ from sros_tool.report.picture import (
     Picture,
     Tie,
     WireLevel,
-    fold,
+    bundled_names,
     is_question,
     joined_by_senders,
 )
@@ -505,7 +505,7 @@ class _Draft:
         return middle + (1 - 2 * hop if is_before_focus else 2 * hop - 1)
 
     def _folded(self) -> Mapping[tuple[bool, str], str]:
-        """Map side of the focus and enclave to the id of the card for the enclave."""
+        """Map pairs (whether before the focus, enclave) to the id of the card with the enclave."""
         nodes = {}
         for before, side in ((True, self._flow.before), (False, self._flow.after)):
             columns: dict[int, list[str]] = defaultdict(list)
@@ -528,7 +528,8 @@ class _Draft:
             for side, fits in enumerate(self._flow.ends(edge, stage)):
                 if fits:
                     edges[side].append(edge)
-        # The node's name begins with its side, so that one call of `fold` can handle both sides.
+        # The node's name begins with its side, so that one call of
+        # `bundled_names` can handle both sides.
         sides = [
             [replace(e, enclave=f"{'lr'[n]}{self._node(n, stage, e.enclave)}") for e in drawn]
             for n, drawn in enumerate(edges)
@@ -536,7 +537,7 @@ class _Draft:
         used = [{(edge.kind, edge.name) for edge in side} for side in sides]
         on_stage = used[0] | used[1] if stage == 0 else used[0] & used[1]
         kept = [edge for side in sides for edge in side if (edge.kind, edge.name) in on_stage]
-        bundles: Iterable[Bundle] = fold(self._picture.names, kept)
+        bundles: Iterable[Bundle] = bundled_names(self._picture.names, kept)
         bundles = joined_by_senders(bundles) if len(tuple(bundles)) > _MOST_BUNDLES else bundles
         middle = self._first + 2 * self._left - 1
         return _Stage(
@@ -628,7 +629,7 @@ class _Draft:
             last = self._column_of(before, self._hops)
             near = {
                 path for path, hop in self._side(before).items() if hop == self._hops
-            } & self._next_to(before)
+            } & self._enclaves_with_further_neighbors(before)
             for card in cards.values():
                 if card.column == last and not near.isdisjoint(card.members):
                     ends = ("s:", card.id) if before else (card.id, "l:")
@@ -637,7 +638,7 @@ class _Draft:
     def _side(self, is_before_focus: bool) -> Mapping[str, int]:
         return self._flow.before if is_before_focus else self._flow.after
 
-    def _next_to(self, is_before_focus: bool) -> set[str]:
+    def _enclaves_with_further_neighbors(self, is_before_focus: bool) -> set[str]:
         """Return the enclaves at the last drawn hop that share a name with further enclaves."""
         stage = self._hops if is_before_focus else -self._hops
         return {e.enclave for e in self._picture.edges if any(self._flow.ends(e, stage))}

@@ -296,7 +296,7 @@ class _Draft:
     def _word(self, unit: int, position: int) -> str:
         return self._units[unit].values[position]
 
-    def _owner(self, enclave: str) -> UnitText:
+    def _path_split_at_own_unit(self, enclave: str) -> UnitText:
         """Return the path of an enclave, split only at the name of the enclave's own unit."""
         return self._text(enclave).with_only_unit(self._of.get(enclave), self._word)
 
@@ -311,7 +311,7 @@ class _Draft:
         } | {enclave.path for enclave in self._picture.enclaves if enclave.problems}
         roles = _roles(self._picture)
         targets = {(focus.kind, focus.name) for focus in self._picture.focus}
-        owners = {e.path: self._owner(e.path) for e in self._picture.enclaves}
+        owners = {e.path: self._path_split_at_own_unit(e.path) for e in self._picture.enclaves}
         for enclave in self._picture.enclaves:
             if enclave.path in self._of:
                 owner, group = owners[enclave.path], self._text(enclave.group)
@@ -488,7 +488,7 @@ class _Draft:
 
     def _path(self, enclave: str) -> str:
         """Return the path that is drawn for an enclave, with labels for units."""
-        text, unit = self._owner(enclave), self._of.get(enclave)
+        text, unit = self._path_split_at_own_unit(enclave), self._of.get(enclave)
         path = text.fill(self._label)
         if unit in self._inside and path not in self._enclaves:
             self._enclaves[path] = tuple(self._per_unit(text, self._inside[unit]))
@@ -675,10 +675,10 @@ class _Draft:
         enclaves = {part for part in drawn if isinstance(part, str)}
         for part in drawn:
             if isinstance(part, str):
-                yield f"enclave {self._owner(part).fill(word)}"
+                yield f"enclave {self._path_split_at_own_unit(part).fill(word)}"
             elif part.enclave not in enclaves:
                 deny = "" if part.qualifier is ALLOW else "DENY "
-                enclave = self._owner(part.enclave).fill(word)
+                enclave = self._path_split_at_own_unit(part.enclave).fill(word)
                 yield f"{enclave} {deny}{part.right} {self._text(part.name).fill(word)}"
 
 

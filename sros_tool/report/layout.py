@@ -25,7 +25,7 @@ from sros_tool.report.picture import (
     Picture,
     Tie,
     WireLevel,
-    fold,
+    bundled_names,
     is_plain,
     joined_by_senders,
     lack_text,
@@ -289,7 +289,7 @@ class _Draft:
         self._everybody = everybody
         self._groups = {enclave.path: enclave.group for enclave in picture.enclaves}
         self._notes = enclave_notes(picture)
-        bundles = fold(picture.names, edges, owner)
+        bundles = bundled_names(picture.names, edges, owner)
         self._looking = _onlookers(bundles)
         self._tags = {side: chr(ord("A") + n) for n, side in enumerate(self._looking)}
         self._own: dict[str, list[Bundle]] = defaultdict(list)

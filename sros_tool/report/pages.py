@@ -31,7 +31,7 @@ from sros_tool.report.picture import (
     PicturedEnclave,
     Requirements,
     Tie,
-    fold,
+    bundled_names,
     lack_text,
 )
 from sros_tool.terminal import visible_json, visible_line
@@ -129,7 +129,7 @@ def _page_data(picture: Picture, scenes: tuple[Scene, ...], drawn: Picture) -> d
     Names with equal rights are grouped into bundles, which take less space than an entry for each
     right.
     """
-    bundles = fold(picture.names, picture.edges, separate_questions=True)
+    bundles = bundled_names(picture.names, picture.edges, separate_questions=True)
     return {
         "requirements": _requirements_json(picture.requirements),
         "headlines": picture.other_answers,
@@ -141,7 +141,7 @@ def _page_data(picture: Picture, scenes: tuple[Scene, ...], drawn: Picture) -> d
         **_bundles_json(bundles, [enclave.path for enclave in picture.enclaves]),
         "scenes": [_scene_json(scene) for scene in scenes],
         "equal": as_plain(picture.equal),
-        "rows": [_row_json(bundle) for bundle in fold(drawn.names, drawn.edges)],
+        "rows": [_row_json(bundle) for bundle in bundled_names(drawn.names, drawn.edges)],
         "differences": as_plain(picture.differences),
         "validities": as_plain(picture.validities),
         "findings": as_plain(picture.findings),

@@ -610,14 +610,14 @@ class Bundle:
     lacks: Lack = Lack.NOTHING
 
 
-def fold(
+def bundled_names(
     names: Iterable[Name],
     edges: Iterable[Edge],
     owner: Callable[[str], str] = str,
     *,
     separate_questions: bool = False,
 ) -> tuple[Bundle, ...]:
-    """Group the names to which an enclave has a right into bundles, by kind and first name.
+    """Return bundles of names that have the same rights, sorted by kind and first name.
 
     Args:
         names: the names.

@@ -387,12 +387,14 @@ class ProcessTable:
                 unseen = None
             except (PermissionError, _TooLongError) as error:
                 why = error.strerror or "the operating system refuses it"
-                unseen = UnseenProcess(pid, command, why, _may_speak(command))
+                unseen = UnseenProcess(pid, command, why, _uses_ros_or_zenoh(command))
                 process = None
             if _stat(folder).identity == stat.identity:
                 return _ProcessData(stat, process, unseen)
         why = "it keeps starting other programs"
-        return _ProcessData(stat, None, UnseenProcess(pid, command, why, _may_speak(command)))
+        return _ProcessData(
+            stat, None, UnseenProcess(pid, command, why, _uses_ros_or_zenoh(command))
+        )
 
     def _longest_clock_advance(self, begin: datetime) -> timedelta:
         """Return the longest time by which /proc shows that the clock was set forward.
@@ -503,7 +505,7 @@ def _examine(pid: int, folder: int, command: tuple[str, ...], started: datetime)
             environment.setdefault(name, value)  # getenv(3) takes the first value
     maps = _read(folder, "maps", _MOST_MAPS)
     libraries = frozenset(library.decode() for library in _LIBRARIES.findall(maps))
-    if not libraries and not _may_speak(command):
+    if not libraries and not _uses_ros_or_zenoh(command):
         return None
     network, status = os.readlink("ns/net", dir_fd=folder), _read(folder, "status", _MOST_BYTES)
     return Process(
@@ -659,7 +661,7 @@ def _programs_in(command: tuple[str, ...]) -> set[str]:
     return {Path(word).name for word in command[:3]}
 
 
-def _may_speak(command: tuple[str, ...]) -> bool:
+def _uses_ros_or_zenoh(command: tuple[str, ...]) -> bool:
     """Return whether a command shows that the process uses ROS 2 or Zenoh."""
     is_of_zenoh = not _programs_in(command).isdisjoint((*_ROUTERS, *_BRIDGES))
     is_daemon = any(mark in word for word in command[:3] for mark in _DAEMON)

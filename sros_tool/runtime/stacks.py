@@ -63,7 +63,7 @@ from sros_tool.runtime.vendor_log import (
     plain_text,
 )
 from sros_tool.values import Words
-from sros_tool.zenoh.releases import release_of, too_old_because, version_text
+from sros_tool.zenoh.releases import release_of, version_text, why_too_old
 
 _LOG = logging.getLogger(__name__)
 
@@ -187,7 +187,7 @@ def _with_release(stack: Stack) -> Stack:
     return stack._replace(
         dds="Zenoh",
         version=f"{stack.version} {text}".lstrip(),
-        advice=too_old_because(version) or _ZENOH_ADVICE,
+        advice=why_too_old(version) or _ZENOH_ADVICE,
     )
 
 

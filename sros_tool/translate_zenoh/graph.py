@@ -69,7 +69,7 @@ def announced_nodes(rules: Iterable[AccessRule], enclave: str) -> AnnouncedNodes
     nodes: dict[bool, list[str]] = {True: [], False: []}
     for rule in rules:
         if rule.messages == _ANNOUNCING:
-            own_chunks = [_NODE if rule.allows else _EVERY_KIND, _part(enclave)]
+            own_chunks = [_NODE if rule.allows else _EVERY_KIND, _token_form(enclave)]
             for key in rule.key_expressions:
                 chunks = key.split("/")
                 if chunks[0] == GRAPH and chunks[5:7] == own_chunks:
@@ -86,17 +86,17 @@ def announced_names(
     ``domain``.
     """
     names: dict[bool, dict[str, None]] = {True: {}, False: {}}
-    begin, of_right = [GRAPH, str(domain)], [_ENTITY_KIND_OF_RIGHT[right], _part(enclave)]
+    begin, of_right = [GRAPH, str(domain)], [_ENTITY_KIND_OF_RIGHT[right], _token_form(enclave)]
     for rule in rules:
         for key in rule.key_expressions if _ANNOUNCING[0] in rule.messages else ():
             chunks = key.split("/")
             if chunks[:2] == begin and chunks[5:7] == of_right and len(chunks) > _NAME:
-                names[rule.allows][_named(chunks[_NAME])] = None
+                names[rule.allows][_ros_name_of_chunk(chunks[_NAME])] = None
     return {allows: tuple(of) for allows, of in names.items()}
 
 
-def _named(part: str) -> str:
-    """Return the ROS name for a chunk of a token, the inverse of `_part`."""
+def _ros_name_of_chunk(part: str) -> str:
+    """Return the ROS name for a chunk of a token, the inverse of `_token_form`."""
     return part.replace(ANY_PART, "*").replace("%", "/")
 
 
@@ -108,7 +108,7 @@ def nodes_in_rules(rules: Iterable[AccessRule], enclave: str) -> tuple[NodeName,
 
 def _node_of(place: str) -> NodeName:
     """Return the node for the form ``DOMAIN/NAMESPACE/NAME`` of tokens."""
-    _, ns, name = map(_named, place.split("/"))
+    _, ns, name = map(_ros_name_of_chunk, place.split("/"))
     return NodeName(ns, name)
 
 
@@ -152,7 +152,7 @@ class _Tokens:
 
     def __init__(self, enclave: str, domain: int, nodes: Iterable[NodeName]) -> None:
         self._begin = f"{GRAPH}/{domain}/*/*/*"
-        self._enclave = _part(enclave)
+        self._enclave = _token_form(enclave)
         self._nodes = _token_names(nodes)
         self._of_names = {
             f"{'' if ns == '%' else ns}%{name}": f"{ns}/{name}"
@@ -169,10 +169,12 @@ class _Tokens:
         denied: list[str] = []
         for right, names in sides[True].items():
             without = dict.fromkeys(
-                e for name in sides[False].get(right, ()) for e in _listed_expressions(name)
+                e
+                for name in sides[False].get(right, ())
+                for e in _expressions_with_only_stars(name)
             )
             stated = dict.fromkeys(
-                expression for name in names for expression in _listed_expressions(name)
+                expression for name in names for expression in _expressions_with_only_stars(name)
             )
             if without:
                 never = Names(without)
@@ -183,7 +185,7 @@ class _Tokens:
                 self._key(_ENTITY_KIND_OF_RIGHT[right], "*/*", part, ANY_CHUNKS)
                 for name in without
                 if any(overlap(wide, name) for wide in wild)
-                for part in _parts(name)
+                for part in _token_chunks(name)
             ]
         return tuple(allowed), tuple(denied)
 
@@ -200,7 +202,7 @@ class _Tokens:
 
     def _announced(self, right: str, names: Mapping[str, None]) -> list[str]:
         """Return key expressions for the tokens of names, for each node that may use a name."""
-        parts = [part for name in names for part in _parts(name)]
+        parts = [part for name in names for part in _token_chunks(name)]
         owners = {part: self._owner(right, part) for part in parts}
         everybody = self._nodes
         if len(everybody) * sum(not owner for owner in owners.values()) > _MOST_TOKENS:
@@ -220,7 +222,7 @@ class _Tokens:
         return "/".join((self._begin, kind, self._enclave, node, *rest))
 
 
-def _listed_expressions(name: str) -> list[str]:
+def _expressions_with_only_stars(name: str) -> list[str]:
     """Return expressions with ``*`` as the only wildcard, or one wider expression for too many."""
     try:
         return listed_expressions(name, _MOST_TOKENS)
@@ -229,30 +231,30 @@ def _listed_expressions(name: str) -> list[str]:
         return []
 
 
-def _parts(name: str) -> tuple[str, ...]:
+def _token_chunks(name: str) -> tuple[str, ...]:
     """Return the token chunks that together match a name.
 
     There are two chunks if the name begins with ``*/``, because the star can match nothing.
     """
     if name.startswith("*"):
         rest = name.lstrip("*")
-        return (*([_part(rest)] if rest.startswith("/") else []), _part(f"/*{rest}"))
-    return (_part(name),)
+        return (*([_token_form(rest)] if rest.startswith("/") else []), _token_form(f"/*{rest}"))
+    return (_token_form(name),)
 
 
 def _token_names(nodes: Iterable[NodeName]) -> tuple[str, ...]:
     """Return the namespaces and names of nodes in the form of tokens."""
     places = (
-        f"{_part(ns)}/{_part(name)}"
+        f"{_token_form(ns)}/{_token_form(name)}"
         for node in nodes
-        for ns in _listed_expressions(node.ns)
-        for name in _listed_expressions(node.name)
+        for ns in _expressions_with_only_stars(node.ns)
+        for name in _expressions_with_only_stars(node.name)
         if "/" not in name
     )
     return tuple(dict.fromkeys(places))
 
 
-def _part(name: str) -> str:
+def _token_form(name: str) -> str:
     """Return a name in the form of tokens, with ``%`` for ``/``."""
     return canonical((name.replace("/", "%").replace("*", ANY_PART) or "%",))
 
@@ -398,14 +400,14 @@ def example_token(
     places = [
         key.split("/")[7:]
         for key in key_expressions
-        if key.startswith(begin) and key.split("/")[5:7] == [_NODE, _part(enclave)]
+        if key.startswith(begin) and key.split("/")[5:7] == [_NODE, _token_form(enclave)]
     ]
     tokens = [
         "/".join(
             (
                 f"{begin}zid/0/0",
                 _NODE,
-                _part(enclave),
+                _token_form(enclave),
                 _wildcard_like(name, ns),
                 _wildcard_like(name, node),
             )

@@ -422,7 +422,10 @@ def chunks_of(name: str) -> list[Chunks]:
 
 
 def _chunks_of_part(texts: list[str]) -> list[list[str]]:
-    """Return chunks for a part of a name; ``texts`` are the texts between the part's stars."""
+    """Return the key expressions that match a part of a name, each as a list of chunks.
+
+    ``texts`` are the texts between the stars of the part.
+    """
     if texts == ["", ""]:
         return [["*", ANY_CHUNKS]]
     first, *later_texts = texts
@@ -813,7 +816,7 @@ class _AllowedNames:
         sound = dict.fromkeys(
             (domain, name)
             for key in self._allowed
-            for domain, name in _candidates(key)
+            for domain, name in _candidate_names(key)
             if not expression_problem(name) and self._is_sound(domain, name)
         )
         self._stated_keys = [key for domain, name in sound for key in _keys_of(domain, name)]
@@ -846,7 +849,7 @@ class _AllowedNames:
         ]
 
 
-def _candidates(key: str) -> Iterator[tuple[str, str]]:
+def _candidate_names(key: str) -> Iterator[tuple[str, str]]:
     """Yield pairs of domain and name that may express a key expression, or a part of it."""
     domain, *chunks = key.split("/")
     if domain == ANY_CHUNKS:

@@ -207,7 +207,7 @@ def render_configuration(
     settings: SettingsEdition = SettingsEdition.RULES_ONCE,
 ) -> bytes:
     """Return the file of `Configuration.render`, from rendered rights of remote enclaves."""
-    control = _control([*rights], once=settings is SettingsEdition.RULES_ONCE)
+    control = _access_control_text([*rights], once=settings is SettingsEdition.RULES_ONCE)
     without_control = _text_without_control(mode, listen, connect, revoked, settings)
     return f"{without_control}{_CONTROL}{control}".encode()
 
@@ -215,7 +215,7 @@ def render_configuration(
 _CONTROL = ',\n "access_control": {\n'
 
 
-def _control(rendered_rights: Sequence[RenderedRights], *, once: bool) -> str:
+def _access_control_text(rendered_rights: Sequence[RenderedRights], *, once: bool) -> str:
     """Return the text of a file's access control.
 
     With ``once``, a rule that several enclaves have is written once; otherwise, it is repeated for
@@ -397,9 +397,12 @@ class RenderedReader:
             configuration = self._parse_without_rules(beginning)
             rights = self._rendered_rights(sections)
             settings = configuration.settings
-            if settings is not SettingsEdition.FEW and _control(rights, once=True) == control:
+            if (
+                settings is not SettingsEdition.FEW
+                and _access_control_text(rights, once=True) == control
+            ):
                 settings = SettingsEdition.RULES_ONCE
-            elif _control(rights, once=False) != control:
+            elif _access_control_text(rights, once=False) != control:
                 return None
             remotes = tuple(
                 RemoteRights(rendered.name, tuple(map(self._rule, rendered.rules)))

@@ -146,7 +146,7 @@ def _landmark(expression: str) -> str:
     return max((chunk for chunk in rest.split("/") if "*" not in chunk), key=len, default="")
 
 
-def _without_wildcards(expression: str) -> str:
+def _common_beginning(expression: str) -> str:
     """Return the text with which every key of an expression begins.
 
     A slash before ``**`` is left out, because "/**" can match nothing.
@@ -155,7 +155,7 @@ def _without_wildcards(expression: str) -> str:
     return begin.rstrip("$/") if wildcard else expression
 
 
-_fixed_begin = lru_cache(maxsize=_MANY)(_without_wildcards)
+_fixed_begin = lru_cache(maxsize=_MANY)(_common_beginning)
 
 
 @lru_cache(maxsize=_MANY)
@@ -418,7 +418,7 @@ def _automaton(expression: str) -> Automaton | None:
                 continue
             between = [inside]
         else:
-            between = [_chunk(chunk, begin, number, edges)]
+            between = [_add_chunk_edges(chunk, begin, number, edges)]
     # The automaton begins as if a "/" preceded the key.
     first = {to for at, _, to in edges if at == 0}
     edges = [edge for edge in edges if edge[0]]
@@ -426,7 +426,7 @@ def _automaton(expression: str) -> Automaton | None:
     return Automaton(tuple(edges), frozenset(between) - {0})
 
 
-def _chunk(
+def _add_chunk_edges(
     chunk: str, begin: int, number: Iterator[int], edges: list[tuple[int, Letters, int]]
 ) -> int:
     """Append edges for a chunk to ``edges``, and return the position after the chunk.

@@ -53,7 +53,7 @@ def release_of(version: Version) -> RmwZenohRelease:
     return next(begun, RELEASES[0])
 
 
-def too_old_because(version: Version) -> str:
+def why_too_old(version: Version) -> str:
     """Return a clause on why the files of sros do not work with a version of rmw_zenoh, or ""."""
     release = release_of(version)
     if version >= release.least:

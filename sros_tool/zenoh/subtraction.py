@@ -186,8 +186,8 @@ def _parts(wide: Chunks, denied: Iterable[Chunks]) -> Iterator[Chunks]:
             yield from _parts((*most, *_any_chunks(number), *after), denied)
         yield (*most, ANY_CHUNKS, *_any_chunks(end), *after)
         return
-    begin = max((_to_last_named(first) for first, _ in wild), default=0)
-    end = max((_to_last_named(last[::-1]) for _, last in wild), default=0)
+    begin = max((_length_to_last_named(first) for first, _ in wild), default=0)
+    end = max((_length_to_last_named(last[::-1]) for _, last in wild), default=0)
     begin = max(begin - len(before), 0)
     shortest = len(before) + len(after)
     enough = max(shortest + begin, len(before) + begin + end, fixed + 1)
@@ -207,7 +207,7 @@ def _any_chunks(number: int) -> Chunks:
     return (ANY_CHUNK,) * number
 
 
-def _to_last_named(chunks: Chunks) -> int:
+def _length_to_last_named(chunks: Chunks) -> int:
     """Return the number of chunks up to and including the last chunk that is not ``*``."""
     return max((at + 1 for at, chunk in enumerate(chunks) if chunk != ANY_CHUNK), default=0)
 
@@ -339,14 +339,14 @@ def _chunks(first: str, first_chunks: tuple[str, ...], kinds: frozenset[frozense
     choices = []
     outside = frozenset(first_chunks).difference(*kinds)
     if are_allowed(kind for kind in kinds_of_first if not kind & outside):
-        choices.append(_chunks_less(first, outside))
+        choices.append(_chunks_without_denied(first, outside))
     chosen: dict[str, None] = {}
     for kind in sorted(kinds, key=sorted):
         other_chunks = frozenset(first_chunks) - kind
         if are_allowed(kind_of_chunk for kind_of_chunk in kinds_of_first if kind <= kind_of_chunk):
             other_chunks = frozenset()
         chosen |= dict.fromkeys(
-            c for chunk in kinds_of_first[kind] for c in _chunks_less(chunk, other_chunks)
+            c for chunk in kinds_of_first[kind] for c in _chunks_without_denied(chunk, other_chunks)
         )
     choices.append(tuple(chosen))
     wanted = [chunk for kind in kinds for chunk in kinds_of_first[kind]]
@@ -361,7 +361,7 @@ def _chunks(first: str, first_chunks: tuple[str, ...], kinds: frozenset[frozense
 
 
 @lru_cache(maxsize=_MANY)
-def _chunks_less(wide: str, denied: frozenset[str]) -> Chunks:
+def _chunks_without_denied(wide: str, denied: frozenset[str]) -> Chunks:
     """Return chunks for the names that ``wide`` matches and no chunk of ``denied`` matches."""
     if not denied:
         return (wide,)
@@ -610,7 +610,10 @@ class Difference(NamedTuple):
 
 
 def _common_end(first: str, second: str) -> str | None:
-    """Return the intersection of two endings, or None; endings with "/**" include others."""
+    """Return the narrower of two endings, or None if they have nothing in common.
+
+    An ending followed by ``/**`` includes the ending itself.
+    """
     end, longer = sorted((first, second), key=len)
     return end if longer in (end, f"{end}/{ANY_CHUNKS}") else None
 

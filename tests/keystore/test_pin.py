@@ -13,7 +13,7 @@ from sros_tool.checks.keystores.arrival import verify_arrival
 from sros_tool.errors import KeystoreError, PkiError
 from sros_tool.keystore.delivery import robot as delivered
 from sros_tool.keystore.delivery.archive import pack, unpack
-from sros_tool.keystore.delivery.robot import create_request, import_answer, read_pin, seal
+from sros_tool.keystore.delivery.robot import create_request, import_answer, read_pinned_cas, seal
 from sros_tool.keystore.delivery.signing import sign_request
 from sros_tool.keystore.issuing import authority as authorities
 from sros_tool.keystore.issuing.authority import load_authority
@@ -133,7 +133,12 @@ def test_all_commands_print_the_same_fingerprint(tmp_path: Path) -> None:
     created = sros("create_keystore", home, "--template", "production").ok().out
     (told,) = re.findall(r"permissions CA SHA-256 ([0-9a-f]{64})", created)
     ca = home / "public/permissions_ca.cert.pem"
-    assert read_pin(openssl_fingerprint(ca)) == read_pin(told) == read_pin(str(ca)) == pin(home)
+    assert (
+        read_pinned_cas(openssl_fingerprint(ca))
+        == read_pinned_cas(told)
+        == read_pinned_cas(str(ca))
+        == pin(home)
+    )
     assert "identity CA SHA-256 " + next(iter(pin(home, "identity"))) in created
     sros("create_request", NAME, robot).ok()
     request = robot / FOLDER / "request.pem"

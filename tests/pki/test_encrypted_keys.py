@@ -15,7 +15,7 @@ from sros_tool.errors import PkiError
 from sros_tool.pki import der, keys
 from sros_tool.pki.keys import (
     PrivateKey,
-    few_rounds,
+    few_rounds_clause,
     generate_key,
     holds_private_key,
     key_pem,
@@ -189,10 +189,10 @@ ROUNDS = {
 def test_few_rounds_to_try_a_passphrase(form: str) -> None:
     encrypted = [] if form == "pkey" else ["-passout", f"pass:{PASSPHRASE}"]
     pem = openssl(*form.split(), *encrypted, data=key_pem(KEYS["EC"]))
-    assert few_rounds(pem) == ROUNDS[form]
+    assert few_rounds_clause(pem) == ROUNDS[form]
 
 
 def test_sros_and_its_damaged_keys_have_no_few_rounds() -> None:
     pem = key_pem(KEYS["EC"], PASSPHRASE)
-    assert few_rounds(pem) == ""
-    assert few_rounds(pem.replace(pem[40:80], b"")) == ""
+    assert few_rounds_clause(pem) == ""
+    assert few_rounds_clause(pem.replace(pem[40:80], b"")) == ""

@@ -1,4 +1,4 @@
-"""Check the enclaves in a folder on a robot: whether and until when processes can run in them.
+"""Check the enclaves in a folder on a robot: whether processes can run in them, and how long.
 
 `verify_arrival` is for the delivery of enclaves; the functions below it are for the robot's later
 reports.
@@ -35,7 +35,7 @@ from sros_tool.keystore.layout import (
     is_enclave,
     is_keystore,
     locate_enclave,
-    refuse_earlier,
+    refuse_flat_keystore,
     search_enclaves,
     waits_for_answer,
 )
@@ -86,7 +86,7 @@ class VerifiedFolder(NamedTuple):
 )
 @dataclass(frozen=True, slots=True)
 class ArrivedEnclave:
-    """An enclave on a robot: whether, in which domains and until when a process can run in it.
+    """An enclave on a robot: whether a process can run in it, in which domains, and how long.
 
     It is enough if one vendor accepts the enclave; a refusal by another vendor is a finding.
     ``place`` is the PKCS#11 URI of a key on a token.
@@ -189,7 +189,7 @@ def verify_arrival(
         names, kind = (name,), "enclave"
         only_enclaves = names
     else:
-        refuse_earlier(path)
+        refuse_flat_keystore(path)
         raise DocumentError(
             f"'{path}' is neither a keystore nor an enclave",
             _why_no_enclaves(path),
@@ -315,7 +315,7 @@ class InstalledEnclave(NamedTuple):
 def open_installed(
     folder: Path, names: Iterable[str], *, now: datetime
 ) -> dict[str, InstalledEnclave]:
-    """Return the enclaves ``names`` in the security folder ``folder`` that can be looked at."""
+    """Return the enclaves of ``names`` in the security folder ``folder`` that can be opened."""
     opened, files = {}, FilesReadOnce()
     for name in names:
         place = enclave_path(folder, name)

@@ -45,7 +45,7 @@ from sros_tool.pki.certificates import (
 )
 from sros_tool.pki.chains import denies_issuing, purpose_faults
 from sros_tool.pki.crl import signed_by
-from sros_tool.pki.keys import algorithm, few_rounds, load_key
+from sros_tool.pki.keys import algorithm, few_rounds_clause, load_key
 from sros_tool.pki.token import is_token_uri
 from sros_tool.validity import AUTHORITY_SOON, iso
 from sros_tool.wording import first_few
@@ -125,7 +125,10 @@ WEAK = FindingKind(
 def _authority_findings(
     role: str, chain: tuple[x509.Certificate, ...], moment: datetime, subject: str, file: str
 ) -> Iterator[Finding]:
-    """Yield findings about a CA that a vendor refuses; ``chain`` is the content of its file."""
+    """Yield findings about properties of a CA for which vendors refuse it.
+
+    ``chain`` are the certificates in the file of the CA, its own certificate first.
+    """
     certificate = chain[0]
     name = authority_text(certificate)
     if certificate.issuer != certificate.subject:
@@ -496,7 +499,7 @@ def _ca_key_findings(
 
 
 def _weak_derivation_findings(subject: str, path: Path, pem: bytes) -> Iterator[Finding]:
-    if text := few_rounds(pem):
+    if text := few_rounds_clause(pem):
         old, new = quote(str(path)), quote(f"{path}.new")
         remedy = f"Run `openssl pkcs8 -topk8 -scrypt -in {old} -out {new} && mv {new} {old}`."
         yield CA_KEY_FEW_ROUNDS.found(subject, text, str(path), remedy=remedy)

@@ -644,7 +644,7 @@ def check_governance(
 
 @dataclass(frozen=True, slots=True)
 class _ChosenByTemplate:
-    """A predicate for templates that choose settings whose governance has the same finding."""
+    """A function that says whether the governance of a template's settings has the same finding."""
 
     kind: FindingKind
     text: str

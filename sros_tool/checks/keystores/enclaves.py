@@ -41,7 +41,7 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.reader import weaknesses
 from sros_tool.pki.certificates import subject_text, validity_of
-from sros_tool.pki.token import TokenUri, pin_file_problem, pin_line_break
+from sros_tool.pki.token import TokenUri, pin_file_problem, pin_line_break_clause
 from sros_tool.translate import allows_everything
 from sros_tool.validity import BACKDATE, Span, iso, parse_iso
 
@@ -296,7 +296,7 @@ def _token_findings(enclave: CheckedEnclave, place: TokenUri) -> Iterator[Findin
     if any((enclave.folder / zenoh_file).exists() for zenoh_file in ZENOH_FILES):
         yield TOKEN_ON_ZENOH.found(name, "it has no key.pem", file)
     is_local = not enclave.keystore.is_original or Path(place.pin_source).exists()
-    for problem in (pin_file_problem(place), pin_line_break(place)) if is_local else ():
+    for problem in (pin_file_problem(place), pin_line_break_clause(place)) if is_local else ():
         if problem:
             yield PIN_FILE.found(name, problem, file)
 

@@ -295,10 +295,10 @@ def check_issued(
         text = f"Cyclone DDS mistakes {pairs_text(pairs)}"
         yield ENCLAVE_NAMES.found(pairs[0][0], text, str(keystore.root))
     if "/" in keystore.names:
-        from sros_tool.checks.policies import within_root
+        from sros_tool.checks.policies import clause_on_enclaves_within_root
         from sros_tool.keystore.rights import load_rights
 
-        if text := within_root(load_rights(keystore.opened).rights):
+        if text := clause_on_enclaves_within_root(load_rights(keystore.opened).rights):
             yield ROOT_ENCLAVE.found("/", text, str(keystore.opened.folder("/")))
     yield from _trust_findings(keystore, summaries)
     yield from _exported_governance_findings(keystore, summaries)

@@ -18,7 +18,7 @@ from sros_tool.dds.advisories import Advisory
 from sros_tool.dds.governance import Governance
 from sros_tool.errors import SrosError
 from sros_tool.fleet.robots import Fleet
-from sros_tool.keystore.fleet import edited_fleet, load_fleet
+from sros_tool.keystore.fleet import fleet_edits_clause, load_fleet
 from sros_tool.keystore.layout import (
     CRL,
     FLEET,
@@ -170,7 +170,7 @@ class CheckedKeystore:
     @cached_property
     def fleet_edited(self) -> str:
         """A clause that says how the fleet file was changed by hand, or ""."""
-        return self._part(FLEET, lambda: edited_fleet(self.opened, self.ledger), "")
+        return self._part(FLEET, lambda: fleet_edits_clause(self.opened, self.ledger), "")
 
     @property
     def looks_like_original(self) -> bool:

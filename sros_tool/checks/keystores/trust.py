@@ -201,9 +201,10 @@ def _stranger_findings(
 def _refused_roles(
     parties: Sequence[_Party], other_parties: Sequence[_Party], roles: range
 ) -> tuple[int, ...]:
-    """Return the roles in which all pairs of enclaves refuse each other.
+    """Return the roles of the CAs for which the enclaves of two groups refuse each other.
 
-    Returns () if enclaves of one pair accept each other, or if no enclave can be read.
+    These are the roles of the pair of enclaves, one of each group, with the fewest such roles; ()
+    if a pair accepts each other, or if no enclave can be read.
     """
     pairs = (
         tuple(
@@ -400,7 +401,7 @@ class _Governed:
         return chain.from_iterable(self.domains)
 
     def overlaps(self, other: _Governed) -> bool:
-        """Return whether an enclave of both sides may join one domain; True if that is unknown."""
+        """Return whether enclaves of both targets may join a common domain; True if not known."""
         return _domains_meet(self.first, other.first) or _domains_meet(self.domains, other.domains)
 
 
@@ -485,7 +486,7 @@ _MOST_SHOWN = 3
 def _differences_between(
     own_governance: Governance, other: Governance
 ) -> tuple[Mismatch, tuple[tuple[str, str, str], ...]]:
-    """Return the kind of communication that two documents prevent, and the settings that differ."""
+    """Return the communication that differences of two documents prevent, and these differences."""
     disturbed = mismatch(other, own_governance)
     if not disturbed:
         return disturbed, ()

@@ -435,7 +435,7 @@ class _Denial(NamedTuple):
         return f"{self.text}{where if self.partition else ''}"
 
     def explains(self, finding: Finding) -> bool:
-        """Return whether a finding about the same permissions already names this cause."""
+        """Return whether a finding about the same permissions already names this denial's cause."""
         if finding.kind is UNREACHABLE:
             return bool(self.by) and finding.text.endswith(self.by[self.by.index("denies") :])
         return finding.kind is PARTITIONS and bool(self.partition)

@@ -148,7 +148,8 @@ def choose_grant(
     outdated: Refusal | None = None
     certified = certified_text(traits, subject)
     states = [
-        _state(traits, index, grant, now, zone) for index, grant in enumerate(permissions.grants)
+        _validity_refusal(traits, index, grant, now, zone)
+        for index, grant in enumerate(permissions.grants)
     ]
     for state in states:
         # A malformed date counts even in a grant for another subject.
@@ -177,7 +178,7 @@ def choose_grant(
     )
 
 
-def _state(
+def _validity_refusal(
     traits: VendorTraits, index: int, grant: Grant, now: float, zone: tzinfo
 ) -> Refusal | None:
     """Return the refusal of a grant that is not valid at the moment ``now``, or None."""

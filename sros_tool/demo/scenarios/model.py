@@ -199,11 +199,11 @@ class Party:
 
 @dataclass(frozen=True)
 class Claim:
-    """A claim on whether ``relation`` holds (``holds``) between ``subject`` and ``talker``.
+    """A claim that ``relation`` holds, or does not hold, between ``subject`` and ``talker``.
 
-    ``denied`` is the denial that must be the reason, a status in `DENIALS`; None: any reason.
-    ``evidence`` is a text that a party of the row must have logged about a process that was refused
-    ("": none).
+    ``holds`` is whether the claim is that the relation holds.  If a denial is expected, ``denied``
+    is the status in `DENIALS` that must have caused it (None: any).  ``evidence`` is a text that a
+    party of the row must have logged about a process that was refused ("": none).
     """
 
     relation: Relation
@@ -482,7 +482,7 @@ def check_topic(topic: str) -> str:
             "Use a name such as /chatter or /robot/camera.",
         )
     absolute = topic if topic.startswith("/") else f"/{topic}"
-    if is_of_nodes(absolute):
+    if is_name_of_demo_nodes(absolute):
         raise UsageError(
             f"the demo cannot use {absolute}",
             "Every ROS 2 node, or the demo itself, uses this topic or service.",
@@ -491,7 +491,7 @@ def check_topic(topic: str) -> str:
     return absolute
 
 
-def is_of_nodes(name: str) -> bool:
+def is_name_of_demo_nodes(name: str) -> bool:
     """Return whether the demo's own nodes have a topic or service, which no role can then use."""
     return name in _TOPICS_OF_NODES or bool(node_of_service(name))
 

@@ -339,7 +339,7 @@ def released_files(keystore: OpenedKeystore, name: str) -> dict[str, bytes]:
 
 
 def _evaluated_until(files: Mapping[str, bytes], state: OpenedEnclave, now: datetime) -> datetime:
-    """Return until when files without problems need no new evaluation: their first expiry.
+    """Return the time until which files without problems need no new evaluation: the first expiry.
 
     Revocation lists are not considered, because they are evaluated separately.  If the files also
     depend on lists in other ways (a list in the file of a CA, or Zenoh configurations), the result

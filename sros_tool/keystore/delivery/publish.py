@@ -442,7 +442,7 @@ class _RoleKeys:
 
     def _online_signers(self, role: str, *, new: bool) -> list[CryptoSigner]:
         """Return the signer of a role, and the previous one while robots may still need it."""
-        from sros_tool.keystore.delivery.repository import load_signer, new_key, replaced_key
+        from sros_tool.keystore.delivery.repository import load_signer, lost_key_remedy, new_key
 
         path, before = self._path(role), self._path(f"{role}.{_BEFORE}")
         if new:
@@ -454,7 +454,7 @@ class _RoleKeys:
                 signers.append(load_signer(old, f"'{path}'"))
             return signers
         if not path.exists():
-            raise KeystoreError(f"'{path}' is missing", "", replaced_key(role))
+            raise KeystoreError(f"'{path}' is missing", "", lost_key_remedy(role))
         signers = [load_signer(read_bytes(path, "key"), f"'{path}'")]
         self.roots.check_signer(role, signers[0], path)
         if before.exists():

@@ -80,7 +80,7 @@ def load_signer(data: bytes, label: str) -> CryptoSigner:
     return CryptoSigner(key)
 
 
-def replaced_key(role: str) -> str:
+def lost_key_remedy(role: str) -> str:
     """Return the remedy for a lost key of a role, as a sentence."""
     return (
         "Restore it from a backup, or make another with --rotate-key "
@@ -171,7 +171,7 @@ class Roots:
             raise KeystoreError(
                 f"'{path}' is not the {role} key with which this keystore publishes",
                 "Robots would refuse its signatures.",
-                _REMEDY_ROOT_KEY if role == _ROOT else replaced_key(role),
+                _REMEDY_ROOT_KEY if role == _ROOT else lost_key_remedy(role),
             )
 
     def verify(

@@ -48,7 +48,7 @@ from sros_tool.keystore.layout import (
     ZENOH_SIGNED,
     enclave_folder,
     has_key,
-    refuse_earlier,
+    refuse_flat_keystore,
 )
 from sros_tool.keystore.lifecycle.change import Changed
 from sros_tool.keystore.lifecycle.shown import shown
@@ -197,7 +197,7 @@ def create_request(
     )
 
 
-def read_pin(text: str) -> frozenset[str]:
+def read_pinned_cas(text: str) -> frozenset[str]:
     """Return the SHA-256 of the CA certificates that ``text`` pins, in lower-case hexadecimal.
 
     ``text`` is a SHA-256 fingerprint or the path of a certificate file.  Colons and capital letters
@@ -261,7 +261,7 @@ def check_same_authority(target: Path, files: Mapping[str, bytes]) -> None:
 
 def _refuse_ca_keystore(folder: Path, remedy: str) -> None:
     """Raise `KeystoreError` if ``folder`` is a keystore with CAs, not a folder of a robot."""
-    refuse_earlier(folder)
+    refuse_flat_keystore(folder)
     if (folder / PRIVATE).exists() or (folder / PUBLIC).exists():
         raise KeystoreError(
             f"'{folder}' is a keystore with CAs",

@@ -58,7 +58,7 @@ from sros_tool.keystore.lifecycle.replaced import (
     earlier_permissions,
     lasting_text,
     replaced_rights,
-    with_ledger,
+    with_expiries_in_ledger,
 )
 from sros_tool.keystore.lifecycle.shown import enclave_results, shown
 from sros_tool.keystore.outcomes import (
@@ -629,7 +629,7 @@ def _lost_rights_notes(
     """Return notes on rights that the enclave loses, and on how long its old files still work."""
     (grant,) = issued.permissions.grants
     replaced = replaced_rights(issued.issuance.name, earlier_permissions, grant, change.now)
-    (replaced,) = with_ledger(change.keystore, (replaced,), change.now)
+    (replaced,) = with_expiries_in_ledger(change.keystore, (replaced,), change.now)
     text = lasting_text(change.root, (replaced,))
     if not text:
         return []

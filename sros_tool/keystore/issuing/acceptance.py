@@ -433,7 +433,7 @@ class _FilesOfChange:
             self._keystore.read(CRL, "revocation list") if has_list else b""
         ) | of_ledger.union(self._revoked_before)
 
-    def with_a_newer_list(self) -> set[str] | None:
+    def enclaves_of_newer_list(self) -> set[str] | None:
         """Return the enclaves to evaluate if a newer revocation list is the only change, or None.
 
         These are the enclaves whose certificates only the new list has, and one other enclave.  The
@@ -519,7 +519,7 @@ def _enclaves_by_kind(files: _FilesOfChange, now: datetime) -> dict[_Kind, list[
         for folder, changed_files in changed.items()
         if folder.split("/", 1)[0] == ENCLAVES and not changed_files.isdisjoint(_LOADED_FILES)
     }
-    if shared == {_CRL_NAME} and (others := files.with_a_newer_list()) is not None:
+    if shared == {_CRL_NAME} and (others := files.enclaves_of_newer_list()) is not None:
         names.update(others)
     elif shared:
         names.update(files.transaction.enclaves)

@@ -71,7 +71,7 @@ from sros_tool.keystore.layout import (
     is_keystore,
     key_on_robot,
     keystore_around,
-    refuse_earlier,
+    refuse_flat_keystore,
     remedy_in_closed_robot,
     similar_keystores,
 )
@@ -83,7 +83,7 @@ from sros_tool.keystore.lifecycle.replaced import (
     counterpart_notes,
     earlier_permissions,
     replaced_rights,
-    with_ledger,
+    with_expiries_in_ledger,
 )
 from sros_tool.keystore.protection import less_protected, with_stated
 from sros_tool.keystore.reader import OpenedKeystore, check_domain
@@ -531,7 +531,7 @@ def _check_not_keystore(root: Path) -> None:
     """Raise `KeystoreError` if a new keystore cannot be created at ``root``."""
     if is_keystore(root):
         raise _already_exists_error(root)
-    refuse_earlier(root)
+    refuse_flat_keystore(root)
     # Unlike Path.resolve, realpath does not fail for circular links.
     if os.path.realpath(root) == "/":
         raise KeystoreError(
@@ -807,7 +807,7 @@ def write_enclaves(
     new = (wanted_enclaves[name] or _default_rights(change.template, name) for name in created)
     change.notes += counterpart_notes(change.keystore, replaced, new)
     if not revoke_old:
-        replaced = [*with_ledger(change.keystore, replaced, change.now)]
+        replaced = [*with_expiries_in_ledger(change.keystore, replaced, change.now)]
     change.finish(command="replace the permissions" if superseded else "")
     return tuple(replaced)
 

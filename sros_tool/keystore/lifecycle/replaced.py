@@ -125,8 +125,8 @@ def replaced_rights(
 ) -> ReplacedRights:
     """Return the rights gained and lost when ``grant`` replaces ``earlier_permissions``.
 
-    Other permissions of the enclave may work longer than ``earlier_permissions``; `with_ledger`
-    adds their expiry.
+    Other permissions of the enclave may work longer than ``earlier_permissions``;
+    `with_expiries_in_ledger` adds their expiry.
     """
     difference = compare(grant_rights(name, earlier_permissions.grant), grant_rights(name, grant))
     lost: list[Right] = []
@@ -199,7 +199,7 @@ _WILDCARD_BYTES = rb"[*\[&]|\?(?!xml |>)"
 """A character in permissions that may belong to a wildcard, or to an escape."""
 
 
-def with_ledger(
+def with_expiries_in_ledger(
     keystore: OpenedKeystore, replaced_rights: Collection[ReplacedRights], now: datetime
 ) -> tuple[ReplacedRights, ...]:
     """Return the replaced rights with the latest expiry that the ledger has for their enclave.
@@ -230,7 +230,7 @@ def with_ledger(
 def certificates_until(
     keystore: OpenedKeystore, superseded: Collection[Superseded], template: Template
 ) -> datetime | None:
-    """Return until when the last replaced certificate works; None if none was replaced.
+    """Return when the last replaced certificate stops working; None if none was replaced.
 
     A certificate needs permissions for its subject.  If an enclave's new certificate has another
     subject, no more permissions are signed for the replaced certificate, which therefore works

@@ -305,7 +305,7 @@ def _refuse_edited(keystore: OpenedKeystore) -> None:
         )
 
 
-def _was_replaced(keystore: OpenedKeystore) -> bool:
+def _was_ca_replaced(keystore: OpenedKeystore) -> bool:
     """Return whether the ledger records that a CA was replaced by another one."""
     names = (keystore.certificates_of(f"{role}_ca") for role in ROLES)
     trusted = {
@@ -331,7 +331,7 @@ def _target_stage(
     if to is None:
         return rotation.next_stage()
     if to is RotationStage.RETIRE and rotation.stage is RotationStage.NONE:
-        if not _was_replaced(keystore):
+        if not _was_ca_replaced(keystore):
             raise UsageError(
                 f"no CA of keystore '{root}' is being replaced",
                 "There is no old CA to retire.",
@@ -606,7 +606,7 @@ class _Rotator:
     def _distribute(self, successors: list[_Successor]) -> None:
         for successor in successors:
             bundle = b"".join(map(pem, (*successor.old, successor.new.certificate)))
-            if self._takes_crl(successor) and (old := self._keystore.revocation_list):
+            if self._can_distribute_crl_with(successor) and (old := self._keystore.revocation_list):
                 bundle += self._empty_crl(successor.new, old.number + 1)
             write_bundle(
                 self._transaction, successor.file, successor.roles, bundle, self._change.names
@@ -627,11 +627,12 @@ class _Rotator:
         This is the case if the first revocation was during the stage DISTRIBUTE.
         """
         return (self._root / CRL).exists() and any(
-            self._takes_crl(successor) and not self._keystore.embedded_list(successor.file)
+            self._can_distribute_crl_with(successor)
+            and not self._keystore.embedded_list(successor.file)
             for successor in successors
         )
 
-    def _takes_crl(self, successor: _Successor) -> bool:
+    def _can_distribute_crl_with(self, successor: _Successor) -> bool:
         """Return whether a new CA's revocation list can be distributed together with the CA."""
         return IDENTITY in successor.roles and not crls_confusable(
             successor.old[0], successor.new.certificate

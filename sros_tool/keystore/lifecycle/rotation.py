@@ -20,7 +20,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 
 from sros_tool.errors import KeystoreError, SrosError
 from sros_tool.keystore.expiry import ONE_BY_ONE
-from sros_tool.keystore.fleet import deliver_first
+from sros_tool.keystore.fleet import deliver_first_sentence
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     IDENTITY,
@@ -279,7 +279,7 @@ def _restart_remarks(keystore: OpenedKeystore, rotation: Rotation) -> list[str]:
     if rotation.stage is RotationStage.DISTRIBUTE:
         return [
             f"All vendors: {ONE_BY_ONE} Continue when all have been restarted.",
-            deliver_first(keystore.root),
+            deliver_first_sentence(keystore.root),
         ]
     hindrance = _fast_dds_hindrance(keystore, files)
     remarks = [
@@ -297,7 +297,7 @@ def _restart_remarks(keystore: OpenedKeystore, rotation: Rotation) -> list[str]:
             "Revocations at this stage are signed by both CAs, if the key of the old CA is "
             "available."
         )
-    return [*remarks, deliver_first(keystore.root)]
+    return [*remarks, deliver_first_sentence(keystore.root)]
 
 
 def crls_confusable(old: x509.Certificate, new: x509.Certificate) -> bool:

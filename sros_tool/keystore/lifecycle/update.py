@@ -78,7 +78,7 @@ from sros_tool.keystore.lifecycle.replaced import (
     Superseded,
     replaced_rights,
     rights_text,
-    with_ledger,
+    with_expiries_in_ledger,
 )
 from sros_tool.keystore.lifecycle.rotation import RotationStage, read_rotation
 from sros_tool.keystore.reader import OpenedKeystore
@@ -319,7 +319,9 @@ def update_keystore(
         update = _Updater(change, present, step, revoke_old=revoke_old).update(
             done, pending[len(done) :], progress
         )
-        change.remarks += _signed_payloads(present.settings.protection, goal.settings.protection)
+        change.remarks += _signed_payload_notes(
+            present.settings.protection, goal.settings.protection
+        )
         if not change.dry_run and not allow_looser and (looser := update().looser):
             raise UsageError(
                 f"the update would make keystore '{root}' looser: {'; '.join(looser)}",
@@ -357,7 +359,7 @@ def _first_goal(present_settings: PresentSettings, goal: _Goal) -> _Goal:
     return _Goal(settings, present_settings.domains)
 
 
-def _signed_payloads(before: DomainProtection, after: DomainProtection) -> list[Note]:
+def _signed_payload_notes(before: DomainProtection, after: DomainProtection) -> list[Note]:
     """Return a note if payloads become signed but not encrypted: then Fast DDS loses messages."""
     old, new = (
         {
@@ -486,7 +488,7 @@ class _Updater:
         if revoked:
             rights = tuple(replaced.revoked() for replaced in rights)
         else:
-            rights = with_ledger(change.keystore, rights, change.now)
+            rights = with_expiries_in_ledger(change.keystore, rights, change.now)
         settings = (
             *compare_governance(self._present.governance, governance),
             *compare_settings(before, after, change.now),
@@ -680,7 +682,7 @@ class _Updater:
             text = (
                 "Identity CA and permissions CA now have files of their own, but still the same "
                 "key, so an enclave can sign its own permissions until the permissions CA is "
-                f"replaced: {self._rotation(f' --{PERMISSIONS}')}."
+                f"replaced: {self._rotation_command(f' --{PERMISSIONS}')}."
             )
             return [Note("keystore.one-authority", text)]
         if any(e.effect is Effect.TIGHTER and e.key.startswith("protection") for e in changes):
@@ -688,12 +690,12 @@ class _Updater:
             text = (
                 "The signature of the previous governance stays valid: anyone who can change the "
                 "files of a robot can put it back there, until the CA that signed it is "
-                f"replaced: {self._rotation(role)}."
+                f"replaced: {self._rotation_command(role)}."
             )
             return [Note("keystore.earlier-governance", text)]
         return []
 
-    def _rotation(self, role: str) -> str:
+    def _rotation_command(self, role: str) -> str:
         """Return the command that begins or continues a rotation of CAs, as a clause.
 
         ``role`` is the option that selects a CA, or "".
