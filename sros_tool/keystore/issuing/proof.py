@@ -65,10 +65,8 @@ def _service_topics(client: bool, part: str = "") -> tuple[tuple[str, str, str],
 def _action_topics(client: bool) -> tuple[tuple[str, str, str], ...]:
     """Return (direction, prefix, suffix) of all DDS topics of an action."""
     direction = _SUBSCRIBE if client else _PUBLISH
-    services = (
-        end for p in _ACTION_SERVICES for end in _service_topics(client, f"/_action_topics/{p}")
-    )
-    return (*services, *((direction, "rt", f"/_action_topics/{topic}") for topic in _ACTION_TOPICS))
+    services = (end for p in _ACTION_SERVICES for end in _service_topics(client, f"/_action/{p}"))
+    return (*services, *((direction, "rt", f"/_action/{topic}") for topic in _ACTION_TOPICS))
 
 
 _ENDPOINTS = {
