@@ -75,6 +75,7 @@ _RIGHTS = {
     Role.SERVER: "reply",
     Role.CLIENT: "request",
 }
+_UNREADABLE = (Fault.FILE_UNREADABLE, Fault.FILE_NO_FILE, Fault.CRL_LEFT_OUT)
 _MOST_FAULTY = 8
 """Maximum number of enclaves with faulty or revoked files that get a row."""
 
@@ -294,7 +295,7 @@ def _read_enclaves(keystore: OpenedKeystore, now: datetime, domain: int) -> _Enc
         state = keystore.enclave(name, now=now, domain=domain)
         faults = [problem for problem in state.problems if problem.fault is not Fault.REVOKED]
         by_own_list = len(faults) < len(state.problems)
-        if any(fault.fault in (Fault.FILE_UNREADABLE, Fault.FILE_NO_FILE) for fault in faults):
+        if any(fault.fault in _UNREADABLE for fault in faults):
             unreadable.append(name)
         elif KEY_FILE not in state.files and (state.key_on_robot or state.token):
             elsewhere.append(name)
