@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from sros_tool.keystore.rights import RightsSource, SourcesDifference
     from sros_tool.policy.merge import Merged
     from sros_tool.policy.model import Source, StatedProtection
-    from sros_tool.policy.rights import RightsDifference
+    from sros_tool.policy.rights import PlacedRight, RightsDifference
     from sros_tool.proof.growth import DroppedDenial, Gain, Growth, NewNode, NewReach
     from sros_tool.proof.sources import AccessSource
 
@@ -996,8 +996,27 @@ def _dropped_text(dropped: DroppedDenial) -> str:
     return f"{text}: other policies may allow {'them' if name else 'it'} now"
 
 
-def access_summary(growth: Growth, dropped: Collection[DroppedDenial]) -> str:
-    """Return the added access and reach of a change, and its dropped denials, in one sentence."""
+def elsewhere_lines(elsewhere: Iterable[PlacedRight]) -> list[str]:
+    """Return a line for each right that is new only for users who move the node."""
+    return [
+        f"+ {placed.right.enclave} {placed.right.describe()} in another namespace  "
+        f"({placed.source})"
+        for placed in elsewhere
+    ]
+
+
+def access_summary(
+    growth: Growth, dropped: Collection[DroppedDenial], elsewhere: Collection[PlacedRight] = ()
+) -> str:
+    """Return the added access and reach of a change, and its dropped denials, in one sentence.
+
+    ``elsewhere`` are the rights that are new only for users who put the node into another
+    namespace.
+    """
+    if elsewhere:
+        new = _count(len(elsewhere), "right")
+        here = access_summary(growth, dropped)
+        return f"{new} new for users who put the node into another namespace; without that, {here}"
     from sros_tool.dds.decision.vendors import joined_titles
 
     worlds = ", ".join(joined_titles(growth.worlds))
@@ -1038,14 +1057,18 @@ def _count(number: int, noun: str) -> str:
 
 
 def access_markdown(
-    base: AccessSource, head: AccessSource, growth: Growth, dropped: Collection[DroppedDenial]
+    base: AccessSource,
+    head: AccessSource,
+    growth: Growth,
+    dropped: Collection[DroppedDenial],
+    elsewhere: Collection[PlacedRight] = (),
 ) -> str:
     """Return the added and removed access of a change, and its dropped denials, as Markdown."""
     from sros_tool.markdown import bounded_list, code, plain
 
     shown_by = "which `sros diff_policy --no-new-access` shows"
-    summary = access_summary(growth, dropped)
-    verdict = "yes" if growth else "none, but a DENY is gone" if dropped else "none"
+    summary = access_summary(growth, dropped, elsewhere)
+    verdict = "yes" if growth or elsewhere else "none, but a DENY is gone" if dropped else "none"
     parts = [f"### New access: {plain(verdict)}", plain(summary)]
     added, removed = added_lines(base, head, growth), _removed_lines(base, head, growth)
     renamed = [line for line in added if line.startswith("~")]
@@ -1053,6 +1076,7 @@ def access_markdown(
     for title, lines in (
         ("renamed", renamed),
         ("added", added[len(renamed) :]),
+        ("new in another namespace", elsewhere_lines(elsewhere)),
         ("removed", removed),
         ("DENY gone" if len(gone) == 1 else "DENYs gone", gone),
     ):

@@ -441,8 +441,8 @@ def _sentence(result: Review, step: ReviewStep) -> str:
     match step.content:
         case ChosenFindings() as chosen:
             return f"{chosen.summary()}{place}"
-        case AccessChange(growth=growth, dropped=dropped):
-            return access_summary(growth, dropped)
+        case AccessChange(growth=growth, dropped=dropped, elsewhere=elsewhere):
+            return access_summary(growth, dropped, elsewhere)
         case RightsChange(compared=compared, absolute=absolute, relative=relative):
             added, gone = len(compared.rights.only_second), len(compared.rights.only_first)
             clauses = [
@@ -553,6 +553,10 @@ def _access_findings(change: AccessChange, path: str) -> Iterator[Finding]:
     ):
         line = (place.file, place.line) if place and place.file else (path, 0)
         at.setdefault((is_denial, *line), []).append((subject, text))
+    for placed in change.elsewhere:
+        text = f"may {placed.right.describe()} in another namespace"
+        line = placed.source.file, placed.source.line
+        at.setdefault((False, *line), []).append((placed.right.enclave, text))
     for (is_denial, file, number), [(subject, text), *more] in at.items():
         text += f"; and {len(more)} more of this line" if more else ""
         kind = DROPPED_DENIAL if is_denial else NEW_ACCESS
@@ -584,6 +588,7 @@ def _lines_to_read(step: ReviewStep) -> list[str]:
     from sros_tool.cli.policy import (
         added_lines,
         dropped_lines,
+        elsewhere_lines,
         enclave_lines,
         folded_differences,
         unanswered_lines,
@@ -593,8 +598,9 @@ def _lines_to_read(step: ReviewStep) -> list[str]:
     match step.content:
         case StepFindings() as facts if len(facts.lines) > 1:
             return [f"'{name}' {text}" for text, name in facts.lines]
-        case AccessChange(before=before, after=after, growth=growth, dropped=dropped):
-            return [*added_lines(before, after, growth), *dropped_lines(after, dropped)]
+        case AccessChange(before=before, after=after, growth=growth) as change:
+            lines = [*added_lines(before, after, growth), *elsewhere_lines(change.elsewhere)]
+            return [*lines, *dropped_lines(after, change.dropped)]
         case RightsChange(before=before, after=after, compared=compared):
             unanswered = unanswered_lines(compared, after.fleet)
             differing = folded_differences(before, after, compared.rights, ("BASE", "HEAD"))
@@ -717,8 +723,8 @@ def _detail(result: Review, step: ReviewStep, request: ReviewRequest) -> str:
         case ChosenFindings() as chosen:
             title = f"### {_TITLES[step.kind]}: allowed\n\n" if step.allowed else ""
             return title + findings(chosen) if chosen.shown else ""
-        case AccessChange(before=before, after=after, growth=growth, dropped=dropped):
-            return access_markdown(before, after, growth, dropped)
+        case AccessChange(before, after, growth, dropped, elsewhere):
+            return access_markdown(before, after, growth, dropped, elsewhere)
         case RightsChange(before=before, after=after, compared=compared) as change:
             parts = [rights_markdown(before, after, compared)] if compared else []
             if lines := list(_absolute_lines(change)):

@@ -63,7 +63,7 @@ from sros_tool.pki.certificates import IDENTITY_DIGITS
 from sros_tool.policy.model import ALLOW, PEER_RIGHT, Enclave, Policy, policy_in_namespace
 from sros_tool.policy.patterns import Names, covers
 from sros_tool.policy.remapping import Remapping, renamed_action_text
-from sros_tool.policy.rights import Right
+from sros_tool.policy.rights import Right, placed_rights
 from sros_tool.runtime.log_texts import (
     LET_ENTER_EXPORT,
     LET_ENTER_ORIGINAL,
@@ -280,6 +280,21 @@ class AskedPolicy:
         fitting = [path for path in paths if path != "/" and enclave.endswith(path)]
         path = self.name if self.name in fitting else max(fitting, key=len, default="")
         return enclave.removesuffix(path) if path else "", path
+
+    def likely_namespace(self, denied: Right) -> str:
+        """Return the namespace in which the policy's relative names give a denied right, or "".
+
+        "" also if the log states the namespace.
+        """
+        space, path = self.place(denied.enclave)
+        stated = self.policy.enclave(path) if path and not space else None
+        for placed in placed_rights(stated) if stated else ():
+            own = placed.right
+            is_relative = not placed.written.startswith(("/", "*"))
+            allows = own.qualifier is ALLOW and own.right == denied.right and is_relative
+            if allows and denied.name.endswith(own.name):
+                return denied.name.removesuffix(own.name)
+        return ""
 
     def enclave(self, enclave: str) -> Enclave | None:
         """Return the enclave with its path on the robot, or None if no enclave fits."""
@@ -922,6 +937,14 @@ class _Examiner:
             other, better = self._other_node_cause(denial, answer)
             if not other:
                 other, better = self._similar_name_cause(denial, name, enclave, finding.remedy)
+            asked = [question.allowed(enclave.name) for question in _questions_to_ask(denial)]
+            if likely := self._policy.likely_namespace(asked[0]) if self._policy and asked else "":
+                other = [f"in the namespace {likely}, the policy allows it"]
+                better = (
+                    f"Perhaps the robot has the policy in {likely} (`--namespace {quote(likely)}` of "
+                    "`sros merge_policy`): then rcl's line `Found security directory` in the whole "
+                    f"log names an enclave in {likely}. Otherwise, {finding.remedy}"
+                )
             facts = [answer.decision.text, *other]
             remedy = better or finding.remedy
         return replace(finding, found=tuple(facts), checked=True, remedy=remedy)

@@ -190,12 +190,16 @@ class ReviewRequest:
 
 @dataclass(frozen=True, slots=True)
 class AccessChange:
-    """Access that HEAD allows and BASE does not, and denials that HEAD drops or narrows."""
+    """Access that HEAD allows and BASE does not, and denials that HEAD drops or narrows.
+
+    ``elsewhere`` are the rights that are new only for nodes in another namespace.
+    """
 
     before: AccessSource
     after: AccessSource
     growth: Growth
     dropped: tuple[DroppedDenial, ...]
+    elsewhere: tuple[PlacedRight, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -405,8 +409,8 @@ class _Review:
         """Return whether findings of a kind of step are allowed, by the request or always."""
         if kind == "requirements-before":
             return self.request.allow_dropped_requirements
-        # Authors of a policy seldom have the CA keys, so the keystore may be signed later; and only
-        # users know whether they put the nodes into another namespace.
+        # Authors of a policy seldom have the CA keys, so the keystore may be signed later.
+        # Names that are new in another namespace fail the step on new access.
         return kind in ("signed", "rights") or (
             kind in ("new-access", "files") and self.request.allow_new_access
         )
@@ -967,8 +971,10 @@ class _Review:
         dropped += tuple(
             DroppedDenial(moved.right, "", "") for moved in moving if moved.right.qualifier is DENY
         )
-        status = _FOUND if growth or dropped else _OK
-        return status, AccessChange(before, after, growth, dropped)
+        # A fleet file states the namespace of each robot, so that the comparison has decided there.
+        elsewhere = () if after.fleet else tuple(m for m in moving if m.right.qualifier is ALLOW)
+        status = _FOUND if growth or dropped or elsewhere else _OK
+        return status, AccessChange(before, after, growth, dropped, elsewhere)
 
     @staticmethod
     def _rights(

@@ -1026,6 +1026,22 @@ def test_a_log_of_a_robot_that_has_the_policy_in_a_namespace(
     )
 
 
+def test_a_log_without_the_namespace_that_its_names_show(tmp_path: Path) -> None:
+    """Not a new name first: all instances would share it. Twin: a name that cannot move."""
+    policy, log = tmp_path / "p.xml", tmp_path / "robot.log"
+    log.write_text(
+        "[SECURITY Error] rt/left/y topic not found in allow rule. -> check_create_datawriter\n"
+    )
+    policy.write_text(policy_text({"/a": publish("y")}))
+    said = sros("explain", policy, "/a", "--log", log).out
+    assert "found     in the namespace /left, the policy allows it\n" in said
+    assert "remedy    Perhaps the robot has the policy in /left (`--namespace /left` of" in said
+    assert "/left/y:=/y" not in said
+    policy.write_text(policy_text({"/a": publish("/y")}))
+    said = sros("explain", policy, "/a", "--log", log).out
+    assert "in the namespace" not in said and "remedy    If the node lacks a remapping" in said
+
+
 def test_a_denial_by_a_rule_is_not_said_to_miss_something(tmp_path: Path) -> None:
     policy, log = tmp_path / "p.xml", tmp_path / "robot.log"
     policy.write_text(policy_text({"/a": publish("/x").replace("ALLOW", "DENY")}))

@@ -251,6 +251,13 @@ def test_changed_rights_are_named_and_decided_over_all_policies(change: Change) 
     (absolute,) = (line for line in said if line.startswith("  ~"))
     assert "/c subscribe topic /x has a / at its beginning, so that it does" in absolute
     assert absolute.endswith("(second.xml:3)")
+    # Users in /left and /right now share /x: this is new access for them.
+    change.base = change.commit({"other": "1", "second.xml": policy_text({"/c": reads})})
+    change.commit({"second.xml": policy_text({"/c": reads.replace(">x<", ">/x<")})})
+    ended = change.review("--policy", "robot.xml\nsecond.xml")
+    assert ended.status == 1, ended
+    assert "new-access robot.xml second.xml: 1 right is new for users who put the node" in ended.out
+    assert "\n  + /c subscribe topic /x in another namespace  (second.xml:3)\n" in ended.out
     denies = '<topics publish="DENY"><topic>{}</topic></topics>'
     change.base = change.commit({"second.xml": policy_text({"/c": denies.format("/stop*")})})
     split = denies.format("stop</topic><topic>stop?*")
