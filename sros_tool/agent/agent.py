@@ -469,7 +469,7 @@ class _Round:
             self._problems.append(
                 f"Until {iso(max(recent.values()))}, the agent removed enclaves that the installed "
                 f"release lacks: {first_few(sorted(recent), 3)}. If they belong to another robot, "
-                "somebody may have copied their keys: `sros renew KEYSTORE ENCLAVE --new-key "
+                "somebody may have copied their keys: run `sros renew KEYSTORE ENCLAVE --new-key "
                 "--revoke-old`."
             )
 
@@ -485,7 +485,7 @@ class _Round:
             self._problems.append(
                 f"Until {iso(max(closed.values()))}, others could read "
                 f"{counted(len(closed), 'private key')}: {first_few(sorted(closed), 3)}. The agent "
-                "set the mode to 0600. If anybody may have copied a key: `sros renew KEYSTORE "
+                "set the mode to 0600. If anybody may have copied a key, run `sros renew KEYSTORE "
                 "ENCLAVE --new-key --revoke-old` in the keystore."
             )
 

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 OLD_COPY = (
     "Check the files on the server, and publish there again. Only if the keystore comes from a "
-    "backup: `sros fleet publish KEYSTORE PUB --restored`."
+    "backup, run `sros fleet publish KEYSTORE PUB --restored`."
 )
 """Remedy for a source that has less than this robot had."""
 _METADATA = "metadata"
@@ -300,7 +300,7 @@ def _read_archive(path: Path, robot: str, number: int) -> Release:
     if release.number != number:
         raise FetchError(
             FetchProblem.NOT_SIGNED,
-            f"the release of {robot} has the number {release.number}, the metadata says {number}",
+            f"the release of {robot} has number {release.number}, but the metadata says {number}",
         )
     return release
 

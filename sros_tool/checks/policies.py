@@ -229,7 +229,7 @@ MISSPELT = FindingKind(
 MISTAKEN_SIDE = FindingKind(
     "policy.side-mistaken",
     WARNING,
-    "a service or action with request and reply, or call and execute, mistaken for each other",
+    "a service or action for which request and reply, or call and execute, were confused",
     "A node offers (reply, execute) the services and actions under its own name, and other nodes "
     "use them (request, call). Nobody has the opposite right, so no call succeeds.",
     "sros: compares the rights of all enclaves in the policy.",
@@ -1061,7 +1061,7 @@ CONTRADICTION = FindingKind(
     "policy.contradiction",
     WARNING,
     "the same name is allowed and denied",
-    "The DENY wins, so the ALLOW has no effect; one of them is a mistake.",
+    "The DENY wins, so the ALLOW has no effect; one of the two is a mistake.",
     _ORDER,
     "Remove the ALLOW or the DENY.",
 )

@@ -113,7 +113,7 @@ PROCESS_EXPIRED = FindingKind(
 PROCESS_LOCAL_TIME = FindingKind(
     "runtime.process-local-time",
     ERROR,
-    "a process in whose time zone Fast DDS refuses its permissions",
+    "a process whose permissions Fast DDS refuses in the time zone of the process",
     'Fast DDS reads the dates of permissions in the local time of the process, and says "Not '
     'found the identity subject name in permissions file".',
     "Fast DDS 2.6 to 3.6 (mktime); tested.",

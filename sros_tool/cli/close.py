@@ -335,7 +335,7 @@ def _show_end(robot: LocalRobot, closed: CloseState, *, apply: bool, holds: bool
             stop = _started_together(processes)
             echo(f"stop {stop}, and start it with:" if stop else "start again with:")
             echo(f"  {command}")
-        answer = f"next: these commands, and then {ask}"
+        answer = f"next: run these commands, and then {ask}"
     else:
         steps = f"stop the robot, start each process by the commands in {robot.commands_file}"
         if closed.secured:

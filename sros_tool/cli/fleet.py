@@ -825,9 +825,9 @@ def _fleet_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
         yield f"the published files do not verify: {why}. Run `{publish}`, which prints the remedy"
     elif publication and publication.accepted is False and publication.expires:
         ago = elapsed(compared_fleet.at - publication.expires)
-        yield f"the published files expired {ago} ago, so robots get no new files: `{publish}`"
+        yield f"the published files expired {ago} ago, so robots get no new files: run `{publish}`"
     elif publication and publication.accepted is None:
-        yield f"the expiry of the published files is not known: `{publish}`"
+        yield f"the expiry of the published files is not known: run `{publish}`"
     if status.stage != "complete":
         behind, robots = len(status.unconfirmed), sum(bool(each.enclaves) for each in status.robots)
         every = "all " if robots > 1 else ""

@@ -434,7 +434,7 @@ def list_enclaves(
         echo(name)
     if hidden:
         echo(
-            f"{counted(len(hidden), 'enclave')} in a hidden folder, which DDS loads and sros "
+            f"DDS also loads {counted(len(hidden), 'enclave')} in a hidden folder, which sros "
             f"leaves out: {first_few(hidden, 5)}. `sros check {quote(str(root))}` says what to do.",
             err=True,
         )

@@ -583,7 +583,7 @@ def rotate_ca(
     if is_published and step.replaces_seals:
         cut_off += (
             ". A robot that fetches and does not trust the new permissions CA yet refuses all "
-            "later releases: "
+            "later releases: run "
             f"`sros distribute_key {quote(str(root))} --robot NAME FOLDER --force`, and bring "
             "FOLDER to the robot"
         )

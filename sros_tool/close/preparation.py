@@ -425,10 +425,10 @@ def _unknown_process_problems(robot: LocalRobot, state: CloseState) -> Iterator[
         enclaves = first_few(only_there, MOST_NAMES)
         options = " ".join(f"--elsewhere {name}" for name in only_there)
         yield (
-            f"sros knows no process of this machine for nodes of {enclaves}; if they run on "
-            f"another machine: {close} {options}; if you do not know one of them, it may be a "
-            f"stranger: remove its enclave from '{robot.policy}', and remove "
-            f"'{robot.requirements}', which sros then proposes again; otherwise {silent}"
+            f"sros knows no process of this machine for nodes of {enclaves}. If they run on "
+            f"another machine: {close} {options}. If you do not know one of the nodes, it may be "
+            f"a stranger's: remove its enclave from '{robot.policy}', and remove "
+            f"'{robot.requirements}', which sros then proposes again. Otherwise, {silent}"
         )
 
 

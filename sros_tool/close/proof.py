@@ -313,8 +313,8 @@ def _why_missing(running: RunningRobot, missing: Sequence[str], observed: Observ
     }
     enclaves = ", ".join(f"{name} ({causes[name]})" if name in causes else name for name in absent)
     reasons = [
-        f"no secured process of {enclaves}; start it as {robot.commands_file} says; "
-        f"if it ended: sros explain {shlex.quote(str(robot.export))} --log ITS_LOG"
+        f"no secured process of {enclaves} runs; start it as {robot.commands_file} says; if it "
+        f"ended, look at its log: sros explain {shlex.quote(str(robot.export))} --log ITS_LOG"
     ] * bool(absent)
     if may_end := [name for name in absent if name not in {*has_start, *robot.without}]:
         options = " ".join(f"--without {name}" for name in may_end)

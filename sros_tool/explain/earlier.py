@@ -93,10 +93,10 @@ def note_on_revoked_enclaves(
     root = quote(str(keystore.root))
     if removed:
         text = (
-            f"{first_few(sorted(removed), 3)}: removed from the keystore, and not revoked. Whoever "
-            f"kept the files may have the right, until {max(removed.values())}. To revoke them, "
-            f"create them again (`sros create_enclave {root} ENCLAVE`), and run `sros revoke "
-            f"{root} ENCLAVE`."
+            f"{first_few(sorted(removed), 3)} {'were' if len(removed) > 1 else 'was'} removed from "
+            "the keystore, and not revoked. Whoever kept the files may have the right, until "
+            f"{max(removed.values())}. To revoke an enclave, create it again (`sros create_enclave "
+            f"{root} ENCLAVE`), and run `sros revoke {root} ENCLAVE`."
         )
         yield Note("explain.removed-enclaves", text)
     if vendor:

@@ -520,7 +520,7 @@ class KnownKeys:
                 yield Note(
                     "keystore.key-twice",
                     f"{name} has the same key as {', '.join(shared[name])}: each enclave can "
-                    "act as the others. Renew it with a new key.",
+                    f"act as the others. Renew {name} with a new key.",
                 )
 
     def _other_enclaves(self, key: PublicKey, name: str) -> list[str]:

@@ -399,11 +399,11 @@ def _zenoh_rights(path: Path, document: ConfigurationDocument) -> RightsSource:
     if unclear := access.unclear_reason():
         notes.append(Note("rights.zenoh-conditions", f"{path}: {unclear}."))
     if document.namespace:
-        text = f"{path}: it puts a namespace before the keys, which this answer ignores."
+        text = f"{path}: it puts a namespace before the keys; this answer ignores the namespace."
         notes.append(Note("rights.zenoh-namespace", text))
     if rules.left_out:
-        text = f"{path}: {len(rules.left_out)} key expressions are no ROS names, and left out, "
-        text += f"such as {rules.left_out[0][:80]}."
+        text = f"{path}: {len(rules.left_out)} key expressions are no ROS names, such as "
+        text += f"{rules.left_out[0][:80]}; this answer leaves them out."
         notes.append(Note("rights.zenoh-no-name", text))
     return RightsSource(
         path,
@@ -556,7 +556,7 @@ def _left_out_notes(grants: Iterable[Grant]) -> Iterator[Note]:
         if any(c.partitions for r in grant.rules for c in (*r.publish, *r.subscribe)):
             yield Note("rights.partitions", "this answer ignores its partitions.")
         if len({rule.domains for rule in grant.rules}) > 1:
-            text = "its rules are for different domains, which this answer ignores."
+            text = "its rules are for different domains; this answer ignores the domains."
             yield Note("rights.domains", text)
         kinds = [rule.allow for rule in grant.rules]
         if False in kinds[kinds.index(True) if True in kinds else len(kinds) :]:

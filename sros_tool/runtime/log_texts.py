@@ -129,7 +129,8 @@ _MAKE_READABLE_FOR_USER = (
 )
 _NO_FOLDER = "rcl does not find the enclave's folder {path}"
 _WHY_NO_FOLDER = (
-    "ROS_SECURITY_KEYSTORE or the enclave's name is wrong, or the user of the node cannot enter it"
+    "ROS_SECURITY_KEYSTORE or the enclave's name is wrong, or the user of the node cannot enter "
+    "the folder"
 )
 _SHOW_MODES = "`namei -l {path}` shows who may enter."
 LET_ENTER_EXPORT = (

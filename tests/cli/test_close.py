@@ -499,10 +499,10 @@ def test_what_systemd_does_not_start_is_done_by_hand(
     ended = robot.close("--apply", status=1)
     assert robot.restarts == []
     assert "stop process 4711, and start it with:\n  cd /opt && sros run " in ended.out
-    assert ended.err.endswith("next: these commands, and then sros close robot --proof\n")
+    assert ended.err.endswith("next: run these commands, and then sros close robot --proof\n")
     assert (
         "no: every process was started in its enclave: no secured process of /listener (stop "
-        "process 4712, which is open), /talker (stop process 4711, which is open); "
+        "process 4712, which is open), /talker (stop process 4711, which is open) runs; "
     ) in robot.close("--proof", status=1).out
     for root in ("robot/keystore", "robot/export"):
         denied = sros("explain", root, "/talker", "publish", "/x", cwd=robot.folder).out
@@ -686,7 +686,7 @@ def test_a_node_that_does_not_run_always(robot: Robot) -> None:
     robot.by_hand, robot.absent, robot.remaining = {"/talker"}, {"/listener"}, (TALKER,)
     ended = robot.close("--proof", status=1)
     assert (
-        "no: every process was started in its enclave: no secured process of /listener; st"
+        "no: every process was started in its enclave: no secured process of /listener runs; st"
         in ended.out
     )
     assert "if it does not always run, add --without /listener\n" in ended.out
@@ -975,7 +975,7 @@ def test_processes_that_show_no_id_are_to_be_named(robot: Robot) -> None:
     )
     said = robot.close(status=1).out
     assert "; watch again while they run, or name its node in the command of each process" in said
-    assert "for nodes of /left, /right; if they run on another machine" in said
+    assert "for nodes of /left, /right. If they run on another machine" in said
     assert "from 'robot/policy.xml', and remove 'robot/requirements.toml', which sros then" in said
 
 

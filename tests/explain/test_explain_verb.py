@@ -842,7 +842,7 @@ def test_an_enclave_that_was_removed_without_a_revocation(vendor: str, keystore:
     sros("zenoh", keystore).ok()
     assert "removed-enclaves" not in sros(*asked).ok().err
     shutil.rmtree(keystore / f"enclaves{ENCLAVE}")
-    note = f"note [explain.removed-enclaves]: {ENCLAVE}: removed from the keystore, and not revok"
+    note = f"note [explain.removed-enclaves]: {ENCLAVE} was removed from the keystore, and not "
     assert note in sros(*asked).err
     assert "removed-enclaves" not in sros(*asked, "--at", "2090-01-01").err
     sros("create_enclave", keystore, ENCLAVE).ok()

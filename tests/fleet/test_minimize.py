@@ -51,7 +51,7 @@ def test_what_one_robot_used_stays_for_all(folder: Path) -> None:
         "/{robot}/base was never observed for r2: rights that only these robots use are removed"
         in ended.err
     )
-    assert "observed, but not in the policy: /stranger." in ended.err
+    assert "observed, but the policy lacks them: /stranger." in ended.err
     wanted = POLICY.replace("<topic>{namespace}/unused</topic>", "")
     wanted = wanted.replace("<topic>{namespaces}/never</topic>", "")
     wide = "<topic>{namespace}/wide/%s</topic>"

@@ -541,7 +541,8 @@ def test_a_robot_that_missed_a_stage_gets_its_files_by_hand(field: Field) -> Non
     assert to_do() == "wait: it fetches"
     said = field.run("rotate_ca", "ks", "--next", "--allow-unconfirmed").err
     assert (
-        "refuses all later releases: `sros distribute_key ks --robot NAME FOLDER --force`" in said
+        "refuses all later releases: run `sros distribute_key ks --robot NAME FOLDER --force`"
+        in said
     )
     assert to_do() == "wait: it fetches", "the published release is that of the earlier stage"
     field.run("fleet", "publish", "ks", "pub")

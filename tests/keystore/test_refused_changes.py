@@ -343,4 +343,4 @@ def test_a_dry_run_says_what_it_did_not_keep(
     with Transaction(root, dry_run=True) as transaction:
         _break_governance(transaction, other)
         (note,) = refuse_stopping(transaction, now())
-        assert note.text.startswith("enclaves/governance.p7s not checked against vendors: ")
+        assert note.text.startswith("sros did not check enclaves/governance.p7s against the ")

@@ -203,7 +203,7 @@ DOMAINS = FindingKind(
     "enclave.permissions-domains",
     WARNING,
     "permissions and governance for different domains",
-    "In a domain that only one of them names, no node of the enclave can communicate.",
+    "In a domain that only one of the two documents names, no node of the enclave can communicate.",
     "DDS-Security 1.1, 9.4.1.2 and 9.4.1.3; tested.",
     "Sign both for the same domains: `sros create_permission` uses the domains of the governance, "
     "or the robot's domain in the fleet file.",

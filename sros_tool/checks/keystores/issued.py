@@ -157,7 +157,7 @@ UNKNOWN_AUTHORITY = FindingKind(
     "identity CA can make any enclave; whoever has the key of a permissions CA can give any "
     "rights.",
     "Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; sros: ledger.jsonl has the CAs.",
-    "Find out who added it, and restore the file from a backup.",
+    "Find out who added the CA, and restore the file from a backup.",
 )
 REVOKED_BY_NEWER_LIST = FindingKind(
     "keystore.enclave-revoked",

@@ -56,7 +56,7 @@ PEERS_REVOKED = FindingKind(
     "it, on either side.",
     "RFC 5280, 5; rmw_dds_common (crl.pem); Fast DDS 2.6 to 3.6; tested.",
     "If an enclave is meant to be revoked, remove its files. If not, export it again from its "
-    "keystore, which may have a new certificate already. If it has none: `sros "
+    "keystore, which may have a new certificate already. If the keystore has none, run `sros "
     "generate_artifacts -k KEYSTORE -e ENCLAVE -p POLICY_FILE`, and export the enclave again.",
 )
 PEERS_ACCEPT = FindingKind(
@@ -88,7 +88,7 @@ PEERS_PROTECTION = FindingKind(
     "Both ends of a connection have to protect messages in the same way. Where they differ, nodes "
     "do not hear each other, and Fast DDS does not log why.",
     "DDS-Security 1.1, 9.4.1.2; Fast DDS 2.9.1 and 2.14.5, Cyclone DDS 0.10.2; tested.",
-    "If one of them is an earlier export, export its enclaves again, and restart the processes. "
+    "If one of the two is an earlier export, export its enclaves again, and restart the processes. "
     "Otherwise give both keystores the same protection (`sros inspect` shows it, `sros "
     "update_keystore --set` and `--rule` change it), and export the enclaves again.",
 )

@@ -456,7 +456,7 @@ def _check_authorities(keystore: OpenedKeystore, role: str, path: Path, data: by
         raise KeystoreError(
             f"'{path}' has a CA that the keystore does not know (SHA-256 {strangers[0][:8]})",
             "Robots would trust everything that is issued with its key.",
-            f"Find out who added it: `sros check {quote(str(keystore.root))}`.",
+            f"Find out who added the CA: `sros check {quote(str(keystore.root))}` says what to do.",
         )
 
 

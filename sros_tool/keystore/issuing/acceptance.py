@@ -161,7 +161,8 @@ def refuse_stopping(
         notes.append(Note("keystore.revoked-put-back", text))
     if unseen := transaction.files_not_kept():
         text = (
-            f"{_names_text(unseen)} not checked against vendors: this dry run makes too many files"
+            f"sros did not check {_names_text(unseen)} against the vendors, because this dry run "
+            "makes too many files"
         )
         notes.append(Note("vendor.not-asked", text))
     return tuple(notes)

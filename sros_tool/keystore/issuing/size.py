@@ -200,15 +200,15 @@ def _robot_notes(unobserved: Mapping[str, Sequence[str]]) -> Iterator[Note]:
 def _scope_notes(policy: Policy, result: MinimizedPolicy, observed: Set[Right]) -> Iterator[Note]:
     unseen = [use.enclave for use in result.uses if not use.observed_at_all]
     if unseen:
-        text = f"enclaves never observed, and therefore not changed: {', '.join(unseen)}."
+        text = f"these enclaves were never observed, so they do not change: {', '.join(unseen)}."
         yield Note("minimize.enclave-never-observed", text)
     unknown = sorted(
         {right.enclave for right in observed} - {enclave.path for enclave in policy.enclaves}
     )
     if unknown:
         text = (
-            f"enclaves observed, but not in the policy: {', '.join(unknown)}. If the policy has "
-            "their nodes in another enclave, write its path in the observed file."
+            f"these enclaves were observed, but the policy lacks them: {', '.join(unknown)}. If "
+            "the policy has their nodes in another enclave, write its path in the observed file."
         )
         yield Note("minimize.enclave-not-in-policy", text)
 
