@@ -941,9 +941,9 @@ class _Examiner:
             if likely := self._policy.likely_namespace(asked[0]) if self._policy and asked else "":
                 other = [f"in the namespace {likely}, the policy allows it"]
                 better = (
-                    f"Perhaps the robot has the policy in {likely} (`--namespace {quote(likely)}` of "
-                    "`sros merge_policy`): then rcl's line `Found security directory` in the whole "
-                    f"log names an enclave in {likely}. Otherwise, {finding.remedy}"
+                    f"Perhaps the robot has the policy in {likely} (`--namespace {quote(likely)}` "
+                    "of `sros merge_policy`). If so, rcl's line `Found security directory` in the "
+                    f"whole log names an enclave in {likely}. Otherwise, {finding.remedy}"
                 )
             facts = [answer.decision.text, *other]
             remedy = better or finding.remedy
