@@ -104,10 +104,10 @@ def audit(
     """Report what policies or a keystore would deny to the nodes that are running now.
 
     Nothing is denied: DDS has no permissive mode, so sros observes the ROS graph and decides about
-    every endpoint as the DDS vendor would. A node is looked up in the enclave that the graph shows,
-    or else in the enclave whose profiles name it. By default, sros observes until the graph stops
-    changing; --watch also sees endpoints that nodes create later. Several policies count as one.
-    The default is the keystore of $ROS_SECURITY_KEYSTORE.
+    every endpoint as the DDS vendor would. sros looks a node up in the enclave that the graph
+    shows, or else in the enclave whose profiles name the node. By default, sros observes until the
+    graph stops changing; --watch also sees endpoints that nodes create later. Several policies
+    count as one. The default is the keystore of $ROS_SECURITY_KEYSTORE.
 
     Example:
       $ sros audit robot.xml

@@ -294,9 +294,9 @@ def _collect(
     """Collect the messages of robots, keep their confirmations, and sign requests for renewal.
 
     INBOX is a folder with ROBOT/confirmation.p7s of each robot that runs `sros agent`. sros reads
-    only the messages of robots in the fleet of KEYSTORE. It accepts the message of a robot if an
+    only the messages of robots in the fleet of KEYSTORE. sros accepts the message of a robot if an
     enclave of that robot signed it, with a certificate that this keystore issued and did not
-    revoke. The message must be later than the robot's last message. It signs requests for renewal
+    revoke. The message must be later than the robot's last message. sros signs requests for renewal
     if the fleet file has renewal = "allowed" for the robot; rights do not change. A refused message
     does not stop the others.
 
@@ -634,18 +634,18 @@ def _status(
     A robot should have the files that an export from KEYSTORE would give it now. A file is current;
     earlier (issued for this enclave before); foreign (issued for another enclave); revoked;
     missing; or unknown (never issued by this keystore). Processes use new files only after a
-    restart. Confirmations by the Ansible collection and `sros agent` say which restarts are due,
-    those by `sros fleet report` only if it saw all processes, or with --restarted. A robot without
-    a recent confirmation is offline. Robots with the same state share a line. A robot that reports
-    a release which was never published is shown even if its files are current. The first line also
-    counts the robots whose DDS has known vulnerabilities that a later release of the same major
-    version fixes, by the advisories of sros; --advisories FILE lists them, and so does --robot NAME
-    with --fail-on vulnerabilities.
+    restart. Confirmations by the Ansible collection and `sros agent` say which restarts are due.
+    Confirmations by `sros fleet report` say this only if it saw all processes, or with --restarted.
+    A robot without a recent confirmation is offline. Robots with the same state share a line. A
+    robot that reports a release which was never published is shown even if its files are current.
+    The first line also counts the robots whose DDS has known vulnerabilities that a later release
+    of the same major version fixes, by the advisories of sros; --advisories FILE lists them, and so
+    does --robot NAME with --fail-on vulnerabilities.
 
     The revocation list is in force on a robot if the robot has the list, or an earlier list that
     revokes the same certificates, and confirms that no process has to restart for it. `sros agent`
     and `sros fleet report` confirm for each process whether the process lacks the list. In other
-    confirmations, every restart that is due counts as one for the list.
+    confirmations, every restart that is due counts as a restart for the list.
 
     Example:
       $ sros fleet status keystore

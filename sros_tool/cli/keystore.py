@@ -124,7 +124,7 @@ def create_permission(
 
     Anyone who has a copy of the replaced permissions, and of the certificate and key used with
     them, can use them until they expire. With --revoke-old, processes that load the new crl.pem
-    refuse them.
+    refuse these copies.
 
     Example:
       $ sros create_permission keystore /talker_listener/talker policy.xml

@@ -95,7 +95,7 @@ def renew(
     before those files expire, or all together if some have expired.
 
     Anyone who has a copy of a replaced certificate and its permissions can use them until they
-    expire.  With --revoke-old, processes that load the new crl.pem refuse them: restart the
+    expire. With --revoke-old, processes that load the new crl.pem refuse these copies: restart the
     renewed processes first, then all others.
 
     With --key, ENCLAVE... get new keys on a token, and their key.pem files are removed.
@@ -231,8 +231,8 @@ def revoke(
     to their robots again: they need the new crl.pem and, during a CA rotation, the CA files.
 
     During a rotation both CAs revoke, because Fast DDS trusts both. If the key of the old CA is
-    gone, its certificates are refused only after `sros rotate_ca --to retire`; --until-retired
-    accepts this delay.
+    gone, the certificates of that CA are refused only after `sros rotate_ca --to retire`;
+    --until-retired accepts this delay.
 
     Example:
       $ sros revoke keystore /talker --reason key_compromise

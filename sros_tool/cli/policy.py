@@ -518,7 +518,8 @@ def minimize_policy(
     With --fleet, all robots keep the rights that some robots used in the same enclave, and sizes
     are those of the robot with the longest name.
 
-    The exit status is 0, also if rights are removed; `sros diff_policy POLICY FILE` is then 1.
+    The exit status is 0, also if rights are removed; `sros diff_policy POLICY FILE` then exits with
+    1.
 
     Example:
       $ sros minimize_policy robot.xml --observed learned.xml -o narrow.xml

@@ -515,8 +515,8 @@ def units(
     """Write systemd units to FOLDER: nodes in ENCLAVE..., and timers (--job).
 
     A node runs in its enclave or not at all, sees the keys of no other enclave, and gets no
-    privilege of the system that a ROS node does not need. COMMAND is its program; the default is
-    the file in /etc/sros/nodes that has the path of the enclave.
+    privilege of the system that a ROS node does not need. COMMAND is the node's program; the
+    default is the file in /etc/sros/nodes that has the path of the enclave.
 
     Examples:
       $ sros units keystore /talker units -- /opt/robot/talker.sh
