@@ -282,7 +282,7 @@ def _link_findings(document: ConfigurationDocument) -> Iterator[Finding]:
             allowed = document.protocols is None or endpoint.protocol in document.protocols
             if not allowed:
                 text = (
-                    f"{kind} has {endpoint.text}, and the protocols are {_protocols_text(document)}"
+                    f"{kind} has {endpoint.text}, but the protocols are {_protocols_text(document)}"
                 )
                 yield _finding_at(document, ENDPOINT_REFUSED, f"{kind}/endpoints", text)
             elif not endpoint.is_encrypted():

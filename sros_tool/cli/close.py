@@ -216,20 +216,21 @@ def _show(robot: LocalRobot, closed: CloseState) -> None:
         bring = f"sros distribute_key {shlex.quote(str(robot.keystore))} ENCLAVE FOLDER"
         echo(f"not on this machine: {', '.join(not_here)} (to bring an enclave there: {bring})")
     if outside := robot.processes.enclaves_outside(policy):
-        echo(f"seen when sros watched, and not in the policy: {', '.join(outside)}")
+        echo(f"the policy lacks enclaves that sros saw when it watched: {', '.join(outside)}")
     for right in closed.newly_denied[:_MOST_DENIED]:
-        echo(f"used when sros watched, and denied now: {right}")
+        echo(f"the policy now denies a right that the robot used when sros watched: {right}")
     if more := closed.newly_denied[_MOST_DENIED:]:
         echo(f"  and {counted(len(more), 'right')} more (--json has all)")
     if closed.newly_denied:
         echo(
             "  if this is a mistake, change the policy; otherwise, expect that the node may end "
-            "when "
-            "it starts"
+            "when it starts"
         )
     if stays := len(closed.denied) - len(closed.newly_denied):
         rights = counted(stays, "right")
-        echo(f"{rights} used when sros watched: denied as before (--json has all)")
+        echo(
+            f"the policy still denies {rights} that the robot used when sros watched (--json: all)"
+        )
 
 
 def _process_line(process: ClosedProcess, closed: CloseState, policy: Policy) -> str:

@@ -473,7 +473,7 @@ def expression_problem(text: str) -> str:
     """
     chunks = text.split("/")
     if "" in chunks:
-        return "it begins or ends with '/', or has two of them"
+        return "it begins or ends with '/', or has two '/' in a row"
     if "#" in text or "?" in text:
         return "'#' and '?' are not allowed in a key"
     for chunk in chunks:

@@ -278,7 +278,9 @@ def check_files(keystore: CheckedKeystore, names: Sequence[str] | None = None) -
 def _hidden_enclave_findings(keystore: CheckedKeystore) -> Iterator[Finding]:
     for name in hidden_enclaves(keystore.root):
         folder = str(keystore.opened.folder(name))
-        yield HIDDEN_ENCLAVE.found(name, "its folder or one above it begins with a dot", folder)
+        yield HIDDEN_ENCLAVE.found(
+            name, "the name of its folder, or of a folder above it, begins with a dot", folder
+        )
 
 
 def _has_links(keystore: CheckedKeystore) -> bool:
