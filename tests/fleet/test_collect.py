@@ -1113,8 +1113,10 @@ def test_only_the_seal_of_a_later_release_keeps_a_keystore_from_publishing(
     backup = copy_of(home.root, home.folder / "backup")
     shutil.copytree(home.folder / "pub", home.folder / "pub of the backup")
     home.run("renew", "ks", "/r1/base")
+    home.run("crl", "ks", "--refresh")
     home.run(*publish)
     number = read_published(OpenedKeystore(home.root)).robots["r1"].release.number
+    lost_list = (home.root / "enclaves/r1/base/crl.pem").read_text()
     releases = {release.number: release for release in releases_in(home.folder / "pub", 3)}
     seal = releases[number].seal.decode()
     for path in (home.root, home.folder / "pub"):
@@ -1128,6 +1130,9 @@ def test_only_the_seal_of_a_later_release_keeps_a_keystore_from_publishing(
         now += timedelta(minutes=1)
         assert not home.collect(now).notes
     home.run(*publish)
+    # A lost list explains no seal: whoever sends the list first would let the rights come back.
+    home.send("r3", now, crl=lost_list)
+    assert [note.id for note in home.collect(now).notes] == ["fleet.revocations-restored"]
     home.send("r2", DUE, seal=seal, requests=(home.request("r2"),))
     found = home.collect(DUE, dry_run=True), home.collect(DUE)
     for inbox in found:

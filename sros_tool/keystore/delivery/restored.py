@@ -56,6 +56,8 @@ from sros_tool.values import Words
 from sros_tool.wording import first_few
 
 _SHOWN = 5
+_WAITING = frozenset({LATER_RELEASE, PUBLISHING})
+"""The reasons of restores after which the keystore publishes only with ``--restored``."""
 
 
 class LaterChange(NamedTuple):
@@ -96,7 +98,7 @@ def marks_after_last_release(keystore: OpenedKeystore) -> list[str]:
 
 def is_waiting(keystore: OpenedKeystore) -> bool:
     """Return whether a restore is known that was not published with ``--restored`` yet."""
-    return bool({LATER_RELEASE, PUBLISHING}.intersection(marks_after_last_release(keystore)))
+    return not _WAITING.isdisjoint(marks_after_last_release(keystore))
 
 
 def refuse_while_waiting(keystore: OpenedKeystore, doing: str) -> None:
@@ -130,8 +132,10 @@ class LaterSeals:
     def __init__(self, keystore: OpenedKeystore) -> None:
         entries = keystore.ledger_file.with_values("what", (RESTORED, "release")).entries
         self._known = {entry.number for entry in entries if entry.what == "release"}
-        # A restore that is known already explains all lower numbers.
-        self._explained = max((e.number for e in entries if e.what == RESTORED), default=0)
+        # A restore that the keystore waits for, or published, explains all lower numbers; a restore
+        # that only a revocation list showed keeps the keystore from nothing.
+        marks = (e.number for e in entries if e.what == RESTORED and e.reason in _WAITING)
+        self._explained = max(marks, default=0)
         self._authorities = keystore.authority(PERMISSIONS)
 
     def is_later(self, seal: str | None) -> bool:
