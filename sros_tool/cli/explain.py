@@ -1077,6 +1077,9 @@ def _show_log(
     from sros_tool.explain.log import explain_log_of
 
     if len(other_arguments) > 1:
+        named = Path(other_arguments[0])
+        if not (keystore or policy or named.exists()):
+            raise UsageError(f"'{named}' does not exist", "", "Name a keystore, or a policy.")
         raise UsageError("--log takes at most a keystore and an enclave")
     text = read_log(log)
     explained = explain_log_of(log, text, keystore, "".join(other_arguments), asking, policy)

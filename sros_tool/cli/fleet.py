@@ -837,8 +837,9 @@ def _fleet_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
     yield from _list_facts(compared_fleet)
     yield from _expiry_facts(compared_fleet)
     if status.unassigned:
-        number = counted(status.unassigned, "enclave")
-        yield f"{number} belong to no robot, so no confirmation covers them"
+        whose = counted(status.unassigned, "enclave belongs", "enclaves belong")
+        covered = "it" if status.unassigned == 1 else "them"
+        yield f"{whose} to no robot, so no confirmation covers {covered}"
 
 
 def _list_facts(compared_fleet: ComparedFleet) -> Iterator[str]:

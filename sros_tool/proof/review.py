@@ -875,7 +875,8 @@ class _Review:
         if self.is_relative and not asked.namespaces:
             yield (
                 "requirements with names without '/' at the beginning were decided only in the "
-                f"namespace /{others} (--namespace)"
+                f"namespace /{others} (--namespace NS, if the reviewed policies have their nodes "
+                "in NS)"
             )
         if not self.base:
             yield "nothing is compared with an earlier commit, as the options say"
@@ -969,7 +970,9 @@ class _Review:
         growth = compare_access(before, after)
         dropped = growth.dropped_denials
         dropped += tuple(
-            DroppedDenial(moved.right, "", "") for moved in moving if moved.right.qualifier is DENY
+            DroppedDenial(moved.right, _example_elsewhere(moved), "")
+            for moved in moving
+            if moved.right.qualifier is DENY
         )
         # A fleet file states the namespace of each robot, so that the comparison has decided there.
         elsewhere = () if after.fleet else tuple(m for m in moving if m.right.qualifier is ALLOW)
@@ -1329,6 +1332,12 @@ def _fixed_or_moving_names(before: AccessSource, after: AccessSource) -> Iterato
         if elsewhere and not here:
             same = (denial for denial in denials if Rules([denial.right]).overlaps(placed.right))
             yield from islice(same, 1)
+
+
+def _example_elsewhere(placed: PlacedRight) -> str:
+    """Return a name in another namespace that a DENY no longer denies, if it became absolute."""
+    name = placed.right.name
+    return f"/any_namespace{name}" if placed.written.startswith("/") and "*" not in name else ""
 
 
 def _moved_rights(enclave: Enclave) -> Iterator[tuple[PlacedRight, Right]]:

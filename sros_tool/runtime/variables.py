@@ -69,6 +69,8 @@ def choose_enclave(environment: Mapping[str, str], enclave: str = "/") -> Securi
         if folder.is_dir():
             return SecurityChoice(folder, f"security directory: {folder}")
         why = f"The keystore {keystore} has no enclave {name}."
+        if not Path(keystore).exists():
+            why = f"{KEYSTORE} is {keystore}, which does not exist."
     else:
         why = f"{KEYSTORE} is not set."
     if enforce:

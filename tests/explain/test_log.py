@@ -1003,6 +1003,8 @@ def test_a_log_is_explained_by_a_policy_alone(tmp_path: Path) -> None:
     assert "now has no fault" not in said
     assert sros("explain", "--policy", policy, "/a", "--log", log).out == said
     assert "unable to find enclave /b" in sros("explain", policy, "/b", "--log", log).err
+    absent = sros("explain", tmp_path / "none", "/a", "--log", log)
+    assert (absent.status, "none' does not exist" in absent.err) == (2, True), absent
 
 
 @pytest.mark.parametrize("named", [(), ("/a",), ("/left/a",)])

@@ -268,6 +268,10 @@ def test_changed_rights_are_named_and_decided_over_all_policies(change: Change) 
         "  ~ /c DENY publish topic /stop has no / at its beginning, so that it moves" in ended.out
     )
     assert ended.status == 1 and "! /c DENY publish topic /stop is gone" in ended.out
+    change.base = change.commit({"second.xml": policy_text({"/c": denies.format("stop")})})
+    change.commit({"second.xml": policy_text({"/c": denies.format("/stop")})})
+    gone = "/c DENY publish topic /stop is gone for names such as /any_namespace/stop: other"
+    assert gone in change.review("--policy", "robot.xml\nsecond.xml").out
     # A relative wildcard covers the absolute name only where the policy itself has its nodes.
     change.base = change.commit({"second.xml": policy_text({"/c": reads.replace(">x<", ">*/x<")})})
     both = reads.replace(">x<", ">*/x</topic><topic>/arm/x<")

@@ -59,6 +59,9 @@ def test_a_missing_enclave(
     else:
         with pytest.raises(SrosError):
             choose_enclave(environment)
+    environment["ROS_SECURITY_KEYSTORE"] = "/no/keystore"
+    if starts:
+        assert "KEYSTORE is /no/keystore, which does not" in choose_enclave(environment).note
 
 
 @pytest.mark.parametrize(("strategy", "starts"), [("Enforce", False), ("Permissive", True)])
