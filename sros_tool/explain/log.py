@@ -1012,7 +1012,7 @@ class _Examiner:
         add, renamed = f", add `--ros-args -r {quote(str(rule))}`.", ""
         if question.type == "action" and not is_used:
             add = f": {renamed_action_text(rule)}"
-            renamed = f"If the node's command renames the action{add} "
+            renamed = f" If the node's command renames the action{add}"
         if names:
             is_meant = f"{' and '.join(names)}: perhaps that is meant"
             return [f"the enclave may {question.word} {is_meant}"], (
@@ -1025,9 +1025,10 @@ class _Examiner:
             return [f"no enclave of the {place} may {PEER_RIGHT[denied.right]} {name}"], (
                 "If another name is meant, the node perhaps lacks a remapping: compare its command "
                 "with the one that the robot starts (after `sros close`: start/commands.txt). "
-                f"{renamed}Otherwise, {remedy}"
+                f"Otherwise, {remedy}{renamed}"
             )
-        return [], f"{renamed}Otherwise, {remedy}" if renamed else ""
+        newer = "Perhaps the node is newer than its policy: "
+        return [], f"{newer}{remedy}{renamed}" if renamed else ""
 
     def _how_to_ask(self, denial: Denial, name: str) -> str:
         """Return the commands that show which rights a policy lacks for a denied topic."""

@@ -1028,6 +1028,19 @@ def test_a_log_of_a_robot_that_has_the_policy_in_a_namespace(
     )
 
 
+def test_a_node_that_is_newer_than_its_policy(tmp_path: Path) -> None:
+    """A name unlike all others is seldom a renamed one, so that this is said last."""
+    policy, log = tmp_path / "p.xml", tmp_path / "robot.log"
+    policy.write_text(
+        policy_text({"/a": '<actions execute="ALLOW"><action>/grasp</action></actions>'})
+    )
+    denied = "[SECURITY Error] rq/calibrate/_action/send_goalRequest topic not found in allow rule"
+    log.write_text(f"{denied}. -> check_create_datareader\n")
+    said = sros("explain", policy, "/a", "--log", log).out
+    assert "remedy    Perhaps the node is newer than its policy: `sros explain" in said
+    assert "is missing in the policy. If the node's command renames the action: nodes" in said
+
+
 def test_a_log_without_the_namespace_that_its_names_show(tmp_path: Path) -> None:
     """Not a new name first: all instances would share it. Twin: a name that cannot move."""
     policy, log = tmp_path / "p.xml", tmp_path / "robot.log"
