@@ -929,9 +929,9 @@ def check_requirements(
     from sros_tool.names import check_plain_namespace
     from sros_tool.policy.remapping import parse_remapping_of_names
     from sros_tool.proof.findings import (
-        remappings_unused,
+        left_out_robot_findings,
         requirement_findings,
-        robots_left_out,
+        unused_remapping_findings,
     )
     from sros_tool.proof.requirements import read_all_requirements
     from sros_tool.proof.system import WORLDS, load_system
@@ -957,8 +957,8 @@ def check_requirements(
     wanted = read_all_requirements(paths, system.fleet, places, rules)
     findings = [
         *requirement_findings(wanted, system),
-        *robots_left_out(system, places),
-        *remappings_unused(paths, system, places, rules),
+        *left_out_robot_findings(system, places),
+        *unused_remapping_findings(paths, system, places, rules),
     ]
     return tuple(
         finding for finding in findings if finding.severity > NOTE or finding.kind.prominent

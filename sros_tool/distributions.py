@@ -198,7 +198,7 @@ def sourced_distribution(environment_value: str | None) -> Distribution | None:
     return find_distribution(environment_value) if environment_value in DISTRIBUTIONS else None
 
 
-def unknown_distribution(environment: Mapping[str, str]) -> list[Note]:
+def unknown_distribution_notes(environment: Mapping[str, str]) -> list[Note]:
     """Return a note if $ROS_DISTRO names an unknown distribution, and so selects no vendor."""
     name = environment.get(ROS_DISTRO, "")
     if not name or not distribution_problem(name):

@@ -88,7 +88,7 @@ def loadable_environment(
         KeystoreError: the enclave does not exist, a process cannot run in it, or other users can
             read its private key.
     """
-    from sros_tool.distributions import unknown_distribution
+    from sros_tool.distributions import unknown_distribution_notes
     from sros_tool.keystore.known_keys import other_enclave
     from sros_tool.keystore.layout import (
         KEY_FILE,
@@ -170,7 +170,7 @@ def loadable_environment(
         variables |= REFUSING_ZENOH
     if rmw:
         variables[RMW] = rmw
-    notes = () if target else tuple(unknown_distribution(environment))
+    notes = () if target else tuple(unknown_distribution_notes(environment))
     if state.certificate and (other := other_enclave(keystore, name, state.certificate)):
         text = (
             f"a process in enclave {name} has the rights of {other}: the files of {name} are those "

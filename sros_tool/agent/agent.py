@@ -24,7 +24,7 @@ from urllib.parse import quote, urlsplit
 from cryptography import x509
 from cryptography.hazmat.primitives.serialization import Encoding
 
-from sros_tool.agent.connection import REFUSALS, GuardedConnection, ended_tls
+from sros_tool.agent.connection import REFUSALS, GuardedConnection, is_tls_ended_by_server
 from sros_tool.agent.fetch import ClientCertificate, FetchError, FetchProblem, fetch_release
 from sros_tool.agent.install import Installation, install_release, present_lists, release_time
 from sros_tool.agent.running import (
@@ -111,7 +111,7 @@ _REPLACED_LIST = "replaced.crl.pem"
 _KEEP_REPLACED_LIST = timedelta(days=30)
 """How long the agent sends a revocation list after a release replaced it by a shorter one.
 """
-_REPORT_REPAIRS = timedelta(days=1)
+_REPAIRS_REPORTED_FOR = timedelta(days=1)
 """How long the agent reports that it replaced files which differed from the release."""
 _BRING_KEY = (
     " A release has no keys: bring the key with `sros distribute_key KEYSTORE --robot {} DIR "
@@ -219,14 +219,16 @@ class _Round:
         # Verified documents prove that ``before.latest`` has passed, whatever the clock shows.
         certain = max(now, before.latest) if before.latest else now
         readable_keys = exposed_keys(self._folder, now)
-        recent = {key: at for key, at in before.exposed.items() if abs(now - at) < _REPORT_REPAIRS}
+        recent = {
+            key: at for key, at in before.exposed.items() if abs(now - at) < _REPAIRS_REPORTED_FOR
+        }
         # Remembered now, because installing closes the keys of changed enclaves to others.
         exposed = recent | dict.fromkeys(readable_keys, now)
         self._state = replace(self._state, exposed=exposed)
         installation, fetched = self._fetch_and_install(certain)
         self._note_unreleased_enclaves()
         repaired = self._state.repaired_at
-        if repaired and abs(now - repaired) < _REPORT_REPAIRS:
+        if repaired and abs(now - repaired) < _REPAIRS_REPORTED_FOR:
             self._problems.append(self._state.repaired)
         self._note_removed(now)
         names = self._enclaves()
@@ -462,7 +464,9 @@ class _Round:
     def _note_removed(self, now: datetime) -> None:
         """Report for a day the enclaves that were removed because the release lacks them."""
         recent = {
-            name: at for name, at in self._state.removed.items() if abs(now - at) < _REPORT_REPAIRS
+            name: at
+            for name, at in self._state.removed.items()
+            if abs(now - at) < _REPAIRS_REPORTED_FOR
         }
         self._state = replace(self._state, removed=recent)
         if recent:
@@ -1053,7 +1057,7 @@ def send(
             if connection.is_cut_off:  # the answer may be incomplete
                 raise TimeoutError(errno.ETIMEDOUT, "it takes too long")
     except (OSError, http.client.HTTPException, ValueError) as error:
-        kind = RefusedError if ended_tls(error) else UnavailableError
+        kind = RefusedError if is_tls_ended_by_server(error) else UnavailableError
         raise kind(failure, f"{error}.", ("The agent tries again at its next run.")) from error
     if not 200 <= reply.status < 300:
         kind = RefusedError if reply.status in REFUSALS else UnavailableError

@@ -18,7 +18,7 @@ REFUSALS = frozenset({400, 401, 495, 496})
 """Status with which web servers answer to a client whose certificate they refuse (nginx: 400)."""
 
 
-def ended_tls(error: BaseException | None) -> bool:
+def is_tls_ended_by_server(error: BaseException | None) -> bool:
     """Return whether an error says that the server ended TLS, perhaps to refuse the certificate.
 
     With TLS 1.3 this may be an alert, or only the end of the connection.

@@ -15,7 +15,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from sros_tool.agent.connection import REFUSALS, ended_tls
+from sros_tool.agent.connection import REFUSALS, is_tls_ended_by_server
 from sros_tool.errors import SrosError, UsageError
 from sros_tool.files import remove_file, replace_file
 from sros_tool.fleet.robots import name_problem
@@ -335,7 +335,7 @@ def _fetch_error(error: Exception, source: str, now: datetime) -> FetchError:
             FetchProblem.TOO_LARGE, f"{source} sends more than is allowed", why, "Nothing was kept."
         )
     status = error.status_code if isinstance(error, exceptions.DownloadHTTPError) else 0
-    if status in REFUSALS or ended_tls(error.__cause__):
+    if status in REFUSALS or is_tls_ended_by_server(error.__cause__):
         return FetchError(
             FetchProblem.REFUSED,
             f"{source} refuses this robot",

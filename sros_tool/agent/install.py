@@ -162,7 +162,7 @@ def install_release(
             except (SrosError, OSError) as error:
                 kept[name] = _error_clause(error)
         changes = {name: change for name, change in changes.items() if change}
-        ran = [name for name in changes if name in enclaves and _had_certificate(opened, name)]
+        ran = [name for name in changes if name in enclaves and _has_certificate(opened, name)]
     if changes:
         before(ran)
         failed = _apply_changes(folder, changes)
@@ -230,7 +230,7 @@ def _check_release(
             "changed: find out who can write to the publishing folder.",
         )
     with Folder(folder) as opened:
-        usable = [name for name in present if _had_certificate(opened, name)]
+        usable = [name for name in present if _has_certificate(opened, name)]
     if usable and not {*usable} & release.enclaves().keys():
         raise KeystoreError(
             f"the release of robot {robot} has none of the enclaves that this robot has",
@@ -485,7 +485,7 @@ def _revocation_list_change(
         path, sent = f"{place}/{CRL_FILE}", files.get(CRL_FILE, b"")
         newest = newest_list(sent, authorities)
         expiry = next_update(newest) if newest is not None else None
-        fits = same_cas and _had_certificate(folder, name) and _read_file(folder, path) != sent
+        fits = same_cas and _has_certificate(folder, name) and _read_file(folder, path) != sent
         valid = (
             newest is not None and last_update(newest) <= now and (expiry is None or now < expiry)
         )
@@ -510,11 +510,11 @@ def _waits_for_answer(folder: Folder, name: str) -> bool:
     """Return whether an enclave waits for the first answer to its signing request."""
     with suppress(SrosError, OSError):
         place = enclave_folder(name)
-        return bool(folder.state(f"{place}/{REQUEST}")) and not _had_certificate(folder, name)
+        return bool(folder.state(f"{place}/{REQUEST}")) and not _has_certificate(folder, name)
     return False
 
 
-def _had_certificate(folder: Folder, name: str) -> bool:
+def _has_certificate(folder: Folder, name: str) -> bool:
     """Return whether an enclave has a certificate; without one, no process can run in it."""
     with suppress(SrosError, OSError):
         return folder.state(f"{enclave_folder(name)}/{CERTIFICATE_FILE}") is not None

@@ -50,12 +50,12 @@ from sros_tool.zenoh.document import (
 )
 from sros_tool.zenoh.releases import version_text, why_too_old
 
-_RCL = "rcl 9 (rcl/src/rcl/security.c); tested with ROS 2 Jazzy."
-_NAME_IT = (
+_RCL_SOURCE = "rcl 9 (rcl/src/rcl/security.c); tested with ROS 2 Jazzy."
+_NAME_ENCLAVE_REMEDY = (
     "Start each process with `sros run KEYSTORE ENCLAVE -- COMMAND...`, or set its enclave in the "
     "launch file."
 )
-_ENV = '`eval "$(sros env KEYSTORE ENCLAVE)"` sets all variables.'
+_ENV_REMEDY = '`eval "$(sros env KEYSTORE ENCLAVE)"` sets all variables.'
 
 ENABLE_MISSPELT = FindingKind(
     "runtime.enable-misspelt",
@@ -63,16 +63,16 @@ ENABLE_MISSPELT = FindingKind(
     "ROS_SECURITY_ENABLE is neither true nor false",
     "Only the exact value `true` enables security. With any other value every node runs "
     "unsecured, and does not report it.",
-    _RCL,
-    f"Write ROS_SECURITY_ENABLE=true. {_ENV}",
+    _RCL_SOURCE,
+    f"Write ROS_SECURITY_ENABLE=true. {_ENV_REMEDY}",
 )
 NOT_ENABLED = FindingKind(
     "runtime.not-enabled",
     WARNING,
     "security is configured but not enabled",
     "Without ROS_SECURITY_ENABLE=true every node runs unsecured, whatever the other variables are.",
-    _RCL,
-    f"Write ROS_SECURITY_ENABLE=true, or unset the other variables. {_ENV}",
+    _RCL_SOURCE,
+    f"Write ROS_SECURITY_ENABLE=true, or unset the other variables. {_ENV_REMEDY}",
 )
 MISSPELT = FindingKind(
     "runtime.variable-misspelt",
@@ -80,7 +80,7 @@ MISSPELT = FindingKind(
     "a misspelled or obsolete variable, which ROS 2 ignores",
     "The name looks like a misspelled or old name of a variable that rcl reads. rcl ignores it "
     "without a message.",
-    _RCL,
+    _RCL_SOURCE,
     "Correct the name.",
 )
 STRATEGY_MISSPELT = FindingKind(
@@ -89,8 +89,8 @@ STRATEGY_MISSPELT = FindingKind(
     "ROS_SECURITY_STRATEGY is neither Enforce nor Permissive",
     "Only the exact value `Enforce` enforces security. With any other value a node whose enclave "
     "is missing runs unsecured.",
-    _RCL,
-    f"Write ROS_SECURITY_STRATEGY=Enforce. {_ENV}",
+    _RCL_SOURCE,
+    f"Write ROS_SECURITY_STRATEGY=Enforce. {_ENV_REMEDY}",
 )
 NOT_ENFORCED = FindingKind(
     "runtime.not-enforced",
@@ -98,8 +98,8 @@ NOT_ENFORCED = FindingKind(
     "security is enabled but not enforced",
     "A node runs unsecured if its enclave or one of its files is missing, even if it logs that it "
     "found a security directory.",
-    _RCL,
-    f"Write ROS_SECURITY_STRATEGY=Enforce. {_ENV}",
+    _RCL_SOURCE,
+    f"Write ROS_SECURITY_STRATEGY=Enforce. {_ENV_REMEDY}",
 )
 KEYSTORE_UNSET = FindingKind(
     "runtime.keystore-unset",
@@ -107,16 +107,16 @@ KEYSTORE_UNSET = FindingKind(
     "security is enabled, but ROS_SECURITY_KEYSTORE is not set",
     'With Enforce no node starts (rcl says "error not set"); without Enforce every node runs '
     "unsecured.",
-    _RCL,
-    f"Set ROS_SECURITY_KEYSTORE. {_ENV}",
+    _RCL_SOURCE,
+    f"Set ROS_SECURITY_KEYSTORE. {_ENV_REMEDY}",
 )
 KEYSTORE_NOT_FOUND = FindingKind(
     "runtime.keystore-not-found",
     ERROR,
     "ROS_SECURITY_KEYSTORE is not a keystore",
     "With Enforce no node starts; without Enforce every node runs unsecured.",
-    _RCL,
-    f"Correct the path. {_ENV}",
+    _RCL_SOURCE,
+    f"Correct the path. {_ENV_REMEDY}",
 )
 KEYSTORE_RELATIVE = FindingKind(
     "runtime.keystore-relative",
@@ -124,8 +124,8 @@ KEYSTORE_RELATIVE = FindingKind(
     "ROS_SECURITY_KEYSTORE is a relative path",
     "Each process resolves the path in its working directory, so a service, for instance, looks "
     "in another folder.",
-    _RCL,
-    f"Write the absolute path. {_ENV}",
+    _RCL_SOURCE,
+    f"Write the absolute path. {_ENV_REMEDY}",
 )
 OTHER_DISTRIBUTION = FindingKind(
     "runtime.other-distribution",
@@ -144,7 +144,7 @@ ENCLAVE_NOT_FOUND = FindingKind(
     "the enclave is not in the keystore",
     "With Enforce the node does not start; without Enforce it runs unsecured. Names are "
     "case-sensitive.",
-    _RCL,
+    _RCL_SOURCE,
     "Correct the name, or create the enclave with `sros create_enclave KEYSTORE ENCLAVE`.",
 )
 NO_ENCLAVE = FindingKind(
@@ -153,8 +153,8 @@ NO_ENCLAVE = FindingKind(
     "ROS_SECURITY_ENCLAVE_OVERRIDE is not set",
     "A process without `--ros-args --enclave ENCLAVE` uses the enclave /, which the keystore does "
     "not have, so the process does not start.",
-    _RCL,
-    _NAME_IT,
+    _RCL_SOURCE,
+    _NAME_ENCLAVE_REMEDY,
 )
 UNSECURED_WITHOUT_ENCLAVE = FindingKind(
     "runtime.unsecured-without-enclave",
@@ -163,8 +163,8 @@ UNSECURED_WITHOUT_ENCLAVE = FindingKind(
     "A process without `--ros-args --enclave ENCLAVE` uses the enclave /, which the keystore does "
     "not have. The process runs UNSECURED, because ROS_SECURITY_STRATEGY is not exactly "
     "`Enforce`.",
-    _RCL,
-    f"Write ROS_SECURITY_STRATEGY=Enforce. {_NAME_IT}",
+    _RCL_SOURCE,
+    f"Write ROS_SECURITY_STRATEGY=Enforce. {_NAME_ENCLAVE_REMEDY}",
 )
 DOMAIN_MALFORMED = FindingKind(
     "runtime.domain-malformed",
@@ -194,16 +194,16 @@ CA_KEY_HERE = FindingKind(
     "keystore elsewhere.",
 )
 
-_READ = (
+_VARIABLES_READ = (
     ENABLE, STRATEGY, KEYSTORE, ENCLAVE, DOMAIN, "RMW_IMPLEMENTATION", "ROS_SECURITY_LOG_FILE",
     "ROS_SECURITY_LOG_VERBOSITY", "ROS_SECURITY_LOG_PUBLISH",
 )  # fmt: skip
-_OLD = {
+_OBSOLETE_VARIABLES = {
     "ROS_SECURITY_ROOT_DIRECTORY": KEYSTORE,
     "ROS_SECURITY_NODE_DIRECTORY": ENCLAVE,
     "ROS_SECURITY_LOOKUP_TYPE": ENCLAVE,
 }
-_CLOSE = 0.88
+_LEAST_SIMILARITY = 0.88
 
 
 def variable_findings(
@@ -260,10 +260,12 @@ def _spelling_findings(environment: Mapping[str, str]) -> Iterator[Finding]:
     if strategy not in (None, "", "Enforce", "Permissive"):
         yield STRATEGY_MISSPELT.found(STRATEGY, value_text(environment, STRATEGY))
     for name in sorted(environment):
-        if name in _READ or not name.upper().startswith(("ROS", "RMW")):
+        if name in _VARIABLES_READ or not name.upper().startswith(("ROS", "RMW")):
             continue
-        close = difflib.get_close_matches(name.upper(), _READ, n=1, cutoff=_CLOSE)
-        known_name = _OLD.get(name) or (close[0] if close else "")
+        close = difflib.get_close_matches(
+            name.upper(), _VARIABLES_READ, n=1, cutoff=_LEAST_SIMILARITY
+        )
+        known_name = _OBSOLETE_VARIABLES.get(name) or (close[0] if close else "")
         if known_name:
             yield MISSPELT.found(name, f"{name} is set; ROS 2 reads {known_name}")
 
@@ -331,7 +333,7 @@ def value_text(environment: Mapping[str, str], name: str) -> str:
     return f"{name} is not set" if value is None else f"{name} is {value!r}"
 
 
-_SOURCE = "rmw_zenoh_cpp (zenoh_config.cpp); Zenoh 1.10.2, tested."
+_ZENOH_SOURCE = "rmw_zenoh_cpp (zenoh_config.cpp); Zenoh 1.10.2, tested."
 OWN_CONFIGURATION = (
     "`sros zenoh KEYSTORE` writes the configuration of each enclave, where the CA keys are; `sros "
     "env KEYSTORE ENCLAVE` and `sros run KEYSTORE ENCLAVE -- COMMAND...` set the variables of an "
@@ -344,7 +346,7 @@ NO_SESSION_FILE = FindingKind(
     "rmw_zenoh runs open although security is enabled",
     "rmw_zenoh reads no ROS_SECURITY_* variable and no file of an enclave. Without a session file, "
     "every node uses the default of rmw_zenoh_cpp: no TLS, no access control.",
-    _SOURCE,
+    _ZENOH_SOURCE,
     f"Set ZENOH_SESSION_CONFIG_URI to the session.json5 of the enclave. {OWN_CONFIGURATION}",
 )
 FILE_NOT_FOUND = FindingKind(
@@ -352,7 +354,7 @@ FILE_NOT_FOUND = FindingKind(
     ERROR,
     "a variable of rmw_zenoh names no file that Zenoh can read",
     "No node starts; with ZENOH_ROUTER_CONFIG_URI, no router starts.",
-    _SOURCE,
+    _ZENOH_SOURCE,
     f"Correct the path. {OWN_CONFIGURATION}",
 )
 UNREAD = FindingKind(
@@ -361,7 +363,7 @@ UNREAD = FindingKind(
     "a Zenoh configuration that sros cannot read",
     "Zenoh reads forms that sros does not: YAML, TOML, lists in place of objects, pipes, more than "
     "16 MiB. So sros does not know whether the configuration enforces anything.",
-    _SOURCE,
+    _ZENOH_SOURCE,
     f"Write it as JSON5 objects into a file. {OWN_CONFIGURATION}",
 )
 TOO_OLD = FindingKind(
@@ -379,7 +381,7 @@ OVERRIDDEN = FindingKind(
     "ZENOH_CONFIG_OVERRIDE changes what a Zenoh configuration protects",
     "Zenoh applies it after the file, in nodes and in the router, so it can switch off access "
     "control, TLS and everything else that the file states.",
-    _SOURCE,
+    _ZENOH_SOURCE,
     f"Leave only the paths of certificates and keys in it. {OWN_CONFIGURATION}",
 )
 NO_CERTIFICATE = FindingKind(
@@ -397,11 +399,11 @@ PROCESS_OPEN = FindingKind(
     "The process runs without a session file, or with one that has no access control: whoever "
     "connects to the process, or impersonates its router, can read everything from it and send it "
     "anything.",
-    _SOURCE,
+    _ZENOH_SOURCE,
     f"Stop it, and start it again. {OWN_CONFIGURATION}",
 )
 
-_NEEDED = {
+_NEEDED_TLS_FILES = {
     "listen": ("listen_private_key", "listen_certificate"),
     "connect": ("connect_private_key", "connect_certificate"),
 }
@@ -421,9 +423,9 @@ def secured_by(environment: Mapping[str, str], folder: Path) -> Iterator[str]:
         yield from _security_in_configuration(
             _CYCLONE_SECURITY, "CYCLONEDDS_URI", part.encode() if inline else path
         )
-    for name in (*_PROFILES, "FASTDDS_ENVIRONMENT_FILE"):
+    for name in (*_PROFILE_VARIABLES, "FASTDDS_ENVIRONMENT_FILE"):
         if text := environment.get(name, ""):
-            sought = _PROFILE_SECURITY if name in _PROFILES else _NAMES_PROFILES
+            sought = _PROFILE_SECURITY if name in _PROFILE_VARIABLES else _NAMES_PROFILES
             yield from _security_in_configuration(sought, name, folder / text)
     for path in map(folder.joinpath, _DEFAULT_PROFILES):
         if path.exists():
@@ -468,7 +470,7 @@ _PROFILE_SECURITY = rb"dds\.sec\.|&#"
 """The properties that secure a participant of Fast DDS, or an escape that may hide them."""
 _NAMES_PROFILES = rb"_PROFILES_FILE|\\u"
 """Variables that name profiles, as text in a file of variables, or an escape that may hide them."""
-_PROFILES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
+_PROFILE_VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
 _DEFAULT_PROFILES = ("DEFAULT_FASTRTPS_PROFILES.xml", "DEFAULT_FASTDDS_PROFILES.xml")
 """The files that Fast DDS reads from its working directory (Fast DDS 2.14, ``XMLProfileManager``).
 Security properties in a default profile apply to every participant of rmw_fastrtps.
@@ -575,7 +577,7 @@ def _override_findings(
 
 def _certificate_file_findings(document: ConfigurationDocument, variable: str) -> Iterator[Finding]:
     missing: list[str] = []
-    for side, needed in _NEEDED.items():
+    for side, needed in _NEEDED_TLS_FILES.items():
         endpoints = document.listen if side == "listen" else document.connect
         if any(endpoint.is_encrypted() for endpoint in endpoints):
             wanted = needed if side == "listen" or document.tls.mutual else ()

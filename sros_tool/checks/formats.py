@@ -42,8 +42,8 @@ if TYPE_CHECKING:
     from sros_tool.keystore.expiry import Lifetime
     from sros_tool.prometheus import Metric
 
-_MOST = 20_000  # characters: a comment on GitHub has at most 65,536
-_SIGNS = {"error": "🔴", "warning": "🟠", "note": "🔵"}
+_MOST_CHARACTERS = 20_000  # characters: a comment on GitHub has at most 65,536
+_SEVERITY_SIGNS = {"error": "🔴", "warning": "🟠", "note": "🔵"}
 
 
 _Kinds = Mapping[str, tuple[Hashable, Hashable]]
@@ -142,7 +142,7 @@ def findings_markdown(chosen_findings: ChosenFindings, fleet: Fleet | None = Non
     shown_by = "which `sros check` shows"
     groups = folded_findings(group_by_cause(chosen_findings.shown), fleet)
     items = (_markdown_item(group, others) for group, others in groups)
-    listed = bounded_list(items, _MOST, shown_by)
+    listed = bounded_list(items, _MOST_CHARACTERS, shown_by)
     title = f"### Findings: {plain(chosen_findings.summary())}"
     return "\n\n".join(part for part in (title, listed) if part) + "\n"
 
@@ -158,7 +158,7 @@ def _cause_lines(findings: Sequence[Finding]) -> Iterator[str]:
     assert first.cause, "findings that are shown together have a cause"
     word, place = first.severity.word, first.cause.place or first.place
     ids = code(", ".join(dict.fromkeys(finding.id for finding in findings)))
-    yield f"{_SIGNS[word]} **{word}** {code(place)} {plain(first.cause.title)} ({ids})"
+    yield f"{_SEVERITY_SIGNS[word]} **{word}** {code(place)} {plain(first.cause.title)} ({ids})"
     yield code(first.cause.text)
     yield code(first.cause.remedy)
 
@@ -166,7 +166,7 @@ def _cause_lines(findings: Sequence[Finding]) -> Iterator[str]:
 def _finding_lines(finding: Finding) -> Iterator[str]:
     word = finding.severity.word
     title = f"{plain(finding.kind.title)} ({code(finding.id)})"
-    yield f"{_SIGNS[word]} **{word}** {code(finding.place)} {title}"
+    yield f"{_SEVERITY_SIGNS[word]} **{word}** {code(finding.place)} {title}"
     subject = "" if finding.subject in (finding.file, finding.place) else f"{finding.subject}: "
     by = f" (accepted by the {finding.accepted})" if finding.accepted else ""
     yield code(f"{subject}{finding.text}{by}")
@@ -174,9 +174,9 @@ def _finding_lines(finding: Finding) -> Iterator[str]:
     yield code(finding.remedy)
 
 
-_VERSION = "2.1.0"
-_SCHEMA = "https://json.schemastore.org/sarif-2.1.0.json"
-_BASE = "SRCROOT"
+_SARIF_VERSION = "2.1.0"
+_SARIF_SCHEMA = "https://json.schemastore.org/sarif-2.1.0.json"
+_BASE_URI_ID = "SRCROOT"
 
 
 def sarif(
@@ -197,10 +197,10 @@ def sarif(
     run = {
         "tool": {"driver": driver},
         "columnKind": "unicodeCodePoints",
-        "originalUriBaseIds": {_BASE: {"uri": f"{base.absolute().as_uri()}/"}},
+        "originalUriBaseIds": {_BASE_URI_ID: {"uri": f"{base.absolute().as_uri()}/"}},
         "results": [_sarif_result(finding, rules[finding.id], base) for finding in findings],
     }
-    return {"$schema": _SCHEMA, "version": _VERSION, "runs": [run]}
+    return {"$schema": _SARIF_SCHEMA, "version": _SARIF_VERSION, "runs": [run]}
 
 
 def _sarif_rule(kind: FindingKind) -> dict[str, Any]:
@@ -239,7 +239,7 @@ def _sarif_result(finding: Finding, rule: int, base: Path) -> dict[str, Any]:
     return result
 
 
-_ANNOTATIONS = {"error": "error", "warning": "warning", "note": "notice"}
+_ANNOTATION_LEVELS = {"error": "error", "warning": "warning", "note": "notice"}
 
 
 def github_annotations(findings: Iterable[Finding]) -> str:
@@ -252,7 +252,7 @@ def github_annotations(findings: Iterable[Finding]) -> str:
 
     lines = []
     for finding in sorted(findings, key=lambda finding: -finding.severity.weight):
-        kind = _ANNOTATIONS[finding.severity.word]
+        kind = _ANNOTATION_LEVELS[finding.severity.word]
         place = f"file={_escaped(finding.file, ':,')},line={finding.line or 1}"
         message = _escaped(f"{finding.subject}: {finding.text}. {finding.remedy}")
         lines.append(f"::{kind} {place},title={finding.id}::{message}\n")
@@ -270,7 +270,7 @@ def _sarif_location(file: str, line: int | None, base: Path) -> dict[str, Any]:
         "physicalLocation": {
             "artifactLocation": {
                 "uri": quote(os.fsencode(_relative(file, base))),
-                "uriBaseId": _BASE,
+                "uriBaseId": _BASE_URI_ID,
             },
             "region": {"startLine": line or 1},
         }
@@ -296,7 +296,7 @@ def _relative(file: str, base: Path) -> str:
     return "/".join(("..",) * ups + path.relative_to(common).parts)
 
 
-_KINDS = "certificate, permissions, governance, crl, identity_ca or permissions_ca"
+_FILE_KINDS_TEXT = "certificate, permissions, governance, crl, identity_ca or permissions_ca"
 
 
 class Expiry(NamedTuple):
@@ -360,8 +360,8 @@ def keystore_metrics(
         ),
         Metric(
             "sros_earliest_expiry_timestamp_seconds",
-            f"The first expiry of all files of a kind ({_KINDS}), in seconds since 1970, without "
-            "short-lived enclaves, which a person renews when they are needed.",
+            f"The first expiry of all files of a kind ({_FILE_KINDS_TEXT}), in seconds since 1970, "
+            "without short-lived enclaves, which a person renews when they are needed.",
             tuple(
                 Sample(_timestamp(moment), {**place, "kind": kind})
                 for kind, moment in earliest.items()
@@ -369,7 +369,7 @@ def keystore_metrics(
         ),
         Metric(
             "sros_expiry_timestamp_seconds",
-            f"The expiry of a file by its kind ({_KINDS}), in seconds since 1970; "
+            f"The expiry of a file by its kind ({_FILE_KINDS_TEXT}), in seconds since 1970; "
             "without enclave for a file that all share.",
             tuple(
                 Sample(

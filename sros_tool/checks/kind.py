@@ -292,7 +292,7 @@ class FindingFilter:
         included = not self.include or any(_matches(kind, pattern) for pattern in self.include)
         if self.vendors and kind.vendors and not {*self.vendors} & {*kind.vendors}:
             return False
-        if len(self.vendors) == 1 and kind.id == _DIFFERENCES:
+        if len(self.vendors) == 1 and kind.id == _DIFFERENCES_ID:
             return False
         return included and not any(_matches(kind, pattern) for pattern in self.exclude)
 
@@ -425,7 +425,7 @@ def select_kinds(selection: FindingFilter) -> Sequence[FindingKind]:
     return [kind for kind in all_kinds().values() if selection.wants(kind)]
 
 
-_DIFFERENCES = "portable.vendors-differ"
+_DIFFERENCES_ID = "portable.vendors-differ"
 """Id of the kind of finding about differences between vendors, which has no single vendor."""
 
 

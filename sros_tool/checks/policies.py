@@ -267,18 +267,18 @@ NODE_MISSPELT = FindingKind(
     "Write the name that the node has when it runs.",
 )
 
-_LONGEST = 247
+_LONGEST_NAME = 247
 _DIGIT_FIRST = re.compile(r"/(?:[0-9]|\[[0-9-]+\])")
 _DDS_PREFIX = re.compile(r"/?(?:rt|rq|rr|rs)/")
-_ALL = re.compile(r"/?[*?]*\*[*?]*\Z")
-_SETTING = ("set_parameters", "set_parameters_atomically")
-_ASKING_SIDE = {offering: asking for asking, offering in OFFERING_RIGHT.items()}
+_EVERY_NAME = re.compile(r"/?[*?]*\*[*?]*\Z")
+_SETTING_SERVICES = ("set_parameters", "set_parameters_atomically")
+_ASKING_RIGHT = {offering: asking for asking, offering in OFFERING_RIGHT.items()}
 
 
 def _check_names(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
     """Yield findings about single names."""
     for statement in checked_policy.statements:
-        if reason := _impossible_because(statement.name):
+        if reason := _why_impossible(statement.name):
             yield statement.found(NEVER_MATCHES, f"{statement.name} matches nothing: {reason}")
         if _DDS_PREFIX.match(statement.written):
             yield statement.found(
@@ -311,7 +311,7 @@ def _check_counterparts(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
     alone = [
         statement
         for statement in checked_policy.statements
-        if (other := _ASKING_SIDE.get(statement.right.right)) and is_alone(statement, other)
+        if (other := _ASKING_RIGHT.get(statement.right.right)) and is_alone(statement, other)
     ]
     yield from _offered_by_others_findings(alone)
     offered: dict[str, list[_Statement]] = defaultdict(list)
@@ -403,7 +403,7 @@ def _offered_by_others_findings(unused_statements: Iterable[_Statement]) -> Iter
     for statement in unused_statements:
         owner = owners.get((statement.right.right, statement.name))
         if owner and not statement.is_private and statement.right.enclave != owner.right.enclave:
-            asking = _ASKING_SIDE[statement.right.right]
+            asking = _ASKING_RIGHT[statement.right.right]
             place = RelatedPlace(f"{owner.right.enclave} offers it", *_source_place(owner.source))
             text = (
                 f"{statement.right.describe()} is under the name of a node in {owner.right.enclave}"
@@ -479,7 +479,7 @@ def _check_node_names(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
 def _check_protection(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
     """Yield findings about names with contradicting protect= values."""
     for protection, other in islice(
-        contradictions(stated_protections(checked_policy.policy.enclaves)), _MANY
+        contradictions(stated_protections(checked_policy.policy.enclaves)), _MOST_FILES
     ):
         text = (
             f"{other} has protect={other.word}, "
@@ -489,9 +489,9 @@ def _check_protection(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
         yield CONTRADICTING_PROTECTION.found(other.enclave, text, place.file, place.line)
 
 
-def _impossible_because(name: str) -> str:
-    if len(name) > _LONGEST and not is_expression(name):
-        return f"it has {len(name)} characters; a ROS name has at most {_LONGEST}"
+def _why_impossible(name: str) -> str:
+    if len(name) > _LONGEST_NAME and not is_expression(name):
+        return f"it has {len(name)} characters; a ROS name has at most {_LONGEST_NAME}"
     return "a part of it begins with a digit" if _DIGIT_FIRST.search(name) else ""
 
 
@@ -513,7 +513,7 @@ def _broad_right_findings(statement: _Statement) -> Iterator[Finding]:
     if not is_expression(name):
         return
     text = statement.right.describe()
-    if _ALL.match(name):
+    if _EVERY_NAME.match(name):
         kind = READS_EVERYTHING if right == "subscribe" else EVERYTHING
         yield statement.found(kind, f"{text} matches every name")
     elif literal_prefix(name).count("/") < 2 and is_expression(name.rpartition("/")[2]):
@@ -522,17 +522,17 @@ def _broad_right_findings(statement: _Statement) -> Iterator[Finding]:
             kind,
             f"{text} has a wildcard in the first part and in the last part of the name",
         )
-    elif right == "request" and any(covers(name, f"/*/{service}") for service in _SETTING):
+    elif right == "request" and any(covers(name, f"/*/{service}") for service in _SETTING_SERVICES):
         yield statement.found(SETS_PARAMETERS, f"{text} matches every node")
 
 
-_INCLUDE = (
+_INCLUDE_ELEMENT = (
     '<xi:include xmlns:xi="http://www.w3.org/2001/XInclude" href="common/node.xml" '
     'xpointer="xpointer(/profile/*)"/>'
 )
 _INCLUDE_HINT = (
-    f"{_INCLUDE} allows what every node needs; `sros policies --copy common` writes that file, "
-    "in the folder of the policy."
+    f"{_INCLUDE_ELEMENT} allows what every node needs; `sros policies --copy common` writes that "
+    "file, in the folder of the policy."
 )
 
 NO_TYPE_DESCRIPTION = FindingKind(
@@ -602,8 +602,8 @@ OTHER_NODES_PARAMETERS = FindingKind(
     "rcl_interfaces; rclcpp and rclpy (parameter services of a node).",
     "Remove the right. If the node runs in this enclave, add a profile for the node.",
 )
-_GLOBAL = ("rosout", "parameter_events", "clock")
-_BASICS = (
+_GLOBAL_TOPIC_NAMES = ("rosout", "parameter_events", "clock")
+_NODE_BASICS = (
     (NO_TYPE_DESCRIPTION, "reply", ("~/get_type_description",)),
     (NO_ROSOUT, "publish", ("/rosout",)),
     (NO_PARAMETER_EVENTS, "publish", ("/parameter_events",)),
@@ -618,7 +618,7 @@ _START_ACTIONS = {
 """Kind of finding → action of a starting node that the policy denies."""
 _TF_LISTENER_PREFIX = "transform_listener_impl_"
 """Name prefix of the nodes of tf2_ros listeners, which have no parameter services."""
-_OF_LISTENERS = (NO_TYPE_DESCRIPTION, NO_ROSOUT)
+_KINDS_OF_LISTENERS = (NO_TYPE_DESCRIPTION, NO_ROSOUT)
 
 
 def _check_nodes(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
@@ -656,7 +656,7 @@ def _check_nodes(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
     yield from (gap.finding for gap in lacking)
     for statement in checked_policy.statements:
         if (
-            statement.written in _GLOBAL
+            statement.written in _GLOBAL_TOPIC_NAMES
             and statement.profile.ns != "/"
             and statement.right.kind == "topics"
         ):
@@ -713,11 +713,11 @@ def _check_parameters_of_others(checked_policy: _CheckedPolicy) -> Iterator[Find
                 text = (
                     f"may serve {name}, and so pose as the node {other} of {enclave_by_node[other]}"
                 )
-                remedy = _NAME_THEM.format("nodes" if is_of_parameters else "services")
+                remedy = _NAME_NODES_REMEDY.format("nodes" if is_of_parameters else "services")
                 yield statement.found(OTHER_NODES_PARAMETERS, text, remedy)
 
 
-_NAME_THEM = "Name the {} of this enclave in place of the wildcard."
+_NAME_NODES_REMEDY = "Name the {} of this enclave in place of the wildcard."
 
 
 @dataclass(slots=True)
@@ -761,7 +761,7 @@ def _is_not_shipped(folder: str) -> bool:
     return False
 
 
-def _denied_at_start(lacking: Sequence[_NodeLackingRight]) -> str:
+def _denied_start_actions_sentence(lacking: Sequence[_NodeLackingRight]) -> str:
     """Return a sentence on actions of each starting node that the policy denies."""
     nodes = list(dict.fromkeys(gap.node for gap in lacking))
     kinds = Counter(gap.finding.kind for gap in lacking)
@@ -781,7 +781,7 @@ def _different_common_part_cause(folder: str, lacking: Sequence[_NodeLackingRigh
     new, old = quote(folder), quote(f"{folder}.old")
     return Cause(
         f"the included '{folder}/node.xml' lacks rights that the file of this sros has",
-        _denied_at_start(lacking),
+        _denied_start_actions_sentence(lacking),
         f"'{folder}/node.xml' is included and differs from the file of this sros. Replace it: "
         f"`mv {new} {old} && sros policies --copy {new}`. Files and changes of your own are then "
         f"in {old} only: copy them back.",
@@ -803,25 +803,25 @@ def _missing_common_part_cause(lacking: Sequence[_NodeLackingRight]) -> Cause:
     if plural and len(lines) == len(nodes):  # sed edits only the first match in a line
         addresses = "".join(f"{line}ba;" for line in lines)
         # libxml2 gives a <profile> the line where its start tag ends; the tag may begin earlier.
-        edit = quote(f"{addresses}b;:a;s#(<profile |^)([^<>]*[^/<>])?>#&{_INCLUDE}#")
+        edit = quote(f"{addresses}b;:a;s#(<profile |^)([^<>]*[^/<>])?>#&{_INCLUDE_ELEMENT}#")
         put = f"put the line in this command into {place} ({at}): "
         remedy = f"{copy}{put}`sed -E -i {edit} {quote(str(file))}`"
     else:
-        remedy = f"{copy}put this line into {place} ({at}): {_INCLUDE}"
+        remedy = f"{copy}put this line into {place} ({at}): {_INCLUDE_ELEMENT}"
     remedy = f"{remedy[0].upper()}{remedy[1:]}"
     if any(_is_any_node(node) for node in nodes):
-        remedy = f"{_NAME_FIRST} {remedy}"
+        remedy = f"{_NAME_NODE_FIRST_REMEDY} {remedy}"
     return Cause(
         f"{counted(len(nodes), 'node')} lack the common part"
         if plural
         else "a node lacks the common part",
-        _denied_at_start(lacking),
+        _denied_start_actions_sentence(lacking),
         remedy,
         len(lacking),
     )
 
 
-_NAME_FIRST = (
+_NAME_NODE_FIRST_REMEDY = (
     "First write the name of the node in place of '*': with the line, a process could serve the "
     "parameters of every node."
 )
@@ -841,8 +841,8 @@ def _lacking_basics(
     node = expand("~", profile.ns, profile.node)
     listener = profile.node.startswith(_TF_LISTENER_PREFIX)
     lacks_others = False
-    for kind, right, names in _BASICS:
-        if listener and kind not in _OF_LISTENERS:
+    for kind, right, names in _NODE_BASICS:
+        if listener and kind not in _KINDS_OF_LISTENERS:
             continue
         if kind is NO_TYPE_DESCRIPTION and not has_type_descriptions(checked_policy.distribution):
             continue
@@ -856,7 +856,7 @@ def _lacking_basics(
             kind = NO_PARAMETERS
         lacks_others = True
         text = f"node {node} may not {right} {', '.join(missing)}"
-        remedy = f"{_NAME_FIRST} {kind.remedy}" if _is_any_node(node) else ""
+        remedy = f"{_NAME_NODE_FIRST_REMEDY} {kind.remedy}" if _is_any_node(node) else ""
         finding = kind.found(
             enclave.path, text, profile.source.file, profile.source.line, remedy=remedy
         )
@@ -936,10 +936,12 @@ SEVERAL_PROFILES = FindingKind(
     "Put all <profile> of an enclave into one <profiles>.",
 )
 
-_OUTSIDE = {kind.id: kind for kind in (DOCUMENT_SIZE, LONG_NAME, DENY_BLOCKS, CHARACTER_SET)}
+_PORTABILITY_KINDS = {
+    kind.id: kind for kind in (DOCUMENT_SIZE, LONG_NAME, DENY_BLOCKS, CHARACTER_SET)
+}
 _MEASURED_FROM_BYTES = MAX_SIGNED_BYTES // 2
 _ANY_TIME = Window(datetime(2026, 1, 1, tzinfo=UTC), datetime(2027, 1, 1, tzinfo=UTC))
-_DOMAINS = DomainSet.of((0, 0))
+_DOMAIN_0 = DomainSet.of((0, 0))
 
 
 ROOT_ENCLAVE = FindingKind(
@@ -1005,7 +1007,7 @@ def _check_portability(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
             enclave,
             subject=subject_text(common_name(enclave.path)),
             validity=_ANY_TIME,
-            domains=_DOMAINS,
+            domains=_DOMAIN_0,
         )
         size = _signed_bytes(enclave)
         for finding in portability_findings(
@@ -1042,7 +1044,7 @@ def portability_findings(
     for identity, fact in portability_problems(
         permissions, signed_bytes, lambda names: Names(names).overlaps
     ):
-        yield _OUTSIDE[identity].found(subject, fact, file, line)
+        yield _PORTABILITY_KINDS[identity].found(subject, fact, file, line)
 
 
 def _signed_bytes(enclave: Enclave) -> int:
@@ -1052,7 +1054,7 @@ def _signed_bytes(enclave: Enclave) -> int:
     return SizeEstimator().signed_bytes(enclave) if estimate > _MEASURED_FROM_BYTES else estimate
 
 
-_ORDER = (
+_RULE_ORDER_SOURCE = (
     "sros signs the deny rules of an enclave before its allow rules, as ros2/sros2 does, and the "
     "first rule that matches decides (DDS-Security 1.1, 9.4.1.3)."
 )
@@ -1062,7 +1064,7 @@ CONTRADICTION = FindingKind(
     WARNING,
     "the same name is allowed and denied",
     "The DENY wins, so the ALLOW has no effect; one of the two is a mistake.",
-    _ORDER,
+    _RULE_ORDER_SOURCE,
     "Remove the ALLOW or the DENY.",
 )
 UNREACHABLE = FindingKind(
@@ -1071,7 +1073,7 @@ UNREACHABLE = FindingKind(
     "an ALLOW that a DENY covers completely",
     "A DENY of the same enclave, perhaps of another node in it, covers every name of the rule, "
     "so the permission never allows anything.",
-    _ORDER,
+    _RULE_ORDER_SOURCE,
     "Remove the ALLOW, or narrow the DENY.",
 )
 NO_EFFECT = FindingKind(
@@ -1261,10 +1263,10 @@ _CHECKS = (
 )
 _CHECKS_TOGETHER = (_check_counterparts, _check_instances, _check_parameters_of_others)
 """Checks for which the policies of a robot count as one policy."""
-_PLACE = re.compile(r"(?P<file>.+?):(?P<line>\d+): (?P<text>.*)", re.DOTALL)
-_SYNTAX = re.compile(r", line (?P<line>\d+), column \d+")  # in messages of libxml2
-_INCLUDES = tuple(f"{{http://www.w3.org/{year}/XInclude}}include" for year in (2001, 2003))
-_MANY = 1000
+_PLACED_ERROR = re.compile(r"(?P<file>.+?):(?P<line>\d+): (?P<text>.*)", re.DOTALL)
+_XML_ERROR_PLACE = re.compile(r", line (?P<line>\d+), column \d+")  # in messages of libxml2
+_INCLUDE_TAGS = tuple(f"{{http://www.w3.org/{year}/XInclude}}include" for year in (2001, 2003))
+_MOST_FILES = 1000
 _NUMBER = re.compile(r"[0-9]+")
 
 
@@ -1283,15 +1285,15 @@ def findings_in(
     if len(checked) > 1:
         enclaves = tuple(enclave for policy in policies for enclave in policy.enclaves)
         checked = [_CheckedPolicy(replace(policies[0], enclaves=enclaves), distribution)]
-        yield from _enclaves_of_two_policies(enclaves)
+        yield from _duplicate_enclave_findings(enclaves)
     for checked_policy in checked:
         if not of_fleet:
-            yield from _nodes_in_two_enclaves(checked_policy.policy.enclaves)
+            yield from _node_in_two_enclaves_findings(checked_policy.policy.enclaves)
         for check in _CHECKS_TOGETHER:
             yield from check(checked_policy)
 
 
-def _enclaves_of_two_policies(enclaves: Iterable[Enclave]) -> Iterator[Finding]:
+def _duplicate_enclave_findings(enclaves: Iterable[Enclave]) -> Iterator[Finding]:
     """Yield a finding for each enclave that two policies state at different places."""
     stated: dict[str, Enclave] = {}
     for enclave in enclaves:
@@ -1301,7 +1303,7 @@ def _enclaves_of_two_policies(enclaves: Iterable[Enclave]) -> Iterator[Finding]:
             yield IN_TWO_FILES.found(enclave.path, text, enclave.source.file, enclave.source.line)
 
 
-def _nodes_in_two_enclaves(enclaves: Iterable[Enclave]) -> Iterator[Finding]:
+def _node_in_two_enclaves_findings(enclaves: Iterable[Enclave]) -> Iterator[Finding]:
     """Yield a finding for each node without wildcards in its name that several enclaves have."""
     by_node: dict[str, dict[str, Source]] = defaultdict(dict)
     for enclave in enclaves:
@@ -1361,7 +1363,7 @@ def policy_file_findings(
     if fleet and len(read) == len(paths) and (text := _robots_in_unknown_groups(groups, fleet)):
         yield UNKNOWN_GROUP.found(str(paths[0]), text, str(paths[0]))
     if fleet:
-        yield from _robots_that_are_written_out(read, fleet.with_enclaves(patterns))
+        yield from _written_out_robot_findings(read, fleet.with_enclaves(patterns))
     yield from findings_in(read, distribution, of_fleet=fleet is not None)
     if on_zenoh:
         yield from _check_zenoh(enclave for policy in read for enclave in policy.enclaves)
@@ -1442,7 +1444,7 @@ def _robots_in_unknown_groups(named: Collection[str], fleet: Fleet) -> str:
     return f"no enclave for the group of {first_few(clauses, 5)}" if clauses else ""
 
 
-def _robots_that_are_written_out(policies: Sequence[Policy], fleet: Fleet) -> Iterator[Finding]:
+def _written_out_robot_findings(policies: Sequence[Policy], fleet: Fleet) -> Iterator[Finding]:
     """Yield a finding for each enclave whose path has a robot's name in place of a placeholder."""
     from sros_tool.fleet.robots import robot_of
 
@@ -1484,7 +1486,7 @@ def _unreadable_policy_findings(path: Path, error: SrosError) -> Iterator[Findin
     if has_duplicates:
         return
     file, line, text = _split_place(error)
-    if not file and (syntax := _SYNTAX.search(error.why)):
+    if not file and (syntax := _XML_ERROR_PLACE.search(error.why)):
         line = int(syntax["line"])
     why = " ".join(part for part in (f"{text}.", error.why) if part)
     yield MALFORMED.found(str(path), why, file or str(path), line, error.remedy)
@@ -1492,7 +1494,7 @@ def _unreadable_policy_findings(path: Path, error: SrosError) -> Iterator[Findin
 
 def _split_place(error: SrosError) -> tuple[str, int, str]:
     """Return the file and line that an error begins with ("" and 0 if none), and its text."""
-    match = _PLACE.match(error.what)
+    match = _PLACED_ERROR.match(error.what)
     return (match["file"], int(match["line"]), match["text"]) if match else ("", 0, error.what)
 
 
@@ -1545,8 +1547,8 @@ class _IncludeGraph:
     def includes_by_parent(self) -> Iterator[list[tuple[etree._Element, Path]]]:
         """Yield lists of sibling include elements of the policy file, with the included files."""
         for parent in self._includer.load(self._file).iter():
-            includes = list(parent.iterchildren(*_INCLUDES))
-            if len(includes) <= _MANY:
+            includes = list(parent.iterchildren(*_INCLUDE_TAGS))
+            if len(includes) <= _MOST_FILES:
                 targets = ((element, self._target(self._file, element)) for element in includes)
                 yield [(element, file) for element, file in targets if file]
 
@@ -1555,7 +1557,7 @@ class _IncludeGraph:
         if file not in self._reached:
             paths: set[Path] = set()
             waiting = [file]
-            while waiting and len(paths) < _MANY:
+            while waiting and len(paths) < _MOST_FILES:
                 new = self._files_included_by(waiting.pop()) - paths
                 paths |= new
                 waiting += new
@@ -1565,7 +1567,7 @@ class _IncludeGraph:
     def _files_included_by(self, file: Path) -> frozenset[Path]:
         if file not in self._direct:
             try:
-                includes = list(self._includer.load(file).iter(*_INCLUDES))
+                includes = list(self._includer.load(file).iter(*_INCLUDE_TAGS))
             except DocumentError:
                 includes = []  # the file is in an unused fallback, or does not exist
             targets = (self._target(file, element) for element in includes)
@@ -1582,9 +1584,9 @@ class _IncludeGraph:
 # ── names that are nearly equal ────────────────────────────────────────────────────────────
 
 
-_PARTS = re.compile(r"([/_])")
+_NAME_SEPARATORS = re.compile(r"([/_])")
 _DIGITS = re.compile(r"\d+")
-_SHORTEST = 4  # letters of a part; shorter parts, as in /arm_l and /arm_r, differ on purpose
+_SHORTEST_PART = 4  # letters of a part; shorter parts, as in /arm_l and /arm_r, differ on purpose
 
 
 _MOST_SAME_ENDS = 8
@@ -1644,9 +1646,9 @@ def _name_ends(name: str) -> Iterator[str]:
 def _keys(name: str) -> Iterator[str]:
     """Yield index keys of a name; similar names have a key in common."""
     yield _without_separators(name)
-    parts = _PARTS.split(name)
+    parts = _NAME_SEPARATORS.split(name)
     for index, part in enumerate(parts):
-        if len(part) < _SHORTEST - 1:
+        if len(part) < _SHORTEST_PART - 1:
             continue
         before, after = "".join(parts[:index]), "".join(parts[index + 1 :])
         # The part without each of its letters, and at last the whole part.
@@ -1661,12 +1663,14 @@ def _without_separators(name: str) -> str:
 def _is_near(first_name: str, second_name: str) -> bool:
     if _without_separators(first_name) == _without_separators(second_name):
         return True
-    pairs = zip(_PARTS.split(first_name), _PARTS.split(second_name), strict=False)
+    pairs = zip(
+        _NAME_SEPARATORS.split(first_name), _NAME_SEPARATORS.split(second_name), strict=False
+    )
     different = [(a, b) for a, b in pairs if a != b]
     if len(different) != 1:
         return False
     a, b = sorted(different[0], key=len)
-    if len(b) < _SHORTEST or _DIGITS.sub("", a) == _DIGITS.sub("", b):
+    if len(b) < _SHORTEST_PART or _DIGITS.sub("", a) == _DIGITS.sub("", b):
         return False
     return _is_one_edit(a, b)
 

@@ -241,7 +241,7 @@ def newer_files(process: Process, enclave: ProcessEnclave) -> Iterator[str]:
     newer = [
         file.name
         for file in files
-        if file.changed and file.changed > process.started and file.name not in _KEYS
+        if file.changed and file.changed > process.started and file.name not in _KEY_FILES
     ]
     gone = [name for name in enclave.lacking if any(name == file.name for file in files)]
     yield from (_plain_path(file) for file in newer)
@@ -262,7 +262,7 @@ def may_lack_list(process: Process, enclave: ProcessEnclave, *, has_list: bool =
     return moved or not {*newer_files(process, enclave)} <= same_files
 
 
-_KEYS = (KEY_FILE, KEY_URI_FILE)
+_KEY_FILES = (KEY_FILE, KEY_URI_FILE)
 _OWN_FILES = {CERTIFICATE_FILE, PERMISSIONS_FILE, GOVERNANCE_FILE}
 
 
@@ -1000,11 +1000,11 @@ def _public_keys(certificates: Iterable[x509.Certificate]) -> _PublicKeys:
     keys = set()
     for certificate in certificates:
         with suppress(ValueError, UnsupportedAlgorithm):
-            keys.add(certificate.public_key().public_bytes(*_FORM))
+            keys.add(certificate.public_key().public_bytes(*_PUBLIC_KEY_FORM))
     return frozenset(keys)
 
 
-_FORM = (Encoding.DER, PublicFormat.SubjectPublicKeyInfo)
+_PUBLIC_KEY_FORM = (Encoding.DER, PublicFormat.SubjectPublicKeyInfo)
 
 
 def _different_security_findings(

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, FindingKind
 
-_ENGINE = "sros: its decision engine, with the rules of the DDS that each distribution ships."
-_DECIDE_ALIKE = (
+_ENGINE_SOURCE = (
+    "sros: its decision engine, with the rules of the DDS that each distribution ships."
+)
+_DECIDE_ALIKE_REMEDY = (
     "`sros explain KEYSTORE ENCLAVE ... --all-distros` shows the rule that decides for each "
     "distribution. Remove deny rules for names that no rule allows, and sign the rights in the "
     "form that sros writes: `sros create_permission KEYSTORE ENCLAVE POLICY_FILE`."
@@ -21,8 +23,8 @@ OPENS = FindingKind(
     "an access that is closed now and open after the update",
     "The same signed permissions let the enclave do more with the DDS of the other distribution. "
     "Nothing fails, so nobody notices.",
-    _ENGINE,
-    _DECIDE_ALIKE,
+    _ENGINE_SOURCE,
+    _DECIDE_ALIKE_REMEDY,
 )
 CLOSES = FindingKind(
     "upgrade.closes",
@@ -30,8 +32,8 @@ CLOSES = FindingKind(
     "an access that is open now and closed after the update",
     "The same signed permissions let the enclave do less with the DDS of the other distribution: "
     "its nodes fail when they create the endpoint, or their messages do not arrive.",
-    _ENGINE,
-    _DECIDE_ALIKE,
+    _ENGINE_SOURCE,
+    _DECIDE_ALIKE_REMEDY,
 )
 REFUSED = FindingKind(
     "upgrade.refused",
@@ -39,7 +41,7 @@ REFUSED = FindingKind(
     "an enclave that runs now and is refused after the update",
     "The DDS of the other distribution does not accept a file of the enclave, or its peers do not "
     "accept the enclave.",
-    _ENGINE,
+    _ENGINE_SOURCE,
     "Before the update, replace the refused files, which `sros check KEYSTORE --all-distros` "
     "names.",
 )
@@ -49,7 +51,7 @@ ACCEPTED = FindingKind(
     "an enclave that is refused now and runs after the update",
     "The DDS of the other distribution accepts a file that is refused now, such as expired "
     "permissions: the enclave can join again.",
-    _ENGINE,
+    _ENGINE_SOURCE,
     "If the enclave must stay out, revoke it with `sros revoke KEYSTORE ENCLAVE`. Otherwise "
     "replace the refused file, so that both distributions accept it.",
 )
@@ -99,7 +101,7 @@ NOT_MEASURED = FindingKind(
     "a release of a DDS that sros was not tested with",
     "sros decides by the rules of another release of this product, so it does not see differences "
     "between the two releases.",
-    _ENGINE,
+    _ENGINE_SOURCE,
     "Try the update on one robot, and look at its logs with `sros explain KEYSTORE --log FILE`.",
     prominent=True,
 )
@@ -109,15 +111,15 @@ DIFFER = FindingKind(
     "an access that is open on one distribution of the keystore and closed on another",
     "The settings of the keystore or its fleet name both distributions. The same signed "
     "permissions give an enclave more rights on one of them.",
-    _ENGINE,
-    _DECIDE_ALIKE,
+    _ENGINE_SOURCE,
+    _DECIDE_ALIKE_REMEDY,
 )
 DISTRIBUTION_REFUSES = FindingKind(
     "distribution.refused",
     ERROR,
     "an enclave that runs on one distribution of the keystore and not on another",
     "The settings of the keystore or its fleet name both distributions.",
-    _ENGINE,
+    _ENGINE_SOURCE,
     "Replace the refused file, or correct `distributions` in the settings of the keystore: `sros "
     "update_keystore KEYSTORE --set distributions=NAME,...`.",
 )

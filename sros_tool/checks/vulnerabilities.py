@@ -114,20 +114,23 @@ def robot_findings(
         if not dds.libraries:
             lacking.setdefault("none seen on {}", []).append(robot)
         if dds.unseen:
-            lacking.setdefault(_UNSEEN, []).append(robot)
+            lacking.setdefault(_UNSEEN_TEXT, []).append(robot)
     by = {
-        library: [f"{_SEEN[how]} {names(where[how])}" for how in Seen if how in where]
+        library: [f"{_SEEN_TEXTS[how]} {names(where[how])}" for how in Seen if how in where]
         for library, where in seen.items()
     }
     yield from _library_findings(by, advisories)
     if lacking:
         parts = (template.format(names(robots)) for template, robots in lacking.items())
-        remedy = _UNSEEN_REMEDY if lacking.keys() == {_UNSEEN} else ""
+        remedy = _UNSEEN_REMEDY if lacking.keys() == {_UNSEEN_TEXT} else ""
         yield ROBOTS_UNKNOWN.found("DDS of robots", "; ".join(parts), remedy=remedy)
 
 
-_UNSEEN = "some processes of {} could not be examined"
-_SEEN = {Seen.PROCESS: "loaded by processes of", Seen.INSTALLED: "installed, but not loaded, on"}
+_UNSEEN_TEXT = "some processes of {} could not be examined"
+_SEEN_TEXTS = {
+    Seen.PROCESS: "loaded by processes of",
+    Seen.INSTALLED: "installed, but not loaded, on",
+}
 
 
 def is_fixed_later(library: RobotLibrary, advisories: Sequence[Advisory] | None = None) -> bool:
@@ -166,7 +169,7 @@ def _library_findings(
             kind = KNOWN_VULNERABILITIES
             if library.packaged:
                 kind = PACKAGE_VULNERABILITIES
-            number = _counted_vulnerabilities(known.known, library.version)
+            number = _vulnerability_counts_clause(known.known, library.version)
             ids = f": {', '.join(advisory.id for advisory in known.known)}"
             if known.unclear:
                 ids += f". {_unclear_text(known.unclear)}"
@@ -227,7 +230,7 @@ def _users_by_library(
     return users
 
 
-def _counted_vulnerabilities(advisories: Sequence[Advisory], version: str) -> str:
+def _vulnerability_counts_clause(advisories: Sequence[Advisory], version: str) -> str:
     """Return a clause with numbers of vulnerabilities: in all, by precondition, and by fix."""
     secured = sum("security" in advisory.needs for advisory in advisories)
     needs = (

@@ -24,8 +24,8 @@ from sros_tool.zenoh.document import (
 )
 from sros_tool.zenoh.key_expressions import includes, intersects, widest_expression
 
-_TESTED = "Zenoh 1.10.2, tested."
-_BY_SROS = "Let `sros zenoh` write the files: rules for each enclave, by its name."
+_TESTED_SOURCE = "Zenoh 1.10.2, tested."
+_WRITE_BY_SROS_REMEDY = "Let `sros zenoh` write the files: rules for each enclave, by its name."
 
 MALFORMED = FindingKind(
     "zenoh.malformed",
@@ -59,8 +59,8 @@ ROUTER_WITHOUT_RULES = FindingKind(
     "a router without access control",
     "The router forwards everything between all connected processes: anyone with a certificate of "
     "the CA can publish, hear, call and serve everything.",
-    _TESTED,
-    _BY_SROS,
+    _TESTED_SOURCE,
+    _WRITE_BY_SROS_REMEDY,
 )
 SESSION_WITHOUT_RULES = FindingKind(
     "zenoh.session-without-rules",
@@ -69,8 +69,8 @@ SESSION_WITHOUT_RULES = FindingKind(
     "Anyone who impersonates the router, or in peer mode connects to the session directly, can "
     "read everything that the session publishes and send it anything. The rules of the real router "
     "do not apply.",
-    _TESTED,
-    _BY_SROS,
+    _TESTED_SOURCE,
+    _WRITE_BY_SROS_REMEDY,
 )
 DEFAULT_ALLOW = FindingKind(
     "zenoh.default-allow",
@@ -78,7 +78,7 @@ DEFAULT_ALLOW = FindingKind(
     "access control that allows what no rule denies",
     "A query or a put with a wildcard bypasses a deny rule, and if a process matches two subjects, "
     "a name is denied only if both subjects deny it.",
-    _TESTED,
+    _TESTED_SOURCE,
     'Write "default_permission": "deny", and rules that allow.',
 )
 NOTHING_ALLOWED = FindingKind(
@@ -87,8 +87,8 @@ NOTHING_ALLOWED = FindingKind(
     "access control under which no message passes",
     "The default is to deny, and no policy gives a subject a rule: sessions open, but Zenoh drops "
     "every message without a log line.",
-    _TESTED,
-    _BY_SROS,
+    _TESTED_SOURCE,
+    _WRITE_BY_SROS_REMEDY,
 )
 EVERYBODY = FindingKind(
     "zenoh.subject-of-everybody",
@@ -108,7 +108,7 @@ SELF_LIMITING = FindingKind(
     "process enforces them. Any other process with a certificate of the CA publishes to it, and "
     "reads from it.",
     "zenoh_security_tools writes such files; Zenoh 1.10.2, tested.",
-    _BY_SROS,
+    _WRITE_BY_SROS_REMEDY,
 )
 DENY_IN_WILDCARD = FindingKind(
     "zenoh.deny-in-wildcard",
@@ -152,7 +152,7 @@ PLAIN_ENDPOINT = FindingKind(
     "an endpoint without TLS",
     "Messages there are neither encrypted nor authenticated: everybody on the network can read "
     "them, and gets a connection without a certificate.",
-    _TESTED,
+    _TESTED_SOURCE,
     "Write tls/HOST:PORT.",
 )
 ENDPOINT_REFUSED = FindingKind(
@@ -160,7 +160,7 @@ ENDPOINT_REFUSED = FindingKind(
     ERROR,
     "an endpoint of a protocol that the configuration excludes",
     "Zenoh does not start if it has to listen at the endpoint, and never connects to it.",
-    _TESTED,
+    _TESTED_SOURCE,
     "Change the endpoint, or transport/link/protocols.",
 )
 PROTOCOLS_OPEN = FindingKind(
@@ -169,7 +169,7 @@ PROTOCOLS_OPEN = FindingKind(
     "protocols without encryption are not excluded",
     "Zenoh also uses an endpoint tcp/... that is added (for instance by ZENOH_CONFIG_OVERRIDE) or "
     "that another process names.",
-    _TESTED,
+    _TESTED_SOURCE,
     'Write "protocols": ["tls"] in transport/link.',
 )
 NO_MUTUAL_TLS = FindingKind(
@@ -177,7 +177,7 @@ NO_MUTUAL_TLS = FindingKind(
     ERROR,
     "a listener that asks for no certificate",
     "Everybody gets a connection without a certificate, so rules cannot require a name.",
-    _TESTED,
+    _TESTED_SOURCE,
     'Write "enable_mtls": true in transport/link/tls.',
 )
 NAME_NOT_VERIFIED = FindingKind(
@@ -196,7 +196,7 @@ EXPIRED_STAYS = FindingKind(
     WARNING,
     "a connection outlives its certificate",
     "A process keeps its connection after its certificate has expired, for as long as it runs.",
-    _TESTED,
+    _TESTED_SOURCE,
     'Write "close_link_on_expiration": true in transport/link/tls.',
 )
 SHARED_MEMORY = FindingKind(
@@ -205,7 +205,7 @@ SHARED_MEMORY = FindingKind(
     "shared memory between the processes of a host",
     "Messages of more than 3 KB lie there unencrypted, even with TLS, and stay there after both "
     "processes have ended.",
-    _TESTED,
+    _TESTED_SOURCE,
     'Write "enabled": false in transport/shared_memory; Zenoh\'s default is true.',
 )
 MULTICAST = FindingKind(
@@ -214,7 +214,7 @@ MULTICAST = FindingKind(
     "multicast scouting",
     "Everybody on the network learns, without a certificate, of each process and its endpoints, "
     "and can answer a session that looks for a router.",
-    _TESTED,
+    _TESTED_SOURCE,
     'Write "enabled": false in scouting/multicast; Zenoh\'s default is true.',
 )
 ADMIN_SPACE = FindingKind(
@@ -223,14 +223,14 @@ ADMIN_SPACE = FindingKind(
     "Zenoh's admin space",
     "Anyone who can read the admin space sees sessions, connections and the configuration; anyone "
     "who can write to it can change them.",
-    _TESTED,
+    _TESTED_SOURCE,
     'Write "enabled": false in adminspace.',
 )
 
 _LINK, _TLS, _ACCESS = "transport/link", "transport/link/tls", "access_control"
 _WILDCARD_MESSAGES = frozenset(Message) - {Message.REPLY, Message.LIVELINESS_TOKEN}
 """The messages that can name a key with wildcards."""
-_FEW = 3
+_MOST_SHOWN = 3
 _MOST_PAIRS = 1000
 """Maximum number of pairs of subjects that are counted."""
 _COMPARISON_COST = 20
@@ -256,7 +256,7 @@ def document_findings(document: ConfigurationDocument) -> Iterator[Finding]:
     for setting in document.unknown:
         yield _finding_at(document, UNKNOWN_SETTING, setting, f"Zenoh up to 1.10 has no {setting}")
     yield from _link_findings(document)
-    yield from _open_features(document)
+    yield from _open_feature_findings(document)
     if not document.access.enabled:
         kind = ROUTER_WITHOUT_RULES if document.mode is Mode.ROUTER else SESSION_WITHOUT_RULES
         yield _finding_at(document, kind, f"{_ACCESS}/enabled", "access_control is off")
@@ -331,7 +331,7 @@ def _protocols_text(document: ConfigurationDocument) -> str:
     return "not limited" if document.protocols is None else ", ".join(document.protocols) or "none"
 
 
-def _open_features(document: ConfigurationDocument) -> Iterator[Finding]:
+def _open_feature_findings(document: ConfigurationDocument) -> Iterator[Finding]:
     for kind, on, path in (
         (SHARED_MEMORY, document.shared_memory, "transport/shared_memory"),
         (MULTICAST, document.multicast, "scouting/multicast"),
@@ -416,7 +416,7 @@ def _overlapping_subjects(
 
 
 def _ids_text(subjects: Sequence[AclSubject]) -> str:
-    return first_few([subject.id for subject in subjects], _FEW)
+    return first_few([subject.id for subject in subjects], _MOST_SHOWN)
 
 
 def _described_subject(subject: AclSubject) -> str:

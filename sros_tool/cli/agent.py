@@ -37,8 +37,8 @@ if TYPE_CHECKING:
     from sros_tool.agent.settings import AgentSettings, Unit
     from sros_tool.agent.state import AgentStatus
 
-_INTERVAL = "5m"
-_MOST_ROOT = 512 * 1024
+_DEFAULT_INTERVAL = "5m"
+_MOST_ROOT_BYTES = 512 * 1024
 _MOST_SHOWN = 10
 
 
@@ -193,7 +193,7 @@ def _init(
     settings_from(parse_toml(render_settings(settings).decode()), "these options")
     if tls_ca and not tls_ca.is_file():
         raise UsageError(f"'{tls_ca}' is not a file")
-    root = read_named(root_file, "root metadata", max_bytes=_MOST_ROOT)
+    root = read_named(root_file, "root metadata", max_bytes=_MOST_ROOT_BYTES)
     path = agent_folder(folder) / SETTINGS_FILE
     existed = path.exists()
     if existed and not force:
@@ -238,7 +238,7 @@ def _parse_unit(text: str) -> Unit:
 @click.argument("folder", type=PATH)
 @click.option("--once", is_flag=True, help="Run one round and end, for a timer.")
 @click.option(
-    "--interval", metavar="DURATION", default=_INTERVAL, show_default=True,
+    "--interval", metavar="DURATION", default=_DEFAULT_INTERVAL, show_default=True,
     help="The time between two rounds.",
 )  # fmt: skip
 @click.option(

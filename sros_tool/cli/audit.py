@@ -142,9 +142,9 @@ def audit(
     if patch is not None:
         check_output(patch, force=force)
     if not (vendor or distro):
-        from sros_tool.distributions import unknown_distribution
+        from sros_tool.distributions import unknown_distribution_notes
 
-        print_notes(unknown_distribution(os.environ))
+        print_notes(unknown_distribution_notes(os.environ))
     variables = {**os.environ, **environment}
     enclaves = audits.audited_enclaves(
         sources,
@@ -229,7 +229,7 @@ def audit(
         )
         echo(f"{written}; {by_hand or command}", err=True)
     elif patch is None and audited.missing.profiles:
-        echo(_TO_ALLOW, err=True)
+        echo(_ALLOW_ADVICE, err=True)
     elif patch is not None:
         stays = f"; the earlier '{patch}' stays" if existed else ""
         patch_remark = "no patch is needed" if audited.allowed else _NO_PATCH
@@ -241,7 +241,7 @@ _UNSEEN = "nodes were not seen (--watch finds nodes that start later, --partial 
 _UNJUDGED = (
     "a part of the graph was not judged, or the graph kept changing (--unjudged accepts this)"
 )
-_TO_ALLOW = (
+_ALLOW_ADVICE = (
     "to allow the denied access, add --patch missing.xml: sros then writes the missing rights as a "
     "policy, and names the command that adds them"
 )

@@ -364,7 +364,7 @@ def check(
             raise UsageError(f"{option} is for --requirements", "", "Leave it out.")
     decide = _requirements(family, paths, requirements, earlier, namespaces, remaps)
     with progress("checking"):
-        findings = [*_findings(family, paths, at), *_stated_differences(paths, at)]
+        findings = [*_findings(family, paths, at), *_stated_distribution_findings(paths, at)]
         if decide:
             findings += decide(lambda paths: _load_system(paths, at, template))
     if template:
@@ -401,9 +401,9 @@ def _requirements(
     from sros_tool.names import check_plain_namespace
     from sros_tool.policy.remapping import parse_remapping_of_names
     from sros_tool.proof.findings import (
-        remappings_unused,
+        left_out_robot_findings,
         requirement_findings,
-        robots_left_out,
+        unused_remapping_findings,
     )
     from sros_tool.proof.requirements import (
         dropped_findings,
@@ -420,8 +420,8 @@ def _requirements(
         for system in map(load, paths_of):
             wanted = read_all_requirements(files, system.fleet, places, rules)
             findings += requirement_findings(wanted, system)
-            findings += robots_left_out(system, places)
-            findings += remappings_unused(files, system, places, rules)
+            findings += left_out_robot_findings(system, places)
+            findings += unused_remapping_findings(files, system, places, rules)
             if earlier:
                 before = [
                     requirement
@@ -568,7 +568,9 @@ def _circumstances(
     return Circumstances(moment_of(moment), zone, wanted, tuple(read), fleet=fleet, opened=opened)
 
 
-def _stated_differences(paths: Sequence[Path], circumstances: Circumstances) -> Iterator[Finding]:
+def _stated_distribution_findings(
+    paths: Sequence[Path], circumstances: Circumstances
+) -> Iterator[Finding]:
     """Yield findings if the distributions that a keystore states decide differently."""
     from sros_tool.keystore.fleet import enclaves_of_several_distributions
     from sros_tool.keystore.layout import is_keystore
@@ -946,7 +948,7 @@ _POLL_SECONDS = 2.0
 """Seconds between two looks at the processes."""
 _RECHECK_AFTER = timedelta(minutes=1)
 """Time after which unchanged processes are checked again, because their files may have expired."""
-_ENDING = (signal.SIGINT, signal.SIGTERM)
+_ENDING_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 def _watch_processes(
@@ -965,7 +967,7 @@ def _watch_processes(
     table, news, zone = ProcessTable(), PreviousFindings(), local_zone(environment)
     judged: tuple[RunningProcesses, datetime] | None = None
     # A blocked signal is received only by the wait below, so that it interrupts no output.
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, _ENDING)
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, _ENDING_SIGNALS)
     try:
         echo("watching the processes of this machine until SIGINT (Ctrl-C) or SIGTERM", err=True)
         while True:
@@ -985,7 +987,7 @@ def _watch_processes(
                         echo_lines(visible_json(line))
                     else:
                         echo(str(change))
-            if signal.sigtimedwait(_ENDING, _POLL_SECONDS):
+            if signal.sigtimedwait(_ENDING_SIGNALS, _POLL_SECONDS):
                 return
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)

@@ -259,10 +259,10 @@ def _process_line(process: ClosedProcess, closed: CloseState, policy: Policy) ->
     else:
         ended = process.enclave in closed.observed.ended
         state = "has ended" if ended else "not running as observed"
-    return f"{process.enclave}: {state}{_nodes(policy, process.enclave)}: {restart}"
+    return f"{process.enclave}: {state}{_nodes_clause(policy, process.enclave)}: {restart}"
 
 
-def _nodes(policy: Policy, enclave: str) -> str:
+def _nodes_clause(policy: Policy, enclave: str) -> str:
     """Return a clause on the nodes of an enclave, if it has several; "" otherwise."""
     nodes = _node_names(policy, enclave)
     return f", for the nodes {enumerated(nodes)}" if len(nodes) > 1 else ""
@@ -325,7 +325,7 @@ def _show_end(robot: LocalRobot, closed: CloseState, *, apply: bool, holds: bool
             following += f", and bring {folder}/keystore to another machine: it has the CA keys"
         answer = f"the robot is closed{exceptions}{_validity_text(closed)}{following}"
     elif closed.proofs:
-        accept = _ACCEPT if closed.is_proved(partial=True) else ""
+        accept = _ACCEPT_ADVICE if closed.is_proved(partial=True) else ""
         next_command = (
             f"correct the problems above, and ask again with sros close {folder} --proof, "
         )
@@ -435,4 +435,4 @@ def _started_together(processes: Sequence[ClosedProcess]) -> str:
 _MOST_DENIED = 4
 _ANSWERS = {True: "yes", False: "no", None: "not checked"}
 _NOT_CURRENT = "with earlier files or other settings"
-_ACCEPT = "accept unchecked claims with --partial, "
+_ACCEPT_ADVICE = "accept unchecked claims with --partial, "

@@ -615,7 +615,7 @@ def _clock() -> datetime:
     return datetime.now(UTC)
 
 
-_YEARS = 1970, 2999
+_ALLOWED_YEARS = 1970, 2999
 
 
 def moment_of(text: str | None) -> datetime:
@@ -630,19 +630,19 @@ def moment_of(text: str | None) -> datetime:
         return now()
     try:
         moment = parse_iso(text)
-        if _YEARS[0] <= moment.year <= _YEARS[1]:
+        if _ALLOWED_YEARS[0] <= moment.year <= _ALLOWED_YEARS[1]:
             return moment
     except ValueError:
         with suppress(UsageError):
             return now() + parse_duration(text)
     raise UsageError(
         f"--at {text!r} is not a date",
-        f"It is not a duration, and not a date from {_YEARS[0]} to {_YEARS[1]}.",
+        f"It is not a duration, and not a date from {_ALLOWED_YEARS[0]} to {_ALLOWED_YEARS[1]}.",
         "Write 2027-06-01, 2027-06-01T12:00:00Z, or 90d for 90 days from now.",
     )
 
 
-_OFFSET = re.compile(r"([+-])(\d\d):?(\d\d)\Z")
+_UTC_OFFSET = re.compile(r"([+-])(\d\d):?(\d\d)\Z")
 _LOCALTIME = Path("/etc/localtime")
 
 
@@ -654,7 +654,7 @@ def named_zone(name: str) -> tzinfo:
     from datetime import timedelta, timezone
     from zoneinfo import ZoneInfo
 
-    if match := _OFFSET.match(name):
+    if match := _UTC_OFFSET.match(name):
         offset = timedelta(hours=int(match[2]), minutes=int(match[3]))
         if offset < timedelta(hours=24):
             return timezone(-offset if match[1] == "-" else offset)
@@ -734,11 +734,11 @@ def domain_of(text: str | None) -> int | None:
 
 
 _PASSPHRASE, _PASSPHRASE_FILE = "SROS_CA_PASSPHRASE", "SROS_CA_PASSPHRASE_FILE"
-_PIN = "SROS_PKCS11_PIN"
+_PIN_VARIABLE = "SROS_PKCS11_PIN"
 _taken: dict[str, str] = {}
 _printed_notes: set[Note] = set()
 """Notes on secrets that were printed already."""
-_KEY_PLACES = {"identity": "SROS_IDENTITY_KEY", "permissions": "SROS_PERMISSIONS_KEY"}
+_KEY_PLACE_VARIABLES = {"identity": "SROS_IDENTITY_KEY", "permissions": "SROS_PERMISSIONS_KEY"}
 
 
 @contextmanager
@@ -747,7 +747,7 @@ def without_secrets() -> Iterator[None]:
 
     Commands that replace this process, as with ``sros run``, do not get them either.
     """
-    for name in (_PASSPHRASE, _PASSPHRASE_FILE, _PIN):
+    for name in (_PASSPHRASE, _PASSPHRASE_FILE, _PIN_VARIABLE):
         if name in os.environ:
             _taken[name] = os.environ.pop(name)
     try:
@@ -783,7 +783,9 @@ def keyring(
     from sros_tool.keystore.issuing.keyring import Keyring, absolute_place
 
     named = {"identity": identity, "permissions": permissions}
-    places = {role: named[role] or os.environ.get(name, "") for role, name in _KEY_PLACES.items()}
+    places = {
+        role: named[role] or os.environ.get(name, "") for role, name in _KEY_PLACE_VARIABLES.items()
+    }
     return Keyring(
         _Secrets(encrypt),
         {role: absolute_place(place) for role, place in places.items() if place},
@@ -837,7 +839,7 @@ class _Secrets:
 
     def _find(self, name: str) -> str:
         is_pin = " PIN " in f" {name} "
-        value = _taken.get(_PIN if is_pin else _PASSPHRASE, "")
+        value = _taken.get(_PIN_VARIABLE if is_pin else _PASSPHRASE, "")
         file = "" if is_pin else _taken.get(_PASSPHRASE_FILE, "")
         if not value and file:
             if file not in self._lines:  # a pipe can be read once, and two CA keys may need it
@@ -850,7 +852,7 @@ class _Secrets:
             with without_progress():
                 value = ask_secret(name, confirm=confirm)
         if not value:
-            names = _PIN if is_pin else f"{_PASSPHRASE} or {_PASSPHRASE_FILE}"
+            names = _PIN_VARIABLE if is_pin else f"{_PASSPHRASE} or {_PASSPHRASE_FILE}"
             raise PkiError(
                 f"{name} is needed", "There is no terminal to prompt on.", f"Set {names}."
             )

@@ -62,7 +62,7 @@ if TYPE_CHECKING:
     from sros_tool.zenoh.delivery import Check
 
 _OPERATIONS = ("publish", "subscribe", "call", "serve", "execute", "request", "reply", "join")
-_KINDS = {
+_KIND_OF_NAME = {
     **dict.fromkeys(("publish", "subscribe"), "topics"),
     **dict.fromkeys(("call", "serve", "request", "reply"), "services"),
     "execute": "actions",
@@ -88,7 +88,7 @@ def _complete_arguments(
         return [word for word in _OPERATIONS if word.startswith(incomplete)]
     if len(rest) == before + 1:
         root = Path(arguments[0]) if named else ctx.params.get("keystore")
-        names = _names_in_rights(ctx.params.get("policy") or root, _KINDS.get(rest[-1], ""))
+        names = _names_in_rights(ctx.params.get("policy") or root, _KIND_OF_NAME.get(rest[-1], ""))
         return [*completions(names, incomplete)]
     if rest:
         return []
@@ -464,9 +464,9 @@ def _keystore_of_environment() -> OpenedKeystore:
 
 def _note_unknown_distribution() -> None:
     """Print a note if $ROS_DISTRO, which decides by default, names an unknown distribution."""
-    from sros_tool.distributions import unknown_distribution
+    from sros_tool.distributions import unknown_distribution_notes
 
-    print_notes(unknown_distribution(os.environ))
+    print_notes(unknown_distribution_notes(os.environ))
 
 
 def _stated_distribution(keystore: OpenedKeystore | None, enclave: str) -> Distribution | None:
@@ -723,7 +723,7 @@ def _table_lines(compared: Comparison) -> Iterator[str]:
 
 # ── the answer of Zenoh as text ────────────────────────────────────────────────────────────
 
-_DOES = {
+_RECEIVER_WORDS = {
     "publish": ("heard by", "a put to this wildcard is heard by"),
     "subscribe": ("hears", ""),
     "call": ("served by", "a query on this wildcard is executed by"),
@@ -745,7 +745,7 @@ def _zenoh_lines(explanation: ZenohExplanation) -> Iterator[str]:
     if dropped := answer.dropped:
         dropper = f"{dropped.enforcer}: silently dropped, and {answer.enclave} gets no error"
         yield _labeled_row("denied by", dropper)
-    if allowed and answer.question.word in _DOES:
+    if allowed and answer.question.word in _RECEIVER_WORDS:
         yield from _reached_lines(answer)
     if allowed and answer.until:
         yield _labeled_row("until", f"{iso(answer.until)}, when cert.pem expires")
@@ -776,7 +776,7 @@ def _link_lines(answer: ZenohAnswer) -> Iterator[str]:
 
 
 def _reached_lines(answer: ZenohAnswer) -> Iterator[str]:
-    does, wide_does = _DOES[answer.question.word]
+    does, wide_does = _RECEIVER_WORDS[answer.question.word]
     reachable = [reached.enclave for reached in answer.reached if not reached.problem]
     yield _labeled_row(does, _names_text(reachable))
     for reached in [reached for reached in answer.reached if reached.problem][:_MOST_SHOWN]:
@@ -917,7 +917,7 @@ def _print_answer_for_all(
     decider: Decider, question: Question, kind: str | None, where: _WhoContext, as_json: bool
 ) -> int:
     """Print the decisions on all enclaves; return 0 if any enclave may do it, else 1."""
-    from sros_tool.explain.who import answer_for_all, callable_action, names_meant
+    from sros_tool.explain.who import answer_for_all, note_on_callable_action, note_on_names_meant
 
     with progress("asking"):
         answer = answer_for_all(decider, question, kind)
@@ -928,7 +928,7 @@ def _print_answer_for_all(
         echo(f"decided by {decider.title}", err=True)
         if not (kind or answer.allowed or any(outcome.in_part for outcome in answer.outcomes)):
             enclaves = {outcome.enclave for outcome in answer.outcomes}
-            hint = callable_action(decider, answer.question) or names_meant(
+            hint = note_on_callable_action(decider, answer.question) or note_on_names_meant(
                 decider, answer.question, enclaves
             )
             print_notes([hint] if hint else [])

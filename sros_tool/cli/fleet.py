@@ -406,14 +406,14 @@ def _collected_lines(collected: CollectedInbox) -> Iterator[str]:
         yield f"and {counted(more, 'more request')}, see --json"
 
 
-_IN_WORDS = {"missing": "by hand or without a message"}
+_OUTCOME_WORDS = {"missing": "by hand or without a message"}
 
 
 def _outcome_numbers(numbers: Mapping[str, int], outcomes: Sequence[str], verb_form: str) -> str:
     """Return the number of messages or requests with each outcome, in words."""
     present_outcomes = (outcome for outcome in outcomes if numbers.get(outcome))
     return ", ".join(
-        f"{numbers[name]} {verb_form}{_IN_WORDS.get(name, name.replace('_', ' '))}"
+        f"{numbers[name]} {verb_form}{_OUTCOME_WORDS.get(name, name.replace('_', ' '))}"
         for name in present_outcomes
     )
 
@@ -955,10 +955,10 @@ def _expiry_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
     bring = f"{command}{_delivery_advice(root, soon)}"
     if not command and all(robot.has_release for robot in soon):
         bring = "new files are published; see the column `to do`"
-    yield f"{label}: {when} ({first}, {_KINDS.get(kind, kind)}){others}: {bring}"
+    yield f"{label}: {when} ({first}, {_KIND_WORDS.get(kind, kind)}){others}: {bring}"
 
 
-_KINDS = {"crl": "revocation list"}
+_KIND_WORDS = {"crl": "revocation list"}
 
 
 class _Group(NamedTuple):
@@ -1051,7 +1051,7 @@ def _page_rows(compared_fleet: ComparedFleet, robots: Sequence[str]) -> Iterator
         )
 
 
-_ROBOT = "{robot}"
+_ROBOT_PLACEHOLDER = "{robot}"
 """Placeholder, as in policies, for the names of the robots that share a row."""
 
 
@@ -1059,13 +1059,13 @@ _DURATION = re.compile(r"(?<![\w.])\d+ (?:d|h|min|s)(?: \d+ (?:h|min|s))?(?![\w.
 """A duration as `elapsed` writes it."""
 _CLOCK_SENTENCE = re.compile(r" The clock here shows \S+\.")
 """The time at which a robot reported a problem, which the row shows as well."""
-_UNITS = {"d": 86400, "h": 3600, "min": 60, "s": 1}
+_UNIT_SECONDS = {"d": 86400, "h": 3600, "min": 60, "s": 1}
 
 
 def _joined_durations(texts: Mapping[str, str]) -> str:
     """Join texts of robots that differ only in durations, such as "2 min to 5 min behind".
 
-    The text of a single robot has its name in place of `_ROBOT`.
+    The text of a single robot has its name in place of `_ROBOT_PLACEHOLDER`.
     """
     durations_of_texts = [_DURATION.findall(text) for text in texts.values()]
     ranges = iter(
@@ -1078,19 +1078,20 @@ def _joined_durations(texts: Mapping[str, str]) -> str:
         return " to ".join(dict.fromkeys((durations[0], durations[-1])))
 
     text = _DURATION.sub(with_range, text)
-    return text.replace(_ROBOT, robot) if len(texts) == 1 else text
+    return text.replace(_ROBOT_PLACEHOLDER, robot) if len(texts) == 1 else text
 
 
 def _seconds(duration: str) -> int:
     words = duration.split()
     return sum(
-        int(number) * _UNITS[unit] for number, unit in zip(words[::2], words[1::2], strict=True)
+        int(number) * _UNIT_SECONDS[unit]
+        for number, unit in zip(words[::2], words[1::2], strict=True)
     )
 
 
 def _without_robot_name(text: str, robot: str) -> str:
-    """Return a text with `_ROBOT` in place of the robot's name in paths."""
-    return re.sub(rf"(?<=/){re.escape(robot)}(?=[/\s,;.:]|$)", _ROBOT, text)
+    """Return a text with `_ROBOT_PLACEHOLDER` in place of the robot's name in paths."""
+    return re.sub(rf"(?<=/){re.escape(robot)}(?=[/\s,;.:]|$)", _ROBOT_PLACEHOLDER, text)
 
 
 def _natural_sort_key(name: str) -> list[tuple[int, str]]:
@@ -1178,7 +1179,7 @@ def _expiry_clauses(robot: RobotStatus, moment: datetime) -> Iterator[str]:
 
     for kind, end in robot.expiry.items() if robot.state == "expired" else ():
         if end <= moment:
-            yield f"{_KINDS.get(kind, kind)} expired {elapsed(moment - end)} ago"
+            yield f"{_KIND_WORDS.get(kind, kind)} expired {elapsed(moment - end)} ago"
 
 
 def _summary(robot: RobotStatus, stage: str, moment: datetime) -> Iterator[str]:

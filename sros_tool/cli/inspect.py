@@ -132,7 +132,7 @@ def inspect(
     if as_json:
         print_json(described)
     else:
-        for line in _TEXT[described.kind](described):
+        for line in _LINES_BY_KIND[described.kind](described):
             echo(line)
     print_notes([*keystore.ledger_file.clock_notes(now())] if keystore.root.is_dir() else [])
     if problems_of(described):
@@ -460,7 +460,7 @@ def _indented(lines: Iterable[str]) -> Iterator[str]:
     return (_INDENT + line for line in lines)
 
 
-_TEXT: dict[str, Callable[[Any], Iterator[str]]] = {
+_LINES_BY_KIND: dict[str, Callable[[Any], Iterator[str]]] = {
     "keystore": _keystore_lines,
     "enclave": _enclave_lines,
     "certificate": _certificate_file_lines,

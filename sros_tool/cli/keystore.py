@@ -139,7 +139,9 @@ def create_permission(
     root, rest = split_root(arguments)
     if len(rest) < (1 if patterns or robots else 2):
         raise UsageError(
-            "create_permission takes a keystore, one or more enclaves and a policy", "", _ORDER
+            "create_permission takes a keystore, one or more enclaves and a policy",
+            "",
+            _ORDER_REMEDY,
         )
     *given, last = rest
     file = PATH.convert(last, None, None)
@@ -172,7 +174,9 @@ def create_permission(
     _show(result, as_json, [policy])
 
 
-_ORDER = "Write them in this order: `sros create_permission KEYSTORE ENCLAVE... POLICY_FILE`."
+_ORDER_REMEDY = (
+    "Write them in this order: `sros create_permission KEYSTORE ENCLAVE... POLICY_FILE`."
+)
 
 
 def _check_order(root: Path, names: Sequence[str], file: Path) -> None:
@@ -189,7 +193,7 @@ def _check_order(root: Path, names: Sequence[str], file: Path) -> None:
     wrong, place = (paths[0], "an enclave") if paths else (str(file), "the policy file")
     if not root.is_dir():
         wrong, place = str(root), "the keystore"
-    raise UsageError(f"'{wrong}' stands where {place} belongs", "", _ORDER)
+    raise UsageError(f"'{wrong}' stands where {place} belongs", "", _ORDER_REMEDY)
 
 
 class _SeveralEnclavesAndPolicies(SeveralValues):
@@ -561,7 +565,7 @@ def create_keystore(
     if as_json:
         from sros_tool.keystore.lifecycle.shown import shown_keystore
 
-        shown = shown_keystore(result, imported, _open_rights(root, template))
+        shown = shown_keystore(result, imported, _open_rights_notes(root, template))
     print_changed(result, shown, _new_keystore_lines(result, frozenset(imported)))
     if not dry_run:
         _print_open_rights(root, template)
@@ -639,11 +643,11 @@ def _new_keystore_lines(result: Creation, imported: frozenset[str] = frozenset()
 
 
 def _print_open_rights(root: Path, template: Template) -> None:
-    for note in _open_rights(root, template):
+    for note in _open_rights_notes(root, template):
         echo(f"still open: {note.text}", err=True)
 
 
-def _open_rights(root: Path, template: Template) -> list[Note]:
+def _open_rights_notes(root: Path, template: Template) -> list[Note]:
     """Return warnings about rights that a template gives and that should be restricted."""
     from sros_tool.keystore.template import EVERYTHING
 

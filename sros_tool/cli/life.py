@@ -383,7 +383,7 @@ if TYPE_CHECKING:
     from sros_tool.keystore.lifecycle.rotation import RotationStatus
     from sros_tool.keystore.reader import OpenedKeystore
 
-_DONE = {
+_STAGE_DONE_TEXTS = {
     "distribute": "distributed the new CA next to the old one",
     "reissue": "issued and signed everything with the new CA",
     "retire": "retired the old CA",
@@ -613,8 +613,8 @@ def _print_step(
         )
         return
     reissued = any(change.path.endswith("/cert.pem") for change in step.changes)
-    done = f"{_DONE['reissue']}, and " if together and reissued else ""
-    echo(f"{done}{_DONE[step.stage]}: {', '.join(step.files)}")
+    done = f"{_STAGE_DONE_TEXTS['reissue']}, and " if together and reissued else ""
+    echo(f"{done}{_STAGE_DONE_TEXTS[step.stage]}: {', '.join(step.files)}")
     if step.stage == "retire":
         how = "Restart all processes together." if together else f"All vendors: {ONE_BY_ONE}"
         echo(f"{how} {deliver_first_sentence(step.root)}", err=True)

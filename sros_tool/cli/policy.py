@@ -471,7 +471,7 @@ def folded_differences(
 # ── minimize_policy ─────────────────────────────────────────────────────────────────────
 
 
-_SHOWN = 5
+_MOST_SHOWN = 5
 
 
 class _SeveralObserved(SeveralValues):
@@ -597,7 +597,7 @@ def _use_lines(enclave: MinimizedEnclave) -> Iterator[str]:
     yield f"  permissions.p7s: {sizes.before} bytes{then}, of at most {sizes.limit - 1}{too_large}"
     for proposal in enclave.proposals:
         names = [right.describe() for right in proposal.adds]
-        adds = first_few(names, _SHOWN) or "no other known name"
+        adds = first_few(names, _MOST_SHOWN) or "no other known name"
         yield f"    {proposal.rule.describe()}  in place of {len(proposal.replaces)} names"
         yield f"      this rule saves {proposal.saves} bytes, and also allows {adds}"
 

@@ -97,7 +97,7 @@ FAMILIES: dict[str, dict[str, VerbEntry]] = {
     },
 }
 _VERBS = {name: verb for family in FAMILIES.values() for name, verb in family.items()}
-_NAMES = {alias: name for name, verb in _VERBS.items() for alias in (name, *verb.aliases)}
+_VERB_OF_ALIAS = {alias: name for name, verb in _VERBS.items() for alias in (name, *verb.aliases)}
 
 
 def _report_steps(ctx: click.Context, _parameter: click.Parameter, count: int) -> None:
@@ -170,7 +170,7 @@ class _Program(VerbGroup):
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """Import and return a verb, by its name or an alias."""
-        name = _NAMES.get(cmd_name.replace("-", "_"))
+        name = _VERB_OF_ALIAS.get(cmd_name.replace("-", "_"))
         if name is None:
             return None
         module = importlib.import_module(f"sros_tool.cli.{_VERBS[name].module}")
@@ -189,10 +189,10 @@ class _Program(VerbGroup):
             return super().shell_complete(ctx, incomplete)
         typed = incomplete.replace("-", "_")
         names = [name for name in _VERBS if name.startswith(typed)]
-        names = names or [alias for alias in _NAMES if alias.startswith(typed)]
+        names = names or [alias for alias in _VERB_OF_ALIAS if alias.startswith(typed)]
         mark = "-" if "-" in incomplete else "_"
         return [
-            CompletionItem(name.replace("_", mark), help=_VERBS[_NAMES[name]].help)
+            CompletionItem(name.replace("_", mark), help=_VERBS[_VERB_OF_ALIAS[name]].help)
             for name in names
         ]
 
@@ -201,10 +201,10 @@ class _Program(VerbGroup):
     ) -> tuple[str | None, click.Command | None, list[str]]:
         """Resolve a verb as click does, also by an alias; suggest a verb for a mistyped one."""
         word = args[0].replace("-", "_")
-        if word not in _NAMES:
+        if word not in _VERB_OF_ALIAS:
             from difflib import get_close_matches
 
-            if similar := get_close_matches(word, _NAMES, n=1):
+            if similar := get_close_matches(word, _VERB_OF_ALIAS, n=1):
                 ctx.fail(f"No such command '{args[0]}'. Did you mean '{similar[0]}'?")
         name, command, rest = super().resolve_command(ctx, args)
         return (command.name if command else name), command, rest
@@ -282,7 +282,7 @@ def program() -> None:
 program.params.append(_VERBOSE)
 
 
-_PHRASES = {
+_VERB_PHRASES = {
     "create_keystore": "create keystore",
     "create_enclave": "create enclave",
     "create_permission": "create permission",
@@ -366,14 +366,14 @@ def _with_usage_prefix(text: str, arguments: Sequence[str]) -> str:
     if verb is None:
         return f"sros: {text}"
     words = " ".join([word for word in arguments if not word.startswith("-")][:2])
-    phrase = _PHRASES.get(words) or _PHRASES.get(verb, verb.replace("_", " "))
+    phrase = _VERB_PHRASES.get(words) or _VERB_PHRASES.get(verb, verb.replace("_", " "))
     return f"Unable to {phrase}: {text}"
 
 
 def _verb_in(arguments: Sequence[str]) -> str | None:
     for word in arguments:
         if not word.startswith("-"):
-            return _NAMES.get(word.replace("-", "_"))
+            return _VERB_OF_ALIAS.get(word.replace("-", "_"))
     return None
 
 
@@ -388,7 +388,7 @@ def _os_problem(error: OSError) -> str:
     return f"the operating system refuses '{path}': {error.strerror or error}."
 
 
-def _outdated_dependency() -> str:
+def _outdated_dependency_advice() -> str:
     """Return which required package is missing or too old, and what to do; else "".
 
     colcon installs sros next to packages of the system without checking their versions.
@@ -421,7 +421,9 @@ def _version_numbers(version: str) -> list[int]:
 
 
 def _report_defect(error: BaseException, arguments: Sequence[str]) -> int:
-    if isinstance(error, (ImportError, AttributeError)) and (problem := _outdated_dependency()):
+    if isinstance(error, (ImportError, AttributeError)) and (
+        problem := _outdated_dependency_advice()
+    ):
         return _print_error(_with_usage_prefix(problem, arguments))
     if os.environ.get("SROS_DEBUG"):
         import traceback

@@ -47,9 +47,9 @@ _MAX_MARKDOWN = 60_000
 """Maximum length of the Markdown, in characters: a comment on GitHub has at most 65,536."""
 _MAX_REASONS = 20
 """Maximum number of lines below a failed step."""
-_SIGNS = {0: "🟢", 1: "🔴", 2: "⚪"}
+_STATUS_SIGNS = {0: "🟢", 1: "🔴", 2: "⚪"}
 _SIGN_ALLOWED = "🟡"
-_MARKS = {0: "ok", 1: "FAILED", 2: "UNDECIDED"}
+_STATUS_MARKS = {0: "ok", 1: "FAILED", 2: "UNDECIDED"}
 _TITLES = {
     "new-access": "New access",
     "requirements": "Requirements",
@@ -569,7 +569,7 @@ def _text(result: Review) -> list[str]:
     lines = []
     for step, sentence in _sentences(result, result.steps):
         subject = f" {result.with_shown_paths(step.subject)}" if step.subject else ""
-        mark = "allowed" if step.allowed else _MARKS[step.status]
+        mark = "allowed" if step.allowed else _STATUS_MARKS[step.status]
         lines.append(f"[{mark}] {step.kind}{subject}: {sentence}")
         lines_to_read = _lines_to_read(step)
         further = [f"and {len(lines_to_read) - _MAX_REASONS} more (--summary FILE has all)"]
@@ -667,7 +667,7 @@ def _markdown(result: Review, request: ReviewRequest) -> str:
     passed = "only allowed changes were found" if allowed else "nothing found"
     verdict = (passed, "something found", "could not be decided")[result.status]
     lines = (
-        f"{_SIGN_ALLOWED if step.allowed else _SIGNS[step.status]} {_TITLES[step.kind]}"
+        f"{_SIGN_ALLOWED if step.allowed else _STATUS_SIGNS[step.status]} {_TITLES[step.kind]}"
         f"{' ' + code(result.with_shown_paths(step.subject)) if step.subject else ''}: "
         f"{code(sentence)}"
         for step, sentence in _sentences(result, _sorted_by_weight(result))
@@ -745,4 +745,4 @@ def _detail(result: Review, step: ReviewStep, request: ReviewRequest) -> str:
     return ""
 
 
-assert max(_SIGNS) == NOT_DONE
+assert max(_STATUS_SIGNS) == NOT_DONE

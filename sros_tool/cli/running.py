@@ -65,8 +65,8 @@ _NO_PIN = (
     f"no file has the PIN of the token (pin-source), so Fast DDS takes it from ${_FAST_DDS_PIN}, "
     "which root and this user can read in /proc."
 )
-_WORDS = keystore_arguments("[KEYSTORE] ENCLAVE")
-_DOMAIN = click.option(
+_ENCLAVE_ARGUMENTS = keystore_arguments("[KEYSTORE] ENCLAVE")
+_DOMAIN_OPTION = click.option(
     "--domain", metavar="ID", help="The ROS domain. [default: $ROS_DOMAIN_ID, or the keystore's]"
 )
 
@@ -76,13 +76,13 @@ def _complete_rmw(_ctx: click.Context, _parameter: click.Parameter, incomplete: 
     return [rmw for rmw in RMWS if rmw.startswith(incomplete)]
 
 
-_RMW = click.option(
+_RMW_OPTION = click.option(
     "--rmw",
     metavar="NAME",
     shell_complete=_complete_rmw,
     help="The RMW of the process, such as rmw_zenoh_cpp. [default: $RMW_IMPLEMENTATION]",
 )
-_ACCEPT_KEY = click.option(
+_ACCEPT_KEY_OPTION = click.option(
     "--accept-readable-key",
     is_flag=True,
     help="Start even if other users can read the private key or its token's PIN, or write "
@@ -147,7 +147,7 @@ def _form_of(arguments: Sequence[str]) -> str:
 
 
 @verb("env", cls=_FailingClosed)
-@_WORDS
+@_ENCLAVE_ARGUMENTS
 @click.option(
     "--format",
     "form",
@@ -173,9 +173,9 @@ def _form_of(arguments: Sequence[str]) -> str:
     help="Name of the Compose service or Kubernetes Deployment. [default: from the enclave]",
 )
 @click.option("--image", metavar="IMAGE", help="The image of the container.")
-@_DOMAIN
-@_RMW
-@_ACCEPT_KEY
+@_DOMAIN_OPTION
+@_RMW_OPTION
+@_ACCEPT_KEY_OPTION
 @json_option
 def env(
     arguments: tuple[str, ...],
@@ -301,9 +301,9 @@ class _WithCommand(Verb):
     help="Instead of ENCLAVE: use the enclave that the policy FILE assigns to the node which "
     "COMMAND starts.",
 )
-@_DOMAIN
-@_RMW
-@_ACCEPT_KEY
+@_DOMAIN_OPTION
+@_RMW_OPTION
+@_ACCEPT_KEY_OPTION
 @click.option("--no-ros-args", is_flag=True, help="Do not add --ros-args to COMMAND.")
 @click.pass_context
 def run(
@@ -485,9 +485,9 @@ class _WithCommandAfterDashes(_WithCommand):
     help="With --job renew and --job collect: file with the passphrase of the CA keys, on the "
     "machine that runs the job.",
 )
-@_DOMAIN
-@_RMW
-@_ACCEPT_KEY
+@_DOMAIN_OPTION
+@_RMW_OPTION
+@_ACCEPT_KEY_OPTION
 @click.option("--force", is_flag=True, help="Replace files in FOLDER that differ.")
 @dry_run_option
 @json_option

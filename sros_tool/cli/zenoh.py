@@ -37,8 +37,8 @@ if TYPE_CHECKING:
     from sros_tool.zenoh.configuration import ZenohNetwork
     from sros_tool.zenoh.document import ConfigurationDocument
 
-_DONE = {"create": "wrote", "replace": "replaced", "remove": "removed"}
-_FOUND = {"create": "missing", "replace": "out of date", "remove": "no longer needed"}
+_DONE_WORDS = {"create": "wrote", "replace": "replaced", "remove": "removed"}
+_FOUND_WORDS = {"create": "missing", "replace": "out of date", "remove": "no longer needed"}
 
 
 @verb("zenoh")
@@ -200,8 +200,8 @@ def zenoh(
             result.created, f"{'missing:' if only_check else 'created'} enclave {{}}"
         ):
             echo(line)
-        for action, done in _DONE.items():
-            words = f"{_FOUND[action]}:" if only_check else done
+        for action, done in _DONE_WORDS.items():
+            words = f"{_FOUND_WORDS[action]}:" if only_check else done
             of_action = [path for path in changed if actions.get(path, "replace") == action]
             print_files(root, words, of_action)
     left_out = result.zenoh.left_out

@@ -36,7 +36,7 @@ from sros_tool.values import FileChange
 from sros_tool.wording import enumerated
 from sros_tool.xml import read_bytes
 
-_SYSTEMD = Path("/etc/systemd/system")
+_SYSTEMD_FOLDER = Path("/etc/systemd/system")
 
 _RESTART_SECONDS = 30.0
 """How long processes that sros restarted may take until they run in their enclaves, or open."""
@@ -82,12 +82,12 @@ def _write_drop_ins(
     paths = [f"{unit}.d/{DROP_IN}" for unit in sorted(observed.units)]
     files = {path: read_bytes(robot.start / "units" / path, "unit").decode() for path in paths}
     _drop_ins_of(robot, observed)
-    changes = unit_changes(_SYSTEMD, files, force=True)
+    changes = unit_changes(_SYSTEMD_FOLDER, files, force=True)
     for path, action in changes.items():
-        robot.shell.say(f"{'would ' if dry_run else ''}{action} {_SYSTEMD / path}")
+        robot.shell.say(f"{'would ' if dry_run else ''}{action} {_SYSTEMD_FOLDER / path}")
     if not dry_run:
-        write_units(_SYSTEMD, files, changes)
-    return [FileChange(action, str(_SYSTEMD / path)) for path, action in changes.items()]
+        write_units(_SYSTEMD_FOLDER, files, changes)
+    return [FileChange(action, str(_SYSTEMD_FOLDER / path)) for path, action in changes.items()]
 
 
 def undo(robot: LocalRobot, *, dry_run: bool) -> CloseState:
@@ -257,11 +257,11 @@ def _drop_ins_of(robot: LocalRobot, observed: ObservedProcesses) -> list[Path]:
     """Return the drop-ins for this folder; raise `SrosError` if another folder has one."""
     drop_ins = [
         path
-        for path in sorted(_SYSTEMD.glob(f"*.d/{DROP_IN}"))
+        for path in sorted(_SYSTEMD_FOLDER.glob(f"*.d/{DROP_IN}"))
         if read_bytes(path, "unit").startswith(drop_in_heading(robot).encode())
     ]
     for unit in sorted(observed.units):
-        path = _SYSTEMD / f"{unit}.d/{DROP_IN}"
+        path = _SYSTEMD_FOLDER / f"{unit}.d/{DROP_IN}"
         if path not in drop_ins and os.path.lexists(path):
             raise SrosError(
                 f"'{path}' is not the drop-in of this folder",

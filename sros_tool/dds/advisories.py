@@ -26,7 +26,7 @@ from sros_tool.errors import DocumentError
 from sros_tool.values import parse_json
 from sros_tool.xml import read_bytes
 
-_SHIPPED = Path(__file__).with_name("advisories.json")
+_SHIPPED_FILE = Path(__file__).with_name("advisories.json")
 _REPOSITORIES = {
     "github.com/eprosima/fast-dds": "Fast DDS",
     "github.com/eclipse-cyclonedds/cyclonedds": "Cyclone DDS",
@@ -36,7 +36,7 @@ PRODUCTS = tuple(_REPOSITORIES.values())
 """The products that sros knows from advisories."""
 _MOST_BYTES = 4 * 1024 * 1024
 _MOST_ADVISORIES = 10_000
-_ID = re.compile(r"[A-Za-z][A-Za-z0-9]*(?:-[A-Za-z0-9]+){1,6}", re.ASCII)
+_ADVISORY_ID = re.compile(r"[A-Za-z][A-Za-z0-9]*(?:-[A-Za-z0-9]+){1,6}", re.ASCII)
 _VERSION = re.compile(r"v?(\d{1,6})(?:\.(\d{1,6}))?(?:\.(\d{1,6}))?(?:\.0)?", re.ASCII)
 _LONGEST_ID, _LONGEST_SUMMARY = 60, 200
 
@@ -144,7 +144,7 @@ def version_numbers(version: str) -> Version | None:
 @cache
 def shipped_advisories() -> tuple[Advisory, ...]:
     """Return the advisories that ship with sros."""
-    return parse_advisories(_SHIPPED.read_bytes(), "the advisories of sros")
+    return parse_advisories(_SHIPPED_FILE.read_bytes(), "the advisories of sros")
 
 
 def read_advisories(path: Path) -> tuple[Advisory, ...]:
@@ -202,7 +202,11 @@ def parse_advisories(data: bytes, label: str) -> tuple[Advisory, ...]:
 
 def _advisories_of(record: Mapping[str, Any]) -> Iterator[Advisory]:
     identity = record.get("id")
-    if not isinstance(identity, str) or len(identity) > _LONGEST_ID or not _ID.fullmatch(identity):
+    if (
+        not isinstance(identity, str)
+        or len(identity) > _LONGEST_ID
+        or not _ADVISORY_ID.fullmatch(identity)
+    ):
         raise ValueError("an advisory has no id such as CVE-2025-62599")
     is_withdrawn = bool(_text(record.get("withdrawn") or ""))
     aliases = _list(record.get("aliases", []), "aliases")

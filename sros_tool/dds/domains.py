@@ -12,7 +12,7 @@ from sros_tool.errors import UsageError
 MAX_DOMAIN = 230
 """Largest domain id that every vendor accepts: Cyclone DDS 0.10 refuses larger ids."""
 
-_ONE = re.compile(r"(\d{1,9})(?:-(\d{1,9}))?\Z", re.ASCII)
+_ID_OR_RANGE = re.compile(r"(\d{1,9})(?:-(\d{1,9}))?\Z", re.ASCII)
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +56,7 @@ class DomainSet:
         """
         pairs = []
         for part in text.split(","):
-            match = _ONE.match(part)
+            match = _ID_OR_RANGE.match(part)
             first = int(match[1]) if match else -1
             last = int(match[2]) if match and match[2] else first
             if not match or first > last or last > MAX_DOMAIN:

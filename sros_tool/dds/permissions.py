@@ -343,10 +343,10 @@ def size_of_topic(topic: str) -> int:
 
 # ── the portable profile ───────────────────────────────────────────────────────────────────
 
-_SHOWN = 3
+_MOST_SHOWN = 3
 _LONGEST_TOPIC = 251  # longest DDS topic name, in bytes
 # Parts of an enclave name; a longer name has too many subsets of parts to compare.
-_LONGEST_NAME = 8
+_MOST_NAME_PARTS = 8
 
 
 def document_notes(label: str, permissions: Permissions, signed_bytes: int) -> Iterator[Note]:
@@ -487,7 +487,7 @@ def mistaken_names(names: Iterable[str]) -> list[tuple[str, str]]:
         {
             (inner, outer)
             for outer, parts in parts_of.items()
-            if len(parts) <= _LONGEST_NAME
+            if len(parts) <= _MOST_NAME_PARTS
             for inner in _names_within(parts, by_parts)
             if inner != outer
         }
@@ -496,7 +496,7 @@ def mistaken_names(names: Iterable[str]) -> list[tuple[str, str]]:
 
 def pairs_text(pairs: Sequence[tuple[str, str]]) -> str:
     """Return the first pairs in words, such as "/robot for /robot/admin and 2 more"."""
-    return first_few([f"{inner} for {outer}" for inner, outer in pairs], _SHOWN)
+    return first_few([f"{inner} for {outer}" for inner, outer in pairs], _MOST_SHOWN)
 
 
 def _names_within(
@@ -508,4 +508,4 @@ def _names_within(
 
 
 def _topics_text(topics: list[str]) -> str:
-    return first_few(topics, _SHOWN)
+    return first_few(topics, _MOST_SHOWN)

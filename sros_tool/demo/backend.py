@@ -52,7 +52,7 @@ from sros_tool.translate import governance_for
 
 AUTO, RCLPY, CYCLONE, ZENOH = "auto", "rclpy", "cyclone", "zenoh"
 
-_ASKED = "chosen with --backend"
+_CHOSEN_BY_USER = "chosen with --backend"
 _NO_RCLPY = (
     "Source a ROS 2 installation from packages (its Fast DDS has DDS Security built in), or use"
     " `--backend cyclone`."
@@ -187,12 +187,16 @@ def choose_backend(wished_backend: str, probe: ProbeEnclave) -> Backend:
         UnavailableError: no such backend enforces security here.
     """
     if wished_backend == CYCLONE:
-        return _cyclone(cyclone_stack(probe), _ASKED)
+        return _cyclone(cyclone_stack(probe), _CHOSEN_BY_USER)
     stacks = []
     for stack in rclpy_stacks(probe):
         stacks.append(stack)
         if stack.enforces:
-            why = _ASKED if wished_backend == RCLPY else f"{stack.name} enforces security here"
+            why = (
+                _CHOSEN_BY_USER
+                if wished_backend == RCLPY
+                else f"{stack.name} enforces security here"
+            )
             return Backend(RCLPY, f"{stack.dds} {stack.version}".strip(), why, stack.rmw)
     reason = _why_not(stacks)
     if wished_backend == RCLPY:
@@ -229,14 +233,14 @@ def zenoh_backend() -> Backend:
             f"Version {version} is installed in this Python.",
             "Upgrade it with `pip install --upgrade 'sros_tool[zenoh]'`.",
         )
-    return Backend(ZENOH, f"Zenoh {version}", _ASKED)
+    return Backend(ZENOH, f"Zenoh {version}", _CHOSEN_BY_USER)
 
 
 def _cyclone(stack: Stack, why: str) -> Backend:
     if not stack.enforces:
         raise UnavailableError(
             "no DDS here is known to enforce security",
-            f"{stack.name}: {stack.evidence}. {'' if why == _ASKED else why}",
+            f"{stack.name}: {stack.evidence}. {'' if why == _CHOSEN_BY_USER else why}",
             INSTALL_ADVICE,
         )
     rmw = _observing_rmw()
@@ -271,7 +275,7 @@ _SIGNERS_CHECKED = ((2, 1, 4), (2, 6, 5), (2, 8, 2), (2, 9, 2))
 These releases, and all since 2.10, fix CVE-2023-24010. Source: tags of the repository.
 """
 
-_ENCRYPTING = (ProtectionKind.ENCRYPT, ProtectionKind.ENCRYPT_WITH_ORIGIN_AUTHENTICATION)
+_ENCRYPTING_KINDS = (ProtectionKind.ENCRYPT, ProtectionKind.ENCRYPT_WITH_ORIGIN_AUTHENTICATION)
 
 
 def conditions(backend: Backend, template: Template, topic: str) -> frozenset[Condition]:
@@ -295,7 +299,7 @@ def conditions(backend: Backend, template: Template, topic: str) -> frozenset[Co
         Condition.ONE_CA: not template.separate_authorities,
         Condition.SHARED_SUBJECTS: not template.unique_subject,
         Condition.OPEN_DEFAULT: template.default_permissions == EVERYTHING,
-        Condition.IN_CLEAR: not any(kind in _ENCRYPTING for kind in kinds),
+        Condition.IN_CLEAR: not any(kind in _ENCRYPTING_KINDS for kind in kinds),
         Condition.UNSIGNED: is_unprotected,
         Condition.UNAUTHENTICATED: unauthenticated and is_unprotected and uncontrolled,
         Condition.UNAUTHENTICATED_SEE: unauthenticated and not rule.enable_discovery_protection,
@@ -308,7 +312,7 @@ def conditions(backend: Backend, template: Template, topic: str) -> frozenset[Co
 
 
 _SECONDS_TO_STOP = 5.0
-_SILENCE = 5.0
+_SILENCE_SECONDS = 5.0
 """Seconds without a message or connection after which a node reports silence."""
 
 _LIBRARIES = {CYCLONE: "Cyclone DDS", RCLPY: "rclpy", ZENOH: "Zenoh"}
@@ -347,7 +351,7 @@ class HandNode:
             zenoh_backend()
 
 
-def security_of(node: HandNode, environment: Mapping[str, str]) -> str:
+def security_line(node: HandNode, environment: Mapping[str, str]) -> str:
     """Return a line that names the library on which the node runs, and says whether it is secured.
 
     Raises:
@@ -416,7 +420,7 @@ def run_by_hand(
     Raises:
         SrosError: The environment demands security, and the enclave cannot be loaded.
     """
-    say(f"{security_of(node, os.environ)} (stop with Ctrl-C)")
+    say(f"{security_line(node, os.environ)} (stop with Ctrl-C)")
     if not_heard := _types_not_heard(node, os.environ):
         say(not_heard)
     events, writing = os.pipe()
@@ -480,15 +484,18 @@ def _report(node: HandNode, pipe: int, say: Callable[[str], None]) -> Event | No
     data, seen, event = b"", "", None
     connected = node.backend != ZENOH
     while len(data) < _MAX_EVENT_BYTES:
-        ready, _, _ = select.select([pipe], [], [], _SILENCE)
+        ready, _, _ = select.select([pipe], [], [], _SILENCE_SECONDS)
         if not ready:
             if not connected:
                 say(
-                    f"not connected for {_SILENCE:.0f} s: no router runs (`sros demo router` "
-                    "starts one), or it refuses this node"
+                    f"not connected for {_SILENCE_SECONDS:.0f} s: no router runs (`sros demo "
+                    "router` starts one), or it refuses this node"
                 )
             elif node.role is Role.LISTENER:
-                say(f"heard nothing for {_SILENCE:.0f} s{f', although {seen}' if seen else ''}")
+                say(
+                    f"heard nothing for {_SILENCE_SECONDS:.0f} s"
+                    f"{f', although {seen}' if seen else ''}"
+                )
             continue
         if not (more := os.read(pipe, 65536)):
             return event

@@ -69,7 +69,7 @@ from sros_tool.policy.patterns import matches
 from sros_tool.wording import first_few
 from sros_tool.xml import read_bytes
 
-_RIGHTS = {
+_RIGHT_OF_ROLE = {
     Role.TALKER: "publish",
     Role.LISTENER: "subscribe",
     Role.SERVER: "reply",
@@ -162,7 +162,7 @@ class UserKeystore(NamedTuple):
             return row
         if self.permitted_enclave(row):
             return row
-        right, name = _RIGHTS[attacker.role], self.topic_of(attacker, topic)
+        right, name = _RIGHT_OF_ROLE[attacker.role], self.topic_of(attacker, topic)
         expressions = _expressions_of(self.grants[enclave], right, name)
         if not all(expressions):
             return row
@@ -303,7 +303,7 @@ def _read_enclaves(keystore: OpenedKeystore, now: datetime, domain: int) -> _Enc
             revoked[name] = by_own_list
         elif faults and all(fault.fault is Fault.PERMISSIONS_DOMAIN for fault in faults):
             other_domain.append(name)
-        elif reason := str(faults[0]) if faults else _strange_authority(keystore, state):
+        elif reason := str(faults[0]) if faults else _file_with_strange_authority(keystore, state):
             faulty[name] = reason
         elif grant := state.grant:
             rules = tuple(rule for rule in grant.rules if domain in rule.domains.closed())
@@ -345,7 +345,7 @@ def _content(path: Path) -> bytes:
         return b""
 
 
-def _strange_authority(keystore: OpenedKeystore, state: OpenedEnclave) -> str:
+def _file_with_strange_authority(keystore: OpenedKeystore, state: OpenedEnclave) -> str:
     """Return the name of an enclave's CA file with a CA that the keystore does not have, or ""."""
     for file, role in ((IDENTITY_CA_FILE, IDENTITY), (PERMISSIONS_CA_FILE, PERMISSIONS)):
         known = {digest(certificate) for certificate in keystore.authority(role)}
@@ -535,7 +535,7 @@ def _copy_filter(root: Path, folders: set[str]) -> Callable[[str, list[str]], se
     return left_out_names
 
 
-_WILD = set("*?[")
+_WILDCARDS = set("*?[")
 
 
 def enclave_grant(root: Path, enclave: str) -> Grant | None:
@@ -597,7 +597,7 @@ def _allows_name(grant: Grant, right: str, name: str, *, named: bool = False) ->
 
 def _is_wild(expression: str) -> bool:
     """Return whether a topic expression has wildcards."""
-    return bool(set(expression) & _WILD)
+    return bool(set(expression) & _WILDCARDS)
 
 
 def _application_topics(grant: Grant) -> Iterator[str]:

@@ -141,8 +141,8 @@ def _indented(texts: Sequence[str]) -> list[str]:
 _SROS_PACKAGES = ("sros_tool", "sros_ros2_security")
 """Python packages that provide the `ros2 security` of sros; the second package is for workspaces.
 """
-_SECONDS = 60.0
-_ASK = """
+_PROVIDER_SECONDS = 60.0
+_PROVIDER_PROGRAM = """
 import sys
 sys.path[:] = [path for path in sys.path if path]  # not the working folder: anybody may own it
 import json, importlib.metadata as metadata
@@ -182,12 +182,12 @@ def security_provider(environment: Mapping[str, str]) -> SecurityProvider | None
         return None
     with suppress(OSError, ValueError, subprocess.SubprocessError):
         ended = subprocess.run(
-            [*words, "-c", _ASK],
+            [*words, "-c", _PROVIDER_PROGRAM],
             env=dict(environment),
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
-            timeout=_SECONDS,
+            timeout=_PROVIDER_SECONDS,
             check=True,
         )
         names = [str(package) for package in json.loads(ended.stdout)]
@@ -254,7 +254,7 @@ _PACKAGES = (
     "sros2",
 )
 _SECRET_NAME = re.compile(r"PASS|PIN\b|_PIN|SECRET|TOKEN|KEY|CREDENTIAL|AUTH", re.IGNORECASE)
-_SYSTEM = ("/dev/", "/etc/", "/lib/", "/lib64/", "/opt/ros/", "/proc/", "/sys/", "/usr/")
+_SYSTEM_FOLDERS = ("/dev/", "/etc/", "/lib/", "/lib64/", "/opt/ros/", "/proc/", "/sys/", "/usr/")
 
 
 def support_report(
@@ -344,7 +344,7 @@ class _PrivateDataRemover:
 
     def _path(self, match: re.Match[str]) -> str:
         path = match[0]
-        return path if path.startswith(_SYSTEM) and ".." not in path else "PATH"
+        return path if path.startswith(_SYSTEM_FOLDERS) and ".." not in path else "PATH"
 
 
 def _is_user_known() -> bool:

@@ -60,7 +60,7 @@ from sros_tool.policy.model import Level, TopicProtection
 from sros_tool.validity import Window
 
 _DAY, _MINUTE = timedelta(days=1), timedelta(minutes=1)
-_NOBODY = 65534
+_NOBODY_USER_ID = 65534
 
 STOLEN = "/stolen"
 """Name of the copy of a revoked enclave, made before its revocation."""
@@ -184,12 +184,12 @@ class UncastError(KeystoreError):
     """Raised if the keystore has no enclave for a part of the row."""
 
     def __init__(self, part: str) -> None:
-        needed = _NEEDED.get(part, f"an enclave for the {part}")
+        needed = _NEEDED_ENCLAVES.get(part, f"an enclave for the {part}")
         super().__init__("no enclave of the keystore fits this row", f"The row needs {needed}.")
 
 
 _SERVICE_OF_TWO = "an enclave that offers a service of its own, and another that may call it"
-_NEEDED = {
+_NEEDED_ENCLAVES = {
     "guest": "a third enclave, besides those of the talker and the listener",
     "admin": "two more enclaves: one that may not publish the topic, and one below it that may, as"
     " /arm and /arm/tool",
@@ -561,8 +561,8 @@ def _read_as_nobody(root: Path, files: list[str]) -> list[bytes | None]:
                 status = 1
                 try:
                     os.setgroups([])
-                    os.setgid(_NOBODY)
-                    os.setuid(_NOBODY)
+                    os.setgid(_NOBODY_USER_ID)
+                    os.setuid(_NOBODY_USER_ID)
                     descriptor = os.open(file, os.O_RDONLY, dir_fd=place)
                     with os.fdopen(write_end, "wb") as answer:
                         answer.write(os.read(descriptor, 1 << 20))

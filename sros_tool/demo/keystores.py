@@ -154,7 +154,7 @@ class KeystoreSet:
         environment = self.environment(Identity(OWN, "talker"), domain)
         return ProbeEnclave(environment, topic, DENIED_TOPIC)
 
-    def inapplicable(self, row: Row) -> str:
+    def why_inapplicable(self, row: Row) -> str:
         """Return why a row does not apply to this keystore (no enclave for a part), or ""."""
         for party in row.parties:
             identity = party.identity

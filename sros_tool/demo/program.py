@@ -570,7 +570,7 @@ class _Runner:
         """Run rows that share their processes; return their results by index."""
         rows, domain = [self._plan.rows[index] for index in group], self._plan.domains[group[0]]
         skipped = {row.name: why for row in rows if (why := self._why_skipped(row))}
-        inapplicable = {row.name for row in rows if self._plan.keystores.inapplicable(row)}
+        inapplicable = {row.name for row in rows if self._plan.keystores.why_inapplicable(row)}
         tried = [row for row in rows if row.name not in skipped]
         played = RowRecord(rows[0], domain)
         if tried:
@@ -596,7 +596,7 @@ class _Runner:
         return results
 
     def _why_skipped(self, row: Row) -> str:
-        if why := self._plan.keystores.inapplicable(row):
+        if why := self._plan.keystores.why_inapplicable(row):
             return why
         handshake = any(claim.wire in (Wire.TOPIC, Wire.CERTIFICATE) for claim in row.claims)
         if (handshake or row.replay or row.impersonate) and not self._plan.own_networks:

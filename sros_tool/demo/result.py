@@ -199,7 +199,7 @@ def _observe_row(record: RowRecord) -> _ClaimFinding:
     if record.skipped:
         return _ClaimFinding(RowStatus.SKIPPED, record.skipped)
     for party in record.row.parties:
-        lost = _missing_import(party, record.parties[party.name])
+        lost = _why_import_failed(party, record.parties[party.name])
         if lost:
             return _ClaimFinding(RowStatus.SKIPPED, lost)
     claims = [(claim, _judge_claim(claim, record)) for claim in record.row.claims]
@@ -221,7 +221,7 @@ def _observe_row(record: RowRecord) -> _ClaimFinding:
     return _ClaimFinding(record.row.expected, "; ".join(details))
 
 
-def _missing_import(party: Party, record: PartyRecord) -> str:
+def _why_import_failed(party: Party, record: PartyRecord) -> str:
     """Return why a node could not import rclpy or a ROS interface, or ""."""
     if party.role in (Role.TALKER, Role.LISTENER):
         return ""
@@ -466,7 +466,9 @@ def _why_not_running(name: str, record: PartyRecord) -> _ClaimFinding | None:
     ready = any(event.kind is EventKind.READY for event in record.events)
     for event in record.events:
         if event.kind is EventKind.REFUSED:
-            return _refusal_finding(name, event.stage, _denial_by_itself(record, "") or event.text)
+            return _refusal_finding(
+                name, event.stage, _own_denial_message(record, "") or event.text
+            )
         if event.kind is EventKind.FAILED:
             return _failure(name, record, event)
     if record.status is not None:
@@ -481,7 +483,9 @@ def _failure(name: str, record: PartyRecord, event: Event) -> _ClaimFinding:
     reason = " ".join(event.text.split())
     if lacking := missing_security(reported):
         return _ClaimFinding(RowStatus.NOT_STARTED, f"{name}: {lacking}")
-    if event.stage is ProcessStage.ENDPOINT and (refusal := _denial_by_itself(record, event.text)):
+    if event.stage is ProcessStage.ENDPOINT and (
+        refusal := _own_denial_message(record, event.text)
+    ):
         return _refusal_finding(name, ProcessStage.ENDPOINT, refusal)
     if event.stage in (ProcessStage.PARTICIPANT, ProcessStage.ENDPOINT):
         # A ROS node has standard topics and services: if one is denied, it does not start.
@@ -491,7 +495,7 @@ def _failure(name: str, record: PartyRecord, event: Event) -> _ClaimFinding:
     return _ClaimFinding(RowStatus.CRASHED, f"{name} failed: {reason}")
 
 
-def _denial_by_itself(record: PartyRecord, reported: str) -> str:
+def _own_denial_message(record: PartyRecord, reported: str) -> str:
     """Return the log message in which DDS Security denies the party's own topic, or ""."""
     lines = f"{record.output}\n{reported}".splitlines()
     return endpoint_refusal("\n".join(line for line in lines if _is_about(line, record.topic)))

@@ -207,7 +207,7 @@ def _contains_text(path: Path, text: str) -> bool:
 
 
 _Order = Literal["little", "big"]
-_DATA = 0x15
+_DATA_SUBMESSAGE = 0x15
 _SEQUENCE_NUMBER = 20
 """Offset of the sequence number's low half from the start of a DATA submessage, in bytes."""
 
@@ -250,7 +250,7 @@ def with_changed_bit(packet: bytes, later: int, place: int, places: int) -> byte
         return None
     changed = bytearray(packet)
     for position, end, order in _submessages(packet):
-        if packet[position] == _DATA and end >= position + _SEQUENCE_NUMBER + 4:
+        if packet[position] == _DATA_SUBMESSAGE and end >= position + _SEQUENCE_NUMBER + 4:
             _raise_number(changed, position, order, later)
     changed[begin + (2 * place + 1) * (len(packet) - begin) // (2 * places)] ^= 1
     return bytes(changed)

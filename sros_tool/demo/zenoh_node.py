@@ -43,11 +43,11 @@ from sros_tool.runtime.events import EventKind, EventWriter, ProcessStage
 _POLL_SECONDS = 0.02
 _REPLY_SECONDS = 5.0
 _NO_HASH = f"RIHS01_{'0' * 64}"
-_MESSAGE = (
+_MESSAGE_TYPE = (
     "std_msgs::msg::dds_::String_",
     "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18",
 )
-_SERVICE = (
+_SERVICE_TYPE = (
     "example_interfaces::srv::dds_::AddTwoInts_",
     "RIHS01_e118de6bf5eeb66a2491b5bda11202e7b68f198d6f67922cf30364858239c81a",
 )
@@ -112,7 +112,7 @@ class _ZenohNode:
 
     def publisher(self, name: str) -> Hear:
         """Return a function that publishes a text; ``name`` may have Zenoh wildcards."""
-        kind = _type_of_topic(name, _MESSAGE)
+        kind = _type_of_topic(name, _MESSAGE_TYPE)
         gid = _GID if "*" in name else self._announce("MP", name, kind)
         key, numbers = self._key_of(name, kind), itertools.count(1)
 
@@ -124,7 +124,7 @@ class _ZenohNode:
 
     def subscribe(self, name: str, hear: Hear) -> None:
         """Subscribe to a topic; ``hear`` gets each text."""
-        kind = _type_of_topic(name, _MESSAGE)
+        kind = _type_of_topic(name, _MESSAGE_TYPE)
         if "*" not in name:
             self._announce("MS", name, kind)
         key = self._key_of(name, kind)
@@ -149,7 +149,7 @@ class _ZenohNode:
 
     def serve(self, name: str, answer: Callable[[str], str]) -> None:
         """Offer a service; ``answer`` gets each request and returns the reply."""
-        kind = _type_of_topic(name, _SERVICE)
+        kind = _type_of_topic(name, _SERVICE_TYPE)
         self._announce("SS", name, kind)
         key = self._key_of(name, kind)
 
@@ -165,7 +165,7 @@ class _ZenohNode:
 
         ``name`` may have Zenoh wildcards.
         """
-        kind = _type_of_topic(name, _SERVICE)
+        kind = _type_of_topic(name, _SERVICE_TYPE)
         gid = _GID if "*" in name else self._announce("SC", name, kind)
         key, numbers = self._key_of(name, kind), itertools.count(1)
         exact = "*" not in key

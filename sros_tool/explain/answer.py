@@ -56,7 +56,7 @@ from sros_tool.values import Words, shows
 
 _JOIN = "join"
 TYPES = ("topic", "service", "action")
-_RIGHTS = {
+_RIGHT_OF_WORD_AND_TYPE = {
     ("publish", "topic"): "publish",
     ("subscribe", "topic"): "subscribe",
     ("call", "service"): "request",
@@ -66,7 +66,7 @@ _RIGHTS = {
     ("request", "service"): "request",
     ("reply", "service"): "reply",
 }
-WORDS = (*dict.fromkeys(word for word, _ in _RIGHTS), _JOIN)
+WORDS = (*dict.fromkeys(word for word, _ in _RIGHT_OF_WORD_AND_TYPE), _JOIN)
 """The words of questions; in policies, request and reply stand for call and serve of services."""
 
 _ROLES = {"rq": "requests", "rr": "replies"}
@@ -161,20 +161,24 @@ def ask(word: str, name: str = "", kind: str | None = None) -> Question:
                 "The question is whether the enclave may join the domain.",
             )
         return Question(_JOIN)
-    fitting = [kind_of_name for kind_of_name in TYPES if (word, kind_of_name) in _RIGHTS]
+    fitting = [
+        kind_of_name for kind_of_name in TYPES if (word, kind_of_name) in _RIGHT_OF_WORD_AND_TYPE
+    ]
     chosen = kind or fitting[0]
     if chosen not in fitting:
-        verbs = " or ".join(verb for verb, right in _RIGHTS if right == chosen)
+        verbs = " or ".join(verb for verb, right in _RIGHT_OF_WORD_AND_TYPE if right == chosen)
         raise UsageError(
             f"nobody can {word} {with_article(chosen)}",
             f"A node can {word} {' or '.join(map(with_article, fitting))}, and "
             f"{verbs} {with_article(chosen)}.",
             f"Leave --type out, or write --type {fitting[0]}.",
         )
-    return Question(word, chosen, _RIGHTS[word, chosen], _checked_name(name, word, chosen))
+    return Question(
+        word, chosen, _RIGHT_OF_WORD_AND_TYPE[word, chosen], _checked_name(name, word, chosen)
+    )
 
 
-_OF_ACTIONS = {"call": "call", "serve": "execute"}
+_WORDS_FOR_ACTIONS = {"call": "call", "serve": "execute"}
 
 
 def about_action(question: Question, rights: Iterable[Right]) -> Question | None:
@@ -183,12 +187,12 @@ def about_action(question: Question, rights: Iterable[Right]) -> Question | None
     "call" and "serve" are for services and actions, whose names look the same.  Returns None if
     ``rights`` do not show an action, or if the question is about something else.
     """
-    if question.type != "service" or question.word not in _OF_ACTIONS:
+    if question.type != "service" or question.word not in _WORDS_FOR_ACTIONS:
         return None
     kinds = {right.kind for right in rights if right.name == question.name}
     if "actions" not in kinds or "services" in kinds:
         return None
-    return ask(_OF_ACTIONS[question.word], question.name, "action")
+    return ask(_WORDS_FOR_ACTIONS[question.word], question.name, "action")
 
 
 _COMMANDING_SERVICES = ("send_goal", "cancel_goal")
@@ -491,7 +495,7 @@ class Answer(NamedTuple):
             case Outcome.CRASHES:
                 return "nobody: the process crashes when it starts"
             case Outcome.DENIED if self.part in self.question.parts:
-                entity = _CREATED.get(self.question.word, "it")
+                entity = _CREATED_OBJECTS.get(self.question.word, "it")
                 return f"DDS in the process itself: {entity} is not created"
             case _:
                 text = "DDS in the process itself: no node of the enclave starts"
@@ -578,7 +582,7 @@ class Answer(NamedTuple):
         return [export] if self.is_of_export else []
 
 
-_CREATED = {
+_CREATED_OBJECTS = {
     "publish": "the publisher",
     "subscribe": "the subscription",
     "call": "the client",
@@ -592,7 +596,7 @@ _CREATED = {
 # ── the policy behind an answer ────────────────────────────────────────────────────────────
 
 
-def recorded_policy(keystore: OpenedKeystore, signed: bytes) -> str:
+def recorded_policy_digest(keystore: OpenedKeystore, signed: bytes) -> str:
     """Return the SHA-256 (hexadecimal) of the policy from which permissions were made, or "".
 
     The SHA-256 is in the ledger of the keystore; without a ledger or an entry, the result is "".
@@ -606,7 +610,7 @@ def recorded_policy(keystore: OpenedKeystore, signed: bytes) -> str:
 def template_default(digest: str) -> str:
     """Return the default policy of keystore templates that has this digest, or "".
 
-    ``digest`` is from `recorded_policy`.  The result is "everything" or "node_basics", as in
+    ``digest`` is from `recorded_policy_digest`.  The result is "everything" or "node_basics", as in
     ``permissions.default`` of a template.
     """
     from sros_tool.files import policies_dir

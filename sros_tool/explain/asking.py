@@ -316,7 +316,7 @@ def _action_meant(
     return about_action(question, rights)
 
 
-def taken_for_action(question: Question, action: Question) -> tuple[Note, ...]:
+def notes_on_question_about_action(question: Question, action: Question) -> tuple[Note, ...]:
     """Return a note that a question about a service is answered for an action.
 
     Empty for ``call``, because policies use this word for actions only.
@@ -360,7 +360,7 @@ def question_meant(
             evaluator, question, lambda: asked_enclave.other_rights(question.name)
         )
         if action:
-            return action, taken_for_action(question, action)
+            return action, notes_on_question_about_action(question, action)
     return question, ()
 
 

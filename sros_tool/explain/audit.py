@@ -64,7 +64,7 @@ from sros_tool.values import DryRun, FileChanges, Notes, Words, shows
 from sros_tool.wording import counted, first_few
 
 _DENY_RULE = "deny-rule"
-_USE = "use"
+_USE_WORD = "use"
 ON_ZENOH = Note(
     "audit.on-zenoh",
     "these nodes run on Zenoh, and sros decided by the rules of a DDS vendor. On Zenoh, the files "
@@ -422,11 +422,16 @@ def audit(observation: Observation, enclaves: AuditedEnclaves, observer: str = "
             denied += _without_enclave(node, enclaves.what)
     if divided:
         notes.append(
-            Note("audit.divided-process", f"{_DIVIDED}: {first_subjects(sorted(divided), '; ')}")
+            Note(
+                "audit.divided-process", f"{_DIVIDED_TEXT}: {first_subjects(sorted(divided), '; ')}"
+            )
         )
     if unclear:
         notes.append(
-            Note("audit.several-enclaves", f"{_UNCLEAR}: {first_subjects(sorted(unclear), '; ')}")
+            Note(
+                "audit.several-enclaves",
+                f"{_UNCLEAR_TEXT}: {first_subjects(sorted(unclear), '; ')}",
+            )
         )
     return Audit(
         _group_by_right(denied),
@@ -439,25 +444,25 @@ def audit(observation: Observation, enclaves: AuditedEnclaves, observer: str = "
     )
 
 
-_DIVIDED = (
+_DIVIDED_TEXT = (
     "no single enclave has all nodes of these processes, but a process runs in one enclave; sros "
     "judged the enclave with the fewest denials"
 )
-_UNCLEAR = (
+_UNCLEAR_TEXT = (
     "several enclaves have these nodes, and the graph does not show in which of them they run; "
     "sros judged all of them; start each process with `--ros-args --enclave /its/name` to "
     "distinguish them"
 )
-_TOOLS = (
+_TOOLS_TEXT = (
     "left out, because these nodes are tools that observe the robot; on the secured robot they "
     "need an enclave such as the one in operator_look.xml (`sros policies --copy`)"
 )
-_ENDED = (
+_ENDED_TEXT = (
     "judged as well, although these nodes ended while the graph was observed; on a robot without "
     "security, anyone on the network can show such nodes"
 )
-_SILENT = "not judged, because these nodes were announced but had no endpoint"
-_STRAYS = "not judged, because the writers or readers of these topics belong to no ROS node"
+_SILENT_TEXT = "not judged, because these nodes were announced but had no endpoint"
+_STRAYS_TEXT = "not judged, because the writers or readers of these topics belong to no ROS node"
 
 
 def _unjudged_notes(observation: Observation) -> list[tuple[Note, str]]:
@@ -473,16 +478,20 @@ def _unjudged_notes(observation: Observation) -> list[tuple[Note, str]]:
     strays = {endpoint.topic for _, endpoint in observation.strays}
     notes = [
         (
-            _note("tool", _TOOLS, tools),
+            _note("tool", _TOOLS_TEXT, tools),
             f"{counted(len(active), 'node')} with a tool's name",
             active,
         ),
         (
-            _note("silent", _SILENT, silent_nodes),
+            _note("silent", _SILENT_TEXT, silent_nodes),
             f"{counted(len(silent_nodes), 'node')} without endpoint",
             silent_nodes,
         ),
-        (_note("stray", _STRAYS, strays), f"{counted(len(strays), 'topic')} of no node", strays),
+        (
+            _note("stray", _STRAYS_TEXT, strays),
+            f"{counted(len(strays), 'topic')} of no node",
+            strays,
+        ),
     ]
     return [
         (note, f"{words} ({first_few(sorted(names), _MOST_NAMES)})" if names else "")
@@ -493,7 +502,7 @@ def _unjudged_notes(observation: Observation) -> list[tuple[Note, str]]:
 
 def notes_on_ended(nodes: Iterable[str]) -> tuple[Note, ...]:
     """Return a note on nodes, by full name, that ended while the graph was observed."""
-    note = _note("ended", _ENDED, (n for n in nodes if not is_tool_name(_base_name(n))))
+    note = _note("ended", _ENDED_TEXT, (n for n in nodes if not is_tool_name(_base_name(n))))
     return (note,) if note else ()
 
 
@@ -560,7 +569,7 @@ def _denied_rights(
     parts = tuple(Part(AccessVerb(e.direction), e.topic) for e in sorted(node.endpoints))
     if not parts:
         return
-    answer = evaluator.answer(Question(_USE, only=parts))
+    answer = evaluator.answer(Question(_USE_WORD, only=parts))
     decisions = {
         Endpoint(part.topic, part.verb.value): decision
         for part, decision in answer.parts

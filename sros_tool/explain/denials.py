@@ -186,7 +186,7 @@ def propose(denials: Iterable[Denial]) -> MissingRights:
     )
 
 
-def serving_node(denial: Denial) -> str:
+def node_denied_own_service(denial: Denial) -> str:
     """Return the full name of a node that was denied a service that every node offers, or ""."""
     service, begin = service_of(denial.topic)
     if denial.remote or not service:
@@ -220,21 +220,21 @@ def _without_parts(rights: set[NodeRight]) -> frozenset[NodeRight]:
 _ANY_NODE = ("/", "*")
 """Namespace and name of a profile for any node, in an enclave that also has named nodes."""
 
-_OTHER = (
+_NO_PROFILE_TEXT = (
     "not proposed, because the policy has no profile for nodes with these names; start them with "
     "the names in the policy (--ros-args -r __node:=NAME -r __ns:=NAMESPACE), or add a profile "
     "with --node /NAMESPACE/NAME: {}"
 )
-_ASSUMED = (
+_ASSUMED_NODE_TEXT = (
     "the log does not name the node, so the last part of its enclave's name is taken; if this is "
     "wrong, name the node with --node /NAMESPACE/NAME: {}"
 )
-_WHOLE = (
+_ALL_BASIC_RIGHTS_TEXT = (
     "the profile has none of the rights that every node needs, so all of them are proposed "
     "together, instead of one after each restart: {}"
 )
-_ELSEWHERE = "not proposed, because the log names another enclave than --enclave: {}"
-_SEVERAL = Note(
+_OTHER_ENCLAVE_TEXT = "not proposed, because the log names another enclave than --enclave: {}"
+_SEVERAL_ENCLAVES_NOTE = Note(
     "log.several-enclaves",
     "the log names several enclaves, and each denial is assigned to the enclave that its process "
     "named last. Check that no two processes wrote to the log at the same time without a label, "
@@ -356,10 +356,10 @@ def as_learned(
     notes = [
         Note(name, text.format("; ".join(f"{who}: {reason}" for who, reason in reasons.items())))
         for name, text, reasons in (
-            ("log.node-assumed", _ASSUMED, assumed),
-            ("log.other-node", _OTHER, other_nodes),
-            ("log.common-part", _WHOLE, parts_by_profile),
-            ("log.other-enclave", _ELSEWHERE, elsewhere),
+            ("log.node-assumed", _ASSUMED_NODE_TEXT, assumed),
+            ("log.other-node", _NO_PROFILE_TEXT, other_nodes),
+            ("log.common-part", _ALL_BASIC_RIGHTS_TEXT, parts_by_profile),
+            ("log.other-enclave", _OTHER_ENCLAVE_TEXT, elsewhere),
         )
         if reasons
     ]
@@ -473,7 +473,7 @@ def _notes(missing_rights: MissingRights) -> tuple[Note, ...]:
         ),
     }
     several = len(missing_rights.rights) > 1
-    return (_SEVERAL,) * several + tuple(
+    return (_SEVERAL_ENCLAVES_NOTE,) * several + tuple(
         Note(name, text.format(", ".join(dict.fromkeys(map(_denial_text, denials)))))
         for name, (denials, text) in texts.items()
         if denials

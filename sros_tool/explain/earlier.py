@@ -219,7 +219,7 @@ def _allows(
     return False
 
 
-_UNKNOWN = {
+_UNKNOWN_TEXTS = {
     "explain.earlier-permissions": "whether earlier permissions may still allow it",
     "explain.revoked-enclaves": "whether processes still accept revoked certificates",
 }
@@ -230,4 +230,4 @@ def _note_on_unknown_answer(
 ) -> Note:
     """Return a note which says that the answer is not known, for what reason, and what to do."""
     remedy = remedy or f"`sros check {quote(str(keystore.root))}` says what to do."
-    return Note(kind, f"{_UNKNOWN[kind]} is not known: {reason}. {remedy}")
+    return Note(kind, f"{_UNKNOWN_TEXTS[kind]} is not known: {reason}. {remedy}")

@@ -30,7 +30,7 @@ from sros_tool.explain.answer import (
     Question,
     deciding_lines,
     lines_of_right,
-    recorded_policy,
+    recorded_policy_digest,
 )
 from sros_tool.faults import FAULTS, NOT_IN_THE_FILE, REPLACE, Fault, remedy_in_original_keystore
 from sros_tool.keystore.layout import (
@@ -68,7 +68,7 @@ def explain(evaluator: Evaluator, question: Question) -> Answer:
     )
     keystore = enclave.keystore
     known = keystore is not None and keystore.has(LEDGER)
-    recorded = recorded_policy(keystore, enclave.signed) if keystore and known else ""
+    recorded = recorded_policy_digest(keystore, enclave.signed) if keystore and known else ""
     answer = answer._replace(
         lines=deciding_lines(enclave.policy, answer) if enclave.policy else (),
         provenance=_provenance(enclave, recorded),
@@ -129,15 +129,15 @@ def _with_policy_change(evaluator: Evaluator, answer: Answer) -> Answer | None:
 
 # ── remedies ───────────────────────────────────────────────────────────────────────────────
 
-_ROTATION = (
+_ROTATION_REMEDY = (
     "The CAs of this keystore are being replaced: do the next stage with `sros rotate_ca {root} "
     "--next`, and restart the processes after it."
 )
-_RIGHTS = (
+_RIGHTS_REMEDY = (
     "Sign the intended permissions: `sros create_permission {root} {enclave} POLICY`; `sros renew` "
     "refuses the present permissions, because the ledger has later ones."
 )
-_VENDOR = (
+_VENDOR_REMEDY = (
     "Write it in the form that all vendors read alike: `sros create_permission {root} {enclave} "
     "POLICY`."
 )
@@ -149,9 +149,9 @@ _FAULT_OF_REASON: dict[str, str | Fault] = {
     "domain-not-in-governance": Fault.GOVERNANCE_DOMAIN,
     "peer-refuses-participant": Fault.PERMISSIONS_SUBJECT,
     "unauthenticated-with-rtps-protection": Fault.GOVERNANCE_MALFORMED,
-    "malformed": _VENDOR,
-    "open-range": _VENDOR,
-    "empty-topic": _VENDOR,
+    "malformed": _VENDOR_REMEDY,
+    "open-range": _VENDOR_REMEDY,
+    "empty-topic": _VENDOR_REMEDY,
     "long-name": "Use a shorter name: on DDS at most 251 characters, prefix and suffix included.",
     "no-topic-rule": "Make a keystore from a template: its governance has a rule for every topic.",
     "empty-subject": "Issue a certificate with a common name: `sros renew {root} {enclave}`.",
@@ -161,8 +161,8 @@ _FAULT_OF_REASON: dict[str, str | Fault] = {
 }
 """Reason of a denial that no change of the policy can resolve → the fault, or a remedy."""
 
-_OF_VALIDITY = (Fault.PERMISSIONS_EXPIRED, Fault.PERMISSIONS_NOT_YET_VALID)
-_OF_GOVERNANCE = (Fault.GOVERNANCE_MALFORMED, Fault.GOVERNANCE_DOMAIN)
+_VALIDITY_FAULTS = (Fault.PERMISSIONS_EXPIRED, Fault.PERMISSIONS_NOT_YET_VALID)
+_GOVERNANCE_FAULTS = (Fault.GOVERNANCE_MALFORMED, Fault.GOVERNANCE_DOMAIN)
 
 
 def remedy(cause: Fault | str, root: str, enclave: str, file: str = "") -> str:
@@ -180,7 +180,7 @@ def remedy(cause: Fault | str, root: str, enclave: str, file: str = "") -> str:
     )
     fault, text = (known, "") if isinstance(known, Fault) else (None, known)
     if fault:
-        file = file or (GOVERNANCE_FILE if fault in _OF_GOVERNANCE else "")
+        file = file or (GOVERNANCE_FILE if fault in _GOVERNANCE_FAULTS else "")
         text = fault.remedy_in(file)
     keystore = Path(root) if root and Path(root).is_dir() else None
     if keystore and not is_original_keystore(keystore):
@@ -198,9 +198,9 @@ def remedy(cause: Fault | str, root: str, enclave: str, file: str = "") -> str:
         if wrong_issuer and is_own_copy(keystore, enclave, IDENTITY_CA_FILE):
             return _filled_remedy(REPLACE, root, enclave, IDENTITY_CA_FILE)
         if (wrong_issuer or fault is Fault.CA_EXPIRED) and _is_rotating(keystore):
-            text = _ROTATION
-        elif fault in _OF_VALIDITY and not _is_latest(keystore, enclave):
-            text = _RIGHTS
+            text = _ROTATION_REMEDY
+        elif fault in _VALIDITY_FAULTS and not _is_latest(keystore, enclave):
+            text = _RIGHTS_REMEDY
         elif fault not in NOT_IN_THE_FILE and is_own_copy(keystore, enclave, file):
             text = REPLACE
     return _filled_remedy(text, root or "KEYSTORE", enclave, file)

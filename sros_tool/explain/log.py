@@ -30,7 +30,7 @@ from sros_tool.explain.asking import (
     policy_to_ask,
     signed_enclave,
 )
-from sros_tool.explain.denials import Denial, read_denials, serving_node
+from sros_tool.explain.denials import Denial, node_denied_own_service, read_denials
 from sros_tool.explain.explanation import (
     likely_names,
     meaning_of_other_kind,
@@ -101,7 +101,7 @@ from sros_tool.wording import first_few
 
 _WORD_PATTERNS = (re.compile(r"[\w/]+"), re.compile(r"[^\s(]+"), re.compile(r"\S+"))
 """Patterns that split a log line into words: without punctuation, or with that of topics."""
-_NUMBERS = re.compile(r"\b[0-9a-f]{2}(?:\.[0-9a-f]{2}){5,}\S*|\d+")
+_CHANGING_NUMBERS = re.compile(r"\b[0-9a-f]{2}(?:\.[0-9a-f]{2}){5,}\S*|\d+")
 _MAX_LINE_LENGTH = 8000
 """Maximum number of characters read from a line, because a line may have many megabytes."""
 
@@ -591,7 +591,7 @@ _RIGHT_OF_DROPPED_MESSAGE: Mapping[tuple[str, bool], str] = {
     ("Declare Queryable", False): "call",
 }
 """Kind of message and whether the message was incoming → right that the remote process lacks."""
-_GRAPH: Mapping[tuple[str, bool], str] = {
+_GRAPH_RIGHTS: Mapping[tuple[str, bool], str] = {
     ("Liveliness Token", True): "announce this node, topic or service in the graph",
     ("Liveliness Token", False): "see this node, topic or service in the graph",
     ("Liveliness Query", True): "ask for the graph",
@@ -619,7 +619,7 @@ def _dropped_message_findings(
         kind = message.message, message.ingress is not lacks_own
         _, name = name_of_key(message.key)
         right = _RIGHT_OF_DROPPED_MESSAGE.get(kind, "") if name else ""
-        dropped_right = f"{right} {name}" if right else _GRAPH.get(kind, "")
+        dropped_right = f"{right} {name}" if right else _GRAPH_RIGHTS.get(kind, "")
         dropped_right = dropped_right or f"pass {message.message} of {message.key}"
         group = message.process, message.name or message.zid, lacks_own, dropped_right
         groups.setdefault(group, []).append(message)
@@ -726,10 +726,10 @@ class _Examiner:
         if meaning.id.startswith("peer-"):
             return self._with_peer_causes(plain, hits)
         path = first.fields.get("path", "")
-        if meaning.id in _ABOUT_FOLDERS and (place := _keystore_with(path)):
+        if meaning.id in _FOLDER_IDS and (place := _keystore_with(path)):
             text = LET_ENTER_ORIGINAL if is_original_keystore(place) else LET_ENTER_EXPORT
             advice = self._with_names(_with_name(text, "KEYSTORE", str(place)), named, first)
-            if meaning.id != _ABOUT_FOLDERS[0]:
+            if meaning.id != _FOLDER_IDS[0]:
                 advice = f"{advice} {remedy_of}"
             return replace(plain, found=("the folder is here",), checked=True, remedy=advice)
         if better := self._other_folder_remedy(path, remedy_of):
@@ -775,7 +775,7 @@ class _Examiner:
         own_name = enclave.name if enclave else hit.enclave.rstrip("/")
         own_name = "" if hit.meaning in (NO_ENCLAVE, RUNS_OPEN) else own_name
         if self._is_export and NEEDS_CA_KEYS.search(text):
-            text = remedy_in_closed_robot(Path(self._root), self._for_export(text))
+            text = remedy_in_closed_robot(Path(self._root), self._remedy_for_export(text))
         else:
             text = _with_name(text, "KEYSTORE", self._root)
         return _with_name(text, "ENCLAVE", own_name).format(**hit.quoted)
@@ -788,7 +788,7 @@ class _Examiner:
             and not is_original_keystore(root)
         )
 
-    def _for_export(self, text: str) -> str:
+    def _remedy_for_export(self, text: str) -> str:
         """Return a remedy with this export as KEYSTORE, except in commands that need CA keys."""
         parts = _COMMAND.split(text)
         named = [
@@ -825,9 +825,9 @@ class _Examiner:
             remedies += [f"{cause} Then restart its processes." for _, cause in causes if cause]
             if not causes:
                 known.append(f"the peer is enclave {name}, whose current files have no fault")
-                if not (rotating and finding.id in _OF_ROTATION):
+                if not (rotating and finding.id in _ROTATION_IDS):
                     remedies.append(_OLDER_FILES.format(peer=name))
-        if peers and rotating and finding.id in _OF_ROTATION:
+        if peers and rotating and finding.id in _ROTATION_IDS:
             of = f" of enclave {finding.enclave}" if finding.enclave else ""
             known.append("the CAs of this keystore are being replaced, and stage 2 is done")
             remedies = [_NOT_RESTARTED[finding.dds or Vendor.FAST].format(of=of)]
@@ -849,7 +849,7 @@ class _Examiner:
         missing = {}
         for process, denied in by_process.items():
             enclave = self._find(process[1])
-            if enclave is None or not any(map(serving_node, denied)):
+            if enclave is None or not any(map(node_denied_own_service, denied)):
                 continue
             answer = self._answer(enclave, denied[0].vendor, ask("join"))
             spaces = {node.rpartition("/")[0] for node in _served_names(answer)}
@@ -885,7 +885,7 @@ class _Examiner:
             False: "no rule allows it",
             None: "its permissions do not allow it",
         }[denial.by_rule]
-        if node := serving_node(denial):
+        if node := node_denied_own_service(denial):
             by += f"; every node has this service, and here it belongs to node {node}"
         finding = LogFinding(
             "topic-denied",
@@ -968,7 +968,7 @@ class _Examiner:
 
     def _other_node_cause(self, denial: Denial, answer: Answer) -> tuple[list[str], str]:
         """Return causes and a remedy if the permissions are for a node with another name."""
-        node, nodes = serving_node(denial), _served_names(answer)
+        node, nodes = node_denied_own_service(denial), _served_names(answer)
         if node and not any(covers(own_node, node) for own_node in nodes):
             enclaves = self._keystore.enclaves_for(node) if self._keystore else ()
             beginning = f"the permissions are for {_listed_nodes(nodes)}, and " if nodes else ""
@@ -1092,7 +1092,7 @@ class _Examiner:
                 yield decision.text, remedy(decision.reason, self._root, enclave.name)
                 return
         governed = enclave.domains
-        if hit.meaning.id not in _ABOUT_DOMAINS or governed is None:
+        if hit.meaning.id not in _DOMAIN_IDS or governed is None:
             return
         where = f"domain {domain}" if domain else "another domain"
         if domain and int(domain) in governed:
@@ -1124,7 +1124,7 @@ def _unknown_cause(hits: Iterable[_Hit]) -> str:
     """Return the cause for lines with unknown meaning: the different texts of these lines."""
     lines: dict[str, int] = {}
     for hit in hits:
-        lines.setdefault(_NUMBERS.sub("", plain_refusal(hit.text)), hit.line)
+        lines.setdefault(_CHANGING_NUMBERS.sub("", plain_refusal(hit.text)), hit.line)
     if len(lines) == 1:
         return UNKNOWN.cause
     shown = first_few([str(line) for line in lines.values()], _MOST_LINES)
@@ -1147,7 +1147,7 @@ _COMMAND = re.compile(r"(`sros\b[^`]*`)")
 _MOST_LINES = 20
 _MAX_PEERS = 5
 """Maximum number of peers that are examined for one message."""
-_OF_ROTATION = ("peer-signature", "peer-permissions-ca")
+_ROTATION_IDS = ("peer-signature", "peer-permissions-ca")
 _NOT_RESTARTED = {
     Vendor.FAST: "Restart this process{of}: it was not restarted since stage 1, and so does not "
     "know the new CA.",
@@ -1157,8 +1157,8 @@ _NOT_RESTARTED = {
 _OLDER_FILES = (
     "Restart the processes of {peer}, and then this process: one of them loaded older files."
 )
-_ABOUT_FOLDERS = ("enclave-missing", "runs-unsecured")
-_ABOUT_DOMAINS = ("domain", "domain-of-permissions")
+_FOLDER_IDS = ("enclave-missing", "runs-unsecured")
+_DOMAIN_IDS = ("domain", "domain-of-permissions")
 _EVERY_NODE = "the rights that every node needs: parameter services, /rosout, /parameter_events"
 _TOPICS_OF_EVERY_NODE = ("rt/rosout", "rt/parameter_events")
 
@@ -1199,8 +1199,8 @@ def _renaming_advice(nodes: Sequence[str], wrong: str, enclave: str) -> str:
         renamed = (
             f"; or, if this is {meant[0]} by another name, write this name in its profile, or "
             "merge the policy of its package with this name, into a policy without the node: "
-            f"`sros merge_policy POLICY OTHER {_merge_rules(meant[0], wrong)}`, with the name that "
-            "OTHER has for the node before `:__node`"
+            f"`sros merge_policy POLICY OTHER {_merge_options(meant[0], wrong)}`, with the name "
+            "that OTHER has for the node before `:__node`"
         )
     return (
         f"{start}{renamed}; or, if {wrong} is a further node, give it a profile with "
@@ -1209,7 +1209,7 @@ def _renaming_advice(nodes: Sequence[str], wrong: str, enclave: str) -> str:
     )
 
 
-def _merge_rules(node: str, renamed: str) -> str:
+def _merge_options(node: str, renamed: str) -> str:
     """Return the options with which `sros merge_policy` gives a node another full name."""
     (ns, _, name), (new_ns, _, new_name) = node.rpartition("/"), renamed.rpartition("/")
     rules = [f"{name}:__node:={new_name}"] * (name != new_name)
@@ -1242,13 +1242,13 @@ def _in_ros_terms(denial: Denial) -> tuple[str, str, str]:
     if not right:
         return denial.direction or "use", name, ""
     action, _ = action_part(name)
-    word, kind = _TOLD_AS[right]
+    word, kind = _WORD_AND_TYPE_OF_RIGHT[right]
     if action:
         word, kind = "execute" if right in ("publish", "reply") else "call", "action"
     return word if denial.direction else "use", action or name, kind
 
 
-_TOLD_AS = {
+_WORD_AND_TYPE_OF_RIGHT = {
     "publish": (PUBLISH, "topic"),
     "subscribe": (SUBSCRIBE, "topic"),
     "request": ("call", "service"),

@@ -14,7 +14,7 @@ from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import Governance
 from sros_tool.errors import KeystoreError, Note, SrosError
 from sros_tool.explain.answer import Question, about_action, ask
-from sros_tool.explain.asking import taken_for_action
+from sros_tool.explain.asking import notes_on_question_about_action
 from sros_tool.faults import REFUSE_STRANGERS
 from sros_tool.fleet.robots import Fleet
 from sros_tool.keystore.layout import (
@@ -144,12 +144,12 @@ def answer_for_all(decider: Decider, question: Question, kind: str | None) -> An
     if not kind and unclear and question.type == "service":
         rights = decider.rights_naming(question.name)
         if action := about_action(question, rights):
-            taken = taken_for_action(question, action)
+            taken = notes_on_question_about_action(question, action)
             question, outcomes = action, decider.outcomes(action)
     return AnswerForAll(question, outcomes, (*taken, *decider.notes(question, outcomes)))
 
 
-def callable_action(decider: Decider, question: Question) -> Note | None:
+def note_on_callable_action(decider: Decider, question: Question) -> Note | None:
     """Return a note if enclaves may call an action that has the name of a service."""
     if (question.word, question.type) == ("call", "service"):
         action = ask("call", question.name, "action")
@@ -162,7 +162,9 @@ def callable_action(decider: Decider, question: Question) -> Note | None:
     return None
 
 
-def names_meant(decider: Decider, question: Question, enclaves: Container[str]) -> Note | None:
+def note_on_names_meant(
+    decider: Decider, question: Question, enclaves: Container[str]
+) -> Note | None:
     """Return a note on similar names in the rights of ``enclaves``, for a mistyped name."""
     names = sorted(
         {

@@ -326,7 +326,7 @@ def groups_of(rights: Iterable[NodeRight], ns: str, node: str) -> tuple[Group, .
 # ── names ──────────────────────────────────────────────────────────────────────────────────
 
 
-_CHANGING = (
+_CHANGING_NAMES = (
     # Names of tf2_ros listeners contain a memory address; the other names contain a process id.
     (re.compile(r"(transform_listener_impl_)[0-9a-f]+\Z"), r"\1*"),
     (re.compile(r"(launch_ros_)[0-9]+\Z"), r"\1*"),
@@ -353,7 +353,7 @@ def is_tool_name(name: str) -> bool:
 
 def stable_name(name: str) -> str:
     """Return a node's name with ``*`` for the part that changes with every start."""
-    for pattern, stable in _CHANGING:
+    for pattern, stable in _CHANGING_NAMES:
         if pattern.match(name):
             return pattern.sub(stable, name)
     return name
@@ -515,8 +515,8 @@ def _needed_files(root: Path, part: str) -> dict[str, bytes]:
 # ── notes and news ─────────────────────────────────────────────────────────────────────────
 
 
-_SHOWN = 5
-_TEXTS = {
+_MOST_SHOWN = 5
+_NOTE_TEXTS = {
     "ambiguous": "nodes with the same name run in several enclaves, and the graph does not show "
     "which node runs in which enclave, so each of these enclaves gets the rights of all these "
     "nodes. To tell them apart, start one node at a time under --watch: {}",
@@ -561,24 +561,24 @@ class _Notes:
     def notes(self) -> tuple[Note, ...]:
         """Return a note for each kind of subject, sorted by id."""
         return tuple(
-            Note(f"graph.{kind}", _TEXTS[kind].format(first_subjects(sorted(subjects))))
+            Note(f"graph.{kind}", _NOTE_TEXTS[kind].format(first_subjects(sorted(subjects))))
             for kind, subjects in sorted(self._found.items())
         )
 
 
 def first_subjects(subjects: Sequence[str], separator: str = ", ") -> str:
     """Return the first five subjects, and the number of others: "a, b, c, d, e and 2 more"."""
-    return first_few(subjects, _SHOWN, separator)
+    return first_few(subjects, _MOST_SHOWN, separator)
 
 
-_EVERY_NODE = "common/node.xml"
+_EVERY_NODE_PART = "common/node.xml"
 
 
 class ReportedRights:
     """The nodes and rights that were reported so far, except rights that every node needs."""
 
     def __init__(self, common: CommonParts) -> None:
-        self._ordinary = common.rights.get(_EVERY_NODE, frozenset[NodeRight]())
+        self._ordinary = common.rights.get(_EVERY_NODE_PART, frozenset[NodeRight]())
         self._nodes: set[tuple[str, str, str]] = set()
         self._rights: set[tuple[str, str, str, NodeRight]] = set()
 
@@ -604,7 +604,7 @@ class ReportedRights:
 UNSHOWN = ("/",)
 """`ObservedNode.enclaves` of a node whose enclave the graph does not show."""
 
-_CONTAINER = "~/_container/load_node"
+_CONTAINER_SERVICE = "~/_container/load_node"
 
 
 class NamedEnclaves(NamedTuple):
@@ -648,7 +648,7 @@ def _enclave_name(nodes: Sequence[ObservedNode]) -> str:
 
 def _enclave_rank(node: ObservedNode) -> tuple[bool, bool, int, str]:
     """Return the sort key of a node; the lowest node gives its name to a process's enclave."""
-    (reply,) = dds_names("reply", expand(_CONTAINER, node.ns, node.name)).publish
+    (reply,) = dds_names("reply", expand(_CONTAINER_SERVICE, node.ns, node.name)).publish
     is_container = Endpoint(reply, PUBLISH) in node.endpoints
     return not is_container, stable_name(node.name) != node.name, len(node.fqn), node.fqn
 
@@ -691,7 +691,7 @@ def _notes(
 
 
 _XINCLUDE = "http://www.w3.org/2001/XInclude"
-_UNIT = "  "
+_INDENT = "  "
 _DECLARATION = """<?xml version="1.0" encoding="UTF-8"?>\n"""
 _HEADERS = {
     RightsFound.GRAPH: """\
@@ -890,7 +890,7 @@ def render(learned: Learned) -> bytes:
         lines += [f'    <enclave path="{path}">', "      <profiles>"]
         for profile in profiles:
             lines.append(f'        <profile ns="{profile.ns}" node="{profile.node}">')
-            lines += [f"          {line}" for line in _content(profile, "xi:include", _UNIT)]
+            lines += [f"          {line}" for line in _content(profile, "xi:include", _INDENT)]
             lines.append("        </profile>")
         lines += ["      </profiles>", "    </enclave>"]
     lines += ["  </enclaves>", "</policy>", ""]

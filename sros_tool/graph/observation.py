@@ -180,9 +180,14 @@ _NODE_NAME = "_sros_observer_" + secrets.token_hex(8)
 """Name of the observer's node: random, so that no other program knows it in advance."""
 
 _PREFIX_BYTES = 12  # length of the participant's part of an endpoint's identifier (RTPS 2.3, 9.3.1)
-_DISCOVERY = "ros_discovery_info"
+_DISCOVERY_TOPIC = "ros_discovery_info"
 # These RMWs keep their participants sorted by identifier, and list nodes in that order.
-_ORDERED = ("rmw_fastrtps_cpp", "rmw_fastrtps_dynamic_cpp", "rmw_cyclonedds_cpp", "rmw_connextdds")
+_ORDERED_RMWS = (
+    "rmw_fastrtps_cpp",
+    "rmw_fastrtps_dynamic_cpp",
+    "rmw_cyclonedds_cpp",
+    "rmw_connextdds",
+)
 _LOG_FLUSH_SECONDS = 0.3
 """Seconds to wait before exit, so that the logging thread of Fast DDS can print its errors."""
 _ATTEMPTS = 5
@@ -219,7 +224,7 @@ def main() -> int:
     rmw = rclpy.get_rmw_implementation_identifier()
     try:
         send(report, {"ready": rmw})
-        report_graph(_Observer(node), report, period, ordered=rmw in _ORDERED)
+        report_graph(_Observer(node), report, period, ordered=rmw in _ORDERED_RMWS)
     except BrokenPipeError:
         pass
     finally:
@@ -289,7 +294,9 @@ class _Observer:
         """
         endpoints = set()
         for topic, _ in self._node.get_topic_names_and_types(no_demangle=True):
-            if topic == _DISCOVERY:  # every participant has this topic, and no policy mentions it
+            if (
+                topic == _DISCOVERY_TOPIC
+            ):  # every participant has this topic, and no policy mentions it
                 continue
             for direction, infos in (
                 (PUBLISH, self._node.get_publishers_info_by_topic(topic, no_mangle=True)),

@@ -18,8 +18,8 @@ from cryptography import x509
 
 from sros_tool.dds.decision.access import Access, Decision, GovernedDomain, Outcome, Refusal
 from sros_tool.dds.decision.documents import (
+    are_canonical_permissions,
     canonical_governance,
-    canonical_permissions,
     is_plain_governance,
     is_plain_permissions,
     read_governance_as,
@@ -190,7 +190,7 @@ def loaded_enclave(
 
 def _portable_permissions(permissions: Permissions | None, document: bytes) -> Permissions | None:
     """Return ``permissions`` if all vendors read the document alike, else None."""
-    return permissions if permissions and canonical_permissions(permissions, document) else None
+    return permissions if permissions and are_canonical_permissions(permissions, document) else None
 
 
 def plan_enclave(policy: Enclave, governance: Governance, *, moment: datetime) -> LoadedEnclave:

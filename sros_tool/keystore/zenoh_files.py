@@ -33,7 +33,7 @@ from cryptography import x509
 
 from sros_tool.automata import Automaton, Letters, NameSet
 from sros_tool.dds.decision.access import AccessVerb, GrantedAccess, Refusal, choose_grant
-from sros_tool.dds.decision.documents import canonical_permissions, read_permissions_as
+from sros_tool.dds.decision.documents import are_canonical_permissions, read_permissions_as
 from sros_tool.dds.decision.expressions import names_of as names_of_expressions
 from sros_tool.dds.decision.vendors import TESTED, DocumentReader, Style, Vendor, joined_titles
 from sros_tool.dds.domains import DomainSet
@@ -1085,7 +1085,7 @@ def grant_for_all(document: bytes, name: str, subject: str) -> Grant | None:
     permissions = parse_permissions(document, name)
     grant = permissions.grant_of(subject)
     single = len(permissions.grants) == 1
-    if grant is None or (single and canonical_permissions(permissions, document)):
+    if grant is None or (single and are_canonical_permissions(permissions, document)):
         return grant
     validity = grant.validity
     at = (validity.not_before + (validity.not_after - validity.not_before) / 2).astimezone(UTC)

@@ -70,7 +70,7 @@ FALLBACKS = frozenset(f"{{{ns}}}fallback" for ns in _NAMESPACES)
 _XML_BASE = "{http://www.w3.org/XML/1998/namespace}base"
 # libxml2 evaluates any XPath, even one that is made to take minutes, during which no signal ends
 # it.
-_STEP = re.compile(
+_XPOINTER_STEP = re.compile(
     r"/(?P<tag>\*|[A-Za-z_][\w.-]*)"
     r"(?:\[@(?P<attribute>[A-Za-z_][\w.-]*)(?:=(?P<value>'[^']*'|\"[^\"]*\"))?\])?",
     re.ASCII,
@@ -287,7 +287,7 @@ class Includer:
     ) -> list[tuple[etree._Element, IncludedFile]]:
         """Return the elements that an xpointer selects in a document with resolved includes."""
         path = pointer.removeprefix("xpointer(").removesuffix(")")
-        steps = list(_STEP.finditer(path[:_MAX_LENGTH]))
+        steps = list(_XPOINTER_STEP.finditer(path[:_MAX_LENGTH]))
         if f"xpointer({''.join(step[0] for step in steps)})" != pointer or not steps:
             raise PolicyError(
                 f"{where}: the xpointer {_short(pointer)} is not accepted",
@@ -331,9 +331,9 @@ def _missing_remedy(file: Path) -> str:
     return f"It ships with sros. Put it there: `sros policies --copy {quote(str(place))}`."
 
 
-_ITEMS = frozenset(kind.removesuffix("s") for kind in RIGHTS)
+_NAME_TAGS = frozenset(kind.removesuffix("s") for kind in RIGHTS)
 _INSTRUCTION = "sros"
-_EXAMPLE = 'Write for example <topic>scan<?sros protect="encrypt"?></topic>.'
+_PROTECT_EXAMPLE = 'Write for example <topic>scan<?sros protect="encrypt"?></topic>.'
 _PROTECT = re.compile(r"""protect\s*=\s*(?:"(?P<double>[^"]*)"|'(?P<single>[^']*)')\s*\Z""")
 
 
@@ -344,12 +344,12 @@ def _check_instructions(root: etree._Element, file: Path) -> None:
         if not isinstance(instruction, etree._ProcessingInstruction):
             continue
         parent = instruction.getparent()
-        named = parent is not None and tag_of(parent) in _ITEMS
+        named = parent is not None and tag_of(parent) in _NAME_TAGS
         if not named and (instruction.target or "").lower() == _INSTRUCTION:
             raise PolicyError(
                 f"{file}:{instruction.sourceline}: <?{_INSTRUCTION} ...?> is not in a name",
                 "Protection can be stated only in the element of a topic, service or action.",
-                _EXAMPLE,
+                _PROTECT_EXAMPLE,
             )
 
 
@@ -378,7 +378,9 @@ def _too_large_error(where: str, limit: str) -> PolicyError:
 
 _XML_ATTRIBUTES = ("{http://www.w3.org/XML/1998/namespace}",)
 _VERSION = re.compile(r"0\.2\.[0-9]+\Z")
-_EARLIER = "Version 0.1.0, of ROS 2 Crystal to Eloquent, has nodes in place of enclaves."
+_EARLIER_VERSION_TEXT = (
+    "Version 0.1.0, of ROS 2 Crystal to Eloquent, has nodes in place of enclaves."
+)
 _EARLIER_BLOCKS = ("profiles", "contexts")
 _EARLIER_ROOTS = ("profiles",)
 """Root elements of earlier formats that are converted without a <policy> around them."""
@@ -471,7 +473,7 @@ class _Reader:
         if not _VERSION.match(version):
             raise PolicyError(
                 f"{where}: the policy has version {_short(version)}",
-                f"sros reads version {VERSION} of the SROS2 policy format. {_EARLIER}"
+                f"sros reads version {VERSION} of the SROS2 policy format. {_EARLIER_VERSION_TEXT}"
                 if version == "0.1.0"
                 else f"sros reads version {VERSION} of the SROS2 policy format.",
                 self._conversion_remedy()
@@ -499,7 +501,7 @@ class _Reader:
             if root.tag == "profile":
                 remedy = "It is a fragment for other policies to include."
             elif root.tag in _EARLIER_ROOTS:
-                why += f" {_EARLIER}"
+                why += f" {_EARLIER_VERSION_TEXT}"
                 remedy = self._conversion_remedy()
             raise PolicyError(
                 f"{self._place_text(root, place)}: the file is not a policy", why, remedy
@@ -626,7 +628,7 @@ class _Reader:
                 f"It can contain only {', '.join(f'<{word}>' for word in RIGHTS)}.",
                 f'Write it in <{kind}s {RIGHTS[f"{kind}s"][0]}="ALLOW"> or '
                 f'<{kind}s {RIGHTS[f"{kind}s"][1]}="ALLOW">.'
-                if kind in _ITEMS
+                if kind in _NAME_TAGS
                 else "",
             )
         self._check_attributes(element, place, optional=RIGHTS[kind])
@@ -685,7 +687,7 @@ class _Reader:
                 f"{where}: the processing instructions of a name are not valid",
                 "Only one <?sros ...?> is allowed, directly between the name and its end tag. A "
                 "misspelled instruction would leave the name without protection.",
-                _EXAMPLE,
+                _PROTECT_EXAMPLE,
             )
         stated = _PROTECT.match((instruction.text or "")[:_MAX_LENGTH].lstrip())
         word = (stated["double"] or stated["single"] or "") if stated else ""
@@ -693,7 +695,7 @@ class _Reader:
             raise PolicyError(
                 f"{where}: <?sros {_short(instruction.text or '')[1:-1]}?> is not a protection",
                 "It can be " + " or ".join(f'protect="{known}"' for known in PROTECT) + ".",
-                _EXAMPLE,
+                _PROTECT_EXAMPLE,
             )
         return PROTECT[word]
 
@@ -785,12 +787,12 @@ class _Reader:
     ) -> tuple[etree._Element, IncludedFile]:
         if element.tag != tag:
             actual = tag_of(element)
-            elsewhere = f", or move it into <{actual}s>" if actual in _ITEMS else ""
+            elsewhere = f", or move it into <{actual}s>" if actual in _NAME_TAGS else ""
             raise PolicyError(
                 f"{self._place_text(element, place)}: <{actual}> found, but <{tag}> expected",
                 "",
                 f"Write <{tag}> in its place{elsewhere}."
-                if tag in _ITEMS
+                if tag in _NAME_TAGS
                 else f"Write <{tag}> in its place, or around it.",
             )
         return element, place
@@ -969,7 +971,7 @@ def convert_policy(path: Path) -> ConvertedPolicy:
     return _EarlierReader(path, None).converted()
 
 
-_ONE_NODE = f"""<policy version="{VERSION}" xmlns:xi="http://www.w3.org/2001/XInclude">
+_POLICY_OF_ONE_NODE = f"""<policy version="{VERSION}" xmlns:xi="http://www.w3.org/2001/XInclude">
 <enclaves><enclave path="/node"><profiles><profile ns="/" node="node">
 <xi:include href="common/node.xml" xpointer="xpointer(/profile/*)"/>
 </profile></profiles></enclave></enclaves></policy>"""
@@ -980,7 +982,9 @@ def with_node_rights(policy: Policy, folder: Path) -> Policy:
 
     ``common/node.xml`` in ``folder`` states these rights.
     """
-    needed = read_policy(folder / "node.xml", _ONE_NODE.encode()).enclaves[0].all_profiles()[0]
+    needed = (
+        read_policy(folder / "node.xml", _POLICY_OF_ONE_NODE.encode()).enclaves[0].all_profiles()[0]
+    )
 
     def completed_profile(profile: Profile) -> Profile:
         present = {
@@ -1094,12 +1098,12 @@ class _EarlierReader(_Reader):
         return f"~/{text[1:]}"
 
 
-_WORDS = {level: word for word, level in PROTECT.items()}
+_PROTECT_WORDS = {level: word for word, level in PROTECT.items()}
 
 
 def instruction_text(protect: Level | None) -> str:
     """Return the processing instruction for a protection level, or "" for None."""
-    return f'<?{_INSTRUCTION} protect="{_WORDS[protect]}"?>' if protect else ""
+    return f'<?{_INSTRUCTION} protect="{_PROTECT_WORDS[protect]}"?>' if protect else ""
 
 
 def policy_xml(policy: Policy) -> bytes:
@@ -1122,7 +1126,7 @@ def policy_xml(policy: Policy) -> bytes:
     # The instructions are added after the indentation, which would change texts and names with
     # them.
     for item, level in protected:
-        item.append(etree.PI(_INSTRUCTION, f'protect="{_WORDS[level]}"'))
+        item.append(etree.PI(_INSTRUCTION, f'protect="{_PROTECT_WORDS[level]}"'))
     for profiles, text in metadata:
         last, element = profiles[-1], parse(text.encode(), "metadata")
         last.tail, element.tail = profiles.text, last.tail

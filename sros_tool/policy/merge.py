@@ -55,7 +55,7 @@ from sros_tool.values import DryRun, FileChanges, Notes, shows
 from sros_tool.wording import first_few
 from sros_tool.xml import parse, read_bytes, tag_of
 
-_SHOWN = 3
+_MOST_SHOWN = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -227,7 +227,7 @@ def merge_notes(contradictions: Sequence[Contradiction]) -> tuple[Note, ...]:
     notes = []
     for (denied, new), allowed in by_denial.items():
         shown = [right.describe() for right in dict.fromkeys(sorted(allowed, key=order))]
-        shown_text = first_few(shown, _SHOWN)
+        shown_text = first_few(shown, _MOST_SHOWN)
         if new:
             text = f"{denied} was added, and overrides rights of the enclave: {shown_text}."
             notes.append(Note("merge.newly-denied", text))
@@ -500,7 +500,7 @@ def _name_of(node: str) -> str:
 
 
 def _nodes_text(nodes: Sequence[str]) -> str:
-    return f"the node{'s' * (len(nodes) > 1)} {first_few(nodes, _SHOWN)}"
+    return f"the node{'s' * (len(nodes) > 1)} {first_few(nodes, _MOST_SHOWN)}"
 
 
 def _checked_policy(path: Path, document: bytes, before: Policy, added: Sequence[Right]) -> Policy:

@@ -451,7 +451,7 @@ def _name_written_like(fqn: str, like: str, profile: Profile) -> str:
 # ── wildcards in place of names ────────────────────────────────────────────────────────────
 
 _DIGITS = re.compile(r"\d+")
-_FEWEST = 3  # minimum number of names that a wildcard must replace
+_FEWEST_REPLACED = 3  # minimum number of names that a wildcard must replace
 
 
 class WildcardProposal(NamedTuple):
@@ -508,7 +508,7 @@ def propose_wildcards(
             break
         names = tuple(right for right in proposal.replaces if right not in replaced)
         saves = sum(map(size, names)) - size(proposal.rule)
-        if len(names) < _FEWEST or saves <= 0:
+        if len(names) < _FEWEST_REPLACED or saves <= 0:
             continue
         chosen.append(WildcardProposal(proposal.rule, names, proposal.adds, saves))
         replaced.update(names)
@@ -517,13 +517,15 @@ def propose_wildcards(
 
 
 def _wildcard_candidates(rights: Iterable[Right]) -> dict[Right, list[Right]]:
-    """Map possible wildcards to the rights that they replace: at least `_FEWEST` rights."""
+    """Map possible wildcards to the rights that they replace, at least `_FEWEST_REPLACED`."""
     rights_by_wildcard: dict[Right, list[Right]] = defaultdict(list)
     for right in rights:
         if right.name.startswith("/") and not is_expression(right.name):
             for expression in set(_wider_names(right.name)):
                 rights_by_wildcard[right._replace(name=expression)].append(right)
-    return {rule: names for rule, names in rights_by_wildcard.items() if len(names) >= _FEWEST}
+    return {
+        rule: names for rule, names in rights_by_wildcard.items() if len(names) >= _FEWEST_REPLACED
+    }
 
 
 def _wider_names(name: str) -> Iterator[str]:

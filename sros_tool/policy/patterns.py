@@ -30,7 +30,7 @@ from sros_tool.names import has_parts, is_expression
 if TYPE_CHECKING:
     from sros_tool.automata import Letters, NameSet
 
-_MANY = 4096
+_CACHE_SIZE = 4096
 _WILDCARD = re.compile(r"[*?\[]")
 _PIECE = re.compile(r"\*+|\?|\[(!?)([^\]]+)\]|(.)", re.DOTALL)
 _RANGE = re.compile(r"(.)-(.)|(.)", re.DOTALL)
@@ -49,7 +49,7 @@ _CHOICE = re.compile(r"\[(!?)([^\]]+)\]|(\?)|([^?\[]+)")
 _STARS = re.compile(r"\*\*+")
 
 
-@lru_cache(maxsize=_MANY)
+@lru_cache(maxsize=_CACHE_SIZE)
 def compiled(expression: str) -> re.Pattern[str]:
     """Return a compiled regular expression that matches the same names as ``expression``."""
     return re.compile(translate(expression))
@@ -189,7 +189,7 @@ def _pieces_overlap(first: _Pieces, second: _Pieces) -> bool:
     return not any(map(frozenset.isdisjoint, first, second))
 
 
-@lru_cache(maxsize=4 * _MANY)
+@lru_cache(maxsize=4 * _CACHE_SIZE)
 def _pattern(expression: str) -> _Pattern:
     return _Pattern(_pieces(expression))
 
@@ -209,7 +209,7 @@ def _pieces(expression: str) -> _Pieces:
     return tuple(letter_sets)
 
 
-@lru_cache(maxsize=_MANY)
+@lru_cache(maxsize=_CACHE_SIZE)
 def _single_letter(letter: str) -> frozenset[str]:
     return frozenset(letter)
 
@@ -249,11 +249,11 @@ class ComparisonLimit:
 
 _MAX_WITHOUT_INDEX = 16
 """Maximum number of expressions that are compared one by one, without an index."""
-_LAST = "\U0010ffff"
-_END = re.compile(r".*[*?\]]", re.DOTALL)
-_BETWEEN = "\0"
-_RUN = re.compile(r"[^\0]+")
-_GRAM = 4
+_LAST_CHARACTER = "\U0010ffff"
+_ALL_BEFORE_FIXED_END = re.compile(r".*[*?\]]", re.DOTALL)
+_NO_FIXED_LETTER = "\0"
+_FIXED_LETTERS = re.compile(r"[^\0]+")
+_PART_LENGTH = 4
 
 
 class Names:
@@ -309,7 +309,9 @@ class Names:
             return self._wild
         text = _letters_of(name)
         keys = {
-            text[i : i + size] for size in range(_GRAM + 1) for i in range(len(text) - size + 1)
+            text[i : i + size]
+            for size in range(_PART_LENGTH + 1)
+            for i in range(len(text) - size + 1)
         }
         candidates = [
             number for key in keys & self._by_letters.keys() for number in self._by_letters[key]
@@ -325,7 +327,7 @@ class Names:
         grams = [
             {
                 gram
-                for run in _RUN.findall(_letters_of(expression))
+                for run in _FIXED_LETTERS.findall(_letters_of(expression))
                 for gram in _four_letter_parts(run)
             }
             for expression in self._wild
@@ -345,7 +347,7 @@ class Names:
         """Return the positions of expressions that may overlap ``expression``."""
         if len(self._names) <= _MAX_WITHOUT_INDEX:
             return range(len(self._names))
-        begin, end = literal_prefix(expression), _END.sub("", expression)[::-1]
+        begin, end = literal_prefix(expression), _ALL_BEFORE_FIXED_END.sub("", expression)[::-1]
         return min(
             self._by_begin.numbers_of_texts(begin), self._by_end.numbers_of_texts(end), key=len
         )
@@ -360,7 +362,7 @@ class Names:
     def _by_end(self) -> _Beginnings:
         return _Beginnings(
             [
-                (_END.sub("", expression)[::-1], True)
+                (_ALL_BEFORE_FIXED_END.sub("", expression)[::-1], True)
                 if is_expression(expression)
                 else (expression[::-1], False)
                 for expression in self._names
@@ -387,7 +389,7 @@ class _Beginnings:
     def numbers_of_texts(self, begin: str) -> list[int]:
         """Return the numbers of the texts that begin with ``begin``; open texts may be shorter."""
         first = bisect_left(self._texts, begin)
-        numbers = self._numbers[first : bisect_left(self._texts, begin + _LAST, lo=first)]
+        numbers = self._numbers[first : bisect_left(self._texts, begin + _LAST_CHARACTER, lo=first)]
         for size in self._sizes:
             if size >= len(begin):
                 break
@@ -398,17 +400,18 @@ class _Beginnings:
 def _letters_of(expression: str) -> str:
     """Return the fixed letters of an expression, with NUL in place of all other characters."""
     if "[" not in expression:
-        return expression.replace("*", _BETWEEN).replace("?", _BETWEEN)
+        return expression.replace("*", _NO_FIXED_LETTER).replace("?", _NO_FIXED_LETTER)
     pieces = _pattern(expression).pieces
     return "".join(
-        next(iter(piece)) or _BETWEEN if len(piece) == 1 else _BETWEEN for piece in pieces
+        next(iter(piece)) or _NO_FIXED_LETTER if len(piece) == 1 else _NO_FIXED_LETTER
+        for piece in pieces
     )
 
 
 def _four_letter_parts(run: str) -> Iterator[str]:
     """Yield all parts of a text with four letters, or the whole text if it is shorter."""
-    for i in range(max(len(run) - _GRAM, 0) + 1):
-        yield run[i : i + _GRAM]
+    for i in range(max(len(run) - _PART_LENGTH, 0) + 1):
+        yield run[i : i + _PART_LENGTH]
 
 
 # ── names that expressions have in common ──────────────────────────────────────────────────
@@ -428,7 +431,7 @@ def _ros_names(absolute: bool, elsewhere: bool) -> NameSet:
     return NameSet((), [Automaton((*begin, *parts), frozenset((2,)))])
 
 
-@lru_cache(maxsize=_MANY)
+@lru_cache(maxsize=_CACHE_SIZE)
 def _names_of(expression: str) -> NameSet:
     """Return the set of the names that an expression matches."""
     from sros_tool.automata import Automaton, NameSet
@@ -442,7 +445,7 @@ def _names_of(expression: str) -> NameSet:
     )
 
 
-@lru_cache(maxsize=_MANY)
+@lru_cache(maxsize=_CACHE_SIZE)
 def _as_letters(piece: frozenset[str]) -> Letters:
     from sros_tool.automata import Letters
 

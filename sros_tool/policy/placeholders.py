@@ -15,7 +15,7 @@ from functools import lru_cache
 from typing import NamedTuple
 
 _BRACES = re.compile(r"\{([^{}]*)\}")
-_KIND = re.compile(r"(robot|namespace)(s?)(?::([A-Za-z_][A-Za-z0-9_]{0,63}))?", re.ASCII)
+_PLACEHOLDER = re.compile(r"(robot|namespace)(s?)(?::([A-Za-z_][A-Za-z0-9_]{0,63}))?", re.ASCII)
 _WILDCARDS = frozenset("*?[]!")
 _SAMPLES = {"robot": "r", "namespace": "/r"}
 
@@ -52,7 +52,7 @@ def parts_of(text: str) -> Parts:
     parts: list[str | Placeholder] = []
     end = 0
     for brace in _BRACES.finditer(text):
-        kind = _KIND.fullmatch(brace[1])
+        kind = _PLACEHOLDER.fullmatch(brace[1])
         if not kind:
             raise ValueError(
                 f"{brace[0][:80]!r} is not a placeholder: write {{robot}}, {{namespace}}, "

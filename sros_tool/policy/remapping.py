@@ -35,8 +35,8 @@ from sros_tool.wording import enumerated, first_few
 _RULE = re.compile(r"(?:([A-Za-z_]\w*):)?([^:=]+):=([^:=]+)")
 _NODE_NAME = re.compile(r"[A-Za-z_]\w*", re.ASCII)
 _NODE, _NAMESPACE = "__node", "__ns"
-_EMPTY = Policy(())
-_SHOWN = 3
+_EMPTY_POLICY = Policy(())
+_MOST_SHOWN = 3
 
 
 class Remapping(NamedTuple):
@@ -167,7 +167,7 @@ def renamed_action_text(rule: Remapping) -> str:
 
 
 def remapped_policies(
-    policies: Iterable[Policy], texts: Iterable[str], file: Policy = _EMPTY
+    policies: Iterable[Policy], texts: Iterable[str], file: Policy = _EMPTY_POLICY
 ) -> tuple[list[Policy], list[Note]]:
     """Return remapped policies, and notes on changes of the nodes' rights.
 
@@ -239,9 +239,9 @@ def _notes_on_requirements(
             or (not use.kind and any(name.startswith(f"{use.old}/") for name in moved))
         }
         text = (
-            f"requirements that name {first_few(sorted(gone), _SHOWN)} do not apply to the new "
-            "name: check them with the same --namespace and with the new name, as in `sros check "
-            "POLICY --requirements FILE "
+            f"requirements that name {first_few(sorted(gone), _MOST_SHOWN)} do not apply to the "
+            "new name: check them with the same --namespace and with the new name, as in `sros "
+            "check POLICY --requirements FILE "
             f"{' '.join(f'--remap {quote(option)}' for option in sorted(options))}`."
         )
         yield Note("merge.requirements-of-old-names", text)

@@ -607,7 +607,7 @@ def lost_counterpart_text(right: Right) -> str:
 def lost_counterparts_text(rights: Iterable[Right]) -> str:
     """Return a sentence on some rights that lost their counterpart."""
     clauses = list(map(lost_counterpart_text, sorted(rights)))
-    return f"{first_few(clauses, _SHOWN, '; ', ', and ')}."
+    return f"{first_few(clauses, _MOST_SHOWN, '; ', ', and ')}."
 
 
-_SHOWN = 3
+_MOST_SHOWN = 3

@@ -413,12 +413,20 @@ _POLICY_TEXTS = (
 _EBCDIC = b"\x4c\x6f\xa7\x94"
 """The beginning of an XML file in EBCDIC (XML 1.0, appendix F)."""
 _ENCODING = re.compile(rb"encoding ?= ?[\"']([^\"']*)")
-_READABLE = (b"utf-8", b"utf8", b"utf-16", b"us-ascii", b"ascii", b"iso-8859-", b"windows-125")
+_READABLE_ENCODINGS = (
+    b"utf-8",
+    b"utf8",
+    b"utf-16",
+    b"us-ascii",
+    b"ascii",
+    b"iso-8859-",
+    b"windows-125",
+)
 _LEADING_BYTES = b"\xef\xbb\xbf\xfe\xff \t\r\n"
 """Byte order marks and white space, which may precede the first XML element."""
-_BEGIN = 4096
-_NAMES = frozenset(kind.removesuffix("s") for kind in RIGHTS)
-_WITH_PARTS = ("policy", "enclaves", "enclave", "profiles", "profile", *RIGHTS)
+_BEGIN_BYTES = 4096
+_NAME_TAGS = frozenset(kind.removesuffix("s") for kind in RIGHTS)
+_TAGS_WITH_PARTS = ("policy", "enclaves", "enclave", "profiles", "profile", *RIGHTS)
 _WHOLE_FILE_POINTER = re.compile(r"(?:xpointer\(/(?:\*|[\w.-]+)(?P<below>/\*)?\))?")
 """An xpointer that selects a whole file, or everything below its root element."""
 
@@ -432,7 +440,7 @@ def may_be_policy(content: bytes) -> bool:
         return False
     text = b" ".join(text.split())
     encoding = _ENCODING.search(text.partition(b"?>")[0])
-    if encoding and not encoding[1].lower().startswith(_READABLE):
+    if encoding and not encoding[1].lower().startswith(_READABLE_ENCODINGS):
         return True  # such as UTF-7, in which no element is readable here
     if any(second in text.partition(first)[2] for first, second in _POLICY_TEXTS):
         return True
@@ -445,13 +453,13 @@ def may_be_policy(content: bytes) -> bool:
 def _is_part(root: etree._Element) -> bool:
     """Return whether an XML document has elements that policies can include."""
     below = list(root.iter(etree.Element))
-    only_names = below[0] if root.tag in _NAMES else below[1:]
+    only_names = below[0] if root.tag in _NAME_TAGS else below[1:]
     return (
         any(element.keys() and _gives_access(element) for element in below)
-        or (root.tag in _WITH_PARTS and any(element.tag in INCLUDES for element in below))
+        or (root.tag in _TAGS_WITH_PARTS and any(element.tag in INCLUDES for element in below))
         or (
-            (bool(below[1:]) or root.tag in _NAMES)
-            and all(e.tag in _NAMES and e.text for e in only_names)
+            (bool(below[1:]) or root.tag in _NAME_TAGS)
+            and all(e.tag in _NAME_TAGS and e.text for e in only_names)
         )
     )
 
@@ -500,7 +508,7 @@ def used_whole(policies: Iterable[str], content: Callable[[str], bytes | None]) 
 
 def includes_files(content: bytes) -> bool:
     """Return whether a file may be XML, and so may include other files."""
-    begin = content[:_BEGIN].replace(b"\0", b"").lstrip(_LEADING_BYTES)
+    begin = content[:_BEGIN_BYTES].replace(b"\0", b"").lstrip(_LEADING_BYTES)
     return not begin or begin.startswith((b"<", _EBCDIC))
 
 

@@ -224,7 +224,7 @@ def _confirm(requirement: Requirement, witness: Witness, world: World) -> None:
 
 # ── rights and their topics ────────────────────────────────────────────────────────────────
 
-_HERE = "\0"
+_NAME_MARK = "\0"
 
 
 @dataclass(frozen=True, slots=True)
@@ -247,9 +247,9 @@ class _Part:
 @lru_cache(maxsize=16)
 def _parts_of(right: str) -> tuple[_Part, ...]:
     """Return the DDS topics that a right needs."""
-    names = dds_names(right, _HERE)
+    names = dds_names(right, _NAME_MARK)
     return tuple(
-        _Part(writes, *topic.split(_HERE))
+        _Part(writes, *topic.split(_NAME_MARK))
         for writes, topics in ((True, names.publish), (False, names.subscribe))
         for topic in topics
     )

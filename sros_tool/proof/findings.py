@@ -183,7 +183,7 @@ def decide_all(requirements: Sequence[Requirement], system: System) -> Decided:
             differing = [uses for uses in witness.others if not _are_alike(uses, witness)]
             other_steps = tuple(
                 tuple(_step(use, world, system) for use in uses)
-                for uses in (*similar_uses[:_SHOWN], *differing[:_SHOWN])
+                for uses in (*similar_uses[:_MOST_SHOWN], *differing[:_MOST_SHOWN])
             )
             violations.append(
                 Violation(requirement, witness, steps, titles, missing, idle, other_steps)
@@ -225,7 +225,7 @@ def _texts_in_all(lists: Iterable[Sequence[str]]) -> tuple[str, ...]:
 
 # ── as findings ────────────────────────────────────────────────────────────────────────────
 
-_SHOWN = 5
+_MOST_SHOWN = 5
 
 
 def requirement_findings(
@@ -241,7 +241,7 @@ def requirement_findings(
     return decided_findings(decide_all(requirements, system), system, before)
 
 
-def robots_left_out(system: System, namespaces: Sequence[str]) -> list[Finding]:
+def left_out_robot_findings(system: System, namespaces: Sequence[str]) -> list[Finding]:
     """Return a finding if requirements in ``namespaces`` leave out robots of the fleet.
 
     Requirements in the namespace ``/`` may be for every robot.
@@ -252,11 +252,11 @@ def robots_left_out(system: System, namespaces: Sequence[str]) -> list[Finding]:
     others = sorted(robot.name for robot in robots if robot.namespace not in above)
     if not others:
         return []
-    text = f"robots outside the named namespaces: {first_few(others, _SHOWN)}"
+    text = f"robots outside the named namespaces: {first_few(others, _MOST_SHOWN)}"
     return [ROBOTS_LEFT_OUT.found(system.file, text, system.file)]
 
 
-def remappings_unused(
+def unused_remapping_findings(
     files: Iterable[Path],
     system: System,
     namespaces: Sequence[str],
@@ -307,7 +307,9 @@ def decided_findings(
     if system.is_export:
         text = "only the enclaves in this export were judged: others of its keystore may be missing"
         if decided.unjudged:
-            text += f", such as {first_few(decided.unjudged, _SHOWN)}, which should have rights"
+            text += (
+                f", such as {first_few(decided.unjudged, _MOST_SHOWN)}, which should have rights"
+            )
         findings.append(OF_EXPORT.found(system.file, text, system.file))
     if system.left_out:
         error = system.left_out
@@ -379,7 +381,8 @@ def _edit_text(violation: Violation) -> str:
     place, quoted = requirement.source, [f'"{name}"' for name in sorted({*enclaves})]
     return (
         "Change the policy at the named lines; or, if this is wanted, add "
-        f"{first_few(quoted, _SHOWN)} to `{key}` of the requirement at {place.file}:{place.line}."
+        f"{first_few(quoted, _MOST_SHOWN)} to `{key}` of the requirement at "
+        f"{place.file}:{place.line}."
     )
 
 
@@ -466,8 +469,8 @@ def _other_violators(violation: Violation) -> str:
 
 
 def _listed_names(names: Sequence[str]) -> str:
-    if len(names) > _SHOWN:
-        names = (*names[:_SHOWN], f"{len(names) - _SHOWN} more")
+    if len(names) > _MOST_SHOWN:
+        names = (*names[:_MOST_SHOWN], f"{len(names) - _MOST_SHOWN} more")
     *first, last = names
     return f"{', '.join(first)} and {last}" if first else last
 
@@ -478,7 +481,7 @@ def _vacuous_finding(requirement: Requirement, why: Sequence[str], remedy: str =
     return VACUOUS.found(place.file, text, place.file, place.line, remedy)
 
 
-_GONE = (
+_GONE_REMEDY = (
     "If the name was changed, change it in the requirement, too. If nobody uses the name any more, "
     "approve this in the review."
 )
@@ -499,7 +502,7 @@ def _unnamed_finding(
     }
     if gone := [name for name in names if name in known_before]:
         why = f"no right names {_listed_names(gone)} any more"
-        return _vacuous_finding(requirement, [why], _GONE)
+        return _vacuous_finding(requirement, [why], _GONE_REMEDY)
     text = f"no right names {_listed_names(names)}: {demand(requirement)}"
     return UNNAMED.found(place.file, text, place.file, place.line)
 

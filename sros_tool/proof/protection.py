@@ -296,8 +296,8 @@ def _dropped_statements(
         names = _set_of_names((protection.name,)) - _set_of_names(enough)
         example = names.example(limit)
         if example is not None:
-            valid = names & _ABSOLUTE
-            name = example if example in _ABSOLUTE else valid.example(limit) or example
+            valid = names & _ABSOLUTE_NAMES
+            name = example if example in _ABSOLUTE_NAMES else valid.example(limit) or example
             less = (
                 "sign"
                 if name in _set_of_names(_names_of_kind(later, protection.kind))
@@ -319,11 +319,11 @@ def _set_of_names(names: Iterable[str]) -> NameSet:
     return NameSet.union(map(names_of_expression, names))
 
 
-_ABSOLUTE = valid_topics("", "")
+_ABSOLUTE_NAMES = valid_topics("", "")
 """All absolute ROS names."""
 
 
-_ALL = names_of_expression("*")
+_ALL_NAMES = names_of_expression("*")
 
 
 def limits_crossing(side: AccessSource) -> bool:
@@ -428,12 +428,12 @@ _Crossing = tuple[tuple[str, ...], ...]
 def _newly_passing_name(before: _Crossing, after: _Crossing, limit: SearchLimit) -> str:
     """Return a name that may pass by ``after`` but not by ``before``; "" if there is none."""
     names = _names(after) - _names(before)
-    return (names & _ABSOLUTE).example(limit) or names.example(limit) or ""
+    return (names & _ABSOLUTE_NAMES).example(limit) or names.example(limit) or ""
 
 
 @lru_cache(maxsize=1024)
 def _names(crossing: _Crossing) -> NameSet:
-    names = _ALL
+    names = _ALL_NAMES
     for expressions in crossing:
         names &= NameSet.union(map(names_of_expression, expressions))
     return names

@@ -26,23 +26,23 @@ FILES = ("100644", "100755")
 
 _MOST_BYTES = 32 * 1024 * 1024
 """Size in bytes of the largest object that is read."""
-_AT_ONCE = 64 * 1024 * 1024
+_BATCH_BYTES = 64 * 1024 * 1024
 _MOST_DEPTH = 200
 _MOST_TAGS = 10
-_MOST_KNOWN = 1024
+_CACHE_SIZE = 1024
 _MOST_KNOWN_BYTES = 16 * 1024
-_WAIT = 60  # seconds
+_WAIT_SECONDS = 60  # seconds
 _WAIT_FOR_SERVER = 600
-_SAFE = (
+_SAFE_OPTIONS = (
     "--no-pager",
     "--no-replace-objects",
     *("-c", "core.fsmonitor=false"),
     *("-c", "core.hooksPath=/dev/null"),
     *("-c", "core.alternateRefsCommand=:"),
 )
-_READING = {"GIT_ALLOW_PROTOCOL": "", "GIT_NO_LAZY_FETCH": "1"}
-_FETCHING = {"GIT_ALLOW_PROTOCOL": "file:git:http:https:ssh"}
-_ALWAYS = {
+_READING_VARIABLES = {"GIT_ALLOW_PROTOCOL": "", "GIT_NO_LAZY_FETCH": "1"}
+_FETCHING_VARIABLES = {"GIT_ALLOW_PROTOCOL": "file:git:http:https:ssh"}
+_COMMON_VARIABLES = {
     "GIT_NO_REPLACE_OBJECTS": "1",
     "GIT_OPTIONAL_LOCKS": "0",
     "GIT_TERMINAL_PROMPT": "0",
@@ -349,11 +349,11 @@ class Repository:
         if sum(sizes.values()) > maximum:
             raise DocumentError(f"the files of the commit have more than {maximum} bytes")
         part: list[str] = []
-        room = _AT_ONCE
+        room = _BATCH_BYTES
         for object_id, size in sizes.items():
             if part and size > room:
                 yield from _contents_of_kind("blob", part, self._read(part, sizes)).items()
-                part, room = [], _AT_ONCE
+                part, room = [], _BATCH_BYTES
             part.append(object_id)
             room -= size
         yield from _contents_of_kind("blob", part, self._read(part, sizes)).items()
@@ -408,7 +408,7 @@ class Repository:
                 )
             objects[object_id] = words[1], content
             if words[1] != "blob" and len(content) <= _MOST_KNOWN_BYTES:
-                if len(_known) >= _MOST_KNOWN:
+                if len(_known) >= _CACHE_SIZE:
                     _known.clear()
                 _known[self.folder, object_id] = objects[object_id]
         return objects
@@ -440,7 +440,7 @@ class Repository:
             *("--no-auto-maintenance", "--no-write-fetch-head", "--refmap="),
             *("--upload-pack=git-upload-pack", "--", remote, digits),
         )
-        self._git(["fetch", *options], environment=_FETCHING, wait=_WAIT_FOR_SERVER)
+        self._git(["fetch", *options], environment=_FETCHING_VARIABLES, wait=_WAIT_FOR_SERVER)
 
     def _refuse_settings_inside(self) -> None:
         """Raise if git would read settings from the work tree.
@@ -488,7 +488,7 @@ class Repository:
         stdin: bytes = b"",
         quiet: bool = False,
         environment: dict[str, str] | None = None,
-        wait: int = _WAIT,
+        wait: int = _WAIT_SECONDS,
     ) -> bytes:
         """Run git and return its output.
 
@@ -508,9 +508,9 @@ class Repository:
         }
         try:
             done = subprocess.run(
-                [_program(variables.get("PATH", os.defpath)), *_SAFE, *words],
+                [_program(variables.get("PATH", os.defpath)), *_SAFE_OPTIONS, *words],
                 cwd=self.folder,
-                env={**variables, **_ALWAYS, **(environment or _READING)},
+                env={**variables, **_COMMON_VARIABLES, **(environment or _READING_VARIABLES)},
                 input=stdin,
                 capture_output=True,
                 timeout=wait,

@@ -92,9 +92,9 @@ from sros_tool.proof.commit_files import (
 )
 from sros_tool.proof.decide import restricted_enclaves
 from sros_tool.proof.findings import (
-    remappings_unused,
+    left_out_robot_findings,
     requirement_findings,
-    robots_left_out,
+    unused_remapping_findings,
 )
 from sros_tool.proof.growth import DroppedDenial, Growth, compare_access, undenied_name
 from sros_tool.proof.repository import FILES, LINK, SUBMODULE, Repository, TreeEntry, walk
@@ -132,21 +132,21 @@ _ARCHIVE_SIGNATURES = (
 )
 """First bytes of files of gzip, ZIP, xz, bzip2, Zstandard and 7z."""
 _MOST_NAMESPACES = 20
-_LONGEST = 200  # characters that are shown of a link's target
-_NOT_USED = (
+_LONGEST_TARGET_SHOWN = 200  # characters that are shown of a link's target
+_NOT_USED_TEXT = (
     "changes and is not reviewed: no reviewed policy uses it. Name it with --policy, leave it out "
     "with"
 )
-_BOTH_NAMES = "name the folder of both names with --policy, which compares them"
+_BOTH_NAMES_REMEDY = "name the folder of both names with --policy, which compares them"
 _PRIVATE_KEY = re.compile(rb"-----BEGIN (?:[A-Z0-9]+ )*PRIVATE KEY-----(?:\s|\\[nr])+[\w+/]")
 """A private key in PEM; a text that only mentions the first line does not match."""
 _UNSIGNED_POLICY_IDS = tuple(
     kind.id for kind in (STALE, LESS_PROTECTED, NOT_IN_POLICY, NOT_IN_KEYSTORE, NOT_IN_EXPORT)
 )
 """Ids of findings which say that a keystore is not signed for the policies."""
-_OF_TEMPLATES = ("authorities", "certificates", "permissions", "protection")
+_TEMPLATE_TABLES = ("authorities", "certificates", "permissions", "protection")
 _SETTINGS_TABLE = re.compile(
-    rf"^[ \t]*\[+(?:{'|'.join((*_OF_TEMPLATES, *KINDS))})\b".encode(), re.MULTILINE
+    rf"^[ \t]*\[+(?:{'|'.join((*_TEMPLATE_TABLES, *KINDS))})\b".encode(), re.MULTILINE
 )
 """A table of a keystore template or of requirements."""
 _LARGEST_SETTINGS = 1024 * 1024
@@ -320,7 +320,7 @@ class Review:
         )
 
 
-_STEPS = (
+_STEP_KINDS = (
     *("files", "policy", "requirements", "requirements-before", "new-access", "rights"),
     *("keystore", "signed", "expiry"),
 )
@@ -329,7 +329,7 @@ _STEPS = (
 class StepResult(NamedTuple):
     """The result of one step of a review."""
 
-    step: Annotated[str, Words(_STEPS)]
+    step: Annotated[str, Words(_STEP_KINDS)]
     """Name of the step; ``requirements-before`` reports requirements that the change drops,
     ``signed`` whether a keystore is signed for the reviewed policies.
     """
@@ -551,7 +551,7 @@ class _Review:
         def files_at(path: str) -> Sequence[Path]:
             files = side.policies(path, placeholders=fleet is not None)
             if not files:
-                raise self._missing_file_error(path, f" If it is renamed, {_BOTH_NAMES}.")
+                raise self._missing_file_error(path, f" If it is renamed, {_BOTH_NAMES_REMEDY}.")
             return files
 
         read = yield from _read_each("policy", self.request.policies, files_at)
@@ -703,7 +703,7 @@ class _Review:
         for path in self._policies_among(changed, self.head):
             content = self.request.repository.content(entries[path].id)
             if (Path(path).name, content) not in shipped:
-                lines.append((f"{_NOT_USED} --leave-out {quote(path)}, or delete it", path))
+                lines.append((f"{_NOT_USED_TEXT} --leave-out {quote(path)}, or delete it", path))
         earlier = list(self._changed_files(self.base, self.head))
         for path in self._unreviewed_keystores([*changed, *earlier]):
             if not self._has(self.head, str(Path(path) / ENCLAVES)):
@@ -830,7 +830,7 @@ class _Review:
             linked = None if _is_below(place, self.request.left_out) else self.head.entry(place)
             if linked and linked.mode in FILES and not may_be_policy(repository.content(linked.id)):
                 return ""
-        return f"a symbolic link to '{target[:_LONGEST]}'"
+        return f"a symbolic link to '{target[:_LONGEST_TARGET_SHOWN]}'"
 
     @staticmethod
     def _has(side: CommitFiles, path: str) -> bool:
@@ -959,7 +959,9 @@ class _Review:
             assert self.base
             for path in self.request.policies:  # raises the error of a file that was not read
                 self.base.policies(path, placeholders=base_fleet is not None)
-            text = f"is new, so that all of its access is new; if it is renamed, {_BOTH_NAMES}"
+            text = (
+                f"is new, so that all of its access is new; if it is renamed, {_BOTH_NAMES_REMEDY}"
+            )
             new = ((text, " ".join(self.request.policies)),)
             return _FOUND, StepFindings(new)
         return self._compared_access(before(), head, moving())
@@ -1083,9 +1085,9 @@ class _Review:
         asked = self.request
         findings = [
             *requirement_findings(requirements, system, before),
-            *robots_left_out(system, asked.namespaces),
+            *left_out_robot_findings(system, asked.namespaces),
             *elsewhere(),
-            *remappings_unused(files, system, asked.namespaces, asked.remaps),
+            *unused_remapping_findings(files, system, asked.namespaces, asked.remaps),
         ]
         chosen = FindingFilter().choose(findings)
         return _status(chosen), chosen
@@ -1187,7 +1189,7 @@ class _Review:
         left: list[Finding] = []
         if moved:
             with suppress(SrosError, OSError):  # the comparison reports the error
-                left = list(_requirements_left(wanted_requirements, *moved()))
+                left = list(_left_requirement_findings(wanted_requirements, *moved()))
         if not (dropped or left):
             return None
         assert self.base
@@ -1383,7 +1385,7 @@ def _status(chosen_findings: ChosenFindings) -> int:
     return _FOUND if chosen_findings.fails(WARNING) else _OK
 
 
-def _requirements_left(
+def _left_requirement_findings(
     requirements: Sequence[Requirement], before: AccessSource, after: AccessSource
 ) -> Iterator[Finding]:
     """Yield a finding for each requirement on an enclave that a node leaves for another enclave."""

@@ -404,7 +404,7 @@ def _authorities(folders: Iterable[Path]) -> frozenset[tuple[str, str]]:
     )
 
 
-_NEVER = "9999"
+_NEVER_EXPIRES = "9999"
 
 
 def _expiries(root: Path) -> dict[int, str]:
@@ -415,7 +415,7 @@ def _expiries(root: Path) -> dict[int, str]:
     for entry in OpenedKeystore(root).ledger_with("what", "certificate").entries:
         with suppress(ValueError):
             serial = int(entry.serial, 16)
-            expiries[serial] = max(expiries.get(serial, ""), entry.not_after or _NEVER)
+            expiries[serial] = max(expiries.get(serial, ""), entry.not_after or _NEVER_EXPIRES)
     return expiries
 
 
@@ -493,12 +493,12 @@ def _governance(file: Path) -> Governance:
 
 AT = datetime(2026, 1, 1, tzinfo=UTC)
 """The time for which permissions are compared; all permissions then count as valid."""
-_VALID = window(AT - timedelta(days=2), timedelta(days=9))
+_ASSUMED_VALIDITY = window(AT - timedelta(days=2), timedelta(days=9))
 
 
 def _without_dates(permissions: Permissions) -> Permissions:
     """Return permissions with dates that are valid at `AT`, because dates are not compared."""
-    begin, end = iso(_VALID.not_before), iso(_VALID.not_after)
+    begin, end = iso(_ASSUMED_VALIDITY.not_before), iso(_ASSUMED_VALIDITY.not_after)
     return Permissions(
         tuple(grant._replace(not_before=begin, not_after=end) for grant in permissions.grants)
     )
@@ -533,7 +533,10 @@ def _access_of_policies(shown: str, policies: list[_Read]) -> AccessSource:
     enclaves = {enclave.path: enclave for enclave in policy.enclaves}
     permissions = {
         path: permissions_for(
-            enclave, subject=subject_text(common_name(path)), validity=_VALID, domains=ALL_DOMAINS
+            enclave,
+            subject=subject_text(common_name(path)),
+            validity=_ASSUMED_VALIDITY,
+            domains=ALL_DOMAINS,
         )
         for path, enclave in enclaves.items()
     }

@@ -346,7 +346,7 @@ def _with_lists(requirement: Requirement, change: Callable[[Names, str], Names])
 
 # ── writing ────────────────────────────────────────────────────────────────────────────────
 
-_HEAD = """\
+_HEADING = """\
 # Requirements that hold for {of} today, for all names that could ever be used.
 # Keep the requirements that have to hold tomorrow, say why, and delete the others.
 # In a package, write a name that moves with the namespace of its users without the first "/".
@@ -361,7 +361,7 @@ def render_requirements(
     ``of`` names the source at the top.  `sros_tool.proof.requirements.parse_requirements` returns
     equal requirements, with other places.
     """
-    lines = [_HEAD.format(of=json.dumps(of))]
+    lines = [_HEADING.format(of=json.dumps(of))]
     for requirement in requirements:
         lines += [f"# {demand(requirement)}", f"[[{requirement.KIND}]]"]
         lines += [f"{key} = {_toml(value)}" for key, value in _values(requirement)]

@@ -79,7 +79,7 @@ from sros_tool.wording import first_few
 from sros_tool.zenoh.access import Enforcement, Remote
 from sros_tool.zenoh.releases import version_text
 
-_SHOWN = 4
+_MOST_SHOWN = 4
 _ZENOH = "zenoh"
 
 
@@ -214,9 +214,9 @@ def check_upgrade(
     by_distribution = _present_distributions(files, present, here, later)
     for before, enclaves in by_distribution.items():
         findings += _upgrade_findings(files.only_for(enclaves), before, later, vendor)
-        findings += _vulnerabilities(before, later, vendor, circumstances.advisories)
+        findings += _vulnerability_findings(before, later, vendor, circumstances.advisories)
         if not files.keystore:
-            findings += _rights_needed_after(path, circumstances, before, later)
+            findings += _newly_needed_right_findings(path, circumstances, before, later)
     compared = {name for enclaves in by_distribution.values() for name in enclaves}
     joined_findings = with_joined_findings(list(dict.fromkeys(findings)))
     return UpgradeFindings(joined_findings, len(compared), len(files.enclaves))
@@ -239,7 +239,7 @@ def _present_distributions(
             if distribution and distribution != later:
                 by_distribution.setdefault(distribution, []).append(name)
     if unknown or (files.enclaves and not by_distribution):
-        source = first_few(unknown, _SHOWN) if by_distribution else f"'{files.file}'"
+        source = first_few(unknown, _MOST_SHOWN) if by_distribution else f"'{files.file}'"
         raise UsageError(
             f"it is not known from which distribution {source} is updated to {later.title}",
             "Neither --distro, nor $ROS_DISTRO, nor the keystore names another distribution.",
@@ -277,7 +277,7 @@ def _products(
             yield old, new
 
 
-def _vulnerabilities(
+def _vulnerability_findings(
     before: Distribution, after: Distribution, vendor: str, advisories: Sequence[Advisory] | None
 ) -> Iterator[Finding]:
     """Yield findings on vulnerabilities that the latest release of only one distribution has."""
@@ -306,7 +306,7 @@ def _vulnerabilities(
             yield VULNERABILITIES.found(title, "; ".join(parts))
 
 
-def _rights_needed_after(
+def _newly_needed_right_findings(
     path: Path, circumstances: Circumstances, before: Distribution, after: Distribution
 ) -> Iterator[Finding]:
     """Yield rights that a policy denies and that nodes need only after the update."""
@@ -466,7 +466,7 @@ def _changes_of_enclave(
         )
         if gains:
             accesses = first_few(
-                list(dict.fromkeys(map(_gain_text, gains))), _SHOWN, "; ", "; and "
+                list(dict.fromkeys(map(_gain_text, gains))), _MOST_SHOWN, "; ", "; and "
             )
             closed = first.shipped.title
             opened = f"{where}{accesses}: open on {second.shipped.title}, closed on {closed}"
@@ -556,7 +556,7 @@ def _zenoh_findings(
         if any(_drops_below_name(source.enforcers, right, domain, key) for key in more)
     }
     if dropped:
-        yield BUFFERS.found(files.file, f"for {first_few(sorted(dropped), _SHOWN)}")
+        yield BUFFERS.found(files.file, f"for {first_few(sorted(dropped), _MOST_SHOWN)}")
 
 
 _SUBSCRIPTION_KEYS = "_buf/*"

@@ -34,7 +34,7 @@ LONGEST = 255
 """Length in bytes of the longest DDS topic name in ROS 2 (rmw, validate_full_topic_name.h)."""
 ANYBODY = "anybody without an identity"
 """Name that stands for all processes without an enclave, where a governance admits them."""
-_LAST = "\U0010ffff"
+_LAST_CHARACTER = "\U0010ffff"
 _COMPARISONS_PER_STEP = 4
 """Number of comparisons of wildcard prefixes and suffixes that count as one search step."""
 
@@ -239,7 +239,7 @@ class Side:
 
 def _starting(ordered: list[str], begin: str) -> range:
     """Return the indexes of the texts in a sorted list that begin with ``begin``."""
-    return range(bisect_left(ordered, begin), bisect_left(ordered, begin + _LAST))
+    return range(bisect_left(ordered, begin), bisect_left(ordered, begin + _LAST_CHARACTER))
 
 
 class Crossing:
@@ -430,7 +430,7 @@ class World:
         """Return a topic of a set, or None; stated topics and topics that nodes can have come
         first.
         """
-        sets = (names, *(names & name_set for name_set in _VALID))
+        sets = (names, *(names & name_set for name_set in _VALID_TOPICS))
         stated = (next(name_set.stated(), None) for name_set in sets)
         examples = (
             name_set.example(limit, longest=self.longest) for name_set in (*sets[1:], names)
@@ -500,7 +500,7 @@ class World:
             shared = written & self._readers.of.get(reader, NameSet())
             crossing = self.topics_between(writer, reader)
             shared = shared if crossing is None else shared & crossing
-            valid = (shared & names for names in _VALID)
+            valid = (shared & names for names in _VALID_TOPICS)
             example = next(
                 filter(None, (name_set.example(limit, longest=self.longest) for name_set in valid)),
                 None,
@@ -513,7 +513,9 @@ class World:
         return self._weak.get(level)
 
 
-_VALID = tuple(valid_topics(*ends) for ends in (("rt", ""), ("rq", "Request"), ("rr", "Reply")))
+_VALID_TOPICS = tuple(
+    valid_topics(*ends) for ends in (("rt", ""), ("rq", "Request"), ("rr", "Reply"))
+)
 
 
 def topics_of(right: Right) -> Iterator[tuple[bool, str]]:
@@ -526,7 +528,7 @@ def topics_of(right: Right) -> Iterator[tuple[bool, str]]:
 # ── the topics of an enclave ───────────────────────────────────────────────────────────────
 
 _IN, _OUT = Flow.INGRESS, Flow.EGRESS
-_ENDS = {"rt": "", **SERVICE_ENDS}
+_TOPIC_SUFFIXES = {"rt": "", **SERVICE_ENDS}
 _MESSAGES_BY_USE: dict[tuple[bool, str], tuple[tuple[Flow, Message], ...]] = {
     (True, "rt"): ((_IN, Message.PUT),),
     (False, "rt"): ((_OUT, Message.PUT),),
@@ -560,7 +562,7 @@ def ros_access(stated_rights: Iterable[StatedRight]) -> TopicAccess:
         return NameSet.union(
             (NameSet.union(names[writes, begin, True]) & valid_topics(begin, end))
             - NameSet.union(names[writes, begin, False])
-            for begin, end in _ENDS.items()
+            for begin, end in _TOPIC_SUFFIXES.items()
         )
 
     return TopicAccess(side(True), side(False))
@@ -583,7 +585,7 @@ def enforced_access(enforcers: Iterable[Enforcement], enclave: str, domain: int)
         )
         for names in other_sets:
             first &= names
-        return first & names_of_expression(f"{begin}/*{_ENDS[begin]}")
+        return first & names_of_expression(f"{begin}/*{_TOPIC_SUFFIXES[begin]}")
 
     all_enforcers = tuple(enforcers)
     return TopicAccess(
@@ -591,7 +593,7 @@ def enforced_access(enforcers: Iterable[Enforcement], enclave: str, domain: int)
             NameSet.union(
                 topics(enforcement, writes, begin)
                 for enforcement in all_enforcers
-                for begin in _ENDS
+                for begin in _TOPIC_SUFFIXES
             )
             for writes in (True, False)
         )
@@ -658,7 +660,7 @@ def _topics(key: str, domain: int, begin: str) -> NameSet:
     """
     if "/@" in key:
         return NameSet()
-    end, space = _ENDS[begin], str(domain)
+    end, space = _TOPIC_SUFFIXES[begin], str(domain)
     key = untyped(key)
     name = key.removesuffix(_UNTYPED).removeprefix(space)
     if len(name) == len(key) - len(space) - len(_UNTYPED) and "*" not in name:
@@ -680,7 +682,7 @@ def zenoh_message(topic: str, domain: int, *, writes: bool) -> list[tuple[Flow, 
     A topic without a ROS name has no messages.
     """
     begin = topic[:2]
-    end = _ENDS.get(begin)
+    end = _TOPIC_SUFFIXES.get(begin)
     if end is None or not topic[2:].startswith("/") or not topic.endswith(end):
         return []
     key = f"{domain}{topic[2 : len(topic) - len(end)]}{_ANY_TYPE_CHUNKS}"

@@ -64,7 +64,7 @@ _OVERLAYS = {
     "worlds": Overlay("worlds", "not in the Zenoh rules", "only in the Zenoh rules"),
 }
 """The kinds of comparisons of two sources, by name, with their labels."""
-_ONE_WAY = ("publish", "subscribe")
+_TOPIC_RIGHTS = ("publish", "subscribe")
 
 
 @dataclass(frozen=True, slots=True)
@@ -285,7 +285,7 @@ def _senders_and_receivers(edges: Iterable[Edge]) -> Mapping[tuple[str, str], li
     for edge in edges:
         if edge.qualifier is ALLOW:
             # A publisher of feedback serves the action; a subscriber to feedback is a client.
-            sends = edge.sends != (edge.kind == "actions" and edge.right in _ONE_WAY)
+            sends = edge.sends != (edge.kind == "actions" and edge.right in _TOPIC_RIGHTS)
             allowed[edge.kind, edge.name][0 if sends else 1] = True
     return allowed
 
@@ -583,14 +583,14 @@ class _DrawnWildcards:
 
 
 _NO_ACTION = Right("", ALLOW, "call", "")
-_WHOLE: dict[str, frozenset[tuple[str, str]]] = {
+_PARTS_OF_WHOLE_ACTION: dict[str, frozenset[tuple[str, str]]] = {
     right: frozenset(
         (part.right, part.name.removeprefix(ACTION_SEPARATOR))
         for part in parts(_NO_ACTION._replace(right=right))
     )
     for right in ("call", "execute")
 }
-_RIGHTS_IN = {right: {part for part, _ in whole} for right, whole in _WHOLE.items()}
+_RIGHTS_IN = {right: {part for part, _ in whole} for right, whole in _PARTS_OF_WHOLE_ACTION.items()}
 """Maps a right to a whole action to the rights to its topics and services."""
 _Found = dict[Qualifier, set[str]]
 
@@ -634,7 +634,7 @@ def _action_edges(
 ) -> Iterable[Edge]:
     """Yield an edge for a right to the whole action, or edges for rights to parts of the action."""
     remaining = dict(members)
-    for right, needed in _WHOLE.items():
+    for right, needed in _PARTS_OF_WHOLE_ACTION.items():
         if needed <= members.keys():
             whole = {member for part in needed for member in members[part]}
             yield Edge(
@@ -690,7 +690,7 @@ def protection_of(governance: Governance | None, kind: str, name: str) -> Protec
     )
     weakest = min(
         protections,
-        key=lambda protection: _ORDER.index(protection.level),
+        key=lambda protection: _LEVEL_ORDER.index(protection.level),
         default=Protection(WireLevel.NONE),
     )
     return replace(
@@ -702,7 +702,7 @@ def protection_of(governance: Governance | None, kind: str, name: str) -> Protec
     )
 
 
-_ORDER = list(WireLevel)
+_LEVEL_ORDER = list(WireLevel)
 
 
 class _DemandedProtection:
@@ -718,12 +718,12 @@ class _DemandedProtection:
     def protection(self, kind: str, name: str) -> Protection | None:
         """Return the weakest protection demanded for the topics of a name, or None."""
         levels = [self._level(topic) for topic in _topics(kind, name)] if self._names else []
-        least = min(levels, key=_ORDER.index, default=WireLevel.UNKNOWN)
+        least = min(levels, key=_LEVEL_ORDER.index, default=WireLevel.UNKNOWN)
         return None if least is WireLevel.UNKNOWN else Protection(least)
 
     def _level(self, topic: str) -> WireLevel:
         covering = [level for level, names in self._names.items() if names.cover(topic)]
-        return max(covering, key=_ORDER.index, default=WireLevel.UNKNOWN)
+        return max(covering, key=_LEVEL_ORDER.index, default=WireLevel.UNKNOWN)
 
 
 def _topics(kind: str, name: str) -> tuple[str, ...]:
@@ -750,7 +750,7 @@ def _protection(domain: DomainRule, rule: TopicRule) -> Protection:
     data, metadata = rule.data_protection_kind, rule.metadata_protection_kind
     rtps = domain.rtps_protection_kind
     return Protection(
-        max((_level(kind) for kind in (data, metadata, rtps)), key=_ORDER.index),
+        max((_level(kind) for kind in (data, metadata, rtps)), key=_LEVEL_ORDER.index),
         str(data),
         str(metadata),
         str(rtps),

@@ -65,9 +65,9 @@ _WORDS_OF_KIND = {
     "dds": ("publish DDS topic", "publisher", "subscribe to"),
 }
 """Kind of name → verb of senders, noun for senders, verb of receivers."""
-_ONE_WAY = ("publish", "subscribe")
-_COMMANDS = ("send_goal", "cancel_goal")
-_NAMED = 3  # maximum number of enclaves that a sentence names; more are counted
+_TOPIC_RIGHTS = ("publish", "subscribe")
+_COMMANDING_SERVICES = ("send_goal", "cancel_goal")
+_MOST_NAMED = 3  # maximum number of enclaves that a sentence names; more are counted
 
 
 def focused_picture(
@@ -209,14 +209,14 @@ class FocusFlow:
 
 def _may_write(edge: Edge) -> bool:
     """Return whether information goes from the enclave of an edge to its name."""
-    if edge.right in _ONE_WAY:
+    if edge.right in _TOPIC_RIGHTS:
         return edge.sends
     return not (edge.right == "request" and is_question(edge))
 
 
 def _may_read(edge: Edge) -> bool:
     """Return whether information goes from the name of an edge to its enclave."""
-    if edge.right in _ONE_WAY:
+    if edge.right in _TOPIC_RIGHTS:
         return not edge.sends
     return not (edge.right == "reply" and is_question(edge))
 
@@ -389,7 +389,7 @@ def _commands(kind: str, name: str) -> Iterator[str]:
     if kind == "dds":
         yield name
     elif kind == "actions":
-        for command in _COMMANDS:
+        for command in _COMMANDING_SERVICES:
             yield from dds_names("request", f"{name}{ACTION_SEPARATOR}{command}").publish
     else:
         yield from dds_names("publish" if kind == "topics" else "request", name).publish
@@ -436,7 +436,7 @@ def _enclaves_text(enclaves: Collection[str], *, partial: bool) -> str:
     """Return the paths of a few enclaves, or the number of many enclaves, in words."""
     if not enclaves:
         return "no enclave"
-    if len(enclaves) > _NAMED:
+    if len(enclaves) > _MOST_NAMED:
         return counted(len(enclaves), "enclave")
     alone = len(enclaves) == 1 and not partial
     return enumerated(sorted(enclaves)) + (" alone" if alone else "")

@@ -52,7 +52,7 @@ _LABEL_CHARACTERS = "{}…"
 _WORD = re.compile(r"[A-Za-z0-9_]+")
 _MAX_PIECES = 16
 """Maximum number of pieces of a word (split at underscores) that are compared with unit names."""
-_SELF = -1
+_OWN_SYMBOL = -1
 _TITLE_LETTERS = 30
 """Maximum length of the title of a frame, in characters; a frame is as wide as a card."""
 _ENCLAVE = "enclave"
@@ -407,7 +407,7 @@ class _Draft:
 
     def _symbols_around(self, units: Sequence[int], unit: int) -> tuple[int, ...]:
         return tuple(
-            _SELF if other_unit == unit else self._symbols[other_unit] for other_unit in units
+            _OWN_SYMBOL if other_unit == unit else self._symbols[other_unit] for other_unit in units
         )
 
     def _are_alike(self, view: Iterable[_Part], other: Iterable[_Part]) -> bool:

@@ -332,9 +332,11 @@ def _card_legend(picture: Picture, scene: Scene) -> Iterable[str]:
     """Yield the lines of the legend for marked cards, and for labels of equal units."""
     rows = []
     if any(card.chosen for card in scene.cards):
-        rows.append((_BOX.format("chosen"), "in focus: information goes to it from the left"))
+        rows.append(
+            (_LEGEND_BOX.format("chosen"), "in focus: information goes to it from the left")
+        )
     if any(card.lacks for card in scene.cards):
-        rows.append((_BOX.format("lacking"), "nobody may send it, or nobody may receive it"))
+        rows.append((_LEGEND_BOX.format("lacking"), "nobody may send it, or nobody may receive it"))
     if rows:
         yield _legend_row(rows)
     for units in picture.equal[:_MOST_LABELS]:
@@ -346,7 +348,7 @@ def _card_legend(picture: Picture, scene: Scene) -> Iterable[str]:
         )
 
 
-_BOX = '<g class="card {}"><rect y="-11" width="34" height="14" rx="4"/></g>'
+_LEGEND_BOX = '<g class="card {}"><rect y="-11" width="34" height="14" rx="4"/></g>'
 _MOST_LABELS = 8
 
 
@@ -374,7 +376,7 @@ _COLORS = {
 }
 _VIOLATING = "#b3261e"
 _MERMAID_ARROWS = {"encrypt": "==>", "sign": "-->", "none": "-.->", "unknown": "-->"}
-_WAIT = 60
+_WAIT_SECONDS = 60
 
 
 def render_dot(picture: Picture, scene: Scene) -> str:
@@ -483,7 +485,7 @@ def _graphviz_svg(dot: str) -> str:
             capture_output=True,
             encoding="utf-8",
             errors="replace",
-            timeout=_WAIT,
+            timeout=_WAIT_SECONDS,
             check=True,
         )
     except FileNotFoundError as error:

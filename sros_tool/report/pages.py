@@ -495,7 +495,7 @@ def _demo_row(row: Json) -> Iterator[str]:
 
 # ── a fleet ──────────────────────────────────────────────────────────────────────────────────────
 
-_GOOD = ("current", "none")
+_GOOD_STATES = ("current", "none")
 _OUT_OF_DATE = ("restart", "unusable", "earlier", "different", "missing", "offline", "never")
 
 
@@ -591,4 +591,4 @@ def _urgency(state: str) -> int:
 
 
 def _fleet_class(state: str) -> str:
-    return "good" if state in _GOOD else "warning" if state in _OUT_OF_DATE else "error"
+    return "good" if state in _GOOD_STATES else "warning" if state in _OUT_OF_DATE else "error"

@@ -23,7 +23,7 @@ SENDS = {"publish": True, "request": True, "call": True} | dict.fromkeys(
 )
 """Right → whether its holder sends, so that the arrow points to the name."""
 
-_ASKED = tuple(f"/{name}" for name in READING_SERVICES)
+_QUESTION_SUFFIXES = tuple(f"/{name}" for name in READING_SERVICES)
 _KINDS = (*RIGHTS, "dds")
 """Kinds of names in display order; ``dds`` is a topic without a ROS name."""
 
@@ -186,7 +186,7 @@ def lack_text(kind: str, lacks: Lack) -> str:
 
 def is_question(name: Name | Edge) -> bool:
     """Return whether a name is a service whose requests change nothing (`QUESTIONS` of reach)."""
-    return name.kind == "services" and name.name.endswith(_ASKED)
+    return name.kind == "services" and name.name.endswith(_QUESTION_SUFFIXES)
 
 
 class Statement(NamedTuple):
@@ -381,8 +381,8 @@ class PicturedViolation(NamedTuple):
     """Uses of names that break the requirement."""
 
 
-_SAID = 5  # violations, and differing units, in the headlines; JSON has all
-_SHOWN = 2  # rights of one unit in the headlines
+_MOST_IN_HEADLINES = 5  # violations, and differing units, in the headlines; JSON has all
+_MOST_SHOWN = 2  # rights of one unit in the headlines
 
 
 class Requirements(NamedTuple):
@@ -406,8 +406,14 @@ class Requirements(NamedTuple):
         if not self.violations:
             return (holds,)
         number = len(self.violations)
-        more = (f"{number - _SAID} more do not hold",) if number > _SAID else ()
-        violated = (f"Violated: {violation.text}" for violation in self.violations[:_SAID])
+        more = (
+            (f"{number - _MOST_IN_HEADLINES} more do not hold",)
+            if number > _MOST_IN_HEADLINES
+            else ()
+        )
+        violated = (
+            f"Violated: {violation.text}" for violation in self.violations[:_MOST_IN_HEADLINES]
+        )
         return (*violated, *more, *((holds,) if self.hold else ()))
 
 
@@ -467,7 +473,7 @@ class DifferentUnit(NamedTuple):
         """Return the difference as a sentence without a full stop."""
         parts = []
         for has, rights in (("it has", self.more), ("it lacks", self.fewer)):
-            parts += [f"{has} {first_few(rights, _SHOWN, '; ')}"] if rights else []
+            parts += [f"{has} {first_few(rights, _MOST_SHOWN, '; ')}"] if rights else []
         usual = self.usual.strip("{}").replace("…", " … ")
         return f"{self.unit.strip('{}')} differs from {usual}: {', and '.join(parts)}"
 
@@ -538,8 +544,8 @@ class Picture:
     def notes(self) -> tuple[str, ...]:
         """Sentences without a full stop: on units that are drawn once, and on units that differ."""
         equal = (f"{units.title} are drawn as one" for units in self.equal)
-        more = len(self.different) - _SAID
-        different = [unit.sentence() for unit in self.different[:_SAID]]
+        more = len(self.different) - _MOST_IN_HEADLINES
+        different = [unit.sentence() for unit in self.different[:_MOST_IN_HEADLINES]]
         different += [f"{more} more differ"] if more > 0 else []
         return (*equal, *different)
 
@@ -548,13 +554,13 @@ class Picture:
             return
         members = [member for units in self.unread for member in units.members]
         number, enclaves = len(members), sum(units.enclaves for units in self.unread)
-        likes = first_few([units.like for units in self.unread], _SHOWN)
+        likes = first_few([units.like for units in self.unread], _MOST_SHOWN)
         yield (
             f"{counted(number, self.unread[0].what)} with {counted(enclaves, 'enclave')} "
-            f"({first_few(members, _SAID)}) were only compared: their permissions have the same "
-            f"text as the permissions of {likes}, except for names. Their signatures, "
-            "certificates, expiry and findings, and rights of others to their names, are not in "
-            "this picture: --robot NAME reads one, `sros check` checks all"
+            f"({first_few(members, _MOST_IN_HEADLINES)}) were only compared: their permissions "
+            f"have the same text as the permissions of {likes}, except for names. Their "
+            "signatures, certificates, expiry and findings, and rights of others to their names, "
+            "are not in this picture: --robot NAME reads one, `sros check` checks all"
         )
 
 

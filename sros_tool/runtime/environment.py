@@ -46,7 +46,7 @@ _VARIABLES = (SESSION_URI, ROUTER_URI, OVERRIDE)
 NO_CONFIGURATION = "/dev/null/refused-by-sros.json5"
 """A path that can never exist: a process that has to read a configuration from it exits."""
 
-_TLS = "transport/link/tls"
+_TLS_SETTING = "transport/link/tls"
 _LINE_ENDS = {point: f"\\u{point:04x}" for point in (0x2028, 0x2029)}
 """Escapes for characters that JSON allows in a string, and JSON5 does not."""
 _MOST_KEYS = 5
@@ -125,7 +125,7 @@ def render_environment(variables: Mapping[str, str], form: str) -> str:
             )
     if form == "json":
         return json.dumps(dict(variables), indent=2) + "\n"
-    return "".join(_LINES[form](name, value) for name, value in variables.items())
+    return "".join(_LINE_RENDERERS[form](name, value) for name, value in variables.items())
 
 
 def _fish(name: str, value: str) -> str:
@@ -147,7 +147,7 @@ def _docker(name: str, value: str) -> str:
     return f"{name}={value}\n"
 
 
-_LINES = {"sh": _sh, "fish": _fish, "systemd": _systemd, "docker": _docker}
+_LINE_RENDERERS = {"sh": _sh, "fish": _fish, "systemd": _systemd, "docker": _docker}
 
 
 def _is_not_unicode(value: str) -> bool:
@@ -350,7 +350,7 @@ def zenoh_environment(
         RMW: RMW_ZENOH,
         SESSION_URI: configurations.get(SESSION_URI, NO_CONFIGURATION),
         ROUTER_URI: configurations.get(ROUTER_URI, NO_CONFIGURATION),
-        OVERRIDE: ";".join(f"{_TLS}/{name}={_text(path)}" for name, path in files.items()),
+        OVERRIDE: ";".join(f"{_TLS_SETTING}/{name}={_text(path)}" for name, path in files.items()),
     }
 
 
@@ -420,14 +420,14 @@ MAX_SECRET = 1024 * 1024
 
 _CONTAINER_USER = 1000
 """User id and group id of the process in a container, as in most ROS images."""
-_OWNER_READS = 0o400
-_LOGS = {"ROS_LOG_DIR": "/tmp"}  # noqa: S108 (a path in the container, which has it alone)
+_OWNER_READ_MODE = 0o400
+_LOG_VARIABLES = {"ROS_LOG_DIR": "/tmp"}  # noqa: S108 (a path in the container, which has it alone)
 _ENCLAVE_VOLUME, _LOG_VOLUME = "sros-enclave", "tmp"
 _NAME_LABEL = "app.kubernetes.io/name"
 
 _SERVICE = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*\Z")
 _RFC_1123 = re.compile(r"[a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?\Z")
-_PLAIN = re.compile(r"(/[a-z][a-z0-9]*)+\Z")
+_PLAIN_ENCLAVE = re.compile(r"(/[a-z][a-z0-9]*)+\Z")
 _LONGEST_PLAIN = 40
 
 
@@ -454,7 +454,7 @@ def object_name(enclave: str) -> str:
     "--" and the first 64 bits of the enclave's SHA-256, so that the name is unique.
     """
     words = "-".join(re.findall(r"[a-z0-9]+", enclave.lower()))
-    if _PLAIN.match(enclave) and len(words) <= _LONGEST_PLAIN:
+    if _PLAIN_ENCLAVE.match(enclave) and len(words) <= _LONGEST_PLAIN:
         return words
     digest = hashlib.sha256(enclave.encode()).hexdigest()[:16]
     return f"{words[:_LONGEST_PLAIN].rstrip('-') or 'root'}--{digest}"
@@ -536,7 +536,8 @@ def render_secret(enclave: str, files: Mapping[str, bytes]) -> str:
 def _service(container: Container) -> dict[str, Any]:
     # Compose replaces $NAME in every value; $$ stands for $.
     variables = {
-        name: value.replace("$", "$$") for name, value in {**container.variables, **_LOGS}.items()
+        name: value.replace("$", "$$")
+        for name, value in {**container.variables, **_LOG_VARIABLES}.items()
     }
     folder = container.folder.replace("$", "$$")
     mount = {
@@ -552,7 +553,7 @@ def _service(container: Container) -> dict[str, Any]:
         "environment": variables,
         "volumes": [mount],
         "read_only": True,
-        "tmpfs": list(_LOGS.values()),
+        "tmpfs": list(_LOG_VARIABLES.values()),
         "cap_drop": ["ALL"],
         "security_opt": ["no-new-privileges:true"],
     }
@@ -579,7 +580,7 @@ def _pod(container: Container) -> dict[str, Any]:
         # Kubernetes replaces $(NAME) in every value; $$ stands for $.
         "env": [
             {"name": name, "value": value.replace("$", "$$")}
-            for name, value in {**container.variables, **_LOGS}.items()
+            for name, value in {**container.variables, **_LOG_VARIABLES}.items()
         ],
         "securityContext": {
             "allowPrivilegeEscalation": False,
@@ -588,10 +589,10 @@ def _pod(container: Container) -> dict[str, Any]:
         },
         "volumeMounts": [
             {"name": _ENCLAVE_VOLUME, "mountPath": container.folder, "readOnly": True},
-            *({"name": _LOG_VOLUME, "mountPath": path} for path in _LOGS.values()),
+            *({"name": _LOG_VOLUME, "mountPath": path} for path in _LOG_VARIABLES.values()),
         ],
     }
-    files = {"secretName": secret_name(container.enclave), "defaultMode": _OWNER_READS}
+    files = {"secretName": secret_name(container.enclave), "defaultMode": _OWNER_READ_MODE}
     return {
         "automountServiceAccountToken": False,
         "securityContext": {

@@ -170,7 +170,7 @@ def _internet_address(text: str) -> bytes:
     return struct.pack("=HH4s8x", socket.AF_INET, 0, socket.inet_aton(text))
 
 
-_HERE = "/proc/thread-self/ns/net"
+_OWN_NETWORK = "/proc/thread-self/ns/net"
 
 
 class RowNetwork:
@@ -184,10 +184,10 @@ class RowNetwork:
         self._there = self._back = -1
         if not own:
             return
-        self._back = os.open(_HERE, os.O_RDONLY | os.O_CLOEXEC)
+        self._back = os.open(_OWN_NETWORK, os.O_RDONLY | os.O_CLOEXEC)
         try:
             enter_isolation()
-            self._there = os.open(_HERE, os.O_RDONLY | os.O_CLOEXEC)
+            self._there = os.open(_OWN_NETWORK, os.O_RDONLY | os.O_CLOEXEC)
         finally:
             _enter(self._back)
 

@@ -82,7 +82,7 @@ _KERNEL_THREAD = 0x00200000
 _DOMAIN_NUMBER = re.compile(
     r"\s*\+?(0[xX][0-9a-fA-F]{1,16}|0[0-7]{0,22}|[1-9][0-9]{0,19})", re.ASCII
 )
-_LONGEST = 40
+_LONGEST_TEXT = 40
 
 
 class MappedLibrary(NamedTuple):
@@ -252,12 +252,14 @@ class RunningProcesses:
 def boot_id(proc: Path = Path("/proc")) -> str:
     """Return the random id of this boot of the machine; "" if the kernel shows no id."""
     try:
-        return (proc / "sys/kernel/random/boot_id").read_text(errors="replace").strip()[:_LONGEST]
+        return (
+            (proc / "sys/kernel/random/boot_id").read_text(errors="replace").strip()[:_LONGEST_TEXT]
+        )
     except OSError:
         return ""
 
 
-def plain(text: str, longest: int = _LONGEST) -> str:
+def plain(text: str, longest: int = _LONGEST_TEXT) -> str:
     """Return a text that a process chose, shortened and escaped for messages."""
     return re.sub(r"[^\w.+/ -]", "?", text[:longest])
 
@@ -538,13 +540,15 @@ def _forked_by(folder: int, command: tuple[str, ...]) -> tuple[int, tuple[str, .
             finally:
                 os.close(handle)
             is_python = bool(words) and Path(words[0]).name.startswith("python")
-            if words != command and not (is_python and any(map(_CHILD.match, command))):
+            if words != command and not (
+                is_python and any(map(_MULTIPROCESSING_CHILD.match, command))
+            ):
                 break
             first, command, parent = (parent, words), words, above
     return first
 
 
-_CHILD = re.compile(r"from multiprocessing\.(?:spawn|forkserver) import ")
+_MULTIPROCESSING_CHILD = re.compile(r"from multiprocessing\.(?:spawn|forkserver) import ")
 
 
 def _mapped_dds(maps: bytes) -> tuple[MappedLibrary, ...]:

@@ -40,17 +40,19 @@ class WrittenUnits(NamedTuple):
 TEMPLATE = "sros@.service"
 """The unit of all nodes; its instance name is an enclave, in the form of `unit_instance`."""
 
-_NODES = "/etc/sros/nodes"
+_NODES_FOLDER = "/etc/sros/nodes"
 """Folder with a program for each enclave, which runs if no command is named."""
 
 METRICS_FILE = "/var/lib/sros-metrics/sros.prom"
 FLEET_FILE = "/var/lib/sros-metrics/fleet.prom"
 
-_MADE = "# Made by `sros units`; change it with `systemctl edit`, and this file stays as it is."
+_ORIGIN_COMMENT = (
+    "# Made by `sros units`; change it with `systemctl edit`, and this file stays as it is."
+)
 _PLAIN_PATH = re.compile(r"(/(?!\.\.?(/|\Z))[A-Za-z0-9_.][A-Za-z0-9._+-]*)+\Z")
 _USER = re.compile(r"[A-Za-z_][A-Za-z0-9_-]{0,30}\Z")
 
-_CLOSED = """\
+_SANDBOX_SETTINGS = """\
 # The process can neither change the system nor gain privileges.
 NoNewPrivileges=yes
 CapabilityBoundingSet=
@@ -84,15 +86,15 @@ class Job(StrEnum):
     AGENT = "agent"
 
 
-_OFTEN = "*:0/15"
-_WHEN = {
+_OFTEN_SCHEDULE = "*:0/15"
+_SCHEDULES = {
     Job.RENEW: "daily",
     Job.CHECK: "daily",
-    Job.METRICS: _OFTEN,
-    Job.FLEET: _OFTEN,
+    Job.METRICS: _OFTEN_SCHEDULE,
+    Job.FLEET: _OFTEN_SCHEDULE,
     Job.COLLECT: "*:0/5",
 }
-_SPREAD = {
+_RANDOM_DELAYS = {
     Job.RENEW: "1h",
     Job.CHECK: "1h",
     Job.METRICS: "30s",
@@ -151,7 +153,7 @@ def node_template(user: str) -> str:
     """
     return f"""\
 # Runs a node in the enclave of its instance name, which sros@NAME.service.d/enclave.conf adds.
-{_MADE}
+{_ORIGIN_COMMENT}
 [Unit]
 Description=ROS node in enclave %f
 # Certificates are not valid before their time, and DDS looks for network interfaces only once.
@@ -168,7 +170,7 @@ LogsDirectory=sros/%i
 LogsDirectoryMode=0700
 Environment=ROS_LOG_DIR=%L/sros/%i
 
-{_CLOSED}
+{_SANDBOX_SETTINGS}
 # DDS lists network interfaces through netlink. /dev stays: it has shared memory, and the devices
 # of drivers. No limit on real time, which controllers use.
 RestrictAddressFamilies=AF_UNIX AF_INET AF_INET6 AF_NETLINK
@@ -193,8 +195,8 @@ def node_settings(
         enclave: the name of the enclave.
         variables: the environment variables of the enclave.
         keystore: the path of the keystore.
-        command: the command with its arguments; if empty, the program in `_NODES` with the path of
-            the enclave.
+        command: the command with its arguments; if empty, the program in `_NODES_FOLDER`
+            with the path of the enclave.
         below: the enclaves in subfolders of this enclave's folder.
         sros: the path of the program sros, which verifies the enclave before the start; "" for no
             verification.
@@ -205,11 +207,13 @@ def node_settings(
     folder = _check_path(keystore, "the keystore") + "/enclaves"
     place = folder + enclave.rstrip("/")
     program = (
-        " ".join(unit_words(command)) if command else f"{_NODES}{enclave.rstrip('/') or '/root'}"
+        " ".join(unit_words(command))
+        if command
+        else f"{_NODES_FOLDER}{enclave.rstrip('/') or '/root'}"
     )
     lines = [
         f"# Enclave {enclave} for {TEMPLATE}.",
-        _MADE,
+        _ORIGIN_COMMENT,
         "[Service]",
         *render_environment(variables, "systemd").splitlines(),
         "# The node sees the keys of no other enclave, and of no CA.",
@@ -321,7 +325,7 @@ def job_units(
             f"Environment=SROS_CA_PASSPHRASE_FILE=/run/credentials/{name}.service/ca-passphrase",
         ]
     service = f"""\
-{_MADE}
+{_ORIGIN_COMMENT}
 [Unit]
 Description={description}
 Wants=time-sync.target
@@ -332,18 +336,18 @@ Type=oneshot
 User={_check_user(user)}
 ExecStart={" ".join((program, *words))}
 {_lines(own_lines)}
-{_CLOSED}
+{_SANDBOX_SETTINGS}
 PrivateDevices=yes
 RestrictAddressFamilies=AF_UNIX
 """
     timer = f"""\
-{_MADE}
+{_ORIGIN_COMMENT}
 [Unit]
 Description={description}
 
 [Timer]
-OnCalendar={_WHEN[job]}
-RandomizedDelaySec={_SPREAD[job]}
+OnCalendar={_SCHEDULES[job]}
+RandomizedDelaySec={_RANDOM_DELAYS[job]}
 Persistent=yes
 
 [Install]
@@ -359,7 +363,7 @@ def _guard(keystore: str, sros: str, domain: int) -> str:
     # Only the two capabilities of root that are needed to look at all processes.
     rights = "CapabilityBoundingSet=CAP_SYS_PTRACE CAP_DAC_READ_SEARCH"
     return f"""\
-{_MADE}
+{_ORIGIN_COMMENT}
 [Unit]
 Description=Watch the ROS processes of this machine, which the keystore {root} secures
 
@@ -371,7 +375,7 @@ RestartSec=5
 Nice=10
 ExecStart={" ".join((_check_program(sros), "check", "runtime", "--watch"))}
 {_lines(render_environment(variables, "systemd").splitlines())}
-{_CLOSED.replace("CapabilityBoundingSet=", rights)}
+{_SANDBOX_SETTINGS.replace("CapabilityBoundingSet=", rights)}
 PrivateDevices=yes
 RestrictAddressFamilies=AF_UNIX
 
@@ -389,9 +393,9 @@ def _agent(folder: str, *, user: str, sros: str, writable: Sequence[str] = ()) -
     places = " ".join((root, *(f"-{_check_path(place, 'the inbox')}" for place in writable)))
     description = f"Keep the enclaves in {root} up to date"
     # The agent asks the kernel whether the clock is set, which ProtectClock would forbid.
-    closed = _CLOSED.replace("ProtectClock=yes\n", "")
+    closed = _SANDBOX_SETTINGS.replace("ProtectClock=yes\n", "")
     service = f"""\
-{_MADE}
+{_ORIGIN_COMMENT}
 [Unit]
 Description={description}
 Wants=network-online.target time-sync.target
@@ -412,7 +416,7 @@ PrivateDevices=yes
 RestrictAddressFamilies=AF_UNIX AF_INET AF_INET6
 """
     timer = f"""\
-{_MADE}
+{_ORIGIN_COMMENT}
 [Unit]
 Description={description}
 
@@ -444,7 +448,7 @@ def unit_words(command: Sequence[str]) -> Iterable[str]:
             raise UsageError(
                 f"the word {word!r} cannot be written in a unit",
                 "systemd ends a line at some characters that cannot be printed.",
-                f"Put the command into a program, such as {_NODES}/NAME.",
+                f"Put the command into a program, such as {_NODES_FOLDER}/NAME.",
             )
         if re.fullmatch(r"[A-Za-z0-9_/.,:=+@-]+", word):
             yield word

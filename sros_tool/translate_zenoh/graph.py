@@ -47,8 +47,8 @@ _ENTITY_KIND_OF_RIGHT = {"publish": "MP", "subscribe": "MS", "reply": "SS", "req
 _MOST_TOKENS = 4096
 """Maximum number of key expressions for the tokens of a right of an enclave."""
 _EVERY_KIND = "*"
-_ANNOUNCING = (Message.LIVELINESS_TOKEN,)
-_ASKING = (Message.LIVELINESS_QUERY, Message.DECLARE_LIVELINESS_SUBSCRIBER)
+_ANNOUNCING_MESSAGES = (Message.LIVELINESS_TOKEN,)
+_ASKING_MESSAGES = (Message.LIVELINESS_QUERY, Message.DECLARE_LIVELINESS_SUBSCRIBER)
 _ANY_NODE = NodeName("*", "*")
 _LETTER = "[a-zA-Z0-9_]"
 """Matches any character of a ROS name."""
@@ -68,7 +68,7 @@ def announced_nodes(rules: Iterable[AccessRule], enclave: str) -> AnnouncedNodes
     """Return the nodes that an enclave may announce by the rules from `graph_rules`."""
     nodes: dict[bool, list[str]] = {True: [], False: []}
     for rule in rules:
-        if rule.messages == _ANNOUNCING:
+        if rule.messages == _ANNOUNCING_MESSAGES:
             own_chunks = [_NODE if rule.allows else _EVERY_KIND, _token_form(enclave)]
             for key in rule.key_expressions:
                 chunks = key.split("/")
@@ -88,7 +88,7 @@ def announced_names(
     names: dict[bool, dict[str, None]] = {True: {}, False: {}}
     begin, of_right = [GRAPH, str(domain)], [_ENTITY_KIND_OF_RIGHT[right], _token_form(enclave)]
     for rule in rules:
-        for key in rule.key_expressions if _ANNOUNCING[0] in rule.messages else ():
+        for key in rule.key_expressions if _ANNOUNCING_MESSAGES[0] in rule.messages else ():
             chunks = key.split("/")
             if chunks[:2] == begin and chunks[5:7] == of_right and len(chunks) > _NAME:
                 names[rule.allows][_ros_name_of_chunk(chunks[_NAME])] = None
@@ -139,12 +139,12 @@ def graph_rules(
     )
     whole_domain = f"{GRAPH}/{domain}/{ANY_CHUNKS}"
     if allowed:
-        yield AccessRule(Flow.INGRESS, _ANNOUNCING, allowed)
+        yield AccessRule(Flow.INGRESS, _ANNOUNCING_MESSAGES, allowed)
     if denied:
-        yield AccessRule(Flow.INGRESS, _ANNOUNCING, denied, allows=False)
-    yield AccessRule(Flow.EGRESS, _ANNOUNCING, (whole_domain,))
-    yield AccessRule(Flow.INGRESS, _ASKING, (whole_domain,))
-    yield AccessRule(Flow.EGRESS, _ASKING, (whole_domain,))
+        yield AccessRule(Flow.INGRESS, _ANNOUNCING_MESSAGES, denied, allows=False)
+    yield AccessRule(Flow.EGRESS, _ANNOUNCING_MESSAGES, (whole_domain,))
+    yield AccessRule(Flow.INGRESS, _ASKING_MESSAGES, (whole_domain,))
+    yield AccessRule(Flow.EGRESS, _ASKING_MESSAGES, (whole_domain,))
 
 
 class _Tokens:
@@ -295,7 +295,7 @@ def shared_nodes(announced: Mapping[str, AnnouncedNodes]) -> Iterator[SharedNode
     owners: dict[str, list[str]] = {}
     wide: dict[AnnouncedNodes, list[str]] = {}
     for enclave, (allowed, denied) in announced.items():
-        lasting = [node for node in allowed if not _CHANGING.search(node)]
+        lasting = [node for node in allowed if not _CHANGING_NODE.search(node)]
         never = KeyExpressions(denied)
         for node in lasting:
             if not _is_wide(node) and not never.include(node):
@@ -329,7 +329,7 @@ def shared_nodes(announced: Mapping[str, AnnouncedNodes]) -> Iterator[SharedNode
             )
 
 
-_CHANGING = re.compile("[/%](?:" + "|".join(CHANGING_NODES) + ")[^/]*[*]")
+_CHANGING_NODE = re.compile("[/%](?:" + "|".join(CHANGING_NODES) + ")[^/]*[*]")
 
 
 def _is_wide(node: str) -> bool:

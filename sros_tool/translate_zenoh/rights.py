@@ -91,20 +91,20 @@ _ADVANCED = f"@adv/{ANY_CHUNKS}"
 _M = Message
 _IN, _OUT = Flow.INGRESS, Flow.EGRESS
 _DATA, _HISTORY = False, True
-_ASKED = (_M.DECLARE_SUBSCRIBER, _M.QUERY, _M.DECLARE_LIVELINESS_SUBSCRIBER)
-_OFFERED = (_M.PUT, _M.DECLARE_QUERYABLE, _M.LIVELINESS_TOKEN)
+_ASKED_MESSAGES = (_M.DECLARE_SUBSCRIBER, _M.QUERY, _M.DECLARE_LIVELINESS_SUBSCRIBER)
+_OFFERED_MESSAGES = (_M.PUT, _M.DECLARE_QUERYABLE, _M.LIVELINESS_TOKEN)
 _MESSAGES: dict[str, tuple[tuple[Flow, tuple[Message, ...], bool], ...]] = {
     "publish": (
         (_IN, (_M.PUT, _M.DELETE, _M.REPLY), _DATA),
         (_OUT, (_M.DECLARE_SUBSCRIBER,), _DATA),
-        (_IN, _OFFERED, _HISTORY),
-        (_OUT, _ASKED, _HISTORY),
+        (_IN, _OFFERED_MESSAGES, _HISTORY),
+        (_OUT, _ASKED_MESSAGES, _HISTORY),
     ),
     "subscribe": (
         (_IN, (_M.DECLARE_SUBSCRIBER,), _DATA),
         (_OUT, (_M.PUT, _M.DELETE, _M.REPLY), _DATA),
-        (_IN, _ASKED, _HISTORY),
-        (_OUT, _OFFERED, _HISTORY),
+        (_IN, _ASKED_MESSAGES, _HISTORY),
+        (_OUT, _OFFERED_MESSAGES, _HISTORY),
     ),
     "request": (
         (_IN, (_M.QUERY,), _DATA),
@@ -456,7 +456,7 @@ _RIGHT_OF_MESSAGE = {
     (Flow.EGRESS, Message.QUERY): "reply",
 }
 """Direction and kind of a message → right that the message uses."""
-_WILD = ("*", ANY_CHUNKS)
+_WILD_CHUNKS = ("*", ANY_CHUNKS)
 _TYPE_AND_HASH = 2
 _MOST_ANY_CHUNKS = 6
 """Maximum number of ``**`` in a key expression; every ``**`` doubles the number of names."""
@@ -598,7 +598,7 @@ def _without_type(chunks: list[str]) -> list[str]:
     The expression is in canonical form, in which ``*`` stands before ``**``.
     """
     end = len(chunks)
-    while end and chunks[end - 1] in _WILD:
+    while end and chunks[end - 1] in _WILD_CHUNKS:
         end -= 1
     wild = chunks[end:]
     if wild.count("*") >= _TYPE_AND_HASH:

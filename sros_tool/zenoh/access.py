@@ -423,12 +423,12 @@ def is_within(remote: RemoteRights, own_rights: RemoteRights) -> bool:
     )
 
 
-_ORDER = {message: number for number, message in enumerate(Message)}
+_MESSAGE_ORDER = {message: number for number, message in enumerate(Message)}
 
 
 @lru_cache(maxsize=64)  # the rules of all enclaves have the same few directions and messages
 def _rule_order(flow: Flow, messages: tuple[Message, ...]) -> tuple[bool, list[int]]:
-    return flow is Flow.EGRESS, [_ORDER[message] for message in messages]
+    return flow is Flow.EGRESS, [_MESSAGE_ORDER[message] for message in messages]
 
 
 @dataclass(frozen=True, slots=True)
@@ -542,7 +542,7 @@ class MessageFilter(Protocol):
         """Return the common names for which there are rules."""
 
 
-_OF_HISTORY = (Message.PUT, Message.QUERY)
+_HISTORY_MESSAGES = (Message.PUT, Message.QUERY)
 
 _Combination = tuple[str | None, ...]
 """A value for each of `PROPERTIES`; None stands for any value."""
@@ -602,7 +602,7 @@ class Enforcement:
         history: dict[Flow, set[str]] = {flow: set() for flow in Flow}
         for rule in self.rules_of(subject):
             for flow, message in product(rule.flows, rule.messages):
-                if message not in _OF_HISTORY:
+                if message not in _HISTORY_MESSAGES:
                     continue
                 # A process that asks for a history gets what the other direction lets pass.
                 other = Flow.EGRESS if flow is Flow.INGRESS else Flow.INGRESS

@@ -139,7 +139,7 @@ class ZenohNetwork:
         return connections
 
 
-_REVOKED = "last_revocation"
+_REVOKED_KEY = "last_revocation"
 _REPLY_TIMEOUT_MILLISECONDS = 600_000
 """Time that rmw_zenoh waits for a reply; Zenoh's default of 10 s would end long calls."""
 _MICROSECONDS_UNTIL_CLOSED = 60_000_000
@@ -209,10 +209,10 @@ def render_configuration(
     """Return the file of `Configuration.render`, from rendered rights of remote enclaves."""
     control = _access_control_text([*rights], once=settings is SettingsEdition.RULES_ONCE)
     without_control = _text_without_control(mode, listen, connect, revoked, settings)
-    return f"{without_control}{_CONTROL}{control}".encode()
+    return f"{without_control}{_CONTROL_BEGIN}{control}".encode()
 
 
-_CONTROL = ',\n "access_control": {\n'
+_CONTROL_BEGIN = ',\n "access_control": {\n'
 
 
 def _access_control_text(rendered_rights: Sequence[RenderedRights], *, once: bool) -> str:
@@ -286,7 +286,7 @@ def _text_without_control(
     if settings is not SettingsEdition.FEW:
         _add_settings_of_rmw_zenoh(document, mode)
     if revoked:
-        document["metadata"] = {_REVOKED: revoked}
+        document["metadata"] = {_REVOKED_KEY: revoked}
     return json.dumps(document, indent=1).removesuffix("\n}")
 
 
@@ -390,7 +390,7 @@ class RenderedReader:
 
     def _read_in_full(self, data: bytes) -> Configuration | None:
         try:
-            beginning, mark, control = data.decode().partition(_CONTROL)
+            beginning, mark, control = data.decode().partition(_CONTROL_BEGIN)
             sections = _SECTIONS.fullmatch(control)
             if not mark or not sections:
                 return None
@@ -422,7 +422,7 @@ class RenderedReader:
             document = json.loads(f"{text}\n}}")
             mode = Mode(document["mode"])
             listen, connect = (tuple(document[key]["endpoints"]) for key in ("listen", "connect"))
-            revoked = document.get("metadata", {}).get(_REVOKED, "")
+            revoked = document.get("metadata", {}).get(_REVOKED_KEY, "")
             editions = [
                 edition
                 for edition in SettingsEdition

@@ -48,7 +48,7 @@ _TLS_FILES = (
     "connect_private_key",
     "connect_certificate",
 )
-_TLS = frozenset(
+_TLS_SETTINGS = frozenset(
     {*_TLS_FILES, *(f"{name}_base64" for name in _TLS_FILES), "enable_mtls"}
     | {"verify_name_on_connect", "close_link_on_expiration", "so_sndbuf", "so_rcvbuf"}
 )
@@ -63,9 +63,9 @@ ENCRYPTED = frozenset({"tls", "quic"})
 _LINK_PROTOCOLS = frozenset(
     {"tcp", "udp", "tls", "quic", "serial", "unixpipe", "unixsock-stream", "vsock", "ws"}
 )
-_AS_YAML = (".yaml", ".yml")
-_AS_TOML = (".toml",)
-ENDINGS = (".json5", ".json", *_AS_YAML, *_AS_TOML)
+_YAML_ENDINGS = (".yaml", ".yml")
+_TOML_ENDINGS = (".toml",)
+ENDINGS = (".json5", ".json", *_YAML_ENDINGS, *_TOML_ENDINGS)
 """Endings of file names that Zenoh reads (tested with 1.10.2)."""
 _DIFFERENT_IN_YAML = re.compile(r"\\u|[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\u2028\u2029\ufeff]")
 """Characters and escapes that YAML refuses, or reads differently from JSON."""
@@ -252,7 +252,7 @@ def _root(data: bytes, name: str, *, lines: bool) -> _Section:
     return _Section(name, "", value)
 
 
-def _has_ending(name: str, endings: tuple[str, ...] = (*_AS_YAML, *_AS_TOML)) -> bool:
+def _has_ending(name: str, endings: tuple[str, ...] = (*_YAML_ENDINGS, *_TOML_ENDINGS)) -> bool:
     return name.endswith(endings)
 
 
@@ -263,11 +263,11 @@ def _parse_yaml(text: str, name: str) -> object:
         UnreadConfigurationError: the text is other YAML, or TOML.
     """
     value: object = None
-    if not _has_ending(name, _AS_TOML) and not _DIFFERENT_IN_YAML.search(text):
+    if not _has_ending(name, _TOML_ENDINGS) and not _DIFFERENT_IN_YAML.search(text):
         with suppress(Json5Error):
             value = parse_json(text)
     if value is None:
-        language = "TOML" if _has_ending(name, _AS_TOML) else "YAML"
+        language = "TOML" if _has_ending(name, _TOML_ENDINGS) else "YAML"
         raise UnreadConfigurationError(
             f"the Zenoh configuration '{name}' is in a language that sros does not read",
             f"Zenoh reads it as {language}, by the ending of its name.",
@@ -399,7 +399,7 @@ def _configuration(root: _Section, name: str) -> ConfigurationDocument:
     shared = root.section("transport").section("shared_memory")
     unknown = [
         *root.unknown_members(_SECTIONS),
-        *(f"{tls.path}/{name}" for name in tls.unknown_members(_TLS)),
+        *(f"{tls.path}/{name}" for name in tls.unknown_members(_TLS_SETTINGS)),
     ]
     return ConfigurationDocument(
         name,

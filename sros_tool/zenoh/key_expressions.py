@@ -16,7 +16,7 @@ from sros_tool.automata import Automaton, Letters, NameSet
 from sros_tool.names import has_parts
 
 ANY_PART, ANY_CHUNK, ANY_CHUNKS = "$*", "*", "**"
-_MANY = 65536
+_CACHE_SIZE = 65536
 _LITERAL = re.compile(r"(?<![^/])[^/*]+(?![^/])")
 """Matches a chunk without wildcards."""
 _MOST_COMPARED = 100_000
@@ -133,13 +133,13 @@ class KeyExpressions:
         return candidates
 
 
-@lru_cache(maxsize=_MANY)
+@lru_cache(maxsize=_CACHE_SIZE)
 def _wildcard_form(expression: str) -> str:
     """Return the wildcards and slashes of an expression, without other text."""
     return _LITERAL.sub("", expression)
 
 
-@lru_cache(maxsize=_MANY)
+@lru_cache(maxsize=_CACHE_SIZE)
 def _landmark(expression: str) -> str:
     """Return the longest chunk without wildcards after the first wildcard, or ""."""
     rest = expression[len(_fixed_begin(expression)) :]
@@ -155,10 +155,10 @@ def _common_beginning(expression: str) -> str:
     return begin.rstrip("$/") if wildcard else expression
 
 
-_fixed_begin = lru_cache(maxsize=_MANY)(_common_beginning)
+_fixed_begin = lru_cache(maxsize=_CACHE_SIZE)(_common_beginning)
 
 
-@lru_cache(maxsize=_MANY)
+@lru_cache(maxsize=_CACHE_SIZE)
 def _chunks(expression: str) -> tuple[str, ...]:
     return tuple(expression.split("/"))
 
@@ -236,7 +236,7 @@ def intersects(first: str, second: str) -> bool:
     return sequences_intersect(_chunks(first), _chunks(second))
 
 
-@lru_cache(maxsize=_MANY)
+@lru_cache(maxsize=_CACHE_SIZE)
 def sequences_intersect(first: tuple[str, ...], second: tuple[str, ...]) -> bool:
     """Return whether any key matches both expressions, given as chunks."""
     return _sequences_intersect(first, second, ANY_CHUNKS, chunks_intersect)
@@ -317,7 +317,7 @@ _ANY_LETTERS = "\0"
 """Stands for ``$*``; a key cannot contain this character."""
 
 
-@lru_cache(maxsize=_MANY)
+@lru_cache(maxsize=_CACHE_SIZE)
 def common_chunks(first: str, second: str) -> tuple[str, ...]:
     """Return chunks for the intersection of two chunks, in which ``**`` matches any chunk."""
     if first == second:
@@ -394,11 +394,11 @@ def _common_parts(
 # ── the keys as sets of names ──────────────────────────────────────────────────────────────
 
 _SLASH = Letters.of("/")
-_IN_CHUNK = ~_SLASH
-_BEGINS_CHUNK = ~Letters.of("/@")
+_CHUNK_LETTERS = ~_SLASH
+_CHUNK_BEGIN_LETTERS = ~Letters.of("/@")
 
 
-@lru_cache(maxsize=_MANY)
+@lru_cache(maxsize=_CACHE_SIZE)
 def _automaton(expression: str) -> Automaton | None:
     """Return an automaton for the keys that an expression includes; None if it is a single key."""
     if "*" not in expression:
@@ -411,7 +411,7 @@ def _automaton(expression: str) -> Automaton | None:
         edges += [(position, _SLASH, begin) for position in between]
         if chunk in (ANY_CHUNK, ANY_CHUNKS):
             inside = next(number)
-            edges += [(begin, _BEGINS_CHUNK, inside), (inside, _IN_CHUNK, inside)]
+            edges += [(begin, _CHUNK_BEGIN_LETTERS, inside), (inside, _CHUNK_LETTERS, inside)]
             if chunk == ANY_CHUNKS:
                 edges.append((inside, _SLASH, begin))
                 between.append(inside)
@@ -438,20 +438,22 @@ def _add_chunk_edges(
     for index, part in enumerate(parts):
         if index and at == begin:  # "$*" at the beginning of the chunk
             gap = next(number)
-            edges += [(begin, _BEGINS_CHUNK, gap), (gap, _IN_CHUNK, gap)]
+            edges += [(begin, _CHUNK_BEGIN_LETTERS, gap), (gap, _CHUNK_LETTERS, gap)]
             if part:
                 after = next(number)
                 edges += [(gap, Letters.of(part[0]), after)]
-                edges += [(begin, Letters.of(part[0]) & _BEGINS_CHUNK, after)]
+                edges += [(begin, Letters.of(part[0]) & _CHUNK_BEGIN_LETTERS, after)]
                 part, at = part[1:], after
             else:
                 at = gap
         elif index:
-            edges.append((at, _IN_CHUNK, at))
+            edges.append((at, _CHUNK_LETTERS, at))
         for letter in part:
             letters = Letters.of(letter)
             to = next(number)
-            edges.append((at, letters & _BEGINS_CHUNK if wild and at == begin else letters, to))
+            edges.append(
+                (at, letters & _CHUNK_BEGIN_LETTERS if wild and at == begin else letters, to)
+            )
             at = to
     return at
 
@@ -465,7 +467,7 @@ def names_of(expressions: Iterable[str]) -> NameSet:
     )
 
 
-@lru_cache(maxsize=_MANY)
+@lru_cache(maxsize=_CACHE_SIZE)
 def expression_problem(text: str) -> str:
     """Return a clause on why Zenoh does not accept a key expression; "" for an accepted one.
 

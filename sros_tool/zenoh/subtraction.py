@@ -39,7 +39,7 @@ MOST_EXPRESSIONS = 24576
 In a process with Zenoh 1.10.2, a right to publish with 16,384 key expressions takes 212 MB.
 """
 _LETTERS = "_" + digits + ascii_letters
-_MANY, _FEW = 65536, 1024
+_CACHE_SIZE, _SMALL_CACHE_SIZE = 65536, 1024
 _MOST_CHARACTERS = 1_000_000
 """Maximum number of characters that are compared for a chunk, which takes about one second."""
 
@@ -56,7 +56,7 @@ class CannotSubtract(Exception):  # noqa: N818 - the caller makes an error of it
         self.denied = denied
 
 
-@lru_cache(maxsize=_FEW)
+@lru_cache(maxsize=_SMALL_CACHE_SIZE)
 def subtract_all(allowed: frozenset[Chunks], denied: frozenset[Chunks]) -> frozenset[Chunks]:
     """Return expressions for the keys that ``allowed`` includes and ``denied`` does not.
 
@@ -212,7 +212,7 @@ def _length_to_last_named(chunks: Chunks) -> int:
     return max((at + 1 for at, chunk in enumerate(chunks) if chunk != ANY_CHUNK), default=0)
 
 
-@lru_cache(maxsize=_FEW)
+@lru_cache(maxsize=_SMALL_CACHE_SIZE)
 def _remaining_keys(wide: Chunks, denied: frozenset[Chunks]) -> frozenset[Chunks]:
     """Return expressions for the keys of ``wide`` without ``denied``.
 
@@ -284,7 +284,7 @@ def _first_chunks(expression: Chunks) -> Iterator[tuple[str, Chunks]]:
         yield expression[0], expression[1:]
 
 
-@lru_cache(maxsize=_MANY)
+@lru_cache(maxsize=_CACHE_SIZE)
 def _kinds(first: str, first_chunks: tuple[str, ...]) -> Mapping[frozenset[str], Chunks]:
     """Map the kinds of chunks that ``first`` matches to expressions for the chunks of this kind.
 
@@ -317,12 +317,12 @@ def _matches_any(chunk: str, wild: Iterable[str], excluded: frozenset[str]) -> b
     return any(_matches(wide, chunk) for wide in wild if wide not in excluded)
 
 
-@lru_cache(maxsize=_MANY)
+@lru_cache(maxsize=_CACHE_SIZE)
 def _matches(wide: str, narrow: str) -> bool:
     return sequence_includes((wide,), (narrow,))
 
 
-@lru_cache(maxsize=_MANY)
+@lru_cache(maxsize=_CACHE_SIZE)
 def _chunks(first: str, first_chunks: tuple[str, ...], kinds: frozenset[frozenset[str]]) -> Chunks:
     """Return few chunks that together match the names of ``first`` that are of some ``kinds``.
 
@@ -360,7 +360,7 @@ def _chunks(first: str, first_chunks: tuple[str, ...], kinds: frozenset[frozense
 # ── by letters ─────────────────────────────────────────────────────────────────────────────
 
 
-@lru_cache(maxsize=_MANY)
+@lru_cache(maxsize=_CACHE_SIZE)
 def _chunks_without_denied(wide: str, denied: frozenset[str]) -> Chunks:
     """Return chunks for the names that ``wide`` matches and no chunk of ``denied`` matches."""
     if not denied:
@@ -551,7 +551,7 @@ def _with_shorter(chunks: Chunks) -> Chunks:
     return (*chunks[: at - 1], *chunks[at:])
 
 
-_MANY, _FEW = 65536, 1024
+_CACHE_SIZE, _SMALL_CACHE_SIZE = 65536, 1024
 
 
 class Difference(NamedTuple):
@@ -618,12 +618,12 @@ def _common_end(first: str, second: str) -> str | None:
     return end if longer in (end, f"{end}/{ANY_CHUNKS}") else None
 
 
-@lru_cache(maxsize=_FEW)
+@lru_cache(maxsize=_SMALL_CACHE_SIZE)
 def _search_index(expressions: frozenset[Chunks]) -> KeyExpressions:
     return KeyExpressions("/".join(chunks) for chunks in expressions)
 
 
-@lru_cache(maxsize=_FEW)
+@lru_cache(maxsize=_SMALL_CACHE_SIZE)
 def _common_expressions(
     expressions: frozenset[Chunks], other_expressions: frozenset[Chunks]
 ) -> frozenset[Chunks]:
@@ -695,12 +695,12 @@ class RuleKeys:
         )
 
 
-@lru_cache(maxsize=_MANY)
+@lru_cache(maxsize=_CACHE_SIZE)
 def _in_order(expressions: frozenset[str]) -> tuple[str, ...]:
     return tuple(sorted(expressions))
 
 
-@lru_cache(maxsize=_MANY)
+@lru_cache(maxsize=_CACHE_SIZE)
 def keys_of(expressions: frozenset[str], differences: tuple[Difference, ...] = ()) -> RuleKeys:
     """Return the keys that expressions include; results are cached."""
     return RuleKeys(expressions, differences)
@@ -730,7 +730,7 @@ def _differences(expressions: Iterable[str]) -> tuple[Difference, ...]:
     )
 
 
-@lru_cache(maxsize=_MANY)
+@lru_cache(maxsize=_CACHE_SIZE)
 def _plain_in(plain: frozenset[str], wide: RuleKeys) -> frozenset[str]:
     keys: set[str] = set()
     for key in plain:
@@ -745,7 +745,7 @@ def _plain_in(plain: frozenset[str], wide: RuleKeys) -> frozenset[str]:
     return frozenset(keys)
 
 
-@lru_cache(maxsize=_MANY)
+@lru_cache(maxsize=_CACHE_SIZE)
 def _common_of_differences(
     differences: tuple[Difference, ...], other_differences: tuple[Difference, ...]
 ) -> frozenset[str]:
@@ -761,7 +761,7 @@ def _common_of_differences(
     return frozenset(shared)
 
 
-@lru_cache(maxsize=_MANY)
+@lru_cache(maxsize=_CACHE_SIZE)
 def _common_of_tokens(first: KeyExpressions, second: KeyExpressions) -> frozenset[str]:
     if first.all == second.all:
         return first.all
@@ -777,6 +777,6 @@ def _common_of_tokens(first: KeyExpressions, second: KeyExpressions) -> frozense
     return frozenset(KeyExpressions(shared).needed())
 
 
-@lru_cache(maxsize=_MANY)
+@lru_cache(maxsize=_CACHE_SIZE)
 def _common_with_all(key: str, wide: KeyExpressions) -> tuple[str, ...]:
     return tuple(shared for token in wide.all for shared in common(key, token))

@@ -188,7 +188,7 @@ def robot(beside_graph: Beside, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     # The RMWs of this machine may lack security.
     lacking = tmp_path / "lacking"
     monkeypatch.setattr(preparation, "built_without_security", lambda *_: lacking.exists())
-    monkeypatch.setattr(apply, "_SYSTEMD", tmp_path / "systemd")
+    monkeypatch.setattr(apply, "_SYSTEMD_FOLDER", tmp_path / "systemd")
     monkeypatch.setattr(apply, "_RESTART_SECONDS", 0.1)
     monkeypatch.setattr(apply, "_STABLE_FOR", timedelta())
     monkeypatch.setattr(proof, "_START_SECONDS", 0.1)
@@ -1625,7 +1625,7 @@ def test_the_nodes_of_a_process_that_has_several(tmp_path: Path) -> None:
         '<policy version="0.2.0"><enclaves><enclave path="/p/tracker"><profiles>'
         f"{profiles}</profiles></enclave></enclaves></policy>"
     )
-    nodes = close._nodes(read_policy(file), "/p/tracker")
+    nodes = close._nodes_clause(read_policy(file), "/p/tracker")
     assert nodes == ", for the nodes /p/detector and /p/tracker"
 
 

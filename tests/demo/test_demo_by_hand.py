@@ -22,7 +22,7 @@ from sros_tool.demo.backend import (
     backend_by_hand,
     end_within,
     run_by_hand,
-    security_of,
+    security_line,
 )
 from sros_tool.demo.cyclone_node import CycloneNode
 from sros_tool.demo.nodes import ROLES, NodeOptions
@@ -39,7 +39,7 @@ TALKER = HandNode(Role.TALKER, "cyclone", "/chatter")
 
 
 def test_a_node_says_whether_it_is_secured(keystore: Path) -> None:
-    assert security_of(TALKER, {}).endswith("/chatter, domain 0: WITHOUT security")
+    assert security_line(TALKER, {}).endswith("/chatter, domain 0: WITHOUT security")
     variables = {
         "ROS_SECURITY_ENABLE": "true",
         "ROS_SECURITY_STRATEGY": "Enforce",
@@ -47,21 +47,21 @@ def test_a_node_says_whether_it_is_secured(keystore: Path) -> None:
         "ROS_SECURITY_ENCLAVE_OVERRIDE": "/a",
         "ROS_DOMAIN_ID": "7",
     }
-    assert security_of(TALKER, variables).endswith("domain 7: secured, in the enclave /a")
+    assert security_line(TALKER, variables).endswith("domain 7: secured, in the enclave /a")
     (keystore / "enclaves" / "a" / "key.pem").unlink()
     with pytest.raises(SrosError, match=r"key\.pem"):
-        security_of(TALKER, variables)
+        security_line(TALKER, variables)
     # As rcl does: without Enforce, the node runs without the enclave.
     variables["ROS_SECURITY_STRATEGY"] = "Permissive"
-    assert "WITHOUT security" in security_of(TALKER, variables)
+    assert "WITHOUT security" in security_line(TALKER, variables)
 
 
 def test_a_node_on_zenoh_says_its_configuration() -> None:
     pytest.importorskip("zenoh")
     node = HandNode(Role.LISTENER, "zenoh", "/chatter")
-    assert "WITHOUT security" in security_of(node, {"ROS_SECURITY_ENABLE": "true"})
-    assert "--rmw rmw_zenoh_cpp" in security_of(node, {"ROS_SECURITY_ENABLE": "true"})
-    assert security_of(node, {"ZENOH_SESSION_CONFIG_URI": "/a.json5"}).endswith("by /a.json5")
+    assert "WITHOUT security" in security_line(node, {"ROS_SECURITY_ENABLE": "true"})
+    assert "--rmw rmw_zenoh_cpp" in security_line(node, {"ROS_SECURITY_ENABLE": "true"})
+    assert security_line(node, {"ZENOH_SESSION_CONFIG_URI": "/a.json5"}).endswith("by /a.json5")
     with pytest.raises(UsageError, match="only Zenoh has routers"):
         HandNode(Role.ROUTER, "rclpy", "/chatter")
 
@@ -117,7 +117,7 @@ def test_a_listener_ends_after_its_time_and_without_a_reader(
         load_cyclone()
     except UnavailableError as error:
         pytest.skip(str(error))
-    monkeypatch.setattr(backend, "_SILENCE", 0.1)
+    monkeypatch.setattr(backend, "_SILENCE_SECONDS", 0.1)
     node = HandNode(Role.LISTENER, "cyclone", "/nobody_talks")
 
     def say(line: str) -> None:

@@ -200,10 +200,10 @@ def test_a_vendor_that_matches_a_wildcard_differently_is_found(
 ) -> None:
     """Matchers are compared for small and for large documents."""
     names = [f"/t{number}" for number in range(count)]
-    assert proof.matched_as_meant("rt/robot[0-9]/*")
+    assert proof.is_matched_as_meant("rt/robot[0-9]/*")
     prove(enclave := of_text(publish(*names, "/a[bc]"), tmp_path), permissions_of(enclave), DOMAINS)
     monkeypatch.setattr(proof, "dds_matches", lambda _, expression, name: expression == name)
-    proof.matched_as_meant.cache_clear()
+    proof.is_matched_as_meant.cache_clear()
     asked: list[Enclave] = []
 
     def differences(policy: Enclave, *_: object) -> list[object]:
@@ -212,7 +212,7 @@ def test_a_vendor_that_matches_a_wildcard_differently_is_found(
 
     monkeypatch.setattr(proof, "differences", differences)
     prove(enclave, permissions_of(enclave), DOMAINS)
-    proof.matched_as_meant.cache_clear()
+    proof.is_matched_as_meant.cache_clear()
     assert asked == [enclave], "the engine has the last word"
 
 

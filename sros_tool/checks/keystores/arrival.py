@@ -47,7 +47,7 @@ from sros_tool.values import Words, shows
 from sros_tool.wording import first_few
 
 _FILE_MISSING = f"enclave.{Fault.FILE_MISSING.id}"
-_FILES = (*REQUIRED_FILES, KEY_URI_FILE, *OPTIONAL_FILES)
+_FILES_OF_ENCLAVE = (*REQUIRED_FILES, KEY_URI_FILE, *OPTIONAL_FILES)
 
 
 class ArrivalFinding(NamedTuple):
@@ -140,7 +140,7 @@ class Arrival:
         """Return the enclave that a finding is about, or ""."""
         file = Path(finding.file)
         for enclave in self.enclaves:
-            of_enclave = file.name in _FILES and file.parent == enclave_path(
+            of_enclave = file.name in _FILES_OF_ENCLAVE and file.parent == enclave_path(
                 self.root, enclave.name
             )
             if enclave.name == finding.subject or of_enclave:

@@ -218,8 +218,8 @@ FEWER_DOMAINS = FindingKind(
     "Nothing to do if the robot is in this domain.",
 )
 
-_MOMENT = re.compile(r"(\d{4})-\d\d-\d\dT\d\d:\d\d:\d\dZ\Z")
-_SUBJECT = re.compile(
+_PORTABLE_DATE = re.compile(r"(\d{4})-\d\d-\d\dT\d\d:\d\d:\d\dZ\Z")
+_PORTABLE_SUBJECT = re.compile(
     r"(?:[A-Za-z0-9.]+=[^,|\"\s/][^,|\"]*|CN=/[^,|\"\s]*)(?:,(?! )[A-Za-z0-9.]+=[^,|\"/]+)*"
     r"(?:,CN=/)?\Z"
 )
@@ -264,7 +264,7 @@ def _domain_problems(domains: DomainSet) -> Iterator[str]:
 def _form_findings(grant: Grant, name: str, file: str) -> Iterator[Finding]:
     if not grant.name:
         yield GRANT_NAME.found(name, f"the grant for {grant.subject} has no name", file)
-    if not (_SUBJECT.match(grant.subject) and grant.subject.isascii()):
+    if not (_PORTABLE_SUBJECT.match(grant.subject) and grant.subject.isascii()):
         yield SUBJECT.found(name, f"the subject is {grant.subject!r}", file)
     if grant.default_allow:
         yield DEFAULT_ALLOW.found(name, "<default> is ALLOW", file)
@@ -273,7 +273,7 @@ def _form_findings(grant: Grant, name: str, file: str) -> Iterator[Finding]:
     dates = [
         repr(moment)
         for moment in (grant.not_before, grant.not_after)
-        if not (match := _MOMENT.match(moment)) or int(match[1]) > _LAST_YEAR
+        if not (match := _PORTABLE_DATE.match(moment)) or int(match[1]) > _LAST_YEAR
     ]
     if dates:
         yield TIME_FORMAT.found(name, f"of its validity: {' and '.join(dates)}", file)
@@ -462,8 +462,8 @@ def _domain_findings(enclave: CheckedEnclave, grant: Grant, file: str) -> Iterat
     yield kind.found(enclave.name, text, file)
 
 
-_GOVERNANCE = "DDS-Security 1.1, 9.4.1.2"
-_TEMPLATE = (
+_GOVERNANCE_SOURCE = "DDS-Security 1.1, 9.4.1.2"
+_TEMPLATE_REMEDY = (
     "Run `sros update_keystore KEYSTORE --template production --dry-run` to see what it would "
     "change, and then without --dry-run."
 )
@@ -476,8 +476,8 @@ UNAUTHENTICATED = FindingKind(
     "protection; on Cyclone DDS, each topic that has no protection, even if it has access control. "
     "If the governance also protects RTPS messages, Fast DDS refuses it; only Fast DDS 2.9 accepts "
     "it, and ignores allow_unauthenticated_participants.",
-    f"{_GOVERNANCE} (allow_unauthenticated_participants); Fast DDS 2.9.1 and 2.14.5, Cyclone DDS "
-    "0.10 and 11.0; tested.",
+    f"{_GOVERNANCE_SOURCE} (allow_unauthenticated_participants); Fast DDS 2.9.1 and 2.14.5, "
+    "Cyclone DDS 0.10 and 11.0; tested.",
     f"Run {REFUSE_STRANGERS}.",
 )
 UNAUTHENTICATED_KEPT_OUT = FindingKind(
@@ -496,7 +496,7 @@ NO_JOIN_CONTROL = FindingKind(
     "any authenticated participant may join, whatever its permissions",
     "The permissions of a participant are not checked when it joins; vendors then decide "
     "differently about a participant without permissions.",
-    f"{_GOVERNANCE} (enable_join_access_control); Fast DDS 2.14.5, Cyclone DDS 0.10.2.",
+    f"{_GOVERNANCE_SOURCE} (enable_join_access_control); Fast DDS 2.14.5, Cyclone DDS 0.10.2.",
     "Run `sros update_keystore KEYSTORE --set protection.join_access_control=true`.",
 )
 NO_ACCESS_CONTROL = FindingKind(
@@ -504,16 +504,16 @@ NO_ACCESS_CONTROL = FindingKind(
     WARNING,
     "topics that every participant in the domain may read or write",
     "Permissions are not checked for these topics, so a policy has no effect on them.",
-    f"{_GOVERNANCE} (enable_read_access_control, enable_write_access_control).",
-    _TEMPLATE,
+    f"{_GOVERNANCE_SOURCE} (enable_read_access_control, enable_write_access_control).",
+    _TEMPLATE_REMEDY,
 )
 NO_ENCRYPTION = FindingKind(
     "governance.no-encryption",
     WARNING,
     "topics whose payload can be read on the wire",
     "Neither the payload, nor the submessage, nor the whole message is encrypted.",
-    f"{_GOVERNANCE} (data_protection_kind, metadata_protection_kind, rtps_protection_kind).",
-    _TEMPLATE,
+    f"{_GOVERNANCE_SOURCE} (data_protection_kind, metadata_protection_kind, rtps_protection_kind).",
+    _TEMPLATE_REMEDY,
 )
 SIGNED_PAYLOAD = FindingKind(
     "governance.signed-payload",
@@ -530,24 +530,24 @@ NOT_AUTHENTIC = FindingKind(
     ERROR,
     "topics whose messages anybody can forge",
     "Nothing is signed: neither payload, nor submessage, nor the whole message.",
-    f"{_GOVERNANCE} (rtps, metadata and data protection kinds).",
-    _TEMPLATE,
+    f"{_GOVERNANCE_SOURCE} (rtps, metadata and data protection kinds).",
+    _TEMPLATE_REMEDY,
 )
 DISCOVERY_OPEN = FindingKind(
     "governance.discovery-open",
     WARNING,
     "discovery without protection",
     "Anyone in the network can read every node, topic and type, and announce false ones.",
-    f"{_GOVERNANCE} (discovery_protection_kind, enable_discovery_protection).",
-    _TEMPLATE,
+    f"{_GOVERNANCE_SOURCE} (discovery_protection_kind, enable_discovery_protection).",
+    _TEMPLATE_REMEDY,
 )
 LIVELINESS_OPEN = FindingKind(
     "governance.liveliness-open",
     WARNING,
     "liveliness without protection",
     "An attacker can make readers believe that a dead writer is still alive.",
-    f"{_GOVERNANCE} (liveliness_protection_kind, enable_liveliness_protection).",
-    _TEMPLATE,
+    f"{_GOVERNANCE_SOURCE} (liveliness_protection_kind, enable_liveliness_protection).",
+    _TEMPLATE_REMEDY,
 )
 NO_TOPIC_RULE = FindingKind(
     "governance.no-topic-rule",
@@ -555,7 +555,7 @@ NO_TOPIC_RULE = FindingKind(
     "topics without a topic rule",
     "An endpoint can be created only if a topic rule matches, and every ROS 2 node needs "
     "ros_discovery_info.",
-    f"{_GOVERNANCE}; Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; tested.",
+    f"{_GOVERNANCE_SOURCE}; Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; tested.",
     "Add a rule for * at the end.",
 )
 NO_OTHER_TOPIC_RULE = FindingKind(
@@ -563,7 +563,7 @@ NO_OTHER_TOPIC_RULE = FindingKind(
     NOTE,
     "topic rules for ROS names only",
     "A program that uses DDS without ROS can create no endpoint.",
-    f"{_GOVERNANCE}; Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; tested.",
+    f"{_GOVERNANCE_SOURCE}; Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; tested.",
     "Nothing to do if all programs are ROS 2 nodes. Otherwise add a rule for * at the end.",
 )
 UNREACHABLE_TOPIC_RULE = FindingKind(
@@ -571,7 +571,7 @@ UNREACHABLE_TOPIC_RULE = FindingKind(
     WARNING,
     "a topic rule that never applies, because an earlier one matches first",
     "The first topic rule that matches a topic decides.",
-    f"{_GOVERNANCE}; Fast DDS 2.14.5, Cyclone DDS 0.10.2.",
+    f"{_GOVERNANCE_SOURCE}; Fast DDS 2.14.5, Cyclone DDS 0.10.2.",
     "Put narrower rules first, as sros does.",
 )
 GOVERNANCE_DOMAIN_RANGE = FindingKind(
@@ -619,8 +619,8 @@ _OPEN_KINDS = {
 """The kind of finding for each governance attribute that is open."""
 _ROS_TOPICS = ("rt/*", "rq/*Request", "rr/*Reply")
 """The DDS topics of all topics, services and actions of ROS."""
-_SIGNING = (ProtectionKind.SIGN, ProtectionKind.SIGN_WITH_ORIGIN_AUTHENTICATION)
-_NONE = (ProtectionKind.NONE,)
+_SIGNED_KINDS = (ProtectionKind.SIGN, ProtectionKind.SIGN_WITH_ORIGIN_AUTHENTICATION)
+_UNPROTECTED_KINDS = (ProtectionKind.NONE,)
 
 
 def check_governance(
@@ -701,7 +701,7 @@ def _unauthenticated_text(rule: DomainRule, vendors: Sequence[Vendor]) -> tuple[
         if vendor.traits.ignores_unauthenticated:
             clause = "they are still refused"
         elif rule.rtps_protection_kind is ProtectionKind.NONE:
-            kind, clause = UNAUTHENTICATED, _reach_of_strangers(rule, vendor)
+            kind, clause = UNAUTHENTICATED, _clause_on_topics_of_unauthenticated(rule, vendor)
         elif vendor.traits.refuses_open_rtps:
             kind, clause = (
                 UNAUTHENTICATED,
@@ -715,7 +715,7 @@ def _unauthenticated_text(rule: DomainRule, vendors: Sequence[Vendor]) -> tuple[
     )
 
 
-def _reach_of_strangers(rule: DomainRule, vendor: Vendor) -> str:
+def _clause_on_topics_of_unauthenticated(rule: DomainRule, vendor: Vendor) -> str:
     """Return a clause on the topics that participants without a certificate can use on a vendor."""
     opened = [
         topic_rule.topic_expression
@@ -782,11 +782,11 @@ def _topic_rule(rule: DomainRule, topic: TopicRule) -> Iterator[tuple[FindingKin
         topic.metadata_protection_kind,
         topic.data_protection_kind,
     )
-    if all(level in _NONE for level in levels):
+    if all(level in _UNPROTECTED_KINDS for level in levels):
         yield NOT_AUTHENTIC, f"messages of {name} are neither signed nor encrypted"
-    elif all(level in (*_NONE, *_SIGNING) for level in levels):
+    elif all(level in (*_UNPROTECTED_KINDS, *_SIGNED_KINDS) for level in levels):
         yield NO_ENCRYPTION, f"messages of {name} are only signed"
-    if topic.data_protection_kind in _SIGNING:
+    if topic.data_protection_kind in _SIGNED_KINDS:
         yield SIGNED_PAYLOAD, f"data_protection_kind is {topic.data_protection_kind} for {name}"
     for attribute, text in _open_attributes(topic):
         yield _OPEN_KINDS[attribute], f"{text} for {name}"

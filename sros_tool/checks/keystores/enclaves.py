@@ -89,7 +89,7 @@ def _check_loading(enclave: CheckedEnclave) -> Iterator[Finding]:
                 f"{kind.id}` hides this finding)"
             )
         remedy = fault_remedy(enclave, problem.fault, problem.file)
-        accepted = enclave.accepts_expiry if problem.fault in _EXPIRED else ""
+        accepted = enclave.accepts_expiry if problem.fault in _EXPIRY_FAULTS else ""
         yield kind.found(enclave.name, text, file, remedy=remedy, accepted=accepted)
 
 
@@ -255,7 +255,7 @@ PIN_FILE = FindingKind(
     "Write the PIN alone into the file, with mode 0600, for the user that runs the node.",
 )
 
-_LONG = timedelta(days=2 * 366)
+_LONG_VALIDITY = timedelta(days=2 * 366)
 
 
 def check_enclave(enclave: CheckedEnclave) -> Iterator[Finding]:
@@ -358,7 +358,7 @@ def _expiry_findings(
             yield EXPIRES_SOON.found(enclave.name, text, enclave.file(file), accepted=accepted)
 
 
-_EXPIRED = (Fault.CERTIFICATE_EXPIRED, Fault.PERMISSIONS_EXPIRED)
+_EXPIRY_FAULTS = (Fault.CERTIFICATE_EXPIRED, Fault.PERMISSIONS_EXPIRED)
 
 
 def _rights_findings(enclave: CheckedEnclave, grant: Grant) -> Iterator[Finding]:
@@ -379,7 +379,7 @@ def _rights_findings(enclave: CheckedEnclave, grant: Grant) -> Iterator[Finding]
     unique = "," in grant.subject or "+" in grant.subject
     window = grant.validity
     length = window.not_after - window.not_before
-    if length > _LONG and not unique:
+    if length > _LONG_VALIDITY and not unique:
         accepted = keystore.accepts(
             LONG_PERMISSIONS, lambda s: _lasts_at_least(s.permissions_validity, length)
         )

@@ -177,7 +177,7 @@ _ON_A_ROBOT = (
     "On a robot, replace the folder by an export (`sros distribute_key KEYSTORE ENCLAVE TARGET`); "
     "if others had access, run `sros rotate_ca`."
 )
-_WITHOUT_LINKS = (
+_COPY_WITHOUT_LINKS_REMEDY = (
     "On the keystore machine, keep the CA keys, and copy the keystore again with its links (`cp "
     f"-a`), or add `--exclude keystore.home-or-robot`. {_ON_A_ROBOT}"
 )
@@ -220,8 +220,8 @@ UNKNOWN_FILE = FindingKind(
 )
 
 _KEY_FOLDERS = (PRIVATE, ENCLAVES, REVOKED, RETIRED, AGENT)
-_MOST_READ = 65536
-_KNOWN = (
+_MOST_BYTES_READ = 65536
+_KNOWN_FILES = (
     *REQUIRED_FILES,
     KEY_URI_FILE,
     *OPTIONAL_FILES,
@@ -262,7 +262,7 @@ def check_files(keystore: CheckedKeystore, names: Sequence[str] | None = None) -
         yield from _hidden_enclave_findings(keystore)
         yield from _folder_findings(root, keystore, links, trusted, kept)
         if kept and not (keystore.is_original and _has_links(keystore)):
-            remedy = _WITHOUT_LINKS if keystore.is_original else ""
+            remedy = _COPY_WITHOUT_LINKS_REMEDY if keystore.is_original else ""
             yield HOME_OR_ROBOT.found(root, f"it has {names_text(kept)}", root, remedy=remedy)
         return
     passed: set[Path] = set()
@@ -306,7 +306,7 @@ def _folder_findings(
     root = os.fspath(keystore.root)
     keys = {os.path.join(root, ENCLAVES, name[1:], KEY_FILE) for name in keystore.names}
     keys |= {os.path.join(root, ENCLAVES, KEY_FILE)}
-    keys |= set(map(_mounted, keys))
+    keys |= set(map(_real_path_in_mounted_secret, keys))
     original = keystore.is_original
     unread: list[OSError] = []
     for parent, folders, files in os.walk(start, onerror=unread.append):
@@ -321,7 +321,7 @@ def _folder_findings(
                 yield from links.check(path)
                 continue
             yield from _write_access_findings(path, info, trusted_users)
-            yield from _open_folder(path, root, info.st_mode, original)
+            yield from _open_folder_findings(path, root, info.st_mode, original)
         if parent == root and AGENT in folders:
             folders.remove(AGENT)  # the folder of `sros agent` is closed to others
         inside = os.path.relpath(parent, root)
@@ -337,7 +337,7 @@ def _folder_findings(
             yield from _write_access_findings(path, info, trusted_users)
             if path in keys:
                 yield from key_mode_findings(path, info.st_mode)
-            elif name in _KNOWN and inside.startswith(ENCLAVES) and name != KEY_FILE:
+            elif name in _KNOWN_FILES and inside.startswith(ENCLAVES) and name != KEY_FILE:
                 if name == KEY_URI_FILE or name.endswith("_ca.cert.pem"):
                     with suppress(OSError):  # `check_enclave` reports an unreadable one
                         if _holds_key(keystore, path, info):
@@ -351,7 +351,7 @@ def _folder_findings(
         yield _unread_path_finding(error, root)
 
 
-def _mounted(key: str) -> str:
+def _real_path_in_mounted_secret(key: str) -> str:
     """Return the real path of a key in a mounted Kubernetes secret; of other keys, the given path.
 
     In such a secret, files are links into ..data, which is a link to a sibling folder.
@@ -389,7 +389,7 @@ def _interrupted_change_finding(parent: Path, root: str) -> Finding:
     return INTERRUPTED.found(root, text, str(parent / STAGE))
 
 
-def _open_folder(path: str, root: str, mode: int, original: bool) -> Iterator[Finding]:
+def _open_folder_findings(path: str, root: str, mode: int, original: bool) -> Iterator[Finding]:
     inside = Path(path).relative_to(root)
     # Below a closed top folder, other users cannot enter any folder.
     asked = inside.parts[0] in _KEY_FOLDERS and (len(inside.parts) == 1 or not original)
@@ -459,7 +459,7 @@ class _Links:
 
 
 def _holds_key(keystore: CheckedKeystore, path: str, info: os.stat_result) -> bool:
-    small = stat.S_ISREG(info.st_mode) and info.st_size <= _MOST_READ
+    small = stat.S_ISREG(info.st_mode) and info.st_size <= _MOST_BYTES_READ
     return small and holds_private_key(_content(keystore, path))
 
 
@@ -512,7 +512,7 @@ def _stray_file_findings(
     known = (
         (inside == "." and (is_layout_path(name) or name in (LEDGER_INDEX, LOCK)))
         or (place in (PUBLIC, PRIVATE) and _KNOWN_ANYWHERE.match(name))
-        or (place == REVOKED and name in _KNOWN)
+        or (place == REVOKED and name in _KNOWN_FILES)
         or place == RETIRED
         or (place == CONFIRMED and name.endswith(".json"))
     )

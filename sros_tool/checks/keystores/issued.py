@@ -62,7 +62,7 @@ KEY_TWICE = FindingKind(
     "RFC 5280, 4.1.2.6 (the subject is the holder of the key); DDS-Security 1.1, 9.3.",
     "Run `sros renew KEYSTORE ENCLAVE --new-key` for one of them.",
 )
-_RESTORE = (
+_RESTORE_REMEDY = (
     "Restore the files of the others, or run `sros renew KEYSTORE ENCLAVE --new-key` for them."
 )
 UNEXPLAINED = FindingKind(
@@ -283,7 +283,9 @@ def check_issued(
             text, remedy = "their certificates have the same public key", ""
         else:
             text = "they have the same certificate: the files of one were copied to the others"
-            remedy = _RESTORE if keystore.looks_like_original else "Export these enclaves again."
+            remedy = (
+                _RESTORE_REMEDY if keystore.looks_like_original else "Export these enclaves again."
+            )
         yield KEY_TWICE.found(", ".join(names), text, remedy=remedy)
     # A subject name with a unique part matches no other subject name.
     plain = {summary.name for summary in summaries if not summary.unique}

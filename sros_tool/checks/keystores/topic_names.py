@@ -13,7 +13,7 @@ from sros_tool.names import ROS_DISCOVERY_TOPIC, is_expression
 from sros_tool.policy.patterns import overlap
 from sros_tool.wording import first_few
 
-_MAPPING = 'ROS 2 design "Topic and Service name mapping to DDS"; rmw_dds_common; tested.'
+_MAPPING_SOURCE = 'ROS 2 design "Topic and Service name mapping to DDS"; rmw_dds_common; tested.'
 
 NO_ROS_NAME = FindingKind(
     "permissions.no-ros-name",
@@ -22,7 +22,7 @@ NO_ROS_NAME = FindingKind(
     "The DDS names of ROS topics begin with rt/, and the DDS names of services with rq/ and rr/. A "
     "rule with another name matches no endpoint of a node: access that the rule should allow is "
     "denied, and access that it should deny may be allowed.",
-    _MAPPING,
+    _MAPPING_SOURCE,
     "Write the DDS name, such as rt/chatter, rq/addRequest and rr/addReply, or let sros write it: "
     "`sros create_permission KEYSTORE ENCLAVE POLICY_FILE`. The current name is right only for a "
     "program that uses DDS without ROS.",
@@ -33,7 +33,7 @@ NOT_FOR_ROS = FindingKind(
     "permissions without any ROS 2 name",
     "No ROS 2 node can run in this enclave: a node needs ros_discovery_info, and the DDS names "
     "of ROS topics begin with rt/, and the DDS names of services with rq/ and rr/.",
-    _MAPPING,
+    _MAPPING_SOURCE,
     "Nothing to do if a program uses DDS without ROS. Otherwise give the enclave a policy: `sros "
     "create_permission KEYSTORE ENCLAVE POLICY_FILE`.",
     prominent=True,
@@ -51,23 +51,23 @@ CAPITALS = FindingKind(
     WARNING,
     "two names that differ only in capitals",
     "The two names are two topics: nodes on one topic do not communicate with nodes on the other.",
-    _MAPPING,
+    _MAPPING_SOURCE,
     "If one topic is meant, write its name in the same way in the permissions of all enclaves.",
 )
 
 _PREFIXES = ("ra", "rp", "rq", "rr", "rs", "rt")
-_OF_ROS = (ROS_DISCOVERY_TOPIC, "rq/*Request", "rr/*Reply", "ra/*", "rp/*", "rs/*", "rt/*")
-_ENDS = {"rq/": "Request", "rr/": "Reply"}
+_ROS_TOPICS = (ROS_DISCOVERY_TOPIC, "rq/*Request", "rr/*Reply", "ra/*", "rp/*", "rs/*", "rt/*")
+_SERVICE_SUFFIXES = {"rq/": "Request", "rr/": "Reply"}
 _TOKENS = r"(?:/[A-Za-z_][A-Za-z0-9_]*)+"
 _ROS_NAME = re.compile(
     rf"(?:r[apst]{_TOKENS}|rq{_TOKENS}(?<=Request)|rr{_TOKENS}(?<=Reply)|{ROS_DISCOVERY_TOPIC})\Z"
 )
 _BUILT_IN_TOPIC = re.compile(r"DCPS[A-Z]\w*\Z")
 """Built-in topics of DDS, which need no right but appear in some permissions."""
-_TYPE = re.compile(r"[a-z][a-z0-9_]*/(?:msg|srv|action)/[A-Z][A-Za-z0-9]*\Z")
+_ROS_TYPE = re.compile(r"[a-z][a-z0-9_]*/(?:msg|srv|action)/[A-Z][A-Za-z0-9]*\Z")
 _WILDCARD = re.compile(r"\[[^\]]*\]|[*?]")
-_FOREIGN = re.compile(r"[^A-Za-z0-9_/]")
-_SHOWN = 3
+_INVALID_CHARACTER = re.compile(r"[^A-Za-z0-9_/]")
+_MOST_SHOWN = 3
 
 
 def check_topic_names(enclave: CheckedEnclave, grant: Grant, file: str) -> Iterator[Finding]:
@@ -79,7 +79,7 @@ def check_topic_names(enclave: CheckedEnclave, grant: Grant, file: str) -> Itera
     named = dict.fromkeys((*_rule_topics(grant, allow=True), *_rule_topics(grant, allow=False)))
     problems = [text for name in named if (text := ros_name_problem(name))]
     if problems:
-        text = first_few(problems, _SHOWN, "; ", "; and ")
+        text = first_few(problems, _MOST_SHOWN, "; ", "; and ")
         yield NO_ROS_NAME.found(enclave.name, text, file)
     relayed = {topic for rule in grant.rules for topic in _topics(rule.relay) if rule.allow}
     if relayed and (only := sorted(relayed.difference(_rule_topics(grant, allow=True)))):
@@ -129,20 +129,20 @@ def ros_name_problem(text: str) -> str:
     if has_invalid_characters(name):
         return _character_problem(name)
     if is_expression(name):
-        possible = "//" not in name and any(overlap(name, known) for known in _OF_ROS)
+        possible = "//" not in name and any(overlap(name, known) for known in _ROS_TOPICS)
         return "" if possible else f"{name!r} matches no valid ROS name{_intended_name_hint(name)}"
-    if _TYPE.match(name):
+    if _ROS_TYPE.match(name):
         return f"{name!r} is the name of a type: write the name of the topic"
     return f"{name!r} is not a valid ROS name{_intended_name_hint(name)}"
 
 
 def has_invalid_characters(name: str) -> bool:
     """Return whether an expression has characters outside [sets] that no ROS name can have."""
-    return bool(_FOREIGN.search(_WILDCARD.sub("", name.strip())))
+    return bool(_INVALID_CHARACTER.search(_WILDCARD.sub("", name.strip())))
 
 
 def _character_problem(name: str) -> str:
-    letters = dict.fromkeys(_FOREIGN.findall(_WILDCARD.sub("", name)))
+    letters = dict.fromkeys(_INVALID_CHARACTER.findall(_WILDCARD.sub("", name)))
     shown = " ".join("a blank" if letter.isspace() else letter for letter in letters)
     advice = ""
     if "{" in name or "$(" in name:
@@ -166,7 +166,7 @@ def _intended_name_hint(name: str) -> str:
     parts = [part for part in (rest if begin in _PREFIXES else name).split("/") if part]
     prefix = begin if slash and begin in _PREFIXES else "rt"
     meant = "/".join((prefix, *parts))
-    end = _ENDS.get(f"{prefix}/", "")
+    end = _SERVICE_SUFFIXES.get(f"{prefix}/", "")
     if end and not meant.endswith(end):
         meant += end
     plain = _WILDCARD.sub("x", meant)

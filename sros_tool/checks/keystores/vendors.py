@@ -43,8 +43,10 @@ from sros_tool.names import (
 from sros_tool.policy.patterns import common_name, overlap
 from sros_tool.wording import counted, enumerated, first_few
 
-_ENGINE = "sros: its decision engine, compared with Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0."
-_SEE = "`sros explain --all-vendors` shows the answer of each vendor."
+_ENGINE_SOURCE = (
+    "sros: its decision engine, compared with Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0."
+)
+_SEE_VENDORS_REMEDY = "`sros explain --all-vendors` shows the answer of each vendor."
 
 REFUSED = FindingKind(
     "enclave.refused",
@@ -52,24 +54,24 @@ REFUSED = FindingKind(
     "an enclave that no DDS vendor accepts",
     "Every vendor refuses the enclave, or peers refuse its nodes, so no node can run in it. With "
     "--vendor, only that vendor counts.",
-    _ENGINE,
-    f"Replace the files that the vendors refuse. {_SEE}",
+    _ENGINE_SOURCE,
+    f"Replace the files that the vendors refuse. {_SEE_VENDORS_REMEDY}",
 )
 SOME_REFUSE = FindingKind(
     "portable.refused",
     WARNING,
     "an enclave that some DDS vendors refuse",
     "With one RMW, a node runs in the enclave; with another RMW, it fails or finds no peer.",
-    _ENGINE,
+    _ENGINE_SOURCE,
     "Use an RMW of a vendor that accepts it, or replace the files that the other vendors "
-    f"refuse. {_SEE}",
+    f"refuse. {_SEE_VENDORS_REMEDY}",
 )
 DIFFER = FindingKind(
     "portable.vendors-differ",
     WARNING,
     "vendors that decide differently on the same permissions",
     "An access that works with one RMW is denied, or open to everybody, with another.",
-    _ENGINE,
+    _ENGINE_SOURCE,
     "Use only the portable profile; `sros explain --all-vendors` shows the decision of each "
     "vendor.",
 )
@@ -115,12 +117,12 @@ _IDS_BY_REASON: Mapping[str, frozenset[str]] = {
 }
 """Reason of a vendor's refusal → ids of other findings that name the same cause."""
 
-_SAYS = {
+_OUTCOME_VERBS = {
     Outcome.CRASHES: ("crash on it", "crashes on it"),
     Outcome.PEER_DENIES: ("start, and its peers refuse it", "starts, and its peers refuse it"),
 }
-_HIT_PEERS = ("start, and their peers crash", "starts, and its peers crash")
-_REFUSES = ("refuse it", "refuses it")
+_HIT_PEERS_VERBS = ("start, and their peers crash", "starts, and its peers crash")
+_REFUSAL_VERBS = ("refuse it", "refuses it")
 
 
 def asked_vendors(words: Sequence[str]) -> tuple[Vendor, ...]:
@@ -305,7 +307,9 @@ def _file_name(finding: Finding) -> str:
 
 def refusal_clause(cause: RefusalCause, titles: Sequence[str]) -> str:
     """Return a clause on how vendors with these titles react to a cause of refusal."""
-    plural, singular = _HIT_PEERS if cause.hits_peers else _SAYS.get(cause.outcome, _REFUSES)
+    plural, singular = (
+        _HIT_PEERS_VERBS if cause.hits_peers else _OUTCOME_VERBS.get(cause.outcome, _REFUSAL_VERBS)
+    )
     says = singular if len(titles) == 1 else plural
     return f"{enumerated(titles)} {says} ({cause.text})"
 
@@ -313,8 +317,8 @@ def refusal_clause(cause: RefusalCause, titles: Sequence[str]) -> str:
 # ── what they decide differently ───────────────────────────────────────────────────────────
 
 _UNNAMED_TOPIC = "rt/sros_nobody_has_this"
-_BLANKS = "portable.blanks"
-_SHOWN = 3
+_BLANKS_FINDING_ID = "portable.blanks"
+_MOST_SHOWN = 3
 
 
 def _different_rights_findings(
@@ -335,7 +339,7 @@ def _different_rights_findings(
     }
     differing = list(_differences(evaluation, answers, _topics_to_ask(enclave, known)))
     if differing:
-        text = f"on domain {domain}, {first_few(differing, _SHOWN, '; ', '; and ')}"
+        text = f"on domain {domain}, {first_few(differing, _MOST_SHOWN, '; ', '; and ')}"
         yield DIFFER.found(enclave.name, text, enclave.file(PERMISSIONS_FILE))
 
 
@@ -367,7 +371,7 @@ def _topics_to_ask(enclave: CheckedEnclave, known: Collection[str]) -> list[str]
     for rule in grant.rules if grant else ():
         for criteria in (*rule.publish, *rule.subscribe):
             for topic in criteria.topics:
-                if not (_BLANKS in known and topic != topic.strip()) and not (
+                if not (_BLANKS_FINDING_ID in known and topic != topic.strip()) and not (
                     NO_ROS_NAME.id in known and has_invalid_characters(topic)
                 ):
                     named[_example_name(topic)] = None
@@ -406,14 +410,14 @@ NO_NODE = FindingKind(
     "how), and sign the policy with `sros generate_artifacts -k KEYSTORE -p POLICY_FILE`.",
 )
 _PARAMETER_EVENTS, _ROSOUT = "rt/parameter_events", "rt/rosout"
-_OF_TOOLS = (
+_ENDPOINTS_OF_TOOLS = (
     (AccessVerb.PUBLISH, ROS_DISCOVERY_TOPIC),
     (AccessVerb.SUBSCRIBE, ROS_DISCOVERY_TOPIC),
     (AccessVerb.PUBLISH, _PARAMETER_EVENTS),
 )
-_ENDPOINTS = (*_OF_TOOLS, (AccessVerb.PUBLISH, _ROSOUT))
-_TYPES = "get_type_description"
-_SOME_NODE = "/sros_nobody_has_this"
+_ENDPOINTS_OF_NODES = (*_ENDPOINTS_OF_TOOLS, (AccessVerb.PUBLISH, _ROSOUT))
+_TYPES_SERVICE = "get_type_description"
+_UNNAMED_NODE = "/sros_nobody_has_this"
 
 
 class _Denial(NamedTuple):
@@ -490,12 +494,14 @@ def _states_all(grant: Grant) -> bool:
         for side_criteria in (grant.rules[0].publish, grant.rules[0].subscribe)
     )
     return (
-        published.issuperset(topic for verb, topic in _ENDPOINTS if verb is AccessVerb.PUBLISH)
+        published.issuperset(
+            topic for verb, topic in _ENDPOINTS_OF_NODES if verb is AccessVerb.PUBLISH
+        )
         and ROS_DISCOVERY_TOPIC in subscribed
         and any(
             names.subscribe[0] in subscribed
             for topic in published
-            if topic.endswith(f"/{_TYPES}Reply") and not is_expression(topic)
+            if topic.endswith(f"/{_TYPES_SERVICE}Reply") and not is_expression(topic)
             for names in (dds_names("reply", service_of(topic)[0]),)
         )
     )
@@ -510,7 +516,9 @@ def _ordinary_node_denial(
     """
     access = participant.access
     assert access is not None
-    denied = [endpoint for endpoint in _ENDPOINTS if not access.decide(*endpoint).outcome.ok]
+    denied = [
+        endpoint for endpoint in _ENDPOINTS_OF_NODES if not access.decide(*endpoint).outcome.ok
+    ]
     verbs = [verb.value for verb, topic in denied if topic == ROS_DISCOVERY_TOPIC]
     wanted = [f"{' or '.join(verbs)} {ROS_DISCOVERY_TOPIC}"] if verbs else []
     wanted += [
@@ -519,8 +527,8 @@ def _ordinary_node_denial(
         if topic != ROS_DISCOVERY_TOPIC
     ]
     if described and not _offers_types(access, grant):
-        wanted.append(f"offer ~/{_TYPES}")
-    is_tool = not set(denied).intersection(_OF_TOOLS)
+        wanted.append(f"offer ~/{_TYPES_SERVICE}")
+    is_tool = not set(denied).intersection(_ENDPOINTS_OF_TOOLS)
     if not wanted or (is_tool and not any(map(_is_topic_of_robot, _allowed_to_publish(grant)))):
         return None
     text = f"no node may {' or '.join(wanted)}"
@@ -554,31 +562,31 @@ def _offers_types(access: Access, grant: Grant) -> bool:
 
     Tries a node name that no rule names, and an example name for each matching expression.
     """
-    wanted = dds_names("reply", f"/*/{_TYPES}").publish[0]
+    wanted = dds_names("reply", f"/*/{_TYPES_SERVICE}").publish[0]
     return any(
         all(access.publish(topic).outcome.ok for topic in names.publish)
         and all(access.subscribe(topic).outcome.ok for topic in names.subscribe)
         for node in _nodes_to_try(grant, wanted)
-        for names in (dds_names("reply", f"{node}/{_TYPES}"),)
+        for names in (dds_names("reply", f"{node}/{_TYPES_SERVICE}"),)
     )
 
 
 def _nodes_to_try(grant: Grant, wanted: str) -> Iterator[str]:
     """Yield a node that no rule names, and a node for each expression that overlaps ``wanted``."""
-    yield _SOME_NODE
+    yield _UNNAMED_NODE
     with suppress(DocumentError):  # too many wildcards
         for expression in _allowed_to_publish(grant):
             if not overlap(expression, wanted):
                 continue
             # If only the part after the node's name has a wildcard, that node is the example.
             beginning = expression.partition("*")[0].rpartition("/")[0]
-            topic = f"{beginning}/{_TYPES}Reply"
+            topic = f"{beginning}/{_TYPES_SERVICE}Reply"
             if not is_expression(topic) and overlap(topic, wanted) and overlap(expression, topic):
                 example: str | None = topic
             else:
                 example = common_name([expression, wanted], absolute=False)
             if example:
-                yield service_of(example)[0].removesuffix(f"/{_TYPES}")
+                yield service_of(example)[0].removesuffix(f"/{_TYPES_SERVICE}")
 
 
 def _allowed_to_publish(grant: Grant) -> Iterator[str]:

@@ -20,8 +20,8 @@ from sros_tool.keystore.layout import PERMISSIONS, SESSION_FILE, SETTINGS, ZENOH
 if TYPE_CHECKING:
     from sros_tool.keystore.zenoh_files import DriftedConfiguration, OpenedZenoh
 
-_AGAIN = "Run `sros zenoh KEYSTORE`, and restart the processes that it names."
-_SOURCE = "sros (docs/zenoh.md); Zenoh 1.10 verifies no signature of its configuration."
+_WRITE_AGAIN_REMEDY = "Run `sros zenoh KEYSTORE`, and restart the processes that it names."
+_ZENOH_SOURCE = "sros (docs/zenoh.md); Zenoh 1.10 verifies no signature of its configuration."
 
 MISSING = FindingKind(
     "zenoh.missing",
@@ -29,39 +29,39 @@ MISSING = FindingKind(
     "an enclave without its Zenoh configuration",
     "Processes of rmw_zenoh_cpp do not run in it with `sros run`; without sros, they run with the "
     "default of rmw_zenoh_cpp, which is open.",
-    _SOURCE,
-    _AGAIN,
+    _ZENOH_SOURCE,
+    _WRITE_AGAIN_REMEDY,
 )
 UNSIGNED = FindingKind(
     "zenoh.unsigned",
     ERROR,
     "a Zenoh configuration that the permissions CA has not signed",
     "Anyone who could write the file may have changed its rules: the process may enforce nothing.",
-    _SOURCE,
-    _AGAIN,
+    _ZENOH_SOURCE,
+    _WRITE_AGAIN_REMEDY,
 )
 OTHER_DOCUMENT = FindingKind(
     "zenoh.other-document",
     ERROR,
     "a Zenoh configuration that differs from its signed copy",
     "Somebody changed it after it was signed, and Zenoh reads the changed file.",
-    _SOURCE,
-    f"Find out who changed it. {_AGAIN}",
+    _ZENOH_SOURCE,
+    f"Find out who changed it. {_WRITE_AGAIN_REMEDY}",
 )
 OUT_OF_DATE = FindingKind(
     "zenoh.out-of-date",
     ERROR,
     "a Zenoh configuration that does not state the rights of the signed permissions",
     "DDS and Zenoh enforce different rights: one of them enforces an earlier policy.",
-    _SOURCE,
-    _AGAIN,
+    _ZENOH_SOURCE,
+    _WRITE_AGAIN_REMEDY,
 )
 LEFT_OVER = FindingKind(
     "zenoh.left-over",
     WARNING,
     "a signed Zenoh configuration that its enclave should not have",
     "A process that uses it enforces rules that sros no longer updates.",
-    _SOURCE,
+    _ZENOH_SOURCE,
     "Run `sros zenoh KEYSTORE`, or remove all Zenoh configurations with `sros zenoh KEYSTORE "
     "--off`.",
 )
@@ -70,7 +70,7 @@ LEFT_OUT = FindingKind(
     WARNING,
     "an enclave that has no rights on Zenoh",
     "The enclave gets no configuration, and all other enclaves deny it everything.",
-    _SOURCE,
+    _ZENOH_SOURCE,
     "State the enclave's rights with `sros create_permission KEYSTORE ENCLAVE POLICY_FILE`, or "
     "revoke it if nobody needs it.",
 )
@@ -79,7 +79,7 @@ OTHER_DOMAIN = FindingKind(
     NOTE,
     "an enclave outside the ROS domains of the Zenoh network",
     "The enclave gets no configuration, and all enclaves of the network deny it everything.",
-    _SOURCE,
+    _ZENOH_SOURCE,
     "An enclave that runs on DDS needs no configuration. For an enclave that runs on Zenoh, "
     "name all domains of the network: `sros zenoh KEYSTORE --domain IDS`.",
 )
@@ -94,15 +94,15 @@ SHARED_NODE = FindingKind(
     "Name each node in the policy of one enclave. If a wildcard gives an enclave the services of "
     "all nodes, deny the services of other enclaves' nodes, such as `/camera/*`.",
 )
-_RENEW = "Renew it with `sros renew KEYSTORE ENCLAVE`, or revoke it if nobody needs it."
-_EXPIRED = {Fault.CERTIFICATE_EXPIRED, Fault.PERMISSIONS_EXPIRED}
+_RENEW_REMEDY = "Renew it with `sros renew KEYSTORE ENCLAVE`, or revoke it if nobody needs it."
+_EXPIRY_FAULTS = {Fault.CERTIFICATE_EXPIRED, Fault.PERMISSIONS_EXPIRED}
 CANNOT_BE_MADE = FindingKind(
     "zenoh.cannot-be-made",
     ERROR,
     "a Zenoh network whose configurations cannot be made",
     "The keystore's settings define the network, but its permissions or its enclaves do not fit "
     "the network, so sros does not update the files.",
-    _SOURCE,
+    _ZENOH_SOURCE,
     "Run `sros zenoh KEYSTORE --dry-run` and do what it says.",
 )
 
@@ -191,7 +191,7 @@ def check_network(
             yield OTHER_DOMAIN.found(name, why, folder)
         else:
             faults = {e.fault for e in keystore.enclave(name).problems_in_keystore}
-            remedy = _RENEW if faults and faults <= _EXPIRED else ""
+            remedy = _RENEW_REMEDY if faults and faults <= _EXPIRY_FAULTS else ""
             yield LEFT_OUT.found(name, why.rstrip("."), folder, remedy=remedy)
 
 

@@ -29,7 +29,7 @@ from sros_tool.dds.permissions import Criteria, Grant, Permissions, Rule
 
 _BLANKS = " \t\v\r\n"
 _CDATA = "<![CDATA["
-_ROOM = len(_CDATA) - 2  # if fewer bytes are left, Cyclone DDS does not look for more text
+_SHORTEST_TEXT = len(_CDATA) - 2  # if fewer bytes are left, Cyclone DDS does not look for more text
 _DEEPEST = (
     # Levels of nested elements; a deeper document has unknown elements, and is refused for them.
     200
@@ -172,7 +172,7 @@ class _Reader:
                 if stop < 0:
                     raise self._error("a comment is not closed")
                 self._index = stop + len("-->")
-            if len(text) - self._index < _ROOM:
+            if len(text) - self._index < _SHORTEST_TEXT:
                 break
         content = (done + self._unescaped(pending)).strip(_BLANKS)
         return decoded(content.partition("\0")[0])
@@ -193,7 +193,7 @@ class _Reader:
 
 
 _SCHEMA_ATTRIBUTES = ("xmlns:xsi", "xsi:nonamespaceschemalocation")
-_IGNORED = ("relay", "value", "name", "tag", "data_tags")
+_IGNORED_TAGS = ("relay", "value", "name", "tag", "data_tags")
 _MATCHES_NOTHING = "["
 """An expression that matches no name: a set of characters without a closing bracket."""
 _LONGEST_NUMBER = 4000
@@ -246,7 +246,7 @@ def read_permissions(xml: bytes) -> Permissions:
     content.  A ``<topic>`` without text is read as "".  A rule without domains is read with a range
     that is open at both ends.  A ``<default>`` may be empty.
     """
-    dds = _Node.root(xml, _PERMISSIONS, _IGNORED)
+    dds = _Node.root(xml, _PERMISSIONS, _IGNORED_TAGS)
     parent = dds.last("permissions")
     grants = parent.all("grant") if parent else []
     if not grants:

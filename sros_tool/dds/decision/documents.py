@@ -81,7 +81,7 @@ def canonical_governance(document: bytes) -> Governance | None:
     return None
 
 
-def canonical_permissions(permissions: Permissions, document: bytes) -> bool:
+def are_canonical_permissions(permissions: Permissions, document: bytes) -> bool:
     """Return whether ``document`` has exactly the bytes that sros writes for ``permissions``.
 
     All vendors read such a document alike.

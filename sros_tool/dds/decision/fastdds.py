@@ -27,7 +27,7 @@ from sros_tool.dds.governance import (
 from sros_tool.dds.permissions import Criteria, Grant, Permissions, Rule
 
 _BLANKS = " \t\n\v\f\r"
-_MARK = "\xef\xbb\xbf"
+_BYTE_ORDER_MARK = "\xef\xbb\xbf"
 _DEEPEST = 99  # nesting of elements
 _NAME = "[A-Za-z_:\x80-\xff][A-Za-z0-9_:.\x80-\xff-]*+"
 _VALUE = "(?:\"[^\"]*\"|'[^']*')"
@@ -53,7 +53,9 @@ class _Reader:
     def __init__(self, xml: bytes) -> None:
         # Signed documents have CR LF line ends; each character stands for one byte.
         canonical = xml.replace(b"\r\n", b"\n").replace(b"\n", b"\r\n").decode("latin-1")
-        self._read_text = canonical.partition("\0")[0].lstrip(_BLANKS).removeprefix(_MARK)
+        self._read_text = (
+            canonical.partition("\0")[0].lstrip(_BLANKS).removeprefix(_BYTE_ORDER_MARK)
+        )
         self._index = 0
 
     def root(self) -> XmlElement:

@@ -247,17 +247,17 @@ _COMPARE: dict[Subjects, Callable[[str, str], bool]] = {
 
 # ── dates ──────────────────────────────────────────────────────────────────────────────────
 
-_CYCLONE = re.compile(
+_CYCLONE_DATE = re.compile(
     r"(\d{4})-(\d\d)-(\d\d)T(\d\d):(\d\d):(\d\d)(\.\d{1,12})?(?:Z|([+Z-])(\d\d):(\d\d))?\Z",
     re.ASCII,
 )
 # The form that std::get_time of libstdc++ reads with %Y-%m-%dT%H:%M:%S: the text may end after the
 # year, the month or the day; one blank may precede the day; anything may follow the seconds.
-_LOCAL = re.compile(
+_LOCAL_DATE = re.compile(
     r"\s*(\d{1,4})(?:-(\d\d?)(?:-\s?(\d\d?)(?:[Tt](\d\d?):(\d\d?):(\d\d?))?)?)?", re.ASCII
 )
 _LAST_YEAR = 2262  # the last year that 64 bits of nanoseconds can hold
-_FARTHEST = timedelta(hours=12)
+_FARTHEST_ZONE = timedelta(hours=12)
 
 
 @lru_cache(maxsize=64)  # the enclaves of a keystore share most of their dates
@@ -280,7 +280,7 @@ def read_date(rule: DateRule, text: str, zone: tzinfo) -> float | None:
 
 
 def _local_time(text: str, zone: tzinfo) -> float | None:
-    match = _LOCAL.match(text)
+    match = _LOCAL_DATE.match(text)
     if not match or (match[6] is None and match.end() < len(text)):
         return None
     year, month, day, hour, minute, second = (int(group or -1) for group in match.groups())
@@ -300,12 +300,12 @@ def _local_time(text: str, zone: tzinfo) -> float | None:
 
 
 def _cyclone_time(text: str) -> float:
-    match = _CYCLONE.match(text)
+    match = _CYCLONE_DATE.match(text)
     if not match:
         return -inf
     year, month, day, hour, minute, second = (int(match[index]) for index in range(1, 7))
     offset = timedelta(hours=int(match[9] or 0), minutes=int(match[10] or 0))
-    if not 1970 <= year <= _LAST_YEAR or offset > _FARTHEST or int(match[10] or 0) > 59:
+    if not 1970 <= year <= _LAST_YEAR or offset > _FARTHEST_ZONE or int(match[10] or 0) > 59:
         return -inf
     try:
         moment = timegm(datetime(year, month, day, hour, minute, second).timetuple())

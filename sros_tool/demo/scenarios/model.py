@@ -457,7 +457,7 @@ DENIED_TOPIC: Final = "/sros_not_allowed"
 _POLICY_FILE = "talker_listener.xml"
 _POLICY_TOPIC = "chatter"
 _TALKER, _LISTENER = "/talker_listener/talker", "/talker_listener/listener"
-_WITHOUT = "_without_permission"
+_DENIED_SUFFIX = "_without_permission"
 GUEST: Final = "/talker_listener/guest"
 _GUEST_TOPIC: Final = "/guest_book"
 SERVICE: Final = "/add_two_ints"
@@ -511,8 +511,8 @@ def talking_policy(topic: str) -> Policy:
         enclaves=(
             _with_topic(talker, topic),
             _with_topic(listener, topic),
-            replace(_with_topic(talker, None), path=f"{_TALKER}{_WITHOUT}"),
-            replace(_with_topic(listener, None), path=f"{_LISTENER}{_WITHOUT}"),
+            replace(_with_topic(talker, None), path=f"{_TALKER}{_DENIED_SUFFIX}"),
+            replace(_with_topic(listener, None), path=f"{_LISTENER}{_DENIED_SUFFIX}"),
         ),
     )
 
@@ -530,7 +530,9 @@ def attacked_policy(topic: str) -> Policy:
     guest = replace(_with_topic(talker, _GUEST_TOPIC), path=GUEST)
     guest_enclaves = (guest, replace(_with_topic(talker, topic), path=f"{GUEST}/admin"))
     service = _shipped_policy("add_two_ints.xml").enclaves
-    allowed = tuple(enclave for enclave in talking.enclaves if not enclave.path.endswith(_WITHOUT))
+    allowed = tuple(
+        enclave for enclave in talking.enclaves if not enclave.path.endswith(_DENIED_SUFFIX)
+    )
     return replace(talking, enclaves=(*allowed, *guest_enclaves, *service))
 
 

@@ -308,7 +308,7 @@ _WIRE_ROWS = tuple(
     for row in _wiretap_rows(attack, wire, readable=readable)
 )
 
-_LARGE = 64 * 1024
+_LARGE_BYTES = 64 * 1024
 
 
 def _shared_memory_row(name: str, keystore: KeystoreChoice, *, readable: bool) -> Row:
@@ -319,7 +319,7 @@ def _shared_memory_row(name: str, keystore: KeystoreChoice, *, readable: bool) -
         "a large message lies in shared memory unencrypted"
         if readable
         else "the files switch shared memory off: TLS carries large messages, too",
-        (wide, replace(talker, size=_LARGE), listener),
+        (wide, replace(talker, size=_LARGE_BYTES), listener),
         (Claim(Relation.READABLE, "talker", holds=readable, wire=Wire.MEMORY),),
         _CHATTER,
         brief=True,

@@ -1008,7 +1008,7 @@ def _sign(
     if not by_robot:
         return "", notes, changes
     joint = sign(by_robot)
-    if joint and (problem := _cannot_sign(root, **options)):
+    if joint and (problem := _why_cannot_sign(root, **options)):
         for request in (request for judged in by_robot for request in judged):
             request.set_outcome("not_signed", problem)
         return problem, notes, changes
@@ -1016,7 +1016,7 @@ def _sign(
     return "", notes, changes
 
 
-def _cannot_sign(root: Path, **options: Unpack[ChangeOptions]) -> str:
+def _why_cannot_sign(root: Path, **options: Unpack[ChangeOptions]) -> str:
     """Return why the keystore's CAs can sign nothing now, as a clause; "" if they can sign."""
     try:
         with KeystoreChange(root, **options | {"dry_run": True}) as change:

@@ -253,7 +253,9 @@ class EnclaveWriter:
                 ("permissions", self._permissions_validity, permissions),
             )
             if authority
-            and (note := _early_expiry(kind, validity, authority.certificate, transaction.root))
+            and (
+                note := _early_expiry_note(kind, validity, authority.certificate, transaction.root)
+            )
         )
         if permissions:
             self._permissions_validity = self._permissions_validity.intersection(
@@ -472,7 +474,7 @@ def _permissions(
     return permissions
 
 
-def _early_expiry(
+def _early_expiry_note(
     label: str, wanted_validity: Window, authority: x509.Certificate, root: Path
 ) -> Note | None:
     """Return a note if the CA's expiry shortens the chosen validity by more than 1 %."""

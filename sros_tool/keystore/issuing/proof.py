@@ -150,7 +150,7 @@ def prove(policy: Enclave, permissions: Permissions, domains: DomainSet) -> None
     stated = stated_expressions(policy)
     wildcards = {expression for expression in stated.all() if is_expression(expression)}
     signed = signed_expressions(permissions, domains)
-    if signed and signed.matches_same_names(stated) and all(map(matched_as_meant, wildcards)):
+    if signed and signed.matches_same_names(stated) and all(map(is_matched_as_meant, wildcards)):
         return
     disagreements = differences(policy, permissions, domains)
     if disagreements:
@@ -180,7 +180,7 @@ def _are_matched_by_wildcards(left_out: set[str], expressions: set[str]) -> bool
 
 
 @lru_cache(maxsize=4096)
-def matched_as_meant(expression: str) -> bool:
+def is_matched_as_meant(expression: str) -> bool:
     """Return whether vendors and policies agree on which example names an expression matches."""
     return all(
         dds_matches(vendor.traits.style, expression, name) == matches(expression, name)

@@ -48,7 +48,7 @@ from sros_tool.keystore.lifecycle.replaced import Superseded
 from sros_tool.keystore.lifecycle.rotation import (
     Replacement,
     RotationStage,
-    crls_confusable,
+    are_crls_confusable,
     read_rotation,
 )
 from sros_tool.keystore.reader import OpenedKeystore
@@ -595,7 +595,7 @@ class RevocationListSigner:
         certificates = self._keystore.certificates_of(file)
         sha256 = replaced.new if coming else replaced.old
         (other,) = [candidate for candidate in certificates if digest(candidate) == sha256]
-        if coming and crls_confusable(certificates[0], other):
+        if coming and are_crls_confusable(certificates[0], other):
             return None  # then all processes have to be restarted together anyway
         old = self._list_if_authentic(self._keystore.embedded_list(file))
         try:

@@ -71,7 +71,7 @@ from sros_tool.keystore.lifecycle.rotation import (
     Replacement,
     Rotation,
     RotationStage,
-    crls_confusable,
+    are_crls_confusable,
     read_rotation,
     render_rotation,
     retired_key,
@@ -634,7 +634,7 @@ class _Rotator:
 
     def _can_distribute_crl_with(self, successor: _Successor) -> bool:
         """Return whether a new CA's revocation list can be distributed together with the CA."""
-        return IDENTITY in successor.roles and not crls_confusable(
+        return IDENTITY in successor.roles and not are_crls_confusable(
             successor.old[0], successor.new.certificate
         )
 

@@ -300,7 +300,7 @@ def _restart_remarks(keystore: OpenedKeystore, rotation: Rotation) -> list[str]:
     return [*remarks, deliver_first_sentence(keystore.root)]
 
 
-def crls_confusable(old: x509.Certificate, new: x509.Certificate) -> bool:
+def are_crls_confusable(old: x509.Certificate, new: x509.Certificate) -> bool:
     """Return whether OpenSSL may mistake the revocation list of one CA for the list of the other.
 
     OpenSSL finds a list by name and key identifier.  If both CAs have the same name and the old CA

@@ -503,7 +503,7 @@ class _Updater:
             change.remarks.append(restart_note(disturbed, revoked=revoked))
             change.remarks.append(exports_note(change.keystore, names))
         change.remarks += self._kept_open_notes()
-        change.remarks += self._open_tasks(settings)
+        change.remarks += self._open_task_notes(settings)
         ends = [right.works_until for right in rights if right.works_until]
         renewed = dict.fromkeys((document.name for document in reissued if document.old), "renewed")
         signed = dict.fromkeys(
@@ -675,7 +675,7 @@ class _Updater:
         )
         return [Note("keystore.kept-open", text)]
 
-    def _open_tasks(self, changes: Sequence[SettingChange]) -> list[Note]:
+    def _open_task_notes(self, changes: Sequence[SettingChange]) -> list[Note]:
         identity = self._change.identity.certificate
         shared = same_key(identity, self._change.permissions.key)
         if self._goal.settings.separate_authorities and shared:
