@@ -79,6 +79,10 @@ PUBLISHING = "publishing"
 
 A line with an enclave says that publishing was refused, and named rights that the enclave had lost.
 """
+RENEWED_BY_NAME = "renewed by name"
+"""The ``reason`` of permissions that `sros renew` signed for a named enclave after a restore."""
+NEW_CA = "new CA"
+"""The ``reason`` of a governance that a rotation signed again, without a change."""
 SAME_KEY = "same key"
 """The ``reason`` of a CA certificate with the same key as the CA's previous certificate."""
 FROM_BEFORE = "from before the ledger"
@@ -123,8 +127,9 @@ class Entry(NamedTuple):
     policy: str = ""
     """SHA-256 of the policy with its includes from which the permissions were made."""
     reason: str = ""
-    """Reason of a revocation; fault that a gap records; what showed a restore; or how a certificate
-    became known, if the keystore did not issue it with this line.
+    """Reason of a revocation; fault that a gap records; what showed a restore; why a
+    document was signed again; or how a certificate became known, if the keystore did not issue it
+    with this line.
     """
     key: str = ""
     """SHA-256 of the public key (DER) of the certificate, or of the revoked certificate."""

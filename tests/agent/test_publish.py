@@ -1356,7 +1356,11 @@ def test_a_right_that_was_taken_away_after_the_backup_does_not_come_back_in_sile
         if way == "with the certificates" and "certificates of /r1/base" in str(said.value):
             assert "If the enclaves are to have" not in str(said.value)
             publisher.run(*again)  # as the error advises: it agrees to no right yet
-    if way == "renew":
+    if way == "renew":  # other signatures agree to no right
+        sign("x", "cmd", "y")
+        publisher.run("rotate_ca", "ks", "--finish", "--allow-unconfirmed")
+        with pytest.raises(KeystoreError, match=r"rights of /r1/base, .* were taken away"):
+            publisher.publish(restored=True)
         publisher.run(*again)
     else:
         sign("x")
@@ -1394,6 +1398,9 @@ def test_what_a_restored_keystore_cannot_know_is_not_published_in_silence(
         refused.value
     )
     assert "/r1/base: domain 0" in str(refused.value).replace("/{robot}/base", "/r1/base")
+    publisher.run("rotate_ca", "ks", "--finish", "--allow-unconfirmed")
+    with pytest.raises(KeystoreError, match="the governance was changed"):
+        publisher.publish(restored=True)
     publisher.run(
         "update_keystore",
         "ks",

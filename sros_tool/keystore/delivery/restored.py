@@ -39,7 +39,7 @@ from sros_tool.keystore.layout import (
     PERMISSIONS_FILE,
     key_on_robot,
 )
-from sros_tool.keystore.ledger import LATER_RELEASE, PUBLISHING, RESTORED
+from sros_tool.keystore.ledger import LATER_RELEASE, PUBLISHING, RENEWED_BY_NAME, RESTORED
 from sros_tool.keystore.lifecycle.replaced import EarlierPermissions, replaced_rights
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.pki import smime
@@ -291,7 +291,8 @@ _ELEMENT = re.compile(r"<(\w+)>(.*)</\w+>")
 def without_agreed(keystore: OpenedKeystore, changes: Sequence[LaterChange]) -> list[LaterChange]:
     """Return ``changes`` without rights and governance that were signed again on purpose.
 
-    Rights count as agreed to if they were signed after publishing was refused only because of them.
+    Rights count as agreed to if their enclave was renewed by name after publishing was refused only
+    because of them.  Other commands sign rights, too, such as a rotation, and agree to none.
     """
     releases = keystore.ledger_with("what", "release").entries
     last = max((entry.number for entry in releases if entry.what == "release"), default=0)
@@ -300,14 +301,14 @@ def without_agreed(keystore: OpenedKeystore, changes: Sequence[LaterChange]) -> 
     for entry in keystore.ledger_file.with_values("enclave", names).entries if names else ():
         if entry.what == RESTORED and entry.number > last:
             named.add(entry.enclave)
-        elif entry.what == "permissions" and entry.enclave in named:
+        elif entry.reason == RENEWED_BY_NAME and entry.enclave in named:
             agreed.add(entry.enclave)
     is_refused = is_governance_agreed = False
     kinds = ("governance", RESTORED)
     for entry in keystore.ledger_file.with_values("what", kinds).entries:
         if entry.what == RESTORED and entry.number > last:
             is_refused |= entry.reason == PUBLISHING
-        elif entry.what == "governance":
+        elif entry.what == "governance" and not entry.reason:
             is_governance_agreed = is_refused
     return [
         change

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterator, Sequence
+from collections.abc import Container, Iterable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from shlex import quote
@@ -26,6 +26,7 @@ from sros_tool.keystore.issuing.enclave import (
     NewIdentity,
 )
 from sros_tool.keystore.layout import KEY_URI_FILE, enclave_path, has_key
+from sros_tool.keystore.ledger import RENEWED_BY_NAME, RESTORED, Entry
 from sros_tool.keystore.lifecycle.change import Changed, ChangeOptions, KeystoreChange
 from sros_tool.keystore.lifecycle.replaced import Superseded, certificates_until, may_lack_entries
 from sros_tool.keystore.rights import RecordedRights, SignedRights
@@ -122,7 +123,7 @@ def renew(
             change.notes += change.edit_notes()
         if not (new_key or places):
             change.notes += change.known.shared_notes(renewed)
-        change.entries += writer.entries
+        change.entries += _marked_by_name(change, writer.entries, names)
         if revoke_old:
             change.revoke(replaced)
         if replaced:
@@ -138,6 +139,20 @@ def renew(
         works_until=until if until and until >= change.now else None,
         may_work_longer=may_work_longer,
     )
+
+
+def _marked_by_name(
+    change: KeystoreChange, entries: Iterable[Entry], names: Sequence[str]
+) -> Iterator[Entry]:
+    """Yield ledger entries; permissions of ``names`` say after a restore that they were named.
+
+    `sros fleet publish --restored` takes this as consent to rights that were taken away.
+    """
+    restored = change.keystore.ledger_with("what", RESTORED).entries
+    named = {*names} if any(entry.what == RESTORED for entry in restored) else set[str]()
+    for entry in entries:
+        is_named = entry.what == "permissions" and entry.enclave in named
+        yield entry._replace(reason=RENEWED_BY_NAME) if is_named else entry
 
 
 def _due_enclave_names(

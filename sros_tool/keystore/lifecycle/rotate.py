@@ -61,6 +61,7 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.ledger import (
     FROM_BEFORE,
+    NEW_CA,
     SAME_KEY,
     certificate_entry,
     document_entry,
@@ -729,7 +730,8 @@ class _Rotator:
             parse_governance(signed.document)  # raises an error if the governance is malformed
             message = permissions.new.sign(signed.document, "the governance document")
             self._transaction.write(path, message)
-            self._change.entries.append(document_entry(self._change.now, "governance", message))
+            entry = document_entry(self._change.now, "governance", message)
+            self._change.entries.append(entry._replace(reason=NEW_CA))
 
     def _retire_old_cas(self) -> None:
         files = self._keystore.authority_files
