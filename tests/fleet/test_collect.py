@@ -44,12 +44,14 @@ from sros_tool.keystore.delivery.collect import (
 )
 from sros_tool.keystore.delivery.publish import publish as publish_releases
 from sros_tool.keystore.delivery.published import read_published, releases_in
+from sros_tool.keystore.delivery.release import seal_releases
 from sros_tool.keystore.delivery.signing import certify_requests
 from sros_tool.keystore.fleet import recorded_fleet
 from sros_tool.keystore.fleet_status import fleet_status
+from sros_tool.keystore.issuing.authority import load_authority
 from sros_tool.keystore.issuing.keyring import IN_KEYSTORE
 from sros_tool.keystore.known_keys import KnownKeys
-from sros_tool.keystore.layout import IDENTITY, PUBLISHED, key_on_robot
+from sros_tool.keystore.layout import IDENTITY, PERMISSIONS, PUBLISHED, key_on_robot
 from sros_tool.keystore.ledger import RESTORED, certificate_entry
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.reader import OpenedKeystore, read_certificate
@@ -1152,6 +1154,14 @@ def test_only_the_seal_of_a_later_release_keeps_a_keystore_from_publishing(
     publish_releases(home.root, home.folder / "pub", now=DUE)
     home.send("r3", DUE, seal=seal)
     assert not home.collect(DUE).notes, "the restore is known"
+    # The seal of a release that was published while the clock was far ahead.
+    keystore = OpenedKeystore(home.root)
+    authority = load_authority(keystore, PERMISSIONS, keystore.template, IN_KEYSTORE, DUE)
+    (ahead,) = seal_releases([("r3", number := 10**11, {})], authority)
+    for noted in (True, False):
+        home.send("r3", DUE + timedelta(minutes=1 + noted), seal=ahead.decode())
+        assert bool(home.collect(DUE).notes) is noted
+    assert OpenedKeystore(home.root).ledger.next_number() > number, "robots refuse a lower number"
 
 
 def test_a_new_key_that_a_robot_reports_before_the_list_is_not_revoked(home: Home) -> None:

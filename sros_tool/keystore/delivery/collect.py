@@ -232,9 +232,9 @@ def collect(
                 message.seal = message.verified.confirmation.seal
             if message.crl and forgotten.add(message.crl.encode()):
                 robots_with_lists.append(message.robot.name)
-            if seals.is_later(message.seal):
+            if number := seals.later_number(message.seal):
                 robots_with_seals.append(message.robot.name)
-                forgotten.has_later_release = True
+                forgotten.later_number = max(number, forgotten.later_number)
             if message.signer_certificate:
                 forgotten.add_certificate(message.signer_certificate, REPORTED)
             if message.received:
@@ -255,7 +255,7 @@ def collect(
             OpenedKeystore(root),
             taken,
             is_restored=bool(signed),
-            is_older=forgotten.has_later_release,
+            is_older=bool(forgotten.later_number),
         )
         if not not_signed:
             not_signed, more_notes, more_signed = _sign(
@@ -857,7 +857,7 @@ def _revoke_again(
     cannot be signed, no request is signed.  But for lists of a CA service there is only a note,
     because this service alone signs its lists and knows its certificates.
     """
-    is_later = forgotten_lists.has_later_release
+    is_later = bool(forgotten_lists.later_number)
     unknown = forgotten_lists.unknown_certificates(OpenedKeystore(root))
     if not (forgotten_lists.lists or unknown or is_later):
         return "", [], []

@@ -138,14 +138,15 @@ class LaterSeals:
         self._explained = max(marks, default=0)
         self._authorities = keystore.authority(PERMISSIONS)
 
-    def is_later(self, seal: str | None) -> bool:
-        """Return whether a CA of the keystore signed a seal whose number the ledger lacks."""
+    def later_number(self, seal: str | None) -> int:
+        """Return the number in a seal if a CA signed it and the ledger lacks it; otherwise 0."""
         with suppress(SrosError):
             if seal:
                 number = sealed_robot(seal.encode()).number
                 is_unknown = number > self._explained and number not in self._known
-                return is_unknown and not smime.parse(seal.encode()).problem_for(self._authorities)
-        return False
+                if is_unknown and not smime.parse(seal.encode()).problem_for(self._authorities):
+                    return number
+        return 0
 
 
 # ── what changed ───────────────────────────────────────────────────────────────────────────

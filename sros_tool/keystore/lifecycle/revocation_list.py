@@ -88,8 +88,8 @@ class LostRecords:
     def __init__(self, keystore: OpenedKeystore, now: datetime) -> None:
         self.lists: list[RevocationList] = []
         self.certificates: dict[str, Entry] = {}
-        self.has_later_release = False
-        """Whether a robot has a release that the keystore sealed and does not know."""
+        self.later_number = 0
+        """Highest number of a robot's release that the keystore sealed and does not know, or 0."""
         self._now = now
         self._issuing = keystore.ca_certificate(IDENTITY)
         self._authorities = keystore.authority(IDENTITY)

@@ -176,9 +176,10 @@ def restore_revocations(
     certificate that the ledger lacked has the same key; so is each key that such a key vouched for
     since then.  Certificates that the ledger lacks are recorded, so that they can be revoked; those
     of a revoked enclave are revoked immediately.  The ledger also records that the keystore was
-    restored, with a number that it never had: the seconds since 1970.  ``shown_by`` is the
-    ``reason`` of this entry.  So that a later signature of their rights counts as consent, another
-    entry names each enclave of ``rights_named``, unless there are certificates to replace first.
+    restored, with a number that it never had: the seconds since 1970, or the number of a later
+    release that a robot has.  ``shown_by`` is the ``reason`` of this entry.  So that a later
+    renewal of them counts as consent, another entry names each enclave of ``rights_named``, unless
+    there are certificates to replace first.
 
     Raises:
         KeystoreError: as `revoke`.
@@ -242,7 +243,9 @@ def restore_revocations(
                         entry = entry._replace(enclave=of.enclave, not_after=of.not_after)
                 revocations.append(entry)
         gone = frozenset(lost_revocations)
-        number = max(change.keystore.ledger_file.next_number(), int(change.now.timestamp()))
+        # A release that was published while the clock was ahead can have an even higher number.
+        least = max(int(change.now.timestamp()), forgotten_lists.later_number)
+        number = max(change.keystore.ledger_file.next_number(), least)
         revoked = known | {int(serial, 16) for serial in reasons}
         replaced = _key_revoked_by_enclave(change, revoked, {key for _, key in replaced_keys}, gone)
         mark = Entry(iso(change.now), RESTORED, number=number, reason=shown_by)
