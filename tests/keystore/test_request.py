@@ -245,12 +245,15 @@ def test_a_request_for_an_existing_enclave_is_refused(
     sign(home, robot)
     thief = create_request(tmp_path / "thief", NAME)
     before = snapshot(home)
-    with pytest.raises(KeystoreError, match=f"already exists.*`sros revoke .* {NAME}`.* --enclave"):
+    steps = f"already exists.*`sros revoke .* {NAME}`.* --enclave.* -p POLICY_FILE.*--fleet"
+    with pytest.raises(KeystoreError, match=steps):
         sign_request(home, thief.file.read_bytes(), now=NOW)
     with pytest.raises(KeystoreError, match=r"already exists.*add --renew;"):
         sign_request(home, request_of(robot), now=NOW)
     base = create_request(tmp_path / "thief", "/base")
-    with pytest.raises(KeystoreError, match=r"has another key.*, without --renew"):
+    with pytest.raises(
+        KeystoreError, match=r"has another key.* -p POLICY_FILE.* Leave --renew out"
+    ):
         sign_request(home, base.file.read_bytes(), now=NOW, renew=True)
     assert snapshot(home) == before
     (note,) = sign_request(home, thief.file.read_bytes(), now=NOW, renew=True).notes
@@ -302,6 +305,23 @@ def test_a_revoked_enclave_comes_back_only_if_it_is_named(
     assert snapshot(home) == before
     signed = sign_request(home, request, now=NOW, only_enclaves=[NAME])
     assert "keystore.revoked-before" in {each.id for each in signed.notes}
+
+
+def test_rights_that_an_enclave_had_are_not_lost_in_silence(home: Path, tmp_path: Path) -> None:
+    """The refusal of another key says to revoke the enclave, and to repeat the command."""
+    (tmp_path / "p.xml").write_text(policy_text({"/base": publish("a")}))
+    policy = read_policy(tmp_path / "p.xml")
+    request = create_request(tmp_path / "new", "/base").file.read_bytes()
+    default, stated = home, copy_of(home, tmp_path / "stated")
+    create_permission(stated, ["/base"], policy, now=NOW)
+    for root, given, lost in (
+        (default, None, False),
+        (copy_of(stated, tmp_path / "again"), policy, False),
+        (stated, None, True),
+    ):
+        revoke(root, ["/base"], now=NOW)
+        done = sign_request(root, request, policy=given, only_enclaves=["/base"], now=NOW)
+        assert ("request.default-rights" in {note.id for note in done.notes}) == lost
 
 
 def test_a_restored_keystore_revokes_only_the_earlier_key_of_new_hardware(

@@ -422,6 +422,8 @@ class _RequestCertifier:
         if present and stated is None:
             rights = _earlier_rights(change, name, present)
         else:
+            if stated is None:
+                change.notes += _default_rights_notes(change, name)
             enclave = stated or default_rights(change.template, name)
             rights = StatedRights(enclave, self._domains.of(name))
         unique = change.template.unique_subject or (
@@ -585,7 +587,7 @@ def _check_same_key(
         raise KeystoreError(
             f"enclave {request.name} has another key in keystore '{root}'",
             f"Its {path.name} would not fit a certificate for the key in the request.",
-            f"First {_revocation_advice(keystore, request.name)}, without --renew.",
+            f"First {_revocation_advice(keystore, request.name)}. Leave --renew out.",
         )
 
 
@@ -593,7 +595,9 @@ def _revocation_advice(keystore: OpenedKeystore, name: str) -> str:
     """Return advice, as a clause, on how an enclave gets a key made on its robot."""
     return (
         f"revoke the old key with `sros revoke {quote(str(keystore.root))} {name}` (or, with "
-        f"--robot, all keys of its robot), and then repeat this command with --enclave {name}"
+        f"--robot, all keys of its robot), and then repeat this command with --enclave {name} and "
+        "with the policy, which states the enclave's rights: -p POLICY_FILE, for a fleet also "
+        "--fleet FLEET_FILE"
     )
 
 
@@ -636,6 +640,28 @@ def _lost_rights_notes(
     lost = f"{replaced.enclave} loses: {replaced.lost_text()}."
     remedy = "Then answer its request again with `sros sign_request --renew`."
     return [Note("request.rights-lost", f"{lost} {text} {remedy}")]
+
+
+def _default_rights_notes(change: KeystoreChange, name: str) -> Iterator[Note]:
+    """Yield a note if a created enclave would need other rights than the default of the template.
+
+    It had others before it was revoked or removed, or it belongs to a robot of the fleet.
+    """
+    root, fleet, last = quote(str(change.root)), change.fleet, change.recorded.last(name)
+    had_others = last and last.policy != default_rights(change.template, name).digest
+    of_robot = bool(fleet and robot_of(fleet, name))
+    if had_others or of_robot:
+        command = (
+            f"sros generate_artifacts -k {root} -p POLICY_FILE --fleet FLEET_FILE"
+            if of_robot
+            else f"sros create_permission {root} {quote(name)} POLICY_FILE"
+        )
+        lacks = "not the rights that it had before" if had_others else "not those of a policy"
+        yield Note(
+            "request.default-rights",
+            f"{name}: no policy was given, so it has only the default permissions of the "
+            f"keystore's template, and {lacks}. To give it the rights of its policy: `{command}`.",
+        )
 
 
 def _earlier_rights(
