@@ -69,9 +69,8 @@ def read_file(
         number = getattr(error, "errno", errno.ENOENT)  # ValueError: the path contains a NUL
         if number in (errno.ENOENT, errno.ENOTDIR, errno.ELOOP):
             raise DocumentError(f"the {label} '{path}' does not exist") from error
-        raise DocumentError(
-            f"the {label} '{path}' cannot be read", f"{os.strerror(number)}."
-        ) from error
+        why = why_unreadable(path, number)
+        raise DocumentError(f"the {label} '{path}' cannot be read", why) from error
     if max(state.st_size, len(data)) > max_bytes:
         raise DocumentError(
             f"the {label} '{path}' is too large",
@@ -79,6 +78,14 @@ def read_file(
         ) from OSError(errno.EFBIG, os.strerror(errno.EFBIG), str(path))
     log_step("DEBUG", __name__, "read the %s '%s', %d bytes", label, path, len(data))
     return state, data
+
+
+def why_unreadable(path: Path, number: int | None) -> str:
+    """Return a sentence on why a file cannot be read; ``number`` is the errno(3) of the attempt."""
+    barred = [folder for folder in path.absolute().parents if not os.access(folder, os.X_OK)]
+    if number == errno.EACCES and barred:
+        return f"The folder '{barred[-1]}' cannot be entered: {os.strerror(number)}."
+    return f"{os.strerror(number or errno.EIO)}."
 
 
 def _read_open(path: Path, max_bytes: int) -> tuple[os.stat_result, bytes]:

@@ -44,7 +44,7 @@ from sros_tool.keystore.lifecycle.rotate import rotate_ca
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.template import load_template
 from sros_tool.keystore.transaction import staged_name
-from sros_tool.xml import read_bytes
+from sros_tool.xml import read_bytes, why_unreadable
 from tests.conftest import MEMORY, POLICY
 from tests.support.children import run
 from tests.support.harness import copy_of, snapshot, sros
@@ -835,3 +835,17 @@ def test_a_file_that_became_a_pipe_meanwhile_is_not_waited_for(
     monkeypatch.setattr(Path, "stat", lambda _self: os.stat(tmp_path / "before"))
     with pytest.raises(DocumentError, match="is not a regular file"):
         read_bytes(tmp_path / "file", "policy")
+
+
+def test_a_folder_that_cannot_be_entered_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not the file, whose mode may be right; root can enter every folder."""
+    (folder := tmp_path / "enclaves").mkdir()
+    file = folder / "governance.p7s"
+    monkeypatch.setattr(os, "access", lambda path, _mode: path != folder)
+    barred = f"The folder '{folder}' cannot be entered: Permission denied."
+    assert why_unreadable(file, errno.EACCES) == barred
+    assert why_unreadable(file, errno.EIO) == "Input/output error."
+    monkeypatch.setattr(os, "access", lambda _path, _mode: True)
+    assert why_unreadable(file, errno.EACCES) == "Permission denied."

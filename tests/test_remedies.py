@@ -134,7 +134,7 @@ def test_a_remedy_in_a_folder_of_close_names_close(tmp_path: Path) -> None:
     export, keystore = tmp_path / "export", tmp_path / "keystore"
     for folder in (export, keystore / "private"):
         folder.mkdir(parents=True)
-    for file in ("processes.json", "policy.xml", "keystore/private/key"):
+    for file in ("processes.json", "policy.xml", "observed.json", "keystore/private/key"):
         (tmp_path / file).touch()
     close = f"run `sros close {tmp_path}`"
     sign = STALE.remedy
@@ -153,5 +153,7 @@ def test_a_remedy_in_a_folder_of_close_names_close(tmp_path: Path) -> None:
             mended = remedy_in_closed_robot(root, remedy)
             assert said in mended and mended.count("sros close") == 1
         assert remedy_in_closed_robot(tmp_path, remedy) == remedy
-    (keystore / "private/key").unlink()
-    assert remedy_in_closed_robot(export, renew) == renew
+    for gone in ("observed.json", "keystore/private/key"):  # an office has no observation
+        (kept := tmp_path / gone).rename(tmp_path / "gone")
+        assert remedy_in_closed_robot(export, renew) == renew
+        (tmp_path / "gone").rename(kept)

@@ -94,6 +94,7 @@ def distribute_key(
     """
     from sros_tool.keystore.delivery.archive import SUFFIXES
     from sros_tool.keystore.delivery.export import distribute, pack_enclaves, with_keys_here
+    from sros_tool.keystore.layout import enclave_folder
     from sros_tool.keystore.outcomes import changes_below
     from sros_tool.keystore.reader import OpenedKeystore
 
@@ -107,6 +108,7 @@ def distribute_key(
     chosen = chosen_enclaves(keystore, names, patterns, robots)
     selection = with_keys_here(keystore, chosen, names, keyless=keyless)
     notes: tuple[Note, ...] = ()
+    kept: list[str] = []
     if target == _STREAM:
         if not dry_run:
             _refuse_json(as_json)
@@ -138,22 +140,28 @@ def distribute_key(
         changes = changes_below(below, export.changes)
         if dry_run and not as_json:
             print_plan(below, export.changes)
-        elif not export.changes and not dry_run:
-            for name in selection.names:
-                echo(f"enclave {name} in '{target}' is already up to date", err=True)
+        changed = {Path(change.path).parent for change in export.changes}
+        kept = [
+            name
+            for name in selection.names
+            if not changed or (below == target and Path(enclave_folder(name)) not in changed)
+        ]
+        for name in kept if not dry_run else ():
+            echo(f"enclave {name} in '{target}' is already up to date", err=True)
         for change in export.changes if done else ():
             if word := {"replace": "replaced", "remove": "removed"}.get(change.action):
                 echo(f"{word} {change.path}", err=True)
         if done:
             print_closed(below, export.changes, keystore=root)
-    for name in selection.names if done and not as_json else ():
+    exported = [name for name in selection.names if name not in kept]
+    for name in exported if done and not as_json else ():
         echo(f"exported enclave {name} to {where}", err=target == _STREAM)
     if as_json:
         from sros_tool.keystore.delivery.export import ExportedEnclaves, exported_outcomes
 
         archive = target == _STREAM or target.name.endswith(SUFFIXES)
         folder, names = Path() if archive else target, selection.names
-        outcomes = exported_outcomes(keystore, names, folder, changed=bool(changes))
+        outcomes = exported_outcomes(keystore, names, folder, kept=kept)
         left_out = selection.left_out
         print_json(ExportedEnclaves(root, dry_run, target, outcomes, left_out, changes, notes))
     else:

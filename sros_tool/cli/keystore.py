@@ -361,7 +361,7 @@ def _next_step_hints(result: Creation, as_json: bool) -> Iterator[str]:
     """Yield hints for standard error: how enclaves get to robots, and unchanged enclaves."""
     from sros_tool.fleet.robots import robot_of
     from sros_tool.keystore.fleet import load_fleet, publish_command
-    from sros_tool.keystore.layout import FLEET, remedy_in_closed_robot
+    from sros_tool.keystore.layout import EARLIER_FILES, FLEET, remedy_in_closed_robot
     from sros_tool.keystore.reader import OpenedKeystore
 
     published = "" if as_json or result.dry_run else publish_command(result.root)
@@ -387,8 +387,7 @@ def _next_step_hints(result: Creation, as_json: bool) -> Iterator[str]:
     elif result.changed and not (as_json or result.dry_run):
         yield remedy_in_closed_robot(
             result.root,
-            "running processes keep the earlier files: restart them; first export again if they "
-            "use an export",
+            f"{EARLIER_FILES}: restart them; first export again if they use an export",
         )
     if result.revoked:
         verb = "would revoke" if result.dry_run else "revoked"

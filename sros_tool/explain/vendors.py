@@ -272,7 +272,12 @@ def _provenance_notes(answer: Answer) -> Iterator[Note]:
                 "rights. The lines shown are from the current file."
             )
         case Provenance.UNKNOWN:
-            text = f"the ledger does not say whether the permissions were made from '{policy}'."
+            why = (
+                "an export has no ledger, which would"
+                if answer.is_of_export
+                else "the ledger does not"
+            )
+            text = f"{why} say whether the permissions were made from '{policy}'."
             if answer.sign:
                 text = f"'{policy}' allows this: the permissions are older, or from another policy."
         case _:

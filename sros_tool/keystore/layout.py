@@ -20,6 +20,7 @@ from sros_tool.faults import ORIGINAL_KEYSTORE, remedy_in_original_keystore
 
 ENCLAVES, PUBLIC, PRIVATE = "enclaves", "public", "private"
 CLOSED_PROCESSES, CLOSED_POLICY = "processes.json", "policy.xml"
+CLOSED_OBSERVATION = "observed.json"
 """Files that `sros close` writes next to its keystore."""
 CLOSED_KEYSTORE = "keystore"
 """The keystore in a folder of `sros close`, until it is brought to another machine."""
@@ -257,6 +258,8 @@ def remedy_in_keystore(root: Path, remedy: str) -> str:
     return remedy_in_closed_robot(root, remedy_in_original_keystore(remedy))
 
 
+EARLIER_FILES = "running processes keep the earlier files"
+"""Begins the advice on what to do after permissions were signed."""
 _EXPORT_AGAIN = re.compile(
     r"\b([Ee])xport (?:(?:(?:the|their|its|these) enclaves?|them) )?again"
     rf"(?:(?: from the {ORIGINAL_KEYSTORE}:)? \(?`sros distribute_key [^`]+`\)?)?"
@@ -269,10 +272,12 @@ _SIGN_POLICY = re.compile(r"un `sros generate_artifacts -k [^`]+ -p POLICY_FILE`
 def remedy_in_closed_robot(root: Path, remedy: str) -> str:
     """Return a remedy for ``root``; in a closed robot's folder, `sros close` signs and exports.
 
-    If the CA keys are no longer in that folder, the remedy is returned unchanged.
+    The remedy is returned unchanged if the CA keys are no longer in that folder, and in an office,
+    to which nobody brings the observation of the robot.
     """
     robot = folder_of_closed_robot(root)
-    if not (robot and is_original_keystore(robot / CLOSED_KEYSTORE)):
+    is_here = robot and (robot / CLOSED_OBSERVATION).is_file()
+    if not (robot and is_here and is_original_keystore(robot / CLOSED_KEYSTORE)):
         return remedy
     close, keystore = f"un `sros close {quote(str(robot))}`", quote(str(robot / CLOSED_KEYSTORE))
     remedy = _EXPORT_AGAIN.sub(lambda found: ("R" if found[1] == "E" else "r") + close, remedy)

@@ -597,7 +597,8 @@ class _Draft:
         for before, paths in zip((True, False), self._further, strict=True):
             if paths:
                 side = self._side(before)
-                notes = [f"over up to {max(side[path] for path in paths)} hops"]
+                hops, direct = max(side[path] for path in paths), 2 if before else 1
+                notes = ["directly" if hops <= direct else f"over up to {hops} hops"]
                 column = 1 if before else self.columns - 2  # one column before the outermost one
                 card = "s:" if before else "l:"
                 yield side_card(card, column, f"{len(paths)} more", notes, paths)

@@ -78,6 +78,10 @@ def test_exported_enclaves_are_listed(keystore: Path, tmp_path: Path) -> None:
     ]
     ended = sros("distribute_key", keystore, "--all", tmp_path / "out").ok()
     assert (ended.out, ended.err.count("already up to date")) == ("", 2)
+    (tmp_path / "out/enclaves/b/permissions.p7s").unlink()
+    ended = sros("distribute_key", keystore, "--all", tmp_path / "out", "--force").ok()
+    assert ended.out == f"exported enclave /b to '{tmp_path / 'out'}'\n"
+    assert f"enclave /a in '{tmp_path / 'out'}' is already up to date\n" in ended.err
     assert sros("list_enclaves", tmp_path / "out").ok().out == "/a\n/b\n"
 
 

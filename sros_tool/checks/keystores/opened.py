@@ -36,6 +36,7 @@ from sros_tool.keystore.settings import HandEdits, hand_edits
 from sros_tool.keystore.template import Template, load_template, template_names
 from sros_tool.pki.crl import RevocationList
 from sros_tool.policy.model import Policy
+from sros_tool.xml import why_unreadable
 
 _Part = TypeVar("_Part")
 
@@ -104,7 +105,9 @@ class CheckedKeystore:
         except SrosError as error:
             self._unread[path] = UnreadablePart(path, error)
         except OSError as error:
-            why = SrosError(f"'{path}' cannot be read", f"{error.strerror}.")
+            why = SrosError(
+                f"'{path}' cannot be read", why_unreadable(self.root / path, error.errno)
+            )
             self._unread[path] = UnreadablePart(path, why)
         return otherwise
 

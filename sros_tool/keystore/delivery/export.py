@@ -667,7 +667,7 @@ class ExportedEnclaves(NamedTuple):
             Annotated[
                 str,
                 Words(("exported", "kept")),
-                "`exported`, or `kept` if TARGET was up to date.",
+                "`exported`, or `kept` if its files in TARGET were up to date.",
             ]
         ]
     ]
@@ -679,14 +679,19 @@ class ExportedEnclaves(NamedTuple):
 
 
 def exported_outcomes(
-    keystore: OpenedKeystore, names: Sequence[str], folder: Path, *, changed: bool
+    keystore: OpenedKeystore, names: Sequence[str], folder: Path, *, kept: Collection[str]
 ) -> list[EnclaveResult[str]]:
     """Return the outcomes of exported enclaves, whose files are below ``folder``.
 
-    ``changed`` says whether the export changed any file.
+    The files of the enclaves ``kept`` were up to date.
     """
-    outcome = "exported" if changed else "kept"
     return [
-        enclave_result(keystore, name, outcome, written=True, folder=folder / enclave_folder(name))
+        enclave_result(
+            keystore,
+            name,
+            "kept" if name in kept else "exported",
+            written=True,
+            folder=folder / enclave_folder(name),
+        )
         for name in names
     ]
