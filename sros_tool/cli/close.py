@@ -178,7 +178,7 @@ def close(
     elif not dry_run:
         if not (apply or prove):
             _show(robot, closed)
-        _show_end(robot, closed, apply=apply, holds=holds)
+        _show_end(robot, closed, apply=apply, holds=holds, partial=partial)
     if dry_run:
         return 0
     return int(bool(closed.problems) or ((apply or prove) and not holds))
@@ -188,6 +188,7 @@ def _show(robot: LocalRobot, closed: CloseState) -> None:
     """Print on one screen who may do what, how processes are restarted, and what looks wrong."""
     from sros_tool.close.rights import access_lines
     from sros_tool.keystore.reader import OpenedKeystore
+    from sros_tool.keystore.rights import load_rights
     from sros_tool.policy.document import read_policy
     from sros_tool.reach import unguarded
 
@@ -195,9 +196,13 @@ def _show(robot: LocalRobot, closed: CloseState) -> None:
     if not closed.is_signed:
         return
     echo(f"rights, without those that every node needs (all rights: {robot.page}):")
-    for line in access_lines(policy, robot.folder):
+    keystore, outside = OpenedKeystore(robot.keystore), robot.enclaves_outside_policy()
+    others = load_rights(keystore, only_enclaves=outside).rights
+    for line in access_lines(policy, robot.folder, others):
         echo(f"  {line}")
-    for left_open in unguarded(OpenedKeystore(robot.keystore).governance):
+    if outside:
+        echo(f"  not in the policy, and still with signed rights: {', '.join(outside)}")
+    for left_open in unguarded(keystore.governance):
         does = f"{left_open.direction} DDS topic {left_open.topic}"
         echo(f"  every enclave may {does}: the governance of the keystore leaves it open")
     echo(f"how to restart each process with security (all files: {robot.start}):")
@@ -212,11 +217,11 @@ def _show(robot: LocalRobot, closed: CloseState) -> None:
         echo(f"  {name}: {why}, start it with: {start}")
     if naming := _renaming_advice(closed, policy):
         echo(naming)
-    if not_here := closed.observed.not_here:
+    if not_here := sorted({*closed.observed.not_here}.difference(outside)):
         bring = f"sros distribute_key {shlex.quote(str(robot.keystore))} ENCLAVE FOLDER"
         echo(f"not on this machine: {', '.join(not_here)} (to bring an enclave there: {bring})")
-    if outside := robot.processes.enclaves_outside(policy):
-        echo(f"the policy lacks enclaves that sros saw when it watched: {', '.join(outside)}")
+    if dropped := robot.processes.enclaves_outside(policy):
+        echo(f"the policy lacks enclaves that sros saw when it watched: {', '.join(dropped)}")
     for right in closed.newly_denied[:_MOST_DENIED]:
         echo(f"the policy now denies a right that the robot used when sros watched: {right}")
     if more := closed.newly_denied[_MOST_DENIED:]:
@@ -295,7 +300,9 @@ def _renaming_advice(closed: CloseState, policy: Policy) -> str:
     )
 
 
-def _show_end(robot: LocalRobot, closed: CloseState, *, apply: bool, holds: bool) -> None:
+def _show_end(
+    robot: LocalRobot, closed: CloseState, *, apply: bool, holds: bool, partial: bool
+) -> None:
     """Print whether the robot is closed, the reasons, and what to do next."""
     from sros_tool.close.preparation import rmws_without_security
 
@@ -308,6 +315,7 @@ def _show_end(robot: LocalRobot, closed: CloseState, *, apply: bool, holds: bool
         )
     for proof in closed.proofs:
         accept = " (--partial accepts this)" if proof.is_accepted_by_partial else ""
+        accept = " (accepted: --partial)" if accept and partial else accept
         echo(f"{_ANSWERS[proof.holds]}: {proof.claim}: {proof.reason}{accept}")
     if closed.problems:
         echo(f"{_state_text(closed, apply=apply)}; fix this first:")

@@ -67,6 +67,7 @@ def apply(robot: LocalRobot, prepared: CloseState, *, dry_run: bool) -> CloseSta
         observed=running.observed,
         secured=running.secured,
         outdated=running.outdated,
+        outdated_pids=running.outdated_pids,
         new=running.new,
         absent=running.absent,
     )

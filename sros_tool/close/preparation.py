@@ -18,8 +18,8 @@ from typing import NamedTuple
 
 from sros_tool.checks.requirements import VACUOUS, VIOLATED
 from sros_tool.close.nodes import ObservedNodes
-from sros_tool.close.processes import ROUTER, ClosedProcess, ObservedProcesses, run_words
-from sros_tool.close.robot import MOST_NAMES, OBSERVER, TEMPLATE, LocalRobot
+from sros_tool.close.processes import ClosedProcess, ObservedProcesses, run_words
+from sros_tool.close.robot import MOST_NAMES, TEMPLATE, LocalRobot
 from sros_tool.close.start_files import write_start_files
 from sros_tool.close.state import CloseState, CloseStep, RunningRobot, current_state
 from sros_tool.close.watch import check_watchable, watch
@@ -27,6 +27,7 @@ from sros_tool.errors import SrosError, UsageError
 from sros_tool.files import replace_file
 from sros_tool.folders import Folder
 from sros_tool.keystore.layout import (
+    EARLIER_FILES,
     KEY_FILES,
     enclave_folder,
     enclave_path,
@@ -38,7 +39,12 @@ from sros_tool.keystore.selection import revocation_of
 from sros_tool.policy.document import read_policy
 from sros_tool.runtime.environment import RMW_ZENOH, node_argument
 from sros_tool.runtime.processes import SEVERAL_USERS, launch_verb
-from sros_tool.runtime.rmw import RMW, built_without_security, rmw_implementations
+from sros_tool.runtime.rmw import (
+    RMW,
+    built_without_security,
+    default_rmw,
+    no_security_text,
+)
 from sros_tool.runtime.variables import ENCLAVE
 from sros_tool.values import FileChange
 from sros_tool.wording import counted, enumerated, first_few
@@ -109,9 +115,8 @@ def prepare(robot: LocalRobot, duration: str | None, *, partial: bool, dry_run: 
     if not state.secured:
         for rmw in rmws_without_security(robot, state.observed):
             robot.shell.say(
-                f"WARNING: {rmw} is built without security here: no node starts in an enclave "
-                "with it. Before you stop the robot, find an RMW that enforces security: "
-                "sros doctor"
+                f"WARNING: {no_security_text(rmw)}. Before you stop the robot, find an RMW that "
+                "enforces security: sros doctor"
             )
     return state._replace(
         denied=denied, newly_denied=newly_denied, problems=problems, changes=changes
@@ -264,7 +269,9 @@ def _run_step(robot: LocalRobot, step: CommandStep) -> tuple[str, list[str]]:
     if status or (step.guards and output):
         robot.shell.say_lines("" if step.into else f"{output}{messages}")
     elif step.signs and output:
-        robot.shell.say_lines(messages)
+        for line in messages.splitlines():
+            if not line.startswith(EARLIER_FILES):  # this run exports, and says what to restart
+                robot.shell.say(line)
     needed = shlex.quote(str(robot.requirements))
     if step.guards and VACUOUS.id in output:
         robot.shell.say(
@@ -284,7 +291,7 @@ def _run_step(robot: LocalRobot, step: CommandStep) -> tuple[str, list[str]]:
 def rmws_without_security(robot: LocalRobot, observed: ObservedProcesses) -> list[str]:
     """Return the RMWs that the processes use and that were built without security."""
     environment = robot.shell.environment
-    default = environment.get(RMW) or next(iter(rmw_implementations(environment)), "")
+    default = default_rmw(environment)
     rmws = sorted({process.rmw or default for process in observed.processes})
     return [rmw for rmw in rmws if built_without_security(rmw, environment)]
 
@@ -336,19 +343,21 @@ def _problems_of(robot: LocalRobot, state: CloseState, *, partial: bool) -> Iter
 
 
 def _keystore_problems(robot: LocalRobot) -> Iterator[str]:
-    """Yield a text if the keystore has enclaves that the policy does not have."""
-    known = {OBSERVER, ROUTER, *robot.not_here, *robot.policy_enclaves()}
-    for name in list_enclaves(robot.keystore):
-        if name not in known:
-            revoke = f"sros revoke {shlex.quote(str(robot.keystore))} {name}"
-            yield (
-                f"the keystore has {name}, and the policy does not. If nothing needs it any more: "
-                f"{revoke} (then restart all closed processes, because a process reads "
-                "revocations only when it starts). If it belongs to another machine, such as a "
-                f"laptop: {robot.close_command} --elsewhere {name}. If it belongs to this "
-                "machine: sros "
-                f"merge_policy {shlex.quote(str(robot.policy))} ITS_POLICY --in-place"
+    """Yield a text for each enclave of the keystore that the policy does not have."""
+    merge = f"sros merge_policy {shlex.quote(str(robot.policy))} ITS_POLICY --in-place"
+    for name in robot.enclaves_outside_policy():
+        revoke = f"sros revoke {shlex.quote(str(robot.keystore))} {name}"
+        yield (
+            f"the keystore has {name}, and the policy does not, so {name} keeps the rights that "
+            f"were signed. If nothing needs it any more: {revoke} (then restart all closed "
+            "processes, because a process reads revocations only when it starts). "
+            + (
+                f"If its machine still needs it: {merge}"
+                if name in robot.not_here
+                else f"If it belongs to this machine: {merge}. If it belongs to another machine, "
+                f"such as a laptop: also {robot.close_command} --elsewhere {name}"
             )
+        )
 
 
 def _user_problems(robot: LocalRobot, observed: ObservedProcesses) -> Iterator[str]:

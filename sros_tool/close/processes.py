@@ -32,8 +32,6 @@ from sros_tool.xml import read_bytes
 
 ROUTER = "/router"
 """The enclave of a Zenoh router."""
-_DEMO_ROUTER = ("sros", "demo", "router")
-"""What starts the Zenoh router of the demo."""
 COMPOSE_FILE = "compose.yaml"
 
 
@@ -77,10 +75,8 @@ class ClosedProcess(NamedTuple):
         cls, process: Process, enclave: str, origin: ProcessOrigin, known_by: str
     ) -> ClosedProcess:
         """Return a running process with its enclave and what started it."""
-        pid, command = process.program
-        if process.is_demo_router:  # the arguments of this start would not fit another one
-            command = _DEMO_ROUTER
-        start = enclave, pid, command, origin.folder, process.user, origin.unit
+        pid, _ = process.program
+        start = enclave, pid, _start_command(process), origin.folder, process.user, origin.unit
         rmw = _rmw_to_start(process)
         chooses = process.environment.get(ENCLAVE) == enclave
         return cls(*start, known_by, origin.launch, origin.container, rmw, (), chooses)
@@ -91,9 +87,9 @@ class ClosedProcess(NamedTuple):
         return self.rmw == RMW_ZENOH and self.enclave == ROUTER
 
     @property
-    def is_demo_router(self) -> bool:
-        """Whether `sros demo router` starts the process."""
-        return tuple(self.command) == _DEMO_ROUTER
+    def is_demo(self) -> bool:
+        """Whether `sros demo` starts the process; its nodes name their enclaves themselves."""
+        return tuple(self.command[:2]) == ("sros", "demo")
 
     @property
     def pids_text(self) -> str:
@@ -108,7 +104,7 @@ class ClosedProcess(NamedTuple):
     @property
     def lacks_enclave_argument(self) -> bool:
         """Whether the command has to name the enclave, because Zenoh nodes look for the name."""
-        is_node = self.rmw == RMW_ZENOH and not self.is_router
+        is_node = self.rmw == RMW_ZENOH and not (self.is_router or self.is_demo)
         return is_node and named_enclave(self.command) != self.enclave
 
     def fits(self, process: Process) -> bool:
@@ -121,7 +117,7 @@ class ClosedProcess(NamedTuple):
         rmws = {self.rmw, _rmw_to_start(process)}
         if len(rmws - {""}) > 1 or rmws == {"", RMW_ZENOH}:  # a process that names no RMW is on DDS
             return False
-        words = command_without_enclave(process.program[1], self.enclave)
+        words = command_without_enclave(_start_command(process), self.enclave)
         return words == command_without_enclave(self.command, self.enclave)
 
     def with_current_pid(
@@ -180,7 +176,7 @@ class ClosedProcess(NamedTuple):
         if self.container:
             overlay = shlex.quote(str(folder / "start" / COMPOSE_FILE))
             return f"docker compose -f compose.yaml -f {overlay} up -d"
-        words = (_sros_word(), *self.command[1:]) if self.is_demo_router else self.command
+        words = (_sros_word(), *self.command[1:]) if self.is_demo else self.command
         if self.launch:
             after = launch_verb(self.launch) + 1
             words = launch_words(folder, self.launch[:after], self.launch[after:])
@@ -192,6 +188,11 @@ class ClosedProcess(NamedTuple):
         elif self.rmw:
             words = ("env", f"{RMW}={self.rmw}", *words)
         return f"cd {_shell_word(self.folder)} && {' '.join(map(_shell_word, words))}"
+
+
+def _start_command(process: Process) -> tuple[str, ...]:
+    """Return the command that starts a process again."""
+    return process.demo_command or process.program[1]
 
 
 def _rmw_to_start(process: Process) -> str:

@@ -137,6 +137,10 @@ def _proof_of_files(robot: LocalRobot, expired: Sequence[str]) -> Proof:
                 number = counted(len(changes), "file")
                 reason = f"{number} of '{robot.keystore}' would change there, such as {changes[0]}"
                 holds, reason = False, f"{reason}; `{robot.close_command}` exports them"
+            elif outside := robot.enclaves_outside_policy():
+                reason = f"the keystore has {first_few(outside, MOST_NAMES)}, and the policy does "
+                reason += f"not; `{robot.close_command}` says how to revoke or keep this"
+                holds = False
     unsigned = _unsigned_policy_text(robot) if status == 0 else ""
     return Proof("the files are accepted", holds, f"{reason}: {robot.export}{unsigned}")
 
@@ -259,8 +263,8 @@ def _proof_of_processes(running: RunningRobot, number: int) -> Proof:
         robot.shell.say(f"{finding.subject}: {finding.text}. {remedy}")
     wrong = [finding for finding in findings if finding.id != PROCESS_NOT_SEEN.id]
     if findings:
-        worst = (wrong or findings)[0]
-        return Proof(_CLAIM_STARTED, False if wrong else None, f"{worst.subject}: {worst.text}")
+        texts = [f"{finding.subject}: {finding.text}" for finding in wrong or findings]
+        return Proof(_CLAIM_STARTED, False if wrong else None, first_few(texts, MOST_NAMES, "; "))
     guests = "".join(f"; {guest}" for guest in _unexpected_processes(running))
     summary = f"{counted(number, 'enclave')}, and no open process in domain {robot.domain}"
     return Proof(_CLAIM_STARTED, True, f"{summary}{guests}")
@@ -321,13 +325,30 @@ def _why_missing(running: RunningRobot, missing: Sequence[str], observed: Observ
         reasons.append(f"if it does not always run, add {options}")
     if absent and (in_other_domains := running.in_other_domains()):
         reasons.append(in_other_domains)
-    for why in dict.fromkeys(why for _, why in outdated.values()):
+    for why in dict.fromkeys(why for processes in outdated.values() for _, why in processes):
+        pids = {
+            name: [str(process.pid) for process, cause in outdated[name] if cause == why]
+            for name in outdated
+        }
         enclaves = ", ".join(
-            f"{name} (process {outdated[name][0].pid})"
+            f"{name} ({'process' if len(pids[name]) == 1 else 'processes'} "
+            f"{first_few(pids[name], MOST_NAMES)})"
             for name in missing
-            if name in outdated and outdated[name][1] == why
+            if pids.get(name)
         )
         reasons.append(f"{why} the processes of {enclaves}; restart them")
+    named = {
+        pid
+        for process in observed.processes
+        if process.enclave in absent
+        for pid in (process.pid, *process.alike)
+    }
+    if others := [
+        process.label
+        for process in running.open_processes
+        if not process.is_daemon and process.program[0] not in named
+    ]:
+        reasons.append(f"also open: {first_few(others, MOST_NAMES)}; stop these processes, too")
     return "; ".join(reasons)
 
 
@@ -347,20 +368,21 @@ def _proof_of_talk(running: RunningRobot, nodes: ObservedNodes, away: Collection
         except UnavailableError as error:
             return Proof(TALK, None, f"{error}{_renamed_text(nodes, None, fails=False)}")
         comparison = _TalkComparison(running, nodes, away, audited)
-        differences = {
-            **comparison.differences(),
-            "not judged": audited["unjudged"],
-            "not done": ["the ROS graph kept changing"] if status else [],
-        }
-        reasons = [
-            f"{why}: {first_few(names, MOST_NAMES)}{_remedy(robot, why)}"
+        differences = {**comparison.differences(), "not judged": audited["unjudged"]}
+        if status and not any(differences.values()):
+            differences = {"not done": ["the ROS graph kept changing"]}
+        reasons = {
+            why: f"{why}: {first_few(names, MOST_NAMES)}"
             for why, names in differences.items()
             if names
-        ]
+        }
         if not reasons:
             renamed = _renamed_text(nodes, comparison.current, fails=False)
             return Proof(TALK, True, f"{comparison.summary()}{renamed}")
-    return Proof(TALK, False, f"{reasons[0]}{_renamed_text(nodes, comparison.current, fails=True)}")
+    first, *others = reasons
+    texts = f"{reasons[first]}{_remedy(robot, first)}", *(f"also {reasons[why]}" for why in others)
+    renamed = _renamed_text(nodes, comparison.current, fails=True)
+    return Proof(TALK, False, f"{'; '.join(texts)}{renamed}")
 
 
 def _remedy(robot: LocalRobot, difference: str) -> str:
@@ -403,6 +425,13 @@ class _TalkComparison:
             nodes.nodes_to_compare(self._away, self.current),
             nodes.expected(self.current),
         )
+        names = {*map(node_name, self.current.nodes)}
+        absent = {node["enclave"] for node in unseen}
+        present = [
+            node
+            for node in before.nodes
+            if node_name(node) in names or node.enclaves[0] not in absent
+        ]
         moved, enclaves = nodes.moved_endpoints(self.current), nodes.policy_enclaves
         observed = [
             node for node in nodes.in_their_enclaves() if enclaves.issuperset(node.enclaves)
@@ -420,9 +449,11 @@ class _TalkComparison:
                 if node["enclave"] in ended
             ],
             "not seen": [
-                _unseen_text(self._running, node["node"], node["enclave"]) for node in unseen
+                _unseen_text(self._running, node["node"], node["enclave"])
+                for node in unseen
+                if node["enclave"] not in ended
             ],
-            "gone": _lost_endpoints(before, self.current, self._denied),
+            "gone": _lost_endpoints(make_observation(present), self.current, self._denied),
             "left alone": [
                 *_abandoned_names(before, expected, moved, self._denied),
                 *_lonely_endpoints(

@@ -18,6 +18,7 @@ from sros_tool.names import is_expression, moves_robot
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.merge import merge_into
 from sros_tool.policy.model import ALLOW, DENY, RIGHTS, Policy
+from sros_tool.policy.node_basics import NodeRights
 from sros_tool.policy.patterns import overlap
 from sros_tool.policy.rights import Right, Rules, policy_rights
 from sros_tool.proof.findings import decide_all
@@ -30,13 +31,14 @@ _MOST_LINES = 20
 """Number of names that are shown; the others are counted."""
 
 
-def access_lines(policy: Policy, folder: Path) -> list[str]:
-    """Return a line for each name in a policy: its senders and its receivers.
+def access_lines(policy: Policy, folder: Path, others: frozenset[Right] = frozenset()) -> list[str]:
+    """Return a line for each name that somebody may use: its senders and its receivers.
 
-    Names are left out if they are only used as every node uses them (the common parts).  Names that
-    move the robot come first, with all of their senders.
+    ``others`` are the signed rights of enclaves that the policy does not have.  Names are left out
+    if they are only used as every node uses them (the common parts).  Names that move the robot
+    come first, with all of their senders.
     """
-    sides = _users_by_name(policy, folder)
+    sides = _users_by_name(policy, folder, others)
     kinds = [*RIGHTS]
     names_in_order = sorted(
         sides,
@@ -75,12 +77,15 @@ class _Users(NamedTuple):
         return shown if self.enclaves else f"in part {shown}"
 
 
-def _users_by_name(policy: Policy, folder: Path) -> Mapping[tuple[str, str], Sequence[_Users]]:
+def _users_by_name(
+    policy: Policy, folder: Path, others: frozenset[Right]
+) -> Mapping[tuple[str, str], Sequence[_Users]]:
     """Map kinds and names to the enclaves that may use them, by the rights of the kind."""
-    rights = policy_rights(policy)
+    rights, of_nodes = policy_rights(policy) | others, NodeRights(others)
     rules, enclaves = Rules(rights), sorted({right.enclave for right in rights})
     allowed = {right for right in rights if right.qualifier is ALLOW}
     ordinary = _ordinary_uses(policy, folder)
+    ordinary |= {(use.enclave, use.right, use.name) for use in others if of_nodes.needs(use)}
     expressions = {right for right in allowed if is_expression(right.name)}
 
     def may(enclave: str, right: str, name: str) -> bool:

@@ -13,13 +13,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from sros_tool.checks.environment import secured_by
-from sros_tool.close.processes import ObservedProcesses, read_processes
+from sros_tool.close.processes import ROUTER, ObservedProcesses, read_processes
 from sros_tool.enclave_environment import loadable_environment
 from sros_tool.errors import SrosError, UnavailableError, UsageError
 from sros_tool.files import replace_file
 from sros_tool.folders import make_folders, remove_folders
 from sros_tool.keystore.layout import (
     CLOSED_KEYSTORE,
+    CLOSED_OBSERVATION,
     CLOSED_OBSERVER,
     CLOSED_POLICY,
     CLOSED_PROCESSES,
@@ -107,7 +108,7 @@ class LocalRobot:
         self.keystore, self.export = folder / CLOSED_KEYSTORE, folder / "export"
         self.start, self.page = folder / "start", folder / "rights.html"
         self.commands_file = self.start / "commands.txt"
-        self.observation_file = folder / "observed.json"
+        self.observation_file = folder / CLOSED_OBSERVATION
         self.processes_file = folder / CLOSED_PROCESSES
         self.observed_policy = folder / "seen.xml"
         self._chosen_domain = domain
@@ -202,6 +203,16 @@ class LocalRobot:
     def keystore_enclaves(self) -> set[str]:
         """Return the names of the enclaves in the keystore; none without a keystore."""
         return {*(list_enclaves(self.keystore) if self.keystore.exists() else ())}
+
+    def enclaves_outside_policy(self) -> list[str]:
+        """Return the enclaves of the keystore, of any machine, that the policy does not have.
+
+        Without a policy file, the result is empty.
+        """
+        if not self.policy.exists():
+            return []
+        known = {OBSERVER, ROUTER, *self.policy_enclaves()}
+        return sorted(self.keystore_enclaves() - known)
 
     def export_words(self) -> Sequence[str]:
         """Return the verb, with its arguments, that exports the enclaves of this machine."""

@@ -49,6 +49,9 @@ _LONGEST_PATH = 300
 _LOOK_SECONDS = 0.2
 """How often processes are looked at until they are as they should be."""
 
+_TOOLS = ("ros2", "sros", "sros_tool")
+"""Programs, and packages of Python modules, with which a person tries an enclave."""
+
 TALK = "everything that talked can still talk"
 SILENCE = "an open listener finds nothing"
 _ACCEPTS_REVOKED = f"a certificate was revoked ({CRL_FILE}), and is still accepted by"
@@ -126,24 +129,23 @@ class RunningRobot:
         return {enclave.name for _, enclave in self.secured} - self.not_current.keys()
 
     @cached_property
-    def not_current(self) -> Mapping[str, tuple[Process, str]]:
-        """Map each enclave with a process that is not closed to this process, and the reason.
+    def not_current(self) -> Mapping[str, Sequence[tuple[Process, str]]]:
+        """Map each enclave with processes that are not closed to these processes, with the reasons.
 
-        The reason is text before "the processes of X".  A process of a user who cannot read the
+        A reason is text before "the processes of X".  A process of a user who cannot read the
         files only claims to run in an enclave: such a process counts only if the enclave has no
         other process.
         """
         by_enclave: dict[str, list[SecuredProcess]] = {}
         for secured in self.secured:
             by_enclave.setdefault(secured.enclave.name, []).append(secured)
-        return {
-            name: (process, why)
-            for name, processes in by_enclave.items()
-            for process, enclave in (
-                [each for each in processes if self.may_use_files(each.process)] or processes
-            )
-            if (why := self._why_not_current(process, enclave))
-        }
+        not_current: dict[str, list[tuple[Process, str]]] = {}
+        for name, processes in by_enclave.items():
+            may_use = [each for each in processes if self.may_use_files(each.process)]
+            for process, enclave in may_use or processes:
+                if why := self._why_not_current(process, enclave):
+                    not_current.setdefault(name, []).append((process, why))
+        return not_current
 
     def may_use_files(self, process: Process) -> bool:
         """Return whether a process is of a user who can read the enclaves.
@@ -238,8 +240,9 @@ def secured_process(process: Process, enclave: str) -> ClosedProcess:
 def _with_running_command(observed: ClosedProcess, running: Sequence[Process]) -> ClosedProcess:
     """Return an observed process with the command of the only program that runs in its enclave.
 
-    A program of `ros2`, such as `ros2 topic echo`, does not count. The command also stays if a
-    unit, a launch, a container or another process starts the observed process.
+    Programs of `ros2` and sros, such as `ros2 topic echo` and `sros demo talker`, do not count. The
+    command also stays if a unit, a launch, a container or another process starts the observed
+    process.
     """
     started_by = observed.unit or observed.launch or observed.container or observed.shares
     programs = {process.program: process for process in running}
@@ -247,7 +250,8 @@ def _with_running_command(observed: ClosedProcess, running: Sequence[Process]) -
         return observed
     (process,) = programs.values()
     now = secured_process(process, observed.enclave)
-    if now.unit or now.launch or now.container or program_of(process.command) == "ros2":
+    is_tool = program_of(process.command).partition(".")[0] in _TOOLS
+    if now.unit or now.launch or now.container or is_tool:
         return observed
     return observed._replace(command=now.command, folder=now.folder, rmw=now.rmw, user=now.user)
 
@@ -306,6 +310,9 @@ class CloseState(NamedTuple):
     outdated: Mapping[str, str]
     """Why the processes of these enclaves have to be restarted, as text before "the processes of"
     and the enclave."""
+    outdated_pids: Mapping[str, Sequence[int]]
+    """The ids of the processes that have to be restarted, by these enclaves, in the order in which
+    they should be restarted."""
     new: Sequence[str]
     """The enclaves of the policy without a process: none was observed, and none runs now."""
     absent: Sequence[str]
@@ -315,7 +322,7 @@ class CloseState(NamedTuple):
     needed_elsewhere: Mapping[str, datetime]
     """The enclaves of other machines, and when their files in the keystore changed last, in UTC. A
     machine with earlier files still trusts certificates that were revoked since, and needs the
-    current files.
+    current files. Without enclaves that the policy does not have: `problems` names them.
     """
     valid_until: datetime | None
     """When the first enclave of the export expires, in UTC; null without an export."""
@@ -399,26 +406,32 @@ def current_state(robot: LocalRobot, policy: Policy | None) -> CloseState:
     if policy and robot.observed:
         new = {enclave.path for enclave in policy.enclaves} - known - {*observed.elsewhere}
         new -= robot.not_here | {OBSERVER}
+    outdated = {
+        name: processes
+        for name, processes in sorted(
+            running.not_current.items(),
+            key=lambda entry: (entry[1][-1][1].endswith(_ACCEPTS_REVOKED), entry[0]),
+        )
+        if name in secured
+    }
     check_enclaves(robot.without, known | new | robot.not_here, "--without")
+    outside = robot.enclaves_outside_policy() if policy else ()  # the policy may be broken
     return CloseState(
         folder=robot.folder,
         observed=observed,
         steps=(),
         secured=secured,
-        outdated={
-            name: why
-            for name, (_, why) in sorted(
-                running.not_current.items(),
-                key=lambda entry: (entry[1][1].endswith(_ACCEPTS_REVOKED), entry[0]),
-            )
-            if name in secured
+        outdated={name: processes[-1][1] for name, processes in outdated.items()},
+        outdated_pids={
+            name: [*dict.fromkeys(process.program[0] for process, _ in processes)]
+            for name, processes in outdated.items()
         },
         new=sorted(new),
         absent=sorted(absent - secured.keys()),
         without=robot.without,
         needed_elsewhere={
             name: time_of_file(max(times))
-            for name in sorted(robot.not_here)
+            for name in sorted(robot.not_here.difference(outside))
             if (times := _file_times(enclave_path(robot.keystore, name)))
         },
         valid_until=(until := _valid_until(robot)),

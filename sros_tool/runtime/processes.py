@@ -28,6 +28,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from functools import cache, partial
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -64,6 +65,9 @@ _ZENOHD = "zenohd"
 """The Zenoh router without rmw_zenoh, which does not read the variables of rmw_zenoh."""
 _ROUTERS = ("rmw_zenohd", _ZENOHD)
 _BRIDGES = ("zenoh-bridge-ros2dds", "zenoh-bridge-dds")
+_DEMO_MODULE = re.compile(r"sros_tool\.demo\.(?:cyclone|ros|zenoh)_node")
+_DEMO_TYPE = "std_msgs/msg/String"
+"""The type of messages without the option --type, which only some nodes of the demo take."""
 _INTERPRETER = re.compile(r"(?:python[\d.]*|sh|bash|dash|perl|ruby|node)\Z")
 _PYTHON_FLAGS = re.compile(r"-[BEIOPbdiqsuvx]+\Z")
 """Python options without a value (such as -u); some of them are also options of shells."""
@@ -187,17 +191,29 @@ class Process:
         uris = self.environment.get(SESSION_URI), self.environment.get(ROUTER_URI, "")
         is_no_session = uris[0] == NO_CONFIGURATION and uris[1] not in ("", NO_CONFIGURATION)
         return (
-            self.is_demo_router
+            self.demo_command[2:] == ("router",)
             or (is_no_session and self.rmw.startswith(RMW_ZENOH))
             or not _programs_in(self.command).isdisjoint(_ROUTERS)
         )
 
     @property
-    def is_demo_router(self) -> bool:
-        """Whether the process is the router that `sros demo router` starts."""
-        return ("-m", "sros_tool.demo.zenoh_node", "router") in zip(
-            self.command, self.command[1:], self.command[2:], strict=False
-        )
+    def demo_command(self) -> tuple[str, ...]:
+        """The `sros demo` command that started this node or router; () for other processes.
+
+        The node's own command has a file descriptor of one start.
+        """
+        words = self.command
+        for flag, module, role in zip(words, words[1:], words[2:], strict=False):
+            if flag == "-m" and _DEMO_MODULE.fullmatch(module):
+                is_by_hand = role == "router" or "--by-hand" in words
+                options = [
+                    word
+                    for pair in pairwise(words)
+                    if pair[0] in ("--topic", "--type") and pair[1] != _DEMO_TYPE
+                    for word in pair
+                ]
+                return ("sros", "demo", role, *options) if is_by_hand else ()
+        return ()
 
     @property
     def is_daemon(self) -> bool:

@@ -106,6 +106,11 @@ def rmw_implementations(environment: Mapping[str, str]) -> tuple[str, ...]:
     return tuple(sorted(names, key=lambda name: (name != preferred, name)))
 
 
+def default_rmw(environment: Mapping[str, str]) -> str:
+    """Return the RMW that nodes use in an environment; "" if that is not known."""
+    return environment.get(RMW) or next(iter(rmw_implementations(environment)), "")
+
+
 def _prefixes(environment: Mapping[str, str]) -> list[str]:
     paths = environment.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
     return [prefix for prefix in (*paths, sys.prefix) if prefix]
@@ -160,6 +165,11 @@ def built_without_security(rmw: str, environment: Mapping[str, str]) -> bool:
             except OSError:
                 return False
     return False
+
+
+def no_security_text(rmw: str) -> str:
+    """Return a sentence on an RMW that `built_without_security` names."""
+    return f"{rmw} is built without security here: no node starts in an enclave with it"
 
 
 _MOST_BYTES = 16 * 1024 * 1024

@@ -317,9 +317,9 @@ def test_what_is_taken_out_of_the_policy_stays_out(robot: Robot) -> None:
     mine = robot.folder / "robot/start/mine.env"
     mine.write_text("A=1\n")
     first = robot.close("--apply", status=1)
-    assert "the keystore has /listener, and the policy does not. If nothing needs" in first.out
+    assert "the keystore has /listener, and the policy does not, so /listener keeps" in first.out
     assert f"{revoke} (then restart all closed processes, " in first.out
-    assert ". If it belongs to another machine, such as a laptop: sros close r" in first.out
+    assert ". If it belongs to another machine, such as a laptop: also sros cl" in first.out
     assert (
         "removed robot/start/listener.env: it was for an enclave without a " in first.err
         and mine.exists()
@@ -374,10 +374,11 @@ def renew_without_systemd(robot: Robot) -> None:
     page = (Path(__file__).parents[2] / "docs/howto/close.md").read_text()
     script = page.partition("tests/cli/test_close.py runs these lines -->\n```sh\n")[2]
     lines = script.partition("```")[0].replace("/opt/robot/stands-still", "true")
-    # The process of an enclave runs by another command than the known one.
+    # A second process runs in an enclave, by another command than the known one.
+    robot.more = (replace(robot.process("/talker", is_secured=True), pid=13, command=("b",)),)
     closed = json.loads(robot.close("--json", "--dry-run").out)
+    robot.more = ()
     assert closed["outdated"].keys() == PID.keys()
-    closed["processes"].append({**closed["processes"][0], "pid": 0})
     (said := robot.folder / "said.json").write_text(json.dumps(closed))
     functions = f"""
         sros() {{ [ "$3" != --json ] && echo "sros $*" || cat {said}; }}
@@ -388,7 +389,7 @@ def renew_without_systemd(robot: Robot) -> None:
     assert (ran.returncode, ran.stderr) == (0, "")
     assert ran.stdout.splitlines() == [
         "sros renew /opt/robot/keystore --all-expiring 30d",
-        *(f"kill {PID[process['enclave']]}" for process in closed["processes"][:2]),
+        *(f"kill {pid}" for pid in (PID["/listener"], PID["/talker"], 13)),
         "sros close /opt/robot --proof",
     ]
     said.unlink()
@@ -708,7 +709,7 @@ def test_a_node_that_does_not_run_always(robot: Robot) -> None:
     assert "the robot is closed, without a process of /listener; the files are" in ended.err
     robot.unseen = (UnseenProcess(9, (), "/proc hides it", speaks=False),)
     ended = robot.close(*without, "--partial")
-    assert "; not seen: /listener (--partial accepts this)\n" in ended.out
+    assert "; not seen: /listener (accepted: --partial)\n" in ended.out
     robot.unseen = ()
     robot.absent, robot.by_hand = set(), {"/listener", "/talker"}  # it is compared, too
     assert "no: everything that talked can still t" in robot.close(*without, status=1).out
@@ -735,7 +736,14 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     robot.close("--apply")
     robot.more = (Process(5, ("spy", "--ros-args"), {}, datetime.now(UTC)),)
     robot.more += (robot.process("/talker", is_secured=False),)
+    robot.more += tuple(replace(robot.more[0], pid=pid) for pid in (6, 7))
+    robot.absent = {"/listener"}
+    said = robot.close("--proof", status=1).out
+    assert "no secured process of /listener (" in said
+    assert "; also open: process 5 (spy), process 4711 (run), process 6 (spy) and 1 more; " in said
+    robot.absent = set()
     ended = robot.close("--proof", status=1)
+    assert "; process 6 (spy): in domain 0" in ended.out and " and 1 more\n" in ended.out
     assert "no: every process was started in its enclave: process 5 (spy)" in ended.out
     assert "ROS_SECURITY_ENABLE. Stop it: another process runs in /talker.\n" in ended.err
     robot.more = ()
@@ -753,6 +761,9 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     said = robot.close().out
     assert "\n  restart, because " in said
     assert " changed, or got another mode, after the start of the processes of /talker\n" in said
+    robot.more = (replace(robot.process("/talker", is_secured=True), pid=13, command=("b",)),)
+    named = f"the processes of /talker (processes {PID['/talker']}, 13); restart them\n"
+    assert named in robot.close("--proof", status=1).out
     robot.outdated, robot.absent = set(), {"/talker"}
     talker = robot.process("/talker", is_secured=True)
     robot.more = (replace(talker, started=datetime.now(UTC) + timedelta(days=1)),)
@@ -791,9 +802,9 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
         "; if the node uses another name now, write that name into its profile in 'robot/" in said
     )
     assert "start the node as before (robot/start/commands.txt)" in said
-    robot.remaining = (TALKER, LISTENER, ros_node("guest", "05"))
+    robot.remaining = (TALKER, ros_node("guest", "05"))
     said = robot.close("--proof", status=1).out
-    assert f"{lost}denied: /guest " in said
+    assert f"{lost}denied: /guest " in said and "; also not seen: /listener (" in said
     assert "; if a node needs this, add it to its profile in 'robot/policy.xml', and run `s" in said
     robot.remaining = (TALKER, LISTENER)
     robot.nodes = (*robot.nodes, ("/", "/", "spy", "03", ["subscribe rt/chatter"]))
@@ -850,7 +861,7 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     )
     assert (
         "not checked: every process was started in its enclave: processes: process 9 (?) may be a "
-        "node, and cannot be looked at (/proc hides it) (--partial accepts this)\n"
+        "node, and cannot be looked at (/proc hides it) (accepted: --partial)\n"
     ) in ended.out
     assert "closed, except for the claims that were not checked" in ended.err
 
@@ -1457,7 +1468,9 @@ def test_what_is_exported_without_the_enclaves_of_other_machines(
     state_now = state.current_state(robot, None)
     assert state_now.needed_elsewhere == {"/b": datetime.fromtimestamp(revoked, UTC)}
     for problems in ((), ("the policy is broken",)):
-        close._show_end(robot, state_now._replace(problems=problems), apply=False, holds=False)
+        close._show_end(
+            robot, state_now._replace(problems=problems), apply=False, holds=False, partial=False
+        )
         said = capsys.readouterr()
         assert ("fix this first" in said.out) is bool(problems)
         assert "restart the process: /b (2027-01-15T08:00:00Z): sros distr" in said.err
@@ -1560,12 +1573,22 @@ def test_an_enclave_that_belongs_to_another_machine(robot: Robot) -> None:
     policy.write_bytes(without_person)
     assert list_enclaves(robot.folder / "robot/export") == ("/sros_observer", "/talker")
     robot.remaining = (TALKER, LISTENER)
-    assert "(types are not compared), without /operator/look\n" in robot.close("--proof").out
+    # Out of the policy, it keeps what was signed, and its machine has the key.
+    ended = robot.close(status=1)
+    kept = "  the keystore has /operator/look, and the policy does not, so /operator/look keeps"
+    assert kept in ended.out and "sros revoke robot/keystore /operator/look (then" in ended.out
+    assert "  topic /chatter: /talker -> /listener, /operator/look\n" in ended.out
+    assert "  not in the policy, and still with signed rights: /operator/look\n" in ended.out
+    assert "\nnot on this machine: /listener (to " in ended.out
+    assert "/operator/look (" not in ended.err, "nobody is to bring its files there"
+    proved = robot.close("--proof", status=1).out
+    assert "no: the files are accepted: the keystore has /operator/look, and the policy" in proved
+    assert "(types are not compared), without /operator/look\n" in proved
     sros("revoke", "robot/keystore", "/operator/look", cwd=robot.folder).ok()
     assert "\nnot on this machine: /listener (to " in robot.close().out
     assert "/operator/look" not in robot.close("--proof").out
     sros("create_enclave", "robot/keystore", "/operator/look", cwd=robot.folder).ok()
-    robot.close("--elsewhere", "/operator/look")
+    robot.close("--elsewhere", "/operator/look", status=1)
     robot.by_hand = set()
     there = "start /listener and /operator/look, on other machines, without sros run, too"
     assert f"sros sees no process in an enclave of this folder; {there}\n" in (

@@ -111,6 +111,9 @@ def test_the_command_of_a_secured_process_takes_the_place_of_the_observed_one(
         return " ".join(first.command), f"{first.folder} {first.rmw}".rstrip()
 
     assert command_after([before], camera) == ("pilot --camera", "/new")
+    # What such a try left behind gives way to the program.
+    tried = before._replace(command=("sros", "demo", "talker", "--topic", "/image"))
+    assert command_after([tried], camera) == ("pilot --camera", "/new")
     cyclone = replace(camera, environment={RMW: "rmw_cyclonedds_cpp"})
     assert command_after([before], cyclone) == ("pilot --camera", "/new rmw_cyclonedds_cpp")
     ros2 = replace(camera, command=("/usr/bin/python3", "/opt/ros/bin/ros2", "topic", "echo"))
@@ -120,6 +123,9 @@ def test_the_command_of_a_secured_process_takes_the_place_of_the_observed_one(
         ([before], (replace(camera, user=4321),)),
         *(([before], (replace(camera, pid=pid),)) for pid in origins),
         ([before], (ros2,)),
+        ([before], (replace(camera, command=demo_node("talker", "/image")),)),
+        ([before], (replace(camera, command=demo_node("talker", "/image")[:-4]),)),
+        ([before], (replace(camera, command=("/opt/venv/bin/python3", "/opt/venv/bin/sros")),)),
         ([before], (replace(camera, enclave=replace(enclave, folders=((1, 1),))),)),
         ([before, before._replace(pid=6)], (camera,)),
         ([before._replace(unit="pilot.service")], (camera,)),
@@ -196,6 +202,29 @@ def test_a_router_has_no_node_and_is_no_unknown_process() -> None:
         assert known.fits(script) and known.fits(open_script), "it is known by its command, too"
 
 
+def demo_node(role: str, topic: str, kind: str = "std_msgs/msg/String") -> tuple[str, ...]:
+    """The command of the node that `sros demo` starts."""
+    module = "sros_tool.demo.ros_node" if "String" not in kind else "sros_tool.demo.cyclone_node"
+    node = ("/opt/python3", "-P", "-m", module, role, "--period", "1", "--topic", topic)
+    return (*node, "--by-hand", "--type", kind, "--report", "/proc/self/fd/4")
+
+
+def test_a_node_of_the_demo_is_started_by_the_command_of_a_person() -> None:
+    """Its own command names a file descriptor of one start, and would end with an error."""
+    twist = "geometry_msgs/msg/Twist"
+    for command, again in (
+        (demo_node("talker", "/image"), "sros demo talker --topic /image"),
+        (demo_node("listener", "/image"), "sros demo listener --topic /image"),
+        (demo_node("talker", "/a b", twist), f"sros demo talker --topic '/a b' --type {twist}"),
+    ):
+        node = process(8, *command)
+        for rmw in ("", RMW_ZENOH):
+            here = replace(node, environment={RMW: rmw})
+            known = ClosedProcess.from_process(here, "/tried", ProcessOrigin("", "/opt"), "enclave")
+            assert known.secured_command(Path()).endswith(f"-- {again}"), rmw
+            assert known.fits(replace(here, pid=9)) and not known.fits(process(9, "other"))
+
+
 def test_an_enclave_is_closed_only_if_all_its_processes_are(tmp_path: Path) -> None:
     """Such as two routers, of which one is old; a process of others only claims to be in one."""
     now, state = datetime.now(UTC), tmp_path.stat()
@@ -228,5 +257,6 @@ def test_an_enclave_is_closed_only_if_all_its_processes_are(tmp_path: Path) -> N
         ),
     ):
         running = RunningRobot(robot, RunningProcesses(processes))
-        assert running.not_current.get("/router", (old, None))[1] == why
+        reasons = [reason for _, reason in running.not_current.get("/router", ())]
+        assert reasons == ([why] if why else [])
         assert ("/router" in running.current_enclaves) is (why is None)
