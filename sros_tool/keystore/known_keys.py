@@ -27,7 +27,7 @@ from sros_tool.keystore.layout import (
     REVOKED,
     revoked_certificates,
 )
-from sros_tool.keystore.ledger import RECORDED_LATE, REPORTED, RESTORED, Entry
+from sros_tool.keystore.ledger import RECORDED_LATE, REPORTED, RESTORED, Entry, Ledger
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.parallel import map_slices
 from sros_tool.pki.certificates import (
@@ -109,6 +109,25 @@ def restored_at(keystore: OpenedKeystore) -> str:
     """Return when a keystore was restored with an identity CA that it trusts; "" if never."""
     entries = _since_trusted(keystore, keystore.ledger_with("what", RESTORED).entries)
     return next((entry.time for entry in reversed(entries) if entry.what == RESTORED), "")
+
+
+def subjects_since_restore(keystore: OpenedKeystore, ledger: Ledger) -> frozenset[str] | None:
+    """Return the subjects first recorded after the last restore; None if no restore matters.
+
+    Nothing that a ledger lacks after a restore fits such a subject: neither certificates nor
+    permissions.  A restore matters until both CAs were replaced.  Subjects that only messages or
+    published releases showed (`KnownKeys.shown_after_restore`) do not count.
+    """
+    entries = ledger.entries
+    trusted = max((_since_trusted(keystore, entries, r) for r in (IDENTITY, PERMISSIONS)), key=len)
+    times = {entry.time for entry in trusted if entry.what == RESTORED}
+    if not times:
+        return None
+    last = max(place for place, entry in enumerate(entries) if entry.what == RESTORED) + 1
+    shown = {e.subject for e in entries[last:] if e.reason == REPORTED or e.time in times}
+    return frozenset(entry.subject for entry in entries[last:]).difference(
+        shown, (entry.subject for entry in entries[:last])
+    )
 
 
 def _since_trusted(

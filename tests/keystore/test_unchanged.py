@@ -12,6 +12,7 @@ import pytest
 from sros_tool.errors import KeystoreError
 from sros_tool.fleet.robots import Fleet, Robot
 from sros_tool.keystore.expiry import read_credentials
+from sros_tool.keystore.ledger import REPORTED
 from sros_tool.keystore.lifecycle.create import (
     Creation,
     create_enclaves,
@@ -19,7 +20,8 @@ from sros_tool.keystore.lifecycle.create import (
     generate_artifacts,
 )
 from sros_tool.keystore.lifecycle.renew import renew
-from sros_tool.keystore.lifecycle.revoke import revoke
+from sros_tool.keystore.lifecycle.revocation_list import LostRecords
+from sros_tool.keystore.lifecycle.revoke import restore_revocations, revoke
 from sros_tool.keystore.lifecycle.rotate import rotate_ca
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.template import load_template
@@ -276,6 +278,23 @@ def test_old_certificates_are_revoked_where_other_permissions_fit_them(folder: P
     again = sros(*words, cwd=folder).ok()
     assert not again.out and "revoke" not in again.err
     assert state(folder, datetime.now(UTC)).kept == NAMES
+
+
+def test_after_a_restore_certificates_are_replaced_once(folder: Path) -> None:
+    """What the ledger lacks cannot fit a subject that the keystore chose after the restore."""
+    root, backup = folder / "ks", copy_of(folder / "ks", folder / "backup")
+    renew(root, ["/a"], now=NOW)
+    lost = LostRecords(OpenedKeystore(backup), NOW)
+    assert lost.add_certificate(OpenedKeystore(root).certificate_of("/a"), REPORTED)
+    restore_revocations(backup, lost, now=NOW)
+    renew(backup, ["/a"], now=NOW + DAY, revoke_old=True)
+    root.rename(folder / "lost")
+    backup.rename(root)
+    first, second = (state(folder, NOW + n * DAY, revoke_old=True) for n in (2, 3))
+    assert (first.changed, first.kept, second.kept) == (("/b", "/c"), ("/a",), NAMES)
+    assert first.revoked == 2 and not second.revoked
+    (note,) = (each.text for each in first.notes if each.id == "permissions.others-fit")
+    assert note.startswith("/b, /c: new certificates") and "restored from a backup" in note
 
 
 @pytest.mark.parametrize(

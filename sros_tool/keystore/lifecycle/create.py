@@ -52,7 +52,7 @@ from sros_tool.keystore.issuing.enclave import (
     present_files,
     stated_enclave,
 )
-from sros_tool.keystore.known_keys import revoked_serials
+from sros_tool.keystore.known_keys import revoked_serials, subjects_since_restore
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     ENCLAVES,
@@ -790,6 +790,7 @@ def write_enclaves(
     change.entries += writer.entries
     change.notes = [
         *(note for made in done.values() for note in made.notes),
+        *_others_notes(done),
         *(writer.notes if writer.entries else ()),
         *(() if change.template.unique_subject else name_notes({*change.names, *created}, created)),
         *change.notes,
@@ -814,12 +815,24 @@ def write_enclaves(
 
 @dataclass(frozen=True, slots=True)
 class _EnclaveOutcome:
-    """The outcome for an enclave; ``superseded`` is its old certificate if that must be revoked."""
+    """The outcome for an enclave; ``superseded`` is its old certificate if that must be revoked.
+
+    ``others`` is the reason why this was done although the rights stay the same.
+    """
 
     outcome: str
     notes: tuple[Note, ...]
     replaced: ReplacedRights | None = None
     superseded: Superseded | None = None
+    others: str = ""
+
+
+def _others_notes(done: Mapping[str, _EnclaveOutcome]) -> Iterator[Note]:
+    """Yield a note for each reason to replace certificates of enclaves that keep their rights."""
+    for reason in sorted({made.others for made in done.values()} - {""}):
+        names = [name for name, made in done.items() if made.others == reason]
+        text = f"new certificates although the rights are the same: {reason}"
+        yield Note("permissions.others-fit", f"{first_few(names, 5)}: {text}.")
 
 
 class _EnclaveMaker:
@@ -850,7 +863,7 @@ class _EnclaveMaker:
         present = present_files(root, name)
         before = len(change.transaction.changes)
         identity = self._identity(name, present, replaced=bool(policy))
-        earlier, old = None, None
+        earlier, old, others = None, None, ""
         certificate = identity if isinstance(identity, x509.Certificate) else None
         rights = None
         if policy or PERMISSIONS_FILE not in present:
@@ -861,9 +874,10 @@ class _EnclaveMaker:
             and certificate
             and PERMISSIONS_FILE in present
             and self._is_kept(certificate, rights)
-            and not (self._revoke_old and self._may_have_others(name, certificate))
         ):
-            rights = None
+            others = self._others(name, certificate) if self._revoke_old else ""
+            if not others:
+                rights = None
         if rights and PERMISSIONS_FILE in present:
             earlier = earlier_permissions(
                 change.keystore, name, change.permissions.certificate, certificate
@@ -885,44 +899,60 @@ class _EnclaveMaker:
             if old is None:
                 return _EnclaveOutcome("changed", notes, replaced)
             superseded = Superseded.record(name, old, issued.certificate, change.now)
-            return _EnclaveOutcome("changed", notes, replaced and replaced.revoked(), superseded)
+            revoked = replaced and replaced.revoked()
+            return _EnclaveOutcome("changed", notes, revoked, superseded, others)
         if rights and policy is None:
             notes += tuple(self._lost_rights_notes(rights.enclave, present))
         completed = len(change.transaction.changes) > before
         return _EnclaveOutcome("completed" if completed else "kept", notes)
 
-    def _may_have_others(self, name: str, certificate: x509.Certificate) -> bool:
-        """Return whether other files of an enclave may still work, by the ledger.
+    def _others(self, name: str, certificate: x509.Certificate) -> str:
+        """Return why other files of an enclave may still work, or "", by the ledger.
 
         These are an earlier certificate, or other permissions for the subject of the present
         certificate.
         """
-        certificates, permissions = self._recorded_credentials.get(name, (set(), []))
+        missing, recorded, since_restore = self._recorded_credentials
+        if missing:
+            return f"earlier permissions may fit the present certificates, because {missing}"
+        certificates, permissions = recorded.get(name, (set(), []))
         subject = subject_text(certificate.subject)
-        return not (
+        if since_restore is not None and subject not in since_restore:
+            return (
+                "the keystore was restored from a backup, so permissions that its ledger lacks may "
+                "fit the present certificates; none fit the new ones"
+            )
+        if (
             has_unique_part(certificate.subject)
             and certificates == {certificate.serial_number}
             and permissions.count(subject) == 1
-        )
+        ):
+            return ""
+        return "certificates or permissions that the ledger has from earlier may still work"
 
     @cached_property
-    def _recorded_credentials(self) -> Mapping[str, tuple[set[int], list[str]]]:
-        """Maps enclaves to their certificates' serial numbers and their permissions' subjects.
+    def _recorded_credentials(
+        self,
+    ) -> tuple[str, Mapping[str, tuple[set[int], list[str]]], frozenset[str] | None]:
+        """Why entries may be missing in the ledger, what it has, and subjects since a restore.
 
-        Expired and revoked certificates are left out.  The map is empty if entries may be missing
-        in the ledger.
+        Maps enclaves to their certificates' serial numbers and their permissions' subjects.
+        Expired and revoked certificates are left out.  `subjects_since_restore` has the subjects.
         """
         keystore, now = self._change.keystore, iso(self._change.now)
         working: dict[str, tuple[set[int], list[str]]] = {}
         try:
             ledger = keystore.ledger_file.with_values("enclave", {*self._names})
-            was_restored = any(
-                entry.what == RESTORED for entry in keystore.ledger_with("what", RESTORED).entries
-            )
-        except SrosError:  # a sealed part of the ledger is in an archive
-            return working
-        if ledger.gaps or ledger.unchained or was_restored or may_have_later_releases(keystore):
-            return working
+            restored = keystore.ledger_with("what", RESTORED)
+            is_restored = any(entry.what == RESTORED for entry in restored.entries)
+            # Only the whole ledger has the order of marks and subjects.
+            since = subjects_since_restore(keystore, keystore.ledger) if is_restored else None
+        except SrosError:
+            return "a sealed part of the ledger is in an archive", working, None
+        if ledger.gaps or ledger.unchained:
+            return "entries of the ledger may be missing", working, None
+        if may_have_later_releases(keystore):
+            return "the published folder has later releases", working, None
         revoked = revoked_serials(keystore)
         for entry in ledger.entries:
             certificates, permissions = working.setdefault(entry.enclave, (set(), []))
@@ -930,7 +960,7 @@ class _EnclaveMaker:
                 certificates |= {int(entry.serial, 16)} - revoked
             elif entry.what == "permissions":
                 permissions.append(entry.subject)
-        return working
+        return "", working, since
 
     def _lost_rights_notes(self, default: Enclave, existing_files: set[str]) -> Iterator[Note]:
         """Yield a note if an enclave that gets the default permissions had other rights before.
