@@ -1157,9 +1157,14 @@ def test_only_the_seal_of_a_later_release_keeps_a_keystore_from_publishing(
     # The seal of a release that was published while the clock was far ahead.
     keystore = OpenedKeystore(home.root)
     authority = load_authority(keystore, PERMISSIONS, keystore.template, IN_KEYSTORE, DUE)
-    (ahead,) = seal_releases([("r3", number := 10**11, {})], authority)
-    for noted in (True, False):
-        home.send("r3", DUE + timedelta(minutes=1 + noted), seal=ahead.decode())
+    *_, last = sorted(releases_in(home.folder / "pub", 3), key=lambda release: release.number)
+    new = {"enclaves/r3/base/permissions.p7s": b"unknown"}
+    sealed = [(last.robot, 10**10, last.files), ("r3", number := 10**11, {**last.files, **new})]
+    of_killed_run, ahead = seal_releases(sealed, authority)
+    for minute, (signed, noted) in enumerate(
+        ((of_killed_run, False), (ahead, True), (ahead, False)), 1
+    ):
+        home.send("r3", DUE + timedelta(minutes=minute), seal=signed.decode())
         assert bool(home.collect(DUE).notes) is noted
     assert OpenedKeystore(home.root).ledger.next_number() > number, "robots refuse a lower number"
 

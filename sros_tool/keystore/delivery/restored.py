@@ -126,6 +126,10 @@ def older_than_robots_error(
     )
 
 
+_LISTED_FILE = re.compile(r"(?m)^([0-9a-f]{64})  (.+)$")
+"""Matches the line of a file in a seal."""
+
+
 class LaterSeals:
     """Recognizes the seals of releases that a keystore sealed, and does not know any more."""
 
@@ -137,6 +141,7 @@ class LaterSeals:
         marks = (e.number for e in entries if e.what == RESTORED and e.reason in _WAITING)
         self._explained = max(marks, default=0)
         self._authorities = keystore.authority(PERMISSIONS)
+        self._keystore = keystore
 
     def later_number(self, seal: str | None) -> int:
         """Return the number in a seal if a CA signed it and the ledger lacks it; otherwise 0."""
@@ -144,9 +149,30 @@ class LaterSeals:
             if seal:
                 number = sealed_robot(seal.encode()).number
                 is_unknown = number > self._explained and number not in self._known
-                if is_unknown and not smime.parse(seal.encode()).problem_for(self._authorities):
-                    return number
+                signed = smime.parse(seal.encode())
+                if is_unknown and not signed.problem_for(self._authorities):
+                    return 0 if self._has_issued(signed.text) else number
         return 0
+
+    def _has_issued(self, sealed: bytes) -> bool:
+        """Return whether the keystore issued all files that a seal lists, except certificates.
+
+        Then publishing was only interrupted before the ledger recorded its number: whoever can read
+        the folder has this seal.  Permissions are signed with each certificate of an enclave.
+        """
+        listed = _LISTED_FILE.findall(sealed.decode())
+        digests = {sha256 for sha256, _ in listed}
+        try:
+            entries = self._keystore.ledger_file.with_values("sha256", digests).entries
+            issued = {entry.sha256 for entry in entries}
+            return bool(listed) and all(
+                sha256 in issued
+                or path.endswith(f"/{CERTIFICATE_FILE}")
+                or hashlib.sha256(self._keystore.read(path, "file")).hexdigest() == sha256
+                for sha256, path in listed
+            )
+        except SrosError:  # the keystore lacks the file, or a part of the ledger
+            return False
 
 
 # ── what changed ───────────────────────────────────────────────────────────────────────────
