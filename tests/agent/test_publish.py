@@ -58,7 +58,8 @@ from sros_tool.keystore.layout import ROLES as ROLES_OF_CAS
 from sros_tool.keystore.ledger import Entry
 from sros_tool.keystore.lifecycle.change import KeystoreChange
 from sros_tool.keystore.lifecycle.renew import renew
-from sros_tool.keystore.lifecycle.revoke import revoke
+from sros_tool.keystore.lifecycle.revocation_list import LostRecords
+from sros_tool.keystore.lifecycle.revoke import restore_revocations, revoke
 from sros_tool.keystore.lifecycle.rotate import rotate_ca
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.pki.certificates import key_digest, load_request, validity_of
@@ -1318,6 +1319,29 @@ def test_a_later_key_of_a_robot_is_certified_again_as_publishing_advises(publish
     known = KnownKeys(OpenedKeystore(root))
     keys = (key_digest(load_request(each, "it").public_key) for each in (first, second))
     assert [known.is_revoked(key) for key in keys] == [True, False]
+
+
+def test_a_revoked_key_that_a_robot_made_is_replaced_on_the_robot(publisher: Home) -> None:
+    """The certificate was renewed with --revoke-old after the backup, and the key stayed."""
+    root, name = publisher.root, "/r2/base"
+    files = [create_request(publisher.folder / each, name).file for each in ("first", "second")]
+    revoke(root, [name], now=publisher.now)
+    sign_request(root, files[0].read_bytes(), only_enclaves=[name], now=publisher.now)
+    publisher.publish()
+    backup = copy_of(root, publisher.folder / "backup")
+    renew(root, [name, "/r1/base"], revoke_old=True, now=publisher.now)
+    lost = LostRecords(OpenedKeystore(backup), publisher.now)
+    lost.add((root / "public/identity_ca.crl.pem").read_bytes())
+    shutil.rmtree(root)
+    backup.rename(root)
+    done = restore_revocations(root, lost, now=publisher.now)
+    (note,) = (each.text for each in done.notes if each.id == "fleet.replaced-after-backup")
+    assert f"for {name}, new keys that their robots make" in note
+    assert f"`sros renew {root} /r1/base --new-key --revoke-old`" in note
+    with pytest.raises(KeystoreError, match="was revoked"):
+        sign_request(root, files[0].read_bytes(), renew=True, now=publisher.now)
+    sign_request(root, files[1].read_bytes(), renew=True, now=publisher.now)
+    renew(root, [name], revoke_old=True, now=publisher.now)
 
 
 @pytest.mark.parametrize(

@@ -258,6 +258,9 @@ def test_a_request_for_an_existing_enclave_is_refused(
     assert snapshot(home) == before
     (note,) = sign_request(home, thief.file.read_bytes(), now=NOW, renew=True).notes
     assert note.id == "request.new-key"
+    assert f"`sros renew {home} {NAME} --revoke-old`" in note.text
+    with pytest.raises(KeystoreError, match=f"{NAME} --revoke-old`"):
+        renew(home, [NAME], now=LATER, new_key=True, revoke_old=True)
 
 
 def test_other_commands_handle_an_enclave_whose_key_is_on_its_robot(

@@ -372,7 +372,10 @@ def refuse_lost_changes(
         steps.append(f"Give new certificates: {renew(certificates)}.")
     if keys := names["key"]:
         of = first_few(keys, _SHOWN)
-        what.append(f"{of} got another key, and the keystore has only the earlier one")
+        what.append(
+            f"{of} got another key, or the certificates of the earlier key were revoked, and the "
+            "keystore has only the earlier key"
+        )
         why.append("Whoever has an earlier key could be trusted again.")
         on_robots = [name for name in keys if key_on_robot(keystore.folder(name))]
         if here := [name for name in keys if name not in on_robots]:
@@ -381,7 +384,8 @@ def refuse_lost_changes(
             steps.append(
                 "For keys that were made on the robot, sign each request again, with `sros "
                 f"sign_request {root} REQUEST --no-answer --renew`, and then run "
-                f"{renew(on_robots, ' --revoke-old')}."
+                f"{renew(on_robots, ' --revoke-old')}. If the key of a request was revoked, first "
+                "make a new key on the robot (docs/howto/rotate.md, A key in wrong hands)."
             )
     if rights := names["rights_taken"]:
         taken = [

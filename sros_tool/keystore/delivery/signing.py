@@ -413,7 +413,7 @@ class _RequestCertifier:
                 f"If you have the robot back and it may have the enclave, add --enclave {name}.",
             )
         if present:
-            note = _new_key_note(present, request)
+            note = _new_key_note(root, present, request)
             change.notes += note or [*known.shared_notes([name])]
         else:
             self._new.append(name)
@@ -613,7 +613,7 @@ def _check_answer_usable(answer: RequestAnswer, request: SigningRequest, now: da
         ) from error
 
 
-def _new_key_note(old: x509.Certificate, request: SigningRequest) -> list[Note]:
+def _new_key_note(root: Path, old: x509.Certificate, request: SigningRequest) -> list[Note]:
     """Return a note if the request's key is not the key of the current certificate ``old``."""
     if old.public_key() == request.public_key:
         return []
@@ -622,7 +622,8 @@ def _new_key_note(old: x509.Certificate, request: SigningRequest) -> list[Note]:
         Note(
             "request.new-key",
             f"{request.name}: the request has a new key. The certificate of the old key "
-            f"stays valid until {until} for anyone who has that key.",
+            f"stays valid until {until} for anyone who has that key. To revoke it: "
+            f"`sros renew {quote(str(root))} {quote(request.name)} --revoke-old`.",
         )
     ]
 

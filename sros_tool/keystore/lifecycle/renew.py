@@ -249,7 +249,9 @@ class _Renewer:
                 f"the key of enclave {name} is not in this keystore",
                 "It was generated on the robot and stays there, so no new key is generated here.",
                 "Remove the enclave's folder on the robot, create a new request there with "
-                "`sros create_request`, and sign it here with `sros sign_request --renew`.",
+                "`sros create_request`, and sign it here with `sros sign_request --renew`. To "
+                "revoke the earlier key, then run "
+                f"`sros renew {quote(str(self._root))} {quote(name)} --revoke-old`.",
             )
 
 

@@ -26,6 +26,7 @@ from sros_tool.keystore.layout import (
     ZENOH_FILES,
     enclave_folder,
     has_key,
+    key_on_robot,
 )
 from sros_tool.keystore.ledger import RESTORED, Entry, certificate_entry
 from sros_tool.keystore.lifecycle.change import Changed, ChangeOptions, KeystoreChange
@@ -333,17 +334,29 @@ def _key_revoked_by_enclave(
 
 def _replaced_notes(change: KeystoreChange, replaced: Mapping[str, bool]) -> Iterator[Note]:
     """Yield a note on enclaves whose certificates, and perhaps keys, were replaced."""
-    commands = [
-        f"`sros renew {quote(str(change.root))} {' '.join(map(quote, names))}{options}`"
+    root = quote(str(change.root))
+    on_robots = {
+        name
+        for name, is_key in replaced.items()
+        if is_key and key_on_robot(change.keystore.folder(name))
+    }
+    steps = [
+        f"`sros renew {root} {' '.join(map(quote, names))}{options}`"
         for is_key_revoked, options in ((False, ""), (True, " --new-key --revoke-old"))
-        if (names := [name for name, is_key in replaced.items() if is_key is is_key_revoked])
+        if (names := [n for n in replaced if replaced[n] is is_key_revoked and n not in on_robots])
     ]
-    if commands:
+    if on_robots:
+        steps.append(
+            f"for {first_few(sorted(on_robots), _MOST_SHOWN)}, new keys that their robots make "
+            "(docs/howto/rotate.md, A key in wrong hands), because the revoked keys were made there"
+        )
+    if steps:
         yield Note(
             REPLACED_AFTER_BACKUP,
             f"after the backup, the certificates of {first_few(tuple(replaced), _MOST_SHOWN)} were "
-            "replaced and revoked, and the keystore has only the revoked certificates: give these "
-            f"enclaves new certificates with {' and '.join(commands)}.",
+            "replaced and revoked, and the keystore has only the revoked certificates. Revoke "
+            f"robots that were stolen (`sros revoke {root} --robot NAME`); give the other enclaves "
+            f"new certificates with {' and '.join(steps)}.",
         )
 
 
@@ -376,8 +389,10 @@ def _unknown_note(change: KeystoreChange, unknown: Mapping[str, Entry]) -> Note:
     if missing := [name for name in valid if not change.keystore.has_enclave(name)]:
         text += (
             f". The keystore lacks {first_few(missing, _MOST_SHOWN)}, whose certificates stay "
-            "valid: create these enclaves again and revoke them, or replace the CA with "
-            "`sros rotate_ca`"
+            "valid. To keep such a robot, create its enclaves again with `sros "
+            "generate_artifacts`, then give them new keys: `sros renew "
+            f"{quote(str(change.root))} --robot NAME --new-key --revoke-old`. Otherwise create "
+            "them again and revoke them, or replace the CA with `sros rotate_ca`"
         )
     return Note("fleet.certificates-restored", f"{text}.")
 
