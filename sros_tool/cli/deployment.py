@@ -146,8 +146,6 @@ def distribute_key(
             for name in selection.names
             if not changed or (below == target and Path(enclave_folder(name)) not in changed)
         ]
-        for name in kept if not dry_run else ():
-            echo(f"enclave {name} in '{target}' is already up to date", err=True)
         for change in export.changes if done else ():
             if word := {"replace": "replaced", "remove": "removed"}.get(change.action):
                 echo(f"{word} {change.path}", err=True)
@@ -156,6 +154,8 @@ def distribute_key(
     exported = [name for name in selection.names if name not in kept]
     for name in exported if done and not as_json else ():
         echo(f"exported enclave {name} to {where}", err=target == _STREAM)
+    for name in kept if not dry_run else ():
+        echo(f"enclave {name} in '{target}' is already up to date", err=True)
     if as_json:
         from sros_tool.keystore.delivery.export import ExportedEnclaves, exported_outcomes
 
