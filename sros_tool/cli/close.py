@@ -387,7 +387,7 @@ def _show_undone(robot: LocalRobot, closed: CloseState) -> None:
 
 
 def _state_text(closed: CloseState, *, apply: bool) -> str:
-    """Return a clause on which processes run in their enclaves, and which do not."""
+    """Return a clause that says which processes run in their enclaves and which do not."""
     if not closed.secured:
         not_closed = "nothing was closed" if apply else "nothing is closed yet"
         return "no process of the robot runs" if closed.stopped >= {*closed.pending} else not_closed

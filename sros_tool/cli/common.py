@@ -496,8 +496,8 @@ def keystore_arguments(metavar: str, **more: Any) -> Callable[[Decorated], Decor
 def completions(names: Iterable[str], incomplete: str) -> list[str]:
     """Return the names that start with ``incomplete`` and that a shell need not quote.
 
-    Bash puts a completion into the line as it is, and would then run a command in the name of a
-    folder or topic.
+    Bash inserts a completion unquoted, so it would run a command that the name of a folder or topic
+    contains, such as ``$(...)``.
     """
     return [name for name in names if name.startswith(incomplete) and quote(name) == name]
 

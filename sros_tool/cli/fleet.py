@@ -484,9 +484,9 @@ def _publish(
     for example each hour. Archives of unchanged robots stay; archives of robots that were revoked
     or left the fleet are removed.
 
-    The keys are in KEYSTORE/private. The root key only signs the list of the other keys.  Move the
-    root key away from the keystore.  Name it with --root-key to replace a key, and once a year to
-    renew the list of keys.
+    The keys that sign PUB are in KEYSTORE/private.  The root key only signs the list of the other
+    keys.  Move the root key away from the keystore.  Name it with --root-key to replace a key, and
+    once a year to renew the list of keys.
 
     Example:
       $ sros fleet publish keystore pub

@@ -297,7 +297,7 @@ class AskedPolicy:
         return ""
 
     def enclave(self, enclave: str) -> Enclave | None:
-        """Return the enclave with its path on the robot, or None if no enclave fits."""
+        """Return the policy's enclave, under its path on the robot; None if the policy lacks it."""
         ns, path = self.place(enclave)
         stated = self.policy.enclave(path) if path else None
         if stated is None:

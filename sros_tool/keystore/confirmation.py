@@ -656,7 +656,7 @@ _CONFIRM_AGAIN = "Make the confirmation again on the robot."
 
 
 class _FormError(ValueError):
-    """A part of a confirmation does not have its form; the text is a clause."""
+    """A part of a confirmation is malformed; the text of the error is a clause."""
 
     def __init__(self, why: str, remedy: str = _CONFIRM_AGAIN) -> None:
         super().__init__(why)

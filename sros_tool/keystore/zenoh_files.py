@@ -450,9 +450,9 @@ def zenoh_drift(
 ) -> ZenohDrift:
     """Return the drifted configurations of a keystore, and the enclaves without a configuration.
 
-    If ``now`` is None, permissions that have expired count, too.  ``only_enclaves`` are the
-    enclaves whose files are examined, ``among`` the enclaves whose rights are compared in these
-    files; empty means all.  ``reader`` may already have read the files.
+    If ``now`` is None, permissions that have expired count, too.  Only the
+    files of ``only_enclaves`` are examined, and in these files only the rights of the enclaves
+    ``among``; for both, empty means all enclaves.  ``reader`` may have read the files already.
 
     Raises:
         SrosError: the rights of an enclave cannot be stated to Zenoh, or the router has no enclave.

@@ -243,8 +243,8 @@ class UnitNames:
     ) -> tuple[tuple[int, int] | None, int]:
         """Return the unit with the longest name that begins at piece ``at``, and the name's length.
 
-        The unit is a pair of numbers, of the unit and of the word in its ``values``, or None; the
-        length is a number of pieces.
+        The first result is None if no name begins there; otherwise it is the number of the unit,
+        and the number of the word in the unit's ``values``.  The length is a number of pieces.
         """
         for size in range(min(len(pieces) - at, _MAX_PIECES), 0, -1):
             unit = self.words.get("_".join(pieces[at : at + size]))

@@ -72,7 +72,7 @@ class Protection:
 
     @property
     def everybody(self) -> str:
-        """The participants that need no permissions for open access to the name, in words."""
+        """Words for the participants that may use a name with open access without permissions."""
         return (
             "everybody, even without an identity"
             if self.strangers

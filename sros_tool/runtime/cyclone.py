@@ -101,8 +101,8 @@ class SecurityRefusedError(DdsError):
     """A refusal of a participant, topic, writer or reader by DDS Security."""
 
 
-class Publication(NamedTuple):
-    """A discovered writer or reader: its DDS topic name and DDS type name."""
+class DiscoveredEndpoint(NamedTuple):
+    """The DDS topic name and DDS type name of a discovered writer or reader."""
 
     topic: str
     type_name: str
@@ -163,11 +163,11 @@ class Participant:
         handle = self._endpoint("reader", topic, type_name, reliable=False)
         return Reader(self._library, handle, self.handle)
 
-    def publications(self) -> tuple[Publication, ...]:
+    def publications(self) -> tuple[DiscoveredEndpoint, ...]:
         """Return the writers of this participant and all discovered writers, sorted by topic."""
         return tuple(sorted(self._discovered(_BUILTIN_PUBLICATIONS, _publication_of)))
 
-    def subscriptions(self) -> tuple[Publication, ...]:
+    def subscriptions(self) -> tuple[DiscoveredEndpoint, ...]:
         """Return the readers of this participant and all discovered readers, sorted by topic."""
         return tuple(sorted(self._discovered(_BUILTIN_SUBSCRIPTIONS, _publication_of)))
 
@@ -398,9 +398,9 @@ def _string_of(address: int) -> str:
     return _text(ctypes.cast(address, ctypes.POINTER(StringSample)).contents.data)
 
 
-def _publication_of(address: int) -> Publication:
+def _publication_of(address: int) -> DiscoveredEndpoint:
     sample = ctypes.cast(address, ctypes.POINTER(_EndpointSample)).contents
-    return Publication(_text(sample.topic_name), _text(sample.type_name))
+    return DiscoveredEndpoint(_text(sample.topic_name), _text(sample.type_name))
 
 
 def _text(raw: bytes | None) -> str:

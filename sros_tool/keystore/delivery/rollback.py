@@ -199,9 +199,9 @@ def _foreign_authorities(
 ) -> Mapping[str, x509.Certificate]:
     """Map paths of CA files in ``present`` to a CA in them, for enclaves of another keystore.
 
-    In both roles, such an enclave trusts only CAs that are neither in the ledger nor in ``files``.
-    One role alone does not show this, because the keystore may be a backup whose CA was replaced
-    since.
+    An enclave is one of another keystore if none of its identity CAs and none of its permissions
+    CAs is in the ledger or in ``files``.  If only one kind of CA is unknown, the keystore may be a
+    backup from before that CA was replaced.
     """
     entries = keystore.ledger_with("what", "ca").entries
     recorded = {entry.sha256 for entry in entries if entry.what == "ca"}
