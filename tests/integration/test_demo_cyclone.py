@@ -31,7 +31,7 @@ DOMAIN = 110
 PREAMBLE = """
 import os, time
 from pathlib import Path
-from sros_tool.runtime.cyclone import DdsError, Participant, Publication, SecurityRefusedError
+from sros_tool.runtime.cyclone import DdsError, Participant, DiscoveredEndpoint, SecurityRefusedError
 from sros_tool.runtime.variables import choose_enclave, domain_of
 def join():
     return Participant(domain_of(os.environ), choose_enclave(os.environ).enclave)
@@ -134,7 +134,7 @@ def test_what_is_written_is_read_and_seen(child: Callable[[Identity, str], list[
                 heard += reader.take()
             print(heard)
             print(p.publications() == (
-                Publication("rt/chatter", "std_msgs::msg::dds_::String_"),))
+                DiscoveredEndpoint("rt/chatter", "std_msgs::msg::dds_::String_"),))
             print([*p.process_ids().values()] == [os.getpid()])
         """,
     )
