@@ -31,7 +31,8 @@ DOMAIN = 110
 PREAMBLE = """
 import os, time
 from pathlib import Path
-from sros_tool.runtime.cyclone import DdsError, Participant, DiscoveredEndpoint, SecurityRefusedError
+from sros_tool.runtime.cyclone import DdsError, DiscoveredEndpoint, Participant
+from sros_tool.runtime.cyclone import SecurityRefusedError
 from sros_tool.runtime.variables import choose_enclave, domain_of
 def join():
     return Participant(domain_of(os.environ), choose_enclave(os.environ).enclave)
