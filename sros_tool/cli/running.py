@@ -334,7 +334,6 @@ def run(
             demo_nodes_cpp talker_listener_launch.py
     """
     from sros_tool.runtime.environment import enclave_argument, named_enclave, with_enclave
-    from sros_tool.runtime.rmw import built_without_security, default_rmw, no_security_text
 
     root, rest = split_root(arguments)
     if policy and rest and ctx.meta[_COMMAND_KEY]:
@@ -381,10 +380,6 @@ def run(
     print_notes(
         [*secured.notes, *(() if policy else other_node_notes(keystore, name, words, now=now()))]
     )
-    rmw_here = default_rmw(environment)
-    if not _is_demo(command) and built_without_security(rmw_here, environment):
-        text = f"{no_security_text(rmw_here)}; `sros doctor` finds an RMW that enforces security"
-        print_notes([Note("run.no-security", text)])
     names_enclave = enclave_argument(command) == name or _is_demo(command)
     if not names_enclave:
         print_notes(secured.enclave_notes)

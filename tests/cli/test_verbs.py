@@ -27,10 +27,8 @@ from sros_tool.pki import smime
 from sros_tool.pki.certificates import common_name, issue_ca, pem
 from sros_tool.pki.keys import generate_key
 from sros_tool.runtime.environment import REFUSING, render_refusal
-from sros_tool.runtime.rmw import RMW
 from sros_tool.runtime.variables import DOMAIN
 from sros_tool.validity import Window
-from tests.runtime.test_rmw import FAST, installed_rmw
 from tests.support.children import run, wait_for
 from tests.support.harness import (
     Running,
@@ -721,20 +719,6 @@ def test_no_process_starts_with_files_that_others_can_replace(place: str, keysto
     run(["sh", "-c", re.findall("`(chmod .+?)`", refused.err)[0]])
     forked("run", *command).ok()
     assert marker.exists()
-
-
-@pytest.mark.parametrize("secured", [False, True])
-def test_an_rmw_that_cannot_secure_the_command_is_named(
-    secured: bool, keystore: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A node of the demo says itself which DDS it uses, and another program may need no RMW."""
-    monkeypatch.setattr("sys.prefix", "")  # this Python may have wheels with an RMW
-    monkeypatch.delenv(RMW, raising=False)
-    for name, value in installed_rmw(keystore.parent / "ros", FAST, secured=secured).items():
-        monkeypatch.setenv(name, value)
-    said = forked("run", keystore, "/a", "--", "true").ok().err
-    named = f"[run.no-security]: {FAST} is built without security here: no node starts in an encl"
-    assert (named in said) is not secured, said
 
 
 def test_the_command_names_no_other_enclave(keystore: Path) -> None:

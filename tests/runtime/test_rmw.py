@@ -21,7 +21,7 @@ OPEN_BUILDS = {
 }
 
 
-def installed_rmw(root: Path, rmw: str, *, secured: bool) -> dict[str, str]:
+def _prefix(root: Path, rmw: str, *, secured: bool) -> dict[str, str]:
     index = root / "share/ament_index/resource_index/rmw_typesupport"
     index.mkdir(parents=True)
     (index / rmw).touch()
@@ -38,7 +38,7 @@ def test_an_rmw_without_security_is_said(
     rmw: str, named: bool, secured: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("sys.prefix", "")  # this Python may have wheels with an RMW
-    here = installed_rmw(tmp_path, rmw, secured=secured)
+    here = _prefix(tmp_path, rmw, secured=secured)
     if named:
         here[RMW] = rmw
     vendor, why = vendor_here(here)
@@ -48,7 +48,7 @@ def test_an_rmw_without_security_is_said(
 
 
 def test_without_its_files_nothing_is_said_of_an_rmw(tmp_path: Path) -> None:
-    here = installed_rmw(tmp_path, FAST, secured=False)
+    here = _prefix(tmp_path, FAST, secured=False)
     assert not built_without_security(CYCLONE, here)
     (tmp_path / "lib/librmw_fastrtps_shared_cpp.so").unlink()
     assert not built_without_security(FAST, here)
