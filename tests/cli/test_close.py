@@ -943,7 +943,7 @@ def test_a_unit_that_does_not_run_is_not_called_open(
     robot.absent = {"/listener"}
     unit = robot.units["/listener"]
     said = robot.close("--proof", status=1).out
-    assert f"of /listener ({unit} does not run it: systemctl status {unit}); start it" in said
+    assert f"of /listener ({unit} does not run it: systemctl status {unit}) runs; start it" in said
     assert "--without" not in said
     ended = robot.close()
     assert "  /listener: not running: --apply restarts" in ended.out

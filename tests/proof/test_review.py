@@ -1294,7 +1294,7 @@ def test_requirements_of_a_package_are_decided_in_a_namespace(
         some = "and in 1 of 2 other namespaces (those of changed names first) only whether the ch"
         assert some in change.review(*asked).ok().out
     assert (
-        "in the namespace / (--namespace)"
+        "in the namespace / (--namespace NS, "
         in sros("review", "--base", "none", *asked, cwd=change.folder).out
     )
     ended = change.review(*asked, "--namespace", "/l", "--namespace", "/")
