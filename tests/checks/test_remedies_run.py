@@ -41,6 +41,7 @@ ELSEWHERE = {
     "keystore.home-or-robot": "its command is for the keystore from which the export came",
     "keystore.weak-cryptography": "the case puts in the certificate of a CA without its key",
     "enclave.certificate-not-yet-valid": "the clock is wrong, and so the CA is not valid either",
+    "enclave.crl-left-out": "the folder has to be moved away first, as the remedy says",
     "enclave.permissions-not-yet-valid": _UNKNOWN,
     "enclave.subject-not-unique": _UNKNOWN,
     "governance.unauthenticated": _EDITED,
