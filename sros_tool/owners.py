@@ -37,8 +37,8 @@ def other_writers(state: os.stat_result, trusted_users: frozenset[int]) -> str:
 
 
 def is_for_root_alone(mode: int) -> bool:
-    """Return whether this process, as root, can read a file that its owner cannot read."""
-    return os.geteuid() == 0 and not mode & stat.S_IRUSR
+    """Return whether this process, as root, can read a file that nobody else can read."""
+    return os.geteuid() == 0 and not mode & (stat.S_IRUSR | stat.S_IRGRP | stat.S_IROTH)
 
 
 def replaceable_on_the_way(path: Path, trusted_users: frozenset[int]) -> Iterator[tuple[Path, str]]:

@@ -1398,15 +1398,8 @@ def test_what_a_restored_keystore_cannot_know_is_not_published_in_silence(
     monkeypatch.setattr("sros_tool.cli.common._clock", lambda: publisher.now)
     publisher.publish()
     backup = copy_of(publisher.root, publisher.folder / "backup")
-    publisher.run(
-        "update_keystore",
-        "ks",
-        "--set",
-        "protection.rtps=SIGN",
-        "--domain",
-        "7",
-        "--allow-looser",
-    )
+    update = ("update_keystore", "ks", "--allow-looser", "--set", "protection.rtps=SIGN")
+    publisher.run(*update, "--domain", "7")
     publisher.publish()
     number = numbers(publisher)["r2"]
     shutil.rmtree(publisher.root)
@@ -1425,15 +1418,10 @@ def test_what_a_restored_keystore_cannot_know_is_not_published_in_silence(
     publisher.run("rotate_ca", "ks", "--finish", "--allow-unconfirmed")
     with pytest.raises(KeystoreError, match="the governance was changed"):
         publisher.publish(restored=True)
-    publisher.run(
-        "update_keystore",
-        "ks",
-        "--set",
-        "protection.rtps=SIGN",
-        "--domain",
-        "7",
-        "--allow-looser",
-    )
+    publisher.run(*update)
+    with pytest.raises(KeystoreError, match=r"the governance was changed .*7"):
+        publisher.publish(restored=True)
+    publisher.run(*update, "--domain", "7")
     with pytest.raises(KeystoreError, match="rights of /r2/base were taken") as refused:
         publisher.publish(restored=True)
     assert "governance" not in str(refused.value)

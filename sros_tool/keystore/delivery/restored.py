@@ -319,7 +319,8 @@ def without_agreed(keystore: OpenedKeystore, changes: Sequence[LaterChange]) -> 
     """Return ``changes`` without rights and governance that were signed again on purpose.
 
     Rights count as agreed to if their enclave was renewed by name after publishing was refused only
-    because of them.  Other commands sign rights, too, such as a rotation, and agree to none.
+    because of them.  Other commands sign rights, too, such as a rotation, and agree to none.  A
+    governance counts as agreed to only if nothing shows the difference to the published governance.
     """
     releases = keystore.ledger_with("what", "release").entries
     last = max((entry.number for entry in releases if entry.what == "release"), default=0)
@@ -342,7 +343,7 @@ def without_agreed(keystore: OpenedKeystore, changes: Sequence[LaterChange]) -> 
         for change in changes
         if not (
             (change.change == "rights_taken" and change.enclave in agreed)
-            or (change.change == "governance" and is_governance_agreed)
+            or (change.change == "governance" and not change.what and is_governance_agreed)
         )
     ]
 
@@ -404,7 +405,8 @@ def refuse_lost_changes(
         if change.change == "governance":
             what.append(f"the governance was changed{f' ({change.what})' if change.what else ''}")
             why.append("Messages could be protected less.")
-            steps.append(f"Change it again: `sros update_keystore {root} --set KEY=VALUE`.")
+            again = f"`sros update_keystore {root} --set KEY=VALUE`"
+            steps.append(f"Change it again, with {again}: to another governance only afterwards.")
     if what:
         raise KeystoreError(
             f"'{folder}' cannot be published yet: after the backup, {'; '.join(what)}",
