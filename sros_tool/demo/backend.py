@@ -311,6 +311,7 @@ def conditions(backend: Backend, template: Template, topic: str) -> frozenset[Co
     return frozenset(name for name, holds in holding.items() if holds) | vendor
 
 
+_SECONDS_TO_START = 60.0
 _SECONDS_TO_STOP = 5.0
 _SILENCE_SECONDS = 5.0
 """Seconds without a message or connection after which a node reports silence."""
@@ -415,7 +416,9 @@ def run_by_hand(
 ) -> int:
     """Run a node for ``duration``, or until a signal; return the exit status of the node.
 
-    ``say`` gets lines about what is sent and heard, without line breaks at their ends.
+    The duration begins when the node is ready, on Zenoh when the node starts; a node that is not
+    ready within a minute is stopped, too.  ``say`` gets lines about what is sent and heard, without
+    line breaks at their ends.
 
     Raises:
         SrosError: The environment demands security, and the enclave cannot be loaded.
@@ -444,13 +447,27 @@ def run_by_hand(
         os.close(writing)
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             signal.signal(number, stop)
-        if duration is not None:
-            timer = threading.Timer(duration.total_seconds(), stop)
+
+        def stop_after(seconds: float) -> threading.Timer:
+            timer = threading.Timer(seconds, stop)
             timer.daemon = True
             timer.start()
+            return timer
+
+        until_ready = None
+        if duration is not None:
+            # A node on Zenoh may never connect, which is an answer, too.
+            from_start = duration.total_seconds() if node.backend == ZENOH else _SECONDS_TO_START
+            until_ready = stop_after(from_start)
+
+        def start_duration() -> None:
+            if duration and until_ready and node.backend != ZENOH:
+                until_ready.cancel()
+                stop_after(duration.total_seconds())
+
         with open(events, "rb", buffering=0) as pipe:
             try:
-                last = _report(node, pipe.fileno(), say)
+                last = _report(node, pipe.fileno(), say, on_ready=start_duration)
             except BaseException:  # such as nobody who reads the lines any more
                 end_within(_SECONDS_TO_STOP, process)
                 process.wait()
@@ -479,14 +496,21 @@ def end_within(seconds: float, process: subprocess.Popen[bytes]) -> None:
     timer.start()
 
 
-def _report(node: HandNode, pipe: int, say: Callable[[str], None]) -> Event | None:
-    """Pass the node's reports to ``say`` until the node ends, and return the last report."""
+def _report(
+    node: HandNode, pipe: int, say: Callable[[str], None], *, on_ready: Callable[[], None]
+) -> Event | None:
+    """Pass the node's reports to ``say`` until the node ends, and return the last report.
+
+    ``on_ready`` is called when the node is ready: before that, it hears nothing in any case.
+    """
     data, seen, event = b"", "", None
-    connected = node.backend != ZENOH
+    is_ready = False
     while len(data) < _MAX_EVENT_BYTES:
         ready, _, _ = select.select([pipe], [], [], _SILENCE_SECONDS)
         if not ready:
-            if not connected:
+            if not is_ready and node.backend != ZENOH:
+                say(f"not ready for {_SILENCE_SECONDS:.0f} s: the node still starts")
+            elif not is_ready:
                 say(
                     f"not connected for {_SILENCE_SECONDS:.0f} s: no router runs (`sros demo "
                     "router` starts one), or it refuses this node"
@@ -502,7 +526,9 @@ def _report(node: HandNode, pipe: int, say: Callable[[str], None]) -> Event | No
         *lines, data = (data + more).split(b"\n")
         for line in lines:
             event = parse_event(line, Path("the node's report"))
-            connected = connected or event.kind is EventKind.READY
+            if event.kind is EventKind.READY and not is_ready:
+                is_ready = True
+                on_ready()
             seen = event.text if event.kind is EventKind.SEEN else seen
             if text := _line(event, node.type):
                 say(text)

@@ -127,6 +127,8 @@ def test_a_listener_ends_after_its_time_and_without_a_reader(
     def played() -> list[str]:
         lines: list[str] = []
         assert run_by_hand(node, lines.append, timedelta(seconds=0.5)) == 0
+        starting = lines[: lines.index("ready")]
+        assert not any(line.startswith("heard nothing") for line in starting), starting
         with suppress(BrokenPipeError):
             run_by_hand(node, say)
             lines.append("goes on")
