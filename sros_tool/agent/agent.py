@@ -67,7 +67,7 @@ from sros_tool.keystore.confirmation import (
 )
 from sros_tool.keystore.delivery.archive import listed_digests
 from sros_tool.keystore.delivery.release import Release, sealed_robot
-from sros_tool.keystore.expiry import Lifetime, Threshold, read_credentials
+from sros_tool.keystore.expiry import Threshold, read_credentials
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     CRL_FILE,
@@ -1104,14 +1104,14 @@ def _is_renewal_due(keystore: OpenedKeystore, name: str, now: datetime, *, new_k
     Raises:
         SrosError: the certificate cannot be read.
     """
+    if new_key:
+        with suppress(SrosError):  # what is wrong with permissions is reported elsewhere
+            lifetime = read_credentials(keystore, name).lifetime()
+            return lifetime.due(Threshold(elapsed=_NEW_KEY_AFTER), now)
     file = keystore.folder(name) / CERTIFICATE_FILE
     validity, here_since = validity_of(read_certificate(file)), time_of_file(file.stat().st_mtime)
-    if not new_key:
-        return now >= validity.not_after - validity.lifetime(here_since) / 3
-    lifetime = Lifetime(name, validity, validity, here_since)
-    with suppress(SrosError):  # what is wrong with permissions is reported elsewhere
-        lifetime = read_credentials(keystore, name).lifetime()
-    return lifetime.due(Threshold(elapsed=_NEW_KEY_AFTER), now)
+    left = 1 - _NEW_KEY_AFTER if new_key else 1 / 3
+    return now >= validity.not_after - validity.lifetime(here_since) * left
 
 
 def _enclave_key(folder: Path, name: str, secrets: Secrets) -> PrivateKey:
