@@ -29,7 +29,7 @@ from sros_tool.checks.keystores.issued import (
 from sros_tool.checks.keystores.opened import Circumstances
 from sros_tool.checks.kind import WARNING, ChosenFindings, Finding, FindingFilter
 from sros_tool.checks.policies import is_mended_by
-from sros_tool.checks.requirements import DROPPED, VACUOUS, VIOLATED
+from sros_tool.checks.requirements import DROPPED, UNNAMED, VACUOUS, VIOLATED
 from sros_tool.checks.targets import path_findings, policy_findings
 from sros_tool.errors import DocumentError, SrosError
 from sros_tool.faults import Fault
@@ -1050,7 +1050,7 @@ class _Review:
                 if subject in earlier_sources:
                     rights = earlier_sources[subject]().rights
             sources = moved.get(subject)
-            elsewhere = partial(self._broken_elsewhere, files.values(), wanted, system, sources)
+            elsewhere = partial(self._failing_elsewhere, files.values(), wanted, system, sources)
             yield from self._step_result(
                 "requirements",
                 subject,
@@ -1092,15 +1092,16 @@ class _Review:
         chosen = FindingFilter().choose(findings)
         return _status(chosen), chosen
 
-    def _broken_elsewhere(
+    def _failing_elsewhere(
         self,
         files: Iterable[Path],
         requirements: Sequence[Requirement],
         system: System,
         sources: Callable[[], tuple[AccessSource, AccessSource]] | None,
     ) -> Iterator[Finding]:
-        """Yield a finding for each requirement that the change breaks in another namespace alone.
+        """Yield a finding for each requirement that fails in another namespace by the change alone.
 
+        A requirement fails if it is broken, or if it names only what no right names any more.
         Users may put the nodes of a package, and its requirements, into their own namespaces.
         ``requirements`` are the requirements in ``files`` for the namespace / of ``system``.
         """
@@ -1118,7 +1119,7 @@ class _Review:
         left = {
             at
             for at, here in enumerate(requirements)
-            if here.is_relative and not _violations(here, system)
+            if here.is_relative and not _failures(here, system)
         }
 
         def system_in(ns: str, source: AccessSource) -> System:
@@ -1133,8 +1134,8 @@ class _Review:
             )
             before, after = cache(partial(system_in, ns, base)), system_in(ns, head)
             for at in sorted(left):
-                broken = _violations(moved[at], after)
-                known = _violations(moved[at], before()) if broken else ()
+                broken = _failures(moved[at], after, before)
+                known = _failures(moved[at], before()) if broken else ()
                 texts = {(finding.subject, finding.text) for finding in known}
                 broken = [
                     finding for finding in broken if (finding.subject, finding.text) not in texts
@@ -1376,9 +1377,17 @@ def _namespaces_to_try(before: AccessSource, after: AccessSource) -> list[str]:
     return [*dict.fromkeys([ordinary, *namespaces])]
 
 
-def _violations(requirement: Requirement, system: System) -> list[Finding]:
+def _failures(
+    requirement: Requirement, system: System, before: Callable[[], System] | None = None
+) -> list[Finding]:
+    """Return the findings which say that a requirement does not hold, or protects nothing.
+
+    A name that no right states counts only if a right of ``before`` states it.
+    """
     findings = requirement_findings([requirement], system)
-    return [finding for finding in findings if finding.kind is VIOLATED]
+    if before and any(finding.kind is UNNAMED for finding in findings):
+        findings = requirement_findings([requirement], system, before().rights)
+    return [finding for finding in findings if finding.kind in (VIOLATED, VACUOUS)]
 
 
 def _status(chosen_findings: ChosenFindings) -> int:

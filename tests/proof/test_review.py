@@ -1323,6 +1323,23 @@ def test_a_name_that_breaks_requirements_of_users_in_a_namespace(change: Change)
     assert said not in change.review(*asked).out
 
 
+@pytest.mark.parametrize("after", ["/x", "x"])
+def test_a_requirement_that_protects_nothing_any_more_in_a_namespace(
+    change: Change, after: str
+) -> None:
+    """The policy then has the name only outside the namespace; twin: the name stays relative."""
+    only = '[[only]]\npublish = ["x"]\nenclaves = ["/a"]\n'
+    change.base = change.commit(
+        {"robot.xml": policy_text({"/a": publish("x")}), "robot.toml": only}
+    )
+    change.commit({"robot.xml": policy_text({"/a": publish(after, "y")})})
+    asked = ("--policy", "robot.xml", "--requirements", "robot.toml", "--new-access", "allow")
+    ended = change.review(*asked)
+    assert ended.status == (after == "/x"), ended
+    said = ": only /any_namespace/a may publish /any_namespace/x"
+    assert (said in ended.out) == (after == "/x"), ended
+
+
 @pytest.mark.parametrize(
     ("name", "namespace"),
     [("/*/x", "/any_namespace"), ("/[!a]*/x", "/b"), ("/left/x", "/left"), ("/*_arm/x", "/_arm")],
