@@ -66,7 +66,8 @@ class Denial:
     (None: unknown), ``remote`` whether the permissions of a peer deny it.  ``enclave`` is "" if the
     log does not name the enclave.  ``process`` is the label of the process that printed the denial,
     or "", and ``lines`` the numbers of its lines, from 1.  ``folder`` is the folder from which the
-    process loaded its enclave, or "".
+    process loaded its enclave, or "".  ``neither`` says that the process may use the topic in
+    neither direction.
     """
 
     topic: str
@@ -78,6 +79,7 @@ class Denial:
     process: str = ""
     lines: tuple[int, ...] = field(default=(), compare=False)
     folder: str = field(default="", compare=False)
+    neither: bool = field(default=False, compare=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,10 +136,18 @@ def _denials_of(process: str, numbered: list[tuple[int, str]]) -> Iterator[Denia
             remote, direction = _direction(
                 lines[index : index + 1 + _MAX_LINES_TO_DIRECTION], topic
             )
-            rule = match.groupdict().get("rule")
-            by_rule = "deny" in rule.lower() if rule else None
+            rule, neither = match.groupdict().get("rule"), match.groupdict().get("neither")
             yield Denial(
-                topic, direction, enclave, by_rule, remote, vendor, process, (number,), folder
+                topic,
+                direction,
+                enclave,
+                by_rule="deny" in rule.lower() if rule else None,
+                remote=remote,
+                vendor=vendor,
+                process=process,
+                lines=(number,),
+                folder=folder,
+                neither=bool(neither),
             )
 
 

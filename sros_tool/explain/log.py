@@ -906,12 +906,12 @@ class _Examiner:
             for direction in directions
         ]
         answer = answers[0]
-        if all(answer.allowed for answer in answers):
-            facts = ["the current permissions allow it"]
-            if self._policy:
-                space, path = self._policy.place(enclave.name)
-                where = f" to {path}, which is {enclave.name} in namespace {space}" if space else ""
-                facts = [f"the policy allows it{where}"]
+        is_allowed = any if denial.neither else all
+        if is_allowed(answer.allowed for answer in answers):
+            rules = "policy allows" if self._policy else "current permissions allow"
+            one = "" if all(answer.allowed for answer in answers) else " in one direction"
+            created = ", which is enough to create the topic" if one else ""
+            facts = [f"the {rules} it{one}{self._namespace_clause(enclave)}{created}"]
             elsewhere, remedy = self._other_folder_cause(denial, enclave)
             facts += elsewhere
             remedy = remedy or (
@@ -948,6 +948,11 @@ class _Examiner:
             facts = [answer.decision.text, *other]
             remedy = better or finding.remedy
         return replace(finding, found=tuple(facts), checked=True, remedy=remedy)
+
+    def _namespace_clause(self, enclave: LoadedEnclave) -> str:
+        """Return a clause on the enclave of the policy that an enclave in a namespace is, or ""."""
+        space, path = self._policy.place(enclave.name) if self._policy else ("", "")
+        return f" to {path}, which is {enclave.name} in namespace {space}" if space else ""
 
     def _other_folder_cause(self, denial: Denial, enclave: LoadedEnclave) -> tuple[list[str], str]:
         """Return cause and remedy if the process loaded its files from another folder."""

@@ -673,18 +673,18 @@ _DENIED_TOPIC_TEXTS = (
     ),
     _log_text(
         "topic-denied", _CYCLONE,
-        r"(?:Local topic permission denied|Writer is not permitted|Reader is not permitted): "
+        r"(?:(?P<neither>Local topic permission denied)|(?:Writer|Reader) is not permitted): "
         r"(?P<topic>\S+) (?P<rule>denied by default rule|found in deny_rule)",
         refuses=RefusedObject.TOPIC,
     ),
     _log_text(  # rmw_cyclonedds, which also has reasons other than a refusal
         "topic-denied", _CYCLONE,
-        r"failed to create topic \[(?P<topic>[^\]\s]+)\] for unknown reasons",
+        r"(?P<neither>failed to create topic) \[(?P<topic>[^\]\s]+)\] for unknown reasons",
         refuses=RefusedObject.TOPIC,
     ),
     _log_text(  # the nodes of `sros demo`
         "topic-denied", _CYCLONE,
-        r"cannot create (?:topic|a (?:writer|reader) on) (?P<topic>\S+)\. "
+        r"cannot create (?:(?P<neither>topic)|a (?:writer|reader) on) (?P<topic>\S+)\. "
         r"Not Allowed By Security",
         refuses=RefusedObject.TOPIC,
     ),

@@ -117,7 +117,8 @@ def _first_refusal(refused: RefusedObject, text: str) -> str:
 def denied_topic(line: str) -> tuple[Vendor, re.Match[str]] | None:
     """Return the vendor that denies a topic, and the match with group ``topic``.
 
-    Group ``rule`` is the denying rule, if the line names the rule.
+    Group ``rule`` is the denying rule, if the line names the rule; group ``neither`` is present if
+    the line says that the topic may be used in neither direction.
     """
     for vendor, pattern in _TOPIC_DENIED:
         if match := pattern.search(line):

@@ -1028,6 +1028,33 @@ def test_a_log_of_a_robot_that_has_the_policy_in_a_namespace(
     )
 
 
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        (
+            "[rmw_cyclonedds_cpp]: failed to create topic [rq/homeRequest] for unknown reasons",
+            "the policy allows it in one direction, which is enough to create the topic\n",
+        ),
+        (
+            "Writer is not permitted: rq/homeRequest denied by default rule(code: 145)",
+            "/a may not call /home",
+        ),
+    ],
+)
+def test_a_topic_of_cyclone_dds_that_one_direction_would_create(
+    line: str, said: str, tmp_path: Path
+) -> None:
+    """Then the process has files of another policy. Twin: only its writer is denied."""
+    policy, log = tmp_path / "p.xml", tmp_path / "robot.log"
+    served = '<services reply="ALLOW"><service>home</service></services>'
+    policy.write_text(policy_text({"/a": served}))
+    log.write_text(line)
+    ended = sros("explain", policy, "/a", "--log", log)
+    assert said in ended.out, ended
+    is_older = "The process loaded permissions of another policy" in ended.out
+    assert is_older == ("failed" in line), ended
+
+
 def test_a_node_that_is_newer_than_its_policy(tmp_path: Path) -> None:
     """A name unlike all others is seldom a renamed one, so that this is said last."""
     policy, log = tmp_path / "p.xml", tmp_path / "robot.log"
