@@ -1037,7 +1037,7 @@ def test_a_log_of_a_robot_that_has_the_policy_in_a_namespace(
         ),
         (
             "Writer is not permitted: rq/homeRequest denied by default rule(code: 145)",
-            "/a may not call /home",
+            "no rule names publish rq/homeRequest",
         ),
     ],
 )
