@@ -48,7 +48,7 @@ class DateRule(Enum):
     LOCAL = auto()
     """A date is in the host's standard time; its offset is ignored (Fast DDS)."""
     CYCLONE = auto()
-    """As in the standard, but dates before 1970, after 2262 or incomplete are past."""
+    """As in the standard, but a date is past if it is incomplete, before 1970 or after 2262."""
 
 
 class OpenRange(Enum):
@@ -166,9 +166,9 @@ class VendorTraits:
     """If the first grant for a subject is not valid now, a later grant is used."""
     open_range: OpenRange = OpenRange.OPEN
     filters_own_domain: bool = True
-    """The participant itself ignores its rules for other domains; peers always do."""
+    """A participant itself ignores its rules for other domains, as peers always do."""
     relays_count_for_readers: bool = False
-    """For peers, the ``<relay>`` of a rule also applies to a reader, after the ``<subscribe>``."""
+    """For a reader, peers look at the ``<subscribe>`` of a rule, and then at its ``<relay>``."""
     topic_decides: bool = False
     """The first rule that names the topic decides, even if its partitions do not match."""
     deny_partitions: DenyPartitions = DenyPartitions.ANY_OR_ALL
@@ -185,12 +185,12 @@ class VendorTraits:
     longest_topic_name: int | None = None
     """Longest topic name that rules match, in bytes; longer topics can still be created."""
     creates_topics: bool = False
-    """A topic is created before its endpoint, and this needs a right in either direction.
+    """Creating an endpoint first creates its topic, which needs a right to publish or subscribe.
 
     The first rule that names the topic decides, for publishing or for subscribing.
     """
     asks_both_directions: bool = False
-    """A topic is created if its first rule to publish, or its first to subscribe, allows this."""
+    """A topic can be created if either the rules to publish or the rules to subscribe allow it."""
     always_needs_allow_rule: bool = False
     """A participant without allow rules never starts, even if joining is not controlled."""
     needs_domain_rule: bool = True

@@ -795,8 +795,8 @@ _WILDCARD_ROWS = (
                 attack,
                 party,
                 denied,
-                "a rule applies to a wildcard only if it covers all of it, and sros writes no"
-                " deny rules inside wildcards",
+                "Zenoh applies a rule to a wildcard only if the rule covers every key of the"
+                " wildcard, and sros writes no deny rules inside wildcards",
                 OWN,
                 _PEERS,
             ),
