@@ -1,9 +1,10 @@
 """A launch action of ROS 2 that starts each node in the enclave that its policy names.
 
-In Python ``SecuredNodes(keystore="keystore", policy="policy.xml")`` from this module, in XML
-``<secured_nodes keystore="keystore" policy="policy.xml"/>``, before the nodes: the action applies
-to the nodes that follow in the same launch file and group, also in included files.  ``ros2 launch
---secured KEYSTORE POLICY_FILE`` puts it before a launch file.
+A launch file has the action before its nodes: in Python as ``SecuredNodes(keystore="keystore",
+policy="policy.xml")`` from this module, in XML as ``<secured_nodes keystore="keystore"
+policy="policy.xml"/>``.  The action applies to the nodes that follow in the same launch file and
+group, also in included files.  ``ros2 launch --secured KEYSTORE POLICY_FILE`` puts the action
+before a launch file.
 
 This is the only module that imports ``launch``, and only ``launch`` and ``ros2 launch`` import it,
 by the entry points ``launch.frontend.launch_extension`` and ``ros2launch.option``.

@@ -44,8 +44,8 @@ def is_for_root_alone(mode: int) -> bool:
 def replaceable_on_the_way(path: Path, trusted_users: frozenset[int]) -> Iterator[tuple[Path, str]]:
     """Yield the folders and links above ``path`` through which others can replace it, and why.
 
-    A sticky folder such as ``/tmp``, in which only the owner of a file can rename it, counts only
-    if others own the next part of the path.
+    In a sticky folder such as ``/tmp``, only the owner of a file can rename the file.  So a sticky
+    folder counts only if others own the next part of the path.
     """
     for step, state in _path_states(path):
         kept = state.st_mode & stat.S_ISVTX and state.st_uid in trusted_users

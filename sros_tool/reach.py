@@ -419,7 +419,7 @@ def _accesses(
 
 
 def _exact_names_first(topic: str) -> tuple[bool, bool, bool, bool, str]:
-    """Return a sort key: topics before services, and /rosout last."""
+    """Return a sort key: topics, parts of actions, replies, and /rosout last; exact names first."""
     kind = topic[:3]
     return (
         topic == "rt/rosout",

@@ -211,8 +211,8 @@ def _narrow_first(rules: list[TopicRule]) -> list[TopicRule]:
 def protection_for(governance: Governance) -> DomainProtection | None:
     """Return the protection that `governance_for` translates to ``governance``, or None.
 
-    None means that the document protects a DDS topic without a ROS name, half of a service, or
-    single domains in different ways, which no settings of a keystore can state.
+    None means that no settings of a keystore can state the protection in the document: it protects
+    a DDS topic without a ROS name, only half of a service, or single domains in different ways.
     """
     from sros_tool.policy.model import DomainProtection, NamedProtection, TopicProtection
 

@@ -49,8 +49,8 @@ AUTHORITY_SOON = timedelta(days=90)
 def soon_limit(lifetime: timedelta, longest: timedelta = _SOON_BEFORE_EXPIRY) -> timedelta:
     """Return the remaining time below which a document counts as expiring soon.
 
-    This is ``longest``, or a third of the document's ``lifetime`` if that is shorter, in whole days
-    if possible, so that nothing is renewed each day.
+    This is ``longest``, or a third of the document's ``lifetime`` if that is shorter.  It is in
+    whole days if possible, so that a daily job does not renew the document each time.
     """
     limit = min(longest, lifetime / 3)
     unit = timedelta(days=1) if limit >= timedelta(days=1) else timedelta(seconds=1)

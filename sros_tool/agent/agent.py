@@ -85,7 +85,7 @@ from sros_tool.keystore.reader import OpenedKeystore, read_certificate
 from sros_tool.keystore.transaction import recover_keystore
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import (
-    authority_key,
+    key_digest_of_ca,
     load_certificates,
     make_request,
     pem,
@@ -865,7 +865,7 @@ class _Round:
                 authorities = documents.get(IDENTITY_CA_FILE, b"")
                 for authority in load_certificates(authorities, IDENTITY_CA_FILE):
                     lists = (newest_list(data, pem(authority)) for data in documents.values())
-                    by_authority[authority_key(authority)] += (e for e in lists if e is not None)
+                    by_authority[key_digest_of_ca(authority)] += (e for e in lists if e is not None)
         newest = (max(lists, key=list_number) for _, lists in sorted(by_authority.items()) if lists)
         text = "".join(crl.public_bytes(Encoding.PEM).decode() for crl in newest)
         if not text:

@@ -329,7 +329,7 @@ def _show_from(
                 "`sros zenoh --from` without -o shows what the rules allow. `sros generate_policy` "
                 "makes a policy from a running robot.",
             )
-        notes = tuple(_untranslatable_notes(rights))
+        notes = tuple(_notes_on_lost_rules(rights))
         changes = file_change(output, existed=output.exists())
         saved = "" if dry_run else save(output, policy_xml(policy))
     if as_json:
@@ -416,7 +416,7 @@ def _why_no_policy(subjects: Sequence[RightsOfSubject]) -> str:
     )
 
 
-def _untranslatable_notes(subjects: Sequence[RightsOfSubject]) -> Iterator[Note]:
+def _notes_on_lost_rules(subjects: Sequence[RightsOfSubject]) -> Iterator[Note]:
     """Yield notes about what the rules allow or deny but the policy does not state."""
     from sros_tool.translate_zenoh.rights import enclave_of
 

@@ -184,7 +184,7 @@ def run_demo(options: DemoOptions, now: datetime, progress: Progress) -> DemoRes
     started = time.monotonic()
     results: list[ScenarioResult] = []
     names: dict[str, None] = {}
-    with _ended_by_signals(), _folder(options.keep) as folder:
+    with _ended_by_signals(), _demo_folder(options.keep) as folder:
         if zenoh is None:
             progress("looking for a DDS that enforces security")
         backend = zenoh or find_backend(options.backend, folder, topic, now)
@@ -416,7 +416,7 @@ def _domains(
 
 
 @contextmanager
-def _folder(keep: Path | None) -> Iterator[Path]:
+def _demo_folder(keep: Path | None) -> Iterator[Path]:
     if keep is None:
         with TemporaryDirectory(prefix="sros-demo-") as name:
             yield Path(name)

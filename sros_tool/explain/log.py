@@ -65,8 +65,8 @@ from sros_tool.policy.patterns import Names, covers
 from sros_tool.policy.remapping import Remapping, renamed_action_text
 from sros_tool.policy.rights import Right, placed_rights
 from sros_tool.runtime.log_texts import (
-    LET_ENTER_EXPORT,
-    LET_ENTER_ORIGINAL,
+    CHANGE_OWNER_REMEDY,
+    EXPORT_FOR_USER_REMEDY,
     NO_ENCLAVE,
     RAN_OPEN,
     RUNS_OPEN,
@@ -727,7 +727,7 @@ class _Examiner:
             return self._with_peer_causes(plain, hits)
         path = first.fields.get("path", "")
         if meaning.id in _FOLDER_IDS and (place := _keystore_with(path)):
-            text = LET_ENTER_ORIGINAL if is_original_keystore(place) else LET_ENTER_EXPORT
+            text = EXPORT_FOR_USER_REMEDY if is_original_keystore(place) else CHANGE_OWNER_REMEDY
             advice = self._with_names(_with_name(text, "KEYSTORE", str(place)), named, first)
             if meaning.id != _FOLDER_IDS[0]:
                 advice = f"{advice} {remedy_of}"

@@ -283,7 +283,7 @@ class RouterFacts(NamedTuple):
 
 
 def router_facts(router: ZenohRouter) -> RouterFacts:
-    """Return the facts about a router for the output."""
+    """Return the facts about a Zenoh router that are printed."""
     return RouterFacts(
         router.name, router.endpoints, router.listening(), router.enclaves, router.crossing
     )
@@ -307,7 +307,7 @@ class NetworkFacts(NamedTuple):
 
 
 class SignerFacts(NamedTuple):
-    """A signature."""
+    """The signature of a document, and the certificate of its signer."""
 
     signer: str | None
     """Subject of the signer's certificate, or null."""
@@ -670,7 +670,7 @@ def _describe_keystore(keystore: OpenedKeystore, now: datetime) -> DescribedKeys
 def _unknown_authorities(
     keystore: OpenedKeystore, role: str, names: Iterable[str], now: datetime
 ) -> Iterator[str]:
-    """Yield text on CAs that the ledger does not record, or that only an enclave's file has.
+    """Yield a clause on each CA that the ledger or the CA file of the keystore lacks.
 
     Raises:
         SrosError: the ledger or the CA file of the keystore cannot be read.
@@ -732,16 +732,16 @@ def _describe_enclave(keystore: OpenedKeystore, name: str, now: datetime) -> Key
 
 
 def _facts_in_keystore(evaluation: EvaluatedEnclave, state: OpenedEnclave) -> EnclaveFacts:
-    """Describe an enclave's files; a key that is only on its robot is not a problem there.
+    """Describe an enclave's files, without counting a key that is only on the robot as missing.
 
-    ``state`` also has the problems that some vendors accept.
+    The result also has the problems in ``state`` for which only some vendors refuse the enclave.
     """
     problems = [*evaluation.problems, *evaluation.partial_refusal_clauses(state.problems)]
     return _enclave_facts(evaluation)._replace(problems=problems)
 
 
 def _enclave_facts(evaluation: EvaluatedEnclave) -> EnclaveFacts:
-    """Describe the files of an enclave; ``problems`` has the problems on this machine."""
+    """Describe an enclave's files, with the problems of a process on this machine."""
     state = evaluation.state
     domains, problems = state.domains(), list(evaluation.problems_here)
     identity, identity_sha256 = _subject_and_digest(state.identity_ca)
@@ -841,7 +841,7 @@ def _describe_signature(
 def _describe_signature_next_to(
     path: Path, data: bytes, now: datetime, authority: Path | None, files: FilesReadOnce
 ) -> SignatureFacts:
-    """Describe the signature of a Zenoh configuration, by the signed document next to it."""
+    """Describe the signature in the signed document next to a Zenoh configuration."""
     signed = path.with_name(ZENOH_SIGNED.get(path.name, path.name))
     if signed == path or not signed.exists():
         return _NOT_SIGNED
@@ -952,8 +952,8 @@ def _describe_remote_rights(configuration: Configuration) -> list[RemoteFacts]:
     """Return the rights that a configuration gives to remote enclaves.
 
     In client mode, the remote enclave is the router.  The rules for the router mirror the rules of
-    the client: the router may send what the client may receive.  So its entry shows the rights of
-    the client's own enclave.
+    the client: the router may send what the client may receive.  So the router's entry shows the
+    rights of the client's own enclave.
     """
     is_client = configuration.mode is Mode.CLIENT
     remotes = []
@@ -965,7 +965,7 @@ def _describe_remote_rights(configuration: Configuration) -> list[RemoteFacts]:
 
 
 def _opened_at(folder: Path, now: datetime) -> OpenedZenoh | None:
-    """Return the Zenoh configurations of the enclave in ``folder``; None without an enclave."""
+    """Return the Zenoh configurations in ``folder``; None if it is not an enclave's folder."""
     if not all((folder / file).exists() for file in (CERTIFICATE_FILE, PERMISSIONS_FILE)):
         return None
     state = open_enclave(folder, now=now)

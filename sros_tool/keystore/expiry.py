@@ -59,8 +59,8 @@ class Lifetime(NamedTuple):
     name: str
     certificate: Window
     permissions: Window
-    came: datetime | None = None
-    """When the certificate was written here; an elapsed validity counts from then.
+    written_at: datetime | None = None
+    """When the certificate was written to this keystore; the elapsed fraction counts from then.
 
     A CA service may date certificates differently from sros, which back-dates them.
     """
@@ -78,7 +78,7 @@ class Lifetime(NamedTuple):
             return any(validity.expires_soon_from() < now for validity in validities)
         return any(
             _elapsed_fraction(validity, now, made) >= threshold.elapsed
-            for validity, made in ((self.certificate, self.came), (self.permissions, None))
+            for validity, made in ((self.certificate, self.written_at), (self.permissions, None))
         )
 
 
@@ -86,7 +86,8 @@ class Credentials(NamedTuple):
     """The certificate of an enclave, and the grant that DDS reads; neither is verified.
 
     ``signed`` is the permissions document with the grant.  ``digest`` is the SHA-256 of
-    ``permissions.p7s`` in hexadecimal.  ``came`` is when the certificate was written here.
+    ``permissions.p7s`` in hexadecimal.  ``written_at`` is when the certificate was written to this
+    keystore.
     """
 
     name: str
@@ -94,11 +95,13 @@ class Credentials(NamedTuple):
     signed: smime.SignedDocument
     digest: str
     grant: Grant
-    came: datetime | None
+    written_at: datetime | None
 
     def lifetime(self) -> Lifetime:
         """Return the validity of the certificate and of the grant."""
-        return Lifetime(self.name, validity_of(self.certificate), self.grant.validity, self.came)
+        return Lifetime(
+            self.name, validity_of(self.certificate), self.grant.validity, self.written_at
+        )
 
 
 class UnreadableEnclave(NamedTuple):
@@ -272,10 +275,10 @@ def read_credentials(keystore: OpenedKeystore, name: str) -> Credentials:
                 keystore.root, f"`sros create_permission KEYSTORE {name} POLICY_FILE`."
             ),
         )
-    came = None
+    written_at = None
     with suppress(OSError):
-        came = time_of_file((keystore.folder(name) / CERTIFICATE_FILE).stat().st_mtime)
-    return Credentials(name, certificate, granted.signed, granted.digest, granted.grant, came)
+        written_at = time_of_file((keystore.folder(name) / CERTIFICATE_FILE).stat().st_mtime)
+    return Credentials(name, certificate, granted.signed, granted.digest, granted.grant, written_at)
 
 
 def describe_lifetime(lifetime: Lifetime, now: datetime) -> str:
@@ -290,5 +293,8 @@ def describe_lifetime(lifetime: Lifetime, now: datetime) -> str:
 
 
 def _elapsed_fraction(validity: Window, now: datetime, made_at: datetime | None) -> float:
-    """Return the elapsed fraction of a validity without its back-dating; above 1 after expiry."""
+    """Return the fraction of a validity that is over; more than 1 after the expiry.
+
+    The validity counts from ``made_at``, or else from the first date without its back-dating.
+    """
     return 1 - (validity.not_after - now) / validity.lifetime(made_at)

@@ -64,10 +64,10 @@ def load_fleet(keystore: OpenedKeystore) -> Fleet | None:
 
 
 def stated_distributions(keystore: OpenedKeystore, enclave: str) -> tuple[str, ...]:
-    """Return the ROS 2 distributions of an enclave; () if neither file states any.
+    """Return the ROS 2 distributions of an enclave; () if none are stated.
 
-    The fleet file can state the distribution of a robot; otherwise, the distributions in the
-    keystore's settings apply.
+    The fleet file can state the distribution of the enclave's robot.  If it does not, the
+    distributions in the keystore's settings apply.
 
     Raises:
         SrosError: the fleet or the settings cannot be read.
@@ -183,7 +183,7 @@ def enclaves_of_robot(keystore: OpenedKeystore, fleet: Fleet, robot: Robot) -> t
 
 
 def publish_command(root: Path) -> str:
-    """Return the command that brings new files to robots that fetch; "" before a publication."""
+    """Return the command that gives new files to robots that fetch; "" if nothing is published."""
     return f"`sros fleet publish {quote(str(root))} PUB`" if (root / FLEET_ROOT).exists() else ""
 
 
@@ -219,7 +219,7 @@ def deliver_first_sentence(root: Path) -> str:
 
 
 class EnclaveDomains(NamedTuple):
-    """The ROS domains of enclaves: the domains of the robot, or else of the keystore."""
+    """The ROS domains of enclaves: the domain of their robot, or else those of the keystore."""
 
     keystore: DomainSet
     fleet: Fleet | None = None
@@ -370,7 +370,7 @@ def refuse_stale_domains(
 
 
 def left_enclave_notes(keystore: OpenedKeystore, before: Fleet, after: Fleet) -> Iterator[Note]:
-    """Yield a note on robots that lose enclaves, or a router, that the keystore still has.
+    """Yield a note on each robot that loses enclaves or a router which the keystore still has.
 
     No two robots of ``after`` may have an enclave in common, which `write_fleet` checks.
     """

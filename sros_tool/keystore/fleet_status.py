@@ -75,9 +75,10 @@ from sros_tool.values import NamedKeystore, Words, shows
 
 
 class State(StrEnum):
-    """State of a robot's file, compared with the keystore; a robot has the worst of its states.
+    """State of a robot's file, compared with the keystore.
 
-    The order of the members is from good to bad.
+    The state of a robot is the worst state of its files.  The order of the members is from good to
+    bad.
     """
 
     CURRENT = "current"
@@ -210,14 +211,15 @@ class ConfirmedFile:
 class RobotStatus:
     """The deployment status of a robot, by its last confirmation.
 
-    ``others`` are enclaves of the robot that the fleet does not record.  ``has_release`` says
-    whether the last published release has the current files of the keystore, for a robot whose
-    files differ from these.  ``short_lived`` are short-lived enclaves with a file that expires soon
-    or has expired.  ``has_list`` says whether the robot has the current revocation list, or an
-    earlier list that revokes the same, in force or not.  From ``renew_from`` on, a file of the
-    robot expires soon.  From ``locked_out_from`` on, a web server with the current CA and list
-    refuses a robot that fetches.  ``lacks_key`` are enclaves whose key is in the keystore but not
-    on the robot; a release does not contain keys.  The other fields are about the robot:
+    ``others`` are enclaves of the robot that the fleet does not record.  ``has_release`` is only
+    set for a robot whose files differ from the keystore's: it says whether the last published
+    release has the keystore's current files.  ``short_lived`` are short-lived enclaves with a file
+    that expires soon or has expired.  ``has_list`` says whether the robot has the current
+    revocation list, or an earlier list that revokes the same certificates.  It does not say whether
+    processes have loaded the list.  From ``renew_from`` on, a file of the robot expires soon.  From
+    ``locked_out_from`` on, a web server with the current CA and list refuses a robot that fetches.
+    ``lacks_key`` are enclaves whose key is in the keystore but not on the robot; a release does not
+    contain keys.  The other fields are about the robot:
 
     - ``is_ahead``: by its message, its files are newer than the backup of the keystore;
     - ``reads_copy``: it fetched after the publication and got an earlier release;
@@ -225,7 +227,7 @@ class RobotStatus:
     - ``is_doubtful``: its files are not known, whatever it confirmed, because its last message was
       refused, its release was never published, or two computers have its keys;
     - ``may_trust_replaced``: one of its processes may trust an identity CA that was replaced;
-    - ``reported``: this number of problems, the first ones in the list, are in its own words.
+    - ``reported``: how many of its problems are in its own words; they come first in ``problems``.
     """
 
     robot: str
@@ -332,8 +334,8 @@ class RobotStatus:
     def settled(self) -> bool:
         """Whether there is nothing to do: the files are current and the agent reports no problem.
 
-        A robot without enclaves counts, too.  A revoked robot has no enclaves any more: only the
-        other robots need the revocation list.
+        A robot without enclaves is settled, too.  So is a revoked robot, once its enclaves are
+        gone: only the other robots need the revocation list.
         """
         if self.state is State.REVOKED:
             return not self.enclaves
@@ -351,12 +353,12 @@ class RobotStatus:
         return self.locked_out_from is not None and self.locked_out_from <= now
 
     def offline(self) -> RobotStatus:
-        """Return the status of the robot after it was silent for too long."""
+        """Return a copy with `State.OFFLINE` or worse, for a robot that was silent for too long."""
         state = max(self.state, State.OFFLINE, key=_RANK_OF_STATE.__getitem__)
         return replace(self.without_list(), state=state)
 
     def expired(self, now: datetime) -> RobotStatus:
-        """Return the status at ``now``: `State.EXPIRED` or worse if a file has expired."""
+        """Return a copy for the time ``now``: `State.EXPIRED` or worse if a file has expired."""
         if not self.enclaves or all(end > now for end in self.expiry.values()):
             return self
         status = self
@@ -365,12 +367,12 @@ class RobotStatus:
         return replace(status, state=max(self.state, State.EXPIRED, key=_RANK_OF_STATE.__getitem__))
 
     def without_list(self) -> RobotStatus:
-        """Return the status of a robot on which the last list may not be in force."""
+        """Return a copy for a robot on which the last revocation list may not be in force."""
         crl_in_force = None if self.crl_in_force is None else False
         return replace(self, crl_in_force=crl_in_force, has_list=False)
 
     def with_to_do(self, now: datetime, *, is_accepted: bool) -> RobotStatus:
-        """Return the status with what to do for the robot at ``now``.
+        """Return a copy whose ``to_do`` says what to do for the robot at ``now``.
 
         ``is_accepted`` says whether robots accept the published metadata.
         """
@@ -522,9 +524,9 @@ class FleetStatus:
         """Names of the robots that have not confirmed the stage of the CA rotation.
 
         In the first stage, robots have to confirm that they trust the new CA; in the second, that
-        they have the files of the new CA.  A robot is also unconfirmed if its processes still run
-        with earlier files, if it fetches and is offline, if it reports a release that was never
-        published, or if its last message was refused.
+        they have the files of the new CA.  A robot is also unconfirmed in these cases: its
+        processes still run with earlier files; it fetches and is offline; it reports a release that
+        was never published; or its last message was refused.
         """
         return tuple(
             robot.robot
@@ -541,10 +543,10 @@ class FleetStatus:
 
     @property
     def complete(self) -> bool:
-        """Whether every robot with enclaves confirmed the current files in time, without a restart
-        that is due and without a problem of its agent, robots can still fetch what was published,
-        and nothing else casts doubt on their files; if not, the exit status is 1.  Robots whose
-        enclaves were all revoked do not count.
+        """Whether nothing is left to do for the fleet; if false, the exit status is 1.  True if
+        every robot with enclaves confirmed the current files in time, no restart is due, no agent
+        reports a problem, robots can still fetch what was published, and nothing else casts doubt
+        on the robots' files.  Robots whose enclaves were all revoked do not count.
         """
         if (
             self.overdue
@@ -675,7 +677,7 @@ class _ComparedRobot(NamedTuple):
     def has_current_files(
         self, kind: str, is_equal: Callable[[_Difference], bool] = lambda _: False
     ) -> bool:
-        """Return whether all files of a kind are current, or equal by ``is_equal``.
+        """Return whether all files of a kind are current, or accepted by ``is_equal``.
 
         Enclaves that the robot does not have yet do not count, because no process can run in them.
         """
@@ -711,8 +713,7 @@ class _ComparedRobot(NamedTuple):
     def crl_restart(self) -> tuple[str, ...] | None:
         """Return the enclaves whose processes may lack the revocation list; None if not reported.
 
-        Robots with earlier releases of sros only report which enclaves have to restart, whatever
-        changed.
+        Robots with an earlier release of sros report only which enclaves have to restart, not why.
         """
         due = self.confirmed.crl_restart if self.confirmed else None
         return self.restart() if due is None else due
@@ -1003,9 +1004,9 @@ class _KeystoreRecords:
     def lacks_key(self, compared_robot: _ComparedRobot) -> tuple[str, ...]:
         """Return the enclaves whose certificate is for a key that the robot does not have.
 
-        The robot has no file of the enclave, or an earlier key, or its agent reports that the key
-        is missing.  An enclave whose key is not in the keystore is left out: the key was made on
-        the robot, and a release is enough.
+        This is so if the robot has no file of the enclave, if it has an earlier key, or if its
+        agent reports that the key is missing.  An enclave whose key is not in the keystore is left
+        out: its key was made on the robot, so the robot needs only a release.
         """
         confirmed = compared_robot.confirmed
         if confirmed is None:

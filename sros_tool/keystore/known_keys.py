@@ -114,9 +114,10 @@ def restored_at(keystore: OpenedKeystore) -> str:
 def subjects_since_restore(keystore: OpenedKeystore, ledger: Ledger) -> frozenset[str] | None:
     """Return the subjects first recorded after the last restore; None if no restore matters.
 
-    Nothing that a ledger lacks after a restore fits such a subject: neither certificates nor
-    permissions.  A restore matters until both CAs were replaced.  Subjects that only messages or
-    published releases showed (`KnownKeys.shown_after_restore`) do not count.
+    The ledger may lack certificates and permissions that were issued after the backup, but none of
+    them has one of these subjects.  A restore no longer matters once both CAs have been replaced.
+    Subjects that only messages or published releases showed (`KnownKeys.shown_after_restore`) are
+    left out.
     """
     entries = ledger.entries
     trusted = max((_since_trusted(keystore, entries, r) for r in (IDENTITY, PERMISSIONS)), key=len)
@@ -135,9 +136,13 @@ def _since_trusted(
 ) -> Sequence[Entry]:
     """Return the entries since the ledger first recorded a key of a trusted ``role`` CA.
 
-    ``entries`` come from reading the ledger, and include all CAs. All entries are returned if there
-    is no trusted CA; if a trusted CA was recorded only when it was renewed or replaced, because the
-    earlier ledger was lost; or if CAs are recorded without keys, as by earlier versions.
+    ``entries`` come from reading the ledger, and include all CAs.  All entries are returned in
+    these cases:
+
+    - there is no trusted CA;
+    - a trusted CA was recorded only when it was renewed or replaced, because the earlier ledger was
+      lost;
+    - CAs are recorded without keys, as earlier versions did.
     """
     trusted = {_key_digest_of(ca) for ca in keystore.authority(role)}
     authorities = [
@@ -155,8 +160,9 @@ def _since_trusted(
 def revoked_issues(keystore: OpenedKeystore, listed: Collection[str] = ()) -> Iterator[Entry]:
     """Yield the ledger entries of revoked certificates, and of the permissions of their enclaves.
 
-    Only certificates of CAs that are trusted now count, except certificates with a serial number in
-    ``listed``.  The entry of a certificate records its issue, or else its revocation.
+    Certificates of CAs that are no longer trusted are left out, and certificates whose serial
+    number is in ``listed``.  The entry of a certificate records its issue or, if the ledger lacks
+    the issue, its revocation.
     """
     serials = {f"{serial:x}" for serial in revoked_serials(keystore)}.difference(listed)
     recorded = keystore.ledger_file.with_values("serial", serials).entries if serials else ()
@@ -176,7 +182,7 @@ def revoked_issues(keystore: OpenedKeystore, listed: Collection[str] = ()) -> It
 def removed_enclaves(keystore: OpenedKeystore, now: datetime) -> Mapping[str, str]:
     """Map enclaves that were removed from a keystore, but not revoked, to their files' expiry.
 
-    Until then, whoever has these files can use them with a CA that the keystore trusts.
+    Until the files expire, whoever has them can use them, because the keystore trusts their CA.
     """
     recorded = keystore.ledger_file.recorded_enclaves()
     if recorded is None:
@@ -198,7 +204,7 @@ def removed_enclaves(keystore: OpenedKeystore, now: datetime) -> Mapping[str, st
 
 
 def unlisted_revocations(keystore: OpenedKeystore, now: datetime) -> Sequence[str]:
-    """Return the enclaves with revoked certificates that are still valid, but on no list."""
+    """Return the enclaves with a revoked, unexpired certificate that is on no revocation list."""
 
     def read() -> Sequence[str]:
         lists = keystore.revocation_lists
@@ -246,10 +252,11 @@ def _known_authorities(keystore: OpenedKeystore, role: str) -> frozenset[str] | 
 
 
 def _may_be_of_trusted(keystore: OpenedKeystore, entry: Entry) -> bool:
-    """Return whether a trusted CA may have issued a certificate that was recorded after the CA.
+    """Return whether a trusted CA may have issued the certificate of a ledger entry.
 
-    Until the stage reissue of a rotation, the previous CA goes on to issue.  The file of the
-    revoked certificate shows the issuer, if the file exists and has the recorded digest.
+    An entry after the entry of a trusted CA does not prove it: until the stage reissue of a
+    rotation, the previous CA goes on to issue.  The copy in the folder ``revoked`` shows the issuer
+    if it exists and has the recorded digest; without it, the result is True.
     """
     file = keystore.identity_file
     with suppress(SrosError):
@@ -263,7 +270,7 @@ class IssuedEarlier:
     """The certificates and permissions of enclaves in the ledger, without revoked certificates.
 
     Permissions work with a certificate for their subject, until the permissions or the certificate
-    expires.  Entries from before all CAs that are trusted now are left out.
+    expires.  Entries that are older than every trusted CA are left out.
     """
 
     def __init__(self, keystore: OpenedKeystore, names: Collection[str]) -> None:
@@ -301,10 +308,14 @@ class IssuedEarlier:
     def certificates_until(self, replaced: Entry, signed_for: str | None) -> datetime:
         """Return when ``replaced`` and all earlier certificates of its enclave stop working.
 
-        A certificate works only as long as permissions in the ledger fit it.  But a certificate
-        works until it expires if its subject is ``signed_for``, the subject of the enclave's new
-        certificate, or if its subject has no unique part, because Cyclone DDS finds such a subject
-        in other subjects.  If ``signed_for`` is None, certificates need no permissions.
+        A certificate works until it expires, or until the last permissions for its subject in the
+        ledger expire, if that is earlier.  In three cases, only the expiry of the certificate
+        counts:
+
+        - its subject is ``signed_for``, the subject of the enclave's new certificate;
+        - its subject has no unique part, because Cyclone DDS finds such a subject in other
+          subjects;
+        - ``signed_for`` is None, which says that certificates need no permissions.
         """
         last: defaultdict[str, str] = defaultdict(str)
         for entry in self._permissions[replaced.enclave]:
@@ -380,7 +391,7 @@ class KnownKeys:
 
     @cached_property
     def _unrecorded_serials(self) -> frozenset[int]:
-        """The serial numbers that are only on lists (copied or published), as after a restore."""
+        """The serial numbers on copied or published lists that the ledger lacks."""
         from sros_tool.keystore.delivery.published import later_revoked_serials
 
         recorded = {int(entry.serial, 16) for entry in self._revocations}
@@ -479,8 +490,8 @@ class KnownKeys:
 
         ``certificate`` is the current certificate for the key: a backup may have restored a revoked
         certificate.  With ``publish_first``, if only published lists revoke the key, the remedy is
-        to publish with --restored.  Callers leave it out while CAs have to be replaced again,
-        because publishing is refused until then.
+        to publish with --restored.  Callers set it to False while CAs have to be replaced again,
+        because publishing is refused until that is done.
         """
         revoked = self._revoked_keys.get(key_digest(key))
         if certificate and certificate.serial_number in self._revoked_serials:

@@ -270,10 +270,10 @@ _SIGN_POLICY = re.compile(r"un `sros generate_artifacts -k [^`]+ -p POLICY_FILE`
 
 
 def remedy_in_closed_robot(root: Path, remedy: str) -> str:
-    """Return a remedy for ``root``; in a closed robot's folder, `sros close` signs and exports.
+    """Return a remedy with its commands adapted to ``root`` if this is in a closed robot's folder.
 
-    The remedy is returned unchanged if the CA keys are no longer in that folder, and in an office,
-    to which nobody brings the observation of the robot.
+    There, `sros close` signs and exports.  The remedy is returned unchanged if that folder no
+    longer has the CA keys, or has no observation of the robot, as in an office.
     """
     robot = folder_of_closed_robot(root)
     is_here = robot and (robot / CLOSED_OBSERVATION).is_file()

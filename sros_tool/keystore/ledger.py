@@ -476,9 +476,10 @@ class LedgerFile:
     def last_time(self) -> datetime | None:
         """Return the time of the last entries, in UTC; None if there is no entry.
 
-        This is the latest time since the last revocation list.  So an entry with a wrong time does
-        not hide a clock that is behind, and a new list corrects times that a clock ahead of time
-        wrote.
+        This is the latest time among the entries from the last revocation list on.  Because several
+        entries count, a single entry with an early time does not hide that the clock is behind.
+        Because entries before the list do not count, a new list ends the effect of late times,
+        which were written while the clock was ahead.
         """
         times = []
         for line in reversed(self._opened().last_lines):
@@ -529,7 +530,10 @@ class LedgerFile:
             self._files = None
 
     def _restore_index(self) -> bool:
-        """Remove a damaged index once; the process that locks the keystore makes it again."""
+        """Remove a damaged index, once; return whether this call removed it.
+
+        The process that locks the keystore makes the index again.
+        """
         may_restore, self._may_restore, self._files = self._may_restore, False, None
         if may_restore:
             from sros_tool.folders import Folder
@@ -570,8 +574,8 @@ class LedgerFile:
     def _index(self, file: BinaryIO, head: _Head) -> LedgerIndex | None:
         """Return the index that the head states; None if no index fits the end of this ledger.
 
-        A process that has locked the keystore makes a missing index, or one of another version of
-        sros, again.
+        If the index is missing, or another version of sros made it, a process that has locked the
+        keystore makes a new index.
         """
         is_long = head.lines >= _INDEX_FROM_LINES
         if not head.index_root and (self._follow_link or not is_long):
@@ -789,10 +793,10 @@ class LedgerFile:
         return _Reading(Ledger(gaps=(missing.text,)), [missing])
 
     def _later_than(self, part: int, last: os.stat_result | None = None) -> str:
-        """Return the name of a part of the ledger after the part ``last``; "" if there is none.
+        """Return the name of a file that has lines after the last known part; "" if there is none.
 
-        ``part`` is the number of the last part.  The file of the last part can also have another
-        name, or be a copy.
+        ``part`` is the number of the last known part.  ``last`` is its file, which can also have
+        another name, or be a copy.
         """
         if not self.root.exists():
             return ""
@@ -869,8 +873,8 @@ class _ReadLines(NamedTuple):
     """The entries in a ledger with the ``numbers`` of their lines, and the faults of the chain.
 
     ``unchained`` is the number of lines before the chain, ``lines`` the number of all lines.
-    ``signed`` is the digest of the line that is the last one by the head.  The other fields are as
-    in `_Reading`.
+    ``signed`` is the digest of the line that the head states as the last one.  The other fields are
+    as in `_Reading`.
     """
 
     entries: tuple[Entry, ...]
@@ -887,9 +891,10 @@ class _ReadLines(NamedTuple):
 def _read_lines(
     lines: Iterable[bytes], needed_text: bytes, stated: int, maximum: int, most_bytes: int
 ) -> _ReadLines | None:
-    """Return the lines of a ledger; None if they are more than ``maximum``, or ``most_bytes`` long.
+    """Return the lines of a ledger; None if there are too many.
 
-    ``stated`` is the number of lines that the head states; ``needed_text`` is as in `LedgerFile`.
+    At most ``maximum`` lines and ``most_bytes`` bytes are read.  ``stated`` is the number of lines
+    that the head states; ``needed_text`` is as in `LedgerFile`.
     """
     entries: list[Entry] = []
     numbers = array("Q")
@@ -1072,7 +1077,7 @@ class _Head(NamedTuple):
 def _head_fault(head: _Head | None, lines: int, signed: str, *, is_chained: bool) -> _Fault | None:
     """Return the fault if a ledger and its signed head disagree, or None.
 
-    ``signed`` is the digest of the ledger's line that is the last one by the head.
+    ``signed`` is the digest of the line that the head states as the last one.
     """
     if not head:
         text = f"{LEDGER_HEAD}, which signs its end, is missing"

@@ -1,11 +1,11 @@
 """The index of a long ledger: it finds the lines about an enclave, a key or a document.
 
 The index is an SQLite file next to the ledger.  With it, a change of one enclave need not read the
-lines about all other enclaves.  The index is only a cache, and trusted as little as any other file:
-the signed head of the ledger states its `root`, the digest of its whole content, and every part
-that is read is compared with the root.  An index that is missing, damaged, forged, or of another
-state of the ledger is not used, and is made again from the ledger when the keystore is next
-changed.
+lines about all other enclaves.  The index is only a cache, and trusted as little as any other file.
+Its `root` is the digest of its whole content.  The signed head of the ledger states the root, and
+every part of the index that is read is compared with the root.  An index that is missing, damaged,
+forged, or of another state of the ledger is not used.  The next change of the keystore makes it
+again from the ledger.
 
 A *term* is the value of a field of an entry, such as the name of an enclave.  A *posting* says that
 a line has a term, where the line is, and what its digest is.  Postings are kept in buckets, by the

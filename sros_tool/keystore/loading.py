@@ -190,8 +190,8 @@ def _is_vendor_specific(problem: Problem, state: OpenedEnclave) -> bool:
 class _Trust(NamedTuple):
     """The CA files of a keystore, as a vendor reads them.
 
-    ``authorities`` are the certificates in the file of the identity CA, and ``signers`` those in
-    the file of the permissions CA, in order; empty if the file cannot be read.
+    ``authorities`` are the certificates in the file of the identity CA, in order.  ``signers`` are
+    the certificates in the file of the permissions CA.  Either is empty if the file cannot be read.
     """
 
     authorities: Certificates

@@ -125,7 +125,7 @@ def authority_facts(roles: Sequence[str], certificate: x509.Certificate | None) 
 def trusted_authorities(
     identity: x509.Certificate, permissions: x509.Certificate
 ) -> tuple[AuthorityFacts, ...]:
-    """Return the facts about the CAs that a robot trusts: once for a single CA with both roles."""
+    """Return the facts about the CAs that a robot trusts: one CA if it has both roles, else two."""
     if identity == permissions:
         return (authority_facts(ROLES, identity),)
     pairs = zip(ROLES, (identity, permissions), strict=True)

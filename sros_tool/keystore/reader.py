@@ -283,7 +283,7 @@ class OpenedKeystore:
         return is_original_keystore(self.root) or self.has(GOVERNANCE_P7S)
 
     @_ReadOnceProperty
-    def is_of_ros2(self) -> bool:
+    def was_written_only_by_sros2(self) -> bool:
         """Whether ros2/sros2 made the keystore, and sros has not written to it yet.
 
         Such a keystore has neither settings nor a ledger, and its CAs have no key identifier.  sros
@@ -454,7 +454,7 @@ class OpenedKeystore:
 
     @_ReadOnceProperty
     def has_keys(self) -> bool:
-        """Whether any enclave has its key or says where it is; a copy may have no keys."""
+        """Whether the folder of any enclave has the key, or says where the key is."""
         return not self._lacks_keys and any(
             os.path.lexists(enclave_path(self.root, name) / file)
             for name in enclave_names(self.root, hidden=True)
@@ -720,7 +720,7 @@ class OpenedEnclave:
 class EnclaveIdentity(NamedTuple):
     """The certificate of an enclave, and the problems of certificate, key and identity CA.
 
-    In a keystore, a key that was generated on the robot and stays there is not here.
+    A keystore lacks a key that was generated on the robot and stays there.
     """
 
     certificate: x509.Certificate | None
@@ -1103,7 +1103,7 @@ def read_consistently(
 ) -> Callable[Concatenate[Opened, Arguments], Result]:
     """Decorate a function so that it is called again if the keystore changes in the meantime.
 
-    After five calls, the last result or exception counts.
+    After five calls, the last result is returned, or the last exception raised.
     """
 
     @wraps(read)

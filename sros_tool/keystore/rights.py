@@ -92,8 +92,8 @@ class RightsSource:
     access control of each Zenoh process that checks other processes.  ``routers`` are the enclaves
     of a keystore's routers, and ``links`` describes the names that pass between several routers.
     ``configurations`` are the Zenoh configurations that were read, including those of clients.
-    ``key_domains`` maps their rights to the ROS domains in the keys; None stands for a wildcard.
-    ``policy`` is the policy in a policy file.
+    ``key_domains`` maps the rights in these configurations to the ROS domains in their keys, where
+    None stands for a wildcard.  ``policy`` is the policy in a policy file.
     """
 
     path: Path
@@ -333,8 +333,8 @@ def _router_links(
 ) -> RouterLinks | None:
     """Return the links between routers: the names that pass, and the router of each enclave.
 
-    ``files`` maps enclaves to their folders, and ``sources`` has the rights in the configurations
-    there.
+    ``files`` maps enclaves to their folders.  ``sources`` maps these folders to the rights in their
+    configurations.
     """
     from sros_tool.translate_zenoh.rights import RouterLinks
 
@@ -666,8 +666,9 @@ def compared_enclaves(
 ) -> frozenset[str] | None:
     """Return the enclaves for which two sources are compared; None for all.
 
-    If one source is only for some enclaves, these are compared.  Two exports, or two enclaves, are
-    compared in all their enclaves.  An enclave and an export are compared only in this enclave.
+    If only one source is limited to some enclaves, these are compared.  For two exports or two
+    enclaves, the enclaves of both sources are compared.  For an enclave and an export, only this
+    enclave is compared.
 
     Args:
         sides: the kind and the ``scope`` of each source, as in `RightsSource`.
@@ -869,8 +870,9 @@ For more enclaves, the whole ledger is read.
 class _LedgerPermissions:
     """The permissions in the ledger, or in the part of the ledger about some enclaves.
 
-    ``last`` maps enclaves to their last permissions.  ``chained`` are enclaves with permissions
-    after the lines without a hash chain, and ``certain`` those with permissions after the last gap.
+    ``last`` maps enclaves to their last permissions.  ``chained`` are the enclaves with permissions
+    in the lines that have a hash chain.  ``certain`` are the enclaves with permissions after the
+    last gap.
     """
 
     def __init__(self, ledger: Ledger, keystore: OpenedKeystore) -> None:
@@ -879,7 +881,7 @@ class _LedgerPermissions:
         chained = ledger.entries[ledger.unchained :]
         self.chained = {entry.enclave for entry in chained if entry.what == "permissions"}
         # The first write of sros records the files of ros2/sros2.
-        self.complete = not keystore.is_of_ros2
+        self.complete = not keystore.was_written_only_by_sros2
         self.last = {
             entry.enclave: entry for entry in ledger.entries if entry.what == "permissions"
         }
@@ -889,8 +891,9 @@ class _LedgerPermissions:
 class RecordedRights:
     """The rights that were last signed for each enclave, by the ledger.
 
-    Signatures of older permissions stay valid.  Without this check, whoever puts older permissions
-    back could have their rights signed again, with a new date.
+    The signatures of older permissions stay valid.  So present permissions are compared with the
+    ledger before their rights are signed again.  Otherwise, whoever puts older permissions back
+    could get their rights signed with a new date.
     """
 
     def __init__(self, keystore: OpenedKeystore, ledger: Ledger | None = None) -> None:

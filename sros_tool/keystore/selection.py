@@ -155,8 +155,9 @@ def _possible_enclaves(
 ) -> Sequence[str]:
     """Return all enclaves that may belong to ``robots``, and perhaps others.
 
-    If the ledger has an index, these are the enclaves in the folders of the robots, and enclaves in
-    the ledger with the name of a robot or of such a folder in their paths.
+    Without an index of the ledger, these are all enclaves.  With an index, they are the enclaves in
+    the folders of the robots, and enclaves in the ledger whose path has the name of a robot or of
+    such a folder.
     """
     folders = folders_of_robots(fleet, robots)
     recorded = keystore.ledger_file.recorded_with(*robots, *folders)
@@ -353,9 +354,10 @@ _PERMISSION_TEXTS = {
 def _enclaves_using(
     keystore: OpenedKeystore, name: str, names: Sequence[str]
 ) -> dict[str, list[str]]:
-    """Map each kind that ``name`` has in permissions to the enclaves that use it; always "node".
+    """Map kinds of names to the enclaves whose permissions use ``name`` as this kind.
 
-    A node belongs to the enclaves that may serve its parameters.
+    The kind "node" is always in the result.  A node belongs to the enclaves that may serve its
+    parameters.
     """
     uses: dict[str, list[str]] = {"node": []}
     for enclave in names:

@@ -67,8 +67,8 @@ from sros_tool.parallel import map_slices
 from sros_tool.xml import read_bytes
 
 _BEFORE, _AFTER, _LIVE, _ADDED, MANIFEST = "before", "after", "live", "added", "manifest.json"
-_VERSION = 3
-_EARLIER_VERSION = 2
+_MANIFEST_VERSION = 3
+_MANIFEST_VERSION_WITHOUT_FOLDERS = 2
 """The earlier version of the manifest, which lists no moves of folders."""
 
 
@@ -94,8 +94,8 @@ _ACTION_ADOPT = "adopt"
 class Change:
     """A change of a file or link by a transaction.
 
-    ``action`` is "create", "replace" or "remove".  The action is `_ACTION_CLOSE` for a private key
-    or a folder of keys that other users could open before, and `_ACTION_ADOPT` for a keystore of
+    ``action`` is usually "create", "replace" or "remove".  It is `_ACTION_CLOSE` for a private key
+    or a folder of keys that other users could open before.  It is `_ACTION_ADOPT` for a keystore of
     ros2/sros2 that gets settings and a ledger.  ``path`` is relative to the keystore.
     """
 
@@ -222,7 +222,7 @@ def _point_live(folder: Folder, to: str) -> None:
 
 def _write_manifest(folder: Folder, moves: Sequence[Move]) -> None:
     """Write the manifest; the caller flushes it to disk before the first move."""
-    text = json.dumps({"version": _VERSION, "moves": moves})
+    text = json.dumps({"version": _MANIFEST_VERSION, "moves": moves})
     folder.write(f"{STAGE}/{MANIFEST}", text.encode(), 0o600)
 
 
@@ -234,8 +234,8 @@ def _read_manifest(folder: Folder) -> tuple[Move, ...]:
     """
     try:
         read = json.loads(folder.read(f"{STAGE}/{MANIFEST}"))
-        if read["version"] not in (_EARLIER_VERSION, _VERSION):
-            raise ValueError(f"its version is not {_VERSION}")
+        if read["version"] not in (_MANIFEST_VERSION_WITHOUT_FOLDERS, _MANIFEST_VERSION):
+            raise ValueError(f"its version is not {_MANIFEST_VERSION}")
         return tuple(_checked_move(*move) for move in read["moves"])
     except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
         raise _damaged_stage_error(
@@ -799,9 +799,9 @@ class Transaction:
         """Put all staged changes in place atomically, and flush them to disk.
 
         Private keys and folders of keys that other users could open are closed to them, because
-        ros2/sros2 leaves their mode to the umask.  This applies to the keys of the CAs and of the
-        changed enclaves; when a keystore of ros2/sros2 is taken over, or all enclaves are read, it
-        applies to all enclaves.
+        ros2/sros2 leaves their mode to the umask.  Only the keys of the CAs and of the changed
+        enclaves are closed.  When a keystore of ros2/sros2 is taken over, or all enclaves are read,
+        the keys of all enclaves are closed.
 
         Raises:
             KeystoreError: another process has created the keystore in the meantime.

@@ -891,6 +891,6 @@ def key_digest(key: PublicKey) -> str:
     return hashlib.sha256(der).hexdigest()
 
 
-def authority_key(authority: x509.Certificate) -> str:
+def key_digest_of_ca(authority: x509.Certificate) -> str:
     """Return the `key_digest` of a CA: a later certificate of the same key is the same CA."""
     return key_digest(authority.public_key())  # type: ignore[arg-type]

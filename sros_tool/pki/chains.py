@@ -268,7 +268,7 @@ def _key_faults(certificate: x509.Certificate) -> Iterator[str]:
 
 @lru_cache(maxsize=64)
 def _extension_faults(certificate: x509.Certificate) -> tuple[str, ...]:
-    """Return the faults of extensions for which OpenSSL or sros refuses every chain with them."""
+    """Return the faults of extensions that make OpenSSL or sros refuse chains of a certificate."""
     name = subject_text(certificate.subject)
     faults = [*_unread_faults(certificate)]
     if extension(certificate, x509.KeyUsage) == _NO_USAGE:

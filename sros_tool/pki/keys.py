@@ -227,7 +227,7 @@ _ENCRYPTED = re.compile(rb"-----BEGIN ENCRYPTED PRIVATE KEY-----([^-]*)")
 
 
 def _validated(key: rsa.RSAPrivateKey, name: str) -> rsa.RSAPrivateKey:
-    """Return an RSA key that was loaded without validation, validated now.
+    """Validate an RSA key that was loaded without validation, and return it.
 
     Raises:
         PkiError: the key is invalid, or so large that validation would take minutes.

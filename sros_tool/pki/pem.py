@@ -1,4 +1,4 @@
-"""A reader of PEM that reads as OpenSSL 3, used by every DDS vendor (pem_lib.c); file types.
+"""Reading PEM files as OpenSSL 3 of all DDS vendors does (pem_lib.c), and finding file types.
 
 OpenSSL is stricter than other programs, which RFC 7468 permits: a block begins and ends at the
 start of a line, and a damaged block hides all blocks after it.

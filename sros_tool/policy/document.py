@@ -135,7 +135,7 @@ class Includer:
     _digests: list[bytes] = field(default_factory=list)
 
     def digest(self) -> str:
-        """Return the SHA-256 (hexadecimal) of all files read so far, in any order."""
+        """Return the SHA-256 (hexadecimal) of all files read so far, whatever their order."""
         return hashlib.sha256(b"".join(sorted(self._digests))).hexdigest()
 
     def load(self, file: Path) -> etree._Element:
@@ -563,7 +563,7 @@ class _Reader:
         element: etree._Element,
         place: IncludedFile,
     ) -> PolicyError:
-        """Return the error for a name that is invalid with any values of placeholders.
+        """Return the error for a name that is invalid, whatever its placeholders stand for.
 
         ``written`` is the name as in the file.  ``label`` is "enclave name" or "namespace".
         """

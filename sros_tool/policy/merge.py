@@ -436,9 +436,9 @@ def merge_into(path: Path, additions: Policy) -> Merged:
     """Return the policy file at ``path`` with the rights of ``additions`` merged; write nothing.
 
     Raises:
-        PolicyError: (or another `DocumentError`) the file is not a policy, or a right cannot be
-            added: its enclave is in an included file, or the part to change is also included
-                elsewhere, where it would add rights that nobody requested.
+        PolicyError: (or another `DocumentError`) the file is not a policy; or a right cannot be
+            added, because its enclave is in an included file, or because the part to change is also
+            included elsewhere, where the change would add rights that nobody requested.
     """
     return merge_all(path, (additions,))
 

@@ -54,12 +54,12 @@ def enclaves_of_nodes(
 ) -> dict[str, str]:
     """Map observed enclaves that are named like nodes to the enclaves of these nodes in a policy.
 
-    ``generate_policy --enclave-per-node`` names enclaves like nodes.
+    ``generate_policy --enclave-per-node`` names enclaves like nodes.  Left out are nodes in several
+    enclaves, and observed enclaves that are in the policy.
 
     Args:
         observed: the enclaves that were observed.
-        nodes: the full names of the nodes in each enclave of the policy. The result leaves out
-            nodes in several enclaves, and observed enclaves that are in the policy.
+        nodes: the full names of the nodes in each enclave of the policy.
     """
     homes = defaultdict(list)
     for enclave, names in nodes.items():
@@ -529,7 +529,7 @@ def _wildcard_candidates(rights: Iterable[Right]) -> dict[Right, list[Right]]:
 
 
 def _wider_names(name: str) -> Iterator[str]:
-    """Yield wildcards for a name, with ``*`` after a namespace (not "/") or for its numbers."""
+    """Yield wildcards for a name: ``*`` after a namespace (not "/"), or in place of numbers."""
     tokens = name.split("/")[1:-1]
     for depth in range(1, len(tokens) + 1):
         yield "/" + "/".join((*tokens[:depth], "*"))
@@ -543,7 +543,10 @@ def _wider_names(name: str) -> Iterator[str]:
 def _names_without_right(
     enclave: str, own_rules: Rules, known_rights: Iterable[Right]
 ) -> dict[str, list[str]]:
-    """Map rights to known names for which the enclave lacks the right; actions count as parts."""
+    """Map rights to the known names for which the enclave lacks the right.
+
+    An action counts as the services and topics of which it consists.
+    """
     by_service: dict[bool, set[str]] = {True: set(), False: set()}
     for part in split_actions(known_rights):
         if not is_expression(part.name):

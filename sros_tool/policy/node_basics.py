@@ -33,10 +33,10 @@ def _basics() -> Rules:
 class NodeRights:
     """The rights of some enclaves that their own nodes need to start.
 
-    The services of a node count only if the enclave may serve all these services and no other
-    enclave may serve any of them, because with such a right, a process can pose as another
-    enclave's node.  The comparison leaves out a right to serve the services of nodes with any name,
-    which enclaves without a policy have.
+    The services of a node count only if the enclave may serve all of them, and no other enclave may
+    serve any of them.  The reason is that a process with such a right can pose as another enclave's
+    node.  The comparison leaves out a right to serve the services of nodes with any name, which
+    enclaves without a policy have.
     """
 
     def __init__(self, rights: Iterable[Right]) -> None:

@@ -47,7 +47,7 @@ class Remapping(NamedTuple):
     new: str
 
     @property
-    def is_of_node(self) -> bool:
+    def depends_on_node(self) -> bool:
         """Whether the rule has names that differ from node to node."""
         return self.old == _NODE or "~" in (self.old[0], self.new[0])
 
@@ -106,7 +106,7 @@ def parse_remapping_of_names(text: str) -> Remapping:
     problem = remedy = ""
     if rule.old == _NAMESPACE:
         problem, remedy = "It is for a namespace.", "Name the namespace with --namespace."
-    elif rule.is_of_node:
+    elif rule.depends_on_node:
         if not rule.node:
             problem, remedy = "It does not say for which node.", f"Write it as NODE:{rule}."
     elif rule.node:
@@ -232,7 +232,7 @@ def _notes_on_requirements(
     if gone:
         # These rules are for `parse_remapping_of_names`, where no node is named.
         options = {
-            str(use.rule._replace(node=use.node if use.rule.is_of_node else ""))
+            str(use.rule._replace(node=use.node if use.rule.depends_on_node else ""))
             for _, uses in remapped
             for use in uses
             if use.old in gone

@@ -330,8 +330,8 @@ def compare(
 
     An action counts as its services and topics.  A right that only one side states is no difference
     if it is covered by wildcards that both sides state, because large permissions leave such rights
-    out.  But a part of an action is a difference if the other side has the part only with the whole
-    action, and the whole action is a difference.
+    out.  There is one exception: if the whole action is a difference, a part of it that the other
+    side states is one, too.
     """
     first, second = (
         join_actions(right for right in side if scope is None or right.enclave in scope)
@@ -531,9 +531,10 @@ def rights_without_counterpart(
     """Return the ``second_rights`` whose counterpart was in ``first_rights``, and is gone.
 
     An example is a right to subscribe to a topic that no enclave may publish any more, because the
-    right to publish it is gone or denied; another is a right to publish a topic to which no enclave
-    may subscribe any more.  A right with a wildcard counts if no counterpart has a matching name.
-    Names that every node offers, such as its parameter services, need no counterpart.
+    right to publish it is gone or denied.  Another example is a right to publish a topic to which
+    no enclave may subscribe any more.  A right with a wildcard counts if no counterpart has a
+    matching name.  Names that every node offers, such as its parameter services, need no
+    counterpart.
     """
     reduced = [right for right in difference.only_first if right.qualifier is not DENY]
     reduced += (right for right in difference.only_second if right.qualifier is DENY)

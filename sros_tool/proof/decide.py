@@ -121,12 +121,12 @@ class Verdict:
     empty: tuple[str, ...] = ()
     always: str = ""
     assumed: str = ""
-    kept: KeptUse | None = None
+    kept: BlockedUse | None = None
     unnamed: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
-class KeptUse:
+class BlockedUse:
     """A use whose messages do not pass between Zenoh routers to or from the enclaves ``others``."""
 
     use: Use
@@ -197,7 +197,7 @@ def decide(requirement: Requirement, world: World, limit: SearchLimit | None = N
     assumed = "" if witness else _assumed_protection(requirement, world, limit)
     kept = None
     if isinstance(requirement, Must) and not witness and world.crossing:
-        kept = _use_kept_from_others(requirement, world, limit)
+        kept = _use_blocked_by_routers(requirement, world, limit)
     return Verdict(requirement, witness, empty, always, assumed, kept, tuple(unnamed))
 
 
@@ -236,8 +236,8 @@ class _Part:
     end: str
 
     @property
-    def longer(self) -> int:
-        """Number of bytes by which the topic is longer than the name."""
+    def added_bytes(self) -> int:
+        """Number of bytes that the topic has in addition to the name."""
         return len(self.begin) + len(self.end)
 
     def topics(self, name: str) -> Topics:
@@ -257,7 +257,7 @@ def _parts_of(right: str) -> tuple[_Part, ...]:
 
 @lru_cache(maxsize=16)
 def _sufficient_parts(right: str) -> tuple[_Part, ...]:
-    """Return the DDS topics of a right that are enough, alone, to do a part of the right."""
+    """Return the DDS topics of a right each of which is enough to do a part of the right."""
     return tuple(part for part in _parts_of(right) if part.writes or right == "subscribe")
 
 
@@ -377,7 +377,9 @@ def _is_on_other_domain(world: World, enclave: str, limit: SearchLimit) -> bool:
     return bool(world.elsewhere) and not has_rights(world) and any(map(has_rights, world.elsewhere))
 
 
-def _use_kept_from_others(requirement: Must, world: World, limit: SearchLimit) -> KeptUse | None:
+def _use_blocked_by_routers(
+    requirement: Must, world: World, limit: SearchLimit
+) -> BlockedUse | None:
     """Return a demanded use that does not reach enclaves at other routers that may receive it."""
     enclave = requirement.enclave
     for right, names in requirement.rights:
@@ -393,7 +395,7 @@ def _use_kept_from_others(requirement: Must, world: World, limit: SearchLimit) -
                     other_enclaves[met.enclave] = topic
             if other_enclaves:
                 topic = next(iter(other_enclaves.values()))
-                return KeptUse(_use(enclave, right, part, topics, topic), tuple(other_enclaves))
+                return BlockedUse(_use(enclave, right, part, topics, topic), tuple(other_enclaves))
     return None
 
 
@@ -470,7 +472,7 @@ def _shared_by(
     for parts in holders_by_part:
         names = {part.topics(expression).ros_name(t) for part, met in parts for t in met.stated}
         stated |= names
-        longest = min(longest, *(world.longest - part.longer for part, _ in parts))
+        longest = min(longest, *(world.longest - part.added_bytes for part, _ in parts))
         if any(met.wild for _, met in parts):
             own_names = (met.names.between(part.begin, part.end) for part, met in parts)
             wild.append(NameSet.union(own_names))
@@ -548,7 +550,7 @@ def _witness_against_not_both(
 ) -> Witness | None:
     """Return a witness with an enclave that has rights of both sets: the shortest uses."""
     first, second = (
-        _with_anybody(_uses_of_rights(rights, world, limit), world)
+        _with_unauthenticated_uses(_uses_of_rights(rights, world, limit), world)
         for rights in (requirement.first, requirement.second)
     )
     pairs = [
@@ -561,7 +563,9 @@ def _witness_against_not_both(
     return Witness(best, tuple(pair for pair in pairs if pair is not best))
 
 
-def _with_anybody(uses: Mapping[str, Sequence[Use]], world: World) -> Mapping[str, Sequence[Use]]:
+def _with_unauthenticated_uses(
+    uses: Mapping[str, Sequence[Use]], world: World
+) -> Mapping[str, Sequence[Use]]:
     """Return uses in which each enclave also has the uses of processes without an identity.
 
     A process with the files of an enclave can also run without an identity.
@@ -667,9 +671,10 @@ def _unused_names(
 ) -> tuple[list[str], list[str]]:
     """Return clauses on unused names in a requirement, and the names that no right states.
 
-    Names that no right states are used by wildcards only, or by nobody, as `Nobody` demands. Such a
-    name counts as unused if a right states another name that differs by one typing error, as in
-    ``/cmd_vle``, or if the name is in use as another kind (service or action).
+    A name that no right states can still be used by a wildcard, and `Nobody` demands that nobody
+    uses it.  So such a name counts as unused only if a right states another name that differs by
+    one typing error, as in ``/cmd_vle``, or if the name is in use as another kind (service or
+    action).
     """
     clauses, unnamed = [], []
     for right, name, parts in _restricted_names(requirement):
@@ -853,11 +858,11 @@ def _shortest_chain(
 
         for number, flow in enumerate(flows):
             for topic, target in flow.hops(source, partial(is_unused, number), is_new):
-                longer = (*chain, TopicHop(source, target, topic))
+                longer_chain = (*chain, TopicHop(source, target, topic))
                 if target in targets:
-                    return longer
+                    return longer_chain
                 origins.setdefault(target, set()).add(origin)
-                queue.append((target, origin, longer))
+                queue.append((target, origin, longer_chain))
     return ()
 
 
@@ -909,8 +914,8 @@ class _Flow:
     ) -> Iterator[tuple[str, str]]:
         """Yield pairs of a topic and an enclave that reads the topic from ``enclave``.
 
-        Only readers for which ``is_new`` returns True count. Exact topics come first, except topics
-        for which ``is_unused`` returns False; matches of wildcards follow.
+        Only readers for which ``is_new`` returns True count. Exact topics come first, but only
+        those for which ``is_unused`` returns True; matches of wildcards follow.
         """
         written, around, exact = self._world.written_by(enclave, _IGNORED_TOPICS)
         for topic in sorted(exact, key=_topics_before_services):

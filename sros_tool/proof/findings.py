@@ -31,7 +31,7 @@ from sros_tool.names import (
 from sros_tool.policy.model import ALLOW, Level, Source
 from sros_tool.policy.remapping import Remapping, has_new_name
 from sros_tool.policy.rights import KIND_OF, Right
-from sros_tool.proof.decide import MOST_STEPS, KeptUse, Use, Verdict, Witness, Worlds
+from sros_tool.proof.decide import MOST_STEPS, BlockedUse, Use, Verdict, Witness, Worlds
 from sros_tool.proof.requirements import (
     EXCEPT,
     Apart,
@@ -148,7 +148,7 @@ class Decided:
     violations: tuple[Violation, ...]
     vacuous: tuple[tuple[Requirement, tuple[str, ...]], ...]
     assumed: tuple[tuple[Requirement, str], ...] = ()
-    kept: tuple[tuple[Requirement, KeptUse], ...] = ()
+    kept: tuple[tuple[Requirement, BlockedUse], ...] = ()
     unnamed: tuple[tuple[Requirement, tuple[str, ...]], ...] = ()
     unjudged: tuple[str, ...] = ()
 
@@ -513,7 +513,7 @@ def _assumption_finding(requirement: Requirement, name: str) -> Finding:
     return ASSUMED.found(place.file, text, place.file, place.line)
 
 
-def _not_crossing_finding(requirement: Requirement, kept_use: KeptUse) -> Finding:
+def _not_crossing_finding(requirement: Requirement, kept_use: BlockedUse) -> Finding:
     place, use, peers = requirement.source, kept_use.use, _listed_names(kept_use.others)
     ends = f"from {use.enclave} to {peers}" if use.writes else f"from {peers} to {use.enclave}"
     text = f"{use.name} does not pass between routers {ends}: {demand(requirement)}"

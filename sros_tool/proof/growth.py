@@ -357,9 +357,9 @@ def compare_access(base: AccessSource, head: AccessSource) -> Growth:
     their robot.
 
     Raises:
-        DocumentError: the comparison cannot be decided: there are too many wildcards, or
-            permissions that a vendor does not accept; or, if nothing else is new, demands of
-            protection contradict each other or Zenoh settings are unknown.
+        DocumentError: the comparison cannot be decided, because there are too many wildcards or
+            permissions that a vendor does not accept.  If nothing else is new, contradictory
+            demands of protection and unknown Zenoh settings are errors, too.
     """
     limit = SearchLimit()
     scope = compared_enclaves((base.kind, base.scope), (head.kind, head.scope))
@@ -613,7 +613,7 @@ def _access_on_zenoh(base: AccessSource, head: AccessSource) -> _AccessOf:
 def _access_by_rights(
     side: AccessSource, robots: Mapping[str, int]
 ) -> Callable[[str, int], _Access]:
-    """Return a function that returns the access by ROS rights, from an enclave and a domain.
+    """Return a function that maps an enclave and a domain to the access by ROS rights.
 
     ``robots`` maps enclaves of a policy to the domain of their robot, if the fleet states one.
     """
@@ -1119,7 +1119,7 @@ def _edges(side: AccessSource, fitting_pairs: Iterable[tuple[str, str]]) -> _Edg
 
 
 def _hop_of(hop: Callable[[], Hop], source: str, target: str) -> Hop:
-    """Return a hop between real enclaves."""
+    """Return the result of ``hop``, with ``source`` and ``target`` as the enclaves of the hop."""
     return hop()._replace(source=source, target=target)
 
 
@@ -1141,8 +1141,8 @@ def _reached(neighbors: Mapping[str, Iterable[str]], start: str) -> dict[str, st
 def _new_nodes(before: AccessSource, after: AccessSource, limit: SearchLimit) -> Iterator[NewNode]:
     """Yield the nodes that policies assign to another enclave, which has more rights.
 
-    The only node of an enclave may be renamed; and a node whose name a wildcard of the enclave
-    matched is not new.
+    Two kinds of nodes are left out: the only node of an enclave, which may be renamed, and a node
+    whose name a wildcard of the enclave already matched.
     """
     old_nodes, new_nodes = _enclaves_of_nodes(before, after), _enclaves_of_nodes(after, before)
     assigned = []

@@ -41,7 +41,7 @@ from sros_tool.zenoh.configuration import ZenohNetwork
 
 @lru_cache(maxsize=1)
 def strict_protection() -> DomainProtection:
-    """Return the protection for a side without governance: the one of the template production.
+    """Return the protection of the template production, which stands for a missing governance.
 
     Whole RTPS messages only have to be signed, as in the template development, because their
     content is encrypted separately.

@@ -18,8 +18,9 @@ Names and enclaves can have the placeholders of policies, which a fleet fills in
 ``{namespaces}`` stand for one name for each robot.
 
 Whoever changes a policy can also change its requirements.  A requirement counts as kept if
-requirements of the new file together demand at least as much, whatever their names and order: in
-the namespace ``/``, and also in every other namespace, for a file that is read for no namespace.
+requirements of the new file together demand at least as much, whatever their names and order.  If
+the file is read for no namespace, this must be so in the namespace ``/`` and in every other
+namespace.
 """
 
 from __future__ import annotations
@@ -153,9 +154,10 @@ class AtMost(RightsRequirement):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Widest(RightsRequirement):
-    """The only names for which the enclaves may have these rights by a wildcard; none if empty.
+    """By a wildcard, the enclaves may have these rights only to the listed names.
 
-    Rights that state a name exactly are not restricted.
+    Without listed names, they may have none of these rights by a wildcard.  Rights that state a
+    name exactly are not restricted.
     """
 
     KIND = "widest"

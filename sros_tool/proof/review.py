@@ -1,7 +1,7 @@
 """Review a change in git: findings in HEAD, and access that HEAD adds to BASE.
 
-The author of the change cannot influence the review: it compares the content of two commits, not of
-a work tree (`sros_tool.proof.repository`, `sros_tool.proof.commit_files`), and the result names
+The author of the change cannot influence the review.  It compares the content of two commits, not
+of a work tree (`sros_tool.proof.repository`, `sros_tool.proof.commit_files`).  The result names
 what was not compared.
 """
 
@@ -162,12 +162,12 @@ class ReviewRequest:
     """The input of a review; paths are relative to the top of the repository.
 
     ``head`` is the commit to review, ``base`` the commit to compare with ("": none). With
-    ``namespaces`` and ``remaps``, the requirements are read for these namespaces and names; with
+    ``namespaces`` and ``remaps``, the requirements are read for these namespaces and names.  With
     ``allow_new_access``, new access and unreviewed policies are shown but do not make the review
-    fail; with ``allow_dropped_requirements``, the same applies to requirements that HEAD drops or
-    weakens. The review fails if an enclave expires within ``renew_within``.  ``left_out`` are files
-    and folders of policies that are not reviewed.  ``template`` is the keystore template whose
-    protection the policies get: a path, the name of a shipped template, or "".
+    fail.  With ``allow_dropped_requirements``, requirements that HEAD drops or weakens do not make
+    the review fail. The review fails if an enclave expires within ``renew_within``.  ``left_out``
+    are files and folders of policies that are not reviewed.  ``template`` is the keystore template
+    whose protection the policies get: a path, the name of a shipped template, or "".
     """
 
     repository: Repository
@@ -916,7 +916,7 @@ class _Review:
             yield f"the checkout differs from the reviewed commit: {files}"
 
     def _unreviewed_keystores(self, entries: Iterable[tuple[str, TreeEntry]]) -> list[str]:
-        """Return the keystores and exports with entries, which are not reviewed or left out."""
+        """Return keystores and exports with ``entries`` that are neither reviewed nor left out."""
         known = (*self.request.keystores, *self.request.left_out)
         folders = {_keystore_with(path) for path, _ in entries if not _is_below(path, known)}
         return sorted(folder or "." for folder in folders if folder is not None)

@@ -116,15 +116,15 @@ class AccessSource:
     ``kind`` is "policy", "permissions", "enclave", "keystore" or "zenoh"; ``shown`` is the name of
     the source in texts. ``permissions`` are what DDS loads for each enclave, or would load after
     signing.  ``rights`` are the rights in ROS terms.  ``zenoh`` are the rights that Zenoh rules
-    give, None without rules; if there are no permissions, ``key_domains`` maps these rights to the
-    ROS domains in their keys, None for a wildcard. ``enforcers`` are the Zenoh rules, ``routers``
-    the enclaves of routers. ``passing`` maps each of several routers to the rights that the router
-    gives to the other routers. ``scope`` are the enclaves that the source is for; None for all.
-    ``governance`` is None for a source without governance. ``authorities`` are the CAs that the
-    enclaves trust, as pairs of role and fingerprint. ``trusts`` maps enclaves and `KEYSTORE_ITSELF`
-    to their trust; None if trust is not known. ``later`` are the settings for enclaves that are
-    created later, or None. ``certified`` has the facts about the certificates of enclaves.
-    ``zenoh_files`` are the Zenoh configurations, by enclave and file name.
+    give, None without rules.  If there are no permissions, ``key_domains`` maps these rights to the
+    ROS domains in their keys; None stands for a wildcard. ``enforcers`` are the Zenoh rules,
+    ``routers`` the enclaves of routers. ``passing`` maps each of several routers to the rights that
+    the router gives to the other routers. ``scope`` are the enclaves that the source is for; None
+    for all.  ``governance`` is None for a source without governance. ``authorities`` are the CAs
+    that the enclaves trust, as pairs of role and fingerprint. ``trusts`` maps enclaves and
+    `KEYSTORE_ITSELF` to their trust; None if trust is not known. ``later`` are the settings for
+    enclaves that are created later, or None. ``certified`` has the facts about the certificates of
+    enclaves.  ``zenoh_files`` are the Zenoh configurations, by enclave and file name.
     """
 
     shown: str

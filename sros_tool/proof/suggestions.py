@@ -48,7 +48,7 @@ _MAX_JOINED_NAMES = 50
 
 
 class Suggestions(NamedTuple):
-    """Requirements that hold, and comments on names that move a robot without being reserved."""
+    """Requirements that hold, and comments on names that move a robot and that nothing reserves."""
 
     requirements: Sequence[Requirement]
     comments: Sequence[str]
@@ -142,7 +142,7 @@ class _Stated:
         return sorted(name for of, name in self.users if of == right)
 
     def with_counterpart(self) -> set[str]:
-        """Return the enclaves that state a right to a name that another enclave's right serves."""
+        """Return the enclaves with a right whose counterpart another enclave has."""
         return {
             enclave
             for (right, name), enclaves in self.users.items()

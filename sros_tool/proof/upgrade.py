@@ -536,7 +536,7 @@ def _node_start_findings(
 def _zenoh_findings(
     files: DecidedFiles, before: Distribution, after: Distribution
 ) -> Iterator[Finding]:
-    """Yield findings on changes for a keystore's Zenoh files by another release of rmw_zenoh."""
+    """Yield findings on what another rmw_zenoh release changes for a keystore's Zenoh files."""
     old, new = before.zenoh, after.zenoh
     if old == new or not files.keystore or not has_zenoh_files(files.keystore.root, hidden=True):
         return

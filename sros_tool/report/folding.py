@@ -2,10 +2,10 @@
 
 A unit is a robot of a fleet.  Without a fleet, units are sibling namespaces or enclaves that
 contain nearly the same enclaves.  Two units are equal if their drawings differ only in the names of
-the units.  The drawing of a unit has the rights and denials of the unit's enclaves, also wildcards
-that the picture shows at known names only, and the rights and denials of other enclaves to the
-unit's names. If a unit has rights to names of other units, such as the robots whose poses a robot
-reads, only the number of these units has to be equal.
+the units.  The drawing of a unit has the rights and denials of the unit's enclaves, and the rights
+and denials of other enclaves to the unit's names.  It also has the wildcards that the picture shows
+only at known names. If a unit has rights to names of other units, such as the robots whose poses a
+robot reads, only the number of these units has to be equal.
 
 A label such as ``{r01…r50}`` stands for each equal unit: ``/{r01…r50}/base`` may publish
 ``/{r01…r50}/odom`` means that each robot may publish its own topic.
@@ -178,9 +178,9 @@ class UnitNames:
     """The names of units in texts, and the unit of each enclave.
 
     ``of`` maps enclaves to the numbers of their units.  An enclave belongs to the unit whose name
-    is in its path, even outside of the unit's namespace, and to no unit if its path has the names
-    of several units. A unit can be folded only if the paths of all its enclaves have the unit's
-    name.
+    is in the enclave's path, even outside of the unit's namespace.  If the path has the names of
+    several units, the enclave belongs to no unit. A unit can be folded only if the paths of all its
+    enclaves have the unit's name.
     """
 
     def __init__(self, units: Sequence[DrawnUnit], paths: Iterable[str]) -> None:
@@ -360,8 +360,8 @@ class _Draft:
         """Return the classes of equal units, sorted by name.
 
         First, units of a family are compared without regard to the names of other units. Then the
-        names of some units count: of units unlike the rest of their family, and of units that have
-        rights from most of the family, such as a leader.
+        names of some units count: the names of units that are unlike the rest of their family, and
+        of units, such as a leader, to whose names most of the family has rights.
         """
         self._symbols = [unit.family for unit in self._units]
         parts = self._parts_by_unit()

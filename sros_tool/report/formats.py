@@ -635,7 +635,8 @@ def render(
 
     Args:
         picture: the picture.
-        folding: the same picture with equal units drawn once. form: the format.
+        folding: the same picture with equal units drawn once.
+        form: the format.
         moment: the time that a page shows.
         everything: also draw rights that every node needs; a page has both.
         graphviz: let Graphviz lay out an SVG.

@@ -81,7 +81,7 @@ _NAMES = "topics, services, actions"
 
 
 class Head(NamedTuple):
-    """The heading of a column; ``x`` is the position of the part of the text named ``anchor``."""
+    """The heading of a column; its ``anchor`` ("start", "middle" or "end") is at ``x``."""
 
     x: int
     anchor: str

@@ -297,7 +297,10 @@ def _sentence(text: str) -> str:
 
 
 def _with_marks(text: str) -> str:
-    """Return ``text`` in HTML, with commands for backticks; options and CVE numbers stay whole."""
+    """Return ``text`` in HTML, with text between backticks as code.
+
+    Options and CVE numbers are marked, so that the browser does not break them at a line end.
+    """
     marked = re.sub(r"`([^`]+)`", r"<code>\1</code>", escape(text))
     return re.sub(
         r"\bCVE-\d+-\d+|(?<![\w-])--[a-z][a-z-]*", r'<span class="id">\g<0></span>', marked
@@ -510,14 +513,14 @@ def render_fleet_page(
     """Return the HTML page of a fleet's status.
 
     Args:
-        status: the output of ``sros fleet status --json``. words: state → its words, if they differ
-            from the name of the state.
+        status: the output of ``sros fleet status --json``.
+        words: maps a state to its words, if they differ from the name of the state.
         facts: sentences about the fleet as a whole.
         rows: a row for each group of robots with the same state: state, names, time of
             confirmation, first expiry, what to do, and why.
-        remedies: what to do → how to do it.
+        remedies: maps what to do to how to do it.
         list_lacking: a sentence on how many robots have the revocation list in force; "" if all
-            do that have to.
+            robots that need the list have it.
     """
     order = {state: (_urgency(state), place) for place, state in enumerate(status["counts"])}
     tiles = "".join(

@@ -29,7 +29,10 @@ _KINDS = (*RIGHTS, "dds")
 
 
 class OverlaySide(StrEnum):
-    """The side of an overlay with the right; BOTH also for a picture without overlay."""
+    """The source of an overlay that has a right: the first, the second, or BOTH.
+
+    In a picture without an overlay, every right has BOTH.
+    """
 
     BOTH = "both"
     FIRST = "first"
@@ -72,7 +75,7 @@ class Protection:
 
     @property
     def everybody(self) -> str:
-        """Words for the participants that may use a name with open access without permissions."""
+        """Words for the participants that may use a name without a right because access is open."""
         return (
             "everybody, even without an identity"
             if self.strangers
@@ -308,8 +311,9 @@ class Overlay(NamedTuple):
 class OverlayDifference(NamedTuple):
     """A right that only one side has, with ``notes``.
 
-    For a change, the notes are the wildcards of the other side that cover the right; for use, the
-    number of never observed names that a wildcard matches.
+    In an overlay of the kind change, the notes are the wildcards of the other side that cover the
+    right.  In the kind use, a note is the number of names that a wildcard matches and that were
+    never observed.
     """
 
     mark: OverlaySide

@@ -444,7 +444,7 @@ def _file_name(path: str) -> str:
 def _pictured_finding(
     finding: Finding, enclaves: Container[str], shown: Callable[[str], str] = _file_name
 ) -> PicturedFinding:
-    """Return a finding for the picture; its text names a subject that is not an enclave.
+    """Return a finding for the picture; its text names the subject, unless this is an enclave.
 
     ``shown`` returns the name of a file.
     """

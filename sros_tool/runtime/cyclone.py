@@ -9,8 +9,8 @@ libddsc is not loaded at import: `load_cyclone` finds and loads it on the first 
 that sros calls are declared here as in ``dds/dds.h`` of Cyclone DDS 0.10 and 11.0, which agree.
 
 ``python -P -m sros_tool.runtime.cyclone DOMAIN PID...`` prints a JSON object that maps participants
-of Cyclone DDS on this machine to the ids of their processes, as the participants themselves state;
-the search takes three seconds at most.
+of Cyclone DDS on this machine to the ids of their processes.  The participants themselves state
+these ids.  The search takes three seconds at most.
 """
 
 from __future__ import annotations

@@ -97,8 +97,8 @@ def render_refusal(form: str) -> str:
 
     Empty output would let nodes start unsecured, for example through a shell or jq: see `REFUSING`.
     In a shell, the text also fails as a command, even if ``eval $(...)`` without quotes makes it a
-    single line; in a unit, it keeps systemd from starting the service.  Compose and Kubernetes
-    refuse the text.
+    single line.  In a unit, the text keeps systemd from starting the service.  Compose and
+    Kubernetes refuse the text.
     """
     if form in CONTAINER_FORMS:
         return yaml_text({"refused-by-sros": "the enclave cannot be used"})

@@ -133,12 +133,12 @@ _WHY_NO_FOLDER = (
     "the folder"
 )
 _SHOW_MODES = "`namei -l {path}` shows who may enter."
-LET_ENTER_EXPORT = (
+CHANGE_OWNER_REMEDY = (
     f"{_SHOW_MODES} Give the export to the user of the node: `sudo chown -R USER KEYSTORE`. If the "
     "folder was made after the node started, restart the node."
 )
 """The remedy if an export has a folder that rcl did not find."""
-LET_ENTER_ORIGINAL = (
+EXPORT_FOR_USER_REMEDY = (
     f"{_SHOW_MODES} It is next to the CA keys, which no node should be able to read: export the "
     "enclave into a folder of the user of the node. If the folder was made after the node started, "
     "restart the node."

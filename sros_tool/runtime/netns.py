@@ -176,7 +176,7 @@ _OWN_NETWORK = "/proc/thread-self/ns/net"
 class RowNetwork:
     """The network of a demo row's processes and capture.
 
-    With ``own`` False, the network is the one of the machine.
+    Without ``own``, the row uses the network of the machine.
     """
 
     def __init__(self, *, own: bool) -> None:

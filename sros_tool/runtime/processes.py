@@ -756,7 +756,8 @@ def _clock_advanced(folder: int, started: datetime) -> timedelta:
 
     ``started`` is the start of the process by the present clock. The kernel gives /proc/PID the
     time at which somebody (systemd, ps, sros) first looks at it (Linux, ``fs/proc/base.c``). This
-    time is after the start, unless the clock was changed in between. The result is 0 if it was not.
+    time is after the start, unless the clock was changed in between. The result is 0 if the clock
+    was not changed.
     """
     first_look = _moment(os.fstat(folder).st_ctime_ns)
     advanced = started - first_look
@@ -1081,7 +1082,7 @@ def _loaded_enclave(
         above = root.folders(top)
     except OSError as error:
         return ProcessEnclave(keystore, name, problem=_reason(error))
-    folder_of_keystore, here = _identity(above), _same_here(top, above)
+    folder_of_keystore, here = _identity(above), _path_if_same_folder(top, above)
     try:
         folders = root.folders(place)
     except OSError as error:
@@ -1129,7 +1130,7 @@ def _identity(folders: Sequence[tuple[str, os.stat_result]]) -> tuple[int, int]:
     return state.st_dev, state.st_ino
 
 
-def _same_here(path: str, folders: Sequence[tuple[str, os.stat_result]]) -> Path | None:
+def _path_if_same_folder(path: str, folders: Sequence[tuple[str, os.stat_result]]) -> Path | None:
     """Return ``path`` if it is the same folder for this process as for the examined process."""
     with suppress(OSError, ValueError):
         if os.path.samestat(Path(path).stat(), folders[-1][1]):

@@ -180,10 +180,11 @@ def vendor_here(
 ) -> tuple[Vendor, str]:
     """Return the DDS vendor of this machine, and the reason as a short text.
 
-    The vendor is the vendor of $RMW_IMPLEMENTATION, else of an installed RMW, else Fast DDS, in the
-    release that $ROS_DISTRO ships. With ``distribution``, the release is the one that this
-    distribution ships, and installed RMWs do not count.  The text also warns if the RMW was built
-    without DDS Security, or if the release was not tested.
+    The vendor is that of $RMW_IMPLEMENTATION.  If the variable is not set, it is that of an
+    installed RMW, or else Fast DDS.  The release is the one that $ROS_DISTRO ships.  With
+    ``distribution``, the release is the one that this distribution ships, and installed RMWs do not
+    count.  The text also warns if the RMW was built without DDS Security, or if the release was not
+    tested.
     """
     named = environment.get(RMW, "")
     rmw, why = "", ""

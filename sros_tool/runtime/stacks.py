@@ -422,7 +422,7 @@ def _join_cyclone() -> tuple[Ask, Close]:
     return ask, participant.close
 
 
-def _join_cyclonedds_package() -> tuple[Ask, Close]:
+def _join_with_cyclonedds_package() -> tuple[Ask, Close]:
     """Join as a participant of the Python package ``cyclonedds``, with its own libddsc."""
     core, domain, idl, pub, sub, topics = (
         importlib.import_module(f"cyclonedds.{name}")
@@ -444,7 +444,7 @@ def _join_cyclonedds_package() -> tuple[Ask, Close]:
 _JOINS: dict[str, Callable[[], tuple[Ask, Close]]] = {
     "rclpy": _join_rclpy,
     "cyclone": _join_cyclone,
-    "cyclonedds": _join_cyclonedds_package,
+    "cyclonedds": _join_with_cyclonedds_package,
 }
 
 

@@ -262,7 +262,7 @@ def job_units(
         user: the owner of the keystore.
         sros: the path of the program sros.
         passphrase: the path of the file with the passphrase of the CA keys, or "".
-        domain: the ROS domain in which the guard takes open nodes for mistakes.
+        domain: the ROS domain in which the guard reports open nodes as mistakes.
         writable: folders besides the keystore in which the agent writes.
         inbox: the path of the folder with the messages of robots, for `Job.COLLECT`.
         publishing: the path of the folder in which `Job.COLLECT` publishes releases.

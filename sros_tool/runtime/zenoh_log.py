@@ -1,7 +1,7 @@
 """The security messages that Zenoh logs, their meanings, and the messages that it drops.
 
-rmw_zenoh prints warnings and errors of nodes, and also informative messages of its router; with
-RUST_LOG=zenoh=debug, a process logs why a connection failed, and with RUST_LOG=zenoh=trace, it logs
+rmw_zenoh prints warnings and errors of nodes, and also informative messages of its router.  With
+RUST_LOG=zenoh=debug, a process logs why a connection failed.  With RUST_LOG=zenoh=trace, it logs
 the messages that access control drops.  Each text was seen in a log of Zenoh 1.10.2; texts of
 rmw_zenoh_cpp are from its source code.
 """

@@ -120,8 +120,9 @@ def graph_rules(
     The processes may see all tokens.  Under the name of their own enclave, the processes may
     announce the topics and services in ``rights``, the nodes in ``nodes``, and the nodes whose own
     services (such as set_parameters) they may offer. Such a node does not count if all its own
-    services are denied. Without such nodes, the processes may announce any node. The expression for
-    seeing tokens is exactly the expression in the requests of rmw_zenoh.
+    services are denied. If neither ``nodes`` nor ``rights`` gives a node, the processes may
+    announce any node. The expression for seeing tokens is exactly the expression in the requests of
+    rmw_zenoh.
     """
     rights, nodes = tuple(rights), tuple(nodes)
     offering, without = nodes_of_rights(rights), denied_nodes(rights)

@@ -108,8 +108,8 @@ class AccessControl:
     """The access control of a process: rules by common name; other processes are denied.
 
     Each common name occurs only once. The rights of a second subject with the same name would be
-    added to the rights of the first, and in Zenoh up to 1.5.1, a random one of both subjects would
-    decide.
+    added to the rights of the first, and in Zenoh up to 1.5.1, one of the two subjects, chosen at
+    random, would decide.
     """
 
     remotes: tuple[RemoteRights, ...]

@@ -111,10 +111,11 @@ class ZenohEndpoint:
 class TlsOptions:
     """The TLS options that decide which processes are accepted, with Zenoh's defaults.
 
-    ``mutual`` says that a connecting process must show a certificate, ``verifies_name`` that the
-    certificate of a listening process must have the host of the endpoint, ``closes_on_expiration``
-    that a connection ends when the certificate of the other side expires.  ``named`` are the names
-    of the settings for certificates and keys in the file, such as "root_ca_certificate".
+    ``mutual`` says that a connecting process must show a certificate.  ``verifies_name`` says that
+    the certificate of a listening process must have the host of the endpoint.
+    ``closes_on_expiration`` says that a connection ends when the certificate of the other side
+    expires.  ``named`` are the names of the settings for certificates and keys in the file, such as
+    "root_ca_certificate".
     """
 
     mutual: bool = False
@@ -184,9 +185,9 @@ def parse_configuration(
     are read faster.
 
     Raises:
-        UnreadConfigurationError: sros cannot read the file, but Zenoh may: the file has more than
-            16 MiB, is TOML, is YAML that is not also JSON, or has lists in place of objects, with a
-            meaning that depends on the version.
+        UnreadConfigurationError: sros cannot read the file, but Zenoh may.  Such a file has more
+            than 16 MiB, is TOML, is YAML that is not also JSON, or has lists in place of objects,
+            whose meaning depends on the version.
         DocumentError: the file is not JSON5, or Zenoh would not accept it.
     """
     root = _root(data, name, lines=lines)

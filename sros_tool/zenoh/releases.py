@@ -21,8 +21,8 @@ class RmwZenohRelease(NamedTuple):
     """The versions of rmw_zenoh_cpp in a ROS 2 distribution, from ``begin`` on.
 
     ``least`` is the first version that has `_LEAST_ZENOH` and reads ZENOH_CONFIG_OVERRIDE.
-    ``below_topics`` are key expressions below the key of a topic.  A publisher sends to
-    subscriptions whose graph tokens it sees on these keys, too, or only on these keys.
+    ``below_topics`` are key expressions below the key of a topic.  If a publisher sees the graph
+    tokens of subscriptions, it sends to them also, or only, on these keys.
     """
 
     distribution: str

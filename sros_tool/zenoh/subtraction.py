@@ -2,8 +2,8 @@
 
 Zenoh does not enforce a denial of a part of the allowed keys, so rules for topics and services only
 allow.  All expressions are tuples of chunks.  A subtraction is exact for keys whose chunks are ROS
-names.  Because ROS names use few letters, ``*`` without ``ab`` can be listed: every chunk that
-contains a letter other than a and b, that begins with a letter other than a, and so on.
+names.  Because ROS names use few letters, ``*`` without ``ab`` can be listed: chunks that contain a
+letter other than a and b, chunks that begin with a letter other than a, and so on.
 """
 
 from __future__ import annotations

@@ -467,7 +467,7 @@ def test_a_root_key_that_is_kept_elsewhere(publisher: Home) -> None:
     assert not (publisher.root / "private/fleet_root.pem").exists()
 
 
-@pytest.mark.parametrize("after", ["stage_elsewhere", "stage", "release", "keep_changes"])
+@pytest.mark.parametrize("after", ["write_new_key_outside", "stage", "release", "keep_changes"])
 def test_a_killed_rotation_of_a_root_key_elsewhere_recovers(
     publisher: Home, monkeypatch: pytest.MonkeyPatch, after: str
 ) -> None:
@@ -475,7 +475,7 @@ def test_a_killed_rotation_of_a_root_key_elsewhere_recovers(
     safe, spare = (publisher.folder / name for name in ("safe.pem", "safe.pem.new"))
     (publisher.root / "private/fleet_root.pem").rename(safe)
     robot, old = publisher.robot(), safe.read_bytes()
-    owner = publishing._RoleKeys if after == "stage_elsewhere" else publishing._Publication
+    owner = publishing._RoleKeys if after == "write_new_key_outside" else publishing._Publication
     done = getattr(owner, after)
 
     def killed(*words: object) -> None:

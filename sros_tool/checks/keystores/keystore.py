@@ -344,7 +344,7 @@ _MOST_NAMED = 3
 def _with_cause_of_ros2(findings: Sequence[Finding], keystore: OpenedKeystore) -> list[Finding]:
     """Return the findings; several findings that ros2/sros2 causes get a common cause."""
     root = keystore.root
-    if keystore.is_of_ros2:
+    if keystore.was_written_only_by_sros2:
         chosen = [finding for finding in findings if finding.kind in _IDS_OF_ROS2_KEYSTORES]
         text = f"It has neither sros.toml nor ledger.jsonl. Found: {_kinds_text(chosen)}."
         return _with_cause(

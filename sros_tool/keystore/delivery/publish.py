@@ -136,7 +136,7 @@ _MOST_SUPERSEDED = 500_000
 There is a limit because anyone who can write to the folder can make many.
 """
 _BEFORE = "before"
-_LIST_PATHS = tuple(f"/{file}" for file in LIST_FILES)
+_ENDS_OF_LIST_PATHS = tuple(f"/{file}" for file in LIST_FILES)
 """Ends of the paths of files that may have revocation lists."""
 
 
@@ -490,7 +490,7 @@ class _RoleKeys:
         self.roots.add({"root": keys[-1], **named}, keys, expires.replace(microsecond=0))
         self.has_new_root = True
 
-    def stage_elsewhere(self) -> None:
+    def write_new_key_outside(self) -> None:
         """Write a new root key outside of the keystore next to the key that it will replace."""
         if self._new_elsewhere and self._elsewhere:
             exists = self._elsewhere.exists()
@@ -576,7 +576,7 @@ class _Evaluator:
         if before:
             by_enclave = {name: released_files(self._keystore, name) for name in enclaves}
             files = _sorted_by_path(by_enclave.values())
-            if before.holds(_digest_without_lists(files), self._now) and all(
+            if before.holds(_digest_except_revocation_lists(files), self._now) and all(
                 self._is_list_good(name, of_enclave) for name, of_enclave in by_enclave.items()
             ):
                 return _RobotFiles(files, "", before)
@@ -584,7 +584,7 @@ class _Evaluator:
         files = _sorted_by_path(enclave.files for enclave in released.values())
         not_valid = (f"{name}: {of.not_valid}" for name, of in released.items() if of.not_valid)
         until = min(enclave.until for enclave in released.values())
-        evaluated = Evaluated(_digest_without_lists(files), self._now, until)
+        evaluated = Evaluated(_digest_except_revocation_lists(files), self._now, until)
         return _RobotFiles(files, "; ".join(not_valid), evaluated if until > self._now else None)
 
     def _is_list_good(self, name: str, files: Mapping[str, bytes]) -> bool:
@@ -625,7 +625,7 @@ def _sorted_by_path(enclaves: Iterable[Mapping[str, bytes]]) -> dict[str, bytes]
     return dict(sorted(item for files in enclaves for item in files.items()))
 
 
-def _digest_without_lists(files: Mapping[str, bytes]) -> str:
+def _digest_except_revocation_lists(files: Mapping[str, bytes]) -> str:
     """Return a digest of files other than revocation lists, and of the evaluating version."""
     others = {path: data for path, data in files.items() if not path.endswith(f"/{CRL_FILE}")}
     return hashlib.sha256(__version__.encode() + b"\n" + listed_digests(others)).hexdigest()
@@ -734,7 +734,7 @@ class _Publication:
                 unknown = [self._last_read()] if is_later else unknown
                 check_authorities(self.keystore, self._folder, unknown[-1])
                 for path, content in chain.from_iterable(of.files.items() for of in unknown):
-                    if path.endswith(_LIST_PATHS):
+                    if path.endswith(_ENDS_OF_LIST_PATHS):
                         forgotten.add(content)
             else:
                 self._notes.append(self._not_shown_note())
@@ -991,7 +991,7 @@ class _Publication:
             or any(
                 forgotten.add(content)
                 for path, content in release.files.items()
-                if path.endswith(_LIST_PATHS)
+                if path.endswith(_ENDS_OF_LIST_PATHS)
             )
         ]
         return sorted(unknown, key=lambda release: release.number)
@@ -1275,7 +1275,7 @@ class _Publication:
     def stage(self, change: KeystoreChange, keys: _RoleKeys) -> None:
         """Stage the keys, the versions of the root, and the list of what is published."""
         if not self._dry_run:
-            keys.stage_elsewhere()
+            keys.write_new_key_outside()
         for path, data in keys.new.items():
             change.transaction.write(path, data, private=True)
         if keys.has_new_root:

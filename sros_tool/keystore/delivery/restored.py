@@ -44,9 +44,9 @@ from sros_tool.keystore.lifecycle.replaced import EarlierPermissions, replaced_r
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import (
-    authority_key,
     authority_text,
     key_digest,
+    key_digest_of_ca,
     load_certificates,
     subject_text,
     validity_of,
@@ -432,7 +432,7 @@ def check_authorities(keystore: OpenedKeystore, folder: Path, last: Release) -> 
             for authority in load_certificates(data, path)
         ]
         newest = max([*own, *published], key=lambda each: validity_of(each).not_before)
-        lost = authority_key(newest) not in map(authority_key, own)
+        lost = key_digest_of_ca(newest) not in map(key_digest_of_ca, own)
         if lost or retired_authorities(published, own):
             replaced[role] = newest
     if not replaced:

@@ -38,9 +38,9 @@ from sros_tool.keystore.layout import (
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.template import is_ca_service
 from sros_tool.pki.certificates import (
-    authority_key,
     authority_text,
     digest,
+    key_digest_of_ca,
     load_certificate,
     load_certificates,
     load_request,
@@ -67,14 +67,14 @@ def retired_authorities(
     trusted: Sequence[x509.Certificate], sent: Iterable[x509.Certificate]
 ) -> list[x509.Certificate]:
     """Return the CAs in ``sent`` that a later CA in ``trusted`` replaced, by key and date."""
-    keys = {authority_key(authority) for authority in trusted}
+    keys = {key_digest_of_ca(authority) for authority in trusted}
     newest = max((validity_of(authority).not_before for authority in trusted), default=None)
     return [
         authority
         for authority in sent
         if newest
         and validity_of(authority).not_before < newest
-        and authority_key(authority) not in keys
+        and key_digest_of_ca(authority) not in keys
     ]
 
 
@@ -210,14 +210,14 @@ def _foreign_authorities(
     for path, data in files.items():
         folder, _, file = path.rpartition("/")
         if file in ROLES_OF_FILES:
-            keys.update(map(authority_key, load_certificates(data, path)))
+            keys.update(map(key_digest_of_ca, load_certificates(data, path)))
             with suppress(SrosError):  # a damaged file trusts no CA
                 trusted[folder][path] = load_certificates(present.get(path, b""), path)
     return {
         path: authorities[0]
         for of_enclave in trusted.values()
         if not any(
-            digest(authority) in recorded or authority_key(authority) in keys
+            digest(authority) in recorded or key_digest_of_ca(authority) in keys
             for authorities in of_enclave.values()
             for authority in authorities
         )
@@ -244,18 +244,18 @@ def _later_authorities(
         newest = max(validity_of(authority).not_before for authority in sent)
         with suppress(SrosError):  # a damaged file trusts no CA
             trusted = load_certificates(present[path], path)
-            keys, kept = set(map(authority_key, trusted)), set(map(authority_key, sent))
+            keys, kept = set(map(key_digest_of_ca, trusted)), set(map(key_digest_of_ca, sent))
             added = [
                 place_in_ledger.get(digest(authority), len(entries))
                 for authority in sent
-                if authority_key(authority) not in keys
+                if key_digest_of_ca(authority) not in keys
             ]
             for authority in trusted:
                 place = place_in_ledger.get(digest(authority))
                 if (
                     any(place > other for other in added)
                     if place is not None
-                    else authority_key(authority) not in kept
+                    else key_digest_of_ca(authority) not in kept
                     and validity_of(authority).not_before >= newest
                 ):
                     later[path] = authority

@@ -162,7 +162,7 @@ def sign_request(
         files = _answer_files(change.keystore, issued, change.zenoh)
         number = change.keystore.ledger_file.next_number()
         sealed = seal(files, number, change.permissions)
-        if not change.is_guess:
+        if not change.has_placeholder_certificates:
             _check_answer_usable(RequestAnswer(name, files, sealed), request, change.moment)
         archive = pack({SEAL: sealed, **files})
         change.entries.append(

@@ -114,9 +114,9 @@ def refuse_stopping(
 ) -> tuple[Note, ...]:
     """Refuse a transaction after which vendors refuse enclaves that they accept today.
 
-    A transaction is also refused if no vendor would accept a new enclave in it.  Enclaves whose
-    certificates were revoked before do not count, because vendors are meant to refuse them:
-    somebody put their files back.
+    A transaction is also refused if no vendor would accept a new enclave in it.  An enclave whose
+    certificate was revoked before this transaction does not count: somebody put its files back, and
+    vendors are meant to refuse them.
 
     Args:
         transaction: the transaction, with all its files staged.
@@ -260,9 +260,10 @@ _VENDORS_READING_ALL_CAS = tuple(
 
 
 def _authority_without_list(files: _FilesOfChange) -> x509.Certificate | None:
-    """Return an earlier CA that may not sign lists, if the change adds the first revocation list.
+    """Return an earlier identity CA that may not sign revocation lists, or None.
 
-    Once there is a list, OpenSSL demands a list of the CA for every certificate.
+    The result is None unless the change adds the first revocation list.  Once there is a list,
+    OpenSSL demands a list of the issuing CA for every certificate.
     """
     if not files.content_after(CRL) or files.content(CRL):
         return None

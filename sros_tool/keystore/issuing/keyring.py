@@ -133,7 +133,7 @@ class Keyring:
             raise KeystoreError(error.what, error.why, error.remedy) from error
 
     def try_files(self, keystore: OpenedKeystore, template: Template) -> None:
-        """Open the key files of the CAs, to find a wrong passphrase before something is to sign.
+        """Open the key files of the CAs now, to find a wrong passphrase early.
 
         Raises:
             KeystoreError: a key file is missing, or cannot be opened.
@@ -160,8 +160,8 @@ class Keyring:
 
         Raises:
             KeystoreError: only the template names the place of an existing key, and the key is not
-                ``compared`` with a certificate that the user chose.  Otherwise, whoever wrote the
-                template could make another CA of the user sign for the new keystore.
+                ``compared`` with a certificate that the user chose.  Without this check, whoever
+                wrote the template could make another CA of the user sign for the new keystore.
         """
         place = self.places.get(role) or template.key_place(role)
         _refuse_ca_service(role, place)

@@ -14,8 +14,8 @@ matches.  Policy and DDS decide alike for every topic name if
 Both comparisons are made for every document.  If one fails, the decision engine is asked about
 example topics: every name in the policy or the document, and names in neither.
 
-The DDS names are defined here a second time, from the ROS 2 design "Topic and Service name mapping
-to DDS", so that the proof finds an error of `sros_tool.translate`.
+The DDS names are defined here a second time, so that the proof finds an error of
+`sros_tool.translate`.  Source: ROS 2 design "Topic and Service name mapping to DDS".
 """
 
 from __future__ import annotations
@@ -190,9 +190,9 @@ def is_matched_as_meant(expression: str) -> bool:
 
 
 def stated_expressions(policy: Enclave) -> ExpressionSets:
-    """Return the rights that a policy gives an enclave as DDS expressions, and ROS discovery.
+    """Return the rights that a policy gives an enclave, as DDS expressions.
 
-    The topic of ROS discovery is added.
+    The topic of ROS discovery, which every node needs, is added.
     """
     expressions = ExpressionSets.none()
     for verb in (_PUBLISH, _SUBSCRIBE):
@@ -242,9 +242,9 @@ def differences(
 ) -> list[Disagreement]:
     """Return the topics on which a vendor's decision differs from the policy's.
 
-    The compared topics are the `example_topics` of all expressions together and of each wildcard
-    expression by itself, and a topic for each expression that only the policy or only the
-    permissions have.
+    Three kinds of topics are compared: the `example_topics` of all expressions together; those of
+    each wildcard expression by itself; and a topic for each expression that only the policy or only
+    the permissions have.
     """
     stated = stated_expressions(policy)
     expressions = {*stated.all(), *_topics_in(permissions)}
@@ -272,9 +272,12 @@ def differences(
 def example_topics(expressions: Iterable[str]) -> tuple[str, ...]:
     """Return sorted example topics that tell the expressions apart.
 
-    These are: each expression without wildcards; for each expression with wildcards, a topic that
-    it matches, a topic that no other expression matches, and a topic that it shares with each
-    overlapping expression; and for each ROS prefix, a topic that no expression matches.
+    They are:
+
+    - each expression without wildcards;
+    - for each expression with wildcards: a topic that it matches, a topic that no other expression
+      matches, and a topic that it shares with each overlapping expression;
+    - for each ROS prefix, a topic that no expression matches.
     """
     known = sorted(set(expressions))
     wild = [expression for expression in known if is_expression(expression)]

@@ -114,9 +114,9 @@ class Changed:
 
     ``outcomes`` maps enclaves to outcomes such as ``created`` or ``renewed``.  ``rights`` are the
     rights that enclaves gain and lose.  ``works_until`` is the latest expiry of replaced files, or
-    None if no replaced file works any more.  ``may_work_longer`` says that files may work longer
-    which the ledger lacks, because the keystore was restored from a backup.  ``revoked`` is the
-    number of revoked certificates.  ``restart`` are the enclaves whose processes have to be
+    None if no replaced file works any more.  ``may_work_longer`` says that replaced files which the
+    ledger lacks may work longer, because the keystore was restored from a backup.  ``revoked`` is
+    the number of revoked certificates.  ``restart`` are the enclaves whose processes have to be
     restarted, ``zenoh`` are the Zenoh configurations.  ``remarks`` are notes on open tasks.
     """
 
@@ -493,7 +493,7 @@ class KeystoreChange:
             return
         if signer is None:
             signer = self.permissions if self.identity.service else self.identity
-            self._check_served()
+            self._check_certificates_of_service()
         if behind := self.keystore.ledger_file.clock_behind(self.now):
             text = (
                 f"{behind}: files that are made now are valid for too short a time. Set the clock."
@@ -509,7 +509,7 @@ class KeystoreChange:
         )
 
     @property
-    def is_guess(self) -> bool:
+    def has_placeholder_certificates(self) -> bool:
         """Whether certificates are only placeholders, as in a dry run with a CA service."""
         return self.dry_run and bool(self._entries_of_ca_service())
 
@@ -528,7 +528,7 @@ class KeystoreChange:
             return []
         return [entry for entry in self.entries if entry.what == "certificate"]
 
-    def _check_served(self) -> None:
+    def _check_certificates_of_service(self) -> None:
         """Add notes on certificates of a CA service that expire earlier than requested.
 
         Raises:
@@ -569,7 +569,7 @@ class KeystoreChange:
         Raises:
             KeystoreError: nodes of a vendor would stop working.
         """
-        if self.is_guess:
+        if self.has_placeholder_certificates:
             text = (
                 "the CA service was not asked in this dry run, so it is unknown whether it would "
                 "issue the certificates, and whether DDS would accept them."
@@ -624,7 +624,7 @@ class KeystoreChange:
 
 
 def _short_lived_notes(fleet: Fleet, template: Template) -> Iterator[Note]:
-    """Yield a note on robots whose enclaves expire early by the settings, such as a person's."""
+    """Yield a note on robots whose enclaves the keystore's settings make short-lived."""
     short_lived: dict[str, str] = {}
     for robot in fleet.robots.values() if template.short_lived else ():
         names = enclaves_of(fleet, robot)
@@ -666,7 +666,7 @@ def _take_over_records(
     of sros, the result is ``entries``.
     """
     added = list(entries)
-    if not keystore.is_of_ros2:
+    if not keystore.was_written_only_by_sros2:
         return added
     before = list(_entries_for_ros2_files(keystore, transaction.enclaves, now))
     transaction.note_adoption()
@@ -768,7 +768,7 @@ def _left_out_notes(left_out: Mapping[str, str]) -> Iterable[Note]:
 def _revoked_name_notes(
     ledger: Ledger, names: Sequence[str], now: datetime, replaced: Collection[str]
 ) -> Iterable[Note]:
-    """Yield a note on names of enclaves that revoked certificates also have, until they expire."""
+    """Yield a note on enclaves of which a revoked certificate has not expired."""
     entries = ledger.entries
     revoked = {entry.serial for entry in entries if entry.what == "revocation"}
     revoked_again = sorted(

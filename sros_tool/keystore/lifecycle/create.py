@@ -370,7 +370,11 @@ def _enclaves_with_protection(policies: Sequence[Policy | FleetPolicy]) -> Itera
 
 
 def _domains_of(fleet: Fleet | None, domain: int | None) -> DomainSet:
-    """Return the domains of a new keystore: the robots' domains, and ``domain`` or 0 for others."""
+    """Return the domains of a new keystore.
+
+    These are the stated domains of the robots, and ``domain`` if it is given.  If a robot states no
+    domain, or if there are no robots, the domain 0 is added unless ``domain`` is given.
+    """
     robots = fleet.robots.values() if fleet else ()
     named = {robot.domain for robot in robots if robot.domain is not None}
     if not named or domain is not None or any(robot.domain is None for robot in robots):
@@ -704,7 +708,7 @@ def _zenoh_notes(template: Template) -> tuple[Note, ...]:
 
 
 def restart_note(mismatch: Mismatch, *, revoked: bool = False) -> Note:
-    """Return a note on which processes to restart and in which order (tested; vendors agree)."""
+    """Return a note on which processes to restart, and in which order."""
     return Note("keystore.restart", _restart_text(mismatch, revoked=revoked))
 
 
@@ -790,7 +794,7 @@ def write_enclaves(
     change.entries += writer.entries
     change.notes = [
         *(note for made in done.values() for note in made.notes),
-        *_others_notes(done),
+        *_other_files_notes(done),
         *(writer.notes if writer.entries else ()),
         *(() if change.template.unique_subject else name_notes({*change.names, *created}, created)),
         *change.notes,
@@ -817,20 +821,21 @@ def write_enclaves(
 class _EnclaveOutcome:
     """The outcome for an enclave; ``superseded`` is its old certificate if that must be revoked.
 
-    ``others`` is the reason why this was done although the rights stay the same.
+    ``other_files`` is the reason why the certificate was replaced although the rights stay the
+    same: other files of the enclave may still work.  It is "" for any other outcome.
     """
 
     outcome: str
     notes: tuple[Note, ...]
     replaced: ReplacedRights | None = None
     superseded: Superseded | None = None
-    others: str = ""
+    other_files: str = ""
 
 
-def _others_notes(done: Mapping[str, _EnclaveOutcome]) -> Iterator[Note]:
+def _other_files_notes(done: Mapping[str, _EnclaveOutcome]) -> Iterator[Note]:
     """Yield a note for each reason to replace certificates of enclaves that keep their rights."""
-    for reason in sorted({made.others for made in done.values()} - {""}):
-        names = [name for name, made in done.items() if made.others == reason]
+    for reason in sorted({made.other_files for made in done.values()} - {""}):
+        names = [name for name, made in done.items() if made.other_files == reason]
         text = f"new certificates although the rights are the same: {reason}"
         yield Note("permissions.others-fit", f"{first_few(names, 5)}: {text}.")
 
@@ -863,7 +868,7 @@ class _EnclaveMaker:
         present = present_files(root, name)
         before = len(change.transaction.changes)
         identity = self._identity(name, present, replaced=bool(policy))
-        earlier, old, others = None, None, ""
+        earlier, old, other_files = None, None, ""
         certificate = identity if isinstance(identity, x509.Certificate) else None
         rights = None
         if policy or PERMISSIONS_FILE not in present:
@@ -875,8 +880,8 @@ class _EnclaveMaker:
             and PERMISSIONS_FILE in present
             and self._is_kept(certificate, rights)
         ):
-            others = self._others(name, certificate) if self._revoke_old else ""
-            if not others:
+            other_files = self._why_other_files_work(name, certificate) if self._revoke_old else ""
+            if not other_files:
                 rights = None
         if rights and PERMISSIONS_FILE in present:
             earlier = earlier_permissions(
@@ -900,16 +905,16 @@ class _EnclaveMaker:
                 return _EnclaveOutcome("changed", notes, replaced)
             superseded = Superseded.record(name, old, issued.certificate, change.now)
             revoked = replaced and replaced.revoked()
-            return _EnclaveOutcome("changed", notes, revoked, superseded, others)
+            return _EnclaveOutcome("changed", notes, revoked, superseded, other_files)
         if rights and policy is None:
             notes += tuple(self._lost_rights_notes(rights.enclave, present))
         completed = len(change.transaction.changes) > before
         return _EnclaveOutcome("completed" if completed else "kept", notes)
 
-    def _others(self, name: str, certificate: x509.Certificate) -> str:
-        """Return why other files of an enclave may still work, or "", by the ledger.
+    def _why_other_files_work(self, name: str, certificate: x509.Certificate) -> str:
+        """Return why, by the ledger, other files of an enclave may still work; "" if none do.
 
-        These are an earlier certificate, or other permissions for the subject of the present
+        Other files are an earlier certificate, or other permissions for the subject of the present
         certificate.
         """
         missing, recorded, since_restore = self._recorded_credentials
@@ -934,10 +939,12 @@ class _EnclaveMaker:
     def _recorded_credentials(
         self,
     ) -> tuple[str, Mapping[str, tuple[set[int], list[str]]], frozenset[str] | None]:
-        """Why entries may be missing in the ledger, what it has, and subjects since a restore.
+        """Return why the ledger may lack entries, what it has, and the subjects since a restore.
 
-        Maps enclaves to their certificates' serial numbers and their permissions' subjects.
-        Expired and revoked certificates are left out.  `subjects_since_restore` has the subjects.
+        The first value is a clause, or "" if the ledger is complete.  The second value maps
+        enclaves to the serial numbers of their certificates and to the subjects of their
+        permissions; expired and revoked certificates are left out.  The third value is that of
+        `subjects_since_restore`.
         """
         keystore, now = self._change.keystore, iso(self._change.now)
         working: dict[str, tuple[set[int], list[str]]] = {}
@@ -1109,7 +1116,10 @@ class _EnclaveMaker:
         )
 
     def _robots_or_names(self, names: Collection[str]) -> str:
-        """Return arguments that select enclaves: robots that are complete, and other enclaves."""
+        """Return command line arguments that select the enclaves ``names``.
+
+        A robot stands for its enclaves if all of them are in ``names``.
+        """
         words, left = [], list(names)
         fleet = load_fleet(self._change.keystore)
         for robot in fleet.robots.values() if fleet and len(names) > 1 else ():

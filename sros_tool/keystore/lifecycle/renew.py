@@ -144,9 +144,10 @@ def renew(
 def _marked_by_name(
     change: KeystoreChange, entries: Iterable[Entry], names: Sequence[str]
 ) -> Iterator[Entry]:
-    """Yield ledger entries; permissions of ``names`` say after a restore that they were named.
+    """Yield ``entries``; in a restored keystore, mark the permissions of the enclaves ``names``.
 
-    `sros fleet publish --restored` takes this as consent to rights that were taken away.
+    The mark says that the user named the enclave.  `sros fleet publish --restored` takes this as
+    consent to rights that were taken away.
     """
     restored = change.keystore.ledger_with("what", RESTORED).entries
     named = {*names} if any(entry.what == RESTORED for entry in restored) else set[str]()

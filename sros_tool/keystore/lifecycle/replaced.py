@@ -152,8 +152,9 @@ def replaced_rights(
 def counterpart_notes(
     keystore: OpenedKeystore, replaced_rights: Iterable[ReplacedRights], created: Iterable[Enclave]
 ) -> Iterator[Note]:
-    """Yield a note on rights whose counterpart the replaced permissions took away.
+    """Yield a note on rights that are useless after the change, as nobody has their counterpart.
 
+    An example is the right to publish a topic to which no enclave may subscribe any more.
     ``keystore`` is the keystore before the change, and ``created`` are the new enclaves.  There is
     no note if permissions of the keystore cannot be read.
     """

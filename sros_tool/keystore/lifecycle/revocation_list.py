@@ -135,9 +135,9 @@ class LostRecords:
     def add(self, document: bytes) -> bool:
         """Add the lists in a PEM file that the keystore has to know; return whether there are any.
 
-        The file may have certificates, too.  A list counts if it revokes certificates that the
-        keystore's list lacks, or if it is not earlier than the keystore's list, because robots
-        would then refuse the keystore's next list.
+        The file may have certificates, too.  The keystore has to know a list that revokes
+        certificates which the keystore's list lacks.  It also has to know a list that is not
+        earlier than its own: a robot that has such a list would refuse the keystore's next list.
         """
         sha256 = hashlib.sha256(document).digest()
         if sha256 in self._seen:
@@ -207,9 +207,10 @@ def _entries_to_repeat(
     """Return the entries of the ``old`` list that the next list must repeat.
 
     These are the certificates that had not expired when the old list was issued.  By RFC 5280, 3.3,
-    an entry stays until it was on a list after the certificate's expiry.  An old list that was
-    issued in the future, by a clock that was wrong, counts as issued ``now``.  ``expiries`` maps
-    serial numbers to expiries (ISO 8601, UTC); an entry without a known expiry is always repeated.
+    an entry may be left out only after a list that was issued after the certificate's expiry has
+    had it.  An old list that was issued in the future, by a clock that was wrong, counts as issued
+    ``now``.  ``expiries`` maps serial numbers to expiries (ISO 8601, UTC); an entry without a known
+    expiry is always repeated.
     """
     if old is None:
         return []
@@ -263,8 +264,8 @@ class RevocationListSigner:
         """Return the enclaves that already have the list; None if some may lack it.
 
         If the ledger has an index and a first list was signed, these are the enclaves in the
-        ledger, because every enclave that is created later gets the list.  In a rotation, files of
-        all enclaves may have to change.
+        ledger, because every enclave that is created later gets the list.  In a rotation, the
+        result is None, because the files of all enclaves may have to change.
         """
         if not self.present or read_rotation(self._keystore).stage is not RotationStage.NONE:
             return None
@@ -339,9 +340,10 @@ class RevocationListSigner:
     ) -> dict[str, dict[int, Entry]]:
         """Map each enclave to its certificates that may not have expired, by serial number.
 
-        The certificates come from the ledger, from the folder ``revoked`` (which a new list after a
-        lost one lacks), and from ``present``, because the ledger lacks certificates that ros2/sros2
-        issued.  Serial numbers in ``listed_serials`` are not searched in the folder.
+        The certificates come from three places: the ledger; the folder ``revoked``, because a new
+        list that replaces a lost one does not have its entries; and ``present``, because the ledger
+        lacks certificates that ros2/sros2 issued.  Serial numbers in ``listed_serials`` are not
+        searched in the folder.
         """
         certificates: dict[str, dict[int, Entry]] = {name: {} for name in names}
         moment = iso(self._known_time)
@@ -503,8 +505,8 @@ class RevocationListSigner:
         """Return the CA service's list, after verifying it.
 
         Raises:
-            KeystoreError: the list is missing, or is not signed by the identity CA, not later than
-                the present list, or not valid now, or does not revoke all ``serials``.
+            KeystoreError: the list is missing, is not signed by the identity CA, is not later than
+                the present list, is not valid now, or does not revoke all ``serials``.
         """
         numbers = ", ".join(sorted(f"{serial:x}" for serial in serials)) or "nothing"
         remedy = (
@@ -539,11 +541,11 @@ class RevocationListSigner:
         )
 
     def _lost_revocations(self, expiries: Mapping[int, str]) -> list[Revoked]:
-        """Return the revocations that the present list lacks.
+        """Return the unexpired revocations in the ledger that the present list lacks.
 
-        If the present list is the last list, only the revocations are returned for which
-        `unlisted_revocations` refuses an export: the list need not have certificates of replaced
-        CAs.
+        If the present list is not the last list in the ledger, all of them are returned.  If it is
+        the last one, it may lack certificates of replaced CAs, so only those revocations are
+        returned for which `unlisted_revocations` refuses an export.
         """
         entries = self._keystore.ledger_file.with_values("what", ("revocation", "crl")).entries
         count = max(

@@ -59,7 +59,8 @@ REPLACED_AFTER_BACKUP = "fleet.replaced-after-backup"
 class Restored(Changed):
     """The result of `restore_revocations`.
 
-    ``replaced`` maps other enclaves with a revoked certificate to whether their key is revoked.
+    ``replaced`` maps enclaves that stay, although their certificate is revoked, to whether their
+    key is revoked, too.
     """
 
     replaced: Mapping[str, bool]
@@ -171,15 +172,20 @@ def restore_revocations(
 ) -> Restored:
     """Revoke again all certificates on revocation lists that the keystore signed and lost.
 
-    The next list has a higher number than the lost lists.  Enclaves that were revoked are moved to
-    ``revoked`` again, even if they were renewed since then.  Enclaves that only had an earlier
-    certificate replaced stay.  The key of a replaced certificate is revoked, too, unless a
-    certificate that the ledger lacked has the same key; so is each key that such a key vouched for
-    since then.  Certificates that the ledger lacks are recorded, so that they can be revoked; those
-    of a revoked enclave are revoked immediately.  The ledger also records that the keystore was
-    restored, with a number that it never had: the seconds since 1970, or the number of a later
-    release that a robot has.  ``shown_by`` is the ``reason`` of this entry.  So that a later
-    renewal of them counts as consent, another entry names each enclave of ``rights_named``, unless
+    The next list has a higher number than the lost lists.
+
+    An enclave that was revoked is moved to ``revoked`` again, even if it was renewed since then.
+    An enclave stays if only an earlier certificate of it was replaced and revoked.  The key of this
+    certificate is revoked, too, unless a certificate that the ledger lacked has the same key.  If a
+    revoked key vouched for later keys, these keys are also revoked.
+
+    Certificates that the ledger lacks are recorded, so that they can be revoked.  Those of a
+    revoked enclave are revoked immediately.
+
+    The ledger also records that the keystore was restored.  This entry has a number that the
+    keystore never used: the seconds since 1970, or the number of a later release that a robot has.
+    Its ``reason`` is ``shown_by``.  Further entries name the enclaves ``rights_named``, so that a
+    later renewal of these enclaves counts as consent to their rights.  They are left out while
     there are certificates to replace first.
 
     Raises:
@@ -279,7 +285,8 @@ def _replaced_keys(
 ) -> set[tuple[str, str]]:
     """Return (enclave, key) of each ``issued`` certificate that was replaced together with its key.
 
-    ``unknown`` are certificates from after the backup, which are valid unless ``reasons`` has them.
+    ``unknown`` are certificates that were issued after the backup.  They are valid unless
+    ``reasons``, the revoked serial numbers with reasons, has them; their keys are left out.
     """
     kept = {(of.enclave, of.key) for serial, of in unknown.items() if serial not in reasons}
     replaced = {(of.enclave, of.key) for s, of in issued.items() if reasons[s] == SUPERSEDED}
@@ -296,8 +303,9 @@ def _vouched_since(
 
     The keystore issued these certificates after the date on which a lost list revoked an ``issued``
     certificate of the same enclave.  The key of that certificate vouched for the first of the later
-    keys (`sros_tool.keystore.delivery.collect`). Keys in the keystore are left out, and keys that
-    were certified before the keystore was lost, such as ``later_keys``, which the ledger lacks.
+    keys (`sros_tool.keystore.delivery.collect`).  Two kinds of keys are left out: keys in the
+    keystore, and keys that were certified before the keystore was lost.  ``later_keys`` are such
+    keys that the ledger lacks.
     """
     dates = {f"{e.serial:x}": iso(e.date) for crl in forgotten_lists.lists for e in crl.revoked}
     since: dict[str, str] = {}
@@ -321,7 +329,7 @@ def _vouched_since(
 def _key_revoked_by_enclave(
     change: KeystoreChange, revoked: Container[int], keys: Container[str], removed: Container[str]
 ) -> dict[str, bool]:
-    """Map other enclaves with a ``revoked`` certificate to whether their key is revoked, too."""
+    """Map the enclaves that keep a ``revoked`` certificate to whether their key is revoked, too."""
     replaced = {}
     for name in change.names:
         with suppress(SrosError):  # the enclave has no certificate
@@ -492,9 +500,10 @@ def _router_error(change: KeystoreChange, router: str) -> KeystoreError:
 
 
 def _move_to_revoked(change: KeystoreChange, name: str) -> Entry:
-    """Stage the move of an enclave's files to ``revoked``; return its certificate's entry.
+    """Stage the move of an enclave's files to ``revoked``; return the entry of its certificate.
 
-    A folder with nothing else in it moves as a whole, unless other users could then read its key.
+    A folder that has only files of the enclave is moved as a whole, unless other users can read the
+    key in it.
     """
     transaction, folder = change.transaction, enclave_folder(name)
     certificate = change.keystore.certificate_of(name)

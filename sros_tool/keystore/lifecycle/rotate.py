@@ -374,8 +374,8 @@ def renew_identity_ca(
     that they embed.
 
     Raises:
-        KeystoreError: the keystore has a single CA, a rotation is in progress, or the CA is not
-            self-signed, its key is weak or missing, or ``issued`` belongs to another CA.
+        KeystoreError: the keystore has a single CA; a rotation is in progress; the CA is not
+            self-signed, or its key is weak or missing; or ``issued`` belongs to another CA.
         UsageError: the new certificate would expire before the current one, or is missing.
     """
     change = KeystoreChange(root, **options)
@@ -576,7 +576,10 @@ class _Rotator:
         return successors
 
     def _record_authorities(self, successor: _Successor) -> None:
-        """Record a new CA, after the CA that it replaces if a ledger with gaps lacks that one."""
+        """Record a new CA in the ledger.
+
+        If the ledger has gaps and lacks the CA that is replaced, that CA is recorded first.
+        """
         now, old = self._change.now, successor.old[0]
         ledger = self._keystore.ledger_with("what", "ca")
         if ledger.gaps and digest(old) not in {entry.sha256 for entry in ledger.entries}:
@@ -822,7 +825,7 @@ def _issuance(
     identity: _Successor | None,
     permissions: _Successor | None,
 ) -> Issuance | None:
-    """Return the issuance by the new CAs for an enclave; None for one without a certificate.
+    """Return what the new CAs issue for an enclave; None if it has no certificate.
 
     Raises:
         KeystoreError: the old CA did not issue the certificate or sign the permissions, or the

@@ -70,7 +70,7 @@ class Replacement:
     old_key: str = ""
 
     def old_key_place(self, certificate: x509.Certificate) -> str:
-        """Return the place of the old CA's key from REISSUE on; ``certificate`` is the old CA's."""
+        """Return where the key of the old CA (with ``certificate``) is from REISSUE on."""
         return self.old_key or retired_key(certificate)
 
 

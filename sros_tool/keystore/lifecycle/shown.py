@@ -246,7 +246,7 @@ class KeystoreZenoh(NamedTuple):
 def shown_zenoh(
     result: Creation, network: ZenohNetwork | None, changed: Collection[str]
 ) -> KeystoreZenoh:
-    """Return the value for a keystore's Zenoh files; ``changed`` are paths of new files."""
+    """Return the value for a keystore's Zenoh files; ``changed`` are the paths of changed files."""
     settings = None
     if network:
         settings = NetworkSettings(
@@ -401,7 +401,7 @@ class OtherList(NamedTuple):
 
 
 class KeystoreLists(NamedTuple):
-    """The revocation lists of a keystore; with ``--refresh``, those after signing again."""
+    """The revocation lists of a keystore; with ``--refresh``, the newly signed lists."""
 
     keystore: NamedKeystore
     dry_run: DryRun
