@@ -28,15 +28,15 @@ class Subjects(Enum):
     EXACT = auto()
     """The same attributes in the same order; spaces around attributes do not count."""
     WHOLE_ATTRIBUTES = auto()
-    """The same texts between commas, even escaped ones; spaces are ignored (Fast DDS 2.6, 2.9)."""
+    """The same texts between commas (also escaped commas); spaces are ignored (Fast DDS 2.6, 2.9)."""
     ANY_ORDER = auto()
     """The same attributes in any order (Fast DDS 2.14)."""
     SUBSET = auto()
     """Each part of the certificate's subject, split at ``, / |``, is in the grant's subject."""
     TRIMMED_SUBSET = auto()
-    """Each part of the certificate's subject, without spaces around it, is in the grant's subject.
+    """Each part of the certificate's subject, split at ``, / |``, is in the grant's subject.
 
-    Parts are as in `SUBSET` (Cyclone DDS 11).
+    Spaces around a part are ignored.
     """
 
 
