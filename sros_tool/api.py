@@ -537,8 +537,8 @@ def revoke(
 ) -> Revocation:
     """Revoke all certificates of enclaves, and move their files away, all or none.
 
-    The other enclaves get the revocation list, and trust the revoked ones until their processes
-    have it and were restarted.
+    The other enclaves get the revocation list. Their processes accept the revoked enclaves until
+    these processes are restarted with the list.
 
     Args:
         keystore: The keystore, or its path.
@@ -591,8 +591,9 @@ def fleet_status(
     Args:
         keystore: A keystore with a fleet, or its path.
         robots: The names of some robots; all by default.
-        max_age: Robots whose last confirmation is older are ``overdue`` and ``offline``; without
-            ``max_age``, this applies to robots that fetch after a day without a message.
+        max_age: A robot whose last confirmation is older is ``overdue`` and ``offline``. Without
+            ``max_age``, a robot that fetches is overdue and offline after a day without a message,
+            and no other robot is.
         now: The time from which ages count; the current time by default.
 
     Returns:
@@ -986,9 +987,10 @@ def new_access(
     Returns:
         What is ``added`` and ``removed``, whom enclaves can influence now (``reach``), the nodes
         that get more rights in another enclave (``new_nodes``), and the protection that is ``lost``
-        and ``gained``; false if nothing is added and nothing lost, and there are no new nodes.
-        ``assumed`` and ``left_out`` state the assumptions: a policy counts as signed with access
-        control of everything, and a policy as ``base`` also with the default protection.
+        and ``gained``. As a condition, the result is false if nothing is added, nothing is lost and
+        there are no new nodes. ``assumed`` and ``left_out`` state the assumptions: a policy counts
+        as signed, with a governance that controls all access; a policy as ``base`` also counts as
+        protected by the default governance.
 
     Raises:
         SrosError: A path cannot be read, or the question cannot be decided, for instance because a

@@ -543,7 +543,7 @@ class NameSet:
     def superset(self) -> Superset | None:
         """Return a simple set with all names of this set, and perhaps others.
 
-        Returns None if no such set smaller than all names is found.
+        Returns None if the only such set that is found is the set of all names.
         """
         return _superset_of(self._node, _longest_affixes_first)
 
@@ -650,7 +650,10 @@ class Superset:
 
 
 def _superset_of(node: _Node, rank: Callable[[Superset], tuple[int, int]]) -> Superset | None:
-    """Return a simple set with all names of ``node``, or None; of several, the first by rank."""
+    """Return a simple set with all names of ``node``, or None if none is found.
+
+    If several sets are found, the result is the one with the lowest ``rank``.
+    """
     match node:
         case _Union():
             return Superset(node.exact, node.automata)
@@ -704,10 +707,10 @@ def _simplified(
 ) -> _Node | bool:
     """Return a set in which automata are replaced by their known answers for some names.
 
-    Only names count that all of ``certain_automata`` accept, and that no automaton accepts except
-    these and ``possible_automata`` (None: every automaton may accept them). The exact names of the
-    set are left out. The result is True if the set then has all of the names that count, and False
-    if the set has none of them.
+    Only some names count: all of ``certain_automata`` accept such a name, each of
+    ``possible_automata`` may accept it (None: each other automaton), and no other automaton does.
+    The exact names of the set are left out. The result is True if the set then has all of the names
+    that count, and False if the set has none of them.
     """
     if isinstance(node, _Union):
         if not certain_automata.isdisjoint(node.automata):

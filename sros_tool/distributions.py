@@ -210,7 +210,7 @@ def unknown_distribution_notes(environment: Mapping[str, str]) -> list[Note]:
 
 
 def _tested_vendor(product: str, version: str) -> Vendor:
-    """Return the tested vendor with a version's release, or else with the latest one before."""
+    """Return the tested vendor with a version's release, or with the latest earlier release."""
     vendors = sorted(
         (vendor for vendor in TESTED if vendor.traits.product == product),
         key=lambda vendor: _numbers(vendor.release),

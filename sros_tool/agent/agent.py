@@ -160,7 +160,7 @@ class Round(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Machine:
-    """The inputs of a round: time, time zone, processes, and programs to run."""
+    """The inputs of a round: time, time zone, and functions that read and change the machine."""
 
     now: datetime
     zone: tzinfo
@@ -321,9 +321,10 @@ class _Round:
         return self._machine.clock()
 
     def _proven_moment(self) -> datetime | None:
-        """Return the latest moment that verified documents prove to be past, or None.
+        """Return the latest moment that is proven to be past; None if none is known.
 
-        Without a verified document, this is the earliest start of a certificate.
+        Verified documents prove it. If none was verified yet, it is the moment when the first
+        certificate of the enclaves began to be valid.
         """
         if self._state.latest:
             return self._state.latest
@@ -383,9 +384,10 @@ class _Round:
     def _changed_files(self) -> tuple[str, ...] | None:
         """Return the paths of files that are missing, or differ from the installed release.
 
-        Certificates of enclaves that the release lacks, and so removes, are included, except those
-        of `_newer_enclaves`. The result is None if no release is installed with all its enclaves,
-        or if the seal of the release cannot be read.
+        If the release lacks an enclave, the path of its certificate is included, too, because
+        installing the release removes this enclave; enclaves in `_newer_enclaves` stay. The result
+        is None if no release is installed with all its enclaves, or if the seal of the release
+        cannot be read.
         """
         state = self._state
         if not state.accepted or state.release != state.accepted:
@@ -403,7 +405,7 @@ class _Round:
         return (*changed_paths, *(path for path in others if path not in released))
 
     def _released_files(self) -> dict[str, str]:
-        """Map the path of each file of the accepted release to its SHA-256, by the seal.
+        """Map the path of each file of the accepted release to the SHA-256 in the seal.
 
         Raises:
             SrosError: the seal is missing or damaged.
@@ -585,7 +587,7 @@ class _Round:
         )
 
     def _record_due(self, names: Sequence[str]) -> None:
-        """Record restarts before the change that needs them, in case the agent is killed."""
+        """Record before a change that ``names`` need a restart, in case the agent is killed."""
         state, moments = self._state, dict.fromkeys(names, _since_boot())
         self._state = replace(
             state,

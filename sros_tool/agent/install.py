@@ -271,8 +271,8 @@ def _check_lists(name: str, files: Mapping[str, bytes], present: Mapping[str, by
     """Raise `KeystoreError` if a revocation list in the release is older than the list here.
 
     ``files`` are the files of an enclave in the release, ``present`` its files here that may
-    contain lists. The owner of the folder can write anything into it, so only lists that a CA in
-    the release signed count.
+    contain lists. Only lists signed by a CA in the release count, because the owner of the folder
+    can write anything into it.
     """
     if older := older_list(present, files):
         here, new = older

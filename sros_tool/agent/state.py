@@ -96,7 +96,7 @@ class AgentState:
 
 
 def read_state(folder: Path) -> AgentState:
-    """Return the state of the agent of ``folder``; of a damaged file, the readable part."""
+    """Return the state of the agent of ``folder``; a damaged file is read as far as possible."""
     state = AgentState()
     with suppress(SrosError, OSError, ValueError, TypeError, KeyError):
         path = agent_folder(folder) / _STATE_FILE

@@ -1,8 +1,8 @@
-"""How files of a publishing folder get to the robot: by https, http, or from a folder.
+"""Transport of published files to the robot: by https, by http, or from a folder of the robot.
 
-`tuf` fetches through one of the two classes, while its ``connection`` is entered. Both limit the
-size and the time of answers, follow no redirect and no link, and leave the verification of files to
-`tuf`.
+`tuf` fetches files through one of the two classes; the caller has to enter the ``connection`` of
+the class before. Both classes limit the size and the time of answers, follow no redirect and no
+link, and leave the verification of files to `tuf`.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ _BLOCK_BYTES = 1 << 16
 
 
 class FolderTransport(FetcherInterface):
-    """Reads the files of a publishing folder in a folder of this machine, such as a USB stick."""
+    """Reads the files of a publishing folder on this machine, such as on a USB stick."""
 
     base = "folder:"
     connection = nullcontext()
 
     def __init__(self, folder: Path, *, max_bytes: int) -> None:
-        """Read from ``folder``, files of at most ``max_bytes`` bytes each."""
+        """Read from ``folder``; each file may have at most ``max_bytes`` bytes."""
         self._folder = folder
         self._most = max_bytes
 

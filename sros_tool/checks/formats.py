@@ -89,8 +89,9 @@ def _merge_robots(
 
     Yields the first finding of each group, with a text that names the robots of the other findings
     ("" without others).  A finding that names several robots is merged by the robot that gives the
-    largest group; many merged findings that differ only in another robot are merged again. Findings
-    that share a cause are not merged. Without ``fleet``, nothing is merged.
+    largest group. If more than `_MOST_SIMILAR` merged findings differ only in the other robots that
+    they name, they are merged again. Findings that share a cause are not merged. Without ``fleet``,
+    nothing is merged.
     """
     read = []
     for group in groups:

@@ -261,10 +261,11 @@ def all_kinds() -> Mapping[str, FindingKind]:
 class FindingFilter:
     """The selection of findings to report.
 
-    With ``vendors``, findings about only other vendors are left out, and with a single vendor, also
-    findings about differences between vendors.  ``include`` and ``exclude`` hold ids, ids of
-    groups, or patterns with ``*`` and ``?``; an empty ``include`` means all.  ``severity`` is the
-    lowest severity that is shown.  A prominent note is shown where warnings are.
+    With ``vendors``, findings that are only about other vendors are left out. With a single vendor,
+    findings about differences between vendors are left out, too.  ``include`` and ``exclude`` hold
+    ids, ids of groups, or patterns with ``*`` and ``?``; an empty ``include`` means all.
+    ``severity`` is the lowest severity that is shown.  A prominent note is shown where warnings
+    are.
 
     A weakness that the keystore's template chose, such as the single CA of template sros2, is
     accepted: it counts as a note, and is summarized in one line if notes are not shown.  With

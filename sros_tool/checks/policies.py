@@ -394,7 +394,7 @@ def _is_service_of_every_node(name: str) -> bool:
 
 
 def _offered_by_others_findings(unused_statements: Iterable[_Statement]) -> Iterator[Finding]:
-    """Yield findings about uncalled services of a node that another enclave may offer, too."""
+    """Yield findings about uncalled services that are under the name of another enclave's node."""
     owners = {
         (statement.right.right, statement.name): statement
         for statement in unused_statements
@@ -624,9 +624,9 @@ _KINDS_OF_LISTENERS = (NO_TYPE_DESCRIPTION, NO_ROSOUT)
 def _check_nodes(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
     """Yield findings about nodes whose enclave lacks a right that every node needs.
 
-    A profile for any node is skipped if the enclave also has nodes with names: those start.
-    Nodes whose names begin with an underscore are skipped: they are hidden nodes of tools such as
-    ros2cli, without log, parameters and type descriptions (ROS 2 design, "Topic and Service
+    A profile for any node is skipped if the enclave also has named nodes, because these nodes
+    start. Nodes whose names begin with an underscore are skipped: they are hidden nodes of tools
+    such as ros2cli, without log, parameters and type descriptions (ROS 2 design, "Topic and Service
     Names").
     """
     lacking = [
@@ -762,7 +762,7 @@ def _is_not_shipped(folder: str) -> bool:
 
 
 def _denied_start_actions_sentence(lacking: Sequence[_NodeLackingRight]) -> str:
-    """Return a sentence on actions of each starting node that the policy denies."""
+    """Return a sentence on the actions at the start of every node that the policy denies."""
     nodes = list(dict.fromkeys(gap.node for gap in lacking))
     kinds = Counter(gap.finding.kind for gap in lacking)
     verbs = [
@@ -1048,7 +1048,7 @@ def portability_findings(
 
 
 def _signed_bytes(enclave: Enclave) -> int:
-    """Return the size in bytes of an enclave's signed permissions; an estimate if small."""
+    """Return the size in bytes of an enclave's signed permissions; a small size is estimated."""
     rights = policy_rights(Policy((enclave,)))
     estimate = sum(map(right_bytes, rights))
     return SizeEstimator().signed_bytes(enclave) if estimate > _MEASURED_FROM_BYTES else estimate
@@ -1464,8 +1464,8 @@ def _robots_on_one_domain(
 ) -> tuple[Robot, Robot] | None:
     """Return two robots that may be in the same ROS domain, or None.
 
-    One robot is from ``robots``, the other one from ``other_robots``, or also from ``robots`` for
-    None.
+    One robot is from ``robots``, and the other is from ``other_robots``. If that is None, both are
+    from ``robots``.
     """
     robots_by_domain = {robot.domain: robot for robot in other_robots or ()}
     for robot in robots:
@@ -1637,7 +1637,7 @@ class NearNames:
 
 
 def _name_ends(name: str) -> Iterator[str]:
-    """Yield each proper suffix of a name that has at least two parts."""
+    """Yield the proper suffixes of a name that have at least two parts."""
     parts = name.split("/")[1:]
     for at in range(1, len(parts) - 1):
         yield "/" + "/".join(parts[at:])

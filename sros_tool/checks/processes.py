@@ -254,8 +254,9 @@ def newer_files(process: Process, enclave: ProcessEnclave) -> Iterator[str]:
 def may_lack_list(process: Process, enclave: ProcessEnclave, *, has_list: bool = False) -> bool:
     """Return whether a process may have loaded another revocation list, or other CAs.
 
-    If only the enclave's own documents are newer than the process, it has loaded the same list.
-    With ``has_list``, all lists since the start of the process revoke the same certificates.
+    The process has loaded the present list and CAs if, since its start, no file of the enclave
+    changed but its certificate, permissions and governance. ``has_list`` says that all lists since
+    the start of the process revoke the same certificates: then the list may have changed, too.
     """
     moved = any(moment > process.started for moment in enclave.moved.values())
     same_files = _OWN_FILES | ({CRL_FILE} if has_list else set())
@@ -986,7 +987,7 @@ def _group_by_authorities(processes: Iterable[Process]) -> list[tuple[_PublicKey
 
 
 def _authorities_here(environment: Mapping[str, str]) -> _PublicKeys:
-    """Return the identity CAs of the enclave that an environment names, or of any enclave."""
+    """Return the identity CAs of the enclave in an environment, or else of the first enclave."""
     root = Path(environment.get(KEYSTORE, ""))
     name = environment.get(ENCLAVE) or next(iter(search_enclaves(root)[0]), "/")
     folder = enclave_path(root, name)

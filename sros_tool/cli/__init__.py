@@ -9,8 +9,8 @@
 - robots that run: `observing`, `audit`
 - answers: `explain`, `check`
 
-All share `common`; `changed` prints what changes a keystore.  `ros2` has the same
-verbs as ``ros2 security``.
+All share `common`; `changed` prints the changes of a keystore.  `ros2` has the verbs for ``ros2
+security``.
 """
 
 from __future__ import annotations

@@ -53,8 +53,8 @@ def print_changed(
         json_data: what ``--json`` prints of the change; None without ``--json``.
         lines: what was done; a dry run prints the files that it would change instead.
         first: messages that come first on standard error.
-        after: messages that follow the rights that change.
-        rights: say what enclaves lose and gain.
+        after: messages that come after the lines about changed rights.
+        rights: say which rights enclaves lose and gain.
         exported: also say that exports are out of date.
         restart: say which processes have to be restarted.
     """

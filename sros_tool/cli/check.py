@@ -391,7 +391,7 @@ def _requirements(
     namespaces: tuple[str, ...],
     remaps: tuple[str, ...],
 ) -> Callable[[Callable[[Sequence[Path]], System]], list[Finding]] | None:
-    """Return a function that checks the requirements of files; None without files.
+    """Return a function that checks the requirements in ``files``; None if there are no files.
 
     The argument of the returned function is a function that reads the policies or the keystore at
     paths.
@@ -472,7 +472,10 @@ def _one_path(family: str, paths: tuple[Path, ...], option: str) -> Path:
 def _paths_of_systems(
     family: str, paths: tuple[Path, ...], option: str
 ) -> Sequence[Sequence[Path]]:
-    """Return the paths of the policies, if any, and the path of the keystore, if any."""
+    """Return the paths of each system: one list with all policies, and one with the keystore.
+
+    A list that would be empty is left out.
+    """
     from sros_tool.keystore.layout import is_keystore
 
     paths = paths or (() if family == "runtime" else (keystore_from_environment(),))
@@ -509,8 +512,9 @@ def _suggested_requirements(system: System) -> str:
 def _split_family(targets: tuple[Path, ...]) -> tuple[str, tuple[Path, ...]]:
     """Return the family of checks that the first word names, or "", and the paths.
 
-    A single word is a path if that path exists: many keystores are named `keystore`.  Next to other
-    paths, too, a keystore of this name is checked unless it is named again.
+    A single word is a path if that path exists: many keystores are named `keystore`.  The word
+    `keystore` before other paths is also a path, if there is a keystore with this name and no other
+    path names it.
     """
     from sros_tool.keystore.layout import is_keystore
 

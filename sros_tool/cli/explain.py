@@ -946,9 +946,9 @@ def _who_lines(
     """Yield the allowed enclaves, the enclaves whose participant does not start now, and counts.
 
     The enclaves of a fleet are grouped by robot.  ``domain`` is the value of --domain.  ``domains``
-    are the domains of the keystore (None for an export or a policy): if only some domains allow the
-    operation, its line names them.  ``asked_in`` says where the enclaves are: " in this export", or
-    "".
+    are the domains of the keystore (None for an export or a policy): if an enclave may do the
+    operation only in some domains, its line names these domains.  ``asked_in`` says where the
+    enclaves are: " in this export", or "".
     """
     from sros_tool.fleet.robots import folded
 

@@ -142,7 +142,7 @@ def renew(
 def _replaced_lines(result: Changed, *, has_new_keys: bool) -> Iterator[str]:
     """Yield lines that say how long replaced certificates still work, and what to do next.
 
-    Next, exports may have to be made again, and running processes be restarted.
+    Next, exports may have to be made again, and processes may have to be restarted.
     """
     from sros_tool.keystore.fleet import publish_command
     from sros_tool.keystore.layout import remedy_in_closed_robot

@@ -998,7 +998,7 @@ def _dropped_text(dropped: DroppedDenial) -> str:
 
 
 def elsewhere_lines(elsewhere: Iterable[PlacedRight]) -> list[str]:
-    """Return a line for each right that is new only for users who move the node."""
+    """Return a line for each right that is new only in another namespace of its node."""
     return [
         f"+ {placed.right.enclave} {placed.right.describe()} in another namespace  "
         f"({placed.source})"

@@ -82,7 +82,7 @@ def assign(
 
 
 def _with_shared_programs(assigned: Sequence[ClosedProcess]) -> Iterator[ClosedProcess]:
-    """Yield processes with the other enclaves whose processes the same program starts."""
+    """Yield processes; each names the other enclaves for which its program runs, too."""
     enclaves: dict[int, set[str]] = {}
     for process in assigned:
         enclaves.setdefault(process.pid, set()).add(process.enclave)
@@ -122,7 +122,7 @@ def _assignments_by_evidence(
 def _states_process_id(
     process: Process, node: ObservedNode, process_ids: Mapping[str, int]
 ) -> bool:
-    """Return whether a node's participant has or states the process id."""
+    """Return whether the identifier or the property of a node's participant has the process id."""
     pid = process.own_pid or process.pid
     if not node.participant.startswith(FAST_DDS):
         return process_ids.get(node.participant) == pid
@@ -150,7 +150,7 @@ _EVIDENCE_CHECKS: dict[str, Callable[[Process, ObservedNode, Mapping[str, int]],
 
 
 def process_ids_of_cyclone(pids: Sequence[int], domain: int) -> Mapping[str, int]:
-    """Return process ids as Cyclone DDS participants state them; none if it cannot be loaded."""
+    """Map participants to the process ids that they state; empty without Cyclone DDS."""
     if not pids:
         return {}
     command = [

@@ -234,7 +234,7 @@ class LocalRobot:
         check_enclaves(self.named_elsewhere, known, "--elsewhere")
 
     def check_rmw(self) -> None:
-        """Raise `UsageError` if only one of watch and shell is on Zenoh, and the other on DDS."""
+        """Raise `UsageError` if the robot runs on Zenoh and this shell uses DDS, or the reverse."""
         rmws = {process.rmw for process in self.processes.processes}
         is_on_zenoh, shell_is = RMW_ZENOH in rmws, self.shell.environment.get(RMW) == RMW_ZENOH
         if rmws and is_on_zenoh != shell_is:

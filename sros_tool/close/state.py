@@ -381,7 +381,7 @@ class CloseState(NamedTuple):
         return dict(sorted(due, key=lambda entry: all(map(self._may_be_last, entry[1]))))
 
     def _may_be_last(self, process: ClosedProcess) -> bool:
-        """Return whether processes with a new key or new rights are to be restarted first."""
+        """Return whether a process may restart after processes with a new key or new rights."""
         why = self.outdated.get(process.enclave, "")
         return why.endswith(_ACCEPTS_REVOKED) and process.enclave != ROUTER
 

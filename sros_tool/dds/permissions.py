@@ -437,7 +437,10 @@ def _topics(criteria: Iterable[Criteria]) -> tuple[str, ...]:
 def _blocked_by_denials(
     denied: list[str], denied_too: set[str], is_allowed: OverlapTest
 ) -> list[str]:
-    """Return the denied expressions that share a name with an expression allowed otherwise."""
+    """Return the expressions ``denied`` in one direction that `is_allowed` accepts for the other.
+
+    Expressions in ``denied_too``, which are denied in both directions, are left out.
+    """
     return [
         expression
         for expression in denied

@@ -401,7 +401,7 @@ def _rmw_here(environment: Mapping[str, str]) -> str:
 
 
 def _types_not_heard(node: HandNode, environment: Mapping[str, str]) -> str:
-    """Return a clause on nodes that a secured node will not hear, by the ROS of this shell."""
+    """Return a clause on ROS nodes of this shell that do not hear a secured node; "" if all do."""
     rmw = _rmw_here(environment)
     differs_in_vendor = node.backend == CYCLONE and vendor_of(rmw) not in (None, Vendor.CYCLONE)
     if not differs_in_vendor or environment.get(ENABLE) != "true":
@@ -416,9 +416,9 @@ def run_by_hand(
 ) -> int:
     """Run a node for ``duration``, or until a signal; return the exit status of the node.
 
-    The duration begins when the node is ready, on Zenoh when the node starts; a node that is not
-    ready within a minute is stopped, too.  ``say`` gets lines about what is sent and heard, without
-    line breaks at their ends.
+    The duration begins when the node is ready, or on Zenoh when the node starts. A node that is not
+    ready within a minute is stopped.  ``say`` gets lines about what is sent and heard, without line
+    breaks at their ends.
 
     Raises:
         SrosError: The environment demands security, and the enclave cannot be loaded.

@@ -68,7 +68,7 @@ class Diagnosis(NamedTuple):
 
     @property
     def sound(self) -> bool:
-        """Whether ROS nodes are secured by their RMW; without an RMW, whether any DDS is."""
+        """Whether the RMW of ROS nodes enforces security; without an RMW, whether any DDS does."""
         return self.enforces if self.ros is None else self.ros.enforces is True
 
     @property
@@ -198,7 +198,7 @@ def security_provider(environment: Mapping[str, str]) -> SecurityProvider | None
 
 
 def _interpreter(script: Path) -> list[str]:
-    """Return the interpreter words of a script's ``#!`` line, if they name a Python."""
+    """Return the words of a script's ``#!`` line if they name a Python; otherwise none."""
     with suppress(OSError, ValueError), script.open("rb") as file:
         first = file.readline(512)
         if first.startswith(b"#!") and b"python" in first:

@@ -53,7 +53,7 @@ class NodeOptions:
 
     @property
     def service(self) -> str:
-        """The ROS service of the role; fixed for a container."""
+        """The ROS service of the role; for a container of nodes, always the same service."""
         return self.topic if self.role in ("server", "client") else _COMPOSED_SERVICE
 
 

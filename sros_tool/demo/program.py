@@ -287,7 +287,11 @@ def _with_expectation(row: Row, backend: Backend, template: Template, topic: str
 
 
 def _with_default_template_status(row: Row, strong_row: Row, options: DemoOptions) -> Row:
-    """Return the row, marked as accepted, or as open if the user's keystore allows the attack."""
+    """Return the row with its fields ``accepted`` and ``unaccepted`` set.
+
+    An attack that the user's keystore allows, and a strong template (``strong_row``) does not, is
+    unaccepted unless --accept-open names the row.
+    """
     opened = bool(row.open_because) and not strong_row.open_because
     accepted = row.name in options.accept_open
     return replace(row, accepted=accepted, unaccepted=opened and not accepted)

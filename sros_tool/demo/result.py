@@ -139,7 +139,7 @@ class RowResult:
 
     @property
     def known_open(self) -> bool:
-        """Whether the row shows an attack that is known to succeed, or accepted by the user."""
+        """Whether the row shows an attack that is known to succeed, or that the user accepted."""
         if self.accepted and self.observed in SUCCESSES:
             return True
         return bool(self.open_because) and self.observed is self.expected and not self.open_here
@@ -153,8 +153,9 @@ class RowResult:
     def untried(self) -> bool:
         """Whether an attack that has to fail was not tried, so that it may succeed.
 
-        False for rows that prove nothing about a keystore (without the defense, or of an attack
-        that is known to succeed or was accepted), and for rows that do not apply to the keystore.
+        False for rows that prove nothing about a keystore: rows without a defense, and rows of an
+        attack that is known to succeed or that the user accepted. Also false for rows that do not
+        apply to the keystore.
         """
         if self.observed is not RowStatus.SKIPPED or not self.applies or self.defence_removed:
             return False

@@ -117,9 +117,10 @@ _IPV6_HEADER = 40
 
 
 def _transport(packet: bytes) -> tuple[int, int]:
-    """Return transport protocol and its offset in an IP packet; (0, 0) for other packets.
+    """Return the transport protocol of an IP packet and the offset of its header.
 
-    UDP counts only over IPv4, and TCP over IPv6 only without extension headers.
+    The result is (0, 0) unless the packet is UDP over IPv4, TCP over IPv4, or TCP over IPv6 without
+    extension headers.
     """
     version = packet[0] >> 4 if len(packet) >= 20 else 0
     if version == 4:

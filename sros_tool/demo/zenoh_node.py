@@ -64,7 +64,7 @@ _CDR_HEADER = b"\0\1\0\0"
 
 
 def _type_of_topic(name: str, default: tuple[str, str]) -> tuple[str, str]:
-    """Return the type and type hash of a name: of a part of an action, or else ``default``."""
+    """Return the type and type hash of a part of an action; ``default`` for all other names."""
     return _ACTION_TYPES.get(name.rpartition("/_action/")[2], default)
 
 

@@ -63,7 +63,7 @@ class AskingContext(NamedTuple):
 def domains_decided_alike(
     joined: DomainSet, governance: Governance | None, grant: Grant | None, domain: int | None
 ) -> Sequence[DomainSet]:
-    """Divide the ROS domains that an enclave may join by the rules for them.
+    """Divide the ROS domains that an enclave may join into sets with the same rules.
 
     With ``domain``, only that domain is returned.
     """
@@ -335,8 +335,8 @@ def note_on_action(
 ) -> Iterator[Note]:
     """Yield a note if the denied name is a part of an action, or names an action that is allowed.
 
-    ``kind`` is the kind of the name if the user gave it; ``decide`` returns whether the enclave has
-    the right, or else the parts that it may use.
+    ``kind`` is the kind of the name if the user gave it. ``decide`` returns whether the enclave has
+    the right, and which parts of an action it may use without this right.
     """
     if name := action_part(question.name)[0]:
         word = "execute" if question.right in ("publish", "reply") else "call"

@@ -127,7 +127,7 @@ def _is_of(node: str, name: str) -> bool:
 
 @dataclass(frozen=True)
 class AuditedEnclaves:
-    """The enclaves of a policy or keystore (``what``), and a function that returns an evaluator."""
+    """The enclaves of a policy or keystore (``what``); ``load`` loads an enclave by its name."""
 
     what: str
     nodes: EnclaveNodes
@@ -153,8 +153,8 @@ def audited_enclaves(
     that fill in the policy's placeholders.
 
     Raises:
-        UsageError: a path is neither a policy nor a keystore, a keystore is one of several paths,
-            or is with ``fleet``.
+        UsageError: a path is neither a policy nor a keystore; or a keystore is given together with
+            other paths or with ``fleet``.
         PolicyError: two policies state the same enclave.
     """
     path, *other_paths = paths

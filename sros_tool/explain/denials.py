@@ -327,9 +327,9 @@ def as_learned(
     whose standard services were denied, else to the only profile of the enclave in ``policy``, else
     to a profile for any node: DDS checks only the enclave.  If ``policy`` does not have the
     enclave, the node is assumed to have the last part of the enclave's name, with a note. A node
-    that is not in the policy gets a note instead of rights. With ``common``, a node that has none
-    of the rights that every node needs gets all these rights, if such a right was denied to the
-    node, or if the profile is new in a policy that is ``written``.
+    that is not in the policy gets a note instead of rights. ``common`` are the rights that every
+    node needs. A node that has none of them gets all of them in two cases: if one of them was
+    denied to the node, or if the profile is new in a policy that is ``written``.
 
     Raises:
         UsageError: The log does not name the enclave of a denial, and ``enclave`` is "".

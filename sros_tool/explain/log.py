@@ -950,7 +950,7 @@ class _Examiner:
         return replace(finding, found=tuple(facts), checked=True, remedy=remedy)
 
     def _namespace_clause(self, enclave: LoadedEnclave) -> str:
-        """Return a clause on the enclave of the policy that an enclave in a namespace is, or ""."""
+        """Return a clause that names the policy's enclave for an enclave in a namespace, or ""."""
         space, path = self._policy.place(enclave.name) if self._policy else ("", "")
         return f" to {path}, which is {enclave.name} in namespace {space}" if space else ""
 

@@ -304,7 +304,7 @@ def _earlier_permissions_notes(answer: Answer, now: datetime) -> Iterator[Note]:
 
 
 def _note_on_action(evaluator: Evaluator, answer: Answer, kind: str | None) -> Iterator[Note]:
-    """Yield a note if the enclave may not call the service, but an action with the same name."""
+    """Yield a note if the enclave may call an action with the name of the denied service."""
 
     def decide(action: Question) -> tuple[bool, Sequence[str]]:
         decided = evaluator.answer(action)
@@ -738,9 +738,9 @@ class VendorOfKeystore(NamedTuple):
         return tuple(o for o in self._with_holders(outcomes) if o.enclave in asked)
 
     def _with_holders(self, outcomes: Sequence[VendorOutcome]) -> tuple[VendorOutcome, ...]:
-        """Return the outcomes; each denial names allowed enclaves whose permissions fit, too.
+        """Return the outcomes; a denial names other enclaves whose permissions allow the access.
 
-        They fit the certificate of the denied enclave.
+        Only permissions that fit the certificate of the denied enclave count.
         """
         certified = {o.enclave: o.subject for o in outcomes if o.subject and not o.allowed}
         granted = {o.enclave: [o.granted] for o in outcomes if o.granted}

@@ -375,7 +375,7 @@ def _fitting_holders(source: RightsSource, enclave: str) -> list[str]:
 
 
 def _admits_strangers(governance: Governance) -> bool:
-    """Return whether processes without an identity may use a name with any tested DDS vendor."""
+    """Return whether a tested DDS vendor lets processes without an identity use some name."""
     return any(
         is_open_to_unauthenticated(domain, rule, vendor)
         for domain in governance.domain_access_rules

@@ -422,7 +422,10 @@ class ZenohEvaluator:
         return replace(answer, in_part=tuple(passing))
 
     def _acts(self, enclave: str, part: Question, brief: bool) -> bool:
-        """Return whether Zenoh passes the data of an action's part; of a call, only the request."""
+        """Return whether Zenoh passes the data of an action's part.
+
+        For a call, only the request counts, not the reply.
+        """
         answer = self.answer(enclave, part, reach=False, brief=brief)
         needed = [c for c in answer.checks if part.word == "reply" or c.message != Message.REPLY]
         return bool(needed) and all(check.allowed for check in needed)
@@ -697,7 +700,7 @@ class ZenohEvaluator:
     def _graph_deliveries(
         self, process: ZenohProcess, other: ZenohProcess
     ) -> tuple[Delivery, Delivery]:
-        """Return the deliveries that announce a node of ``process``, or show other nodes to it."""
+        """Return the delivery of a token of ``process``, and the delivery of other tokens to it."""
         whole_domain = f"@ros2_lv/{self.domain}/**"
         router = self._router_of(process.name).process
         assert router
@@ -850,7 +853,7 @@ def _domains(keystore: OpenedKeystore, now: datetime) -> DomainSet:
 
 
 def _with_equal_rules(evaluator: ZenohEvaluator, domains: DomainSet) -> Iterator[DomainSet]:
-    """Divide ``domains`` into parts with the same rules of the routers in all domains of a part."""
+    """Divide ``domains`` into parts; routers have the same rules in all domains of a part."""
     keys: dict[str, set[object]] = defaultdict(set)
     for router, file in evaluator.routers.items():
         for rule, expressions in _rules(file.process.access) if file.process else ():
@@ -881,7 +884,7 @@ def _rules(access: MessageFilter) -> Iterator[tuple[object, tuple[str, ...]]]:
 
 
 class ZenohOfKeystore:
-    """The decisions of Zenoh for enclaves of a keystore: ``names``, or all and the router."""
+    """The decisions of Zenoh for the enclaves ``names``, or for all enclaves and the router."""
 
     def __init__(
         self,

@@ -40,7 +40,7 @@ class FleetPolicy(Mapping[str, Enclave]):
     """The enclaves of a policy for a fleet, by path; an enclave is expanded when it is read.
 
     ``fleet`` has the robots.  ``patterns`` are the paths with a placeholder, as `Fleet` has them.
-    ``protects`` says whether it states the protection of a name.
+    ``protects`` says whether the policy states the protection of a name.
     """
 
     def __init__(self, policy: Policy, fleet: Fleet, robots: Collection[str] = ()) -> None:

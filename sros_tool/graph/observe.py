@@ -303,10 +303,10 @@ def watch(
 ) -> Snapshot:
     """Return the union of all graphs in ``seconds`` (None: no limit), or until ``stop()`` is true.
 
-    ``report`` is called with the union after it has grown and then not changed for ``still``
-    seconds, so that no node is reported before it is discovered completely; at the latest
-    ``patience`` seconds after the union has grown.  The watch ends at most ``patience`` later, if a
-    node that has just started is not announced yet.
+    When the union has grown, ``report`` is called with it once it has not changed for ``still``
+    seconds, so that no node is reported before it is discovered completely, and at the latest after
+    ``patience`` seconds.  If a node that has just started is not announced yet, the watch ends up
+    to ``patience`` seconds later.
     """
     begin = clock()
     seen = union = reported = Observation()

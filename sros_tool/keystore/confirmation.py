@@ -191,12 +191,13 @@ class Confirmation:
     release; 0 for none.  ``expiry`` maps enclaves to the times at which their files expire, and
     ``running`` maps enclaves to the files that their processes have loaded.  ``crl_restart`` are
     the enclaves in ``restart`` whose processes may lack the revocation list; None stands for all of
-    them.  Processes of the other enclaves lack only their own new documents.  ``boot`` is a SHA-256
-    that changes with each start of the computer.  ``problems`` are short sentences, and
-    ``requests`` signing requests (PEM) for certificates that expire.  ``crl`` is the newest
-    revocation list (PEM) of each identity CA on the robot, if they may differ from the lists that
-    were published last.  From these lists, a keystore that was restored from a backup learns of its
-    later revocations.  ``seal`` is the seal of the installed release, which proves its number.
+    them.  Processes of the remaining enclaves in ``restart`` lack only their own new documents.
+    ``boot`` is a SHA-256 that changes with each start of the computer.  ``problems`` are short
+    sentences, and ``requests`` signing requests (PEM) for certificates that expire.  ``crl`` is the
+    newest revocation list (PEM) of each identity CA on the robot, if they may differ from the lists
+    that were published last.  From these lists, a keystore that was restored from a backup learns
+    of its later revocations.  ``seal`` is the seal of the installed release, which proves its
+    number.
     """
 
     robot: str
@@ -247,7 +248,7 @@ def concerns_key(problem: str) -> bool:
 
 
 def shows_old_copy(problem: str) -> bool:
-    """Return whether an agent's problem shows that the agent may fetch from an old copy."""
+    """Return whether a problem shows that the agent may fetch from an old copy of the releases."""
     phrases = (OLDER_THAN_SEEN, OLDER_THAN_INSTALLED, OF_OTHER_CA)
     return any(phrase in problem for phrase in phrases)
 

@@ -388,7 +388,7 @@ def _rights_findings(enclave: CheckedEnclave, grant: Grant) -> Iterator[Finding]
 
 
 def _published(rule: Rule) -> set[str]:
-    """Return the topic expressions that a rule names to publish."""
+    """Return the topic expressions in the publish criteria of a rule."""
     return {topic for criteria in rule.publish for topic in criteria.topics}
 
 

@@ -346,10 +346,10 @@ def _shared_values(pairs: Iterable[tuple[_Key, str]]) -> Iterator[tuple[_Key, li
 def _trust_findings(
     keystore: CheckedKeystore, summaries: Sequence[EnclaveSummary]
 ) -> Iterator[Finding]:
-    """Yield findings about enclaves that have no CA in common with the keystore.
+    """Yield findings about unknown CAs, and about enclaves that share no CA with the keystore.
 
-    In an export, the CAs of most enclaves count instead.  During a rotation an enclave trusts the
-    old and the new CA, so one common CA is enough.
+    In an export, an enclave is compared with the CAs that most of its enclaves trust.  During a
+    rotation, an enclave trusts the old and the new CA, so one common CA is enough.
     """
     for role in keystore.authorities:
         strangers: Sequence[x509.Certificate] = ()

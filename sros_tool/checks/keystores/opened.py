@@ -202,7 +202,7 @@ class CheckedKeystore:
         )
 
     def accepts(self, kind: FindingKind, accepts_weakness: Callable[[Template], bool]) -> str:
-        """Return text that names the template or keystore which accepts a weakness; "" for neither.
+        """Return text that names the template or keystore which accepts a weakness, or "".
 
         ``accepts_weakness`` returns whether settings choose the weakness.  Its argument is the
         template as sros ships it, so a changed setting of this keystore accepts nothing.  Without

@@ -94,9 +94,9 @@ class _FnmatchSets:
     def take(self, text: str, start: int) -> tuple[Letters, int]:
         """Return the characters of the set after ``[``, and the index after the set.
 
-        After an unknown class or symbol, or a range without an end, the set matches no further
-        character.  An unclosed set is a plain ``[``, but the set matches nothing if such an error
-        comes before any further ``[``.
+        An unknown class or symbol, or a range without an end, is an error: later members of the set
+        match nothing.  The ``[`` of an unclosed set stands for itself; but if an error comes before
+        the next ``[``, it matches nothing.
         """
         index = start
         negated = text[index : index + 1] in ("!", "^")
@@ -117,7 +117,7 @@ class _FnmatchSets:
         return _set_of(members, negated), index + 1
 
     def _end_of(self, index: int, *, is_first: bool) -> tuple[bool, bool]:
-        """Return whether a set is closed after ``index``, and if not, whether its ``[`` is plain.
+        """Return whether a set is closed after ``index``; else, whether its ``[`` matches itself.
 
         Results are cached, because many unclosed sets would otherwise take quadratic time.
         """

@@ -354,7 +354,7 @@ def _check_controls(
     parties: Mapping[str, Party],
     rules: Rules,
 ) -> None:
-    """Raise `DocumentError` if a row expects silence, and no claim that something works."""
+    """Raise `DocumentError` if a row expects silence and has no claim that something works."""
     happening = [claim for claim in (*claims, *controls) if _expects_success(claim)]
     for claim in claims:
         heard = claim.relation is Relation.HEARS
@@ -382,7 +382,10 @@ def _check_controls(
 
 
 def _may_speak(party: Party, rules: Rules) -> bool:
-    """Return whether a party's enclave may publish, serve or execute its name, as far as known."""
+    """Return whether a party's enclave may publish, serve or execute the party's name.
+
+    True for a party without a topic, which cannot be checked.
+    """
     right = {Role.TALKER: "publish", Role.SERVER: "reply", Role.ACTION_SERVER: "execute"}
     if party.role not in right or not party.topic:
         return True

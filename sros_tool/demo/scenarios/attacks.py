@@ -494,7 +494,7 @@ def _trespass_rows(
 ) -> tuple[Row, ...]:
     """Return rows in which an enclave exceeds its rights, and control rows with wider rights.
 
-    ``forge`` gives the enclave of the ``part`` wide permissions, and ``opened`` names the
+    ``forge`` gives the enclave of the ``part`` wide permissions, and ``opened`` names these
     permissions.
     """
     unless_granted = " that it was not given" if attack.startswith("an enclave ") else ""

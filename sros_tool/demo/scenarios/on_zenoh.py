@@ -72,7 +72,7 @@ def _router(keystore: KeystoreChoice | None) -> Party:
 
 
 def _permitted_party(name: str, role: Role, keystore: KeystoreChoice, part: str = "") -> Party:
-    """Return a party that does what its enclave may do; ``part`` is its name by default."""
+    """Return a party that does what its enclave may do; by default, ``part`` is ``name``."""
     return Party(name, role, Identity(keystore, part or name), _TOPIC_OF.get(role, ""), turn=1)
 
 

@@ -404,7 +404,7 @@ def _read_inbox(inbox: Path, fleet: Fleet, verifier: _Verifier) -> Iterator[_Rec
 
 
 def _add_signed_by_others(received: _ReceivedMessage, message: bytes) -> None:
-    """Add what others than the robot signed in a message that is not accepted."""
+    """Keep the parts of a refused message that CAs signed: revocation list and seal."""
     with suppress(SrosError):
         signed = smime.parse_new(message)
         received.signer_certificate = signed.signer()
@@ -906,7 +906,7 @@ def _revoke_again(
 
 
 def _later_release_notes(keystore: OpenedKeystore, robots: Sequence[str]) -> Iterator[Note]:
-    """Yield a note on robots with releases that the keystore sealed, and does not know."""
+    """Yield a note on robots with releases that the keystore sealed, but does not know any more."""
     if robots:
         have = f"{first_few(robots, _SHOWN)} {'has' if len(robots) == 1 else 'have'}"
         yield Note(

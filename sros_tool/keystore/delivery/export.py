@@ -204,7 +204,7 @@ def _readable_key_notes(target: Path, names: Sequence[str]) -> Iterator[Note]:
 def _other_enclave_notes(
     keystore: OpenedKeystore, target: Path, names: Sequence[str]
 ) -> Iterator[Note]:
-    """Yield notes on enclaves in ``target`` that the keystore lacks, or of other robots."""
+    """Yield notes on enclaves in ``target`` that the keystore lacks, or that other robots have."""
     present, fleet = search_enclaves(target)[0], load_fleet(keystore)
     owners = {n: robot_of(fleet, n) if fleet else None for n in (*names, *present)}
     exported = {owner.name for name in names if (owner := owners[name])}
@@ -448,7 +448,10 @@ def _check_list(keystore: OpenedKeystore, now: datetime) -> None:
 
 
 def _check_authorities(keystore: OpenedKeystore, role: str, path: Path, data: bytes) -> None:
-    """Raise `KeystoreError` if a CA file has a CA that a ledger without gaps lacks."""
+    """Raise `KeystoreError` if a CA file has a CA that is not in the ledger.
+
+    A ledger with gaps proves nothing, so there is no error.
+    """
     known = known_authorities(keystore, role)
     if known is None or keystore.ledger_with("what", "ca").gaps:
         return

@@ -2,7 +2,7 @@
 
 Robots find complete files at every moment, because of the order of writing.  First come the new
 archives, which no metadata names yet.  Then the keystore's transaction writes ledger, keys and the
-list of what is published.  The metadata comes last, and in it the timestamp.
+list of what is published.  The metadata comes last, and its last file is the timestamp.
 """
 
 from __future__ import annotations
@@ -339,7 +339,8 @@ def _roots(keystore: OpenedKeystore) -> Roots:
 def age_clause(keystore: OpenedKeystore) -> str:
     """Return why the keystore is older than its robots, as a clause; "" if nothing shows this.
 
-    It was restored from a backup, or is a copy, and has not published with ``--restored`` since.
+    Such a keystore was restored from a backup, or is a copy, and has not published with
+    ``--restored`` since.
     """
     if marks_after_last_release(keystore):
         return "robots have files that it signed but does not know"

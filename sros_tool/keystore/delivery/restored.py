@@ -263,7 +263,7 @@ def _changes_of(
 def _has_earlier_key(
     keystore: OpenedKeystore, name: str, later: x509.Certificate, now: datetime
 ) -> bool:
-    """Return whether the keystore's key of an enclave is older than that of a certificate.
+    """Return whether the keystore's key of an enclave is older than the key in a certificate.
 
     The seal shows this even if the keystore has lost the identity CA of the release.  If the
     validity of both began at the same time, as at a fixed date, the older key is the one that the
@@ -318,9 +318,10 @@ _ELEMENT = re.compile(r"<(\w+)>(.*)</\w+>")
 def without_agreed(keystore: OpenedKeystore, changes: Sequence[LaterChange]) -> list[LaterChange]:
     """Return ``changes`` without rights and governance that were signed again on purpose.
 
-    Rights count as agreed to if their enclave was renewed by name after publishing was refused only
-    because of them.  Other commands sign rights, too, such as a rotation, and agree to none.  A
-    governance counts as agreed to only if nothing shows the difference to the published governance.
+    Rights count as agreed to if publishing was refused because of rights alone, and their enclave
+    was then renewed by name.  Other commands that sign rights, such as a rotation, agree to none.
+    A governance counts as agreed to only if nothing shows the difference to the published
+    governance.
     """
     releases = keystore.ledger_with("what", "release").entries
     last = max((entry.number for entry in releases if entry.what == "release"), default=0)
@@ -353,8 +354,8 @@ def refuse_lost_changes(
 ) -> None:
     """Raise `KeystoreError` if publishing to ``folder`` would undo changes after the backup.
 
-    One error names all of them, so that the remedy for one does not undo another in silence: only
-    an error about nothing but rights asks for consent to them (`restore_revocations`).
+    One error names all changes, so that the remedy for one does not undo another in silence. The
+    error asks for consent to rights that were taken away only if no other change is lost.
     """
     root, names = quote(str(keystore.root)), defaultdict[str, list[str]](list)
     for change in changes:

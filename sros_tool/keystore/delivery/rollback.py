@@ -230,7 +230,7 @@ def _later_authorities(
 ) -> Mapping[str, x509.Certificate]:
     """Map the paths of CA files in ``present`` to a CA in them that replaced the keystore's CA.
 
-    Then the keystore is from before a stage of a rotation.  If the ledger has both CAs, their order
+    Such a keystore is from before a stage of a rotation.  If the ledger has both CAs, their order
     there says which one is later.  A CA that is not in the ledger counts as later if it is not
     older than any CA in ``files``.
     """

@@ -446,8 +446,8 @@ class _RequestCertifier:
     def _keep_only_key_of(self, request: SigningRequest) -> bool:
         """Remove the enclave's private key in the keystore unless it is the key of the request.
 
-        This needs ``replace_keys``, or a keystore from a backup that certified the key of the
-        request since.  Returns whether the keystore had a key file that fits or is removed.
+        This needs ``replace_keys``, or a restored keystore that certified the key of the request
+        after its backup.  Returns whether the keystore had a key file that fits or is removed.
         """
         keystore, name = self._change.keystore, request.name
         path = keystore.folder(name) / KEY_FILE
