@@ -260,7 +260,7 @@ class Automaton:
         """A sort key that is the same in every run of the program."""
         return self.prefix, self.suffix, repr(self.edges)
 
-    def may_meet(self, other: Automaton) -> bool:
+    def may_overlap(self, other: Automaton) -> bool:
         """Return False if the prefixes or suffixes show that no name is accepted by both."""
         return _can_overlap(self.prefix, other.prefix) and _can_overlap(
             self.suffix[::-1], other.suffix[::-1]
@@ -336,12 +336,12 @@ class _Union:
         begin = automaton.prefix
         for length in self._lengths:
             if length < len(begin):
-                yield from filter(automaton.may_meet, self._by_prefix.get(begin[:length], ()))
+                yield from filter(automaton.may_overlap, self._by_prefix.get(begin[:length], ()))
         prefixes = self._prefixes
         for at in range(bisect_left(prefixes, begin), len(prefixes)):
             if not prefixes[at].startswith(begin):
                 break
-            yield from filter(automaton.may_meet, self._by_prefix[prefixes[at]])
+            yield from filter(automaton.may_overlap, self._by_prefix[prefixes[at]])
 
     @cached_property
     def _by_prefix(self) -> dict[str, list[Automaton]]:
@@ -932,8 +932,8 @@ def _letters_to(
 
 
 @lru_cache(maxsize=1024)
-def _machine(automata: tuple[Automaton, ...]) -> _Machine:
-    return _Machine(automata)
+def _machine(automata: tuple[Automaton, ...]) -> _ParallelAutomata:
+    return _ParallelAutomata(automata)
 
 
 class _LetterClass(NamedTuple):
@@ -944,7 +944,7 @@ class _LetterClass(NamedTuple):
     moves: _Moves
 
 
-class _Machine:
+class _ParallelAutomata:
     """Several automata that run in parallel.
 
     The positions of all automata are the bits of one integer, ``reached`` in its methods.

@@ -195,9 +195,9 @@ def test_looking_at_thousands_of_wildcards_counts() -> None:
 def test_wildcards_with_other_beginnings_cost_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     """A set that has thousands of them, below all names, is searched for each of them alone."""
     sizes: list[int] = []
-    machine = automata._Machine
+    machine = automata._ParallelAutomata
 
-    def counted(some: tuple[automata.Automaton, ...]) -> automata._Machine:
+    def counted(some: tuple[automata.Automaton, ...]) -> automata._ParallelAutomata:
         sizes.append(len(some))
         return machine(some)
 

@@ -211,7 +211,7 @@ class _Round:
             # not due.
             self._forget_restarts()
         # Note this before files are replaced: processes may have started with the present files.
-        self._note_due((), self._enclaves())
+        self._note_due_restarts((), self._enclaves())
         if self._machine.restarted:
             self._forget_restarts()
         proven = self._proven_moment()
@@ -237,7 +237,7 @@ class _Round:
             self._problems += unusable_sentences(opened)
         self._problems += exposed_sentences(self._folder, now)
         self._note_closed_keys(exposed, now)
-        self._note_due(installation.changed, names)
+        self._note_due_restarts(installation.changed, names)
         restarted: Sequence[str] = ()
         # With a wrong clock, nodes would not accept their certificates.
         if clock is not RobotClock.BEHIND:
@@ -510,7 +510,7 @@ class _Round:
 
         def before(ran: Sequence[str]) -> None:
             self._keep_replaced_list(replaced)
-            self._record_due(ran)
+            self._record_due_restarts(ran)
 
         try:
             installation = install_release(
@@ -586,7 +586,7 @@ class _Round:
             list_replaced=nothing,
         )
 
-    def _record_due(self, names: Sequence[str]) -> None:
+    def _record_due_restarts(self, names: Sequence[str]) -> None:
         """Record before a change that ``names`` need a restart, in case the agent is killed."""
         state, moments = self._state, dict.fromkeys(names, _since_boot())
         self._state = replace(
@@ -597,7 +597,7 @@ class _Round:
         )
         self._save_state()
 
-    def _note_due(self, changed: Iterable[str], names: Iterable[str]) -> None:
+    def _note_due_restarts(self, changed: Iterable[str], names: Iterable[str]) -> None:
         """Note that processes have to be restarted because files of their enclaves changed.
 
         ``changed`` are the enclaves whose files the agent changed.  Changes by others are found by

@@ -241,7 +241,7 @@ def _check_release(
         )
 
 
-def trusts_any(folder: Path) -> bool:
+def has_permissions_ca(folder: Path) -> bool:
     """Return whether an enclave in a security folder has a permissions CA."""
     return any(_trusted_authorities(folder, search_enclaves(folder)[0]))
 

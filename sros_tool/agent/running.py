@@ -118,8 +118,8 @@ def look_at_processes(
         )
 
     names = [*names]
-    states = _states(names, own_processes, is_outdated, readers)
-    list_states = _states(names, own_processes, lacks_list, readers)
+    states = _loaded_files_by_enclave(names, own_processes, is_outdated, readers)
+    list_states = _loaded_files_by_enclave(names, own_processes, lacks_list, readers)
     other_processes = [
         process
         for process in running.processes
@@ -158,7 +158,7 @@ def look_at_processes(
     )
     return EnclaveProcesses(
         states,
-        _states(names, readers, is_outdated, readers),
+        _loaded_files_by_enclave(names, readers, is_outdated, readers),
         list_states,
         tuple(sorted({*map(_enclave_of, (*elsewhere, *removed))})),
         complete,
@@ -210,7 +210,7 @@ def _can_read_key(process: Process, folder: Path) -> bool:
     return False
 
 
-def _states(
+def _loaded_files_by_enclave(
     names: Iterable[str],
     processes: Iterable[Process],
     is_outdated: Callable[[Process, ProcessEnclave], bool],

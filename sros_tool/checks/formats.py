@@ -46,7 +46,7 @@ _MOST_CHARACTERS = 20_000  # characters: a comment on GitHub has at most 65,536
 _SEVERITY_SIGNS = {"error": "🔴", "warning": "🟠", "note": "🔵"}
 
 
-_Kinds = Mapping[str, tuple[Hashable, Hashable]]
+_MergeKeys = Mapping[str, tuple[Hashable, Hashable]]
 
 
 def folded_findings(
@@ -114,7 +114,7 @@ _FEWEST_ENCLAVES = 2  # only more enclaves than this are merged into one finding
 _MOST_SIMILAR = 5  # more similar findings for different robots become one finding
 
 
-def _merge_keys(group: tuple[Finding, ...], fleet: Fleet) -> _Kinds:
+def _merge_keys(group: tuple[Finding, ...], fleet: Fleet) -> _MergeKeys:
     """Map each robot that a finding names to two keys by which findings are merged.
 
     The first key is equal for findings that differ only in this robot; the second key is also equal

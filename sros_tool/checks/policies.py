@@ -466,9 +466,11 @@ def _check_node_names(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
         near = []
         for profile in enclave.all_profiles():
             full = expand("~", profile.ns, profile.node)
-            if enclave.path == full or (own == profile.node and not _is_typed(enclave.path, full)):
+            if enclave.path == full or (
+                own == profile.node and not _is_typing_error(enclave.path, full)
+            ):
                 break
-            if _is_typed(own, profile.node) or _is_typed(enclave.path, full):
+            if _is_typing_error(own, profile.node) or _is_typing_error(enclave.path, full):
                 near.append((profile, full))
         else:
             for profile, full in near:
@@ -1604,7 +1606,7 @@ class NearNames:
             self._by_last[name.rpartition("/")[2]].append(name)
             for end in _name_ends(name):
                 self._by_end[end].append(name)
-            for key in set(_keys(name)):
+            for key in set(_index_keys(name)):
                 self._by_key[key].append(name)
 
     def similar_names(self, name: str) -> list[str]:
@@ -1615,7 +1617,7 @@ class NearNames:
         Parts that differ in digits, or are shorter than four letters, are not similar.
         """
         candidates = {
-            candidate for key in set(_keys(name)) for candidate in self._by_key.get(key, ())
+            candidate for key in set(_index_keys(name)) for candidate in self._by_key.get(key, ())
         }
         return sorted(
             candidate for candidate in candidates if candidate != name and _is_near(name, candidate)
@@ -1643,7 +1645,7 @@ def _name_ends(name: str) -> Iterator[str]:
         yield "/" + "/".join(parts[at:])
 
 
-def _keys(name: str) -> Iterator[str]:
+def _index_keys(name: str) -> Iterator[str]:
     """Yield index keys of a name; similar names have a key in common."""
     yield _without_separators(name)
     parts = _NAME_SEPARATORS.split(name)
@@ -1675,7 +1677,7 @@ def _is_near(first_name: str, second_name: str) -> bool:
     return _is_one_edit(a, b)
 
 
-def _is_typed(a: str, b: str) -> bool:
+def _is_typing_error(a: str, b: str) -> bool:
     """Return whether two names differ by a typing error, not only in capitals and separators."""
     return _without_separators(a) != _without_separators(b) and _is_near(a, b)
 

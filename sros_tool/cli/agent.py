@@ -148,7 +148,7 @@ def _init(
             --from /media/usb/pub --inbox /media/usb/inbox --restart
     """
     from sros_tool.agent.fetch import pin_root
-    from sros_tool.agent.install import trusts_any
+    from sros_tool.agent.install import has_permissions_ca
     from sros_tool.agent.settings import (
         SETTINGS_FILE,
         AgentSettings,
@@ -170,7 +170,7 @@ def _init(
             "Name the folder that the enclaves of this robot are in, or will be in.",
         )
     check_owner(folder)
-    if not authorities and not trusts_any(folder):
+    if not authorities and not has_permissions_ca(folder):
         raise UsageError(
             f"'{folder}' has no permissions CA, so this robot could trust no release",
             "No delivered enclave is there.",

@@ -48,8 +48,8 @@ from sros_tool.cli.common import (
     print_json,
     print_notes,
     progress,
+    removed_secrets,
     save,
-    taken_secrets,
     verb,
 )
 from sros_tool.dds.decision.vendors import TESTED, ZENOH
@@ -915,7 +915,7 @@ def doctor(report: Path | None, force: bool, advisories: Path | None, as_json: b
                 echo_findings([finding])
     if report:
         lines = _report_sections(diagnosis, provider, findings)
-        text = support_report(os.environ, lines, secrets=taken_secrets())
+        text = support_report(os.environ, lines, secrets=removed_secrets())
         document = visible(text).encode("utf-8", "backslashreplace")
         echo(f"{save(report, document)}; read it before you attach it", err=True)
     if not diagnosis.sound or any(finding.severity >= ERROR for finding in findings):

@@ -758,7 +758,7 @@ def without_secrets() -> Iterator[None]:
         _printed_notes.clear()
 
 
-def taken_secrets() -> tuple[str, ...]:
+def removed_secrets() -> tuple[str, ...]:
     """Return the values of the secrets that were removed from the environment, for redaction."""
     return tuple(_taken.values())
 

@@ -93,7 +93,11 @@ def distribute_key(
       left out enclave /arm/camera: its key was made on its robot
     """
     from sros_tool.keystore.delivery.archive import SUFFIXES
-    from sros_tool.keystore.delivery.export import distribute, pack_enclaves, with_keys_here
+    from sros_tool.keystore.delivery.export import (
+        distribute,
+        pack_enclaves,
+        select_enclaves_to_export,
+    )
     from sros_tool.keystore.layout import enclave_folder
     from sros_tool.keystore.outcomes import changes_below
     from sros_tool.keystore.reader import OpenedKeystore
@@ -106,7 +110,7 @@ def distribute_key(
     keystore = OpenedKeystore(root)
     _check_target(keystore, names_and_target[-1])
     chosen = chosen_enclaves(keystore, names, patterns, robots)
-    selection = with_keys_here(keystore, chosen, names, keyless=keyless)
+    selection = select_enclaves_to_export(keystore, chosen, names, keyless=keyless)
     notes: tuple[Note, ...] = ()
     kept: list[str] = []
     if target == _STREAM:

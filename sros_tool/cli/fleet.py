@@ -718,7 +718,7 @@ def _status(
 
         rows = list(_page_rows(compared, robots))
         in_force, total = _list_in_force(status) or (0, 0)
-        list_lacking = "".join(_list_facts(compared)) if in_force < total else ""
+        list_lacking = "".join(_revocation_list_facts(compared)) if in_force < total else ""
         text = render_fleet_page(
             as_plain(compared),
             _STATE_WORDS,
@@ -834,7 +834,7 @@ def _fleet_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
         confirmed = f"not confirmed by {counted(behind, 'robot')} yet"
         confirmed = confirmed if behind else f"confirmed by {every}{counted(robots, 'robot')}"
         yield f"CA rotation: {status.stage}; {confirmed}"
-    yield from _list_facts(compared_fleet)
+    yield from _revocation_list_facts(compared_fleet)
     yield from _expiry_facts(compared_fleet)
     if status.unassigned:
         whose = counted(status.unassigned, "enclave belongs", "enclaves belong")
@@ -842,7 +842,7 @@ def _fleet_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
         yield f"{whose} to no robot, so no confirmation covers {covered}"
 
 
-def _list_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
+def _revocation_list_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
     """Yield the number of robots on which the revocation list is in force, if there is one."""
     status = compared_fleet.status
     if numbers := _list_in_force(status):

@@ -106,7 +106,7 @@ def renew(
       the replaced certificate works until 2027-05-20T09:00:00Z, when ...
       $ sros renew keystore --all-expiring 30d --revoke-old
     """
-    from sros_tool.keystore.delivery.restored import refuse_while_waiting
+    from sros_tool.keystore.delivery.restored import refuse_unpublished_restore
     from sros_tool.keystore.expiry import parse_threshold
     from sros_tool.keystore.lifecycle.renew import renew as work
     from sros_tool.keystore.reader import OpenedKeystore
@@ -116,7 +116,7 @@ def renew(
     if names or patterns or robots or all_expiring is None:
         names = chosen_enclaves(keystore, names, patterns, robots)
     if patterns or all_expiring is not None:  # as a timer does, which agrees to no right
-        refuse_while_waiting(keystore, "Renewing more than the named enclaves")
+        refuse_unpublished_restore(keystore, "Renewing more than the named enclaves")
     threshold = parse_threshold(all_expiring) if all_expiring is not None else None
     with progress("renewing") as step:
         result = work(

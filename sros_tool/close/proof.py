@@ -456,7 +456,7 @@ class _TalkComparison:
             "gone": _lost_endpoints(make_observation(present), self.current, self._denied),
             "left alone": [
                 *_abandoned_names(before, expected, moved, self._denied),
-                *_lonely_endpoints(
+                *_endpoints_without_peer(
                     make_observation(observed),
                     make_observation([*expected.nodes, *self.current.nodes]),
                     [pair for pair in moved if pair.new_node in map(node_name, before.nodes)],
@@ -603,7 +603,7 @@ def _abandoned_names(
     ]
 
 
-def _lonely_endpoints(
+def _endpoints_without_peer(
     before: Observation,
     now: Observation,
     moved: Iterable[MovedEndpoint],

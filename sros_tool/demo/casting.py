@@ -167,7 +167,9 @@ class UserKeystore(NamedTuple):
         expressions = _expressions_of(self.grants[enclave], right, name)
         if not all(expressions):
             return row
-        wild = next((f" by {expression}" for expression in expressions if _is_wild(expression)), "")
+        wild = next(
+            (f" by {expression}" for expression in expressions if _has_wildcard(expression)), ""
+        )
         claim = row.claims[0]
         success = OUTCOMES[claim.relation][True]
         return replace(
@@ -373,9 +375,9 @@ def _best_cast(
         pair = next(
             (
                 (talker, listener)
-                for talker in _best_first(rights, "publish", talkers, listeners, topic)
+                for talker in _sorted_by_fitness(rights, "publish", talkers, listeners, topic)
                 for listener in sorted(
-                    _best_first(rights, "subscribe", listeners, talkers, topic),
+                    _sorted_by_fitness(rights, "subscribe", listeners, talkers, topic),
                     key=lambda name: name not in without_list,
                 )
                 if talker != listener
@@ -406,7 +408,7 @@ def _best_cast(
     return (cast | serving if cast else cast), topic
 
 
-def _best_first(
+def _sorted_by_fitness(
     rights: Mapping[str, Grant], right: str, chosen: set[str], other_enclaves: set[str], topic: str
 ) -> list[str]:
     """Return ``chosen`` sorted by how well an enclave shows the ``right`` to ``topic``.
@@ -591,12 +593,12 @@ def _expressions_of(grant: Grant, right: str, name: str) -> tuple[str, ...]:
 def _allows_name(grant: Grant, right: str, name: str, *, named: bool = False) -> bool:
     """Return whether a grant allows a right on a ROS name; with ``named``, by exact name only."""
     return all(
-        expression and not (named and _is_wild(expression))
+        expression and not (named and _has_wildcard(expression))
         for expression in _expressions_of(grant, right, name)
     )
 
 
-def _is_wild(expression: str) -> bool:
+def _has_wildcard(expression: str) -> bool:
     """Return whether a topic expression has wildcards."""
     return bool(set(expression) & _WILDCARDS)
 
@@ -618,7 +620,7 @@ def _topics_to_publish(grant: Grant) -> Iterator[str]:
     """Yield the DDS topics that a grant allows to publish by exact name."""
     for rule in grant.rules:
         for topic in _expressions(rule, "publish") if rule.allow else ():
-            if not _is_wild(topic):
+            if not _has_wildcard(topic):
                 yield topic
 
 

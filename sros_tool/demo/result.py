@@ -235,7 +235,7 @@ def _why_import_failed(party: Party, record: PartyRecord) -> str:
     return next((f"{module} cannot be loaded here: {text}" for text in failed), "")
 
 
-class _Case:
+class _ClaimRecords:
     """A claim, with the records of its row and of its two parties."""
 
     def __init__(self, claim: Claim, record: RowRecord) -> None:
@@ -272,7 +272,7 @@ def _judge_claim(claim: Claim, record: RowRecord) -> _ClaimFinding:
         return _ClaimFinding(RowStatus.STARTED, f"{claim.subject} started")
     if record.window is None:
         return _undecided("not all processes were ready in time")
-    return _JUDGES[claim.relation](_Case(claim, record))
+    return _JUDGES[claim.relation](_ClaimRecords(claim, record))
 
 
 def _is_of_user(name: str, row: Row) -> bool:
@@ -280,7 +280,7 @@ def _is_of_user(name: str, row: Row) -> bool:
     return any(e.name == name and e.identity.enclave.startswith("/") for e in row.parties)
 
 
-def _judge_hearing(case: _Case) -> _ClaimFinding:
+def _judge_hearing(case: _ClaimRecords) -> _ClaimFinding:
     claim, record = case.claim, case.record
     sent = {event.text for event in case.messages_sent(case.talker)}
     if not sent:
@@ -293,7 +293,7 @@ def _judge_hearing(case: _Case) -> _ClaimFinding:
     return case.result(bool(heard), f"{claim.subject} heard {heard_of} in {record.seconds:.1f} s")
 
 
-def _judge_answers(case: _Case) -> _ClaimFinding:
+def _judge_answers(case: _ClaimRecords) -> _ClaimFinding:
     claim, asked = case.claim, case.messages_sent(case.subject)
     if not asked:
         return _undecided(f"{claim.subject} sent no request in the window")
@@ -303,7 +303,7 @@ def _judge_answers(case: _Case) -> _ClaimFinding:
     return case.result(bool(answers), f"{claim.subject} asked {len(asked)} times and got {right}")
 
 
-def _judge_execution(case: _Case) -> _ClaimFinding:
+def _judge_execution(case: _ClaimRecords) -> _ClaimFinding:
     """Judge a call by the requests that the server executed, because a reply may be lost."""
     claim, asked = case.claim, case.messages_sent(case.talker)
     if not asked:
@@ -317,7 +317,7 @@ _SECONDS_IN_TRANSIT = 1.0
 """Seconds after expiry in which messages may still arrive: certificates have whole seconds."""
 
 
-def _judge_expiry(case: _Case) -> _ClaimFinding:
+def _judge_expiry(case: _ClaimRecords) -> _ClaimFinding:
     claim, expiry, heard = case.claim, case.record.expiry, case.heard()
     if expiry is None or not any(event.time < expiry for event in heard):
         return _undecided(f"{claim.talker} was not heard before its certificate expired")
@@ -357,7 +357,7 @@ def _message_of(line: str) -> str:
     return " ".join(message.split()).rstrip(".") or line.strip()
 
 
-def _judge_replay(case: _Case) -> _ClaimFinding:
+def _judge_replay(case: _ClaimRecords) -> _ClaimFinding:
     claim, injected = case.claim, case.record.injected
     if injected is None or not injected.packets:
         return _undecided("no packets of the talker were captured to send again")
@@ -369,7 +369,7 @@ def _judge_replay(case: _Case) -> _ClaimFinding:
     )
 
 
-def _judge_forgery(case: _Case) -> _ClaimFinding:
+def _judge_forgery(case: _ClaimRecords) -> _ClaimFinding:
     claim, talker, injected = case.claim, case.talker, case.record.injected
     if injected is None or not injected.packets:
         return _undecided("no packet of the talker could be changed")
@@ -391,7 +391,7 @@ def _messages_heard(speaker: PartyRecord, listener: PartyRecord) -> list[Event]:
     return [e for e in listener.events if e.kind is EventKind.HEARD and e.text.startswith(mark)]
 
 
-def _judge_view(case: _Case) -> _ClaimFinding:
+def _judge_view(case: _ClaimRecords) -> _ClaimFinding:
     claim, observer, topic = case.claim, case.subject, case.talker.topic
     serves = case.record.row.party(claim.talker).role is Role.SERVER
     # A server only has to exist; no client has to call it.
@@ -407,7 +407,7 @@ def _judge_view(case: _Case) -> _ClaimFinding:
     return case.result(most > 0, f"{observer.through} counts {counted} in {len(looks)} polls")
 
 
-def _judge_loss(case: _Case) -> _ClaimFinding:
+def _judge_loss(case: _ClaimRecords) -> _ClaimFinding:
     claim, topic = case.claim, case.talker.topic
     if not any(event.kind is EventKind.SENT for event in case.talker.events):
         return _undecided(f"{claim.talker} found no node")
@@ -424,7 +424,7 @@ def _judge_loss(case: _Case) -> _ClaimFinding:
     return case.result(not left, f"{detail}; {claim.talker} tried it")
 
 
-def _judge_wire(case: _Case) -> _ClaimFinding:
+def _judge_wire(case: _ClaimRecords) -> _ClaimFinding:
     claim, record = case.claim, case.record
     if claim.wire is Wire.MEMORY:
         segments = record.memory.get(claim.subject, 0)
@@ -449,7 +449,7 @@ def _judge_wire(case: _Case) -> _ClaimFinding:
     return case.result(False, f"0 packets show the text, {count.protected} are encrypted")
 
 
-_JUDGES: Mapping[Relation, Callable[[_Case], _ClaimFinding]] = {
+_JUDGES: Mapping[Relation, Callable[[_ClaimRecords], _ClaimFinding]] = {
     Relation.HEARS: _judge_hearing,
     Relation.HEARS_AGAIN: _judge_replay,
     Relation.BELIEVES: _judge_forgery,

@@ -125,11 +125,11 @@ def rights_naming(keystore: OpenedKeystore, name: str) -> Iterator[Right]:
     for enclave in keystore.names:
         with suppress(SrosError, OSError):
             data = keystore.read(keystore.folder(enclave) / PERMISSIONS_FILE, "permissions")
-            if _may_have(data, name):
+            if _may_contain_topic(data, name):
                 yield from _rights_in(enclave, data)
 
 
-def _may_have(document: bytes, name: str) -> bool:
+def _may_contain_topic(document: bytes, name: str) -> bool:
     """Return whether a document can contain a topic of a ROS name, including escaped characters."""
     text = name.encode()
     return text in document and (

@@ -90,7 +90,7 @@ class EnclaveNodes:
         return exact or frozenset(
             name
             for name, nodes in self.by_enclave.items()
-            if any(_is_of(node, named_node) for named_node in nodes)
+            if any(_matches_node_name(node, named_node) for named_node in nodes)
         )
 
     @property
@@ -120,7 +120,7 @@ class EnclaveNode:
         return f"{f'node {self.node}' if self.node else 'every node'} of enclave {self.enclave}"
 
 
-def _is_of(node: str, name: str) -> bool:
+def _matches_node_name(node: str, name: str) -> bool:
     """Return whether the full name of a node matches ``name``, which may have wildcards."""
     return node == name or (is_expression(name) and matches(name, node))
 
@@ -401,7 +401,8 @@ def audit(observation: Observation, enclaves: AuditedEnclaves, observer: str = "
             for enclave_node in expected
             if enclave_node.enclave in candidates
             and (
-                not enclave_node.node or any(_is_of(node.fqn, enclave_node.node) for node in nodes)
+                not enclave_node.node
+                or any(_matches_node_name(node.fqn, enclave_node.node) for node in nodes)
             )
         }
         answers = {name: _judge(nodes, name, enclaves) for name in candidates}

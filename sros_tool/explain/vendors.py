@@ -219,7 +219,7 @@ def explain_on_dds(
         *(note_on_lacking_keys(copied) if copied else ()),
         *_notes_on_files(enclave),
         *_earlier_permissions_notes(answer, context.at),
-        *_note_on_anybody([_opened_parts(evaluator, question)], refuse),
+        *_note_on_anybody([_access_without_identity(evaluator, question)], refuse),
     )
     asked = Asked(enclave.name, question, context)
     if compared is Compared.VENDORS:
@@ -460,19 +460,19 @@ def _runs_on_zenoh(keystore: OpenedKeystore, name: str) -> bool:
 # ── many enclaves ──────────────────────────────────────────────────────────────────────────
 
 
-class OpenedParts(NamedTuple):
+class AccessWithoutIdentity(NamedTuple):
     """The access of processes without an identity: a whole right, or else its `acting_parts`."""
 
     whole: bool = False
     parts: tuple[str, ...] = ()
 
     @staticmethod
-    def joined(opened: Iterable[OpenedParts]) -> OpenedParts:
+    def joined(opened: Iterable[AccessWithoutIdentity]) -> AccessWithoutIdentity:
         """Return the open parts of several enclaves or domains together."""
         known = tuple(opened)
         if any(opened_parts.whole for opened_parts in known):
-            return OpenedParts(whole=True)
-        return OpenedParts(
+            return AccessWithoutIdentity(whole=True)
+        return AccessWithoutIdentity(
             parts=tuple(dict.fromkeys(part for some in known for part in some.parts))
         )
 
@@ -494,7 +494,7 @@ class VendorOutcome(NamedTuple):
     """The expression that decided, or null."""
     domains: str = ""
     """The ROS domains in which the enclave has the right, such as ``10`` or ``10,20``, or null."""
-    opened: OpenedParts = OpenedParts()
+    opened: AccessWithoutIdentity = AccessWithoutIdentity()
     """The rights that the enclave's governance gives to processes without an identity."""
     in_part: Sequence[str] = ()
     """The parts of an action, such as ``send_goal``, by which the enclave can command the server
@@ -558,7 +558,7 @@ class WhoByVendor(NamedTuple):
     def anybody_in_part(self) -> tuple[str, ...]:
         """The parts by which processes without an identity can command the server or inform the
         clients, without the whole right."""
-        return OpenedParts.joined(outcome.opened for outcome in self.enclaves).parts
+        return AccessWithoutIdentity.joined(outcome.opened for outcome in self.enclaves).parts
 
     @property
     def documented_only(self) -> bool:
@@ -582,31 +582,31 @@ def _outcome(evaluator: Evaluator, name: str, question: Question) -> VendorOutco
         answer.reason,
         answer.text,
         expression,
-        opened=_opened_parts(evaluator, question),
+        opened=_access_without_identity(evaluator, question),
         in_part=_allowed_parts(evaluator, answer),
         subject=evaluator.enclave.subject if evaluator.has_accepted_certificate else "",
         granted=of_others.grant.subject if of_others.allowed and of_others.grant else "",
     )
 
 
-def _opened_parts(evaluator: Evaluator, question: Question) -> OpenedParts:
+def _access_without_identity(evaluator: Evaluator, question: Question) -> AccessWithoutIdentity:
     """Return the access that the enclave's governance gives to processes without an identity."""
     access = evaluator.access
     opened = access.topics_of_unauthenticated() if access else None
     if opened is None or not question.parts:
-        return OpenedParts()
+        return AccessWithoutIdentity()
     if all(part.topic in opened for part in question.parts):
-        return OpenedParts(whole=True)
+        return AccessWithoutIdentity(whole=True)
     sent = {part: asked.parts for part, asked in acting_parts(question).items()} or {
         part.role: (part,) for part in question.parts if part.verb is AccessVerb.PUBLISH
     }
-    return OpenedParts(
+    return AccessWithoutIdentity(
         parts=tuple(n for n, parts in sent.items() if all(part.topic in opened for part in parts))
     )
 
 
-def _note_on_anybody(opened_parts: Iterable[OpenedParts], remedy: str) -> Iterator[Note]:
-    opened = OpenedParts.joined(opened_parts)
+def _note_on_anybody(opened_parts: Iterable[AccessWithoutIdentity], remedy: str) -> Iterator[Note]:
+    opened = AccessWithoutIdentity.joined(opened_parts)
     if opened.whole:
         text = (
             "processes without an identity may do it, too: the governance admits them, and does "
@@ -720,7 +720,7 @@ class VendorOfKeystore(NamedTuple):
             parts = domains_decided_alike(joined, governance, grant, self.asking.domain)
             decisions = {domains: decided(next(iter(domains))) for domains in parts}
             decision, domains, in_part = first_allowing_domain(decisions)
-            opened = OpenedParts.joined(outcome.opened for outcome in decisions.values())
+            opened = AccessWithoutIdentity.joined(outcome.opened for outcome in decisions.values())
             return decision._replace(domains=domains, in_part=in_part, opened=opened)
 
         every_name = self.keystore.names

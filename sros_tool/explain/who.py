@@ -327,7 +327,7 @@ def follow_reach(
     reach = network.reach(enclave)
     # Reach follows each domain, so this note does not apply.
     notes = [note for note in source.notes if note.id != "rights.domains"]
-    if of_keystore and _admits_strangers(OpenedKeystore(source.path).governance):
+    if of_keystore and _admits_processes_without_identity(OpenedKeystore(source.path).governance):
         refuse = remedy_in_keystore(source.path, f"Run {REFUSE_STRANGERS}.")
         text = (
             "processes without an identity may use some names, too, because the governance admits "
@@ -374,7 +374,7 @@ def _fitting_holders(source: RightsSource, enclave: str) -> list[str]:
     return sorted({holder for of in fitting for holder in of.get(enclave, ())})
 
 
-def _admits_strangers(governance: Governance) -> bool:
+def _admits_processes_without_identity(governance: Governance) -> bool:
     """Return whether a tested DDS vendor lets processes without an identity use some name."""
     return any(
         is_open_to_unauthenticated(domain, rule, vendor)

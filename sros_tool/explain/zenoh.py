@@ -418,10 +418,10 @@ class ZenohEvaluator:
         if answer.outcome is not _Outcome.DROPPED:
             return answer
         parts = acting_parts(answer.question).items()
-        passing = [part for part, asked in parts if self._acts(answer.enclave, asked, brief)]
+        passing = [part for part, asked in parts if self._passes_part(answer.enclave, asked, brief)]
         return replace(answer, in_part=tuple(passing))
 
-    def _acts(self, enclave: str, part: Question, brief: bool) -> bool:
+    def _passes_part(self, enclave: str, part: Question, brief: bool) -> bool:
         """Return whether Zenoh passes the data of an action's part.
 
         For a call, only the request counts, not the reply.

@@ -339,7 +339,7 @@ def _connection_settings(data: bytes, label: str, *, is_json: bool) -> dict[str,
     variables, the members of the group are added, too.  If a value is a template, all values are
     returned.  Parameters and errors are those of `_table_from_inventory`.
     """
-    values = dict(_values_below(_load_inventory(data, label, is_json=is_json)))
+    values = dict(_inventory_leaves(_load_inventory(data, label, is_json=is_json)))
     known = {*_VARIABLES.values(), _ROBOT_VARIABLE}
     kept = {
         path: text
@@ -353,7 +353,7 @@ def _connection_settings(data: bytes, label: str, *, is_json: bool) -> dict[str,
     return {".".join(path): text for path, text in kept.items()}
 
 
-def _values_below(top: Mapping[str, Any]) -> Iterator[tuple[tuple[str, ...], str]]:
+def _inventory_leaves(top: Mapping[str, Any]) -> Iterator[tuple[tuple[str, ...], str]]:
     """Yield every leaf of an inventory: the keys that lead to it, and its text.
 
     A leaf is any value that is not a mapping, or an empty mapping.

@@ -167,7 +167,9 @@ class Side:
             ]
         else:
             limit.spend(len(self._wild) // _COMPARISONS_PER_STEP)
-            matching = [automaton for automaton in self._wild if automaton.may_meet(own_automaton)]
+            matching = [
+                automaton for automaton in self._wild if automaton.may_overlap(own_automaton)
+            ]
         wild = {enclave for automaton in matching for enclave in self._wild[automaton]}.union(
             self._any
         )
@@ -223,7 +225,7 @@ class Side:
         for topic in self._accepted_topics(own_automaton, limit):
             met.update(self.exact[topic])
         for automaton, enclaves in self._wild.items():
-            if automaton.may_meet(own_automaton):
+            if automaton.may_overlap(own_automaton):
                 met.update(enclaves)
         limit.spend(len(met))  # the result is cached
         return frozenset(met)

@@ -14,7 +14,7 @@ from sros_tool.close import proof
 from sros_tool.close.nodes import MovedEndpoint
 from sros_tool.close.proof import (
     _abandoned_names,
-    _lonely_endpoints,
+    _endpoints_without_peer,
     _proof_of_requirements,
     _unseen_text,
     _without_counterpart,
@@ -63,14 +63,14 @@ def test_a_moved_node_is_left_alone_if_nobody_is_at_its_new_name() -> None:
     moved = [MovedEndpoint("/guard", "/safe/guard", old, new)]
     now = make_observation([tracks, diary, guard])
     alone = ["/safe/guard subscribe /safe/wheel"]
-    assert _lonely_endpoints(before, now, moved, ()) == alone
+    assert _endpoints_without_peer(before, now, moved, ()) == alone
     other = replace(node("other"), endpoints=frozenset({own}))
-    assert not _lonely_endpoints(before, make_observation([*now.nodes, other]), moved, ())
+    assert not _endpoints_without_peer(before, make_observation([*now.nodes, other]), moved, ())
     silent = make_observation([diary])
-    assert not _lonely_endpoints(silent, now, moved, ()), "nobody talked to it before"
+    assert not _endpoints_without_peer(silent, now, moved, ()), "nobody talked to it before"
     right = Right("/guard", ALLOW, "subscribe", "/safe/wheel")
     denied = DeniedRight(right, ("/safe/guard",), "no rule", False, False, (new,))
-    assert not _lonely_endpoints(before, now, moved, [denied])
+    assert not _endpoints_without_peer(before, now, moved, [denied])
 
 
 @pytest.mark.parametrize(

@@ -26,7 +26,7 @@ from sros_tool.keystore.delivery.export import (
     ExportSelection,
     distribute,
     pack_enclaves,
-    with_keys_here,
+    select_enclaves_to_export,
 )
 from sros_tool.keystore.delivery.robot import create_request
 from sros_tool.keystore.delivery.signing import sign_request
@@ -286,7 +286,7 @@ def test_an_export_with_keyless_says_which_private_keys_it_has(fleet: Path, tmp_
 def select(root: Path, names: list[str], patterns: list[str], every: bool) -> ExportSelection:
     keystore = OpenedKeystore(root)
     chosen = chosen_enclaves(keystore, names, ["*"] if every else patterns, [])
-    return with_keys_here(keystore, chosen, names, keyless=False)
+    return select_enclaves_to_export(keystore, chosen, names, keyless=False)
 
 
 @pytest.mark.parametrize(

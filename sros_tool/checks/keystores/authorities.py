@@ -375,7 +375,7 @@ def check_authorities(keystore: CheckedKeystore) -> Iterator[Finding]:
             if role not in keystore.authorities and path not in unread:
                 text = f"there is no certificate of the {role} CA"
                 yield CA_MISSING.found(f"{role} CA", text, keystore.shown(path))
-    yield from _record_findings(keystore)
+    yield from _settings_and_ledger_findings(keystore)
     seen: set[bytes] = set()
     for role, chain in keystore.authorities.items():
         fingerprint = chain[0].fingerprint(hashes.SHA256())
@@ -413,12 +413,12 @@ _NEXT_LIST = (
 )
 
 
-def _is_served(keystore: CheckedKeystore) -> bool:
+def _has_ca_service(keystore: CheckedKeystore) -> bool:
     """Return whether a CA service is the identity CA."""
     return bool(keystore.settings and is_ca_service(keystore.settings.identity_key))
 
 
-def _record_findings(keystore: CheckedKeystore) -> Iterator[Finding]:
+def _settings_and_ledger_findings(keystore: CheckedKeystore) -> Iterator[Finding]:
     """Yield findings about the settings and the ledger, which only sros writes."""
     settings, ledger = ((keystore.root / name).exists() for name in (SETTINGS, LEDGER))
     if ledger and not settings:
@@ -458,7 +458,7 @@ def _authority(
     file, subject = keystore.shown(ca_certificate(role)), f"{role} CA"
     name, validity = authority_text(certificate), validity_of(certificate)
     begin, end = iso(validity.not_before), iso(validity.not_after)
-    remedy = _NEXT_CA if role == IDENTITY and _is_served(keystore) else ""
+    remedy = _NEXT_CA if role == IDENTITY and _has_ca_service(keystore) else ""
     if not validity.contains(keystore.at.now):
         text = f"{name} is valid from {begin} to {end}"
         yield CA_EXPIRED.found(subject, text, file, remedy=remedy)
@@ -560,7 +560,7 @@ def _revocation_list_findings(keystore: CheckedKeystore) -> Iterator[Finding]:
                 yield CRL_LACKS.found("revocation list", text, file)
     if crl is None:
         return
-    remedy = _NEXT_LIST if _is_served(keystore) else ""
+    remedy = _NEXT_LIST if _has_ca_service(keystore) else ""
     if crl.expires_soon_from() < keystore.at.now:
         text = f"it expires at {iso(crl.next_update)}, and DDS then refuses every participant"
         yield CRL_EXPIRES_SOON.found("revocation list", text, file, remedy=remedy)

@@ -372,7 +372,7 @@ def _rights_findings(enclave: CheckedEnclave, grant: Grant) -> Iterator[Finding]
             accepted = keystore.accepts(EVERYTHING, lambda _: False)
             yield EVERYTHING.found(enclave.name, text, file, accepted=accepted)
     elif not (enclave.folder / ROUTER_FILE).exists() and any(
-        _ANY_NODES_SERVICE in _published(rule) for rule in grant.rules if rule.allow
+        _ANY_NODES_SERVICE in _published_expressions(rule) for rule in grant.rules if rule.allow
     ):
         text = f"the permissions allow publishing {_ANY_NODES_SERVICE}"
         yield ANY_NODE.found(enclave.name, text, file)
@@ -387,7 +387,7 @@ def _rights_findings(enclave: CheckedEnclave, grant: Grant) -> Iterator[Finding]
         yield LONG_PERMISSIONS.found(enclave.name, text, file, accepted=accepted)
 
 
-def _published(rule: Rule) -> set[str]:
+def _published_expressions(rule: Rule) -> set[str]:
     """Return the topic expressions in the publish criteria of a rule."""
     return {topic for criteria in rule.publish for topic in criteria.topics}
 

@@ -261,7 +261,7 @@ def check_files(keystore: CheckedKeystore, names: Sequence[str] | None = None) -
     if names is None:
         yield from _hidden_enclave_findings(keystore)
         yield from _folder_findings(root, keystore, links, trusted, kept)
-        if kept and not (keystore.is_original and _has_links(keystore)):
+        if kept and not (keystore.is_original and _has_link_to_identity_ca(keystore)):
             remedy = _COPY_WITHOUT_LINKS_REMEDY if keystore.is_original else ""
             yield HOME_OR_ROBOT.found(root, f"it has {names_text(kept)}", root, remedy=remedy)
         return
@@ -283,7 +283,7 @@ def _hidden_enclave_findings(keystore: CheckedKeystore) -> Iterator[Finding]:
         )
 
 
-def _has_links(keystore: CheckedKeystore) -> bool:
+def _has_link_to_identity_ca(keystore: CheckedKeystore) -> bool:
     """Return whether an enclave has a link to the identity CA, as in the original keystore.
 
     The enclaves of an export have copies, even if somebody adds files to make it look original.
@@ -342,7 +342,9 @@ def _folder_findings(
                     with suppress(OSError):  # `check_enclave` reports an unreadable one
                         if _holds_key(keystore, path, info):
                             yield from _stray_file_findings(keystore, path, info, original)
-            elif keystore.looks_like_original and _is_kept(keystore, path, info):
+            elif keystore.looks_like_original and _is_key_of_ca_or_revoked_enclave(
+                keystore, path, info
+            ):
                 kept_names.append(os.path.relpath(path, root))
                 yield from key_mode_findings(path, info.st_mode)
             else:
@@ -475,7 +477,9 @@ def _content(keystore: CheckedKeystore, path: str) -> bytes:
         return b""  # no longer a regular file
 
 
-def _is_kept(keystore: CheckedKeystore, path: str, info: os.stat_result) -> bool:
+def _is_key_of_ca_or_revoked_enclave(
+    keystore: CheckedKeystore, path: str, info: os.stat_result
+) -> bool:
     """Return whether a file is a private key in a folder for keys of CAs or revoked enclaves."""
     if os.path.relpath(path, keystore.root).partition(os.sep)[0] not in (PRIVATE, REVOKED, RETIRED):
         return False

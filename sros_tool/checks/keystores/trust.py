@@ -154,7 +154,7 @@ def findings_between(
     if not on_zenoh:
         yield from _revoked_findings(targets)
         yield from _earlier_list_findings(targets, now)
-        governed = {shown: _Governed(*target, now) for shown, target in targets.items()}
+        governed = {shown: _TargetGovernance(*target, now) for shown, target in targets.items()}
         yield from _incompatible_governance_findings(governed, refused)
 
 
@@ -353,7 +353,7 @@ def _unexpired_serials(
 # ── governance and domains ─────────────────────────────────────────────────────────────────
 
 
-class _Governed:
+class _TargetGovernance:
     """The governance documents of a target, and the domains that its enclaves may join."""
 
     def __init__(self, keystore: OpenedKeystore, enclaves: Sequence[str], now: datetime) -> None:
@@ -400,7 +400,7 @@ class _Governed:
         """Yield the domains that an enclave may join."""
         return chain.from_iterable(self.domains)
 
-    def overlaps(self, other: _Governed) -> bool:
+    def overlaps(self, other: _TargetGovernance) -> bool:
         """Return whether enclaves of both targets may join a common domain; True if not known."""
         return _domains_meet(self.first, other.first) or _domains_meet(self.domains, other.domains)
 
@@ -422,7 +422,7 @@ class _Incompatibility(NamedTuple):
 
 
 def _incompatible_governance_findings(
-    governed: Mapping[str, _Governed], refused_pairs: set[frozenset[str]]
+    governed: Mapping[str, _TargetGovernance], refused_pairs: set[frozenset[str]]
 ) -> Iterator[Finding]:
     """Yield findings about targets that trust each other, and differ in governance or domains."""
     groups: dict[tuple[_Incompatibility, tuple[str, ...]], list[str]] = defaultdict(list)
@@ -459,7 +459,9 @@ def _incompatible_governance_findings(
         yield incompatibility.kind.found(alike_names[0], text, alike_names[0])
 
 
-def _incompatibility_of(own_side: _Governed, other_side: _Governed) -> _Incompatibility | None:
+def _incompatibility_of(
+    own_side: _TargetGovernance, other_side: _TargetGovernance
+) -> _Incompatibility | None:
     if not own_side.overlaps(other_side):
         return _Incompatibility(PEERS_DOMAINS)
     different = [

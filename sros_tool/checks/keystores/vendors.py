@@ -254,7 +254,7 @@ def _refusal_findings(
             finding for finding in known_findings if finding.kind.severity is ERROR
         ]  # errors by kind, also those that the keystore's template accepts
         if all(
-            any(_is_named(refusal_cause, errors) for refusal_cause in cause)
+            any(_is_cause_named(refusal_cause, errors) for refusal_cause in cause)
             for cause in causes.values()
         ):
             return
@@ -262,7 +262,7 @@ def _refusal_findings(
         by_cause = {
             cause: vendors
             for cause, vendors in by_cause.items()
-            if not _is_named(cause, known_findings)
+            if not _is_cause_named(cause, known_findings)
         }
         if not by_cause:
             return
@@ -284,7 +284,7 @@ def _refusal_findings(
     )
 
 
-def _is_named(cause: RefusalCause, known_findings: Iterable[Finding]) -> bool:
+def _is_cause_named(cause: RefusalCause, known_findings: Iterable[Finding]) -> bool:
     """Return whether a known finding already names the cause of a refusal."""
     wanted = _IDS_BY_REASON.get(cause.reason, frozenset())
     fault_id = f"enclave.{cause.reason}"
@@ -461,7 +461,7 @@ def with_start_finding(
     if grant is None or not is_for_ros(grant):
         return [*known_findings]
     described = has_type_descriptions(enclave.keystore.at.distribution)
-    if evaluation.portable and _states_all(grant):
+    if evaluation.portable and _names_all_node_topics(grant):
         return [*known_findings]
     has_denials = any(not rule.allow for rule in grant.rules)
     for domain, participants in evaluation.by_domain.items():
@@ -485,7 +485,7 @@ def with_start_finding(
     return [*known_findings]
 
 
-def _states_all(grant: Grant) -> bool:
+def _names_all_node_topics(grant: Grant) -> bool:
     """Return whether the only rule of a grant names every topic that a node needs."""
     if len(grant.rules) != 1 or not grant.rules[0].allow:
         return False
@@ -526,7 +526,7 @@ def _ordinary_node_denial(
         for verb, topic in denied
         if topic != ROS_DISCOVERY_TOPIC
     ]
-    if described and not _offers_types(access, grant):
+    if described and not _may_offer_type_description(access, grant):
         wanted.append(f"offer ~/{_TYPES_SERVICE}")
     is_tool = not set(denied).intersection(_ENDPOINTS_OF_TOOLS)
     if not wanted or (is_tool and not any(map(_is_topic_of_robot, _allowed_to_publish(grant)))):
@@ -557,7 +557,7 @@ def _partitions(grant: Grant) -> tuple[str, ...]:
     )
 
 
-def _offers_types(access: Access, grant: Grant) -> bool:
+def _may_offer_type_description(access: Access, grant: Grant) -> bool:
     """Return whether a node of any name may offer ~/get_type_description.
 
     Tries a node name that no rule names, and an example name for each matching expression.

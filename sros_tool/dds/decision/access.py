@@ -865,7 +865,7 @@ class Access:
         allowed = self._granted.topics(verb)
         # If the rules deny nothing, the rule that allows an endpoint also allows creating its
         # topic.
-        if basis is not _DecisionBasis.BOTH_WAYS or self._either.only_allows():
+        if basis is not _DecisionBasis.BOTH_WAYS or self._rules_for_both_directions.only_allows():
             return allowed
         return allowed & self._creatable_names()
 
@@ -889,14 +889,14 @@ class Access:
         return self._granted.peers
 
     @cached_property
-    def _either(self) -> _GrantRules:
+    def _rules_for_both_directions(self) -> _GrantRules:
         """The grant's rules for both directions in one list, to decide on creating topics."""
         return self._granted.deciding_rules(self._granted.rules, *_ENDPOINTS)
 
     def _creation(self, verb: AccessVerb, topic: str) -> RuleVerdict:
         """Return the verdict on creating a topic, the step before an endpoint for ``verb``."""
         if not self._traits.asks_both_directions:
-            return self._either.ask_topic(topic)
+            return self._rules_for_both_directions.ask_topic(topic)
         directions = sorted(_ENDPOINTS, key=lambda endpoint: endpoint is not verb)
         crashes = (self._own[direction].crash_verdict(topic) for direction in directions)
         verdicts = [self._own[direction].ask_topic(topic) for direction in directions]
@@ -906,7 +906,7 @@ class Access:
     def _creatable_names(self) -> NameSet:
         """Return the topics that may be created."""
         if not self._traits.asks_both_directions:
-            return self._either.topic_names()
+            return self._rules_for_both_directions.topic_names()
         publish, subscribe = (self._own[direction] for direction in _ENDPOINTS)
         either = publish.topic_names() | subscribe.topic_names()
         return either & publish.safe_names() & subscribe.safe_names()

@@ -368,7 +368,7 @@ def _check_controls(
         talker = parties[claim.talker or claim.subject]
         if claim.talker and not talker.identity.enclave:
             remedy = remedy.replace("a permitted", "an unsecured")
-        elif claim.talker and not _may_speak(talker, rules):
+        elif claim.talker and not _may_send(talker, rules):
             who = f"{who}, and nobody can: {talker.identity.enclave} lacks the right to speak there"
             remedy = (
                 f"A process of this enclave is refused. Claim that: {{ party = "
@@ -381,7 +381,7 @@ def _check_controls(
         )
 
 
-def _may_speak(party: Party, rules: Rules) -> bool:
+def _may_send(party: Party, rules: Rules) -> bool:
     """Return whether a party's enclave may publish, serve or execute the party's name.
 
     True for a party without a topic, which cannot be checked.

@@ -44,7 +44,7 @@ from sros_tool.keystore.confirmation import (
     store_refusals,
 )
 from sros_tool.keystore.delivery.published import read_published
-from sros_tool.keystore.delivery.restored import LaterSeals, is_waiting
+from sros_tool.keystore.delivery.restored import LaterSeals, has_unpublished_restore
 from sros_tool.keystore.delivery.signing import certify_requests
 from sros_tool.keystore.expiry import read_credentials
 from sros_tool.keystore.fleet import checked_fleet, enclaves_of_robot, recorded_fleet
@@ -399,11 +399,11 @@ def _read_inbox(inbox: Path, fleet: Fleet, verifier: _Verifier) -> Iterator[_Rec
             if is_revoked and (file or taken.why):
                 taken.why = "all its enclaves were revoked; its message does not count"
             if file:
-                _add_signed_by_others(taken, file.data)
+                _keep_parts_signed_by_cas(taken, file.data)
             yield taken
 
 
-def _add_signed_by_others(received: _ReceivedMessage, message: bytes) -> None:
+def _keep_parts_signed_by_cas(received: _ReceivedMessage, message: bytes) -> None:
     """Keep the parts of a refused message that CAs signed: revocation list and seal."""
     with suppress(SrosError):
         signed = smime.parse_new(message)
@@ -942,7 +942,7 @@ def _defer_requests(
         return
     from sros_tool.keystore.delivery.publish import age_clause
 
-    if is_older := is_older or is_waiting(keystore):
+    if is_older := is_older or has_unpublished_restore(keystore):
         reason = "rights that were taken away since would come back"
     elif is_restored or age_clause(keystore):
         reason = "the key that vouches for the new key may be revoked"

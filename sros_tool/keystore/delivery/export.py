@@ -108,7 +108,7 @@ class ExportSelection:
     left_out: tuple[str, ...]
 
 
-def with_keys_here(
+def select_enclaves_to_export(
     keystore: OpenedKeystore, names: Iterable[str], given: Collection[str], *, keyless: bool
 ) -> ExportSelection:
     """Return the enclaves to export, and those left out because a robot has the key.

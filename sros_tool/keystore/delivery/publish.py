@@ -55,13 +55,13 @@ from sros_tool.keystore.delivery.release import (
 from sros_tool.keystore.delivery.restored import (
     LaterChange,
     check_authorities,
-    is_waiting,
+    has_unpublished_restore,
     later_changes,
-    marks_after_last_release,
     older_than_robots_error,
     other_changes_notes,
     refuse_lost_changes,
-    without_agreed,
+    restores_after_last_release,
+    without_agreed_changes,
 )
 from sros_tool.keystore.fleet import checked_fleet, enclaves_of_robot, recorded_fleet
 from sros_tool.keystore.issuing.keyring import IN_KEYSTORE, Keyring
@@ -342,14 +342,14 @@ def age_clause(keystore: OpenedKeystore) -> str:
     Such a keystore was restored from a backup, or is a copy, and has not published with
     ``--restored`` since.
     """
-    if marks_after_last_release(keystore):
+    if restores_after_last_release(keystore):
         return "robots have files that it signed but does not know"
     return _later_in_folder(keystore)
 
 
 def is_all_published(root: Path, published: PublishedRobot, enclaves: Sequence[str]) -> bool:
     """Return whether the files of a robot are unchanged since they were last published."""
-    return published.files == _state(root, enclaves)
+    return published.files == _files_digest(root, enclaves)
 
 
 def _check_apart(root: Path, folder: Path) -> None:
@@ -522,7 +522,7 @@ class _RoleKeys:
         return path.with_name(f"{path.name}.new")
 
 
-class _Changed(NamedTuple):
+class _ChangedRobot(NamedTuple):
     """A robot with possibly changed files: its enclaves, and a digest of the state of its files."""
 
     robot: str
@@ -721,7 +721,9 @@ class _Publication:
             self._check_earlier_folder()
         if not restored:
             is_new_place = is_lost or self._is_other_folder
-            if is_waiting(self.keystore) or (is_new_place and self._robots_show_restore()):
+            if has_unpublished_restore(self.keystore) or (
+                is_new_place and self._robots_show_restore()
+            ):
                 doing = f"Publishing to '{self._folder}'"
                 raise older_than_robots_error(self.keystore, doing, str(self._folder))
         is_later = self._has_later_releases(restored)
@@ -732,13 +734,13 @@ class _Publication:
         if restored:
             forgotten = LostRecords(self.keystore, self._now)
             if is_later or unknown:
-                unknown = [self._last_read()] if is_later else unknown
+                unknown = [self._latest_release()] if is_later else unknown
                 check_authorities(self.keystore, self._folder, unknown[-1])
                 for path, content in chain.from_iterable(of.files.items() for of in unknown):
                     if path.endswith(_ENDS_OF_LIST_PATHS):
                         forgotten.add(content)
             else:
-                self._notes.append(self._not_shown_note())
+                self._notes.append(self._hidden_revocations_note())
             self._restore(forgotten, keyring)
             self._is_restored = True
         self._check_removed()
@@ -757,7 +759,7 @@ class _Publication:
         """Return whether the ledger or a robot shows that the keystore was restored."""
         entries = self.keystore.ledger_with("what", "release").entries
         last = max((entry.number for entry in entries if entry.what == "release"), default=0)
-        if marks_after_last_release(self.keystore):
+        if restores_after_last_release(self.keystore):
             return True
         for robot in recorded_fleet(self.keystore).robots:
             with suppress(SrosError):
@@ -794,11 +796,11 @@ class _Publication:
                 " which says what to do.",
             )
 
-    def _not_shown_note(self) -> Note:
+    def _hidden_revocations_note(self) -> Note:
         """Return a note on revocations that neither keystore nor publishing folder shows."""
         where, since = quote(str(self.keystore.root)), "the backup"
         last = self.keystore.ledger_file.last_time()
-        if last and not marks_after_last_release(self.keystore):
+        if last and not restores_after_last_release(self.keystore):
             since = f"{iso(last)}, the last entry of the ledger"
         return Note(
             "fleet.revocations-not-shown",
@@ -835,7 +837,7 @@ class _Publication:
         if self.list.number >= (unused := self.keystore.ledger_file.next_number()):
             why = f"It has release {self.list.number}, but the ledger has none after {unused - 1}."
             raise damaged_list_error(self.keystore, why)
-        latest = self._latest
+        latest = self._highest_number
         if latest <= self.list.number:
             return False
         # The next number of the ledger does not tell: a restored keystore may have issued files
@@ -886,11 +888,11 @@ class _Publication:
         )
 
     @property
-    def _latest(self) -> int:
+    def _highest_number(self) -> int:
         """The highest number of a release in the folder; 0 without a release."""
         return max((release.number for release in self._there.values()), default=0)
 
-    def _last_read(self) -> Release:
+    def _latest_release(self) -> Release:
         """Return a release with the highest number, which has the last CAs and revocation list.
 
         Robots without such a release may have been refused since, and still have earlier files.
@@ -924,7 +926,7 @@ class _Publication:
         """
         for certificate in self._sealed_certificates():
             forgotten_lists.add_certificate(certificate)
-        changes = without_agreed(
+        changes = without_agreed_changes(
             self.keystore, later_changes(self.keystore, self._last_releases(), self._now)
         )
         lost = [change for change in changes if change.change in ("key", "governance")]
@@ -1077,7 +1079,7 @@ class _Publication:
 
     # ── which robots ───────────────────────────────────────────────────────────────────────
 
-    def changed_robots(self, among: Sequence[_Changed] | None = None) -> list[_Changed]:
+    def changed_robots(self, among: Sequence[_ChangedRobot] | None = None) -> list[_ChangedRobot]:
         """Return the robots that may need a new release, and forget robots without enclaves.
 
         If ``among`` is given, only these robots are examined.
@@ -1090,12 +1092,12 @@ class _Publication:
             if not names:
                 continue
             wanted.add(robot)
-            state = _state(root, names)
+            state = _files_digest(root, names)
             before = self.list.robots.get(robot)
             if not before or before.files != state:
-                changed_robots.append(_Changed(robot, names, state))
+                changed_robots.append(_ChangedRobot(robot, names, state))
             elif not self._has_files_of(robot, before.release):
-                changed_robots.append(_Changed(robot, names, state))
+                changed_robots.append(_ChangedRobot(robot, names, state))
                 self._damaged |= {robot} if self._there.get(robot) == before.release else set()
         known = self.list.robots.keys() | self._there.keys()
         gone = (known if among is None else looked_at) - wanted
@@ -1143,7 +1145,7 @@ class _Publication:
 
     # ── their releases ─────────────────────────────────────────────────────────────────────
 
-    def release(self, changed_robots: Sequence[_Changed], change: KeystoreChange) -> None:
+    def release(self, changed_robots: Sequence[_ChangedRobot], change: KeystoreChange) -> None:
         """Write the archives of new releases, which no metadata names yet.
 
         ``changed_robots`` are those that seemed changed before the keystore was locked.
@@ -1159,7 +1161,7 @@ class _Publication:
             )
         authority = None if self._dry_run or not changed else change.permissions
 
-        def work(part: Sequence[_Changed]) -> list[_ReleaseOutcome]:
+        def work(part: Sequence[_ChangedRobot]) -> list[_ReleaseOutcome]:
             return list(self._release_all(part, number, authority))
 
         on_token = authority is not None and authority.on_token
@@ -1184,11 +1186,11 @@ class _Publication:
             change.entries.append(Entry(iso(self._now), "release", sha256=digest, number=number))
 
     def _release_all(
-        self, robots: Sequence[_Changed], number: int, authority: Authority | None
+        self, robots: Sequence[_ChangedRobot], number: int, authority: Authority | None
     ) -> Iterator[_ReleaseOutcome]:
         """Yield the outcome for each robot; if ``authority`` is None, nothing is written."""
         evaluator = _Evaluator(self.keystore, self._now)
-        new: list[tuple[_Changed, _RobotFiles, str]] = []
+        new: list[tuple[_ChangedRobot, _RobotFiles, str]] = []
         for robot in robots:
             before = self.list.robots.get(robot.robot)
             try:
@@ -1356,7 +1358,7 @@ class _Publication:
         )
 
 
-def _state(root: Path, names: Sequence[str]) -> str:
+def _files_digest(root: Path, names: Sequence[str]) -> str:
     """Return a digest of the inodes, sizes and times of all files in the releases of enclaves."""
     digest = hashlib.sha256()
     for name in names:

@@ -84,7 +84,7 @@ class LaterChange(NamedTuple):
 # ── whether the keystore is older than its robots ──────────────────────────────────────────
 
 
-def marks_after_last_release(keystore: OpenedKeystore) -> list[str]:
+def restores_after_last_release(keystore: OpenedKeystore) -> list[str]:
     """Return the reasons of the restores that the ledger recorded after its last release."""
     entries = keystore.ledger_file.with_values("what", (RESTORED, "release")).entries
     reasons: list[str] = []
@@ -96,17 +96,17 @@ def marks_after_last_release(keystore: OpenedKeystore) -> list[str]:
     return reasons
 
 
-def is_waiting(keystore: OpenedKeystore) -> bool:
+def has_unpublished_restore(keystore: OpenedKeystore) -> bool:
     """Return whether a restore is known that was not published with ``--restored`` yet."""
-    return not _WAITING.isdisjoint(marks_after_last_release(keystore))
+    return not _WAITING.isdisjoint(restores_after_last_release(keystore))
 
 
-def refuse_while_waiting(keystore: OpenedKeystore, doing: str) -> None:
+def refuse_unpublished_restore(keystore: OpenedKeystore, doing: str) -> None:
     """Raise `KeystoreError` if the keystore is known to be older than its robots.
 
     ``doing`` is a verb form, such as "Publishing".
     """
-    if is_waiting(keystore):
+    if has_unpublished_restore(keystore):
         raise older_than_robots_error(keystore, doing)
 
 
@@ -315,7 +315,9 @@ _ELEMENT = re.compile(r"<(\w+)>(.*)</\w+>")
 # ── what keeps `--restored` from publishing ────────────────────────────────────────────────
 
 
-def without_agreed(keystore: OpenedKeystore, changes: Sequence[LaterChange]) -> list[LaterChange]:
+def without_agreed_changes(
+    keystore: OpenedKeystore, changes: Sequence[LaterChange]
+) -> list[LaterChange]:
     """Return ``changes`` without rights and governance that were signed again on purpose.
 
     Rights count as agreed to if publishing was refused because of rights alone, and their enclave
