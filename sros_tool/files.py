@@ -206,7 +206,7 @@ def replace_file(path: Path, data: bytes) -> None:
 
 
 def _write_to(path: Path, state: os.stat_result, data: bytes) -> None:
-    """Write to a device or pipe, unless ``path`` no longer is the file that ``state`` describes."""
+    """Write to a device or pipe, if ``path`` is still the file that ``state`` describes."""
     handle = os.open(path, os.O_WRONLY | os.O_NOCTTY | os.O_CLOEXEC)
     try:
         if not os.path.samestat(os.fstat(handle), state):

@@ -453,7 +453,7 @@ class _Round:
                 )
 
     def _note_repaired(self, release: int, paths: Sequence[str]) -> None:
-        """Keep a report that files were repaired, which every message of the next day contains."""
+        """Report for a day that the files ``paths`` were repaired."""
         if paths:
             now = self._machine.now
             text = (

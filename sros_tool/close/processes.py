@@ -125,9 +125,9 @@ class ClosedProcess(NamedTuple):
     ) -> ClosedProcess:
         """Return a copy with the id that the process has now, in its ROS domain and network.
 
-        A process that runs in its enclave of the ``export`` is preferred to open ones.  A process
-        that may run, but could not be examined, keeps its id, and so does a process that its unit
-        restarts; a process that ended while sros watched has none.
+        A process that runs in its enclave of the ``export`` is preferred to open ones.  The id
+        stays if the process may run but could not be examined, or if its unit restarts the process.
+        A process that ended while sros watched has no id.
         """
         in_domain = [other for other in running.processes if is_in_domain(other, domain)]
         in_enclave = [
@@ -216,7 +216,7 @@ def command_without_enclave(command: Sequence[str], enclave: str) -> Sequence[st
 
 
 def _sros_word() -> str:
-    """Return the word that starts the running sros in a shell: its path if `sros` does not."""
+    """Return ``sros``, or the path of the running sros if ``sros`` does not start it in a shell."""
     running, found = shutil.which(sys.argv[0]), shutil.which("sros")
     if not running or Path(running).name != "sros" or (found and Path(found).samefile(running)):
         return "sros"

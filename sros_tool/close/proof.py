@@ -298,7 +298,7 @@ def _unexpected_processes(running: RunningRobot) -> Iterator[str]:
 
 
 def _why_missing(running: RunningRobot, missing: Sequence[str], observed: ObservedProcesses) -> str:
-    """Return which enclaves have no process or an open one, and why other ones do not count."""
+    """Return the enclaves without a secured process, and why their other processes do not count."""
     robot = running.robot
     outdated = {name: found for name, found in running.not_current.items() if name in missing}
     causes = {

@@ -80,7 +80,7 @@ class _Users(NamedTuple):
 def _users_by_name(
     policy: Policy, folder: Path, others: frozenset[Right]
 ) -> Mapping[tuple[str, str], Sequence[_Users]]:
-    """Map kinds and names to the enclaves that may use them, by the rights of the kind."""
+    """Map each kind and name to its users: one `_Users` for each right of the kind."""
     rights, of_nodes = policy_rights(policy) | others, NodeRights(others)
     rules, enclaves = Rules(rights), sorted({right.enclave for right in rights})
     allowed = {right for right in rights if right.qualifier is ALLOW}

@@ -480,10 +480,10 @@ def grouped_by_robot(
 ) -> dict[tuple[_Kind, bool], dict[str, list[_Item]]]:
     """Group items that differ only in one robot: kind -> robot -> items.
 
-    An item has pairs of a possible kind and the robot in which the item differs from others of that
-    kind; the item is put into the kind with the most robots.  The second pairs of an item are for
-    items that differ in other robots as well: such a kind, marked by True in the result, is used if
-    it joins more than ``most`` groups.
+    The first list of an item has pairs of a kind and a robot: the item differs from other items of
+    the kind only in this robot.  The item is put into the kind with the most robots.  The second
+    list has pairs with wider kinds, whose items also differ in other robots.  A wider kind is used,
+    and marked by True in the result, if it joins more than ``most`` groups.
     """
     robots: dict[_Kind, set[str]] = defaultdict(set)
     read = list(items)

@@ -450,8 +450,8 @@ def with_start_finding(
 ) -> list[Finding]:
     """Return the findings, plus an error if no vendor lets an ordinary node start in the enclave.
 
-    Vendors that refuse the enclave do not count.  Leaves out findings whose cause a known finding
-    names.
+    Vendors that refuse the enclave do not count.  If the error is added, known findings with the
+    same cause are left out.
 
     An enclave with only a part of the rights that every node needs is for a tool such as the
     observer of `sros generate_policy`, which has no log and no services; it gets no error.

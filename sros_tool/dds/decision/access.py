@@ -350,9 +350,9 @@ class _GrantRules:
         return self._entries[position].verdict(fits=True)
 
     def crash_verdict(self, topic: str) -> RuleVerdict | None:
-        """Return the crash of a process that reads all criteria of the rules for a topic.
+        """Return the verdict that a process crashes when it reads all criteria for a topic.
 
-        Returns None if no process crashes.
+        Returns None if the process does not crash.
         """
         passed = 0
         for position in self._index.matching(topic):

@@ -502,7 +502,7 @@ def _shipped_policy(file: str) -> Policy:
 
 
 def talking_policy(topic: str) -> Policy:
-    """Return the shipped policy of talker and listener on ``topic``, and both without access."""
+    """Return the shipped policy on ``topic``, plus a talker and a listener without access to it."""
     shipped = _shipped_policy(_POLICY_FILE)
     by_path = {enclave.path: enclave for enclave in shipped.enclaves}
     talker, listener = by_path[_TALKER], by_path[_LISTENER]

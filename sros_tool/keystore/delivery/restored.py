@@ -290,7 +290,7 @@ def _has_earlier_key(
 def _governance_change(
     keystore: OpenedKeystore, release: Release, known: Collection[str]
 ) -> Iterator[LaterChange]:
-    """Yield the change if a release has another governance, unless it was signed again since."""
+    """Yield the change if a release has another governance, which the keystore did not issue."""
     paths = (path for path in release.files if path.endswith(f"/{GOVERNANCE_FILE}"))
     sent = release.files[next(paths)]
     if hashlib.sha256(sent).hexdigest() in known:

@@ -646,7 +646,8 @@ def _lost_rights_notes(
 def _default_rights_notes(change: KeystoreChange, name: str) -> Iterator[Note]:
     """Yield a note if a created enclave would need other rights than the default of the template.
 
-    It had others before it was revoked or removed, or it belongs to a robot of the fleet.
+    Such an enclave had other rights before it was revoked or removed, or belongs to a robot of the
+    fleet.
     """
     root, fleet, last = quote(str(change.root)), change.fleet, change.recorded.last(name)
     had_others = last and last.policy != default_rights(change.template, name).digest
