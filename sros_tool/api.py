@@ -155,8 +155,8 @@ class AccessAnswer:
     """The decision of one DDS vendor, or of Zenoh, on an access, and the reason.
 
     ``outcome`` is "allowed", "denied" (the endpoint is not created), "peer denies" (the endpoint is
-    created, and no peer matches it), "refused" (no node of the enclave starts) or "crashes"; of
-    Zenoh, "allowed", "dropped" (messages vanish) or "refused" (the process opens no session).
+    created, and no peer matches it), "refused" (no node of the enclave starts) or "crashes". For
+    Zenoh, it is "allowed", "dropped" (messages vanish) or "refused" (the process opens no session).
     ``reason`` is a clause for people.  ``expression`` is the DDS topic expression of the deciding
     rule, or for Zenoh the key expression with a wildcard that allows it, or "".  ``policy_lines``
     are the places ``FILE:LINE`` in the given policy that the rule comes from.  ``until`` is the
@@ -333,7 +333,7 @@ def merge_policies(
             names that do not begin with "/".
         remaps: Remappings of names in the others, as their nodes are started with, such as
             "image:=/front/image" or "__node:=front"; they apply after ``namespace``.
-        enclave: The enclave for all nodes of the others: one process composes them.
+        enclave: The enclave for all nodes of the others, if one process composes these nodes.
         nodes: The only nodes that are taken from the others, by name; all by default.
 
     Returns:
@@ -344,7 +344,8 @@ def merge_policies(
         PolicyError: (or another `DocumentError`) A policy cannot be read, or rights cannot be added
             to it.
         InvalidNameError: A namespace or an enclave is not valid.
-        UsageError: A remapping is not valid, or no policy has its name; or no policy has a node.
+        UsageError: A remapping is not valid, or no policy has the name that it remaps; or no policy
+            has one of ``nodes``.
 
     Example:
         >>> merged = sros_tool.merge_policies("own.xml", "gripper.xml", namespace="/left")

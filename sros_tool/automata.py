@@ -146,7 +146,7 @@ class Automaton:
         return Automaton((*dict.fromkeys(first), *edges), frozenset(ends))
 
     def surrounded(self, begin: str, end: str) -> Automaton:
-        """Return an automaton for ``begin`` + name + ``end``, for each name this one accepts."""
+        """Return an automaton that accepts ``begin`` + name + ``end`` for each accepted name."""
         size, more = self.size, len(begin)
         edges = [(i, Letters.of(letter), i + 1) for i, letter in enumerate(begin)]
         edges += [(at + more, letters, to + more) for at, letters, to in self.edges]

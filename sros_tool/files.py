@@ -176,8 +176,9 @@ def replace_file(path: Path, data: bytes) -> None:
     Other processes read either the old content or the new one.  An existing file of this user keeps
     its mode and its owner; a file of another user keeps them only if nobody else can write to the
     folder.  A symbolic link is followed if it belongs to this user or to root, as ``/dev/stdout``
-    does, and replaced otherwise: in a folder such as ``/tmp`` others could lead the output to any
-    file.  A device or a pipe of this user or of root is written to, not replaced.
+    does.  Any other link is replaced, because in a folder such as ``/tmp``, another user's link
+    could lead the output to any file.  A device or a pipe of this user or of root is written to,
+    not replaced.
 
     Raises:
         OSError: the file cannot be written; the old content stays.

@@ -1,7 +1,8 @@
 """A round of a robot's agent: fetch, install, restart, examine processes, and report.
 
-A part that fails is reported as a problem of the round, and the other parts still run: a robot that
-cannot reach its source still confirms, and a robot that cannot reach its inbox still installs.
+A part that fails is reported as a problem of the round, and the other parts still run.  So a robot
+that cannot reach its source still sends its report, and a robot that cannot reach its inbox still
+installs releases.
 """
 
 from __future__ import annotations
@@ -555,8 +556,8 @@ class _Round:
     def _time_to_be_valid_at(self, release: Release, certain_time: datetime) -> datetime:
         """Return the time at which a release has to be valid.
 
-        This is the time of the clock, unless documents prove that the clock is behind: then it is
-        the time at which the keystore made the release.
+        This is the time of the clock. If documents prove that the clock is behind, it is the time
+        at which the keystore made the release.
         """
         made = (
             release_time(release) if self._machine.now < certain_time - _CLOCK_TOLERANCE else None
@@ -564,7 +565,7 @@ class _Round:
         return max(certain_time, made) if made else certain_time
 
     def _differs_from_accepted_release(self, release: Release) -> bool:
-        """Return whether the accepted release with the same number has other files.
+        """Return whether a release has other files than the accepted release with the same number.
 
         The result is also False if the stored seal is of an earlier release, because the disk had
         no room for the seal of the accepted release.
@@ -600,8 +601,8 @@ class _Round:
     def _note_due_restarts(self, changed: Iterable[str], names: Iterable[str]) -> None:
         """Note that processes have to be restarted because files of their enclaves changed.
 
-        ``changed`` are the enclaves whose files the agent changed.  Changes by others are found by
-        the digests of the files.
+        ``changed`` are the enclaves whose files the agent changed.  Changes that other programs
+        made are found by the digests of the files.
         """
         before, files = self._state.files, self._digests(names)
         changed = {*changed}
@@ -668,8 +669,8 @@ class _Round:
     ) -> Sequence[str]:
         """Restart the units of enclaves whose restart is due, once after each change of files.
 
-        Return the enclaves whose units restarted and whose processes can be seen: other units run
-        no nodes, or run as users whose processes this user cannot look at.
+        Return the enclaves whose units restarted and whose processes can be seen. A unit without
+        visible processes runs no nodes, or runs as a user whose processes this user cannot look at.
         """
         settings, machine = self._settings, self._machine
         if not settings.restart or not self._state.due:

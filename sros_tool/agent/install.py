@@ -1,9 +1,9 @@
 """Installing a release in the security folder of a robot, verified first, and whole or not at all.
 
-Two things are verified that the publishing folder cannot fake: that a permissions CA which the
-robot already trusts sealed the release, and that nothing in it is older than the robot's files.
-Then each enclave is tried as DDS would load it, with the robot's key.  An enclave that cannot be
-used keeps its files, and no other enclave waits for it.
+Two things are verified, which the publishing folder cannot fake: a permissions CA that the robot
+already trusts sealed the release, and no file in the release is older than the robot's own. Then
+each enclave is tried as DDS would load it, with the robot's key.  An enclave that cannot be used
+keeps its files, and no other enclave waits for it.
 
 Units and containers mount the folders of enclaves, so no folder is replaced, and a file that does
 not change is not touched.

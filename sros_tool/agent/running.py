@@ -100,8 +100,9 @@ def look_at_processes(
 
     ``look`` reads the processes of the machine. ``replaced`` maps enclaves to the time when their
     files were replaced, and ``list_replaced`` to the time when their trust files (CAs and
-    revocation list) were replaced. Both times are by the clock of ``now``: the times of the files
-    may be by a clock that was set since.
+    revocation list) were replaced. Both times are by the clock of ``now``. They are used in
+    addition to the modification times of the files, because the clock may have been set since the
+    files were written.
     """
     running = (look or ProcessTable().look)(now)
     own_processes = [process for process in running.processes if _runs_in_folder(process, folder)]
@@ -366,7 +367,7 @@ def _due_units(
 
 
 class Restarts(NamedTuple):
-    """The enclaves whose units were restarted, and sentences on units that were not."""
+    """The enclaves whose units were restarted, and sentences on units that did not restart."""
 
     enclaves: Sequence[str] = ()
     problems: Sequence[str] = ()

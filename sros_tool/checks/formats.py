@@ -55,8 +55,8 @@ def folded_findings(
     """Merge single findings that differ only in one robot or one enclave.
 
     Yields the first finding of each group, with a text that names the robots or enclaves of the
-    other findings ("" without others).  Findings that share a cause, or that have a line or related
-    places, stay as they are.
+    other findings ("" if there are none).  Findings that share a cause, or that have a line or
+    related places, stay as they are.
     """
     similar_groups: dict[Hashable, list[tuple[tuple[Finding, ...], str]]] = {}
     for group, other_robots in _merge_robots(groups, fleet):
@@ -88,10 +88,10 @@ def _merge_robots(
     """Merge single findings that differ only in one robot.
 
     Yields the first finding of each group, with a text that names the robots of the other findings
-    ("" without others).  A finding that names several robots is merged by the robot that gives the
-    largest group. If more than `_MOST_SIMILAR` merged findings differ only in the other robots that
-    they name, they are merged again. Findings that share a cause are not merged. Without ``fleet``,
-    nothing is merged.
+    ("" if there are none).  A finding that names several robots is merged by the robot that gives
+    the largest group. If more than `_MOST_SIMILAR` merged findings differ only in the other robots
+    that they name, they are merged again. Findings that share a cause are not merged. Without
+    ``fleet``, nothing is merged.
     """
     read = []
     for group in groups:
@@ -118,7 +118,7 @@ def _merge_keys(group: tuple[Finding, ...], fleet: Fleet) -> _MergeKeys:
     """Map each robot that a finding names to two keys by which findings are merged.
 
     The first key is equal for findings that differ only in this robot; the second key is also equal
-    for findings that differ in other robots.
+    for findings that differ in further robots.
     """
     first, *more = group
     named = () if more else named_robots(fleet, first.subject, first.text)

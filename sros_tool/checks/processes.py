@@ -256,7 +256,7 @@ def may_lack_list(process: Process, enclave: ProcessEnclave, *, has_list: bool =
 
     The process has loaded the present list and CAs if, since its start, no file of the enclave
     changed but its certificate, permissions and governance. ``has_list`` says that all lists since
-    the start of the process revoke the same certificates: then the list may have changed, too.
+    the start of the process revoke the same certificates, so that a changed list does not matter.
     """
     moved = any(moment > process.started for moment in enclave.moved.values())
     same_files = _OWN_FILES | ({CRL_FILE} if has_list else set())

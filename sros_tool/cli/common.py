@@ -260,7 +260,8 @@ def fleet_policies(
 ) -> list[FleetPolicy]:
     """Return the policies in files, expanded for the fleet in the --fleet file.
 
-    With ``robots``, only the enclaves of these robots count, and each has to have one.
+    With ``robots``, only the enclaves of these robots are kept; each of these robots has to have
+    one.
     """
     from sros_tool.fleet.expansion import FleetPolicy, check_choice
     from sros_tool.fleet.fleet_file import read_fleet

@@ -1246,7 +1246,7 @@ def _kind_in_plural(number: int, kind: str) -> str:
 
 
 def _file_details(robot: RobotStatus) -> Iterator[str]:
-    """Yield the files of a robot: their number by kind and state, and those that differ."""
+    """Yield the files of a robot: their number by kind and state, and the files that differ."""
     yield f"{robot.robot}:"
     where = ("in its folder", "elsewhere, with its name in the path")
     for names, place in zip(robot.others, where, strict=True):

@@ -236,7 +236,7 @@ class ObservedNodes:
 def _possible_endpoints(
     endpoint: Endpoint, node: ObservedNode, ns: str, name: str
 ) -> Sequence[Endpoint]:
-    """Return the possible endpoints of a renamed node for an old one, the likeliest first.
+    """Return the possible new forms of an endpoint of a renamed node, the likeliest first.
 
     Private names of the node change with the node.  Another name in the node's namespace changes
     only if the program wrote it as a relative name, which the graph does not show.

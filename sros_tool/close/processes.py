@@ -319,7 +319,7 @@ class ObservedProcesses(NamedTuple):
         """Return the enclave in which the command of a process is started.
 
         This enclave differs from the enclave of the process if the program itself chooses the
-        latter.
+        enclave in which its process runs.
         """
         enclaves = {process.enclave, *process.shares}
         return min(

@@ -114,8 +114,8 @@ class DomainSet:
     ) -> tuple[int, ...]:
         """Return an example domain for each group of domains that are in the same sets, sorted.
 
-        Only groups within the ``listed`` sets count.  But if a range lacks an end, all groups
-        count, because vendors read such a range differently.
+        Only groups within the ``listed`` sets are included.  But if a range lacks an end, all
+        groups are included, because vendors read such a range differently.
         """
         sets = dict.fromkeys((*listed, *other_sets))
         borders = {0}

@@ -82,7 +82,7 @@ class Diagnosis(NamedTuple):
 
     @property
     def conclusion(self) -> str:
-        """Sentences on the DDS and RMWs here that enforce security, and on the others."""
+        """Sentences that say which DDS and RMWs here enforce security, and which do not."""
         if not self.enforces:
             return f"Nothing here enforces DDS Security. {self.advice}"
         named = " and ".join(stack.name for stack in self.stacks if stack.enforces)

@@ -244,8 +244,8 @@ class NodeRole:
 class OtherTypes:
     """The types of other endpoints on the topic of a talker or listener started by hand.
 
-    ``types`` returns the ROS type of each publisher, or for a talker of each subscription; a
-    listener gets ``count``, as `Node.count` with a topic.
+    ``types`` returns the ROS types of the publishers for a listener, and of the subscriptions for a
+    talker. Only a listener has ``count``, which is `Node.count` for its topic.
     """
 
     def __init__(

@@ -45,8 +45,9 @@ class _CapturedPacket(NamedTuple):
 class PacketCounter:
     """A counter of protected packets, and of packets that contain one of ``marks``.
 
-    ``plain`` counts by mark, ``protected`` by port, for both ports of a packet.  With ``keep``,
-    ``kept`` has the RTPS packets in order.
+    ``plain`` has the number of packets by mark.  ``protected`` has the number of packets by port; a
+    packet counts for its source port and for its target port.  With ``keep``, ``kept`` has the RTPS
+    packets in order.
     """
 
     def __init__(self, marks: Sequence[str], *, keep: bool = False) -> None:

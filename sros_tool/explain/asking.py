@@ -138,7 +138,7 @@ def _may_contain_topic(document: bytes, name: str) -> bool:
 
 
 def _rights_in(enclave: str, data: bytes) -> Iterator[Right]:
-    """Yield the rights in a permissions document, by the first grant for each subject."""
+    """Yield the rights in a permissions document; only the first grant of each subject is read."""
     from sros_tool.pki import smime
     from sros_tool.translate import grant_rights
 
@@ -302,8 +302,8 @@ def _action_meant(
 ) -> Question | None:
     """Return the question about an action, if rights show an action of this name; else None.
 
-    The rights of the enclave are read first.  If they deny the service, ``read_other_rights``
-    returns more rights, such as those in its policy and keystore.
+    The rights of the enclave are read first.  If these deny the service, ``read_other_rights`` is
+    called for more rights, such as the rights in the policy and in the keystore.
     """
     if question.word not in ("call", "serve"):
         return None

@@ -5,9 +5,9 @@ security. So an audit enforces nothing: the decision engine decides on each endp
 graph, in the enclave in which its process would run, and the audit reports the denials that a
 secured robot would log.
 
-On a robot without security, the graph shows the enclave / for most processes.  Then the enclave
-follows from the name of the node: by the profiles of the policy, or by the services of nodes that
-permissions of a keystore name.
+On a robot without security, the graph shows the enclave / for most processes.  In this case, the
+enclave follows from the name of the node: by the profiles of the policy, or by the services of
+nodes that permissions of a keystore name.
 
 Nodes that were not observed are not judged: the result names the nodes of the policy or keystore
 that did not appear, and everything in the graph that belongs to no enclave.
@@ -517,7 +517,7 @@ _OF_EVERY_NODE = ("/rosout", "/parameter_events")
 
 
 def _only_observes(node: ObservedNode) -> bool:
-    """Return whether a node has only its own services and its log, as every node has."""
+    """Return whether a node has only the services and the log that every node has."""
     own_prefix = expand("~/", node.ns, node.name)
     folded = rights_of_endpoints(node.endpoints)
     return not (folded.halves or folded.foreign) and all(

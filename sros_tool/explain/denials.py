@@ -63,11 +63,11 @@ class Denial:
     """A denied DDS topic, and ``direction``: "publish", "subscribe", or "" if unknown.
 
     ``by_rule`` says whether a deny rule denies the topic, so that an allow rule would not help
-    (None: unknown), ``remote`` whether the permissions of a peer deny it.  ``enclave`` is "" if the
-    log does not name the enclave.  ``process`` is the label of the process that printed the denial,
-    or "", and ``lines`` the numbers of its lines, from 1.  ``folder`` is the folder from which the
-    process loaded its enclave, or "".  ``neither`` says that the process may use the topic in
-    neither direction.
+    (None: unknown).  ``remote`` says whether the permissions of a peer deny the topic.  ``enclave``
+    is "" if the log does not name the enclave.  ``process`` is the label of the process that
+    printed the denial, or "", and ``lines`` the numbers of its lines, from 1.  ``folder`` is the
+    folder from which the process loaded its enclave, or "".  ``neither`` says that the process may
+    use the topic in neither direction.
     """
 
     topic: str

@@ -500,7 +500,8 @@ def _log_hits(lines: Iterable[tuple[int, str]]) -> Iterator[_Hit]:
 def _rejoined_message(process: str, line: str, rest: str, following: str) -> str:
     """Return a message that was broken into two lines, for instance by a terminal; else "".
 
-    ``line`` counts as broken if it and ``following`` have no known meaning, but both together do.
+    ``line`` counts as broken if neither ``line`` nor ``following`` has a known meaning, but the
+    joined lines have one.
     """
     if not UNKNOWN.pattern.search(rest):  # checked first, because this check is fast
         return ""
@@ -839,8 +840,8 @@ class _Examiner:
     def missing_namespaces(self, denials: Iterable[Denial]) -> dict[tuple[str, str], str]:
         """Map pairs of process and enclave to the namespace that is missing in all denied names.
 
-        Empty unless a service that every node offers is among the names: otherwise a remapping may
-        be missing, not the namespace of the process.
+        Empty if no service that every node offers is among the names, because in that case a
+        remapping may be missing, not the namespace of the process.
         """
         by_process = defaultdict[tuple[str, str], list[Denial]](list)
         for denial in denials:

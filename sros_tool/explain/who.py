@@ -285,8 +285,8 @@ def follow_reach(
 ) -> FollowedReach:
     """Return the enclaves that an enclave can influence and learn from, by the rights of a source.
 
-    ``infrastructure`` says whether topics of all nodes, and requests that only read, count too.
-    Information goes from enclave to enclave in any common ROS domain, or only in ``domain``.
+    ``infrastructure`` says whether to include topics that every node has, and requests that only
+    read. Information goes from enclave to enclave in any common ROS domain, or only in ``domain``.
 
     Raises:
         KeystoreError: the keystore does not have the enclave, or the enclave has no rights.

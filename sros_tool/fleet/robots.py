@@ -1,10 +1,10 @@
-"""A fleet: the settings of its robots, with a check of each, and which enclaves they have.
+"""A fleet: the checked settings of its robots, and the enclaves that the robots have.
 
 The grammar of every value allows it to be one name in a policy, a command or a path: no markup, no
 wildcard, no white space, and "/" only in a namespace.
 
-A fleet has paths of enclaves with placeholders, so that neither the enclaves of a robot nor the
-robot of an enclave needs a list of all enclaves.
+A fleet has paths of enclaves with placeholders.  So the enclaves of a robot, and the robot of an
+enclave, are found without a list of all enclaves.
 """
 
 from __future__ import annotations

@@ -303,10 +303,10 @@ def watch(
 ) -> Snapshot:
     """Return the union of all graphs in ``seconds`` (None: no limit), or until ``stop()`` is true.
 
-    When the union has grown, ``report`` is called with it once it has not changed for ``still``
-    seconds, so that no node is reported before it is discovered completely, and at the latest after
-    ``patience`` seconds.  If a node that has just started is not announced yet, the watch ends up
-    to ``patience`` seconds later.
+    When the union has grown, ``report`` is called with it after ``still`` seconds without a change,
+    so that no node is reported before it is discovered completely.  At the latest, it is called
+    after ``patience`` seconds.  If a node that has just started is not announced yet, the watch
+    ends up to ``patience`` seconds later.
     """
     begin = clock()
     seen = union = reported = Observation()

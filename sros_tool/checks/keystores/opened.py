@@ -182,7 +182,7 @@ class CheckedKeystore:
 
     @property
     def is_original(self) -> bool:
-        """Whether this is the original keystore with its CAs, and not on a robot."""
+        """Whether this is the original keystore, with its CAs, and does not lie on a robot."""
         return self.looks_like_original and not self.at.on_robot
 
     @property
@@ -208,8 +208,9 @@ class CheckedKeystore:
         template as sros ships it, so a changed setting of this keystore accepts nothing.  Without
         settings (keystores of ros2/sros2) no weakness is accepted.
 
-        An export has no settings, so it is compared with all templates.  A weakness that no
-        template chooses counts as accepted by the original keystore, but an error never does.
+        An export has no settings, so it is compared with all templates.  If no template chooses the
+        weakness, the original keystore must have chosen it, and counts as accepting it, unless the
+        finding is an error.
         """
         if self.settings:
             name = self.settings.name

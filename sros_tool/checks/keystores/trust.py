@@ -140,8 +140,9 @@ def findings_between(
 ) -> Iterator[Finding]:
     """Yield findings about keystores and exports whose nodes do not communicate with each other.
 
-    Other checks report unreadable files, and files that are not valid ``now``: of two enclaves
-    whose files are never valid at the same time, one always has such a file.
+    Other checks report unreadable files, and files that are not valid ``now``. So they also report
+    two enclaves whose files are never valid at the same time: at any moment, the files of one of
+    them are not valid.
 
     Args:
         targets: the keystores and exports, as the user named them.
@@ -203,8 +204,8 @@ def _refused_roles(
 ) -> tuple[int, ...]:
     """Return the roles of the CAs for which the enclaves of two groups refuse each other.
 
-    These are the roles of the pair of enclaves, one of each group, with the fewest such roles; ()
-    if a pair accepts each other, or if no enclave can be read.
+    Of all pairs with one enclave of each group, the pair with the fewest refused roles decides. The
+    result is () if the enclaves of a pair accept each other, or if no enclave can be read.
     """
     pairs = (
         tuple(

@@ -453,8 +453,8 @@ def with_start_finding(
     Vendors that refuse the enclave do not count.  If the error is added, known findings with the
     same cause are left out.
 
-    An enclave with only a part of the rights that every node needs is for a tool such as the
-    observer of `sros generate_policy`, which has no log and no services; it gets no error.
+    An enclave that has only some of the rights that every node needs gets no error: it is for a
+    tool such as the observer of `sros generate_policy`, which has no log and no services.
     """
     enclave = evaluation.enclave
     grant = grant_of(enclave)

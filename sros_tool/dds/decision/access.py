@@ -279,7 +279,7 @@ def _rules_for(
 
 
 def _default_verdict(traits: VendorTraits, grant: Grant) -> RuleVerdict:
-    """Return the verdict by the grant's ``<default>``, which counts if no rule matches."""
+    """Return the verdict by the grant's ``<default>``, which decides if no rule matches."""
     if not traits.honors_default:
         return RuleVerdict(Outcome.DENIED, "no-rule")
     if traits.crashes_on_empty_texts and grant.default_empty:

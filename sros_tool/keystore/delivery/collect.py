@@ -359,7 +359,7 @@ class _RefusedError(SrosError):
 
 
 class _ReplacedCaError(_RefusedError):
-    """The robot itself sent the message, but its certificate is by a replaced identity CA."""
+    """The robot itself sent the message, but a replaced identity CA issued its certificate."""
 
 
 def _shortened(reason: str) -> str:
@@ -720,7 +720,7 @@ class _DecidedRequest:
 
 
 class _Renewals:
-    """Decides which requests of robots may be signed: only those that change nobody's rights."""
+    """Decides which requests of robots may be signed: only requests that change nobody's rights."""
 
     def __init__(self, keystore: OpenedKeystore, fleet: Fleet, now: datetime) -> None:
         self._keystore = keystore

@@ -111,7 +111,7 @@ class ExportSelection:
 def select_enclaves_to_export(
     keystore: OpenedKeystore, names: Iterable[str], given: Collection[str], *, keyless: bool
 ) -> ExportSelection:
-    """Return the enclaves to export, and those left out because a robot has the key.
+    """Return the enclaves to export, and the enclaves left out because their keys are on robots.
 
     With ``keyless``, no enclave is left out. Enclaves that are ``given`` by name are never left
     out, so that `distribute` refuses them.

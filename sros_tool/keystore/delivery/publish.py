@@ -353,7 +353,7 @@ def is_all_published(root: Path, published: PublishedRobot, enclaves: Sequence[s
 
 
 def _check_apart(root: Path, folder: Path) -> None:
-    """Raise `KeystoreError` if the keystore or the publishing folder contains the other."""
+    """Raise `KeystoreError` if the keystore is in the publishing folder, or the reverse."""
     inner, outer = (Path(os.path.realpath(path)) for path in (folder, root))
     if inner.is_relative_to(outer) or outer.is_relative_to(inner):
         raise KeystoreError(
@@ -1074,7 +1074,7 @@ class _Publication:
         yield from (each for each in self._releases() if not seal_problem(each, authorities))
 
     def _releases(self) -> Iterator[Release]:
-        """Yield the releases in all archives, by any CA."""
+        """Yield the releases in all archives, whichever CA sealed them."""
         return releases_in(self._folder, len(recorded_fleet(self.keystore).robots))
 
     # ── which robots ───────────────────────────────────────────────────────────────────────

@@ -112,8 +112,8 @@ class Published:
     sros first noticed this.  ``folder`` is the absolute path of the publishing folder, "" if
     unknown. ``metadata`` has the paths there of the metadata to which the timestamp leads.
     ``until`` is the first expiry of the metadata: from then on, robots refuse it; ``root_until`` is
-    the expiry of the root metadata.  These three are empty or None if nothing was published, or by
-    a release of sros that did not record them.
+    the expiry of the root metadata.  These three fields are empty or None if nothing was published,
+    or if an earlier release of sros, which did not record them, published last.
     """
 
     robots: dict[str, PublishedRobot] = field(default_factory=dict)
@@ -226,7 +226,7 @@ def later_revoked_serials(keystore: OpenedKeystore) -> frozenset[int]:
 
 
 def releases_in(folder: Path, robots: int) -> Iterator[Release]:
-    """Yield the releases in all archives of a publishing folder, by any CA.
+    """Yield the releases in all archives of a publishing folder, whichever CA sealed them.
 
     Archives that cannot be read are left out.  ``robots`` is the number of robots of the fleet.
 

@@ -432,7 +432,7 @@ class MetadataComposer:
         return lasts and signed.version == self.versions[name]
 
     def _can_be_kept(self, metadata: Metadata[_Content]) -> bool:
-        """Return whether top-level metadata can stay: current, and signed by each signer."""
+        """Return whether top-level metadata can stay: it is current, and each signer signed it."""
         signers = self._signers[metadata.signed.type]
         signed = all(signer.public_key.keyid in metadata.signatures for signer in signers)
         return signed and self._is_current(metadata.signed.type, metadata)

@@ -2,8 +2,8 @@
 
 A robot's release counts wherever it comes from, because the permissions CA sealed it.  So a number
 that a robot invents shows nothing, but the seal of a later release shows that the keystore is older
-than its robots.  Until the releases are published with ``--restored``, the keystore then neither
-publishes nor renews by itself: this would bring back rights that were taken away.
+than its robots.  Until its releases are published with ``--restored``, such a keystore neither
+publishes nor renews by itself, because this would bring back rights that were taken away.
 """
 
 from __future__ import annotations
@@ -113,7 +113,7 @@ def refuse_unpublished_restore(keystore: OpenedKeystore, doing: str) -> None:
 def older_than_robots_error(
     keystore: OpenedKeystore, doing: str, folder: str = ""
 ) -> KeystoreError:
-    """Return the error for a keystore that messages of robots show to be older than they are."""
+    """Return the error for a keystore that is older than its robots, as their messages show."""
     where = quote(str(keystore.root))
     place = quote(folder or read_published(keystore).folder or "PUB")
     return KeystoreError(

@@ -270,11 +270,11 @@ def _lost_revocations(
 ) -> Mapping[str, tuple[str, str]]:
     """Map paths of lists in ``present`` to evidence that the keystore's list is older.
 
-    All lists in the folder count, because a new enclave does not have one yet, but only if a CA in
-    ``files`` signed them.  The list of the same CA in ``files`` must have at least the same number.
-    That list must also have every certificate of the list here, with two exceptions: certificates
-    that have expired by the ledger, and certificates of a CA service, which knows more certificates
-    than the ledger.
+    The lists of all enclaves in the folder are compared, because a new enclave does not have a list
+    yet.  A list counts only if a CA in ``files`` signed it.  The list of the same CA in ``files``
+    must have at least the same number. That list must also have every certificate of the list here,
+    with two exceptions: certificates that have expired by the ledger, and certificates of a CA
+    service, which knows more certificates than the ledger.
     """
     places: dict[bytes, list[str]] = defaultdict(list)
     for path, data in present.items():
