@@ -31,7 +31,7 @@ def other_writers(state: os.stat_result, trusted_users: frozenset[int]) -> str:
     mode = f"its mode is {stat.S_IMODE(state.st_mode):04o}"
     if state.st_mode & stat.S_IWOTH:
         return f"{mode}, so everybody can write"
-    if state.st_mode & stat.S_IWGRP and not _is_private(state.st_gid, trusted_users):
+    if state.st_mode & stat.S_IWGRP and not _is_private_group(state.st_gid, trusted_users):
         return f"{mode}, so the group {_group_name(state.st_gid)} can write"
     return ""
 
@@ -96,7 +96,7 @@ def _path_states(path: Path) -> Iterator[tuple[Path, os.stat_result]]:
 
 
 @lru_cache
-def _is_private(group: int, trusted_users: frozenset[int]) -> bool:
+def _is_private_group(group: int, trusted_users: frozenset[int]) -> bool:
     """Return whether a group is the private group of a trusted user, without other members."""
     users = []
     for user in trusted_users:

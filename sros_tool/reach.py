@@ -184,15 +184,15 @@ class _Direction:
         if prefix == topic:
             yield from self._exact.get(topic, ())
         else:
-            for name in _starting(self._topics, prefix):
+            for name in _texts_starting_with(self._topics, prefix):
                 yield from self._exact[name]
-        for longer in _starting(self._prefixes, prefix):
+        for longer in _texts_starting_with(self._prefixes, prefix):
             yield from self._wild[longer]
         for length in range(len(prefix)):
             yield from self._wild.get(prefix[:length], ())
 
 
-def _starting(ordered: list[str], prefix: str) -> Iterator[str]:
+def _texts_starting_with(ordered: list[str], prefix: str) -> Iterator[str]:
     """Yield the texts of a sorted list that start with ``prefix``."""
     for index in range(bisect_left(ordered, prefix), len(ordered)):
         if not ordered[index].startswith(prefix):

@@ -315,7 +315,7 @@ def write_fleet(
             f"{problem} The paths of earlier policies count, too.",
             "Divide the fleet between keystores.",
         )
-    _refuse_shared(fleet)
+    _refuse_shared_enclaves(fleet)
     document = (_FLEET_COMMENT + render_fleet(fleet)).encode()
     if not _edit_text(ledger, document) and _read_fleet_file(keystore):
         return fleet, ()
@@ -324,7 +324,7 @@ def write_fleet(
     return fleet, (Entry(iso(now), "fleet", sha256=digest),)
 
 
-def _refuse_shared(fleet: Fleet) -> None:
+def _refuse_shared_enclaves(fleet: Fleet) -> None:
     """Raise `KeystoreError` if two robots have an enclave in common."""
     owners: dict[str, str] = {}
     for robot in fleet.robots.values():

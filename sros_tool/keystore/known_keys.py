@@ -107,7 +107,7 @@ def certificates_of_revoked(
 
 def restored_at(keystore: OpenedKeystore) -> str:
     """Return when a keystore was restored with an identity CA that it trusts; "" if never."""
-    entries = _since_trusted(keystore, keystore.ledger_with("what", RESTORED).entries)
+    entries = _entries_since_trusted_ca(keystore, keystore.ledger_with("what", RESTORED).entries)
     return next((entry.time for entry in reversed(entries) if entry.what == RESTORED), "")
 
 
@@ -120,7 +120,9 @@ def subjects_since_restore(keystore: OpenedKeystore, ledger: Ledger) -> frozense
     left out.
     """
     entries = ledger.entries
-    trusted = max((_since_trusted(keystore, entries, r) for r in (IDENTITY, PERMISSIONS)), key=len)
+    trusted = max(
+        (_entries_since_trusted_ca(keystore, entries, r) for r in (IDENTITY, PERMISSIONS)), key=len
+    )
     times = {entry.time for entry in trusted if entry.what == RESTORED}
     if not times:
         return None
@@ -131,7 +133,7 @@ def subjects_since_restore(keystore: OpenedKeystore, ledger: Ledger) -> frozense
     )
 
 
-def _since_trusted(
+def _entries_since_trusted_ca(
     keystore: OpenedKeystore, entries: Sequence[Entry], role: str = IDENTITY
 ) -> Sequence[Entry]:
     """Return the entries since the ledger first recorded a key of a trusted ``role`` CA.
@@ -168,14 +170,14 @@ def revoked_issues(keystore: OpenedKeystore, listed: Collection[str] = ()) -> It
     recorded = keystore.ledger_file.with_values("serial", serials).entries if serials else ()
     names = {entry.enclave for entry in recorded if entry.serial in serials} - {""}
     entries = keystore.ledger_file.with_values("enclave", names).entries if names else ()
-    earlier = len(entries) - len(_since_trusted(keystore, entries))
+    earlier = len(entries) - len(_entries_since_trusted_ca(keystore, entries))
     serials -= {entry.serial for entry in entries[:earlier]}
     for entry in entries:
         if entry.enclave in names and entry.what == "permissions":
             yield entry
         elif entry.enclave in names and entry.serial in serials:
             serials.remove(entry.serial)
-            if _may_be_of_trusted(keystore, entry):
+            if _may_be_issued_by_trusted_ca(keystore, entry):
                 yield entry
 
 
@@ -191,7 +193,7 @@ def removed_enclaves(keystore: OpenedKeystore, now: datetime) -> Mapping[str, st
     revoked = {f"{serial:x}" for serial in revoked_serials(keystore)} if gone else set()
     entries = keystore.ledger_file.with_values("enclave", gone).entries if gone else ()
     expiry: dict[str, str] = {}
-    for entry in _since_trusted(keystore, entries):
+    for entry in _entries_since_trusted_ca(keystore, entries):
         if (
             entry.what == "certificate"
             and entry.enclave in gone
@@ -251,7 +253,7 @@ def _known_authorities(keystore: OpenedKeystore, role: str) -> frozenset[str] | 
     return frozenset(known)
 
 
-def _may_be_of_trusted(keystore: OpenedKeystore, entry: Entry) -> bool:
+def _may_be_issued_by_trusted_ca(keystore: OpenedKeystore, entry: Entry) -> bool:
     """Return whether a trusted CA may have issued the certificate of a ledger entry.
 
     An entry after the entry of a trusted CA does not prove it: until the stage reissue of a
@@ -278,10 +280,10 @@ class IssuedEarlier:
         self._permissions: defaultdict[str, list[Entry]] = defaultdict(list)
         self._certificates: defaultdict[str, dict[str, str]] = defaultdict(dict)
         revoked = revoked_serials(keystore)
-        for entry in _since_trusted(keystore, self.ledger.entries, PERMISSIONS):
+        for entry in _entries_since_trusted_ca(keystore, self.ledger.entries, PERMISSIONS):
             if entry.what == "permissions":
                 self._permissions[entry.enclave].append(entry)
-        for entry in _since_trusted(keystore, self.ledger.entries, IDENTITY):
+        for entry in _entries_since_trusted_ca(keystore, self.ledger.entries, IDENTITY):
             if entry.what == "certificate" and not (
                 entry.serial and int(entry.serial, 16) in revoked
             ):
@@ -535,7 +537,7 @@ class KnownKeys:
                 name: others
                 for name in names
                 for key in _key_digests(self._keystore, name)
-                if (others := [holder for holder in self._holders(key) if holder != name])
+                if (others := [holder for holder in self._enclaves_with_key(key) if holder != name])
             }
         else:
             shared = {
@@ -554,9 +556,9 @@ class KnownKeys:
                 )
 
     def _other_enclaves(self, key: PublicKey, name: str) -> list[str]:
-        return [enclave for enclave in self._holders(key_digest(key)) if enclave != name]
+        return [enclave for enclave in self._enclaves_with_key(key_digest(key)) if enclave != name]
 
-    def _holders(self, key: str) -> Sequence[str]:
+    def _enclaves_with_key(self, key: str) -> Sequence[str]:
         """Return the enclaves that have the key with the digest ``key``.
 
         If the ledger has an index, these are the enclaves that the ledger records for the key and

@@ -555,7 +555,7 @@ class LedgerFile:
         self._read_first = read_bytes
         file = self._open()
         if file is None:
-            return _OpenedFiles(head, None, b"", later=self._later_than(0))
+            return _OpenedFiles(head, None, b"", later=self._file_with_later_lines(0))
         with file:
             state = os.fstat(file.fileno())
             before = _sealed_before(file)
@@ -564,7 +564,7 @@ class LedgerFile:
             last = tuple(os.pread(file.fileno(), _LAST_LINES_BYTES, start).split(b"\n"))[
                 bool(start) :
             ]
-            later = self._later_than(part, state)
+            later = self._file_with_later_lines(part, state)
             if head and (index := self._index(file, head)):
                 return _OpenedFiles(head, state, None, index, part, later, last)
             kept = state.st_size <= _MOST_CACHED_BYTES and not before
@@ -792,7 +792,7 @@ class LedgerFile:
         missing = _Fault(0, f"{LEDGER} is empty" if file_exists else f"there is no {LEDGER}")
         return _Reading(Ledger(gaps=(missing.text,)), [missing])
 
-    def _later_than(self, part: int, last: os.stat_result | None = None) -> str:
+    def _file_with_later_lines(self, part: int, last: os.stat_result | None = None) -> str:
         """Return the name of a file that has lines after the last known part; "" if there is none.
 
         ``part`` is the number of the last known part.  ``last`` is its file, which can also have

@@ -258,7 +258,7 @@ _FAULTS_SEEN_BY_PEERS = {
 
 
 @lru_cache(maxsize=64)  # all enclaves of a keystore have the same governance
-def _governed_as(
+def _rules_for_domain(
     vendor: Vendor, document: Governance | bytes, domain: int
 ) -> GovernedDomain | Refusal:
     """Return the rules of a governance for a domain as ``vendor`` reads them, or its refusal."""
@@ -363,7 +363,7 @@ class VendorParticipant:
     def _decide_join(self, enclave: LoadedEnclave, context: JoinContext) -> Access | Decision:
         """Return the access control of the vendor's process, or the decision that stops it."""
         late: Decision | None = None
-        governed = _governed_as(
+        governed = _rules_for_domain(
             self.vendor, enclave.plain_governance or enclave.governance, context.domain
         )
         noticed = [

@@ -1038,7 +1038,7 @@ class KeystoreLock:
         """
         wait = _LOCK_SECONDS if wait is None else wait
         deadline = time.monotonic() + wait
-        while not self._try() and time.monotonic() < deadline:
+        while not self._try_to_lock() and time.monotonic() < deadline:
             time.sleep(_LOCK_RETRY_SECONDS)
         if not self.held:
             raise KeystoreError(
@@ -1048,7 +1048,7 @@ class KeystoreLock:
             )
         return self
 
-    def _try(self) -> bool:
+    def _try_to_lock(self) -> bool:
         """Take the lock if it is free; return whether this process now holds it."""
         try:
             with _signals_held_back():

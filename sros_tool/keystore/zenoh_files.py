@@ -1141,7 +1141,7 @@ def rights_in_domain(enclave: str, grant: Grant, domain: int) -> tuple[StatedRig
             _REMEDY_STATE_RIGHTS,
         )
     rules = [rule for rule in grant.rules if domain in rule.domains.closed()]
-    if not _is_plain(grant):
+    if not _has_denials_first(grant):
         rules = _joined_if_unordered(rules)
         _check_vendors(source, grant, domain, rules)
     rights = set(grant_rights(enclave, grant._replace(rules=_joined_rules(rules))))
@@ -1174,7 +1174,7 @@ def _overlaps_ros_names(topic: str) -> bool:
 # ── rules without an order ─────────────────────────────────────────────────────────────────
 
 
-def _is_plain(grant: Grant) -> bool:
+def _has_denials_first(grant: Grant) -> bool:
     """Return whether a grant has the form that sros writes, with denials first.
 
     All vendors decide alike on such a grant.

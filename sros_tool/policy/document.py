@@ -257,7 +257,7 @@ class Includer:
         try:
             target = self.load(file)
         except DocumentError as error:
-            remedy = error.remedy or ("" if _is_there(file) else _missing_remedy(file))
+            remedy = error.remedy or ("" if _file_exists(file) else _missing_remedy(file))
             raise PolicyError(f"{where}: {error.what}", error.why, remedy) from error
         parent = element.getparent()
         if not pointer and href and parent is not None and parent.tag == target.tag:
@@ -275,7 +275,7 @@ class Includer:
 
     def _exists(self, file: Path) -> bool:
         if self.read is None:
-            return _is_there(file)
+            return _file_exists(file)
         try:
             self.load(file)
         except MissingFileError:
@@ -314,7 +314,7 @@ COMMON = "common"
 """Name of the folder with the fragments that shipped policies include."""
 
 
-def _is_there(file: Path) -> bool:
+def _file_exists(file: Path) -> bool:
     """Return whether a file exists; False for a name that is too long for the file system."""
     return os.path.exists(file)  # noqa: PTH110 - Path.exists raises for such a name
 
@@ -418,7 +418,7 @@ def read_policy(
         PolicyError: (or another `DocumentError`, with file and line) the file violates the format,
             a name is not a valid ROS name, or an enclave is defined twice.
     """
-    if content is None and policy_files is None and os.path.isdir(path):  # noqa: PTH112 - as `_is_there`
+    if content is None and policy_files is None and os.path.isdir(path):  # noqa: PTH112 - as `_file_exists`
         files = list(files_of_policies(path))
         if not files:
             raise PolicyError(
@@ -599,9 +599,9 @@ class _Reader:
     def _read_profile(self, element: etree._Element, place: IncludedFile) -> Profile:
         self._check_attributes(element, place, required=("ns", "node"))
         node, ns = element.get("node", ""), element.get("ns", "")
-        sampled = self._sample(node, element, place, several=False)
+        sampled = self._example_name(node, element, place, several=False)
         try:
-            checked = check_namespace(self._sample(ns, element, place, several=False))
+            checked = check_namespace(self._example_name(ns, element, place, several=False))
             ns = ns.removesuffix("/") if has_placeholder(ns) else checked
         except InvalidNameError as error:
             raise self._invalid_name_error(error, ns, "namespace", element, place) from error
@@ -701,7 +701,7 @@ class _Reader:
 
     def _name(self, element: etree._Element, place: IncludedFile, node: str) -> str:
         name = self._written_name(element)
-        sampled = self._sample(name, element, place, several=True)
+        sampled = self._example_name(name, element, place, several=True)
         inner = next((child for child in element if isinstance(child.tag, str)), None)
         problem = (
             expression_problem(sampled)
@@ -729,7 +729,7 @@ class _Reader:
         """Return the text of a name's element, as written."""
         return element.text or ""
 
-    def _sample(
+    def _example_name(
         self, text: str, element: etree._Element, place: IncludedFile, *, several: bool
     ) -> str:
         """Return a name with example values for its placeholders, to check its grammar.

@@ -111,7 +111,7 @@ class Verdict:
     ``witness`` is None if the requirement holds.  ``empty`` are clauses on enclaves in the
     requirement that do not exist, and on names that no enclave may use.  ``always`` is a clause
     that says why the requirement cannot fail whatever rights enclaves get, or "".  ``assumed`` is a
-    name whose protection is assumed because the policy does not state it, or "".  ``kept`` is a
+    name whose protection is assumed because the policy does not state it, or "".  ``blocked`` is a
     demanded use whose messages do not pass between Zenoh routers, or None. ``unnamed`` are names in
     the requirement that no right states, and that only wildcards match.
     """
@@ -121,7 +121,7 @@ class Verdict:
     empty: tuple[str, ...] = ()
     always: str = ""
     assumed: str = ""
-    kept: BlockedUse | None = None
+    blocked: BlockedUse | None = None
     unnamed: tuple[str, ...] = ()
 
 
@@ -195,10 +195,10 @@ def decide(requirement: Requirement, world: World, limit: SearchLimit | None = N
     empty = (*_missing_enclaves_clauses(requirement, world), *unused)
     always = "" if witness or empty else _why_never_fails(requirement, world)
     assumed = "" if witness else _assumed_protection(requirement, world, limit)
-    kept = None
+    blocked = None
     if isinstance(requirement, Must) and not witness and world.crossing:
-        kept = _use_blocked_by_routers(requirement, world, limit)
-    return Verdict(requirement, witness, empty, always, assumed, kept, tuple(unnamed))
+        blocked = _use_blocked_by_routers(requirement, world, limit)
+    return Verdict(requirement, witness, empty, always, assumed, blocked, tuple(unnamed))
 
 
 def _confirm(requirement: Requirement, witness: Witness, world: World) -> None:
@@ -308,7 +308,7 @@ def _witness_against_only(
     requirement: Only | Nobody, world: World, limit: SearchLimit
 ) -> Witness | None:
     allowed = requirement.enclaves if isinstance(requirement, Only) else ()
-    return _first_of(_uses_of_rights(requirement.rights, world, limit, allowed))
+    return _shortest_use_as_witness(_uses_of_rights(requirement.rights, world, limit, allowed))
 
 
 def _uses_of_rights(
@@ -326,7 +326,7 @@ def _uses_of_rights(
     return uses
 
 
-def _first_of(uses: Mapping[str, Sequence[Use]]) -> Witness | None:
+def _shortest_use_as_witness(uses: Mapping[str, Sequence[Use]]) -> Witness | None:
     """Return the shortest use as a witness, with a use of every other enclave."""
     if not uses:
         return None
@@ -516,7 +516,7 @@ def _witness_against_widest(
                 exact = access.writes if part.writes else access.reads
                 if topic := world.example(own_topics - exact - within, all_topics, limit):
                     uses[enclave].append(_use(enclave, right, part, all_topics, topic))
-    return _first_of(uses)
+    return _shortest_use_as_witness(uses)
 
 
 _WRITTEN_BY_EVERY_NODE = NameSet((ROS_DISCOVERY_TOPIC, "rt/rosout", "rt/parameter_events"))
@@ -542,7 +542,7 @@ def _witness_against_nothing_but(
             if topic := world.any_example(unexpected, limit):
                 right, name = right_to_use(topic, writes=writes)
                 uses[enclave].append(Use(enclave, right, name, topic, writes))
-    return _first_of(uses)
+    return _shortest_use_as_witness(uses)
 
 
 def _witness_against_not_both(
@@ -627,10 +627,10 @@ def _witness_against_apart(requirement: Apart, world: World, limit: SearchLimit)
     chain = _shortest_chain(world, sources, targets, through, limit)
     if not chain:
         return None
-    return Witness(tuple(use for hop in chain for use in _uses(hop)))
+    return Witness(tuple(use for hop in chain for use in _uses_of_hop(hop)))
 
 
-def _uses(hop: TopicHop) -> Iterator[Use]:
+def _uses_of_hop(hop: TopicHop) -> Iterator[Use]:
     """Yield the two uses of a hop: its source writes the topic, its target reads the topic."""
     for enclave, writes in ((hop.source, True), (hop.target, False)):
         right, name = right_to_use(hop.topic, writes=writes)

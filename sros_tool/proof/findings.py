@@ -139,7 +139,7 @@ class Decided:
     """The decisions on all requirements: broken requirements, and reasons why others cannot fail.
 
     ``assumed`` are requirements that hold only with the assumed protection of the default template,
-    with a name whose protection the policy does not state.  ``kept`` are requirements that hold,
+    with a name whose protection the policy does not state.  ``blocked`` are requirements that hold,
     with a use that does not pass between Zenoh routers. ``unnamed`` are requirements that hold,
     with their names that no right states.  ``unjudged`` are enclaves that have to have rights, but
     that an export lacks.
@@ -148,7 +148,7 @@ class Decided:
     violations: tuple[Violation, ...]
     vacuous: tuple[tuple[Requirement, tuple[str, ...]], ...]
     assumed: tuple[tuple[Requirement, str], ...] = ()
-    kept: tuple[tuple[Requirement, BlockedUse], ...] = ()
+    blocked: tuple[tuple[Requirement, BlockedUse], ...] = ()
     unnamed: tuple[tuple[Requirement, tuple[str, ...]], ...] = ()
     unjudged: tuple[str, ...] = ()
 
@@ -159,7 +159,7 @@ def decide_all(requirements: Sequence[Requirement], system: System) -> Decided:
     Raises:
         DocumentError: there are too many wildcards to decide a requirement.
     """
-    violations, vacuous, assumed, kept, unnamed = [], [], [], [], []
+    violations, vacuous, assumed, blocked, unnamed = [], [], [], [], []
     limit = SearchLimit(MOST_STEPS)
     worlds = Worlds(system.worlds)
     known = {enclave for world in system.worlds for enclave in world.enclaves}
@@ -196,9 +196,11 @@ def decide_all(requirements: Sequence[Requirement], system: System) -> Decided:
             assumed_names := [verdict.assumed for _, verdict in verdicts if verdict.assumed]
         ):
             assumed.append((requirement, assumed_names[0]))
-        kept += [(requirement, verdict.kept) for _, verdict in verdicts if verdict.kept][:1]
+        blocked += [(requirement, verdict.blocked) for _, verdict in verdicts if verdict.blocked][
+            :1
+        ]
     return Decided(
-        tuple(violations), tuple(vacuous), tuple(assumed), tuple(kept), tuple(unnamed), unjudged
+        tuple(violations), tuple(vacuous), tuple(assumed), tuple(blocked), tuple(unnamed), unjudged
     )
 
 
@@ -303,7 +305,7 @@ def decided_findings(
         allowed = [right for right in before if right.qualifier is ALLOW]
         findings += [_unnamed_finding(*unnamed, allowed) for unnamed in decided.unnamed]
     findings += [_assumption_finding(*assumption) for assumption in decided.assumed]
-    findings += [_not_crossing_finding(*kept_use) for kept_use in decided.kept]
+    findings += [_not_crossing_finding(*blocked_use) for blocked_use in decided.blocked]
     if system.is_export:
         text = "only the enclaves in this export were judged: others of its keystore may be missing"
         if decided.unjudged:
@@ -320,7 +322,7 @@ def decided_findings(
 
 def _text(violation: Violation) -> str:
     requirement = violation.requirement
-    text = f"{_fact(violation)}, but {demand(requirement)}"
+    text = f"{_violation_clause(violation)}, but {demand(requirement)}"
     if violation.worlds:
         text += f"; with {', '.join(joined_titles(violation.worlds))} only"
     if requirement.why:
@@ -408,7 +410,7 @@ def short_text(violation: Violation) -> str:
     return f"{text}, and {more} more break it" if more else text
 
 
-def _fact(violation: Violation) -> str:
+def _violation_clause(violation: Violation) -> str:
     """Return a clause with the violation of a requirement, without the finding's subject."""
     match violation.requirement:
         case Apart():
@@ -513,8 +515,8 @@ def _assumption_finding(requirement: Requirement, name: str) -> Finding:
     return ASSUMED.found(place.file, text, place.file, place.line)
 
 
-def _not_crossing_finding(requirement: Requirement, kept_use: BlockedUse) -> Finding:
-    place, use, peers = requirement.source, kept_use.use, _listed_names(kept_use.others)
+def _not_crossing_finding(requirement: Requirement, blocked_use: BlockedUse) -> Finding:
+    place, use, peers = requirement.source, blocked_use.use, _listed_names(blocked_use.others)
     ends = f"from {use.enclave} to {peers}" if use.writes else f"from {peers} to {use.enclave}"
     text = f"{use.name} does not pass between routers {ends}: {demand(requirement)}"
     return NOT_CROSSING.found(place.file, text, place.file, place.line)

@@ -380,7 +380,10 @@ def compare_access(base: AccessSource, head: AccessSource) -> Growth:
         )
     sides: tuple[_Edges | None, ...] = ({}, {})
     if added and not partial:
-        sides = tuple(_edges(source, _fitting_pairs(source, worlds)) for source in (before, after))
+        sides = tuple(
+            _hops_between_enclaves(source, _fitting_pairs(source, worlds))
+            for source in (before, after)
+        )
     unknown = "only some enclaves are compared" if partial else ""
     if None in sides:
         unknown = f"there are more than {_MOST_HOPS:,} hops between enclaves"
@@ -1041,10 +1044,10 @@ def _new_reach(before: _Edges | None, after: _Edges | None) -> Iterator[NewReach
     for source, of in after.items():
         for target in of:
             backwards[target].append(source)
-    sources = changed.union(*(_reached(backwards, name) for name in sorted(changed)))
+    sources = changed.union(*(_predecessors(backwards, name) for name in sorted(changed)))
     for source in sorted(sources):
-        known = _reached(before, source).keys()
-        reached = _reached(after, source)
+        known = _predecessors(before, source).keys()
+        reached = _predecessors(after, source)
         for target in sorted(reached.keys() - known - {source}):
             path: list[Hop] = []
             at = target
@@ -1064,7 +1067,9 @@ def _fitting_pairs(side: AccessSource, worlds: Iterable[_World]) -> Iterator[tup
         yield from ((enclave, holder) for holder in dict.fromkeys(fitting_others))
 
 
-def _edges(side: AccessSource, fitting_pairs: Iterable[tuple[str, str]]) -> _Edges | None:
+def _hops_between_enclaves(
+    side: AccessSource, fitting_pairs: Iterable[tuple[str, str]]
+) -> _Edges | None:
     """Return all hops between enclaves, or None if there are too many to follow.
 
     An enclave with the permissions of another enclave counts as a further enclave, without the
@@ -1111,19 +1116,19 @@ def _edges(side: AccessSource, fitting_pairs: Iterable[tuple[str, str]]) -> _Edg
             known.add(reached)
             target = real.get(reached, reached)
             if target != source and target not in edges[source]:
-                edges[source][target] = partial(_hop_of, hop, source, target)
+                edges[source][target] = partial(_hop_between, hop, source, target)
                 left -= 1
         if left < 0:
             return None
     return edges
 
 
-def _hop_of(hop: Callable[[], Hop], source: str, target: str) -> Hop:
+def _hop_between(hop: Callable[[], Hop], source: str, target: str) -> Hop:
     """Return the result of ``hop``, with ``source`` and ``target`` as the enclaves of the hop."""
     return hop()._replace(source=source, target=target)
 
 
-def _reached(neighbors: Mapping[str, Iterable[str]], start: str) -> dict[str, str]:
+def _predecessors(neighbors: Mapping[str, Iterable[str]], start: str) -> dict[str, str]:
     """Map the enclaves that can be reached from ``start`` to their predecessors on the way."""
     reached: dict[str, str] = {}
     row = [start]

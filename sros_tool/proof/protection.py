@@ -138,8 +138,8 @@ def less_protection(
                 if role == "identity"
                 else "anyone who has its key can give any right",
             )
-    yield from _trusted_again(old, new)
-    yield from _certified_otherwise(old, new)
+    yield from _unrevoked_certificates(old, new)
+    yield from _changed_certificates(old, new)
     if old.kind == new.kind == "keystore" and old.zenoh is not None and new.zenoh is None:
         text = "nothing enforces any more what its Zenoh files enforced"
         yield _looser("Zenoh files", "present", "missing", text)
@@ -151,10 +151,10 @@ def less_protection(
         yield from looser_settings(old.zenoh_files, new.zenoh_files)
     if old.protections and new.protections is not None:
         yield from _dropped_statements(old.protections, new.protections, limit)
-    yield from _looser_later(old, new, limit)
+    yield from _weaker_for_later_enclaves(old, new, limit)
 
 
-def _looser_later(
+def _weaker_for_later_enclaves(
     old: AccessSource, new: AccessSource, limit: SearchLimit
 ) -> Iterator[SettingChange]:
     """Yield changes by which enclaves that are created later get less protection."""
@@ -184,7 +184,7 @@ def _looser_later(
                 )
 
 
-def _certified_otherwise(old: AccessSource, new: AccessSource) -> Iterator[SettingChange]:
+def _changed_certificates(old: AccessSource, new: AccessSource) -> Iterator[SettingChange]:
     """Yield a change for each enclave whose certificate has another enclave's name or key."""
     names = {enclave.key: enclave.name for enclave in old.certified.values()}
     for enclave, new_one in new.certified.items():
@@ -198,7 +198,7 @@ def _certified_otherwise(old: AccessSource, new: AccessSource) -> Iterator[Setti
             yield _looser(key, before, new_one.name, text)
 
 
-def _trusted_again(old: AccessSource, new: AccessSource) -> Iterator[SettingChange]:
+def _unrevoked_certificates(old: AccessSource, new: AccessSource) -> Iterator[SettingChange]:
     """Yield a change for each certificate that enclaves refuse in ``old`` but accept in ``new``."""
     if old.trusts is None or new.trusts is None:
         return

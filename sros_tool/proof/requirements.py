@@ -384,7 +384,7 @@ def parse_requirements(
                 "",
                 "Name a group of robots, as in {robot:carriers}, or divide the file.",
             )
-        pairs_left -= _pairs(requirement)
+        pairs_left -= _number_of_pairs(requirement)
         if pairs_left < 0:
             raise DocumentError(
                 f"{requirement.source}: the requirements up to this line compare more than "
@@ -399,7 +399,7 @@ def _stated_tables(data: bytes, file: str) -> list[_Table]:
     """Return the tables of a TOML document, in the order of their lines."""
     document = read_toml(data, f"the requirements file '{file}'")
     text = data.decode()
-    places = _places(text)
+    places = _lines_of_tables(text)
     tables: list[_Table] = []
     for kind, requirements in document.items():
         if kind not in _READERS:
@@ -433,7 +433,7 @@ def _stated_tables(data: bytes, file: str) -> list[_Table]:
     return sorted(tables, key=lambda table: table.source.line)
 
 
-def _pairs(requirement: Requirement) -> int:
+def _number_of_pairs(requirement: Requirement) -> int:
     """Return the number of pairs of names to compare for a requirement with two lists."""
     match requirement:
         case NotBoth(first=first, second=second):
@@ -458,7 +458,7 @@ def _headers(text: str) -> Iterator[tuple[int, str]]:
             yield number, header[1]
 
 
-def _places(text: str) -> dict[str, list[tuple[int, dict[str, int]]]]:
+def _lines_of_tables(text: str) -> dict[str, list[tuple[int, dict[str, int]]]]:
     """Map each kind of requirement to its tables: pairs of a table's line and its keys' lines."""
     places: dict[str, list[tuple[int, dict[str, int]]]] = {}
     keys: dict[str, int] = {}
@@ -961,7 +961,7 @@ def dropped_requirements(
         remaining = (
             new_requirement
             for new_part, new_requirement in new_parts
-            if any(_is_alike(new_part, part) for part in parts)
+            if any(_is_about_same(new_part, part) for part in parts)
         )
         dropped.append(DroppedRequirement(requirement, tuple(dict.fromkeys(remaining)), here))
     return tuple(dropped)
@@ -1143,7 +1143,7 @@ def _enclaves_within(narrow: Sequence[str], wide: Sequence[str]) -> bool:
     )
 
 
-def _is_alike(new: Requirement, old: Requirement) -> bool:
+def _is_about_same(new: Requirement, old: Requirement) -> bool:
     """Return whether both requirements are of one kind, about some equal names or enclaves."""
     if type(new) is not type(old):
         return False

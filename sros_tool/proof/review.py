@@ -603,8 +603,8 @@ class _Review:
         for name, new in head[1].robots.items():
             if name in robots and _delivery_place(robots[name]) != _delivery_place(new):
                 lines.append((f"gets its keys at another address: {_delivery_place(new)}", name))
-        earlier = _holders(*base)
-        for enclave, robot in _holders(*head).items():
+        earlier = _robots_by_enclave(*base)
+        for enclave, robot in _robots_by_enclave(*head).items():
             old = earlier.get(enclave, robot)
             if robot and (
                 not old
@@ -615,7 +615,7 @@ class _Review:
         if base[1] and self.base:
             file = self.request.fleet
             before, after = (read_connections(e.folder / file) for e in (self.base, self.head))
-            for where in sorted({*before, *after}, key=_decisive_first):
+            for where in sorted({*before, *after}, key=_variables_before_hosts):
                 if before.get(where) != (value := after.get(where)):
                     text = "is gone, which" if value is None else f"is {value}, which"
                     lines.append((f"{text} can change which keys Ansible delivers, and how", where))
@@ -1262,7 +1262,7 @@ class _Review:
         return _UNDECIDED if expiring.unreadable else _FOUND if expiring.due else _OK, expiring
 
 
-def _decisive_first(where: str) -> tuple[bool, str]:
+def _variables_before_hosts(where: str) -> tuple[bool, str]:
     """Return a sort key that puts Ansible variables before the hosts that have them."""
     return not any(part in where for part in ("ansible_", "sros_")), where
 
@@ -1272,7 +1272,7 @@ def _delivery_place(robot: Robot) -> str:
     return f"{robot.user}@{robot.address}" if robot.user else robot.address or "its name"
 
 
-def _holders(files: Iterable[Path], fleet: Fleet | None) -> dict[str, Robot | None]:
+def _robots_by_enclave(files: Iterable[Path], fleet: Fleet | None) -> dict[str, Robot | None]:
     """Map enclaves to the robot that gets their keys, or to None if they belong to no robot."""
     if fleet is None:
         return {enclave.path: None for file in files for enclave in read_policy(file).enclaves}

@@ -74,14 +74,14 @@ def suggest(
         if not any(verdict.witness or verdict.empty or verdict.always for _, verdict in verdicts):
             last = _joined_requirement(requirements[-1], requirement) if requirements else None
             requirements[-1:] = [last] if last else [*requirements[-1:], requirement]
-    missing: Iterable[Requirement] = _missing(stated, requirements)
+    missing: Iterable[Requirement] = _unreserved_moves(stated, requirements)
     if fleet:
         missing = _with_placeholders_for_robots(missing, fleet)
         requirements = [*_with_placeholders_for_robots(requirements, fleet)]
-    return Suggestions(requirements, [_not_proposed(each) for each in missing])
+    return Suggestions(requirements, [_comment_on_unmet(each) for each in missing])
 
 
-def _missing(stated: _Stated, proposed: Iterable[Requirement]) -> Iterator[Only]:
+def _unreserved_moves(stated: _Stated, proposed: Iterable[Requirement]) -> Iterator[Only]:
     """Yield a requirement for each name that moves a robot, and that ``proposed`` does not reserve.
 
     These requirements do not hold, or were not decided.
@@ -99,7 +99,7 @@ def _missing(stated: _Stated, proposed: Iterable[Requirement]) -> Iterator[Only]
             yield Only(source=_NOWHERE, rights=((right, (name,)),), enclaves=enclaves)
 
 
-def _not_proposed(requirement: Requirement) -> str:
+def _comment_on_unmet(requirement: Requirement) -> str:
     """Return a comment on a requirement of one name that does not hold."""
     assert isinstance(requirement, Only)
     (right, (name,)), users = requirement.rights[0], counted(len(requirement.enclaves), "enclave")

@@ -328,7 +328,7 @@ def check_distributions(keystore: OpenedKeystore, at: Circumstances) -> list[Fin
     files = signed_files(keystore, at)
     findings = []
     for names, enclaves in of_several.items():
-        for before, after in _pairs([find_distribution(name) for name in names]):
+        for before, after in _pairs_of_releases([find_distribution(name) for name in names]):
             for change in changes(files.only_for(enclaves), before, after):
                 kind = DISTRIBUTION_REFUSES if change.kind in (_LOSES, _JOINS) else DIFFER
                 findings.append(
@@ -337,7 +337,7 @@ def check_distributions(keystore: OpenedKeystore, at: Circumstances) -> list[Fin
     return with_joined_findings(findings)
 
 
-def _pairs(distributions: Sequence[Distribution]) -> Iterator[tuple[Shipped, Shipped]]:
+def _pairs_of_releases(distributions: Sequence[Distribution]) -> Iterator[tuple[Shipped, Shipped]]:
     """Yield pairs of releases of one product in different distributions that decide differently."""
     by_product: dict[str, dict[Vendor, Shipped]] = {}
     for distribution in distributions:

@@ -83,7 +83,7 @@ def names_of_expression(expression: str) -> NameSet:
 
 
 @lru_cache(maxsize=65536)
-def _wild(expression: str) -> Automaton | None:
+def _automaton_of_wildcards(expression: str) -> Automaton | None:
     """Return an automaton for an expression, or None if it has no wildcard."""
     around = names_of_expression(expression).superset()
     return next(iter(around.automata), None) if around else None
@@ -160,7 +160,7 @@ class Side:
             for enclave in self.exact[topic]:
                 if topic in self.of[enclave]:
                     stated.setdefault(enclave, []).append(topic)
-        own_automaton = _wild(topics.expression)
+        own_automaton = _automaton_of_wildcards(topics.expression)
         if own_automaton is None:
             matching = [
                 automaton for automaton in self._wild if automaton.matches(topics.expression)
@@ -182,7 +182,7 @@ class Side:
         """Return the exact topics in rights of all enclaves that match an expression."""
         if expression not in self._found:
             limit.spend(len(self._wild))
-            own_automaton = _wild(expression)
+            own_automaton = _automaton_of_wildcards(expression)
             self._found[expression] = (
                 tuple(self._accepted_topics(own_automaton, limit))
                 if own_automaton
@@ -192,8 +192,8 @@ class Side:
 
     def _accepted_topics(self, automaton: Automaton, limit: SearchLimit) -> Iterator[str]:
         """Yield the exact topics that an automaton accepts."""
-        forwards = _starting(self._topics, automaton.prefix)
-        backwards = _starting(self._backwards, automaton.suffix[::-1])
+        forwards = _indexes_starting_with(self._topics, automaton.prefix)
+        backwards = _indexes_starting_with(self._backwards, automaton.suffix[::-1])
         limit.spend(min(len(forwards), len(backwards)))
         if len(forwards) <= len(backwards):
             topics: Iterator[str] = (self._topics[i] for i in forwards)
@@ -239,7 +239,7 @@ class Side:
         return sorted(user for user in users if topic in self.of[user])
 
 
-def _starting(ordered: list[str], begin: str) -> range:
+def _indexes_starting_with(ordered: list[str], begin: str) -> range:
     """Return the indexes of the texts in a sorted list that begin with ``begin``."""
     return range(bisect_left(ordered, begin), bisect_left(ordered, begin + _LAST_CHARACTER))
 

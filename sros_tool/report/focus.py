@@ -293,7 +293,7 @@ class _System:
                 f"and {_counted_influences(influencing, 2)} can influence it"
             )
             return Focus(kind, name, sentence, (), (), influencing, influenced)
-        topics = tuple(_commands(kind, name))
+        topics = tuple(_command_topics(kind, name))
         senders, receivers = (
             frozenset(user for topic in topics for user in self._direct.users(side, topic))
             for side in ("publish", "subscribe")
@@ -381,7 +381,7 @@ def _overlaps_word(right: Right, kind: str, word: str) -> bool:
     return right.kind == kind and right.qualifier is ALLOW and overlap(right.name, word)
 
 
-def _commands(kind: str, name: str) -> Iterator[str]:
+def _command_topics(kind: str, name: str) -> Iterator[str]:
     """Yield the DDS topics of a name by which a sender can command its receivers.
 
     Leaves out requests of services that only answer questions.

@@ -271,7 +271,7 @@ class _Draft:
         if self._of and not self._has_marks():
             self._kinds: dict[object, int] = {}
             self._common_kinds: set[int] = set()
-            self._seen = tuple(self._sightings())
+            self._seen = tuple(self._parts_with_unit_names())
             classes = self._find_classes()
             if self._picture.focus:
                 # A name from one robot to another robot appears at two stages of the flow.
@@ -300,7 +300,7 @@ class _Draft:
         """Return the path of an enclave, split only at the name of the enclave's own unit."""
         return self._text(enclave).with_only_unit(self._of.get(enclave), self._word)
 
-    def _sightings(self) -> Iterator[tuple[int, tuple[int, ...], Edge | str]]:
+    def _parts_with_unit_names(self) -> Iterator[tuple[int, tuple[int, ...], Edge | str]]:
         """Yield each enclave and drawn right whose texts have names of units.
 
         Yields triples: a number, the units, and the enclave or right. Triples with the same number

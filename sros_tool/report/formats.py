@@ -408,7 +408,7 @@ def render_mermaid(picture: Picture, scene: Scene) -> str:
     clusters = _clusters(cards)
     lines = ["---", f"title: {_yaml(_title(picture))}", "---", "flowchart LR"]
     for number, (title, members) in enumerate(clusters.items()):
-        lines.append(f'  subgraph g{number}["{_entities(title)}"]')
+        lines.append(f'  subgraph g{number}["{_escaped_for_mermaid(title)}"]')
         lines += [f"    {_mermaid_node(scene, key, cards[key])}" for key in members]
         lines.append("  end")
     inside = {key for members in clusters.values() for key in members}
@@ -417,7 +417,7 @@ def render_mermaid(picture: Picture, scene: Scene) -> str:
     styles: dict[str, list[int]] = defaultdict(list)
     for number, link in enumerate(scene.links):
         arrow = _MERMAID_ARROWS[link.level.value] if link.qualifier is ALLOW else "--x"
-        text = _entities(_link_label(picture, link))
+        text = _escaped_for_mermaid(_link_label(picture, link))
         lines.append(f'  {_node_id(link.source)} {arrow}|"{text}"| {_node_id(link.target)}')
         color = _VIOLATING if link.violates else _COLORS[link.mark]
         styles[color].append(number)
@@ -460,12 +460,12 @@ def _render_markdown(picture: Picture, *, everything: bool = False) -> str:
             is_denied_alone = controlled and (kind, name) not in allowed
             first += ["nobody"] if stated.lacks is lack or is_denied_alone else []
             who = ", ".join(dict.fromkeys((*first, *end)))
-            cells.append(who or _who_for_single_names(picture, stated, sends=sends))
+            cells.append(who or _remark_on_single_names(picture, stated, sends=sends))
         lines.append(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |")
     return "\n".join((*lines, ""))
 
 
-def _who_for_single_names(picture: Picture, name: Name, *, sends: bool) -> str:
+def _remark_on_single_names(picture: Picture, name: Name, *, sends: bool) -> str:
     """Return a remark on a wildcard if, on one side, enclaves may use only its known names."""
     single = (
         edge
@@ -597,7 +597,7 @@ def _mermaid_node(scene: Scene, key: str, card: Card) -> str:
 
 
 def _label(scene: Scene, card: Card) -> str:
-    return "<br/>".join(map(_entities, _texts(scene, card)))
+    return "<br/>".join(map(_escaped_for_mermaid, _texts(scene, card)))
 
 
 def _node_id(card: str) -> str:
@@ -612,7 +612,7 @@ def _identifier(key: str) -> str:
     return f"{plain}_"
 
 
-def _entities(text: str) -> str:
+def _escaped_for_mermaid(text: str) -> str:
     """Return ``text`` with all markup characters escaped as Mermaid's numbered entities."""
     return re.sub(r"[^A-Za-z0-9 /_.,:+-]", lambda letter: f"#{ord(letter[0])};", visible_line(text))
 

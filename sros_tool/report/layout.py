@@ -595,7 +595,7 @@ def _stacked_cards(
     for card in by_id.values():
         items[card.column].append(ColumnItem(card.id, card.height, card.group))
     ordered = order_columns(items, lines)
-    tops = _tops(ordered, lines)
+    tops = _card_tops(ordered, lines)
     return {
         item.id: replace(by_id[item.id], y=round(tops[item.id]))
         for column in ordered
@@ -625,7 +625,7 @@ def _linked_cards(cards: Mapping[str, Card], links: Sequence[Link]) -> tuple[Lin
     )
 
 
-def _tops(
+def _card_tops(
     columns: Sequence[Sequence[ColumnItem]], lines: Sequence[tuple[str, str]]
 ) -> dict[str, float]:
     """Map cards to their y; the tallest column has no gaps, and other columns follow it."""

@@ -268,7 +268,7 @@ def render_demo_page(result: Json, made: str) -> str:
     body = "\n".join(
         (
             _demo_head(result, made),
-            _demo_open(result["rows"]),
+            _open_rows(result["rows"]),
             *scenarios,
             _demo_vulnerabilities(result),
             f'<p class="soft">{why}</p>',
@@ -352,7 +352,7 @@ def _demo_head(result: Json, made: str) -> str:
     )
 
 
-def _demo_open(rows: Sequence[Json]) -> str:
+def _open_rows(rows: Sequence[Json]) -> str:
     """Return a list of the rows that are open, with the reason and the remedy, or ""."""
     names: dict[tuple[bool, str, str, str], list[str]] = {}
     for row in rows:

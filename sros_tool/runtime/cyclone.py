@@ -442,9 +442,9 @@ class CycloneLog:
         libc = ctypes.CDLL(None)
         libc.fdopen.restype = ctypes.c_void_p
         ctypes.c_void_p.in_dll(libc, "stderr").value = libc.fdopen(self._file, b"a")
-        os.register_at_fork(after_in_child=self._leave_parent)
+        os.register_at_fork(after_in_child=self._use_own_file_after_fork)
 
-    def _leave_parent(self) -> None:
+    def _use_own_file_after_fork(self) -> None:
         """Write to a new file if this process was forked from the process that opened the log.
 
         The parent's descriptor stays open, because it may belong to another file if the parent

@@ -115,7 +115,7 @@ def enter_isolation() -> None:
         Path("/proc/self/uid_map").write_text(f"{user} {user} 1", encoding="ascii")
         Path("/proc/self/gid_map").write_text(f"{group} {group} 1", encoding="ascii")
     _bring_up_loopback()
-    _keep_off_ports_of_dds()
+    _reserve_dds_ports()
 
 
 def _libc() -> ctypes.CDLL:
@@ -155,7 +155,7 @@ def _add_multicast_route(control: socket.socket) -> None:
     fcntl.ioctl(control, _SIOCADDRT, bytes(entry))
 
 
-def _keep_off_ports_of_dds() -> None:
+def _reserve_dds_ports() -> None:
     """Keep the kernel from assigning ports of DDS domains to sockets that bind to any free port.
 
     From domain 102 on, the DDS ports are in the range from which Linux assigns free ports: a

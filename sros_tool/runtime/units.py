@@ -273,9 +273,9 @@ def job_units(
         UsageError: a path cannot be written in a unit.
     """
     if job is Job.GUARD:
-        return {f"sros-{job}.service": _guard(keystore, sros, domain)}
+        return {f"sros-{job}.service": _guard_service(keystore, sros, domain)}
     if job is Job.AGENT:
-        return _agent(keystore, user=user, sros=sros, writable=writable)
+        return _agent_units(keystore, user=user, sros=sros, writable=writable)
     name = f"sros-{job}"
     root, program = (
         _check_path(keystore, "the keystore"),
@@ -356,7 +356,7 @@ WantedBy=timers.target
     return {f"{name}.service": service, f"{name}.timer": timer}
 
 
-def _guard(keystore: str, sros: str, domain: int) -> str:
+def _guard_service(keystore: str, sros: str, domain: int) -> str:
     """Return the service that watches the processes of a machine while the machine runs."""
     root = _check_path(keystore, "the keystore")
     variables = {KEYSTORE: root, ENABLE: "true", STRATEGY: "Enforce", DOMAIN: str(domain)}
@@ -384,7 +384,9 @@ WantedBy=multi-user.target
 """
 
 
-def _agent(folder: str, *, user: str, sros: str, writable: Sequence[str] = ()) -> dict[str, str]:
+def _agent_units(
+    folder: str, *, user: str, sros: str, writable: Sequence[str] = ()
+) -> dict[str, str]:
     """Return the service and the timer of a robot's agent (`sros agent`)."""
     root, program = (
         _check_path(folder, "the security folder"),

@@ -410,7 +410,7 @@ class _Reissued:
 
 
 @dataclass(frozen=True, slots=True)
-class _KeptOpen:
+class _KeptWideRights:
     """An enclave that keeps the right to everything, although the new default rights are narrower.
 
     ``reissued`` has its new files, or None.
@@ -536,13 +536,13 @@ class _Updater:
 
         keystore = self._change.keystore
 
-        def work(name: str) -> _Reissued | _KeptOpen | UnreadableEnclave | None:
+        def work(name: str) -> _Reissued | _KeptWideRights | UnreadableEnclave | None:
             try:
                 state = read_credentials(keystore, name)
                 done = self._reissue_one(state)
                 keeps_rights = done is None or not done.rights.lost
                 if closes and keeps_rights and allows_everything(state.grant):
-                    return _KeptOpen(name, done)
+                    return _KeptWideRights(name, done)
                 return done
             except CaServiceError:
                 raise
@@ -552,10 +552,10 @@ class _Updater:
         results = self._writer.for_each(names, work, progress).values()
         unreadable = tuple(result for result in results if isinstance(result, UnreadableEnclave))
         refuse_unreadable(unreadable, "updated", takes_names=False)
-        opened = [kept_open for kept_open in results if isinstance(kept_open, _KeptOpen)]
+        opened = [kept_open for kept_open in results if isinstance(kept_open, _KeptWideRights)]
         self._kept_open = tuple(kept_open.name for kept_open in opened)
         reissued = [
-            result.reissued if isinstance(result, _KeptOpen) else result for result in results
+            result.reissued if isinstance(result, _KeptWideRights) else result for result in results
         ]
         return [document for document in reissued if isinstance(document, _Reissued)]
 
