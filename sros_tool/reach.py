@@ -283,11 +283,11 @@ class Network:
         return Reach(enclave, self.influenced_by({enclave}), self.influencers_of({enclave}))
 
     def influenced_by(self, enclaves: Collection[str]) -> dict[str, HopPath]:
-        """Return the other enclaves that ``enclaves`` can influence, each with a shortest path."""
+        """Map the other enclaves that ``enclaves`` can influence to a shortest path."""
         return self._search(enclaves, True)
 
     def influencers_of(self, enclaves: Collection[str]) -> dict[str, HopPath]:
-        """Return the other enclaves that can influence ``enclaves``, each with a shortest path."""
+        """Map the other enclaves that can influence ``enclaves`` to a shortest path."""
         return self._search(enclaves, False)
 
     def _search(self, start_enclaves: Collection[str], forward: bool) -> dict[str, HopPath]:
@@ -386,7 +386,7 @@ def _common_domains(first: DomainSet, second: DomainSet) -> tuple[DomainSet] | t
 def _writers_and_readers(
     rights: DomainRights, ignored: Collection[str]
 ) -> dict[str, list[_Access]]:
-    """Return which enclaves may write (publish) and read (subscribe) which topics.
+    """Map "publish" to the topics that enclaves may write, and "subscribe" to those they may read.
 
     Topics in ``ignored`` are left out.
     """

@@ -48,7 +48,7 @@ class Threshold(NamedTuple):
 
 
 def renewal_command(root: Path, *names: str) -> str:
-    """Return the command that renews ``names``, or everything in a keystore that expires soon."""
+    """Return the command that renews ``names``, and all enclaves that expire soon."""
     words = ("sros", "renew", str(root), *names, "--all-expiring", "soon")
     return " ".join(map(quote, words))
 

@@ -334,8 +334,8 @@ class RobotStatus:
     def settled(self) -> bool:
         """Whether there is nothing to do: the files are current and the agent reports no problem.
 
-        A robot without enclaves is settled, too.  So is a revoked robot, once its enclaves are
-        gone: only the other robots need the revocation list.
+        A robot without enclaves is settled, too.  A revoked robot is settled once its enclaves are
+        gone, because only the other robots need the revocation list.
         """
         if self.state is State.REVOKED:
             return not self.enclaves
@@ -692,7 +692,7 @@ class _ComparedRobot(NamedTuple):
         return 0 < number == len(there) and all(map(is_equal, others))
 
     def running(self) -> Mapping[str, RunningFiles] | None:
-        """Return the files that processes of each enclave have loaded; None if not reported."""
+        """Map each enclave to the files that its processes have loaded; None if not reported."""
         if self.confirmed is None or self.confirmed.running is None:
             return None
         running = self.confirmed.running

@@ -671,14 +671,14 @@ def _wrong_path_remedy(root: Path) -> str:
 
 
 def keystore_around(folder: Path) -> Path | None:
-    """Return the keystore that contains ``folder``, which may be missing; None if none does."""
+    """Return the keystore that contains ``folder`` (which need not exist), or None."""
     with suppress(KeystoreError):
         return next(filter(is_keystore, Path(os.path.realpath(folder)).parents), None)
     return None
 
 
 def similar_keystores(root: Path) -> list[Path]:
-    """Return the keystores next to ``root`` with similar names; digits do not count as similar."""
+    """Return keystores next to ``root`` with similar names, which differ not only in digits."""
     from difflib import get_close_matches  # only needed for this error
 
     def without_digits(name: str) -> str:

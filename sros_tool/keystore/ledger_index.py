@@ -297,7 +297,7 @@ class IndexUpdate:
         )
 
     def seal(self, part: str) -> None:
-        """Note that all lines so far are in sealed parts of the ledger, the last one ``part``."""
+        """Record that all lines so far are in sealed parts, of which ``part`` is the last one."""
         self.state = self.state._replace(sealed=self.state.lines, sealed_size=self.state.size)
         self._sealed.append(part)
 

@@ -120,7 +120,7 @@ class LoadedEnclave(NamedTuple):
         return (self.state.joined_domains() if self.state else None) or self.domains
 
     def expiries(self) -> tuple[tuple[str, datetime], ...]:
-        """Return the files that expire, except the permissions, with the times of their expiry."""
+        """Return (file, expiry) for each file that expires, except the permissions."""
         return tuple(_file_expiries(self.state, self.folder)) if self.state and self.folder else ()
 
     @property

@@ -287,9 +287,9 @@ class OpenedKeystore:
         """Whether ros2/sros2 made the keystore, and sros has not written to it yet.
 
         Such a keystore has neither settings nor a ledger, and its CAs have no key identifier.  sros
-        gives a key identifier to every CA, so removing the ledger of an sros keystore does not make
-        it look like a keystore of ros2/sros2.  Exchanging the CA certificate for one without an
-        identifier does not help either, because only the CA's key can sign it.
+        gives a key identifier to every CA.  So a keystore of sros does not look like this if
+        somebody removes its ledger.  Nobody can exchange the CA certificate for one without an
+        identifier either, because only the CA's key can sign it.
         """
         if any(os.path.lexists(self.root / name) for name in (SETTINGS, LEDGER, LEDGER_HEAD)):
             return False
@@ -734,7 +734,7 @@ def _problems_in_keystore(problems: tuple[Problem, ...], key_on_robot: bool) -> 
 
 
 def weaknesses(state: OpenedEnclave) -> Iterator[tuple[str, str]]:
-    """Yield (file name, clause) for each weak cryptography in an enclave's files."""
+    """Yield (file name, clause) for each use of weak cryptography in an enclave's files."""
     for file in (IDENTITY_CA_FILE, PERMISSIONS_CA_FILE, CERTIFICATE_FILE):
         with suppress(SrosError):
             for certificate in load_certificates(state.files.get(file, b""), file):
@@ -777,7 +777,7 @@ _parse_governance = lru_cache(maxsize=8)(parse_governance)
 def _load_crl(
     data: bytes, authority: x509.Certificate | None, authorities: bytes
 ) -> tuple[x509.CertificateRevocationList, x509.Certificate | None]:
-    """Return a revocation list, and the CA in ``authorities`` (PEM) that signed it, or None."""
+    """Return the list in ``data``, and the CA in ``authorities`` (PEM) that signed it (or None)."""
     crl = read_list(data, CRL_FILE)
     trusted: tuple[x509.Certificate, ...] = (authority,) if authority else ()
     with suppress(SrosError):
@@ -839,7 +839,7 @@ class _EnclaveFiles:
         )
 
     def _read_all(self, names: Sequence[str]) -> tuple[dict[str, bytes | None], TokenUri | None]:
-        """Return the content of files, and the key on a token if there is one."""
+        """Map the files ``names`` to content; also return the place of a key on a token."""
         token_file = self._read_token_file()
         files = {
             name: self._read(name)
@@ -852,7 +852,7 @@ class _EnclaveFiles:
     def _checked_identity(
         self, files: dict[str, bytes | None]
     ) -> tuple[x509.Certificate | None, x509.Certificate | None, object]:
-        """Check the identity, and return its certificate, its CA and its public key."""
+        """Check the identity; return the certificates of enclave and CA, and the public key."""
         identity_ca = self._certificate(IDENTITY_CA_FILE, files)
         certificate = self._certificate(CERTIFICATE_FILE, files)
         public_key = self._check_identity(certificate, identity_ca, files)

@@ -807,7 +807,10 @@ def _stated_domains(source: RightsSource) -> dict[str, str]:
 def _protection_differences(
     first_source: RightsSource, second_source: RightsSource
 ) -> list[tuple[str, StatedProtection]]:
-    """Return the protection that only one of two policies states, with "-" or "+"."""
+    """Return the protection that only one of two policies states.
+
+    Each is paired with "-" if the first policy states it, and with "+" if the second one does.
+    """
     if first_source.protections is None or second_source.protections is None:
         return []
     protections, other = set(first_source.protections), set(second_source.protections)
@@ -892,8 +895,8 @@ class RecordedRights:
     """The rights that were last signed for each enclave, by the ledger.
 
     The signatures of older permissions stay valid.  So present permissions are compared with the
-    ledger before their rights are signed again.  Otherwise, whoever puts older permissions back
-    could get their rights signed with a new date.
+    ledger before their rights are signed again.  Without this comparison, whoever puts older
+    permissions back could get their rights signed with a new date.
     """
 
     def __init__(self, keystore: OpenedKeystore, ledger: Ledger | None = None) -> None:

@@ -192,7 +192,7 @@ def is_signed(
     authority: x509.Certificate,
     files: FilesReadOnce | None = None,
 ) -> bool:
-    """Return whether the permissions CA signed ``document``, by the file next to ``path``."""
+    """Return whether the file next to ``path`` is ``document``, signed by the permissions CA."""
     files = files or FilesReadOnce()
     try:
         message = files.read(path.with_name(ZENOH_SIGNED[path.name]), "signed document")
@@ -624,7 +624,7 @@ def _router_files(
     rules: Mapping[str, _RulesOfEnclave],
     revoked: str,
 ) -> dict[str, bytes]:
-    """Return the configurations of all routers, by path.
+    """Map the paths of all routers' configurations to their content.
 
     ``revoked`` is the time of the last revocation, which is written to the files.  A router gives
     another router the rights that the enclaves at both ends have in common.
@@ -991,7 +991,7 @@ def _announced_names(tokens: KeyExpressions, enclave: str) -> set[tuple[str, str
 def _allowed_announcements(
     stated_rights: Mapping[int, Sequence[StatedRight]],
 ) -> set[tuple[str, str, str]]:
-    """Return the announcements that exact rights allow, in the form of `_announced_names`."""
+    """Return the announcements that rights without wildcards allow, as `_announced_names` does."""
     return {(str(domain), "", "") for domain in stated_rights} | {
         (str(domain), right, name)
         for domain, rights in stated_rights.items()
@@ -1215,8 +1215,8 @@ class _OrderedTopics(NamedTuple):
 def _joined_if_unordered(rules: Sequence[Rule]) -> list[Rule]:
     """Return equivalent rules with denials first, for the default partition.
 
-    A right that an earlier rule completely denies is left out.  So is a denial after all rights
-    that it concerns.
+    A right that an earlier rule completely denies is left out.  A denial is left out if it comes
+    after all rights that it concerns.
     """
     allowed: dict[AccessVerb, tuple[str, ...]] = {}
     denied: dict[AccessVerb, tuple[str, ...]] = {}

@@ -532,7 +532,10 @@ def _percent_encoded(text: str) -> str:
 
 
 def _attributes(parts: Sequence[str], known: Set[str]) -> dict[str, str]:
-    """Decode the attributes of a part of a URI; errors do not quote values, which may be secret."""
+    """Map the attributes in ``parts`` of a URI to their decoded values.
+
+    Errors do not quote values, which may be secret.
+    """
     attributes: dict[str, str] = {}
     for part in filter(None, parts):
         name, _, value = part.partition("=")

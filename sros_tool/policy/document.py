@@ -159,7 +159,7 @@ class Includer:
     def children(
         self, parent: etree._Element, place: IncludedFile
     ) -> Iterator[tuple[etree._Element, IncludedFile]]:
-        """Yield the child elements of ``parent``, with included elements in place of includes."""
+        """Yield each child of ``parent`` with its file; included elements replace includes."""
         return self._expanded(parent, place)
 
     def target(self, element: etree._Element, place: IncludedFile) -> Path:
@@ -285,7 +285,7 @@ class Includer:
     def _selected(
         self, roots: Iterator[tuple[etree._Element, IncludedFile]], pointer: str, where: str
     ) -> list[tuple[etree._Element, IncludedFile]]:
-        """Return the elements that an xpointer selects in a document with resolved includes."""
+        """Return the elements, with their files, that an xpointer selects in expanded documents."""
         path = pointer.removeprefix("xpointer(").removesuffix(")")
         steps = list(_XPOINTER_STEP.finditer(path[:_MAX_LENGTH]))
         if f"xpointer({''.join(step[0] for step in steps)})" != pointer or not steps:

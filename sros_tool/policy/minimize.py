@@ -328,7 +328,7 @@ class _Narrowing:
         )
 
     def _prove(self, remaining_rights: Sequence[Right]) -> None:
-        """Raise unless the narrowed enclave adds no right and keeps every observed right."""
+        """Raise `PolicyError` if the narrowed enclave has a new right, or lacks an observed one."""
         after = Rules(remaining_rights)
         widened = [right for right in remaining_rights if not self._rules.cover(right)]
         lost = [p for p in self._in_use if self._is_allowed(p) and not after.cover(p)]

@@ -73,7 +73,8 @@ def covers(wide: str, narrow: str) -> bool:
     """Return whether ``wide`` matches every name that ``narrow`` matches.
 
     True is always right.  False can be wrong for unusual expressions: ``?*`` and ``*?`` match the
-    same names, but do not cover each other here.  Then callers keep a redundant rule.
+    same names, but do not cover each other here.  If False is wrong, callers only keep a redundant
+    rule.
     """
     if wide == narrow:
         return True
@@ -257,7 +258,7 @@ _PART_LENGTH = 4
 
 
 class Names:
-    """An ordered set of names and expressions, with searches by covered or overlapping name.
+    """An ordered set of names and expressions, searched for those that cover or overlap a name.
 
     Only expressions with the same beginning, end or letters are compared.  ``limit`` limits the
     number of comparisons; sets for the same purpose share a limit.

@@ -118,7 +118,7 @@ def parse_remapping_of_names(text: str) -> Remapping:
 
 
 def remapped_name(name: str, ns: str, rules: Iterable[Remapping]) -> list[str]:
-    """Return the full names that replace a full name of any node in a namespace.
+    """Return the full names that replace the full name ``name`` by ``rules`` for nodes in ``ns``.
 
     The ``rules`` are results of `parse_remapping_of_names`.  A wildcard that matches an old name
     stays, and the new name is added.

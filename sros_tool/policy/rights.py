@@ -314,7 +314,7 @@ def renamed_enclaves(
 
 
 def _rights_by_enclave(rights: Iterable[Right]) -> dict[str, set[Right]]:
-    """Return the rights of each enclave, with "" in place of the enclave's path."""
+    """Map each enclave to its rights, in which "" replaces the path of the enclave."""
     by_enclave: dict[str, set[Right]] = defaultdict(set)
     for right in rights:
         by_enclave[right.enclave].add(right._replace(enclave=""))

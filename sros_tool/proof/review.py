@@ -523,7 +523,7 @@ class _Review:
     # ── files ──────────────────────────────────────────────────────────────────────────────
 
     def _fleet(self, side: CommitFiles | None) -> Generator[ReviewStep, None, Fleet | None]:
-        """Return the fleet of BASE or HEAD, or None; yield the steps that read the fleet."""
+        """Return the fleet of BASE or HEAD, or None; yield a step if it cannot be read."""
         if not self.request.fleet or not side:
             return None
         files = yield from self._files(side, "files", [self.request.fleet])
@@ -533,7 +533,7 @@ class _Review:
     def _files(
         self, side: CommitFiles, kind: str, paths: Iterable[str]
     ) -> Generator[ReviewStep, None, dict[str, Path]]:
-        """Return the files that BASE or HEAD has at paths; a step reports files that HEAD lacks."""
+        """Map ``paths`` to files of BASE or HEAD; yield a step for each file that HEAD lacks."""
 
         def file_at(path: str) -> Path | None:
             file = side.file(path)
@@ -558,7 +558,7 @@ class _Review:
         return list(dict.fromkeys(file for files in read.values() for file in files))
 
     def _keystores(self, side: CommitFiles) -> Generator[ReviewStep, None, dict[str, Path]]:
-        """Return the keystore folders of BASE or HEAD, by path; yield the steps that read them."""
+        """Map paths to keystores of BASE or HEAD; yield a step for each unreadable keystore."""
 
         def folder_at(path: str) -> Path:
             folder = side.tree(path)
@@ -597,7 +597,10 @@ class _Review:
     def _delivery_step(
         self, base: tuple[list[Path], Fleet | None], head: tuple[list[Path], Fleet]
     ) -> tuple[int, Content] | None:
-        """Return the step on robots whose keys would be delivered elsewhere, or in another way."""
+        """Return status and findings on changes of the robots that get keys; None without any.
+
+        Such a change delivers keys to another address, to another robot, or in another way.
+        """
         lines: list[tuple[str, str]] = []
         robots = base[1].robots if base[1] else {}
         for name, new in head[1].robots.items():
@@ -622,7 +625,7 @@ class _Review:
         return (_FOUND, StepFindings(tuple(lines))) if lines else None
 
     def _converted_step(self) -> tuple[int, Content] | None:
-        """Return the step on reviewed files that git may change in a checkout or archive."""
+        """Return status and findings on reviewed files that git may change on checkout, or None."""
         lines = []
         for folder in sorted({parent for path in self.head.files for parent in Path(path).parents}):
             path = str(folder / ATTRIBUTES_FILE)
@@ -655,10 +658,11 @@ class _Review:
         return self.request.repository.contents_in_batches(ids, _MOST_BYTES, largest=largest)
 
     def _keys_step(self) -> tuple[int, Content] | None:
-        """Return the step on private keys in keystores of HEAD, and in files that change.
+        """Return status and findings on private keys in HEAD; None without any.
 
-        Options that allow new access do not apply: everybody who reads the repository has these
-        keys. Keys of keystores that are not reviewed, and were there before, are only named.
+        Keystores and changed files are searched.  Options that allow new access do not apply:
+        everybody who reads the repository has these keys.  Keys of keystores that are not reviewed,
+        and were there before, are only named.
         """
         entries = dict(self._changed_files(self.head, self.base)) if self.base else {}
         entries |= {
@@ -689,7 +693,7 @@ class _Review:
     def _unreviewed_step(
         self, reviewed: Sequence[Path], fleet: Fleet | None
     ) -> tuple[int, Content] | None:
-        """Return the step on policies and keystores that change, but are not reviewed."""
+        """Return status and findings on changed, unreviewed policies and keystores, or None."""
         assert self.base
         lines: list[tuple[str, str]] = []
         named: list[tuple[str, str]] = []
@@ -1081,7 +1085,7 @@ class _Review:
         before: Iterable[Right],
         elsewhere: Callable[[], Iterable[Finding]],
     ) -> tuple[int, ChosenFindings]:
-        """Return the decisions on requirements, also for robots that have another namespace."""
+        """Return the exit status and the findings on requirements, also in other namespaces."""
         asked = self.request
         findings = [
             *requirement_findings(requirements, system, before),
@@ -1455,7 +1459,7 @@ def _undecided(kind: str, subject: str, error: SrosError | OSError) -> ReviewSte
 def _read_each(
     kind: str, paths: Iterable[str], read: Callable[[str], Value | None]
 ) -> Generator[ReviewStep, None, dict[str, Value]]:
-    """Return the values read from paths, without None; yield a step for each unreadable path."""
+    """Map paths to the values read from them; yield a step for each unreadable path."""
     values: dict[str, Value] = {}
     for path in paths:
         try:

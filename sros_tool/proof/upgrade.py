@@ -228,7 +228,7 @@ def _present_distributions(
     here: Distribution | None,
     later: Distribution,
 ) -> Mapping[Distribution, list[str]]:
-    """Return the enclaves for each distribution that is in use before the update."""
+    """Map each distribution that is in use before the update to its enclaves."""
     by_distribution: dict[Distribution, list[str]] = {}
     unknown: list[str] = []
     for name in files.enclaves:

@@ -560,7 +560,7 @@ class _Draft:
     # ── cards ──────────────────────────────────────────────────────────────────────────────
 
     def cards_in_columns(self) -> dict[str, Card]:
-        """Return all cards by id, with x and width but without y."""
+        """Map ids to all cards, which have x and width but no y."""
         cards = [*self._side_cards(), *self._further_cards(), *self._names_cards()]
         widths = [0] * self.columns
         for card in cards:

@@ -357,7 +357,7 @@ class _Draft:
         return self._kinds.setdefault(drawn, len(self._kinds))
 
     def _find_classes(self) -> dict[int, list[int]]:
-        """Return the classes of equal units, sorted by name.
+        """Map numbers to the classes of equal units; each class is sorted by name.
 
         First, units of a family are compared without regard to the names of other units. Then the
         names of some units count: the names of units that are unlike the rest of their family, and
@@ -524,7 +524,7 @@ class _Draft:
             yield replace(edge, enclave=path, name=shown, by=by, differs=edge in differing_parts)
 
     def _is_counted(self, unit: int, other: int) -> bool:
-        """Return whether ``unit`` shows only a number for ``other`` and similar units."""
+        """Return whether ``unit`` shows only the number of units such as ``other``."""
         if other == unit or self._symbols[other] < 0:
             return False
         return other in self._inside or unit in self._inside
@@ -667,7 +667,7 @@ class _Draft:
     def _in_words(
         self, drawn: Sequence[Edge | str], unit: int, replaced: int | None = None
     ) -> Iterator[str]:
-        """Yield enclaves and rights in words, with the name of ``unit`` for ``replaced``."""
+        """Yield enclaves and rights in words, in which the name of ``unit`` replaces ``replaced``."""
 
         def word(named: int, position: int) -> str:
             return self._label(unit if named == replaced else named, position)
@@ -683,7 +683,7 @@ class _Draft:
 
 
 def _classes(views: Sequence[Counter[_Part]], before: Sequence[int]) -> dict[int, list[int]]:
-    """Divide classes of units into classes of units with equal views."""
+    """Map new numbers to classes of units that have equal views and the same number ``before``."""
     numbers: dict[object, int] = {}
     classes: dict[int, list[int]] = defaultdict(list)
     for unit, view in enumerate(views):

@@ -272,7 +272,7 @@ def nodes_with_rules(command: Sequence[str]) -> list[str]:
 
 
 def _node_rules(command: Sequence[str]) -> tuple[dict[str, str], dict[str, str]]:
-    """Return the remapping rules for node names and for namespaces, by the node that they apply to.
+    """Map nodes to their new names, and nodes to their new namespaces, by remapping rules.
 
     The key "" stands for every node.  The rules are ``-r __node:=NAME`` and ``-r __ns:=NAMESPACE``
     behind ``--ros-args``.  The order is the order in the command: rcl takes the first rule that

@@ -389,7 +389,10 @@ Close = Callable[[], None]
 
 
 def _join_rclpy() -> tuple[Ask, Close]:
-    """Join as a node of rclpy with the RMW of ``RMW_IMPLEMENTATION``, or rclpy's default."""
+    """Join as a node of rclpy with the RMW of ``RMW_IMPLEMENTATION``, or rclpy's default.
+
+    Return a function that creates an endpoint, and a function that leaves.
+    """
     import rclpy
     from std_msgs.msg import String
 
@@ -410,7 +413,10 @@ def _join_rclpy() -> tuple[Ask, Close]:
 
 
 def _join_cyclone() -> tuple[Ask, Close]:
-    """Join as a participant with the libddsc that `sros_tool.runtime.cyclone` loads."""
+    """Join as a participant with the libddsc that `sros_tool.runtime.cyclone` loads.
+
+    The result is as for `_join_rclpy`.
+    """
     participant = Participant(domain_of(os.environ), choose_enclave(os.environ).enclave)
 
     def ask(kind: str, topic: str) -> None:
@@ -423,7 +429,10 @@ def _join_cyclone() -> tuple[Ask, Close]:
 
 
 def _join_with_cyclonedds_package() -> tuple[Ask, Close]:
-    """Join as a participant of the Python package ``cyclonedds``, with its own libddsc."""
+    """Join as a participant of the Python package ``cyclonedds``, with its own libddsc.
+
+    The result is as for `_join_rclpy`.
+    """
     core, domain, idl, pub, sub, topics = (
         importlib.import_module(f"cyclonedds.{name}")
         for name in ("core", "domain", "idl", "pub", "sub", "topic")

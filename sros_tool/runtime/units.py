@@ -254,7 +254,7 @@ def job_units(
     publishing: str = "",
     max_age: timedelta | None = None,
 ) -> dict[str, str]:
-    """Return the service and the timer of a job by their names; the guard has no timer.
+    """Map file names to the texts of a job's service and timer; the guard has no timer.
 
     Args:
         job: the job.
@@ -387,7 +387,7 @@ WantedBy=multi-user.target
 def _agent_units(
     folder: str, *, user: str, sros: str, writable: Sequence[str] = ()
 ) -> dict[str, str]:
-    """Return the service and the timer of a robot's agent (`sros agent`)."""
+    """Map file names to the texts of service and timer of a robot's agent (`sros agent`)."""
     root, program = (
         _check_path(folder, "the security folder"),
         _check_program(sros),

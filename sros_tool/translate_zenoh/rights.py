@@ -529,7 +529,7 @@ _NOWHERE = Source("", 0)
 def _differences_in(
     rules: Sequence[AclRule], enclave: str
 ) -> Mapping[tuple[str, int], Sequence[Right]]:
-    """Return the rights and denials behind rules that list only allowed names, by right and domain.
+    """Map (right, domain) to the rights and denials behind rules that list only allowed names.
 
     The names are in the rules for graph tokens.  These names count only if sros would list exactly
     the key expressions of the rules for these names. Without this step, each key expression would

@@ -325,8 +325,8 @@ def imported_notes(
 ) -> tuple[Note, ...]:
     """Return notes on vendors that refuse enclaves of imported CAs, now or after a revocation.
 
-    An example enclave is issued, without being written, and evaluated both without and with a
-    revocation list.  Vendors that the notes of ``authorities`` already name are left out.
+    An example enclave is issued but not written.  It is evaluated with a revocation list and
+    without one.  Vendors that the notes of ``authorities`` already name are left out.
 
     Raises:
         KeystoreError: no vendor would accept an enclave of the keystore.
@@ -474,7 +474,7 @@ class _FilesOfChange:
         return {file: self._place_after(f"{folder}/{file}") for file in _LOADED_FILES}
 
     def _place_after(self, path: str) -> str:
-        """Return the path of the content of ``path``, which may be a link to a shared file."""
+        """Return the path of the file that ``path`` leads to, as a link or as the file itself."""
         target = self.transaction.target_after(path)
         if target is None:
             return path
@@ -503,7 +503,7 @@ class _FilesOfChange:
             return b""
 
     def content_after(self, place: str) -> bytes:
-        """Return the content of a file (not a link) after the transaction; empty without one."""
+        """Return the content of a file (not a link) after the transaction; empty if missing."""
         if not self.transaction.is_staged(place):
             return self.content(place)
         if place not in self._after:
@@ -512,7 +512,10 @@ class _FilesOfChange:
 
 
 def _enclaves_by_kind(files: _FilesOfChange, now: datetime) -> dict[_Kind, list[str]]:
-    """Group the complete, changed enclaves by everything that vendors could treat differently."""
+    """Map kinds of enclaves to the changed, complete enclaves of each kind.
+
+    A kind is everything in an enclave's files that vendors could treat differently.
+    """
     changed, root = files.changed, files.transaction.root
     shared = changed.get(PUBLIC, set()) | changed.get(ENCLAVES, set()) & {GOVERNANCE_FILE}
     documents = not shared <= _SHARED_IDENTITY_FILES

@@ -588,7 +588,7 @@ class KeystoreChange:
         self.transaction.commit()
 
     def _note_unknown_authorities(self) -> None:
-        """Add a note if a CA file has a CA that a ledger without gaps lacks."""
+        """Add a note if the ledger has no gaps, but lacks a CA that is in a CA file."""
         written = (change.path for change in self.transaction.changes)
         replaced = any(path.startswith(f"{PUBLIC}/") and "_ca.cert" in path for path in written)
         if replaced or self.keystore.ledger_with("what", "ca").gaps:
@@ -709,7 +709,7 @@ def _stage_configurations(
     changed: Sequence[DriftedConfiguration],
     authority: Authority,
 ) -> dict[str, bytes]:
-    """Stage changed Zenoh configurations and their signed documents, and map paths to content.
+    """Stage changed Zenoh configurations with signed documents; return content by path.
 
     All cores sign together.
     """

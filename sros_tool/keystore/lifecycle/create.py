@@ -333,7 +333,7 @@ def generate_artifacts(
 
 
 def _expired_enclaves(change: KeystoreChange, names: Iterable[str]) -> Iterator[tuple[str, Note]]:
-    """Yield the short-lived enclaves that have expired, with a note: nobody has to renew them."""
+    """Yield expired, short-lived enclaves, each with a note that nobody has to renew it."""
     for name in sorted(names):
         path = change.keystore.folder(name) / CERTIFICATE_FILE
         if change.template.longest_validity(name) is None or not path.exists():

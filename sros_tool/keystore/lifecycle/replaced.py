@@ -298,7 +298,7 @@ def _described_rights(rights: Sequence[Right]) -> list[str]:
 
 
 def lasting_text(root: Path, replaced_rights: Sequence[ReplacedRights]) -> str:
-    """Return sentences on lost rights that still work and how to end them; "" without any."""
+    """Return sentences on lost rights that still work, and on how to end them; "" without any."""
     lasting = [
         rights
         for rights in replaced_rights

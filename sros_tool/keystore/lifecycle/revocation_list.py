@@ -116,7 +116,7 @@ class LostRecords:
         return True
 
     def unknown_certificates(self, keystore: OpenedKeystore) -> dict[str, Entry]:
-        """Return the certificates that ``keystore`` does not know as issued or revoked.
+        """Map serial numbers to entries of certificates of which ``keystore`` has no record.
 
         A certificate that the ledger has only from a robot's message is included if a sealed
         release now shows it.

@@ -426,8 +426,9 @@ def refresh_crl(
     """Sign the revocation list again, so that it is valid for longer.
 
     The entries are kept, except certificates that expired before the present list was signed.  If
-    the identity CA is a CA service, its new list ``crl`` (PEM) replaces the present list.
-    Otherwise, ``crl`` is a list that was lost with a keystore, whose entries are revoked again.
+    the identity CA is a CA service, ``crl`` is its new list (PEM), which replaces the present list.
+    For any other identity CA, ``crl`` is a list that was lost with a keystore; the certificates on
+    it are revoked again.
 
     Raises:
         KeystoreError: no identity CA of the keystore signed ``crl``; or as `revoke`.
