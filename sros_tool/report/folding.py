@@ -667,7 +667,7 @@ class _Draft:
     def _in_words(
         self, drawn: Sequence[Edge | str], unit: int, replaced: int | None = None
     ) -> Iterator[str]:
-        """Yield enclaves and rights in words, in which the name of ``unit`` replaces ``replaced``."""
+        """Yield enclaves and rights in words, with the name of ``unit`` instead of ``replaced``."""
 
         def word(named: int, position: int) -> str:
             return self._label(unit if named == replaced else named, position)
