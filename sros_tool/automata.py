@@ -804,7 +804,7 @@ def _fewest_automata_first(superset: Superset) -> tuple[int, int]:
 
 
 def _including_automata(node: _Node) -> frozenset[Automaton]:
-    """Return automata that accept every name of a set, which has no exact names."""
+    """Return automata, each of which accepts every name of a set without exact names."""
     match node:
         case _Union():
             return node.automata if len(node.automata) == 1 else frozenset()
@@ -822,7 +822,7 @@ def _including_automata(node: _Node) -> frozenset[Automaton]:
 
 
 def _excluding_automata(node: _Node) -> frozenset[Automaton]:
-    """Return automata that accept every name outside of a set, which has no exact names."""
+    """Return automata, each of which accepts every name outside of a set without exact names."""
     match node:
         case _Complement():
             return _including_automata(node.of)

@@ -1132,8 +1132,9 @@ def _enclave_key(folder: Path, name: str, secrets: Secrets) -> PrivateKey:
 class Renewals(NamedTuple):
     """The signing requests (PEM) for a message, and who has to sign it.
 
-    Only the enclave itself can vouch for its new key, with its current one.  So a message has at
-    most one request for a new key, from the enclave ``signer``, which changes every hour.
+    Only the current key of an enclave can vouch for its new key, by signing the message.  So a
+    message has at most one request for a new key, which is from the enclave ``signer``.  Every
+    hour, another enclave is the signer.
     """
 
     requests: tuple[str, ...]

@@ -285,7 +285,7 @@ def _release_number(target: TargetFile | None, source: str, robot: str) -> int:
 
 
 def _read_archive(path: Path, robot: str, number: int) -> Release:
-    """Return the release in the verified archive at ``path``, which has to be this robot's."""
+    """Return the release in the verified archive at ``path``; it must be a release of ``robot``."""
     try:
         release = read_release(read_bytes(path, "release", max_bytes=OF_ONE_ROBOT.packed))
     except SrosError as error:

@@ -76,7 +76,7 @@ _DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
 class Installation(NamedTuple):
-    """The outcome for the enclaves of a release; no field has an unchanged enclave."""
+    """The outcome for the enclaves of a release; an enclave that did not change is in no field."""
 
     changed: tuple[str, ...] = ()
     """Enclaves of which a file changed."""
@@ -197,7 +197,11 @@ def _check_release(
     installed: int,
     pinned: frozenset[str],
 ) -> None:
-    """Raise `KeystoreError` unless the release is sealed for this robot, usable and not older."""
+    """Raise `KeystoreError` unless a release can replace the installed one.
+
+    A trusted permissions CA must have sealed it for this robot, its number must not be lower than
+    ``installed``, and it must have an enclave of this robot.
+    """
     if release.robot != robot:
         raise KeystoreError(
             f"the release is for robot {release.robot}, not for {robot}",

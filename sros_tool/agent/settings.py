@@ -66,7 +66,7 @@ def agent_folder(folder: Path) -> Path:
 
 
 def check_owner(folder: Path) -> None:
-    """Raise `KeystoreError` unless the agent's folder is safe: nobody else can change it.
+    """Raise `KeystoreError` unless only the user who runs the agent can change its folder.
 
     An agent that runs as root in a folder of another user would run programs which that user
     chooses.

@@ -410,7 +410,7 @@ _NEEDED_TLS_FILES = {
 
 
 def secured_by(environment: Mapping[str, str], folder: Path) -> Iterator[str]:
-    """Yield clauses on settings that secure nodes started with an environment, in a folder."""
+    """Yield clauses on settings that secure nodes which start with an environment in a folder."""
     if environment.get(ENABLE) == "true":
         yield f"{ENABLE} is set"
     if is_zenoh(environment):

@@ -498,7 +498,10 @@ def _why_impossible(name: str) -> str:
 
 
 def _kind_of_ros_name(statement: _Statement) -> str:
-    """Return the kind, "topics" or "services", of a ROS 2 name; "" if the rule has that kind."""
+    """Return the kind that ROS 2 gives to a name, if the policy states another kind; else "".
+
+    The kind is "topics" or "services".
+    """
     kind, name = statement.right.kind, statement.name
     if kind != "services":
         is_service = (
@@ -779,7 +782,7 @@ def _denied_start_actions_sentence(lacking: Sequence[_NodeLackingRight]) -> str:
 
 
 def _different_common_part_cause(folder: str, lacking: Sequence[_NodeLackingRight]) -> Cause:
-    """Return the common cause of findings: an included common part differs from the one of sros."""
+    """Return the common cause of findings: an included common part is not the shipped part."""
     new, old = quote(folder), quote(f"{folder}.old")
     return Cause(
         f"the included '{folder}/node.xml' lacks rights that the file of this sros has",
@@ -1414,7 +1417,7 @@ def _shared_namespaces(fleet: Fleet, enclaves: Iterable[Enclave]) -> Iterator[st
 
 
 def _robots_with_the_same_node(fleet: Fleet, enclaves: Iterable[Enclave]) -> frozenset[str]:
-    """Return the names of robots that have a node of another robot, by its full name."""
+    """Return the names of robots with a node whose full name a node of another robot has, too."""
     from sros_tool.fleet.robots import robot_of
 
     robots_by_node: dict[str, set[str]] = defaultdict(set)

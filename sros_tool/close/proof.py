@@ -76,7 +76,7 @@ def prove(robot: LocalRobot) -> CloseState:
 def proofs_of(robot: LocalRobot, state: CloseState, patience: float) -> list[Proof]:
     """Wait until each process runs in its enclave, and prove that the robot is closed.
 
-    If the enclave of the observer has expired, nothing but the files is examined.
+    If the enclave of the observer has expired, only the files are examined.
     """
     expired = _expired_enclaves(robot, robot.export)
     if OBSERVER in expired:

@@ -180,7 +180,7 @@ class RunningRobot:
         return f"{warning}{newer} changed, or got another mode, after the start of"
 
     def with_later_processes(self, observed: ObservedProcesses) -> ObservedProcesses:
-        """Return observed processes with their later commands, and with processes of new enclaves.
+        """Return the observed processes with their present commands, and processes of new enclaves.
 
         Only processes of users who can read the enclaves count, because sros proposes to run their
         commands.
@@ -240,9 +240,9 @@ def secured_process(process: Process, enclave: str) -> ClosedProcess:
 def _with_running_command(observed: ClosedProcess, running: Sequence[Process]) -> ClosedProcess:
     """Return an observed process with the command of the only program that runs in its enclave.
 
-    Programs of `ros2` and sros, such as `ros2 topic echo` and `sros demo talker`, do not count. The
-    command also stays if a unit, a launch, a container or another process starts the observed
-    process.
+    Programs of `ros2` and sros, such as `ros2 topic echo` and `sros demo talker`, do not count. If
+    a unit, a launch, a container or another process starts the observed process, its command does
+    not change.
     """
     started_by = observed.unit or observed.launch or observed.container or observed.shares
     programs = {process.program: process for process in running}

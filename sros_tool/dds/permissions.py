@@ -378,7 +378,7 @@ OverlapTest = Callable[[str], bool]
 def _overlap_by_text(names: Sequence[str]) -> OverlapTest:
     """Return a function that returns whether an expression and any of ``names`` match.
 
-    The match is textual: an expression has to match the text of the other one as a pattern.
+    The match is textual: one of the two, as a pattern, has to match the text of the other.
     """
     return lambda name: any(
         fnmatchcase(other_name, name) or fnmatchcase(name, other_name) for other_name in names

@@ -395,7 +395,7 @@ def backend_by_hand(role: Role, environment: Mapping[str, str]) -> str:
 
 
 def _rmw_here(environment: Mapping[str, str]) -> str:
-    """Return the RMW on DDS of this shell or machine, or ""."""
+    """Return the RMW of this shell, or else an installed RMW that uses DDS, or ""."""
     installed = rmw_implementations(environment)
     return environment.get(RMW) or next(filter(vendor_of, installed), "")
 

@@ -309,7 +309,7 @@ _FLOODER, _ERASER = "flooder", "eraser"
 
 
 class _RefusedError(Exception):
-    """Raised without a connection to a router whose port is open."""
+    """Raised if there is no connection to a router, although its port is open."""
 
 
 def _open(config: zenoh.Config, patience: float, stop: threading.Event) -> zenoh.Session | None:

@@ -187,7 +187,7 @@ def open_to_ask(
 
 
 def is_policy(path: Path) -> bool:
-    """Return whether a path is a file or a folder of policies, so that it may be a policy."""
+    """Return whether a path may be a policy: it is a file, or a folder of policies."""
     if not path.is_dir() or is_keystore(path) or is_enclave(path):
         return path.is_file()
     from sros_tool.policy.document import files_of_policies  # not needed for a keystore
@@ -264,7 +264,7 @@ def signed_enclave(
 
 
 def _load_enclave(folder: Path, moment: datetime) -> LoadedEnclave:
-    """Load the enclave in a folder, under the common name of its certificate, or ""."""
+    """Load the enclave in a folder; its name is the common name of its certificate, or ""."""
     from sros_tool.pki.certificates import common_name_of
 
     state = open_enclave(folder, now=moment)

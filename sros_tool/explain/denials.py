@@ -322,7 +322,7 @@ def as_learned(
 ) -> Learned:
     """Return the proposed rights as profiles.
 
-    With ``enclave``, only that enclave gets rights: from denials that name this enclave or none.
+    With ``enclave``, only that enclave gets rights: those of denials that name it or no enclave.
     ``node`` (namespace and name) names the profile. Without ``node``, the rights go to the node
     whose standard services were denied, else to the only profile of the enclave in ``policy``, else
     to a profile for any node: DDS checks only the enclave.  If ``policy`` does not have the

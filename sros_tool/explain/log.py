@@ -704,7 +704,7 @@ class _Examiner:
         return UNNOTICED_FAULT if problems else None
 
     def message(self, hits: list[_Hit]) -> LogFinding | None:
-        """Return the finding for a group of equal messages; None if the messages are no trouble."""
+        """Return the finding for a group of equal messages; None if they show no problem."""
         named = self._find(hits[0].enclave)
         meaning = self._meaning(hits[0], named)
         if meaning is None:

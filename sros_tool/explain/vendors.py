@@ -341,7 +341,7 @@ def _not_a_topic_notes(answer: Answer, asked_enclave: AskedEnclave) -> Iterator[
 
 
 def _other_name_notes(answer: Answer, asked_enclave: AskedEnclave) -> Iterator[Note]:
-    """Yield a note if another name may be meant: a similar name, or a name with an offering peer.
+    """Yield a note on names that may be meant, if no peer has a right to the denied name.
 
     A name to which a peer has a right is no mistake.
     """
@@ -468,7 +468,7 @@ class AccessWithoutIdentity(NamedTuple):
 
     @staticmethod
     def joined(opened: Iterable[AccessWithoutIdentity]) -> AccessWithoutIdentity:
-        """Return the open parts of several enclaves or domains together."""
+        """Return the access in several enclaves or domains together."""
         known = tuple(opened)
         if any(opened_parts.whole for opened_parts in known):
             return AccessWithoutIdentity(whole=True)

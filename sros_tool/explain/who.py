@@ -132,7 +132,7 @@ def note_on_export(keystore: OpenedKeystore) -> Iterator[Note]:
 
 
 def answer_for_all(decider: Decider, question: Question, kind: str | None) -> AnswerForAll:
-    """Return the decisions on all enclaves, about an action if ``question`` names an action.
+    """Return the decisions on all enclaves; for the name of an action, they are about the action.
 
     ``kind`` is the kind of the name (topic, service or action) if the user gave it.
     """

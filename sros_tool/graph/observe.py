@@ -306,7 +306,7 @@ def watch(
     When the union has grown, ``report`` is called with it after ``still`` seconds without a change,
     so that no node is reported before it is discovered completely.  At the latest, it is called
     after ``patience`` seconds.  If a node that has just started is not announced yet, the watch
-    ends up to ``patience`` seconds later.
+    lasts up to ``patience`` seconds longer.
     """
     begin = clock()
     seen = union = reported = Observation()

@@ -424,7 +424,7 @@ class _Topics:
         return self._first_earlier(self._names.overlapping(topic), index)
 
     def _first_earlier(self, topics: Iterable[str], index: int) -> str:
-        """Return the first of ``topics`` in an earlier rule that has a domain of rule ``index``."""
+        """Return the first of ``topics`` in an earlier rule with a domain of the rule ``index``."""
         for topic in topics:
             for place in self._places[topic]:
                 if place < index and _share_domains(self._rules[place], self._rules[index]):
@@ -644,7 +644,7 @@ def check_governance(
 
 @dataclass(frozen=True, slots=True)
 class _ChosenByTemplate:
-    """A function that says whether the governance of a template's settings has the same finding."""
+    """A function that returns whether a template's own governance would have the same finding."""
 
     kind: FindingKind
     text: str

@@ -354,7 +354,7 @@ def _folder_findings(
 
 
 def _real_path_in_mounted_secret(key: str) -> str:
-    """Return the real path of a key in a mounted Kubernetes secret; of other keys, the given path.
+    """Return the real path of a key in a mounted Kubernetes secret, or else the given path.
 
     In such a secret, files are links into ..data, which is a link to a sibling folder.
     """

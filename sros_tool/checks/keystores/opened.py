@@ -90,7 +90,7 @@ class Circumstances:
 
 @dataclass(frozen=True)
 class CheckedKeystore:
-    """A view for checks of a keystore, or of an export of it for a robot.
+    """A keystore, or an export for a robot, as checks read it.
 
     A file that exists and cannot be read counts as missing, and is listed in ``unread``.
     """
@@ -230,7 +230,7 @@ class CheckedKeystore:
 
 @dataclass(frozen=True)
 class CheckedEnclave:
-    """A view for checks of an enclave: its name, its files, and its keystore."""
+    """An enclave as checks read it: its name, its files, and its keystore."""
 
     keystore: CheckedKeystore
     name: str

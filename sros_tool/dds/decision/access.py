@@ -375,7 +375,7 @@ class _GrantRules:
         return _every_topic() - NameSet.union(filter(None, crashing))
 
     def _crashing_topics(self, group: Sequence[_TopicEntry]) -> NameSet | None:
-        """Return the topics for which reading a criteria crashes the process, or None.
+        """Return the topics for which reading these criteria crashes the process, or None.
 
         An empty ``<topic>`` crashes the process, unless an earlier ``<topic>`` of the criteria
         matches.
@@ -894,7 +894,7 @@ class Access:
         return self._granted.deciding_rules(self._granted.rules, *_ENDPOINTS)
 
     def _creation(self, verb: AccessVerb, topic: str) -> RuleVerdict:
-        """Return the verdict on creating a topic, the step before an endpoint for ``verb``."""
+        """Return the verdict on creating a topic, which comes before the endpoint for ``verb``."""
         if not self._traits.asks_both_directions:
             return self._rules_for_both_directions.ask_topic(topic)
         directions = sorted(_ENDPOINTS, key=lambda endpoint: endpoint is not verb)

@@ -43,7 +43,7 @@ class Role(StrEnum):
 
     @property
     def uses(self) -> str:
-        """Whether the role's ``topic`` names a topic, a service or an action."""
+        """The kind of name that the role's ``topic`` is: topic, service or action."""
         if self in (Role.SERVER, Role.CLIENT):
             return "service"
         return "action" if self in (Role.ACTION_SERVER, Role.ACTION_CLIENT) else "topic"

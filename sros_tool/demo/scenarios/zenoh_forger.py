@@ -459,7 +459,7 @@ def revoked_name_in_use_again(copy: KeystoreCopy) -> None:
 
 
 def rights_taken_away(copy: KeystoreCopy) -> None:
-    """Take the topic from the talker in the keystore, while all processes run."""
+    """Take away the talker's right to the topic in the keystore, while all processes run."""
     _change_rights(copy, zenoh_policy(copy.topic, silent=copy.enclave("talker")))
 
 
@@ -475,7 +475,7 @@ def _revoke_talker(copy: KeystoreCopy) -> dict[str, bytes]:
 
 
 def _keep_stolen(copy: KeystoreCopy, files: Mapping[str, bytes]) -> None:
-    """Put a copy of an enclave's files, which a thief made, under another name."""
+    """Store the copy that a thief made of an enclave's files, under another name."""
     folder = enclave_path(copy.root, STOLEN)
     folder.mkdir(mode=0o700)
     for name, data in files.items():

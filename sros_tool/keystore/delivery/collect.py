@@ -934,8 +934,8 @@ def _defer_requests(
 
     The key that vouches for a new key may have been revoked after the backup.  If the keystore must
     not publish before ``--restored``, all requests are refused, because a new certificate comes
-    with the rights of the backup.  ``is_restored`` and ``is_older`` say what messages of this run
-    show.
+    with the rights of the backup.  ``is_restored`` and ``is_older`` say whether messages of this
+    run show lost revocations or later releases.
     """
     requests = [request for message in messages for request in message.requests if request.request]
     if not requests:

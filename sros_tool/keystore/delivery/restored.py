@@ -157,8 +157,9 @@ class LaterSeals:
     def _has_issued(self, sealed: bytes) -> bool:
         """Return whether the keystore issued all files that a seal lists, except certificates.
 
-        Then publishing was only interrupted before the ledger recorded its number: whoever can read
-        the folder has this seal.  Permissions are signed with each certificate of an enclave.
+        If so, publishing was only interrupted before the ledger recorded the number of the release,
+        and whoever can read the folder has this seal.  Certificates need no comparison, because
+        permissions are signed again with each new certificate.
         """
         listed = _LISTED_FILE.findall(sealed.decode())
         digests = {sha256 for sha256, _ in listed}
