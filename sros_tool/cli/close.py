@@ -87,6 +87,13 @@ def _run(words: Sequence[str], shows_output: bool) -> tuple[int, str, str]:
     help="Remember that ENCLAVE belongs to another machine, such as a laptop, and keep its key "
     "out of the export. Can be repeated.",
 )
+@click.option(
+    "--here",
+    metavar="ENCLAVE",
+    multiple=True,
+    help="Remember that ENCLAVE belongs to this machine again, and export it: the opposite of "
+    "--elsewhere. Can be repeated.",
+)
 @dry_run_option
 @json_option
 def close(
@@ -99,6 +106,7 @@ def close(
     partial: bool,
     without: tuple[str, ...],
     elsewhere: tuple[str, ...],
+    here: tuple[str, ...],
     dry_run: bool,
     as_json: bool,
 ) -> int:
@@ -142,15 +150,16 @@ def close(
         raise UsageError("--for is for watching an open robot", "", "Leave it out.")
     if prove and dry_run:
         raise UsageError("--proof changes nothing", "", "Leave --dry-run out.")
-    if elsewhere and (prove or undo):
-        raise UsageError(
-            "--elsewhere changes the export",
-            "",
-            f"Run `sros close {shlex.quote(str(folder))} --elsewhere {elsewhere[0]}` first; the "
-            "folder remembers it.",
-        )
+    for option, enclaves in (("--elsewhere", elsewhere), ("--here", here)):
+        if enclaves and (prove or undo):
+            raise UsageError(
+                f"{option} changes the export",
+                "",
+                f"Run `sros close {shlex.quote(str(folder))} {option} {enclaves[0]}` first; the "
+                "folder remembers it.",
+            )
     shell = Shell(_run, lambda line: echo(line, err=True), os.environ, now, local_zone(os.environ))
-    robot = LocalRobot(folder, domain_of(domain_text), shell, without, elsewhere)
+    robot = LocalRobot(folder, domain_of(domain_text), shell, without, elsewhere, here)
     can_undo = undo and robot.export.exists()  # the export shows which processes are closed
     if (apply or prove or undo) and not (robot.observed or can_undo):
         if not folder.is_dir():
@@ -304,8 +313,6 @@ def _show_end(
     robot: LocalRobot, closed: CloseState, *, apply: bool, holds: bool, partial: bool
 ) -> None:
     """Print whether the robot is closed, the reasons, and what to do next."""
-    from sros_tool.close.preparation import rmws_without_security
-
     folder, observed = shlex.quote(str(robot.folder)), closed.observed
     ask = f"sros close {folder} --proof"
     idle = closed.stopped if closed.secured else {*observed.ended}
@@ -345,6 +352,8 @@ def _show_end(
             echo(f"stop {stop}, and start it with:" if stop else "start again with:")
             echo(f"  {command}")
         answer = f"next: run these commands, and then {ask}"
+        if not_starting := _advice_without_security(robot, closed):
+            answer = f"no node would start by these commands yet; next: {not_starting}"
     else:
         steps = f"stop the robot, start each process by the commands in {robot.commands_file}"
         if closed.secured:
@@ -358,10 +367,16 @@ def _show_end(
             following = f"sros close {folder} --apply"
         else:
             following = f"{steps}, and ask {ask}"
-        if not closed.secured and rmws_without_security(robot, observed):
-            following = "sros doctor, to find an RMW that enforces security, and set it"
+        following = _advice_without_security(robot, closed) or following
         answer = f"{_state_text(closed, apply=apply)}{_validity_text(closed)}; next: {following}"
     echo(f"{answer}{_other_machines_advice(robot, closed)}", err=True)
+
+
+def _advice_without_security(robot: LocalRobot, closed: CloseState) -> str:
+    """Return what to do if no process can start closed with the present RMW; "" if one can."""
+    if closed.secured or not robot.rmws_without_security():
+        return ""
+    return "sros doctor, to find an RMW that enforces security, and set it"
 
 
 def _show_undone(robot: LocalRobot, closed: CloseState) -> None:

@@ -41,8 +41,6 @@ from sros_tool.runtime.environment import RMW_ZENOH, node_argument
 from sros_tool.runtime.processes import SEVERAL_USERS, launch_verb
 from sros_tool.runtime.rmw import (
     RMW,
-    built_without_security,
-    default_rmw,
     no_security_text,
 )
 from sros_tool.runtime.variables import ENCLAVE
@@ -91,9 +89,10 @@ def prepare(robot: LocalRobot, duration: str | None, *, partial: bool, dry_run: 
     _check_folder(robot)
     if not duration:
         robot.check_rmw()
-    if robot.observed and robot.named_elsewhere:
-        robot.check_elsewhere()
+    if robot.observed and (robot.named_elsewhere or robot.named_here):
+        robot.check_machines()
         robot.observed = robot.observed.belonging_elsewhere(robot.named_elsewhere)
+        robot.observed = robot.observed.belonging_here(robot.named_here)
         if not dry_run:
             robot.remember(robot.observed)
     denied_before: Sequence[str] = ()
@@ -113,7 +112,7 @@ def prepare(robot: LocalRobot, duration: str | None, *, partial: bool, dry_run: 
     newly_denied = [right for right in denied if right not in denied_before]
     problems += _problems_of(robot, state, partial=partial)
     if not state.secured:
-        for rmw in rmws_without_security(robot, state.observed):
+        for rmw in robot.rmws_without_security():
             robot.shell.say(
                 f"WARNING: {no_security_text(rmw)}. Before you stop the robot, find an RMW that "
                 "enforces security: sros doctor"
@@ -286,14 +285,6 @@ def _run_step(robot: LocalRobot, step: CommandStep) -> tuple[str, list[str]]:
     if step.into:
         replace_file(step.into, output.encode())
     return "done", []
-
-
-def rmws_without_security(robot: LocalRobot, observed: ObservedProcesses) -> list[str]:
-    """Return the RMWs that the processes use and that were built without security."""
-    environment = robot.shell.environment
-    default = default_rmw(environment)
-    rmws = sorted({process.rmw or default for process in observed.processes})
-    return [rmw for rmw in rmws if built_without_security(rmw, environment)]
 
 
 def _enclaves_without_origin(robot: LocalRobot) -> list[str]:

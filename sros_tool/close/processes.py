@@ -284,6 +284,10 @@ class ObservedProcesses(NamedTuple):
             not_here=sorted(not_here),
         )
 
+    def belonging_here(self, names: Iterable[str]) -> ObservedProcesses:
+        """Return a copy in which the enclaves ``names`` belong to this machine again."""
+        return self._replace(not_here=sorted({*self.not_here}.difference(names)))
+
     def within(self, policy: Policy) -> ObservedProcesses:
         """Return a copy without enclaves that the policy does not have any more."""
         names = {ROUTER, *(enclave.path for enclave in policy.enclaves)}

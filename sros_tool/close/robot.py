@@ -31,7 +31,7 @@ from sros_tool.owners import other_writers, replaceable_on_the_way
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import Policy
 from sros_tool.runtime.environment import RMW_ZENOH
-from sros_tool.runtime.rmw import RMW
+from sros_tool.runtime.rmw import RMW, built_without_security, default_rmw
 from sros_tool.runtime.variables import domain_of
 from sros_tool.values import as_plain
 from sros_tool.wording import first_few
@@ -99,9 +99,10 @@ class LocalRobot:
         shell: Shell,
         without: Iterable[str] = (),
         elsewhere: Iterable[str] = (),
+        here: Iterable[str] = (),
     ) -> None:
         self.folder, self.shell, self.without = folder, shell, sorted({*without})
-        self.named_elsewhere = sorted({*elsewhere})
+        self.named_elsewhere, self.named_here = sorted({*elsewhere}), sorted({*here})
         self.close_command = f"sros close {shlex.quote(str(folder))}"
         self.policy, self.observer = folder / CLOSED_POLICY, folder / "observer.xml"
         self.requirements = folder / REQUIREMENTS
@@ -184,7 +185,14 @@ class LocalRobot:
     @property
     def not_here(self) -> set[str]:
         """The enclaves that belong to other machines."""
-        return {*self.named_elsewhere, *self.processes.not_here}
+        return {*self.named_elsewhere, *self.processes.not_here}.difference(self.named_here)
+
+    def rmws_without_security(self) -> list[str]:
+        """Return the RMWs that the observed processes use and that were built without security."""
+        environment = self.shell.environment
+        default = default_rmw(environment)
+        rmws = sorted({process.rmw or default for process in self.processes.processes})
+        return [rmw for rmw in rmws if built_without_security(rmw, environment)]
 
     @property
     def rights_source(self) -> Path:
@@ -228,10 +236,19 @@ class LocalRobot:
         content = f"{json.dumps(as_plain(observed), indent=2)}\n"
         replace_file(self.processes_file, content.encode())
 
-    def check_elsewhere(self) -> None:
-        """Raise `UsageError` if --elsewhere names an enclave that the robot does not have."""
+    def check_machines(self) -> None:
+        """Raise `UsageError` if --elsewhere or --here names an enclave that it cannot move."""
         known = (self.keystore_enclaves() - {OBSERVER}) | self.policy_enclaves()
         check_enclaves(self.named_elsewhere, known, "--elsewhere")
+        check_enclaves(self.named_here, known, "--here")
+        if both := {*self.named_here}.intersection(self.named_elsewhere):
+            raise UsageError(f"--elsewhere and --here both name {min(both)}", "", "Choose one.")
+        if already := sorted({*self.named_here}.difference(self.processes.not_here)):
+            raise UsageError(
+                f"{already[0]} already belongs to this machine",
+                "",
+                f"Leave --here out; `{self.close_command}` exports the enclave.",
+            )
 
     def check_rmw(self) -> None:
         """Raise `UsageError` if the robot runs on Zenoh and this shell uses DDS, or the reverse."""

@@ -18,6 +18,7 @@ from sros_tool.runtime.environment import (
     render_container,
     render_environment,
 )
+from sros_tool.runtime.rmw import no_security_text
 from sros_tool.runtime.units import unit_changes, unit_instance, unit_words, write_units
 from sros_tool.runtime.variables import KEYSTORE
 from sros_tool.values import FileChange
@@ -107,6 +108,8 @@ def _commands_text(robot: LocalRobot, state: CloseState) -> str:
     ]
     if state.secured:
         lines = [f"# Stop each of these processes, and start it {place}"]
+    if not state.secured:
+        lines = [*map(_warning_of_rmw, robot.rmws_without_security()), *lines]
     lines = [*lines, *_commands(due)] if due else []
     for name in state.new:
         start = state.observed.command_of_new(robot.export.absolute(), name)
@@ -119,6 +122,11 @@ def _commands_text(robot: LocalRobot, state: CloseState) -> str:
         launch = shlex.join(launch_words(folder, ("ros2", "launch"), ("PACKAGE", "FILE")))
         lines += ["", "# Any launch file; each process needs name= in it.", launch]
     return _text(lines).lstrip()
+
+
+def _warning_of_rmw(rmw: str) -> str:
+    """Return the comment that keeps a reader from stopping a robot that would not start again."""
+    return f"# NOT YET: {no_security_text(rmw)}. First find an RMW that enforces it: sros doctor"
 
 
 def _commands(by_hand: Mapping[str, Sequence[ClosedProcess]]) -> Iterator[str]:

@@ -25,12 +25,14 @@ from sros_tool.fleet.robots import (
 )
 from sros_tool.keystore.fleet import arguments_for, checked_fleet, enclaves_of_robot, load_fleet
 from sros_tool.keystore.layout import (
+    CLOSED_KEYSTORE,
     CLOSED_POLICY,
     FLEET,
     PERMISSIONS_FILE,
     PRIVATE,
     REVOKED,
     SETTINGS,
+    enclave_path,
     enclaves_below,
     folder_of_closed_robot,
     how_to_learn_one_process,
@@ -327,6 +329,14 @@ def missing_enclave_error(
     why = f"The keystore has {first_few(names, _MOST_SHOWN) or 'no enclave'}."
     if robot := folder_of_closed_robot(root):
         folder, policy = quote(str(robot)), quote(str(robot / CLOSED_POLICY))
+        if not keystore.is_original and enclave_path(robot / CLOSED_KEYSTORE, name).is_dir():
+            return KeystoreError(
+                missing,
+                f"'{robot / CLOSED_KEYSTORE}' has the enclave, but this export does not: perhaps "
+                "it belongs to another machine (--elsewhere of `sros close`).",
+                f"Start its process on that machine, or run `sros close {folder} --here "
+                f"{quote(name)}`.",
+            )
         return KeystoreError(
             missing,
             why,

@@ -258,6 +258,21 @@ _ROS_TEXTS = (
 
 _CYCLONE_PARTICIPANT_TEXTS = (
     _log_text(
+        "peer-revoked", _CYCLONE, r"(?:Begin|Process) handshake (?:request |reply )?failed: "
+        r"Certificate not valid: error: certificate revoked",
+        "a PEER was refused, not this process: its certificate is revoked. The line names the "
+        "subject of this certificate",
+        "If the certificate was replaced (`sros renew --revoke-old`), restart the processes of the "
+        "peer's enclave, with its new files. If none of your processes still has the certificate, "
+        "somebody tries to use it: the refusal is right.",
+    ),
+    _log_text(
+        "peer-expired", _CYCLONE, r"(?:Begin|Process) handshake (?:request |reply )?failed: "
+        r"Certificate not valid: error: certificate (?P<reason>has expired|is not yet valid)",
+        "a PEER was refused, not this process: by the clock of this host, its certificate {reason}",
+        f"Compare the clocks of both hosts. {_RENEW_PARTICIPANT}",
+    ),
+    _log_text(
         "peer-refused", _CYCLONE, r"(?:Begin|Process) handshake (?:request |reply )?failed: "
         r"Certificate not valid: error: (?P<reason>[^;]+)",
         "a PEER was refused, not this process: its certificate is not accepted ({reason}); if the "

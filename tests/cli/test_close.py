@@ -20,6 +20,7 @@ import yaml
 
 from sros_tool.cli import close
 from sros_tool.close import apply, assignment, nodes, preparation, proof, state, watch
+from sros_tool.close import robot as of_robot
 from sros_tool.close.assignment import with_command_of_unit
 from sros_tool.close.preparation import steps
 from sros_tool.close.processes import ClosedProcess, ObservedProcesses, read_processes
@@ -187,7 +188,7 @@ def robot(beside_graph: Beside, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     )
     # The RMWs of this machine may lack security.
     lacking = tmp_path / "lacking"
-    monkeypatch.setattr(preparation, "built_without_security", lambda *_: lacking.exists())
+    monkeypatch.setattr(of_robot, "built_without_security", lambda *_: lacking.exists())
     monkeypatch.setattr(apply, "_SYSTEMD_FOLDER", tmp_path / "systemd")
     monkeypatch.setattr(apply, "_RESTART_SECONDS", 0.1)
     monkeypatch.setattr(apply, "_STABLE_FOR", timedelta())
@@ -219,6 +220,16 @@ MADE = [
     *("common", "export", "keystore", "observed.json", "observer.xml", "policy.xml"),
     *("processes.json", "requirements.toml", "rights.html", "start"),
 ]
+
+
+def test_no_command_is_to_be_run_with_an_rmw_without_security(robot: Robot) -> None:
+    """No node would start again."""
+    (robot.folder / "lacking").touch()  # as the fixture has it
+    robot.close(RMW_IMPLEMENTATION="rmw_fastrtps_cpp")
+    commands = (robot.folder / "robot/start/commands.txt").read_text()
+    assert commands.startswith("# NOT YET: rmw_fastrtps_cpp is built without security")
+    said = robot.close("--apply", status=1, RMW_IMPLEMENTATION="rmw_fastrtps_cpp").err
+    assert "no node would start by these commands yet; next: sros doctor, to find" in said
 
 
 def test_everything_is_prepared_and_nothing_is_closed(robot: Robot) -> None:
@@ -1543,6 +1554,18 @@ def test_an_enclave_that_belongs_to_another_machine(robot: Robot) -> None:
         in ended.out
     )
     assert not (robot.folder / left).exists() and "/listener: process" not in ended.out
+    said = sros("run", "robot/export", "/listener", "--", "true", cwd=robot.folder).err
+    assert "or run `sros close" in said and "robot --here /listener`" in said, said
+    assert "--elsewhere and --here both name /listener" in (
+        robot.close("--elsewhere", "/listener", "--here", "/listener", status=2).err
+    )
+    ended = robot.close("--here", "/listener")
+    assert (robot.folder / left / "key.pem").exists(), ended
+    assert "not on this machine" not in ended.out
+    assert "/listener: new, start it with: sros run " in ended.out
+    assert "already belongs to this" in robot.close("--here", "/listener", status=2).err
+    robot.close("--elsewhere", "/listener")
+    assert not (robot.folder / left).exists()
     robot.by_hand = {"/talker"}
     sros("renew", "robot/keystore", "/talker", "--new-key", "--revoke-old", cwd=robot.folder).ok()
     shared = robot.folder / "robot/keystore/public/identity_ca.crl.pem"

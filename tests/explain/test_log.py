@@ -33,6 +33,7 @@ from tests.support.long_form import some
 
 LOGS = Path(__file__).with_name("logs")
 CYCLONE_LINE = "1795242829.914522 [0]     recvUC: "
+_HANDSHAKE = f"{CYCLONE_LINE}Process handshake failed: Certificate not valid: error: "
 FAST_LINE = "2026-01-01 12:00:00.000 [SECURITY Error] "
 FILE_LINE = "[1795309573.65] [EMERGENCY] 01.0f.78|0.0.1.c1 0 "
 FAST, FAST_14, CYCLONE = "fastdds_2.9.1", "fastdds_2.14.5", "cyclone_0.10.2"
@@ -472,6 +473,9 @@ def test_what_is_not_understood_is_shown(line: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "name"),
     [
+        (f"{_HANDSHAKE}certificate revoked; subject: /CN=\\/a(code: 200)", "peer-revoked"),
+        (f"{_HANDSHAKE}certificate has expired; subject: /CN=\\/a(code: 200)", "peer-expired"),
+        (f"{_HANDSHAKE}certificate is not yet valid; subject: /CN=a(code: 2)", "peer-expired"),
         (f"{CYCLONE_LINE}Could not load Access Control plugin.", "plugin"),
         (f"{CYCLONE_LINE}Could not load Cryptographic library", "plugin"),
         (f"{CYCLONE_LINE}Could not load security", "plugin"),
