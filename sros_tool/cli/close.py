@@ -155,8 +155,8 @@ def close(
             raise UsageError(
                 f"{option} changes the export",
                 "",
-                f"First run `sros close {shlex.quote(str(folder))}` with {option} alone; the folder "
-                "remembers it.",
+                f"First run `sros close {shlex.quote(str(folder))}` with {option} alone; "
+                "the folder remembers it.",
             )
     shell = Shell(_run, lambda line: echo(line, err=True), os.environ, now, local_zone(os.environ))
     robot = LocalRobot(folder, domain_of(domain_text), shell, without, elsewhere, here)
