@@ -974,7 +974,7 @@ class _ParallelAutomata:
         return lambda leaf: any(positions & self._ends[automaton] for automaton in leaf.automata)
 
     def longer_acceptance_test(self, positions: int) -> _Test:
-        """Return a test whether an automaton of a set may accept a longer text."""
+        """Return a function that says whether an automaton of a set may accept a longer text."""
 
         def ask(leaf: _Union) -> _Truth:
             if any(positions & self._endless[automaton] for automaton in leaf.automata):

@@ -821,12 +821,12 @@ def try_given_passphrase(root: Path, keyring: Keyring) -> None:
 
 
 def secrets() -> Callable[[str], str]:
-    """Return a secrets handler for PINs of tokens: environment or prompt."""
+    """Return a secrets handler that takes the PINs of tokens from the environment or a prompt."""
     return _Secrets(new=False)
 
 
 class _Secrets:
-    """A secrets handler that asks for each passphrase or PIN once: environment, file, prompt."""
+    """A secrets handler: takes a passphrase or PIN from the environment, a file, or one prompt."""
 
     def __init__(self, new: bool) -> None:
         self._new = new

@@ -706,7 +706,7 @@ def policies(
 
 
 def _copy(source: Path, target: Path, *, as_json: bool, dry_run: bool) -> None:
-    """Copy the shipped policies, or the common parts to a folder ``common``, to a folder."""
+    """Copy the shipped policies to a folder, or only the common parts to a folder ``common``."""
     from sros_tool.keystore.layout import is_keystore
     from sros_tool.policy.document import COMMON, CopiedPolicies, copy_policies
 

@@ -233,7 +233,7 @@ def _network(
     routers: Sequence[tuple[str, str]],
     crossing: Sequence[str],
 ) -> ZenohNetwork:
-    """Return the network of the settings, or the default network, with ``given_values``.
+    """Return the network of the settings, or the default network, changed by ``given_values``.
 
     ``routers`` are further routers with their endpoints; an empty endpoint removes a router.
     """

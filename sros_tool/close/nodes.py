@@ -184,7 +184,7 @@ class ObservedNodes:
         }
 
     def moved_endpoints(self, current: Observation | None = None) -> Set[MovedEndpoint]:
-        """Return the endpoints of renamed nodes whose names change, too."""
+        """Return the endpoints whose names change because their nodes were renamed."""
         return {
             MovedEndpoint(
                 node_name(node), expand("~", *self.renamed[node_name(node)]), before, after

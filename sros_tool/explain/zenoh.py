@@ -303,8 +303,8 @@ class ZenohEvaluator:
     ) -> None:
         """Read the routers.
 
-        In a copy of a keystore without keys, all keys count as present, except the key of
-        ``joining``.
+        In a copy of a keystore without keys, all keys count as present, unless the question is
+        whether an enclave may join (``joining``).
         """
         keystore.check()
         self._counts_keys = not (joining or keystore.has_keys)

@@ -286,7 +286,8 @@ def _hidden_enclave_findings(keystore: CheckedKeystore) -> Iterator[Finding]:
 def _has_link_to_identity_ca(keystore: CheckedKeystore) -> bool:
     """Return whether an enclave has a link to the identity CA, as in the original keystore.
 
-    The enclaves of an export have copies, even if somebody adds files to make it look original.
+    The enclaves of an export have copies instead.  So an export is recognized, even if somebody
+    adds files to make it look like an original keystore.
     """
     files = [keystore.opened.folder(name) / IDENTITY_CA_FILE for name in keystore.names]
     return not any(map(os.path.lexists, files)) or any(map(os.path.islink, files))

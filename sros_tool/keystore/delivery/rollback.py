@@ -102,7 +102,7 @@ def lost_serials(present: Mapping[str, bytes], sent: Mapping[str, bytes]) -> fro
 def _list_pairs(
     present: Mapping[str, bytes], sent: Mapping[str, bytes]
 ) -> Iterator[tuple[Revocations, Revocations]]:
-    """Yield the lists of each CA that the ``sent`` files trust: in ``present``, and in ``sent``.
+    """Yield two lists for each CA that the ``sent`` files trust: the present one and the sent one.
 
     In a rotation, the list of the second CA is in the file of the CAs.
     """
