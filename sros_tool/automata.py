@@ -220,10 +220,9 @@ class Automaton:
 
     @cached_property
     def levels(self) -> tuple[tuple[int, int], ...]:
-        """Pairs of a number of letters and positions (bits), sorted by the number.
+        """Pairs of a number and positions (bits), sorted by the number.
 
-        From the positions of a pair, at least that number of letters leads to an accepting
-        position.
+        The number says how many letters the nearest accepting position is away.
         """
         before: dict[int, list[int]] = {}
         for at, letters, to in self.edges:

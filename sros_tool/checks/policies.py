@@ -767,7 +767,7 @@ def _is_not_shipped(folder: str) -> bool:
 
 
 def _denied_start_actions_sentence(lacking: Sequence[_NodeLackingRight]) -> str:
-    """Return a sentence on the actions at the start of every node that the policy denies."""
+    """Return a sentence on the denied actions that a node takes when it starts."""
     nodes = list(dict.fromkeys(gap.node for gap in lacking))
     kinds = Counter(gap.finding.kind for gap in lacking)
     verbs = [

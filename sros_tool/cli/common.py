@@ -796,7 +796,7 @@ def keyring(
 
 
 def change_options(*, dry_run: bool, allow_refusal: Sequence[Vendor] = ()) -> ChangeOptions:
-    """Return the options of a change of a keystore that is made now, with the user's CA keys."""
+    """Return the options for changing a keystore now with the user's CA keys."""
     return {
         "now": now(),
         "keyring": keyring(),

@@ -640,7 +640,10 @@ def _to_do_lines(answer: Answer) -> Iterator[str]:
 
 
 def _requirements_forbidding(answer: Answer) -> Sequence[Requirement]:
-    """Return the requirements next to the keystore of a closed robot that forbid the change."""
+    """Return the requirements that forbid the change.
+
+    They are next to the keystore of a closed robot.
+    """
     from sros_tool.keystore.layout import folder_of_closed_robot
 
     root, change = answer.enclave.root, answer.change

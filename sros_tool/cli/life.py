@@ -667,9 +667,9 @@ def _show_status(status: RotationStatus, unconfirmed: Sequence[str] | str, as_js
 
 
 def _new_keys(identity: str | None, permissions: str | None, encrypt: bool) -> Keyring:
-    """Return a keyring for new CA keys, whose places only options name.
+    """Return a keyring for new CA keys.
 
-    Environment variables name the places of the current keys.
+    Only options name the places of new keys; environment variables name those of the current keys.
     """
     from dataclasses import replace
 

@@ -106,7 +106,7 @@ def check_duration(watch: str | None, spin_time: float | None) -> None:
 def observer_environment(
     enclave: str | None, keystore: Path | None, domain: str | None
 ) -> dict[str, str]:
-    """Return the environment variables to set for the observer: its domain, its enclave if any."""
+    """Return the environment variables that give the observer its domain and its enclave."""
     from sros_tool.runtime.variables import DOMAIN, domain_from
 
     if enclave is None:

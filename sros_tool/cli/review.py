@@ -700,7 +700,7 @@ def _sorted_by_weight(result: Review) -> list[ReviewStep]:
 
 
 def _detail(result: Review, step: ReviewStep, request: ReviewRequest) -> str:
-    """Return the details of a step as Markdown, or "" if `_sentence` is complete."""
+    """Return the details of a step as Markdown, or "" if `_sentence` already says everything."""
     from sros_tool.checks.formats import findings_markdown
     from sros_tool.checks.kind import ChosenFindings
     from sros_tool.cli.check import renewal_markdown

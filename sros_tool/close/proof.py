@@ -634,7 +634,7 @@ def _endpoints_without_peer(
 
 
 def _opposite(endpoint: Endpoint) -> Endpoint:
-    """Return the endpoint that can talk to an endpoint."""
+    """Return the counterpart of an endpoint: the subscriber of a publisher, or the reverse."""
     direction = SUBSCRIBE if endpoint.direction == PUBLISH else PUBLISH
     return endpoint._replace(direction=direction)
 

@@ -51,7 +51,7 @@ _StartedProcesses = dict[tuple[str, ...], tuple[Process, ProcessOrigin]]
 
 
 def check_watchable(robot: LocalRobot) -> None:
-    """Raise `SrosError` if the robot cannot be watched as an open one."""
+    """Raise `SrosError` if the robot cannot be watched as an open robot."""
     robot.shell.check_open()
     rmw = robot.shell.environment.get(RMW)
     running = RunningRobot(robot)

@@ -396,7 +396,7 @@ def old_permissions_after_renewal(copy: KeystoreCopy) -> None:
 
 
 def permissions_for_another_domain(copy: KeystoreCopy) -> None:
-    """Give the guest permissions with one more topic, signed by the CA for another domain."""
+    """Give the guest permissions with one more topic but for another domain, signed by the CA."""
     permissions = Permissions(_for_another_domain(_wider_permissions(copy), copy.domain))
     copy.put("guest", PERMISSIONS_FILE, copy.sign(render_permissions(permissions)))
 

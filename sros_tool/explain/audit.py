@@ -467,7 +467,7 @@ _STRAYS_TEXT = "not judged, because the writers or readers of these topics belon
 
 
 def _unjudged_notes(observation: Observation) -> list[tuple[Note, str]]:
-    """Return notes on what was not judged, paired with a text of number and names.
+    """Return notes on what was not judged, each with a text that has the number and the names.
 
     The text is "" for tools that only observe.
     """
