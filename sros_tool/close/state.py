@@ -201,6 +201,7 @@ class RunningRobot:
             for name, processes in running.items()
             if name not in {OBSERVER, *observed.not_here, *known}
             for process in processes
+            if not _is_tool(process)
         ]
         return observed._replace(processes=[*as_started, *later])
 
@@ -240,9 +241,8 @@ def secured_process(process: Process, enclave: str) -> ClosedProcess:
 def _with_running_command(observed: ClosedProcess, running: Sequence[Process]) -> ClosedProcess:
     """Return an observed process with the command of the only program that runs in its enclave.
 
-    Programs of `ros2` and sros, such as `ros2 topic echo` and `sros demo talker`, do not count. If
-    a unit, a launch, a container or another process starts the observed process, its command does
-    not change.
+    Programs of `ros2` and sros do not count. If a unit, a launch, a container or another process
+    starts the observed process, its command does not change.
     """
     started_by = observed.unit or observed.launch or observed.container or observed.shares
     programs = {process.program: process for process in running}
@@ -250,10 +250,15 @@ def _with_running_command(observed: ClosedProcess, running: Sequence[Process]) -
         return observed
     (process,) = programs.values()
     now = secured_process(process, observed.enclave)
-    is_tool = program_of(process.command).partition(".")[0] in _TOOLS
-    if now.unit or now.launch or now.container or is_tool:
+    if now.unit or now.launch or now.container or _is_tool(process):
         return observed
     return observed._replace(command=now.command, folder=now.folder, rmw=now.rmw, user=now.user)
+
+
+def _is_tool(process: Process) -> bool:
+    """Return whether a process is a test, such as `ros2 topic echo` or `sros demo talker`."""
+    is_tool = program_of(process.command).partition(".")[0] in _TOOLS
+    return is_tool and not process.is_router
 
 
 def keystore_text(enclave: ProcessEnclave) -> str:

@@ -134,6 +134,13 @@ def test_the_command_of_a_secured_process_takes_the_place_of_the_observed_one(
         ([before._replace(shares=("/x",))], (camera,)),
     ):
         assert command_after(known, *running) == ("pilot", "/opt"), (known, running)
+    for running, commands in (
+        ((camera,), [("pilot", "--camera")]),
+        ((replace(camera, command=demo_node("talker", "/image")),), []),
+    ):
+        now = RunningRobot(robot, RunningProcesses(running))
+        later = now.with_later_processes(ObservedProcesses(0)).processes
+        assert [known.command for known in later] == commands, "a test is no process of the robot"
 
 
 def test_commands_name_the_rmw_and_on_zenoh_the_enclave() -> None:
