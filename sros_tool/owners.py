@@ -21,8 +21,8 @@ _MOST_LINKS = 40
 def other_writers(state: os.stat_result, trusted_users: frozenset[int]) -> str:
     """Return why other users than ``trusted_users`` (user ids) can change a file or folder, or "".
 
-    The group counts unless it is the private group of a trusted user, which Debian and other
-    systems give to each user, with umask 002.
+    The members of the group count as other users, unless it is the private group of a trusted user.
+    Debian and other systems give each user such a group, with umask 002.
     """
     if state.st_uid not in trusted_users:
         return f"it belongs to {user_name(state.st_uid)}"

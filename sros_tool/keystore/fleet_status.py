@@ -561,9 +561,10 @@ class FleetStatus:
     def with_overdue(self, now: datetime, max_age: timedelta | None = None) -> FleetStatus:
         """Return a copy in which silent robots are offline, with the remedy for each robot.
 
-        A robot is offline if its last confirmation is older than ``max_age``; without ``max_age``,
-        if it fetches and has sent nothing for more than a day.  For robots that fetch, the time in
-        the message itself counts, too, because whoever has the inbox could hold messages back.
+        A robot is offline if its last confirmation is older than ``max_age``.  Without ``max_age``,
+        only a robot that fetches can be offline: if it has sent nothing for more than a day.  For
+        robots that fetch, the time in the message itself counts, too, because whoever has the inbox
+        could hold messages back.
         """
         overdue = frozenset(
             robot.robot
@@ -867,7 +868,7 @@ class _Expiring(NamedTuple):
 
 
 class _KeystoreRecords:
-    """Looks up confirmed files that differ from the keystore in the ledger."""
+    """A reader of the ledger, which identifies confirmed files that differ from the keystore's."""
 
     def __init__(
         self,
@@ -1564,7 +1565,7 @@ def fleet_metrics(
 def _dds_metrics(
     robots: Sequence[tuple[Mapping[str, str], RobotStatus]], advisories: Sequence[Advisory] | None
 ) -> Iterator[Metric]:
-    """Yield metrics on known vulnerabilities of the robots' DDS, and on DDS that is not known."""
+    """Yield metrics on known vulnerabilities of robots' DDS, and on robots with unknown DDS."""
     numbers: list[Sample] = []
     unknown: list[Sample] = []
     for labels, robot in robots:

@@ -46,7 +46,7 @@ from sros_tool.validity import iso, parse_iso
 
 
 def other_enclave(keystore: OpenedKeystore, name: str, certificate: x509.Certificate) -> str:
-    """Return the enclave for which the certificate in the folder of ``name`` was issued, or "".
+    """Return the other enclave for which ``certificate``, in the folder of ``name``, was issued.
 
     The result is "" if the certificate was issued for ``name`` itself, or comes from another PKI,
     whose names no vendor compares with the folder.

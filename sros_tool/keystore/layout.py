@@ -218,7 +218,7 @@ def is_layout_path(path: str) -> bool:
 
 
 def is_keystore(root: Path) -> bool:
-    """Return whether ``root`` is a keystore, either with its CAs or an export without them.
+    """Return whether ``root`` is a keystore with its CAs, or an export of one without CAs.
 
     Raises:
         KeystoreError: this user must not read the folders of ``root``.
@@ -298,7 +298,8 @@ def folder_of_closed_robot(root: Path) -> Path | None:
 def how_to_learn_one_process(robot: Path, domain: int = 0) -> str:
     """Return clauses on how to learn the rights of one process while all others stay closed.
 
-    ``robot`` is a folder of `sros close`, and ``domain`` the ROS domain. Only open nodes are seen.
+    ``robot`` is a folder of `sros close`, and ``domain`` the ROS domain. The rights of a process
+    can be learned only while it runs open.
     """
     option = f" --domain {domain}" * bool(domain)
     return (

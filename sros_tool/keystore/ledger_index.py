@@ -327,9 +327,9 @@ class IndexUpdate:
     def save(self) -> None:
         """Write the index to the keystore; call this after `root` and the commit of the ledger.
 
-        If root runs this in a keystore of another user, nothing is written, because the user could
-        lead the write to another file.  In this case, or if the process stops here, the next change
-        makes the index again.
+        If this process runs as the user root in a keystore of another user, nothing is written,
+        because the user could lead the write to another file.  In this case, or if the process
+        stops here, the next change makes the index again.
         """
         try:
             if not _is_own(self._folder):

@@ -151,7 +151,7 @@ class _RaisedProtection:
     def _deciding_entry(self, topic: str, protection: StatedProtection) -> int | None:
         """Return the number of the settings entry that decides on all names of ``topic``, or None.
 
-        Entries for only some of the names are raised to the stated level.
+        As a side effect, entries for only some of the names are raised to the stated level.
         """
         wide: list[str] = []
         for name in self._topics.overlapping(topic):

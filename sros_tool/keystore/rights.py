@@ -484,7 +484,7 @@ class _Reader:
     documents: dict[str, Permissions] = field(default_factory=dict)
 
     def permissions(self, file: Path, label: str) -> tuple[frozenset[Right], tuple[str, ...]]:
-        """Return the rights in a permissions document, and the enclaves for which it is."""
+        """Return the rights in a permissions document, and the enclaves of its grants."""
         data = self.files.read(file, "permissions document")
         if b"multipart/signed" in data[:1000].lower():
             try:
@@ -590,7 +590,7 @@ class DifferentProtection(NamedTuple):
 
 
 class DifferentEnclave(NamedTuple):
-    """An enclave without rights that only one side has."""
+    """An enclave that only one side has, and that has no rights there."""
 
     only: OnlySide
     """The side that has the enclave."""
@@ -638,7 +638,7 @@ class PolicyDifference(NamedTuple):
 
 
 class SourcesDifference(NamedTuple):
-    """The difference between two sources of rights; false if they do not differ."""
+    """The difference between two sources of rights; in a condition, False if they do not differ."""
 
     scope: frozenset[str] | None
     """The enclaves that were compared; None for all."""

@@ -129,7 +129,7 @@ def issue_ca(key: PrivateKey, name: x509.Name, validity: Window) -> x509.Certifi
 
 
 def check_signer(certificate: x509.Certificate) -> None:
-    """Raise `PkiError` if sros cannot sign with a CA whose certificate breaks rules of X.509."""
+    """Raise `PkiError` if a CA certificate breaks rules of X.509, so that sros cannot sign."""
     if tolerant.is_tolerated(certificate):
         raise PkiError(
             f"sros cannot sign with the CA {subject_text(certificate.subject)}",

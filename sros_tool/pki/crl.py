@@ -341,7 +341,7 @@ def newest_list(data: bytes, authorities: bytes) -> x509.CertificateRevocationLi
 
 
 class Revocations(NamedTuple):
-    """The number of a revocation list, and its serial numbers; -1 and none without a list."""
+    """The number of a revocation list (-1: there is no list), and the revoked serial numbers."""
 
     number: int = -1
     serials: frozenset[int] = frozenset()

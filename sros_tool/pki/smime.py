@@ -593,7 +593,7 @@ def _check_values(*values: der.Value) -> None:
 
 
 def _attributes(attributes: bytes) -> dict[bytes, der.Value]:
-    """Map the types of attributes to first values, and check the form of all (RFC 5652, 11)."""
+    """Map the types of attributes to their first values; check all attributes (RFC 5652, 11)."""
     by_kind: dict[bytes, der.Value] = {}
     for attribute in der.children(attributes):
         name, values = _checked_parts(attribute, der.OID, der.SET)

@@ -62,7 +62,7 @@ def _module_to_load(parsed: TokenUri, *, named: bool) -> str:
 
 
 def _find_proxy() -> str:
-    """Return the path of p11-kit's proxy, a library that loads all registered ones; "" if missing.
+    """Return the path of p11-kit's proxy, which loads all registered libraries; "" if missing.
 
     libp11, too, loads the proxy if no other library is named (Debian and Ubuntu,
     libengine-pkcs11-openssl).

@@ -106,7 +106,7 @@ GroupRights = tuple[tuple[str, Qualifier], ...]
 
 
 def group_rights(rights: Iterable[tuple[str, Qualifier]]) -> Iterator[GroupRights]:
-    """Yield the rights of groups for a name: two groups if a right is allowed and denied."""
+    """Yield the rights of each group for a name: two groups if a right is allowed and denied."""
     ordered = sorted(rights, key=lambda right: (RIGHT_ORDER[right[0]], right[1]))
     if len({right for right, _ in ordered}) == len(ordered):
         yield tuple(ordered)
@@ -170,10 +170,10 @@ def parts(right: Right) -> tuple[Right, ...]:
 
 
 def action_right(right: str, name: str) -> tuple[str, str]:
-    """Return the right to the action of which ``right`` to ``name`` is a part, with its name.
+    """Return the right to an action, and its name, for a right to a part of the action.
 
-    Other pairs are returned unchanged. Subscriptions are also returned unchanged, because watching
-    an action does not need the right to command it.
+    Other pairs of ``right`` and ``name`` are returned unchanged.  Subscriptions are also returned
+    unchanged, because watching an action does not need the right to command it.
     """
     action, part = action_part(name)
     for whole, of in ACTION_PARTS.items():

@@ -488,7 +488,7 @@ def is_whole_policy(content: bytes) -> bool:
 
 
 def used_whole(policies: Iterable[str], content: Callable[[str], bytes | None]) -> dict[str, bool]:
-    """Map files that policies include completely to whether their root element is included.
+    """Map files that are used as a whole to whether their root element is used, too.
 
     Args:
         policies: the paths of the policies.

@@ -411,7 +411,7 @@ def short_text(violation: Violation) -> str:
 
 
 def _violation_clause(violation: Violation) -> str:
-    """Return a clause with the violation of a requirement, without the finding's subject."""
+    """Return a clause that states a violation, without the subject of the finding."""
     match violation.requirement:
         case Apart():
             return f"{_clause(violation)}: {_chain(violation.steps)}"

@@ -193,7 +193,7 @@ class NewNode(NamedTuple):
 
 
 class DroppedDenial(NamedTuple):
-    """A DENY of BASE if HEAD leaves some of its names without ALLOW or DENY.
+    """A DENY of BASE with some names that HEAD neither allows nor denies.
 
     The missing DENY gives no access, but users who merge the policy with others may rely on it.
     """
@@ -214,9 +214,10 @@ class DroppedDenial(NamedTuple):
 )
 @dataclass(frozen=True, slots=True)
 class Growth:
-    """Access and protection that HEAD adds and removes; true if HEAD adds access or protects less.
+    """Access and protection that HEAD adds and removes.
 
-    ``reach_unknown`` says why ``reach`` is not known, or is "".
+    In a condition, the value is True if HEAD adds access or protects less.  ``reach_unknown`` says
+    why ``reach`` is not known, or is "".
     """
 
     added: tuple[Gain, ...]
@@ -868,7 +869,7 @@ class _Denials:
 
 
 class _Stated:
-    """The rights that both sides state, in which the right that gives an added access is found."""
+    """An index of both sides' stated rights, which finds the right that gives an added access."""
 
     def __init__(self, old: AccessSource, new: AccessSource) -> None:
         self._old, self._new = old, new
@@ -1058,7 +1059,7 @@ def _new_reach(before: _Edges | None, after: _Edges | None) -> Iterator[NewReach
 
 
 def _fitting_pairs(side: AccessSource, worlds: Iterable[_World]) -> Iterator[tuple[str, str]]:
-    """Yield pairs of an enclave and another enclave whose permissions it can use in a world."""
+    """Yield pairs of enclaves; the first can use the permissions of the second in a world."""
     worlds = tuple(worlds)
     for enclave in side.permissions:
         fitting_others = (
@@ -1274,7 +1275,7 @@ def _enclaves_of_nodes(side: AccessSource, other: AccessSource) -> dict[_Node, _
 
 
 def _enclaves_near(robots: _EnclavesByRobot, robot: str) -> dict[str, Profile]:
-    """Return the enclaves of a node that belong to a robot or to no robot; all for ""."""
+    """Return the enclaves of a node that belong to ``robot`` or to no robot; for "", return all."""
     near = (robots.get("", {}), robots.get(robot, {})) if robot else robots.values()
     return {path: profile for profiles in near for path, profile in profiles.items()}
 

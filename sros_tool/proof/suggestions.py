@@ -268,7 +268,7 @@ def _with_robot_placeholders(
 
 
 def _with_placeholder(name: str, robot: Robot, placeholder: Placeholder) -> str:
-    """Return a name with a placeholder for the namespace of a robot before it, or for its name."""
+    """Return a name with a placeholder in place of a robot's namespace or name."""
     begin, rest = "", name
     space = f"{robot.namespace}/"
     if placeholder.value == "namespace" and robot.namespace != "/" and name.startswith(space):

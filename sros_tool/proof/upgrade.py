@@ -309,7 +309,7 @@ def _vulnerability_findings(
 def _newly_needed_right_findings(
     path: Path, circumstances: Circumstances, before: Distribution, after: Distribution
 ) -> Iterator[Finding]:
-    """Yield rights that a policy denies and that nodes need only after the update."""
+    """Yield findings on rights that a policy denies and that nodes need only after the update."""
     now, then = (
         policy_findings([path], replace(circumstances, distribution=distribution.given_name))
         for distribution in (before, after)

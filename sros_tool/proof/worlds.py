@@ -60,7 +60,7 @@ class Topics:
 
     @property
     def expression(self) -> str:
-        """The expression of the topics."""
+        """The expression that matches the topics: prefix, name and suffix."""
         return f"{self.begin}{self.name}{self.end}"
 
     def ros_name(self, topic: str) -> str:

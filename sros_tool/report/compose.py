@@ -100,7 +100,7 @@ class PictureSource:
 
     @property
     def is_partial(self) -> bool:
-        """Whether other enclaves of the system may not be in the source."""
+        """Whether the system may have enclaves that are not in the source."""
         return self.is_export or self.origin.kind in ("enclave", "permissions")
 
     def titled(self, title: str) -> PictureSource:
@@ -185,7 +185,8 @@ def overlay(
 def with_requirements(picture: Picture, requirements: Requirements) -> Picture:
     """Return a picture in which the rights that break requirements are marked.
 
-    Adds such rights to names that the picture lacks, such as names that only wildcards match.
+    Such rights are added if the picture lacks their names, for instance because only wildcards
+    match the names.
     """
     broken = {
         (use.enclave, use.kind, use.name, use.right): use

@@ -161,7 +161,7 @@ class Link:
 
 
 class Onlooker(NamedTuple):
-    """An enclave with lines to very many names, whose cards show its letter (``tag``) instead."""
+    """An enclave with rights to very many names: their cards show a letter (``tag``), not lines."""
 
     tag: str
     enclave: str

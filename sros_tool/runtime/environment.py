@@ -272,7 +272,7 @@ def nodes_with_rules(command: Sequence[str]) -> list[str]:
 
 
 def _node_rules(command: Sequence[str]) -> tuple[dict[str, str], dict[str, str]]:
-    """Map nodes to their new names, and nodes to their new namespaces, by remapping rules.
+    """Return two maps from nodes, as remapping rules name them: to new names, and to namespaces.
 
     The key "" stands for every node.  The rules are ``-r __node:=NAME`` and ``-r __ns:=NAMESPACE``
     behind ``--ros-args``.  The order is the order in the command: rcl takes the first rule that

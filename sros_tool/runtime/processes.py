@@ -140,7 +140,7 @@ class Process:
 
     @property
     def program(self) -> tuple[int, tuple[str, ...]]:
-        """The id and the command of the process that has to be started to start this process."""
+        """The id and the command of the process that somebody has to start to get this process."""
         return self.forked_by if self.forked_by[0] else (self.pid, self.command)
 
     @property
@@ -200,7 +200,7 @@ class Process:
     def demo_command(self) -> tuple[str, ...]:
         """The `sros demo` command that started this node or router; () for other processes.
 
-        The node's own command has a file descriptor of one start.
+        The node's own command cannot be used again, because it has a file descriptor of one start.
         """
         words = self.command
         for flag, module, role in zip(words, words[1:], words[2:], strict=False):
@@ -769,7 +769,7 @@ def _user(folder: int, status: bytes) -> int:
 
     The user who starts a set-user-ID program chooses its command and environment, whatever user ids
     the program takes later.  A process can replace its auxiliary vector, but not its ids in
-    ``status`` (PR_SET_MM in prctl(2)), so that the vector can only add a user.
+    ``status`` (PR_SET_MM in prctl(2)).  So the vector can only add a user.
 
     Raises:
         OSError: The process has ended, or may not be examined.

@@ -541,7 +541,7 @@ class _Beginnings:
 
 
 def _one_shorter(chunks: Chunks) -> Chunks | None:
-    """Return ``a/b`` for ``a/*/**/b``, for keys with a chunk less; None for other expressions."""
+    """Return the expression for one chunk less: ``a/b`` for ``a/*/**/b``; None for other forms."""
     at = chunks.index(ANY_CHUNKS) if chunks.count(ANY_CHUNKS) == 1 else 0
     return (*chunks[: at - 1], *chunks[at + 1 :]) if at and chunks[at - 1] == ANY_CHUNK else None
 

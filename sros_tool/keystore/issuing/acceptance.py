@@ -171,12 +171,11 @@ def refuse_stopping(
 def _stopped_enclaves(
     files: _FilesOfChange, now: datetime
 ) -> tuple[dict[Vendor, _Refusals], list[str]]:
-    """Return the enclaves that a vendor accepts today, but would refuse after the change.
+    """Return the refusals by vendors after the change, and the enclaves that are left out.
 
-    New enclaves that a vendor would refuse are included.
-
-    Returns: a map from vendors to the enclaves that they would refuse; and the enclaves that are
-    left out because their certificates were revoked before.
+    The first value maps vendors to the enclaves that they accept today, but would refuse after the
+    change, and to new enclaves that they would refuse.  The second value has the enclaves whose
+    certificates were revoked before.
     """
     stopped: dict[Vendor, dict[str, list[str]]] = {}
     put_back: list[str] = []

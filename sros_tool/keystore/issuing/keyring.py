@@ -311,8 +311,8 @@ def check_imported_keys(roles: Iterable[str], keyring: Keyring, template: Templa
 def _write_outside(path: Path, pem: bytes, transaction: Transaction) -> None:
     """Write a key file outside of the keystore, and remove it if the transaction fails.
 
-    If the folder belongs to the owner of the keystore, so does the file, because the owner needs
-    the key.
+    If the folder belongs to the owner of the keystore, the file also gets this owner, who needs the
+    key.
     """
     root = transaction.root
     write_new_file(path, pem, for_user=root.stat().st_uid if root.exists() else None)

@@ -49,7 +49,8 @@ _BYTES_PER_LINE = len("<topic></topic>\r\n")
 class SizeEstimator:
     """An estimator for the size of signed permissions, which signs with a temporary key.
 
-    The error is less than 100 bytes, because the lengths of CA names and signatures vary.
+    The estimate can be wrong by less than 100 bytes, because the lengths of CA names and signatures
+    vary.
     """
 
     def __init__(self) -> None:
@@ -73,7 +74,8 @@ class SizeEstimator:
 def right_bytes(right: Right) -> int:
     """Return the size in bytes of a right in large permissions.
 
-    A right takes one line for each DDS topic.  In smaller permissions, the lines are indented, too.
+    A right takes one line for each DDS topic.  In smaller permissions, a right takes more, because
+    the lines are indented.
     """
     names = dds_names(right.right, right.name)
     return sum(_BYTES_PER_LINE + len(name) for name in (*names.publish, *names.subscribe))

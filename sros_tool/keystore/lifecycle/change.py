@@ -515,7 +515,7 @@ class KeystoreChange:
 
     @property
     def moment(self) -> datetime:
-        """The time of the change; or, if later, when certificates of a CA service become valid."""
+        """The time of the change, or later: when certificates of a CA service become valid."""
         return max(
             [self.now, *(parse_iso(entry.not_before) for entry in self._entries_of_ca_service())]
         )
