@@ -95,6 +95,17 @@ VULNERABILITIES = FindingKind(
     "release fixes, keep strangers out of the network.",
     prominent=True,
 )
+EXPIRED_PEERS = FindingKind(
+    "upgrade.expired-peers",
+    NOTE,
+    "another effect of an expired certificate on running processes",
+    "With the one release, running processes lose each other when the certificate of one of them "
+    "expires. With the other, they keep communicating until they restart.",
+    "sros: measured with the named releases; CVE-2025-67108.",
+    "Renew in time, and restart: `sros check KEYSTORE --needs-renewal 30d` says what is due. To "
+    "stop an enclave, revoke it; do not wait until it expires.",
+    prominent=True,
+)
 NOT_MEASURED = FindingKind(
     "distribution.not-measured",
     NOTE,
@@ -129,6 +140,6 @@ OF_ENCLAVES = (OPENS, CLOSES, REFUSED, ACCEPTED, NO_NODE, DIFFER, DISTRIBUTION_R
 
 ALL = (
     *(OPENS, CLOSES, REFUSED, ACCEPTED, NO_NODE, BUFFERS, ZENOH, VULNERABILITIES),
-    *(NOT_MEASURED, DIFFER, DISTRIBUTION_REFUSES),
+    *(EXPIRED_PEERS, NOT_MEASURED, DIFFER, DISTRIBUTION_REFUSES),
 )
 """All kinds of this module, the kinds about an update first."""

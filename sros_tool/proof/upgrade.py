@@ -31,6 +31,7 @@ from sros_tool.checks.upgrade import (
     CLOSES,
     DIFFER,
     DISTRIBUTION_REFUSES,
+    EXPIRED_PEERS,
     NO_NODE,
     NOT_MEASURED,
     OPENS,
@@ -256,6 +257,7 @@ def _upgrade_findings(
             yield NOT_MEASURED.found(f"ROS 2 {distribution.title}", distribution.assumption)
     for old, new in _products(before, after, vendor):
         yield from _untested_notes(old, new)
+        yield from _expired_peers_notes(old, new)
         for change in changes(files, old, new):
             kind = _KINDS[change.kind]
             yield kind.found(change.enclave, change.text, change.file, remedy=change.remedy)
@@ -505,6 +507,15 @@ def _untested_notes(before: Shipped, after: Shipped) -> Iterator[Finding]:
             )
             text = f"{shipped}{consequence}"
             yield NOT_MEASURED.found(f"ROS 2 {shipped.distribution.title}", text)
+
+
+def _expired_peers_notes(before: Shipped, after: Shipped) -> Iterator[Finding]:
+    """Yield a note if only one of two releases separates running processes at an expiry."""
+    drops_before, drops_after = (shipped.vendor.traits.drops_expired for shipped in (before, after))
+    if drops_before != drops_after:
+        does = "lose each other" if drops_after else "keep communicating"
+        text = f"running processes {does} when the certificate of one of them expires"
+        yield EXPIRED_PEERS.found(f"{before.release} to {after.release}", text)
 
 
 def _node_start_findings(

@@ -193,12 +193,12 @@ PLANTED: dict[str, tuple[Callable[[Bench], object], set[tuple[str, str, str]]]] 
 }
 
 
-VULNERABLE = "upgrade.vulnerabilities"
+VULNERABLE, EXPIRED = "upgrade.vulnerabilities", "upgrade.expired-peers"
 FOUND = {
     *(f"upgrade.{kind}" for _, wanted in PLANTED.values() for kind, *_ in wanted),
     *("upgrade.closes", "upgrade.zenoh-release", "upgrade.node-cannot-start"),
     *("distribution.not-measured", "distribution.differ", "distribution.refused"),
-    VULNERABLE,
+    *(VULNERABLE, EXPIRED),
 }
 """The ids of findings that the tests of this file bring about."""
 
@@ -211,7 +211,7 @@ def changed(
     found = check_upgrade(bench.root, after, Circumstances(bench.now), present=before)
     for finding in found.findings:
         kind = finding.id.removeprefix("upgrade.")
-        if kind in ("zenoh-release", "vulnerabilities"):
+        if kind in ("zenoh-release", "vulnerabilities", "expired-peers"):
             continue
         product = next((name for name in (FAST, CYCLONE) if name in finding.text), "")
         text = f"{finding.subject}: {finding.text}".partition(": open on")[0]
@@ -254,7 +254,27 @@ def test_an_update_changes_nothing_of_shipped_policies(tmp_path: Path) -> None:
     at = Circumstances(now())
     for before, after in some(list(permutations(SUPPORTED, 2)), 1):
         found = check_upgrade(root, after, at, present=before).findings
-        assert {each.id for each in found} <= {"distribution.not-measured", VULNERABLE}
+        assert {each.id for each in found} <= {"distribution.not-measured", VULNERABLE, EXPIRED}
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "does"),
+    [
+        ("jazzy", "kilted", "lose each other"),
+        ("kilted", "lyrical", "keep communicating"),
+        ("jazzy", "lyrical", ""),
+    ],
+)
+def test_an_update_changes_what_an_expiry_does(
+    before: str, after: str, does: str, bench: Bench
+) -> None:
+    found = check_upgrade(
+        bench.root, find_distribution(after), Circumstances(bench.now), vendor="fastdds",
+        present=find_distribution(before),
+    ).findings  # fmt: skip
+    texts = [finding.text for finding in found if finding.id == EXPIRED]
+    wanted = f"running processes {does} when the certificate of one of them expires"
+    assert texts == ([wanted] if does else [])
 
 
 def test_an_update_mends_and_brings_known_vulnerabilities(bench: Bench) -> None:
@@ -300,7 +320,7 @@ def test_what_an_update_cannot_show_is_said(bench: Bench) -> None:
     with_zenoh(bench)
     unknown = AFTER._replace(fast="99.1.0")
     found = check_upgrade(bench.root, unknown, Circumstances(bench.now), present=BEFORE).findings
-    ids = [each.id for each in found if each.id != VULNERABLE]
+    ids = [each.id for each in found if each.id not in (VULNERABLE, EXPIRED)]
     assert ids == ["distribution.not-measured", "upgrade.zenoh-release"]
     assert "Fast DDS 99.1, assumed to decide as Fast DDS" in found[0].text
 
