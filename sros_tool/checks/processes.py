@@ -690,7 +690,7 @@ def process_findings(
     yield from _other_keystore_findings(secured, environment if is_secured_here else None)
     if is_secured_here and environment.get(KEYSTORE):
         root = Path(environment[KEYSTORE])
-        copies = (node for node in nodes if node.enclave and _has_other_files(node.enclave, root))
+        copies = (node for node in nodes if node.enclave and has_other_files(node.enclave, root))
         yield from other_folder_findings(copies, root)
     yield from _different_security_findings(nodes, security)
     yield from _unseen_process_findings(running)
@@ -948,7 +948,7 @@ def other_folder_findings(processes: Iterable[Process], folder: Path) -> Iterato
         yield PROCESS_OTHER_FOLDER.found(process.label, text)
 
 
-def _has_other_files(enclave: ProcessEnclave, root: Path) -> bool:
+def has_other_files(enclave: ProcessEnclave, root: Path) -> bool:
     """Return whether ``root`` also has the enclave, with other files than the process loaded."""
     with suppress(SrosError, OSError):
         place = enclave_path(root, check_enclave_name(f"/{enclave.name.strip('/')}"))

@@ -16,6 +16,7 @@ from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
+from sros_tool.checks.processes import has_other_files, other_folder_findings
 from sros_tool.checks.requirements import VACUOUS, VIOLATED
 from sros_tool.close.nodes import ObservedNodes
 from sros_tool.close.processes import ClosedProcess, ObservedProcesses, run_words
@@ -327,10 +328,26 @@ def _problems_of(robot: LocalRobot, state: CloseState, *, partial: bool) -> Iter
             f"the export has {name}, which is not in the keystore and was not revoked there: "
             f"{remove}"
         )
+    yield from _copy_problems(robot)
     yield from _user_problems(robot, state.observed)
     yield from _launch_problems(robot, state.observed)
     if not partial:
         yield from _unknown_process_problems(robot, state)
+
+
+def _copy_problems(robot: LocalRobot) -> Iterator[str]:
+    """Yield a text for each process in an enclave of the export with files of another folder."""
+    export = robot.export.absolute()
+    copies = (
+        process
+        for process in RunningRobot(robot).in_domain
+        if process.enclave and has_other_files(process.enclave, export)
+    )
+    for finding in other_folder_findings(copies, export):
+        yield (
+            f"{finding.subject}: {finding.text}: stop it; if it belongs to the robot, start it "
+            f"from '{export}'"
+        )
 
 
 def _keystore_problems(robot: LocalRobot) -> Iterator[str]:

@@ -1536,6 +1536,22 @@ def test_a_robot_whose_files_expire_soon(keystore: Path, tmp_path: Path) -> None
     assert state_at(datetime.now(UTC)).valid_until is None, "nobody knows until when /b works"
 
 
+def test_a_process_with_older_files_of_an_enclave_is_no_closed_process(robot: Robot) -> None:
+    """As a thief's; it would not get a revocation list of this folder. Twin: the robot's own."""
+    robot.close()
+    shutil.copytree(robot.folder / "robot/export", copy := robot.folder / "copy", symlinks=False)
+    robot.by_hand = {"/talker", "/listener"}
+    for spelled, status in (("robot/export", 0), ("copy", 1)):
+        robot.spelled = spelled
+        copied = copy / "enclaves/talker/permissions.p7s"
+        copied.write_bytes(copied.read_bytes() + b"\n")
+        robot.more = (replace(robot.process("/talker", is_secured=True), pid=13),)
+        robot.spelled = "robot/export"
+        ended = robot.close(status=status)
+        said = f"  process 13 (run): /talker from '{copy}', not from '{robot.folder}/robot/export'"
+        assert (f"{said}: stop it; if it belongs to the robot" in ended.out) == bool(status), ended
+
+
 @sometimes("an_enclave_that_belongs_to_another_machine")
 def test_an_enclave_that_belongs_to_another_machine(robot: Robot) -> None:
     """Seen while sros watched, it has to be seen again; another one may be away, as a laptop."""
