@@ -37,10 +37,10 @@ from sros_tool.translate_zenoh.graph import (
 )
 from sros_tool.translate_zenoh.rights import (
     StatedRight,
-    as_router,
     chunks_of,
     remote_of,
     remote_rights,
+    rights_given_to_router,
     stated_rights,
 )
 from sros_tool.validity import Window
@@ -396,7 +396,7 @@ def test_a_session_trusts_its_router_with_its_own_rights_alone(tmp_path: Path) -
     put_x, put_y = (Message.PUT, f"0/x/{TYPE}"), (Message.PUT, f"0/y/{TYPE}")
     for direct in (True, False):
         known = remotes.values() if direct else ()
-        session = AccessControl((*known, as_router("/router", remotes["/a"])))
+        session = AccessControl((*known, rights_given_to_router("/router", remotes["/a"])))
         assert session.allows("/router", OUT, *put_x)
         assert not session.allows("/router", IN, *put_x)
         assert not session.allows("/router", OUT, *put_y)
@@ -459,7 +459,10 @@ def test_tokens_are_bound_to_the_nodes_and_names_of_the_policy(tmp_path: Path) -
         f"{NODES}</profiles></enclave></enclaves></policy>"
     )
     rights = remote_rights(read_policy(file).enclaves[0], 0)
-    router, session = AccessControl((rights,)), AccessControl((as_router("/router", rights),))
+    router, session = (
+        AccessControl((rights,)),
+        AccessControl((rights_given_to_router("/router", rights),)),
+    )
     for token, expected in TOKENS.items():
         place = (Message.LIVELINESS_TOKEN, f"@ros2_lv/0/zid/0/1/{token}")
         assert router.allows("/e", IN, *place) is expected, token

@@ -38,7 +38,7 @@ from sros_tool.keystore.layout import (
     folder_of_closed_robot,
     is_original_keystore,
 )
-from sros_tool.keystore.loading import leaves_open
+from sros_tool.keystore.loading import starts_without_security
 from sros_tool.keystore.participant import JoinContext, LoadedEnclave, VendorParticipant
 from sros_tool.keystore.reader import OpenedKeystore, Problem
 from sros_tool.names import (
@@ -499,7 +499,7 @@ class Answer(NamedTuple):
                 return f"DDS in the process itself: {entity} is not created"
             case _:
                 text = "DDS in the process itself: no node of the enclave starts"
-                if not leaves_open(self.problems):
+                if not starts_without_security(self.problems):
                     return text
                 return f"{text} with the strategy Enforce; with Permissive, each starts open"
 

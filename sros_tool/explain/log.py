@@ -47,7 +47,7 @@ from sros_tool.keystore.layout import (
     remedy_in_closed_robot,
 )
 from sros_tool.keystore.lifecycle.rotation import RotationStage, read_rotation
-from sros_tool.keystore.loading import leaves_open
+from sros_tool.keystore.loading import starts_without_security
 from sros_tool.keystore.participant import JoinContext, LoadedEnclave
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.rights import RightsSource, load_rights
@@ -699,7 +699,7 @@ class _Examiner:
         if enclave is None or self._policy:
             return RUNS_OPEN if unnamed else None
         problems = self._answer(enclave, Vendor.FAST, ask("join")).problems
-        if leaves_open(problems):
+        if starts_without_security(problems):
             return RAN_OPEN
         return UNNOTICED_FAULT if problems else None
 

@@ -369,7 +369,7 @@ def refuse_stale_domains(
             )
 
 
-def left_enclave_notes(keystore: OpenedKeystore, before: Fleet, after: Fleet) -> Iterator[Note]:
+def notes_on_lost_enclaves(keystore: OpenedKeystore, before: Fleet, after: Fleet) -> Iterator[Note]:
     """Yield a note on each robot that loses enclaves or a router which the keystore still has.
 
     No two robots of ``after`` may have an enclave in common, which `write_fleet` checks.

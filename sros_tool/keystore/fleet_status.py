@@ -222,7 +222,7 @@ class RobotStatus:
     contain keys.  The other fields are about the robot:
 
     - ``is_ahead``: by its message, its files are newer than the backup of the keystore;
-    - ``reads_copy``: it fetched after the publication and got an earlier release;
+    - ``got_earlier_release``: it fetched after the publication and got an earlier release;
     - ``lacks_ca``: it refuses releases, because it does not trust the CA that seals releases;
     - ``is_doubtful``: its files are not known, whatever it confirmed, because its last message was
       refused, its release was never published, or two computers have its keys;
@@ -305,7 +305,7 @@ class RobotStatus:
     may_trust_replaced: bool = True
     renew_from: datetime | None = None
     lacks_key: tuple[str, ...] = ()
-    reads_copy: bool = False
+    got_earlier_release: bool = False
     is_ahead: bool = False
     locked_out_from: datetime | None = None
     lacks_ca: bool = False
@@ -382,13 +382,13 @@ class RobotStatus:
         if self.state is State.REVOKED and not self.enclaves:
             return "take it out of the fleet file"
         if self.state in (State.CURRENT, State.NONE):
-            look = "look at its `from`" if self.reads_copy else "look into it"
+            look = "look at its `from`" if self.got_earlier_release else "look into it"
             return look if self.problems else ""
         if self.is_ahead and (self.release or 0) > (self.published or 0):
             return "publish"
         if self.lacks_ca and self.state not in (State.BROKEN, *_SUSPICIOUS_STATES):
             return "deliver"
-        if self.state is State.RESTART and self.reads_copy:
+        if self.state is State.RESTART and self.got_earlier_release:
             return "look at its `from`"  # the state says the restart
         if self.state in _TASKS_BY_STATE and not self.is_ahead:
             return _TASKS_BY_STATE[self.state]
@@ -400,7 +400,7 @@ class RobotStatus:
             return "deliver"
         if not is_accepted:
             return "publish"
-        if self.reads_copy:
+        if self.got_earlier_release:
             return "look at its `from`"
         if (self.published or 0) == (self.release or 0):
             return "find out why" if self.is_published else "publish"
@@ -1040,9 +1040,9 @@ class _KeystoreRecords:
     def lacks_ca(self, compared_robot: _ComparedRobot, *, is_published: bool) -> bool:
         """Return whether a robot that fetches does not trust the CA that seals releases.
 
-        Until the current files are published (``is_published``), the earlier CA may have sealed the
-        robot's release.  A CA that has the same key as its predecessor is also trusted by robots
-        that only have the predecessor.
+        Unless ``is_published`` says that the current files are published, the earlier CA may have
+        sealed the robot's release.  A CA that has the same key as its predecessor is also trusted
+        by robots that only have the predecessor.
         """
         confirmed = compared_robot.confirmed
         trusted = {*chain.from_iterable(compared_robot.authorities.get("permissions_ca", ()))}
@@ -1078,7 +1078,9 @@ class _KeystoreRecords:
             ends.append(long_ago if is_revoked else parse_iso(entry.not_after))
         return max(ends, default=None)
 
-    def reads_copy(self, compared_robot: _ComparedRobot, last_heard: datetime | None) -> bool:
+    def got_earlier_release(
+        self, compared_robot: _ComparedRobot, last_heard: datetime | None
+    ) -> bool:
         """Return whether a robot fetched long after the publication, but got an earlier release.
 
         A robot that reports another problem says itself why it did not get the release.
@@ -1346,15 +1348,17 @@ def _robot_status(
         reported=len((confirmed and confirmed.problems) or ()),
         locked_out_from=records.locked_out_from(compared_robot) if fetches else None,
     )
-    if not (status.fetches and records.reads_copy(compared_robot, status.last_heard)):
+    if not (status.fetches and records.got_earlier_release(compared_robot, status.last_heard)):
         return status
     if status.problems:
-        return replace(status, reads_copy=True)
+        return replace(status, got_earlier_release=True)
     copy_problem = (
         f"It sent a message long after release {status.published} was published, and has release "
         f"{status.release or 'none'}: its `from` is an old copy."
     )
-    return replace(status, reads_copy=True, problems=(*(status.problems or ()), copy_problem))
+    return replace(
+        status, got_earlier_release=True, problems=(*(status.problems or ()), copy_problem)
+    )
 
 
 # ── the stages of a rotation ───────────────────────────────────────────────────────────────

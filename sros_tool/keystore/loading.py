@@ -98,7 +98,7 @@ _CA_FAULTS_ON_READING = (Fault.SIGNATURE_HASH, Fault.CA_CHAIN)
 """Faults in the file of a CA that a process finds together with ``_FAULTS_ON_READING``."""
 
 
-def leaves_open(problems: Iterable[Problem]) -> bool:
+def starts_without_security(problems: Iterable[Problem]) -> bool:
     """Return whether a process with these problems starts without security, except with Enforce.
 
     The process does so if the RMW does not find a file that every enclave needs.

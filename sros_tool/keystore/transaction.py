@@ -530,7 +530,7 @@ class Transaction:
             # Until the folder is locked, another process may consider it stale and remove it.
             with contextlib.suppress(FileNotFoundError):
                 folder = Folder(parent.path / self._sibling)
-                if lock_new(folder) and parent.state(self._sibling):
+                if lock_own_folder(folder) and parent.state(self._sibling):
                     self._folder = folder
                 else:
                     folder.close()
@@ -544,7 +544,7 @@ class Transaction:
             if not state or not stat.S_ISDIR(state.st_mode) or state.st_uid != os.geteuid():
                 continue
             with contextlib.suppress(KeystoreError, OSError), Folder(parent.path / name) as stale:
-                if lock_new(stale):
+                if lock_own_folder(stale):
                     parent.remove_tree(name)
 
     @property
@@ -1098,7 +1098,7 @@ class KeystoreLock:
             self._handle = -1
 
 
-def lock_new(folder: Folder) -> bool:
+def lock_own_folder(folder: Folder) -> bool:
     """Lock a folder that only this user can open; False if another process has locked it.
 
     The lock lasts until the folder is closed.

@@ -76,11 +76,11 @@ from sros_tool.translate_zenoh.graph import (
 from sros_tool.translate_zenoh.rights import (
     ANY_TYPE,
     StatedRight,
-    as_router,
     crossing_rules,
     domains_of,
     remote_of,
     remote_rights,
+    rights_given_to_router,
     stated_names,
 )
 from sros_tool.validity import iso
@@ -805,7 +805,9 @@ class _RightsReader:
         for name in asked:
             _check_rules_match(name, remotes[name], stated[name])
         routers = {
-            name: render_rights(as_router(self._network.router_of(name).name, remotes[name]))
+            name: render_rights(
+                rights_given_to_router(self._network.router_of(name).name, remotes[name])
+            )
             for name in asked
         }
         rendered = {name: render_rights(rights) for name, rights in remotes.items()}

@@ -183,8 +183,9 @@ def checked_path(text: str) -> str:
 class CommitFiles:
     """The requested files of a commit, which are written to the private folder ``folder``.
 
-    ``name`` is the commit's name in messages. ``fell_back`` has the includes whose fallback is used
-    because the commit lacks the included file; ``refused`` has the reasons why files were not read.
+    ``name`` is the commit's name in messages.  ``used_fallbacks`` has the includes whose fallback
+    is used because the commit lacks the included file; ``refused`` has the reasons why files were
+    not read.
     """
 
     repository: Repository
@@ -192,7 +193,7 @@ class CommitFiles:
     commit: str
     folder: Path
     files: dict[str, TreeEntry] = field(default_factory=dict)
-    fell_back: list[str] = field(default_factory=list)
+    used_fallbacks: list[str] = field(default_factory=list)
     refused: list[SrosError] = field(default_factory=list)
 
     def entry(self, path: str) -> TreeEntry | None:
@@ -315,7 +316,7 @@ class CommitFiles:
             try:
                 content = revision.read(file)
             except MissingFileError:
-                self.fell_back.append(where)
+                self.used_fallbacks.append(where)
                 raise
             except SrosError as error:
                 if where not in self.files:  # so that the file does not count as missing
@@ -487,7 +488,9 @@ def is_whole_policy(content: bytes) -> bool:
         return True
 
 
-def used_whole(policies: Iterable[str], content: Callable[[str], bytes | None]) -> dict[str, bool]:
+def files_used_whole(
+    policies: Iterable[str], content: Callable[[str], bytes | None]
+) -> dict[str, bool]:
     """Map files that are used as a whole to whether their root element is used, too.
 
     Args:

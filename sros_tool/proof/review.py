@@ -83,12 +83,12 @@ from sros_tool.proof.commit_files import (
     CommitFiles,
     converting_patterns,
     files_including,
+    files_used_whole,
     includes_files,
     is_whole_policy,
     may_be_policy,
     may_match,
     same_root,
-    used_whole,
 )
 from sros_tool.proof.decide import restricted_enclaves
 from sros_tool.proof.findings import (
@@ -770,7 +770,9 @@ class _Review:
     ) -> Iterator[str]:
         """Yield changed files that the reviewed policies include only in part."""
         files = self.head.files
-        whole = used_whole(named, lambda path: self.head.written(path) if path in files else None)
+        whole = files_used_whole(
+            named, lambda path: self.head.written(path) if path in files else None
+        )
         for path, data in parts.items():
             with suppress(SrosError):
                 if not may_be_policy(data) or whole.get(path):
@@ -904,7 +906,7 @@ class _Review:
         for path in self._changed_settings():
             yield f"'{path}' changes and is not reviewed"
         for side in (self.head, self.base):
-            for path in dict.fromkeys(side.fell_back if side else ()):
+            for path in dict.fromkeys(side.used_fallbacks if side else ()):
                 assert side
                 yield f"'{path}' is not in {side.name}, so the fallback of its include is used"
         parents = asked.repository.parents(asked.head)

@@ -141,7 +141,7 @@ class _Stated:
         """Return the names without wildcards that a right is stated for, sorted."""
         return sorted(name for of, name in self.users if of == right)
 
-    def with_counterpart(self) -> set[str]:
+    def enclaves_with_counterpart(self) -> set[str]:
         """Return the enclaves with a right whose counterpart another enclave has."""
         return {
             enclave
@@ -191,7 +191,7 @@ def _unused_services(stated_rights: _Stated) -> Iterator[Nobody]:
 
     An enclave without a counterpart, such as the enclave of a package, has its users elsewhere.
     """
-    partners = stated_rights.with_counterpart()
+    partners = stated_rights.enclaves_with_counterpart()
     last = {
         name.rpartition("/")[2]
         for name in stated_rights.names("reply")

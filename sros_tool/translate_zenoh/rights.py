@@ -228,7 +228,7 @@ def untyped(key: str) -> str:
     return key
 
 
-def as_router(router: str, own_rights: RemoteRights) -> RemoteRights:
+def rights_given_to_router(router: str, own_rights: RemoteRights) -> RemoteRights:
     """Return the rights that a process with ``own_rights`` gives to its router.
 
     A router forwards messages, so it may send what the process may receive, and receive what the

@@ -607,7 +607,7 @@ def test_stale_stages_beside_a_keystore_are_removed_and_those_in_use_are_not(
     used = tmp_path / ".k[s]*.sros-87654321"
     used.mkdir()
     with Folder(used) as in_use:
-        assert transactions.lock_new(in_use)
+        assert transactions.lock_own_folder(in_use)
         create_keystore(tmp_path / "k[s]*", template=TEMPLATE, now=NOW)
     assert not stale.exists()
     assert used.exists()
@@ -617,7 +617,7 @@ def test_stale_stages_beside_a_keystore_are_removed_and_those_in_use_are_not(
 def test_a_stage_that_was_removed_before_it_was_locked_is_made_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    lock = transactions.lock_new
+    lock = transactions.lock_own_folder
     removed: list[Path] = []
 
     def lose_the_first(folder: Folder) -> bool:
@@ -626,7 +626,7 @@ def test_a_stage_that_was_removed_before_it_was_locked_is_made_again(
             folder.path.rmdir()
         return lock(folder)
 
-    monkeypatch.setattr("sros_tool.keystore.transaction.lock_new", lose_the_first)
+    monkeypatch.setattr("sros_tool.keystore.transaction.lock_own_folder", lose_the_first)
     create_keystore(tmp_path / "ks", template=TEMPLATE, now=NOW)
     assert removed
     check_whole(tmp_path / "ks")

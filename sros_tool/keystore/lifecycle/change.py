@@ -768,7 +768,7 @@ def _left_out_notes(left_out: Mapping[str, str]) -> Iterable[Note]:
 def _revoked_name_notes(
     ledger: Ledger, names: Sequence[str], now: datetime, replaced: Collection[str]
 ) -> Iterable[Note]:
-    """Yield a note on enclaves of which a revoked certificate has not expired."""
+    """Yield a note on enclaves that have a revoked certificate which has not expired."""
     entries = ledger.entries
     revoked = {entry.serial for entry in entries if entry.what == "revocation"}
     revoked_again = sorted(

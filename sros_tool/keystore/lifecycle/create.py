@@ -33,8 +33,8 @@ from sros_tool.keystore.fleet import (
     EnclaveDomains,
     enclaves_of_robot,
     fleet_before_change,
-    left_enclave_notes,
     load_fleet,
+    notes_on_lost_enclaves,
     publish_command,
     refuse_stale_domains,
     unrecorded_notes,
@@ -500,7 +500,7 @@ def _prepare_change(
         refuse_stale_domains(
             change.keystore, EnclaveDomains(change.domains, before), recorded, stated
         )
-        change.notes += left_enclave_notes(change.keystore, before, recorded) if before else ()
+        change.notes += notes_on_lost_enclaves(change.keystore, before, recorded) if before else ()
     if protections:
         _raise_protection(change, protections)
 
