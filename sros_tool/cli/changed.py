@@ -29,7 +29,7 @@ _CLOSED_SHOWN = 3
 
 
 def json_form(result: Changed, form: str, **more: object) -> tuple[object, ...]:
-    """Convert a change to the ``--json`` class ``form``, one of `lifecycle.shown`."""
+    """Convert a change to the ``--json`` class with the name ``form`` in `lifecycle.shown`."""
     from sros_tool.keystore.lifecycle import shown
 
     return shown.shown(result, getattr(shown, form), **more)

@@ -760,7 +760,7 @@ _MOST_LINES, _MOST_GROUPS = 50, 3
 def _lines(
     compared_fleet: ComparedFleet, robots: Sequence[str], *, findings: bool
 ) -> Iterator[str]:
-    """Yield the counts, the table of robots with what to do, and findings on their DDS.
+    """Yield the number of robots by state, a table of robots, and findings on their DDS.
 
     Unless ``findings`` is set, the findings are only counted.
     """

@@ -547,7 +547,7 @@ def _ended_since(running: RunningRobot) -> dict[str, str]:
 
 
 def _unseen_text(running: RunningRobot, node: str, enclave: str) -> str:
-    """Return an unseen node, for which an enclave has a profile, and what to do about it."""
+    """Return text on an unseen node that has a profile in ``enclave``, with what to do about it."""
     for process, process_enclave in running.secured:
         if (
             process_enclave.name == enclave
@@ -583,8 +583,8 @@ def _abandoned_names(
 ) -> list[str]:
     """Return clauses on names that nodes still use, though all peers ``moved`` to another name.
 
-    ``before`` are the nodes to compare, a part of the nodes ``expected`` now; ``denied`` endpoints
-    are left out.
+    The clauses are on the nodes ``before``.  The nodes ``expected`` now show whether a peer still
+    uses the old name.  ``denied`` endpoints are left out.
     """
     refused = _denied_endpoints(denied)
     robot_nodes = [node for node in expected.nodes if not is_tool(node)]

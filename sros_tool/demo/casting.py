@@ -411,11 +411,11 @@ def _best_cast(
 def _sorted_by_fitness(
     rights: Mapping[str, Grant], right: str, chosen: set[str], other_enclaves: set[str], topic: str
 ) -> list[str]:
-    """Return ``chosen`` sorted by how well an enclave shows the ``right`` to ``topic``.
+    """Return ``chosen`` sorted by how well an enclave suits a demo of the ``right`` to ``topic``.
 
-    Enclaves that are not in ``other_enclaves`` come first, then those whose permissions name the
-    topic.  Last are enclaves with a rule that denies the other direction, because Cyclone DDS 0.10
-    then denies both directions.
+    Enclaves that are not in ``other_enclaves`` come first.  Among equal enclaves, those whose
+    permissions name the topic come first.  Last are enclaves with a rule that denies the other
+    direction, because Cyclone DDS 0.10 then denies both directions.
     """
     return sorted(
         (name for name in rights if name in chosen),

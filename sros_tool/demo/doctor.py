@@ -73,7 +73,7 @@ class Diagnosis(NamedTuple):
 
     @property
     def libraries(self) -> tuple[MappedLibrary, ...]:
-        """The libraries of the DDS stacks that were tried, with their versions ("": unknown)."""
+        """The libraries of the DDS stacks that were tried; an unknown version is ""."""
         return tuple(
             MappedLibrary(stack.dds, ".".join(stack.version.split(".")[:3]), stack.where)
             for stack in self.stacks

@@ -111,8 +111,8 @@ class KeystoreSet:
             return self.enclave(Identity(OWN, party.announced))
         return self.enclave(party.identity) if party.identity.keystore is not None else ""
 
-    def shorten(self, identity: Identity, lifetime: int, elapsed: float) -> float:
-        """Issue an enclave a certificate that expires soon; return the seconds left.
+    def issue_short_lived(self, identity: Identity, lifetime: int, elapsed: float) -> float:
+        """Issue an enclave a certificate that expires soon; return the seconds until its expiry.
 
         ``lifetime`` is the validity in seconds, and ``elapsed`` the time since the keystores were
         made. The result can differ from ``lifetime``, because certificates have whole seconds.

@@ -615,7 +615,7 @@ class _Runner:
         expiry = None
         if row.short_lived:
             identity, lifetime = row.talking.identity, patience.lifetime
-            seconds = plan.keystores.shorten(identity, lifetime, self._elapsed())
+            seconds = plan.keystores.issue_short_lived(identity, lifetime, self._elapsed())
             expiry = time.monotonic() + seconds
         processes: dict[str, _PartyProcess] = {}
         tap: Wiretap | None = None

@@ -105,7 +105,10 @@ class AskedEnclave(NamedTuple):
         return self.policy is not None or bool(keystore and keystore.has_all_enclaves)
 
     def other_rights(self, name: str) -> frozenset[Right]:
-        """Return all rights to a name in the policy and the keystore that can be read."""
+        """Return all rights in the policy, and the rights to ``name`` in the keystore.
+
+        Only permissions of the keystore that can be read count.
+        """
         rights: frozenset[Right] = frozenset()
         if self.policy:
             from sros_tool.policy.rights import policy_rights

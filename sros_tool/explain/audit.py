@@ -627,7 +627,10 @@ def _group_by_right(denied: Iterable[DeniedRight]) -> tuple[DeniedRight, ...]:
 
 
 def _nodes_using_denied(denied: Iterable[DeniedRight], observation: Observation) -> Observation:
-    """Return the nodes with the endpoints of denied rights that no deny rule denies."""
+    """Return the nodes that lack a right, with only the endpoints that need the right.
+
+    Rights that a deny rule denies are left out: an allow rule would not help.
+    """
     wanted: dict[tuple[str, str], set[Endpoint]] = {}
     for right in denied:
         if right.by_rule:

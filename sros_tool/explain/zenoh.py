@@ -231,7 +231,7 @@ class ZenohAnswer:
 
     @property
     def dropped(self) -> Check | None:
-        """The check that drops a message, preferably a check on data, or None."""
+        """The check that drops a message, or None; `_check_to_report` chooses from several."""
         return _check_to_report((check for check in self.checks if not check.allowed), self.enclave)
 
     @property
@@ -436,7 +436,7 @@ class ZenohEvaluator:
         file = self._file_of(check.enforcer)
         return f"{check}: {check.decision.why}, in {file} of {check.enforcer}"
 
-    def outdated_enclaves(self, answer: ZenohAnswer) -> tuple[str, ...] | None:
+    def outdated_files(self, answer: ZenohAnswer) -> tuple[str, ...] | None:
         """Return the deciding files of an answer that do not match the permissions.
 
         Only the rules that concern the question are compared.  Returns None if the files cannot be
@@ -1099,7 +1099,7 @@ def explain_on_zenoh(
         decided = evaluator.answer(enclave.name, action, reach=False, brief=True)
         return decided.allowed, evaluator.with_parts(decided, brief=True).in_part
 
-    outdated = evaluator.outdated_enclaves(answer)
+    outdated = evaluator.outdated_files(answer)
     by_permissions = explain(stated, question)
     notes = (
         *taken,

@@ -318,8 +318,8 @@ def former_robot_of(fleet: Fleet, enclave: str) -> str:
 class Unrecorded(NamedTuple):
     """Enclaves whose path has a robot's name, but matches no path pattern of the fleet.
 
-    ``below`` are in a folder of this robot only, such as ``/r3``; ``naming`` have its name as
-    another part of their path, such as ``/desk/r3``.
+    ``below`` are in a folder of this robot only, such as ``/r3``; ``naming`` have the robot's name
+    as another part of their path, such as ``/desk/r3``.
     """
 
     below: tuple[str, ...] = ()
@@ -518,7 +518,11 @@ class _Folding(NamedTuple):
 
 
 def _foldings(fleet: Fleet, enclave: str, text: str) -> list[tuple[_Folding, str]]:
-    """Return texts with a placeholder for the line's own robot, the other robot, or both."""
+    """Return forms of a line with placeholders in place of robots, and the names of these robots.
+
+    One form replaces the robot of ``enclave``, one the only other robot that ``text`` names, and
+    one both.  A line without these robots has a single form, without a robot.
+    """
     own = robot_of(fleet, enclave)
     named = [robot for robot in named_robots(fleet, "", text) if robot != own]
     other = named[0] if len(named) == 1 else None

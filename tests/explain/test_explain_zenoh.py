@@ -473,7 +473,7 @@ def asked_in(root: Path) -> dict[tuple[str, str, str], tuple[tuple[Any, ...], An
         reached = tuple(each.enclave for each in answer.reached)
         wide = tuple((each.expression, each.reaches) for each in answer.wildcards)
         told = (answer.outcome, reached, wide)
-        found[enclave, right, name] = told, evaluator.outdated_enclaves(answer)
+        found[enclave, right, name] = told, evaluator.outdated_files(answer)
     return found
 
 

@@ -826,7 +826,10 @@ class Access:
         return NameSet.union(topics)
 
     def protection(self) -> tuple[tuple[NameSet, DomainRule, TopicRule], ...]:
-        """Return the topic rules of the domain, with the topics to which a rule applies."""
+        """Return the topics, the domain rule and the topic rule for each topic rule of the domain.
+
+        The topics are those to which the topic rule applies.
+        """
         domain = self._governed.rule
         if domain is None:
             return ()

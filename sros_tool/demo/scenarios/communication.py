@@ -413,7 +413,7 @@ def _payload_row(name: str, kind: str, expected: RowStatus, mechanism: str) -> R
 
 
 def _changed_packets_row(kind: str, expected: RowStatus, mechanism: str) -> Row:
-    """Return a row that changes packets with a protection kind."""
+    """Return a row in which somebody changes packets that have the protection ``kind``."""
     return replace(
         _payload_row("changed packets", kind, RowStatus.READABLE, mechanism),
         expected=expected,

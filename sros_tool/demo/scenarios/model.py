@@ -502,7 +502,7 @@ def _shipped_policy(file: str) -> Policy:
 
 
 def talking_policy(topic: str) -> Policy:
-    """Return the shipped policy on ``topic``, plus a talker and a listener without access to it."""
+    """Return the shipped policy for ``topic``, plus a talker and listener without rights to it."""
     shipped = _shipped_policy(_POLICY_FILE)
     by_path = {enclave.path: enclave for enclave in shipped.enclaves}
     talker, listener = by_path[_TALKER], by_path[_LISTENER]

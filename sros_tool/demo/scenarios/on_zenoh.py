@@ -501,7 +501,10 @@ def _trespass_row(
     world: str,
     defence_removed: str = "",
 ) -> Row:
-    """Return a row in which a party uses the topic or the service in a keystore, or tries to."""
+    """Return a row in which a party uses, or tries to use, the topic or the service.
+
+    All parties have enclaves of ``keystore``.
+    """
     claim = {
         Role.TALKER: hears("listener", party.name),
         Role.LISTENER: hears(party.name, "talker"),
@@ -896,7 +899,7 @@ def _false_token_row(
 
 
 def _false_token_rows(token: _FalseToken) -> tuple[Row, ...]:
-    """Return the rows of a token: directly to sessions, through the router, without the defense."""
+    """Return the rows of a token: sent directly, through the router, and without the defense."""
     forgery, wide = zenoh_forger.tokens_of_any_name, "names"
     if token.announced:
         forgery, wide = zenoh_forger.tokens_of_any_enclave, "enclaves"

@@ -102,7 +102,7 @@ def sessions_that_limit_themselves(copy: KeystoreCopy) -> None:
 
 
 def _give_rights_to_everybody(router: str) -> _Change:
-    """Return a change that gives the router's rights in a file to every enclave."""
+    """Return a change by which a file gives every enclave the rights of the router."""
 
     def change(document: _Document) -> None:
         control = document["access_control"]

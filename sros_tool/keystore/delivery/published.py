@@ -62,14 +62,14 @@ class PublishedRelease(NamedTuple):
     def checked(self) -> PublishedRelease:
         """Return this release; raise `ValueError` if it has a value that sros never publishes."""
         for value, most in ((self.number, MOST_NUMBER), (self.length, OF_ONE_ROBOT.packed)):
-            check_count(value, most)
+            check_positive_number(value, most)
         if not (isinstance(self.sha256, str) and _DIGEST.match(self.sha256)):
             raise ValueError("a SHA-256 is none")
         return self
 
 
-def check_count(value: object, maximum: int = MOST_NUMBER) -> int:
-    """Return a number of a release or version; raise `ValueError` for any other value."""
+def check_positive_number(value: object, maximum: int = MOST_NUMBER) -> int:
+    """Return ``value``; raise `ValueError` unless it is a number from 1 to ``maximum``."""
     if type(value) is not int or not 1 <= value <= maximum:
         raise ValueError("a release number or version is no number, or is too high")
     return value
@@ -174,7 +174,7 @@ def read_published(keystore: OpenedKeystore) -> Published:
         value = parse_json(read_bytes(path, "list of what is published", max_bytes=_MOST_BYTES))
         return Published(
             {name: _robot_from(robot_value) for name, robot_value in value["robots"].items()},
-            {name: check_count(version) for name, version in value["versions"].items()},
+            {name: check_positive_number(version) for name, version in value["versions"].items()},
             {path: parse_iso(time) for path, time in value["superseded"].items()},
             str(value.get("folder", "")),
             [str(path) for path in value.get("metadata", ())],

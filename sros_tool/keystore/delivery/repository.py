@@ -40,7 +40,7 @@ from sros_tool.keystore.delivery.published import (
     MOST_NUMBER,
     MetadataExpiry,
     PublishedRelease,
-    check_count,
+    check_positive_number,
 )
 from sros_tool.keystore.delivery.release import release_target
 from sros_tool.xml import read_bytes
@@ -313,7 +313,7 @@ def _read_present(folder: Folder, roots: Roots) -> PresentMetadata:
         _verify(targets.signed, name, bins[name])
     present = PresentMetadata(timestamp, snapshot, file, targets, bins)
     for version in present.versions().values():
-        check_count(version)
+        check_positive_number(version)
     present.releases()
     return present
 
