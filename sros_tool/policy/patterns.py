@@ -514,7 +514,7 @@ def listed_expressions(expression: str, maximum: int) -> list[str]:
 
 
 def _letters_or_text(negated: str, listed: str, any_letter: str, text: str) -> Sequence[str]:
-    """Return the alternatives for a match of `_CHOICE`: several letters, or only its own text."""
+    """Return, for a match of `_CHOICE`, the letters of its wildcard, or only its text."""
     if text:
         return [text]
     if any_letter:

@@ -267,7 +267,7 @@ def unused_remapping_findings(
     """Return a finding for each rule that changes no requirement in ``files``.
 
     Raises:
-        UsageError: a name that such a rule gives is also missing in ``system``.
+        UsageError: a rule changes no requirement, and ``system`` does not have the new name.
         SrosError: a file cannot be read.
     """
     unused = unused_remappings(files, system.fleet, namespaces, remaps) if remaps else []
