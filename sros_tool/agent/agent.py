@@ -215,8 +215,7 @@ class _Round:
         self._note_due_restarts((), self._enclaves())
         if self._machine.restarted:
             self._forget_restarts()
-        proven = self._proven_moment()
-        clock = self._clock(proven)
+        clock = self._clock(self._proven_moment())
         # Verified documents prove that ``before.latest`` has passed, whatever the clock shows.
         certain = max(now, before.latest) if before.latest else now
         readable_keys = exposed_keys(self._folder, now)
@@ -227,6 +226,8 @@ class _Round:
         exposed = recent | dict.fromkeys(readable_keys, now)
         self._state = replace(self._state, exposed=exposed)
         installation, fetched = self._fetch_and_install(certain)
+        if clock is not RobotClock.BEHIND and installation.made:
+            clock = self._clock_next_to_release(installation.made) or clock
         self._note_unreleased_enclaves()
         repaired = self._state.repaired_at
         if repaired and abs(now - repaired) < _REPAIRS_REPORTED_FOR:
@@ -320,6 +321,20 @@ class _Round:
             )
             return RobotClock.BEHIND
         return self._machine.clock()
+
+    def _clock_next_to_release(self, made: datetime) -> RobotClock | None:
+        """Return that the clock is behind, with a problem, if a release was made later."""
+        now = self._machine.now
+        if made <= now + _CLOCK_TOLERANCE:
+            return None
+        self._problems.insert(  # the cause comes before its consequences
+            0,
+            f"The clock shows {iso(now)}, but the published release was made at {iso(made)}: the "
+            f"clock is at least {elapsed(made - now)} behind, unless the clock of the keystore "
+            "machine was ahead. Nothing is restarted, and files that are not valid yet are not "
+            "installed; set the clock.",
+        )
+        return RobotClock.BEHIND
 
     def _proven_moment(self) -> datetime | None:
         """Return the latest moment that is proven to be past; None if none is known.

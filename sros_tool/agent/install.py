@@ -89,6 +89,8 @@ class Installation(NamedTuple):
     """The newest date of the certificates and revocation lists of the enclaves that did not keep
     their files.
     """
+    made: datetime | None = None
+    """The newest date of the certificates and revocation lists of the whole release."""
 
 
 @dataclass(slots=True)
@@ -174,6 +176,7 @@ def install_release(
         kept,
         # A file that is not valid yet proves no time: the keystore's clock may have been ahead.
         _newest_validity_start(files for name, files in enclaves.items() if name not in kept),
+        release_time(release),
     )
 
 

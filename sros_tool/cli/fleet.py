@@ -890,6 +890,8 @@ def _remedies(status: FleetStatus, to_dos: Collection[str]) -> Mapping[str, str]
         "may have a wrong name, or a copied disk. If it has files of another robot, it can act "
         f"as that robot until you run `sros renew {where} --robot OTHER --new-key --revoke-old`; "
         "then deliver to both robots",
+        "check its clock": "set the clock of the robot; its next round continues. If its clock is "
+        "right, somebody held its message back",
         "deliver": by_hand,
         "publish": publish_command(root),
         "renew": f"`{renewal_command(root)}`, then {_delivery_advice(root, to_renew)}",

@@ -227,6 +227,7 @@ class RobotStatus:
     - ``is_doubtful``: its files are not known, whatever it confirmed, because its last message was
       refused, its release was never published, or two computers have its keys;
     - ``may_trust_replaced``: one of its processes may trust an identity CA that was replaced;
+    - ``is_behind``: its clock is earlier than documents that it has verified;
     - ``reported``: how many of its problems are in its own words; they come first in ``problems``.
     """
 
@@ -310,6 +311,7 @@ class RobotStatus:
     locked_out_from: datetime | None = None
     lacks_ca: bool = False
     reported: int = 0
+    is_behind: bool = False
 
     @property
     def is_published(self) -> bool:
@@ -378,9 +380,18 @@ class RobotStatus:
         """
         return replace(self, to_do=self._to_do(now, is_accepted))
 
+    def _shows_wrong_clock(self, now: datetime) -> bool:
+        """Return whether a robot that was heard within a day has to set its clock first."""
+        if self.state is State.OFFLINE and self.received and self.clock:
+            return self.received - self.clock > _OFFLINE_AFTER >= now - self.received
+        others = (State.OFFLINE, State.BROKEN, State.REFUSED, *_SUSPICIOUS_STATES)
+        return self.is_behind and self.state not in others
+
     def _to_do(self, now: datetime, is_accepted: bool) -> str:
         if self.state is State.REVOKED and not self.enclaves:
             return "take it out of the fleet file"
+        if self._shows_wrong_clock(now):
+            return "check its clock"
         if self.state in (State.CURRENT, State.NONE):
             look = "look at its `from`" if self.got_earlier_release else "look into it"
             return look if self.problems else ""
@@ -566,18 +577,24 @@ class FleetStatus:
         robots that fetch, the time in the message itself counts, too, because whoever has the inbox
         could hold messages back.
         """
+        limit = max_age or _OFFLINE_AFTER
         overdue = frozenset(
             robot.robot
             for robot in self.robots
             if robot.enclaves
             and (last_heard := robot.last_heard)
             and (max_age or robot.fetches)
-            and now - last_heard > (max_age or _OFFLINE_AFTER)
+            and now - last_heard > limit
         )
-        robots = (
-            robot.offline() if robot.robot in overdue else robot.expired(now)
-            for robot in self.robots
-        )
+
+        def status(robot: RobotStatus) -> RobotStatus:
+            if robot.robot not in overdue:
+                return robot.expired(now)
+            if robot.is_behind and robot.received and now - robot.received <= limit:
+                return robot.without_list().expired(now)  # it says itself that its clock is wrong
+            return robot.offline()
+
+        robots = map(status, self.robots)
         publication = self.publication and self.publication.at(now)
         is_accepted = publication is None or publication.is_in_order
         to_do = tuple(robot.with_to_do(now, is_accepted=is_accepted) for robot in robots)
@@ -1346,6 +1363,7 @@ def _robot_status(
         lacks_key=records.lacks_key(compared_robot) if different or state is State.UNUSABLE else (),
         is_ahead=is_ahead,
         reported=len((confirmed and confirmed.problems) or ()),
+        is_behind=bool(confirmed and confirmed.clock is RobotClock.BEHIND),
         locked_out_from=records.locked_out_from(compared_robot) if fetches else None,
     )
     if not (status.fetches and records.got_earlier_release(compared_robot, status.last_heard)):

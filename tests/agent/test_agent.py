@@ -579,6 +579,10 @@ def test_a_clock_at_home_that_was_ahead_locks_no_robot_out(home: Home, r1: Robot
     done = r1.round(early + timedelta(minutes=5))
     assert any("/r1/a keeps its files" in problem for problem in done.problems)
     assert done.changed, "the revocation list"
+    wrong = "min behind, unless the clock of the keystore machine was ahead"
+    status = agent_status(r1.folder, now=early + timedelta(minutes=5), oldest=timedelta(days=1))
+    assert wrong in done.problems[0] and wrong in status.problems[0], "or the clock here is wrong"
+    assert r1.message().clock is RobotClock.BEHIND
     latest = read_state(r1.folder).latest
     assert latest and latest <= early + timedelta(minutes=5)
     assert r1.round(early + timedelta(minutes=6)).changed == ()

@@ -33,6 +33,7 @@ from sros_tool.cli.fleet import (
 )
 from sros_tool.keystore.confirmation import (
     MESSAGE_FILE,
+    RobotClock,
     RobotDds,
     RobotLibrary,
     RunningFiles,
@@ -712,7 +713,16 @@ def test_messages_that_were_held_back_are_as_old_as_they_say(field: Field) -> No
     field.send("r1", time=now - 25 * hours)
     found = field.status()
     assert (found["overdue"], found["robots"]["r1"]["state"]) == (["r1"], "offline")
+    assert found["robots"]["r1"]["to_do"] == "check its clock", "it was heard just now"
     field.run("fleet", "status", "ks", "--max-age", "7d")
+    field.send("r1", time=now - 25 * hours, clock=RobotClock.BEHIND, problems=("it is behind",))
+    found = field.status()
+    assert (found["overdue"], found["complete"]) == (["r1"], False)
+    robot = found["robots"]["r1"]
+    assert (robot["state"], robot["to_do"]) == ("current", "check its clock")
+    field.age("r1", 26 * hours)
+    robot = field.status()["robots"]["r1"]
+    assert (robot["state"], robot["to_do"]) == ("offline", "find out why")
     (field.root / "confirmed/r2.json").unlink()
     field.confirm("r2", time=iso(now - 25 * hours))
     field.send("r1", time=now + 25 * hours)
