@@ -354,7 +354,7 @@ class _Round:
     def _fetch_and_install(self, certain_time: datetime) -> tuple[Installation, bool]:
         """Fetch and install a release; return the changes, and whether the source was reached."""
         settings, state = self._settings, self._state
-        changed_files = self._changed_files()
+        changed_files, newer = self._changed_files(), self._newer_enclaves()
 
         def fetch(certificate: ClientCertificate | None) -> Release | None:
             return self._machine.fetch(
@@ -388,17 +388,25 @@ class _Round:
             self._is_in_step = True
             return Installation(), True
         installation = self._install(release, certain_time)
-        if release.number == state.accepted:
-            repaired = (
-                path for path in changed_files or () if enclave_of(path) in installation.changed
-            )
-            self._note_repaired(release.number, tuple(repaired))
+        is_later = release.number != state.accepted
+        published = {path: hashlib.sha256(data).hexdigest() for path, data in release.files.items()}
+        repaired = (
+            path
+            for path, sha256 in (changed_files or {}).items()
+            if enclave_of(path) in installation.changed
+            # Before a later release, somebody may have brought its files, or other new ones.
+            and not (is_later and (enclave_of(path) in newer or sha256 == published.get(path, "")))
+        )
+        self._note_repaired(state.accepted, tuple(repaired))
+        if not is_later:
             removed = dict.fromkeys(installation.removed, self._machine.now)
             self._state = replace(self._state, removed={**self._state.removed, **removed})
         return installation, True
 
-    def _changed_files(self) -> tuple[str, ...] | None:
-        """Return the paths of files that are missing, or differ from the installed release.
+    def _changed_files(self) -> dict[str, str] | None:
+        """Map each file that is missing, or differs from the installed release, to its SHA-256.
+
+        The SHA-256 is "" for a missing file.
 
         If the release lacks an enclave, the path of its certificate is included, too, because
         installing the release removes this enclave; enclaves in `_newer_enclaves` stay. The result
@@ -411,14 +419,12 @@ class _Round:
         try:
             released = self._released_files()
             with Folder(self._folder) as opened:
-                changed_paths = [
-                    path for path, digest in released.items() if _sha256(opened, path) != digest
-                ]
+                newer = self._newer_enclaves()
+                others = (_certificate_path(name) for name in self._enclaves() if name not in newer)
+                present = {path: _sha256(opened, path) for path in (*released, *others)}
         except (SrosError, OSError):
             return None
-        newer = self._newer_enclaves()
-        others = (_certificate_path(name) for name in self._enclaves() if name not in newer)
-        return (*changed_paths, *(path for path in others if path not in released))
+        return {path: sha256 for path, sha256 in present.items() if sha256 != released.get(path)}
 
     def _released_files(self) -> dict[str, str]:
         """Map the path of each file of the accepted release to the SHA-256 in the seal.

@@ -337,6 +337,23 @@ def test_what_somebody_damaged_is_installed_again(home: Home, r1: Robot) -> None
     assert sros("agent", "status", r1.folder).status == 1
 
 
+def test_what_somebody_damaged_is_named_also_if_a_later_release_replaces_it(
+    home: Home, r1: Robot
+) -> None:
+    r1.round()
+    path = "enclaves/r1/b/permissions.p7s"
+    (r1.folder / path).write_bytes(b"damaged")
+    for file, data in files_of(home.root).items():
+        if file.startswith("enclaves/r1/a/"):
+            (r1.folder / file).write_bytes(data)  # brought by hand, and published then
+    r1.release = home.revoked
+    done = r1.round()
+    assert (done.release, done.changed) == (3, ("/r1/b", "/r1/c"))
+    changed = f"1 file of release 1 was changed or missing here, and replaced: {path}. Find"
+    assert sum(changed in problem for problem in done.problems) == 1
+    assert any(changed in problem for problem in r1.round().problems), "for a day"
+
+
 REFUSED = {
     FetchProblem.UNREACHABLE: "cannot be reached",
     FetchProblem.EXPIRED: "expired",
