@@ -246,7 +246,7 @@ def test_the_verb_says_and_writes_what_it_can(tmp_path: Path) -> None:
     ("text", "words", "said"),
     [
         ("{", (), "Line 1: it ends too early"),
-        ("{}", ("-o", "x.xml"), "everybody who gets a connection, but no such name is the name"),
+        ("{}", ("-o", "x.xml"), "everybody who gets a connection, but to no enclave: cert_common_"),
         (rules(puts("demo/**")), ("-o", "x.xml"), "The rules let nobody publish"),
         ("{}", ("--mode", "peer"), "--from takes no keystore"),
     ],

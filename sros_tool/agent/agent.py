@@ -115,8 +115,8 @@ _KEEP_REPLACED_LIST = timedelta(days=30)
 _REPAIRS_REPORTED_FOR = timedelta(days=1)
 """How long the agent reports that it replaced files which differed from the release."""
 _BRING_KEY = (
-    " A release has no keys: bring the key with `sros distribute_key KEYSTORE --robot {} DIR "
-    "--force` in the keystore. The keystore lacks a key that was made on a robot: switch this "
+    " A release has no keys: run `sros distribute_key KEYSTORE --robot {} DIR --force` on the "
+    "keystore machine, and bring DIR here. For a key that was made on a robot: switch this "
     "computer off if it was replaced; otherwise make a new key, as for new hardware "
     "(docs/howto/one_robot.md)."
 )
@@ -495,10 +495,10 @@ class _Round:
         self._state = replace(self._state, removed=recent)
         if recent:
             self._problems.append(
-                f"Until {iso(max(recent.values()))}, the agent removed enclaves that the installed "
-                f"release lacks: {first_few(sorted(recent), 3)}. If they belong to another robot, "
-                "somebody may have copied their keys: run `sros renew KEYSTORE ENCLAVE --new-key "
-                "--revoke-old`."
+                f"The agent removed enclaves, the last one at {iso(max(recent.values()))}, that the "
+                f"installed release lacks: {first_few(sorted(recent), 3)}. If they belong to "
+                "another robot, somebody may have copied their keys: run `sros renew KEYSTORE "
+                "ENCLAVE --new-key --revoke-old`."
             )
 
     def _note_closed_keys(self, exposed: Mapping[str, datetime], now: datetime) -> None:

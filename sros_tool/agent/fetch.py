@@ -110,7 +110,7 @@ def pin_root(agent_folder: Path, data: bytes, *, now: datetime) -> str:
     try:
         root = Metadata[Root].from_bytes(data)
         if not isinstance(root.signed, Root):
-            raise RepositoryError("the file has metadata of another kind")
+            raise RepositoryError("the file has metadata of another kind than root")
         root.signed.verify_delegate(Root.type, root.signed_bytes, root.signatures)
     except (RepositoryError, ValueError) as error:
         raise FetchError(

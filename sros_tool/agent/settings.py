@@ -214,7 +214,7 @@ def settings_from(value: Mapping[str, Any], label: str) -> AgentSettings:
             )
     if not all(map(_DIGEST.match, settings.authorities)):
         raise _invalid_settings_error(
-            label, "authorities are the SHA-256 of CAs, in lower-case hexadecimal"
+            label, "authorities has an entry that is not a SHA-256 in lower-case hexadecimal"
         )
     if not settings.systemctl:
         raise _invalid_settings_error(label, "systemctl is empty")
@@ -223,7 +223,9 @@ def settings_from(value: Mapping[str, Any], label: str) -> AgentSettings:
 
 def _unit(value: Any, label: str) -> Unit:
     if not isinstance(value, dict) or value.keys() != {"name", "enclaves"}:
-        raise _invalid_settings_error(label, "a unit has the keys name and enclaves")
+        raise _invalid_settings_error(
+            label, "a unit does not have exactly the keys name and enclaves"
+        )
     name, enclaves = value["name"], value["enclaves"]
     if not isinstance(name, str) or not _UNIT_NAME.match(name):
         raise _invalid_settings_error(

@@ -104,7 +104,7 @@ class HttpTransport(FetcherInterface):
         ):
             raise UsageError(
                 f"{url!r} is not the address of a publishing folder",
-                "It has a host and a path, without user, '?' and '#'.",
+                "The address must have a host and a path, and no user, '?' or '#'.",
                 "Write it as in https://HOST/fleet.",
             )
         context = ssl.create_default_context(cafile=tls_ca) if secure else None

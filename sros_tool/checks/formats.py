@@ -371,7 +371,7 @@ def keystore_metrics(
         Metric(
             "sros_expiry_timestamp_seconds",
             f"The expiry of a file by its kind ({_FILE_KINDS_TEXT}), in seconds since 1970; "
-            "without enclave for a file that all share.",
+            "a file that all enclaves share has no label `enclave`.",
             tuple(
                 Sample(
                     _timestamp(expiry.moment),

@@ -158,7 +158,8 @@ WRONG_KIND = FindingKind(
     "policy.wrong-kind",
     WARNING,
     "a name of another kind, such as a service in a rule for topics",
-    "Every ROS 2 node uses this name for the other kind, so the rule has no effect.",
+    "Every ROS 2 node has a topic of this name, not a service, or the other way around, so the "
+    "rule has no effect.",
     "ROS 2 Jazzy (rclcpp 28, rclpy 7); ROS 2 design, Actions.",
     "Move the name to the group of its kind: <topics> or <services>.",
 )
@@ -423,7 +424,8 @@ def _misspelt_name_finding(
         kind = first.right.kind.removesuffix("s")
         article = "an" if kind == "action" else "a"
         hint = (
-            f"{first.right.enclave} has this name as {article} {kind} ({first.right.right}), unused"
+            f"{first.right.enclave} offers {article} {kind} of this name ({first.right.right}), "
+            "which no enclave uses"
         )
         if misspelt.right.kind == "actions":
             place = RelatedPlace("", *_source_place(first.source))

@@ -173,7 +173,7 @@ def _file_findings(
         return
     name = plain(enclave.name, _LONGEST_PATH)
     if enclave.problem:
-        text = f"its enclave cannot be looked at: {enclave.problem}"
+        text = f"its enclave cannot be examined: {enclave.problem}"
         yield PROCESS_NOT_SEEN.found(process.label, text)
         return
     newer = list(newer_files(process, enclave))
@@ -270,7 +270,7 @@ _OWN_FILES = {CERTIFICATE_FILE, PERMISSIONS_FILE, GOVERNANCE_FILE}
 def _unread_file_findings(process: Process, enclave: ProcessEnclave) -> Iterator[Finding]:
     unread = [f"{file.name} ({file.problem})" for file in enclave.files if file.problem]
     if unread:
-        text = f"its files cannot be looked at: {', '.join(unread)}"
+        text = f"its files cannot be read: {', '.join(unread)}"
         yield PROCESS_NOT_SEEN.found(process.label, text)
 
 
@@ -428,7 +428,8 @@ def _local_time_findings(
         iso(datetime.fromtimestamp(moment, UTC)) if isfinite(moment) else "never"
         for moment in (begin, end)
     )
-    text = f"they are valid from {grant.not_before} to {grant.not_after}, which it reads as {read}"
+    text = f"they are valid from {grant.not_before} to {grant.not_after}, "
+    text += f"which the process reads as {read}"
     yield PROCESS_LOCAL_TIME.found(process.label, text)
 
 
@@ -933,7 +934,7 @@ def _other_keystore_findings(
             main = f"{largest[0].label} {_domain_text(largest[0])} has '{_keystore(largest[0])}'"
             other_groups = [group for _, group in more]
         for process in (process for group in other_groups for process in group):
-            text = f"it has keystore '{_keystore(process)}', and {main}"
+            text = f"it has keystore '{_keystore(process)}', but {main}"
             yield PROCESS_OTHER_KEYSTORE.found(process.label, text)
 
 
@@ -1022,7 +1023,7 @@ def _unseen_process_findings(running: RunningProcesses) -> Iterator[Finding]:
     remedy = ROOT_IS_NOT_ENOUGH if running.by_root else ""
     for process in running.unseen:
         if process.speaks:
-            text = f"it speaks ROS 2, and cannot be looked at: {process.why}"
+            text = f"it speaks ROS 2, but cannot be examined: {process.why}"
             yield PROCESS_NOT_SEEN.found(process.label, text, remedy=remedy)
     doubtful = [process for process in running.unseen if not process.speaks]
     reasons = [running.hidden] if running.hidden else []
@@ -1031,7 +1032,7 @@ def _unseen_process_findings(running: RunningProcesses) -> Iterator[Finding]:
         may_be = f"{doubtful[0].label} may be a node"
         if len(doubtful) > 1:
             may_be = f"{len(doubtful)} processes may be nodes"
-        reasons.append(f"{may_be}, and cannot be looked at ({why})")
+        reasons.append(f"{may_be}, but cannot be examined ({why})")
     if running.container:
         text = f"{len(running.processes)} of them speak ROS 2"
         yield CONTAINER_ALONE.found("processes", text)

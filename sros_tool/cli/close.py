@@ -210,7 +210,8 @@ def _show(robot: LocalRobot, closed: CloseState) -> None:
     for line in access_lines(policy, robot.folder, others):
         echo(f"  {line}")
     if outside:
-        echo(f"  not in the policy, and still with signed rights: {', '.join(outside)}")
+        signed = ", ".join(outside)
+        echo(f"  enclaves that the policy lacks, and that keep their signed rights: {signed}")
     for left_open in unguarded(keystore.governance):
         does = f"{left_open.direction} DDS topic {left_open.topic}"
         echo(f"  every enclave may {does}: the governance of the keystore leaves it open")
@@ -397,7 +398,7 @@ def _show_undone(robot: LocalRobot, closed: CloseState) -> None:
         state = "no process of the robot runs" if stopped else "the robot is open"
         more = ""
         if other_machines := closed.observed.not_here:
-            more = f"; start {enumerated(other_machines)}, on other machines, without sros run, too"
+            more = f"; on other machines, also start {enumerated(other_machines)} without sros run"
         echo(f"{state}: sros sees no process in an enclave of this folder{more}", err=True)
 
 

@@ -783,7 +783,9 @@ def _reached_lines(answer: ZenohAnswer) -> Iterator[str]:
     reachable = [reached.enclave for reached in answer.reached if not reached.problem]
     yield _labeled_row(does, _names_text(reachable))
     for reached in [reached for reached in answer.reached if reached.problem][:_MOST_SHOWN]:
-        yield _labeled_row("", f"not {reached.enclave}, which has the right: {reached.problem}")
+        yield _labeled_row(
+            "", f"{reached.enclave} has the right, but does not take part: {reached.problem}"
+        )
     for wildcard, enclaves in answer.wildcards:
         yield _labeled_row("wildcard", f"{wildcard} also matches other names")
         if wide_does:
@@ -988,7 +990,8 @@ def _who_lines(
     if in_part:
         whole = f"{len(in_part)} of {count}{asked_in} may {answer.question} in part, {len(able)} "
         whole += "as a whole"
-    further = f", and {len(holding)} with permissions of another enclave" if holding else ""
+    further = f"; {len(holding)} more may do so with the permissions of another enclave"
+    further *= bool(holding)
     yield f"{whole}{where}{further}"
 
 

@@ -772,9 +772,9 @@ def _lines(
         (
             text
             for text, is_so in (
-                ("by a keystore that is older than its robots", status.older),
+                ("compared with a keystore that is older than its robots", status.older),
                 ("perhaps not all robots", status.edited),
-                ("by a clock that is behind", status.clock),
+                ("judged by a clock that is behind", status.clock),
             )
             if is_so
         ),
@@ -942,8 +942,8 @@ def _expiry_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
     when = f"{end:%Y-%m-%d}" if time_left > timedelta(days=1) else iso(end)
     label, others = "first expiry on a robot", f", within 30 days on {counted(len(soon), 'robot')}"
     if time_left <= timedelta(0):
-        label, more = "expired on a robot since", counted(len(soon) - 1, "more robot")
-        others = f"; expired, or expires within 30 days, on {more}" if soon[1:] else ""
+        label, more = "first file that expired on a robot", counted(len(soon) - 1, "more robot")
+        others = f"; files of {more} have expired or expire within 30 days" if soon[1:] else ""
     short_lived = [name for robot in soon for name in robot.short_lived]
     named = short_lived[:_MOST_GROUPS]  # enclave names need no quotes
     named += ["..."] * (len(short_lived) > _MOST_GROUPS)
@@ -1171,8 +1171,11 @@ def _dds_count_lines(compared_fleet: ComparedFleet) -> Iterator[str]:
     elif list(_dds_findings(compared_fleet)):
         severities = Counter(finding.severity.word for finding in compared_fleet.findings)
         words = ", ".join(counted(number, word) for word, number in severities.items())
-        see = "--robot NAME --fail-on vulnerabilities"
-        yield f"on the DDS of robots: {words}; see {see}, or --json"
+        yield (
+            f"findings on the DDS of robots: {words}; `sros fleet status "
+            f"{quote(str(status.keystore))} --robot NAME --fail-on vulnerabilities` lists them, "
+            "and so does --json"
+        )
 
 
 def _expiry_clauses(robot: RobotStatus, moment: datetime) -> Iterator[str]:
@@ -1213,9 +1216,11 @@ def _summary(robot: RobotStatus, stage: str, moment: datetime) -> Iterator[str]:
     waits_for = {enclave_of(file.path) for file in robot.pending}
     has_the_rest = waits_for and waits_for <= {*robot.lacks_key}
     if robot.fetches and (robot.published or 0) != (robot.release or 0) and not has_the_rest:
-        yield (
-            f"release {robot.release or 'none'}; the published one is {robot.published or 'none'}"
+        has, published = (
+            f"release {number}" if number else "no release"
+            for number in (robot.release, robot.published)
         )
+        yield f"reports {has}; {published} is published"
     elif robot.fetches and robot.pending and not has_the_rest:
         other = f"its files differ from the published release {robot.release}"
         yield other if robot.is_published else "not published yet"
@@ -1234,7 +1239,7 @@ def _summary(robot: RobotStatus, stage: str, moment: datetime) -> Iterator[str]:
         names = first_few(unseen, _MOST_GROUPS)
         yield f"not known whether processes of {names} have loaded the installed files"
     if robot.enclaves and robot.stage not in ("", "unknown", stage):
-        yield f"CA files of the stage {robot.stage}"
+        yield f"its CA files are of the stage '{robot.stage}'"
     yield from robot.notes
     for number, problem in enumerate((robot.problems or ())[:_MOST_GROUPS]):
         # Whoever controls the robot chose the words.
@@ -1255,7 +1260,7 @@ def _file_details(robot: RobotStatus) -> Iterator[str]:
         see = ", see --json" if len(names) > _MOST_GROUPS else ""
         if names:
             yield (
-                f"  {counted(len(names), 'enclave')} that the fleet does not record {place}: "
+                f"  {counted(len(names), 'enclave')} {place}, but not recorded in the fleet: "
                 f"{first_few(names, _MOST_GROUPS)}{see}"
             )
     for kind, states in robot.files.items():

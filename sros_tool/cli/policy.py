@@ -717,7 +717,7 @@ def _copy(source: Path, target: Path, *, as_json: bool, dry_run: bool) -> None:
     if as_json:
         print_json(CopiedPolicies(target, dry_run, changes, ()))
     elif not changes:
-        echo(f"nothing to copy: '{target}' has the {kind}")
+        echo(f"nothing to copy: '{target}' already has the {kind}")
     else:
         echo(f"{'would copy' if dry_run else 'copied'} the {kind} to '{target}'")
 

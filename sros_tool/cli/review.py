@@ -559,7 +559,7 @@ def _access_findings(change: AccessChange, path: str) -> Iterator[Finding]:
         line = placed.source.file, placed.source.line
         at.setdefault((False, *line), []).append((placed.right.enclave, text))
     for (is_denial, file, number), [(subject, text), *more] in at.items():
-        text += f"; and {len(more)} more of this line" if more else ""
+        text += f"; and {counted(len(more), 'more change')} by this line" if more else ""
         kind = DROPPED_DENIAL if is_denial else NEW_ACCESS
         yield kind.found(subject, text, file, number)
 

@@ -368,7 +368,7 @@ def run(
         command = list(with_enclave(words, name))
     if (added := " ".join(command[len(words) :])) and not policy:
         echo(
-            f"added {added}, so that the ROS graph shows the enclave (--no-ros-args: do not)",
+            f"added {added}, so that the ROS graph shows the enclave (--no-ros-args adds nothing)",
             err=True,
         )
     environment = {**os.environ, **secured.variables}

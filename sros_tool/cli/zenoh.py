@@ -411,8 +411,8 @@ def _why_no_policy(subjects: Sequence[RightsOfSubject]) -> str:
     if not strangers:
         return "The rules let nobody publish, subscribe, call or serve any ROS name."
     return (
-        f"The rules allow something to {first_few(strangers, _MOST_KEYS)}, but no such name is the "
-        "name of an enclave, such as /talker, in cert_common_names."
+        f"The rules allow something to {first_few(strangers, _MOST_KEYS)}, but to no enclave: "
+        "cert_common_names has no name of an enclave, such as /talker."
     )
 
 
@@ -423,7 +423,9 @@ def _notes_on_lost_rules(subjects: Sequence[RightsOfSubject]) -> Iterator[Note]:
     for rights in subjects:
         if (rights.rights or rights.unsaid) and not enclave_of(rights):
             yield Note(
-                "zenoh.no-enclave", f"{_subject_text(rights)}: no enclave, so not in the policy"
+                "zenoh.no-enclave",
+                f"the policy leaves out {_subject_text(rights)}, because a policy gives rights "
+                "only to enclaves",
             )
         elif rights.unsaid:
             keys = ", ".join(key for _, key in rights.unsaid[:_MOST_KEYS])

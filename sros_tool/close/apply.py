@@ -202,13 +202,14 @@ class _RemainingProcesses:
                 continue
             names, old_name = nodes.names_in(process.enclave)
             under = f", under its old name {old_name}" if old_name else ""
-            state = "does not run; "
+            state, start = "does not run; ", "start it"
             if labels := [
                 other.label for other in unknown if _may_be_process(other, process, names)
             ]:
-                state = f"runs open by another command ({labels[0]}); if this is another program, "
+                state = f"may run open by another command ({labels[0]}); if that is not so, "
+                start = f"start {process.enclave}"
             command = process.open_command(self._robot.domain)
-            self._robot.shell.say(f"{process.enclave} {state}start it open{under}: {command}")
+            self._robot.shell.say(f"{process.enclave} {state}{start} open{under}: {command}")
 
     def secured_in_unobserved_enclaves(self) -> Iterator[str]:
         """Yield processes in enclaves of the export for which no process was observed."""
@@ -240,7 +241,7 @@ class _RemainingProcesses:
         if running.processes.hidden or any(not unseen.speaks for unseen in unseen_processes):
             why = "some processes cannot be examined"
             by_root = running.processes.by_root
-            remedy = f". {ROOT_IS_NOT_ENOUGH}" if by_root else ": ask as root, to see all processes"
+            remedy = f". {ROOT_IS_NOT_ENOUGH}" if by_root else ": run this command as root"
             self._robot.shell.say(f"{why}{remedy}")
 
 

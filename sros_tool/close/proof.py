@@ -239,7 +239,8 @@ def _proof_of_silence(robot: LocalRobot, before: Observation, *, hears: bool) ->
         found = f"it sees {first_few(sorted(nodes), MOST_NAMES)}"
         return Proof(SILENCE, False, f"{found}; stop what runs open, or start it in its enclave")
     if not hears:
-        return Proof(SILENCE, None, "nor does the observer in its enclave see the robot now")
+        why = "this proves nothing, because the observer in its enclave does not see the robot now"
+        return Proof(SILENCE, None, why)
     seen = nodes_text(before.nodes)
     return Proof(SILENCE, True, f"the observer that saw {seen} before sees none")
 
@@ -488,8 +489,8 @@ class _TalkComparison:
         expected = {*map(node_name, self._nodes.expected(self.current).nodes)}
         new = sorted({*map(node_name, with_profile)} - expected)
         if new:
-            text += f"; not compared: {first_few(new, MOST_NAMES)} (new: only nodes that sros saw "
-            text += "on the open robot are compared)"
+            text += "; not compared, because sros did not see them on the open robot: "
+            text += first_few(new, MOST_NAMES)
         return text
 
 
@@ -555,8 +556,9 @@ def _unseen_text(running: RunningRobot, node: str, enclave: str) -> str:
             and named_enclave(process.command) != enclave
         ):
             return (
-                f"{node or f'any node in {enclave}'} (start {process.label} with `{ROS_ARGS} "
-                f"--enclave {enclave}` at its end: on Zenoh, others do not see it otherwise)"
+                f"{node or f'any node in {enclave}'} (add `{ROS_ARGS} --enclave {enclave}` at the "
+                f"end of the command of {process.label}, because others on Zenoh do not see a node "
+                "without these arguments)"
             )
     if not node or is_expression(node):
         return f"any node in {enclave}"

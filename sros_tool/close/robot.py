@@ -166,7 +166,7 @@ class LocalRobot:
             except BlockingIOError:
                 raise UnavailableError(
                     f"another `{self.close_command}` is at work",
-                    "It would lose what this one writes.",
+                    "The other command would overwrite what this command writes.",
                     "Wait for it, or end it. --proof, --undo and --dry-run work meanwhile.",
                 ) from None
             except OSError:  # a file system without locks

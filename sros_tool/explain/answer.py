@@ -501,7 +501,7 @@ class Answer(NamedTuple):
                 text = "DDS in the process itself: no node of the enclave starts"
                 if not starts_without_security(self.problems):
                     return text
-                return f"{text} with the strategy Enforce; with Permissive, each starts open"
+                return f"{text} with the strategy Enforce; with Permissive, every node starts open"
 
     @property
     def rule(self) -> DecidingRule | None:

@@ -384,8 +384,8 @@ def explain_log_of(
 _NOTES = (
     Note(
         "log.only-text",
-        "a process can print any line, true or false: sros checked in the enclave only the lines "
-        "after 'found'",
+        "a process can print any line, true or false: only the rows 'found' are what sros itself "
+        "found in the enclave",
     ),
 )
 
@@ -1203,13 +1203,14 @@ def _renaming_advice(nodes: Sequence[str], wrong: str, enclave: str) -> str:
     renamed = ""
     if len(meant) == 1:
         renamed = (
-            f"; or, if this is {meant[0]} by another name, write this name in its profile, or "
-            "merge the policy of its package with this name, into a policy without the node: "
-            f"`sros merge_policy POLICY OTHER {_merge_options(meant[0], wrong)}`, with the name "
-            "that OTHER has for the node before `:__node`"
+            f". Or, if this is {meant[0]} by another name, write {wrong} in the profile of "
+            f"{meant[0]}. If the profile comes from the policy of a package, merge that policy "
+            "again, into a policy without the node: `sros merge_policy POLICY OTHER "
+            f"{_merge_options(meant[0], wrong)}`, with the name that OTHER has for the node before "
+            "`:__node`"
         )
     return (
-        f"{start}{renamed}; or, if {wrong} is a further node, give it a profile with "
+        f"{start}{renamed}. Or, if {wrong} is a further node, give it a profile with "
         f"common/node.xml: in the policy of {enclave}, or in an enclave of its own if it is "
         "another program."
     )

@@ -966,8 +966,8 @@ class ZenohOfKeystore:
         if any(outcome.mode is Mode.PEER for outcome in outcomes):
             text = (
                 "peers decide by their own files, but this answer uses only the router's file, "
-                "which has the same rights if `sros zenoh --check` says so. A question about one "
-                "enclave also reads the files at the other end."
+                "which has the same rights if `sros zenoh --check` finds it up to date. A question "
+                "about one enclave also reads the files at the other end."
             )
             yield Note("explain.zenoh-by-router", text)
         if self._asks_all:

@@ -821,13 +821,13 @@ def _list_from(value: Any, most: int, what: str) -> list[Any]:
 
 def _crl_from(value: Any) -> str:
     if not (isinstance(value, str) and len(value) <= LONGEST_LIST and _CRL_PEM.match(value)):
-        raise _FormError("its crl is not a few revocation lists in PEM")
+        raise _FormError("its crl is too long, or not a text with revocation lists in PEM")
     return value
 
 
 def _seal_from(value: Any) -> str:
     if not (isinstance(value, str) and len(value) <= LONGEST_SEAL and value.isascii()):
-        raise _FormError("its seal is not the text of a seal")
+        raise _FormError("its seal is too long, or not a text in ASCII")
     return value
 
 

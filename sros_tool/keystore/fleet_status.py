@@ -811,7 +811,7 @@ def _notes_on_clock(received: ReceivedConfirmation) -> Iterator[str]:
     if note := received.clock_note():
         yield note
     if received.confirmation.clock == RobotClock.BEHIND:
-        yield "its clock is earlier than documents that it has verified"
+        yield "its clock shows an earlier time than documents that it has verified"
 
 
 class _KeystoreFile(NamedTuple):
@@ -1303,7 +1303,8 @@ def _robot_status(
     if is_ahead and confirmed:
         ahead_note = (
             f"it says that it has release {confirmed.release}, from after the backup of the "
-            "keystore: its files are newer then, and the next release replaces them"
+            "keystore: its files are then newer than the keystore's, and the next release replaces "
+            "them"
         )
         compared_robot = compared_robot._replace(notes=(*compared_robot.notes, ahead_note))
     problems = confirmed.problems if confirmed else None
@@ -1372,7 +1373,8 @@ def _robot_status(
         return replace(status, got_earlier_release=True)
     copy_problem = (
         f"It sent a message long after release {status.published} was published, and has release "
-        f"{status.release or 'none'}: its `from` is an old copy."
+        f"{status.release or 'none'}: the place that `from` names in the settings of its agent has "
+        "an old copy."
     )
     return replace(
         status, got_earlier_release=True, problems=(*(status.problems or ()), copy_problem)

@@ -459,7 +459,7 @@ def _identity_faults(
         yield Problem(CERTIFICATE_FILE, text, Fault.CERTIFICATE_CRASH)
     remaining = validity_of(certificate).not_after - moment
     if traits.expiry_overflows and remaining // _LONGEST_TIMER % 2:
-        text = "it expires more than 292 years from now, which counts as expired, or crashes"
+        text = "it expires more than 292 years from now: DDS takes it for expired, or crashes"
         yield Problem(CERTIFICATE_FILE, text, Fault.CERTIFICATE_LASTS)
     if fault := chain_fault(certificate, trusted, moment=moment, checks=_chain_checks(traits)):
         yield Problem(CERTIFICATE_FILE, fault, Fault.CERTIFICATE_ISSUER)

@@ -686,7 +686,7 @@ def _unused_names(
         if not _is_used_by_anybody(world, parts, name, limit):
             other = _RIGHT_OF_OTHER_KIND.get(right, "")
             if other and _is_used_by_anybody(world, _sufficient_parts(other), name, limit):
-                meant = f", but some may {other} {_named_right(other, name)}"
+                meant = f", but some enclaves may {other} {_named_right(other, name)}"
             if isinstance(requirement, Nobody) and not meant:
                 unnamed.append(named)
             else:
@@ -763,7 +763,7 @@ def _why_never_fails(requirement: Requirement, world: World) -> str:
     match requirement:
         case Only(enclaves=enclaves) if any(map(is_expression, enclaves)):
             if len(_matching_enclaves(enclaves, world.enclaves)) == count:
-                return f"all {count} enclaves are among them"
+                return f"the listed names match all {count} enclaves"
         case AtMost(most=most) if most >= count:
             return f"there are only {count} enclaves"
         case Widest(rights=rights):

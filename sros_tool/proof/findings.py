@@ -275,14 +275,14 @@ def unused_remapping_findings(
     for rule in unused:
         if not has_new_name(rule, names, namespaces or ("/",)):
             raise UsageError(
-                f"--remap {rule}: no requirement names this, and '{system.file}' has no such new "
-                "name",
+                f"--remap {rule}: no requirement has the old name, and '{system.file}' does not "
+                "have the new name",
                 "",
                 "Write both names as the requirements and the policy do, or leave --remap out.",
             )
     return [
         REMAPPING_UNUSED.found(
-            system.file, f"--remap {rule}: no requirement names this", system.file
+            system.file, f"--remap {rule}: no requirement has the old name", system.file
         )
         for rule in unused
     ]

@@ -224,7 +224,7 @@ def _unrevoked_certificates(old: AccessSource, new: AccessSource) -> Iterator[Se
         yield _looser(f"certificate {serial:x}", "revoked", "trusted", text)
     if (more := len(trusted) - _MOST_SERIALS) > 0:
         text = "enclaves again trust anyone who has their keys"
-        yield _looser(f"{more} certificates more", "revoked", "trusted", text)
+        yield _looser(f"{more} more certificates", "revoked", "trusted", text)
 
 
 _MOST_SERIALS = 20

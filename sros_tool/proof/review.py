@@ -902,7 +902,7 @@ class _Review:
         except SrosError as error:
             yield f"keystores that did not change were not looked for: {error.what}"
         if self._template_changes():
-            yield f"new access by the changes of '{asked.template}'"
+            yield f"access that the changes of '{asked.template}' give is not compared"
         for path in self._changed_settings():
             yield f"'{path}' changes and is not reviewed"
         for side in (self.head, self.base):
@@ -911,7 +911,10 @@ class _Review:
                 yield f"'{path}' is not in {side.name}, so the fallback of its include is used"
         parents = asked.repository.parents(asked.head)
         if asked.base and len(parents) > 1 and asked.base not in parents:
-            yield "access that a merged branch lost since BASE, and that the merge restores"
+            yield (
+                "access that a merged branch lost since BASE, and that the merge restores, is not "
+                "reported"
+            )
         top = asked.repository.top()
         if not top:
             return

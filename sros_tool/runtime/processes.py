@@ -433,7 +433,7 @@ class ProcessTable:
             working_folder = os.readlink("cwd", dir_fd=folder)
             root = os.open("root", os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC, dir_fd=folder)
         except OSError as error:
-            problem = f"its root directory cannot be looked at ({error.strerror})"
+            problem = f"its root directory cannot be examined ({error.strerror})"
             enclave = ProcessEnclave("", "", problem=problem) if process.asks_for_security else None
             return replace(process, enclave=enclave, configuration=_configuration_of(process))
         try:
@@ -694,6 +694,9 @@ def _is_sros_run(command: tuple[str, ...]) -> bool:
     return "run" in names and any(script in names for script in _SCRIPTS_OF_SROS)
 
 
+_CHOSEN_BY_PROGRAM = "the program or its arguments choose the file, and sros does not know which"
+
+
 def _configuration_of(process: Process) -> LoadedFile | None:
     """Return the configuration file of a Zenoh process, without its content; None for others.
 
@@ -704,14 +707,15 @@ def _configuration_of(process: Process) -> LoadedFile | None:
     by_rmw = RMW in process.environment or "librmw_zenoh_cpp" in process.libraries
     is_of_zenoh = not _programs_in(process.command).isdisjoint((_ZENOHD, *_BRIDGES))
     if is_of_zenoh or not (by_rmw or process.is_router):
-        return LoadedFile("", problem="its program or its arguments choose it")
+        return LoadedFile("", problem=_CHOSEN_BY_PROGRAM)
     session, router = (process.environment.get(name, "") for name in (SESSION_URI, ROUTER_URI))
     is_certain = process.is_router or "librcl" in process.libraries
     if not is_certain and {session, router}.isdisjoint({"", NO_CONFIGURATION}):
-        return LoadedFile("", problem=f"its program chooses {SESSION_URI} or {ROUTER_URI}")
+        why = f"sros does not know whether the program uses {SESSION_URI} or {ROUTER_URI}"
+        return LoadedFile("", problem=why)
     path = router if process.is_router else session
     if path == NO_CONFIGURATION:  # with this path, no process of rmw_zenoh runs
-        return LoadedFile("", problem="its program or its arguments choose it")
+        return LoadedFile("", problem=_CHOSEN_BY_PROGRAM)
     return LoadedFile(path) if path else None
 
 

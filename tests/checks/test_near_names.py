@@ -85,16 +85,21 @@ AN_ACTION = 'as an action: <actions {}="ALLOW"><action>pick</action></actions>.'
 @pytest.mark.parametrize(
     ("asking", "offering", "text", "remedy"),
     [
-        (CALL, services("reply", "pick"), "a service (reply)", "p.xml:1 " + AN_ACTION),
-        (services("request", "pick"), EXECUTE, "an action (execute)", AN_ACTION),
-        (topics("subscribe", "pick"), services("reply", "pick"), "a service (reply)", "same kind"),
+        (CALL, services("reply", "pick"), "a service of this name (reply)", "p.xml:1 " + AN_ACTION),
+        (services("request", "pick"), EXECUTE, "an action of this name (execute)", AN_ACTION),
+        (
+            topics("subscribe", "pick"),
+            services("reply", "pick"),
+            "a service of this name (reply)",
+            "same kind",
+        ),
     ],
 )
 def test_another_kind_is_meant(
     asking: str, offering: str, text: str, remedy: str, tmp_path: Path
 ) -> None:
     said = findings(tmp_path / "p.xml", asking + OTHER + offering)["policy.name-misspelt"]
-    assert f"; /a has this name as {text}, unused" in said.text
+    assert f"; /a offers {text}, which no enclave uses" in said.text
     right = "call" if "request" in asking else "execute"
     assert remedy.format(right) in said.remedy
     same = found(tmp_path / "p.xml", asking + offering)

@@ -176,7 +176,7 @@ def test_a_name_that_something_of_ros_may_have(name: str) -> None:
 def test_a_denial_that_hides_several_topics_is_one_finding(bench: Bench) -> None:
     bench.permissions((ALLOW, DENY_ALL.replace("rt/*", "rr/*") + ALLOW))
     (text,) = (each.text for each in found_in(bench) if each.id == "permissions.unreachable-rule")
-    assert text.startswith("rule 2 allows to publish rr/base/") and text.count("rr/base/") > 1
+    assert text.startswith("rule 2 allows publish rr/base/") and text.count("rr/base/") > 1
     assert text.endswith("after a rule that denies rr/*")
 
 

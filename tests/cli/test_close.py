@@ -614,11 +614,11 @@ def test_what_systemd_does_not_start_is_done_by_hand(
     policy.write_text(policy.read_text().replace('node="listener"', 'node="hearer"'))
     undone = robot.close("--undo")
     assert undone.err.startswith(
-        "/listener runs open by another command (process 12 (run)); if this is another program, "
-        "start it open, under its old name /listener: cd /opt && /opt/run listener\n"
+        "/listener may run open by another command (process 12 (run)); if that is not so, "
+        "start /listener open, under its old name /listener: cd /opt && /opt/run listener\n"
         "/talker does not run; start it open: cd /opt "
     )
-    assert "\nsome processes cannot be examined: ask as root, to see all " in undone.err
+    assert "\nsome processes cannot be examined: run this command as root\n" in undone.err
     assert "the robot is open: " in undone.err
     looked = replace(robot.look(None, datetime.now(UTC)), by_root=True)
     monkeypatch.setattr(ProcessTable, "look", lambda _table, _now: looked)
@@ -859,7 +859,7 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     assert (
         "not checked: everything that talked can still talk: there is nothing to audit" in ended.out
     )
-    assert "not checked: an open listener finds nothing: nor does the observer in its" in ended.out
+    assert "not checked: an open listener finds nothing: this proves nothing, because" in ended.out
     assert "accept with --partial" not in ended.err
     robot.remaining = (TALKER, LISTENER)
     robot.unseen = (UnseenProcess(9, (), "/proc hides it", speaks=False),)
@@ -872,7 +872,7 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     )
     assert (
         "not checked: every process was started in its enclave: processes: process 9 (?) may be a "
-        "node, and cannot be looked at (/proc hides it) (accepted: --partial)\n"
+        "node, but cannot be examined (/proc hides it) (accepted: --partial)\n"
     ) in ended.out
     assert "closed, except for the claims that were not checked" in ended.err
 
@@ -1077,7 +1077,10 @@ def test_a_renamed_node_is_compared_and_a_new_one_is_named(
         "policy has no profile for them any more: /rear_camera (a renamed node is compared if"
         in said
     )
-    assert "; not compared: /nav/bow_camera, /nav/stern_camera (new: only nodes that sros" in said
+    assert (
+        "; not compared, because sros did not see them on the open robot: /nav/bow_camera, /n"
+        in said
+    )
 
 
 def test_a_process_that_the_policy_lacks_keeps_its_command(robot: Robot) -> None:
@@ -1617,7 +1620,10 @@ def test_an_enclave_that_belongs_to_another_machine(robot: Robot) -> None:
     kept = "  the keystore has /operator/look, and the policy does not, so /operator/look keeps"
     assert kept in ended.out and "sros revoke robot/keystore /operator/look (then" in ended.out
     assert "  topic /chatter: /talker -> /listener, /operator/look\n" in ended.out
-    assert "  not in the policy, and still with signed rights: /operator/look\n" in ended.out
+    assert (
+        "  enclaves that the policy lacks, and that keep their signed rights: /operator/look\n"
+        in ended.out
+    )
     assert "\nnot on this machine: /listener (to " in ended.out
     assert "/operator/look (" not in ended.err, "nobody is to bring its files there"
     proved = robot.close("--proof", status=1).out
@@ -1629,7 +1635,7 @@ def test_an_enclave_that_belongs_to_another_machine(robot: Robot) -> None:
     sros("create_enclave", "robot/keystore", "/operator/look", cwd=robot.folder).ok()
     robot.close("--elsewhere", "/operator/look", status=1)
     robot.by_hand = set()
-    there = "start /listener and /operator/look, on other machines, without sros run, too"
+    there = "on other machines, also start /listener and /operator/look without sros run"
     assert f"sros sees no process in an enclave of this folder; {there}\n" in (
         robot.close("--undo").err
     )

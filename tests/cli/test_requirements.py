@@ -127,7 +127,7 @@ def test_an_action_that_is_a_service(tmp_path: Path) -> None:
     held = tmp_path / "held.toml"
     held.write_text('[[only]]\ncall = ["/set"]\nenclaves = ["/a"]\n')
     ended = sros("check", "p.xml", "--requirements", held, cwd=tmp_path)
-    said = "no enclave may call action /set, but some may request service /set"
+    said = "no enclave may call action /set, but some enclaves may request service /set"
     assert said in ended.out
 
 
@@ -526,7 +526,7 @@ def test_requirements_are_remapped_as_the_policy(tmp_path: Path) -> None:
     assert ended.status == 1
     assert "/base: may request /g, but only /left/planner may request /g" in ended.out
     for words, problem in (
-        (("--remap", "close:=/h"), "--remap close:=/h: no requirement names this"),
+        (("--remap", "close:=/h"), "--remap close:=/h: no requirement has the old name"),
         (("--remap", "~/close:=/g"), "Write it as NODE:~/close:=/g."),
         (("--remap", "close:=~/g"), "Write it as NODE:close:=~/g."),
         (("--remap", "__node:=x"), "Write it as NODE:__node:=x."),
@@ -555,9 +555,9 @@ def test_what_merging_prints_runs_where_no_requirement_names_the_node(tmp_path: 
     command = printed.replace("POLICY", "p.xml").replace("FILE", "r.toml").split()
     asked = (*command, "--include", "requirement.*")
     ended = sros(*asked, cwd=tmp_path).ok()
-    assert "--remap mapper:__node:=sonar_map: no requirement names this" in ended.out
+    assert "--remap mapper:__node:=sonar_map: no requirement has the old name" in ended.out
     assert ended.out.count("remapping-unused") == 1, ended
     for misspelled in ("mapper:__node:=sonar_mop", "mapper:~/reset:=~/rest", "rnge:=distanc"):
         ended = sros(*asked, "--remap", misspelled, cwd=tmp_path)
-        said = f"--remap {misspelled}: no requirement names this, and 'p.xml' has no such new name"
+        said = f"{misspelled}: no requirement has the old name, and 'p.xml' does not have the new"
         assert (ended.status, said in ended.err) == (2, True), ended

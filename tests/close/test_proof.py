@@ -128,7 +128,9 @@ def test_a_node_that_others_do_not_see_on_zenoh_needs_its_enclave_in_its_command
     process = Process(1, ("python3", "talk"), variables, datetime.now(UTC))
     now: Any = SimpleNamespace(secured=[(process, ProcessEnclave("/export", "/talker"))])
     unseen = _unseen_text(now, "/talker", "/talker")
-    assert "start process 1 (talk) with `--ros-args --enclave /talker` at its end" in unseen
+    assert (
+        "add `--ros-args --enclave /talker` at the end of the command of process 1 (talk)" in unseen
+    )
 
 
 def test_expired_files_are_named_with_the_keystore_that_renews_them(

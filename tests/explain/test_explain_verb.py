@@ -615,7 +615,7 @@ def test_permissions_of_another_enclave_that_fit_are_said(tmp_path: Path) -> Non
             line = "/mux  with the permissions of /robot/mux, which fit its certificate"
             assert who[:-1] == [line] * fits + ["/robot/mux"]
             assert who[-1].endswith(
-                ", and 1 with permissions of another enclave" if fits else "/cmd_vel"
+                "; 1 more may do so with the permissions of another enclave" if fits else "/cmd_vel"
             )
             assert explain(keystore, "--who", *words, "--match", "/mux").status == 1 - fits
             single = explain(keystore, "/mux", *words)

@@ -903,7 +903,7 @@ def test_a_node_that_started_without_a_file_ran_open(
     denied = log.read_text() + f"{FAST_LINE}rt/x topic not found in allow rule.\n"
     assert "RAN UNSECURED" not in "".join(each.cause for each in explained(denied))
     asked = sros("explain", keystore, ENCLAVE, "publish", "/x").out
-    assert "starts with the strategy Enforce; with Permissive, each starts open\n" in asked
+    assert "starts with the strategy Enforce; with Permissive, every node starts open\n" in asked
 
 
 def test_a_fault_of_which_a_log_says_nothing_is_no_proof_of_an_open_node(

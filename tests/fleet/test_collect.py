@@ -713,7 +713,7 @@ def test_a_list_of_another_keystore_revokes_nothing(home: Home) -> None:
     found = home.collect()
     assert found.robots[0].outcome == "kept" and not found.notes
     home.send("r1", crl=9 * foreign)
-    assert "not a few revocation lists" in home.of("r1").why
+    assert "not a text with revocation lists" in home.of("r1").why
     home.send("r1", crl=foreign.replace("\n-----END", "\nAAAA\n-----END"))
     assert home.of("r1").outcome == "kept"
     assert OpenedKeystore(home.root).revocation_list is None
@@ -1043,7 +1043,7 @@ def test_what_was_renewed_is_published_at_once(home: Home) -> None:
     found = {robot["robot"]: (robot["release"], robot["published"]) for robot in status["robots"]}
     assert found["r1"] == (number - 1, number) and found["r3"][0] is None
     text = sros("fleet", "status", "ks", cwd=home.folder).out
-    assert f"release {number - 1}; the published one is {number}" in text
+    assert f"reports release {number - 1}; release {number} is published" in text
     home.run("renew", "ks", "/r1/base")
     home.send("r1", datetime.now(UTC), release=number)
     ended = sros("fleet", "collect", "ks", "inbox", "--publish", "ks", cwd=home.folder)

@@ -988,8 +988,10 @@ def test_a_robot_whose_files_have_expired_is_not_in_order(field: Field) -> None:
     assert {robot.to_do for robot in expired.robots} == {"renew"}
     lines = [*_lines(ComparedFleet(late, expired, [], []), (), findings=False)]
     assert lines[0] == "3 robots: 3 expired"
-    since = rf"expired on a robot since: {end:%Y-%m-%d}[^ ]* \(r1, {kind}\)"
-    assert re.match(f"{since}; expired, or expires within 30 days, on 2 more robots: ", lines[1])
+    since = rf"first file that expired on a robot: {end:%Y-%m-%d}[^ ]* \(r1, {kind}\)"
+    assert re.match(
+        f"{since}; files of 2 more robots have expired or expire within 30 days: ", lines[1]
+    )
     assert f"{kind} expired 17 min ago" in lines[-1]
     field.run("renew", "ks", "--robot", "r1")
     renewed = fleet_status(OpenedKeystore(field.root), ["r1"]).with_overdue(late)
@@ -1166,7 +1168,7 @@ def test_what_is_to_be_done_for_robots_that_do_not_fetch_what_is_published(field
     field.run("fleet", "publish", "ks", "pub")
     rows = said()
     assert rows["r1"][0] == "deliver" and "lacks the key of /r1/base, which no" in rows["r1"][1]
-    assert "the published one" not in rows["r1"][1], "no other enclave waits for it"
+    assert "is published" not in rows["r1"][1], "no other enclave waits for it"
     refused = "a web server with the current CA and list refuses it"
     assert rows["r3"][0] == "wait, else deliver" and refused in rows["r3"][1]
     assert rows["r2"][0] == "wait: it fetches"
@@ -1190,7 +1192,7 @@ def test_what_is_to_be_done_for_robots_that_do_not_fetch_what_is_published(field
     )
     rows = said()
     assert rows["r1"][0] == "deliver" and "lacks the key" in rows["r1"][1], "it has no file"
-    assert rows["r2"][0] == "look at its `from`" and "its `from` is an old copy." in rows["r2"][1]
+    assert rows["r2"][0] == "look at its `from`" and "its agent has an old copy." in rows["r2"][1]
     assert rows["r3"][0] == "deliver"
     metrics = field.run("fleet", "status", "ks", "--prometheus", status=1).out
     assert re.search(r'agent_problems\{.*robot="r2"\} 1', metrics)
@@ -1214,7 +1216,7 @@ def test_a_robot_that_says_it_has_a_release_that_was_never_published(field: Fiel
     assert [found[name]["crl_in_force"] for name in ROBOTS] == [True, False, True]
     rows = field.run("fleet", "status", "ks", status=1).out
     assert "3 robots: 2 current, 1 claims a later release" in rows
-    assert re.search(r"\nr2 +claims a later release +.* ago +find out why +release ", rows)
+    assert re.search(r"\nr2 +claims a later release +.* ago +find out why +reports release ", rows)
     field.age("r2", timedelta(days=2))
     assert field.states()["r2"] == "later"
     (field.root / "published.json").unlink()
@@ -1296,7 +1298,10 @@ def test_home_is_older_than_its_robots(field: Field) -> None:
             assert field.send("r1").status == 1
         rows = field.run("fleet", "status", "ks", status=1).out
         why = "robots have files that it signed" if away else "'.*/pub' has later releases"
-        assert " (by a keystore that is older than its robots)\n" in rows[: rows.index("\n") + 1]
+        assert (
+            " (compared with a keystore that is older than its robots)\n"
+            in rows[: rows.index("\n") + 1]
+        )
         command = rf"`sros fleet publish ks {field.folder}/pub --restored`"
         assert re.search(rf"the keystore is older than its robots: {why}.*{command}", rows), rows
         assert not field.status()["complete"] and in_force() == {False}
@@ -1461,7 +1466,8 @@ def test_an_earlier_confirmation_does_not_name_the_dds(field: Field) -> None:
     del value["confirmation"]["dds"]
     kept.write_text(json.dumps(value))
     assert (
-        "on the DDS of robots: 1 note; see --robot NAME" in field.run("fleet", "status", "ks").out
+        "findings on the DDS of robots: 1 note; `sros fleet status"
+        in field.run("fleet", "status", "ks").out
     )
     ended = field.run("fleet", "status", "ks", "--robot", "r1", "--fail-on", "vulnerabilities")
     assert f"[{NOT_SEEN}]" in ended.out and "not reported by r1" in ended.out

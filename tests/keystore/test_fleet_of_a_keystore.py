@@ -183,7 +183,9 @@ def test_what_lies_below_a_robot_is_revoked_with_it(unknown: Path, tmp_path: Pat
     assert (after["enclaves"], after["unrecorded"]) == (0, [])
     assert after["sharing_name"] == ["/desk/r3"]
     said = sros("fleet", "status", root, "--robot", "r3").out
-    assert "1 enclave that the fleet does not record elsewhere" in said, said
+    assert (
+        "1 enclave elsewhere, with its name in the path, but not recorded in the fleet: " in said
+    ), said
 
 
 def test_the_other_computer_of_a_revoked_robot_is_named(tmp_path: Path) -> None:

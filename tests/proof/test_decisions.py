@@ -207,8 +207,8 @@ ROBOT = {
     "/r/c": may("publish", "/z") + may("subscribe", "/*"),
 }
 CANNOT_FAIL = {
-    '[[only]]\npublish = ["/x"]\nenclaves = ["*"]': "all 3 enclaves are among them",
-    '[[only]]\npublish = ["/x"]\nenclaves = ["/r/?"]': "all 3 enclaves are among them",
+    '[[only]]\npublish = ["/x"]\nenclaves = ["*"]': "the listed names match all 3 enclaves",
+    '[[only]]\npublish = ["/x"]\nenclaves = ["/r/?"]': "the listed names match all 3 enclaves",
     '[[at_most]]\npublish = ["/x"]\nenclaves = 100': "there are only 3 enclaves",
     '[[at_most]]\npublish = ["/x"]\nenclaves = 3': "there are only 3 enclaves",
     '[[widest]]\nenclaves = ["*"]\npublish = ["*"]': "wildcards may match every name",
@@ -265,7 +265,10 @@ def test_a_guard_of_a_name_that_only_wildcards_match(name: str) -> None:
     [
         ('publish = ["*joint_commands"]', ""),
         ('call = ["/move"]', ""),
-        ('call = ["/set"]', "no enclave may use action /set, but some may request service /set"),
+        (
+            'call = ["/set"]',
+            "no enclave may use action /set, but some enclaves may request service /set",
+        ),
         ('publish = ["/cmd_vle"]', "no enclave may use topic /cmd_vle (perhaps /cmd_vel is meant)"),
     ],
 )

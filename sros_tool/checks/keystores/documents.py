@@ -372,8 +372,7 @@ def _order_findings(grant: Grant, name: str, file: str) -> Iterator[Finding]:
                     late.setdefault(met, []).append(topic)
             for met, topics in late.items():
                 text = (
-                    f"rule {index + 1} denies to {direction} {names_text(topics)} after a rule "
-                    "that "
+                    f"rule {index + 1} denies {direction} {names_text(topics)} after a rule that "
                 )
                 yield NO_EFFECT.found(name, f"{text}allows {met}", file)
 
@@ -398,7 +397,7 @@ def _unreachable_rule_findings(
         described_topics = " and ".join(
             f"{direction} {names_text(topic)}" for direction, topic in topics.items()
         )
-        text = f"rule {index + 1} allows to {described_topics} after a rule that denies {by}"
+        text = f"rule {index + 1} allows {described_topics} after a rule that denies {by}"
         yield UNREACHABLE.found(name, text, file)
 
 

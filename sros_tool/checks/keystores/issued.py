@@ -63,7 +63,8 @@ KEY_TWICE = FindingKind(
     "Run `sros renew KEYSTORE ENCLAVE --new-key` for one of them.",
 )
 _RESTORE_REMEDY = (
-    "Restore the files of the others, or run `sros renew KEYSTORE ENCLAVE --new-key` for them."
+    "Restore the files of the enclaves that got a copy, or run `sros renew KEYSTORE ENCLAVE "
+    "--new-key` for these enclaves."
 )
 UNEXPLAINED = FindingKind(
     "keystore.not-in-ledger",
@@ -330,7 +331,7 @@ def _lower_protection_findings(keystore: CheckedKeystore) -> Iterator[Finding]:
     except SrosError:
         return  # another check reports it
     for protection, level in less_protected(governance, stated):
-        text = f"{protection} has {level.lower()}, and the policy says {protection.word}"
+        text = f"{protection} has {level.lower()}, but the policy demands {protection.word}"
         yield LESS_PROTECTED.found(
             protection.enclave, text, protection.source.file, protection.source.line
         )

@@ -958,8 +958,9 @@ class Access:
             if join.outcome is Outcome.PEER_DENIES:
                 if not self._can_exchange_unprotected(rule):
                     return self._peers_refuse(rule)
-                text += (
-                    " or protect the topic, which even peers that refuse the participant exchange"
+                text = (
+                    f"the governance neither controls {asked} nor protects the topic, so even "
+                    "peers that refuse the participant exchange its messages"
                 )
             return self._answer(Outcome.ALLOWED, "unrestricted", text, topic_rule=rule)
         verdict = self._own[verb].ask(topic, partitions)

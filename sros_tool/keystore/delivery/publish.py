@@ -234,7 +234,8 @@ def publish(
             behind,
             "Robots would refuse what is published now, or get it with wrong dates.",
             "Set the clock, and publish again. If it is right, and was ahead before, first run "
-            f"`sros crl {quote(str(root))} --refresh`, so that the last entry has today's date.",
+            f"`sros crl {quote(str(root))} --refresh`, so that the last entry of the ledger has "
+            "today's date.",
         )
     with ExitStack() as stack:
         if not dry_run:
@@ -499,8 +500,8 @@ class _RoleKeys:
             if os.path.lexists(path):
                 raise KeystoreError(
                     f"'{path}' is in the way",
-                    "The new root key is there until the keystore names it.",
-                    "Move it away.",
+                    "sros writes the new root key to this path before the keystore names the key.",
+                    "Move this file away.",
                 )
             with staged_file(path, self._new_elsewhere) as put_in_place:
                 put_in_place()
@@ -807,9 +808,9 @@ class _Publication:
             f"nothing in '{self._folder}' shows what was revoked, or which rights were taken away, "
             f"after {since}: a robot that was stolen after that gets releases, and is trusted. "
             f"Unless you have done so, run `sros fleet collect {where} INBOX`, which revokes again "
-            "what messages of robots show, revoke again what else was stolen (`sros revoke "
-            f"{where} --robot NAME`), sign the present policy (`sros generate_artifacts`), and "
-            "publish again.",
+            "what messages of robots show. Revoke again what else was stolen (`sros revoke "
+            f"{where} --robot NAME`), and sign the present policy (`sros generate_artifacts`). "
+            "Then publish again.",
         )
 
     def _not_restored_error(self) -> KeystoreError:
@@ -853,7 +854,8 @@ class _Publication:
                 if robot not in known or release.number > known[robot].release.number
             ]
             raise self._restored_error(
-                f"has later releases: {first_few(robots, _MOST_NAMES)}, up to the number {latest}",
+                f"has later releases of {first_few(robots, _MOST_NAMES)} than the keystore "
+                f"'{self.keystore.root}' knows (up to the number {latest})",
                 f"repeat the later changes, and add --restored to {self._command}, which "
                 "revokes again what these releases revoke",
             )
@@ -874,14 +876,15 @@ class _Publication:
             if removed := [robot for robot in gone if self._enclaves(fleet, robot)]:
                 revoke = f"sros revoke {quote(str(self.keystore.root))} --robot {removed[0]}"
                 raise self._restored_error(
-                    f"was published later without {first_few(removed, _MOST_NAMES)}",
+                    f"was published again without {first_few(removed, _MOST_NAMES)}, and the "
+                    f"keystore '{self.keystore.root}' does not know this",
                     f"repeat the revocations (`{revoke}`), remove robots that left the fleet from "
                     "the fleet file, and publish again",
                 )
 
     def _restored_error(self, evidence: str, remedy: str) -> KeystoreError:
         return KeystoreError(
-            f"'{self._folder}' {evidence}, which the keystore '{self.keystore.root}' does not know",
+            f"'{self._folder}' {evidence}",
             "The keystore was restored from a backup, or is a copy. Publishing would undo later "
             "changes, such as a revocation.",
             f"Restore a later backup. If there is none, {remedy}.",
@@ -1045,19 +1048,18 @@ class _Publication:
     def _unknown_error(self, unknown: Sequence[Release]) -> KeystoreError:
         where = quote(str(self.keystore.root))
         robots = sorted({release.robot for release in unknown})
-        end = "and publish again"
+        end = ""
         if not self._published_before:
-            end = "publish again, and give agents the new root metadata (`sros agent init --force`)"
+            end = " Give agents the new root metadata (`sros agent init --force`)."
         return self._restored_error(
-            "has releases that the keystore's CA sealed: "
-            f"{first_few(robots, _MOST_NAMES)}, up to the number "
-            f"{unknown[-1].number}",
-            f"first run `sros fleet collect {where} INBOX`, because messages of robots show what "
-            f"was revoked; revoke again what else was revoked (`sros revoke {where} --robot "
-            f"NAME`); empty '{self._folder / _METADATA}', and add --restored --new-folder to "
-            f"{self._command}, which also revokes again what these releases revoke. Then renew all "
-            f"certificates, {end}: "
-            "docs/howto/keystore_is_lost.md",
+            f"has releases of {first_few(robots, _MOST_NAMES)} that the keystore "
+            f"'{self.keystore.root}' sealed but does not know (up to the number "
+            f"{unknown[-1].number})",
+            f"run `sros fleet collect {where} INBOX`, which revokes again what messages of robots "
+            f"show. Revoke again what else was revoked (`sros revoke {where} --robot NAME`). Empty "
+            f"'{self._folder / _METADATA}', and add --restored --new-folder to {self._command}: "
+            "this also revokes again what these releases revoke. Then renew all certificates, and "
+            f"publish again.{end} docs/howto/keystore_is_lost.md has these steps",
         )
 
     def _sealed_certificates(self) -> Iterator[x509.Certificate]:
@@ -1168,8 +1170,8 @@ class _Publication:
         made = [(changed, work(changed))] if on_token else map_slices(changed, work)
         self._made = [robot for _, part in made for robot in part]
         if self._damaged:
-            text = f"missing or damaged in '{self._folder}', so that robots refused them: the "
-            text += f"archives of {first_few(sorted(self._damaged), 5)}"
+            text = f"archives in '{self._folder}' were missing or damaged, so that robots refused "
+            text += f"them: {first_few(sorted(self._damaged), 5)}"
             self._notes.append(Note("fleet.archive-damaged", text))
         lines = []
         for robot, published, is_new, _, not_valid in self._made:

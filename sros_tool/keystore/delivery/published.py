@@ -64,7 +64,7 @@ class PublishedRelease(NamedTuple):
         for value, most in ((self.number, MOST_NUMBER), (self.length, OF_ONE_ROBOT.packed)):
             check_positive_number(value, most)
         if not (isinstance(self.sha256, str) and _DIGEST.match(self.sha256)):
-            raise ValueError("a SHA-256 is none")
+            raise ValueError("a SHA-256 does not have 64 hexadecimal digits")
         return self
 
 
@@ -251,9 +251,9 @@ def releases_in(folder: Path, robots: int) -> Iterator[Release]:
     if excess:
         raise KeystoreError(
             f"'{folder / 'targets/robots'}' has {excess} archives",
-            "The keystore did not publish so many. It has to read them, because it does not know "
-            "the metadata there.",
-            "Find out who else can write there, and remove what is not from a keystore.",
+            "The keystore did not publish so many. sros would have to read all of them, because "
+            "the keystore does not know the metadata in this folder.",
+            "Find out who else can write to the folder, and remove what no keystore published.",
         )
 
 

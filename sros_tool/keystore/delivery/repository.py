@@ -325,7 +325,7 @@ def _read_metadata(
     data = folder.read(f"{_METADATA}/{name}", max_bytes=_MOST_BYTES)
     metadata = Metadata[_Content].from_bytes(data)
     if not isinstance(metadata.signed, kind):
-        raise RepositoryError(f"{name} is metadata of another kind")
+        raise RepositoryError(f"{name} has metadata of another kind than {role}")
     return metadata
 
 

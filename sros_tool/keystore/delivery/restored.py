@@ -378,8 +378,8 @@ def refuse_lost_changes(
     if keys := names["key"]:
         of = first_few(keys, _SHOWN)
         what.append(
-            f"{of} got another key, or the certificates of the earlier key were revoked, and the "
-            "keystore has only the earlier key"
+            f"{of} got another key, which the keystore lacks, or the certificates of the "
+            "keystore's key were revoked"
         )
         why.append("Whoever has an earlier key could be trusted again.")
         on_robots = [name for name in keys if key_on_robot(keystore.folder(name))]
@@ -410,7 +410,10 @@ def refuse_lost_changes(
             what.append(f"the governance was changed{f' ({change.what})' if change.what else ''}")
             why.append("Messages could be protected less.")
             again = f"`sros update_keystore {root} --set KEY=VALUE`"
-            steps.append(f"Change it again, with {again}: to another governance only afterwards.")
+            steps.append(
+                f"Change the governance again to what was published last, with {again}; make other "
+                "changes only after publishing."
+            )
     if what:
         raise KeystoreError(
             f"'{folder}' cannot be published yet: after the backup, {'; '.join(what)}",
@@ -483,6 +486,6 @@ def other_changes_notes(keystore: OpenedKeystore, changes: Sequence[LaterChange]
         yield Note(
             "fleet.changed-after-backup",
             f"the releases from after the backup show other changes: {shown}. Sign the present "
-            "policy and fleet again with `sros generate_artifacts`; remove what is no longer to "
-            "be there.",
+            "policy and fleet again with `sros generate_artifacts`, and remove the enclaves that "
+            "robots should not have any more.",
         )
