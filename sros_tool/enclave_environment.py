@@ -780,7 +780,8 @@ def _unnamed_node_error(policy: Policy, command: Sequence[str]) -> UsageError:
         enclaves = policy.enclaves_of_node(ns or "/", name)
         if len(enclaves) == 1:
             run = f"`sros run KEYSTORE {quote(enclaves[0].path)} -- COMMAND`"
-            remedy = f"If the process has the node {_full_name(ns, name)}, as a rule says: {run}."
+            node = _full_name(ns, name)
+            remedy = f"If the process has the node {node}, as a remapping rule says: {run}."
     return UsageError(
         f"the command '{command[0]}' names no node",
         "The policy assigns enclaves to node names, and `--ros-args -r __node:=NAME` sets the "

@@ -495,7 +495,7 @@ class _Round:
         self._state = replace(self._state, removed=recent)
         if recent:
             self._problems.append(
-                f"The agent removed enclaves, the last one at {iso(max(recent.values()))}, that the "
+                f"The agent removed enclaves, the last at {iso(max(recent.values()))}, that the "
                 f"installed release lacks: {first_few(sorted(recent), 3)}. If they belong to "
                 "another robot, somebody may have copied their keys: run `sros renew KEYSTORE "
                 "ENCLAVE --new-key --revoke-old`."

@@ -638,7 +638,7 @@ def moment_of(text: str | None) -> datetime:
             return now() + parse_duration(text)
     raise UsageError(
         f"--at {text!r} is not a date",
-        f"It is not a duration, and not a date from {_ALLOWED_YEARS[0]} to {_ALLOWED_YEARS[1]}.",
+        f"It is neither a duration nor a date from {_ALLOWED_YEARS[0]} to {_ALLOWED_YEARS[1]}.",
         "Write 2027-06-01, 2027-06-01T12:00:00Z, or 90d for 90 days from now.",
     )
 

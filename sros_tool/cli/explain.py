@@ -696,7 +696,7 @@ def _change_lines(answer: Answer) -> Iterator[str]:
         yield from (f"    remove: {right.qualifier} {right.describe()}" for right in change.lift)
     for right in change.lift:
         if is_expression(right.name):
-            yield f"    this also removes the DENY of all other names in {right.name}"
+            yield f"    this also removes the DENY of all other names that {right.name} matches"
     if change.document:
         if answer.enclave.has_placeholders:
             place = f"at {_place_text(policy.source)}" if policy else "to the fleet's policy"
@@ -746,7 +746,7 @@ def _zenoh_lines(explanation: ZenohExplanation) -> Iterator[str]:
     yield _labeled_row("why", answer.text)
     yield from _link_lines(answer)
     if dropped := answer.dropped:
-        dropper = f"{dropped.enforcer}: silently dropped, and {answer.enclave} gets no error"
+        dropper = f"{dropped.enforcer}, which drops it silently: {answer.enclave} gets no error"
         yield _labeled_row("denied by", dropper)
     if allowed and answer.question.word in _RECEIVER_WORDS:
         yield from _reached_lines(answer)

@@ -552,7 +552,8 @@ def _published_lines(published: PublishedFleet, moment: datetime) -> Iterator[st
             yield f"refused: {robot.robot} {keeps}: {robot.why}"
     if published.rotated:
         yield (
-            f"new keys: {', '.join(published.rotated)}; robots accept them by {published.root.name}"
+            f"new keys: {', '.join(published.rotated)}; {published.root.name} lets robots accept "
+            "them"
         )
     if published.versions.get("timestamp") == 1:
         yield f"robots pin {published.root}, SHA-256 {published.root_sha256}"

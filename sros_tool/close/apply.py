@@ -267,7 +267,7 @@ def _drop_ins_of(robot: LocalRobot, observed: ObservedProcesses) -> list[Path]:
         if path not in drop_ins and os.path.lexists(path):
             raise SrosError(
                 f"'{path}' is not the drop-in of this folder",
-                "Its first line names another folder, or was changed. Nothing was changed.",
+                "Its first line names another folder, or was edited. sros changed nothing.",
                 "Use the folder that its first line names, spelled as there, or remove the "
                 "drop-in.",
             )

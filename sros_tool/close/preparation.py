@@ -404,7 +404,7 @@ def _launch_problems(robot: LocalRobot, observed: ObservedProcesses) -> Iterator
 def _unknown_process_problems(robot: LocalRobot, state: CloseState) -> Iterator[str]:
     """Yield the processes without known nodes, and the nodes without a known process."""
     observed, close = state.observed, robot.close_command
-    silent = "they would not be heard any more (accept: --partial)"
+    silent = "nobody would hear them any more (--partial accepts this)"
     if observed.unknown:
         processes = first_few(observed.unknown, MOST_NAMES)
         remap = "--ros-args -r __node:=NODE -r __ns:=NAMESPACE"
@@ -428,7 +428,8 @@ def _unknown_process_problems(robot: LocalRobot, state: CloseState) -> Iterator[
         yield (
             f"{routers[0].label} is a Zenoh router that did not run when sros watched, or does not "
             f"belong to the robot. Watch again while it runs, or stop it: {close} --for 1m. "
-            "Otherwise closed nodes do not reach each other through this router (accept: --partial)"
+            "Otherwise closed nodes do not reach each other through this router (--partial accepts "
+            "this)"
         )
     pids = {process.enclave: process.pid for process in observed.processes}
     if twice := sorted(pids.keys() & {*observed.elsewhere}):

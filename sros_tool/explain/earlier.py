@@ -59,8 +59,9 @@ def note_on_earlier_permissions(
         which = quote(names[0]) if len(names) == 1 else "ENCLAVE..."
         text = (
             f"the rights in earlier permissions of {first_few(names, 3)} are not known here: they "
-            "were signed from another policy. Whoever kept them and the key has these rights until "
-            f"{max(ends.values())}. To end that, run `sros renew {root} {which} --revoke-old`."
+            "were signed from another policy. Whoever kept these permissions and the key has the "
+            f"rights until {max(ends.values())}. To end that, run `sros renew {root} {which} "
+            "--revoke-old`."
         )
         yield Note("explain.earlier-permissions", text)
 

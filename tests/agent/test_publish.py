@@ -944,7 +944,7 @@ def test_a_refused_robot_in_another_folder(publisher: Home, tmp_path: Path) -> N
 def test_a_publishing_folder_that_lost_metadata(publisher: Home) -> None:
     robot = publisher.robot()
     next(publisher.pub.glob("metadata/*.targets.json")).unlink()
-    with pytest.raises(KeystoreError, match=r"targets\.json' is missing, which robots") as refused:
+    with pytest.raises(KeystoreError, match=r"targets\.json', which robots fetch, is") as refused:
         publisher.publish()
     assert f"remove '{publisher.pub}/metadata', and publish again with --new-folder" in str(
         refused.value

@@ -1007,7 +1007,10 @@ def test_nothing_is_closed_of_what_is_not_understood(robot: Robot) -> None:
     robot.units = UNITS
     robot.more = (Process(5, ("other", "--ros-args"), {}, datetime.now(UTC)),)
     assert "first:\n  sros saw no node of 1 process: process 5 (other)" in robot.close(status=1).out
-    assert "would not be heard any more (accept: --partial)" in robot.close("--apply", status=1).out
+    assert (
+        "nobody would hear them any more (--partial accepts this)"
+        in robot.close("--apply", status=1).out
+    )
     assert robot.restarts == []
     robot.more = (replace(robot.more[0], pid=6, environment={"ROS_DOMAIN_ID": "1"}),)
     ended, in_1 = robot.close("--for", "1s"), "in domain 1, not 0: process 6 (other); to cl"

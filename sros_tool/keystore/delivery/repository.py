@@ -260,7 +260,7 @@ def read_present(folder: Path, roots: Roots) -> PresentMetadata:
         if not folder.exists():
             return PresentMetadata()
         raise KeystoreError(
-            f"'{error.filename}' is missing, which robots fetch",
+            f"'{error.filename}', which robots fetch, is missing",
             "The keystore wrote the metadata that leads there.",
             "Copy the file back. If the keystore was restored from a backup, first follow "
             f"docs/howto/keystore_is_lost.md. If the file is lost, "

@@ -109,8 +109,9 @@ def revoke(
     if reason == SUPERSEDED:
         raise UsageError(
             f"{SUPERSEDED} is not a reason to revoke an enclave",
-            "It marks earlier certificates of renewed enclaves, which keep their rights: machines "
-            "that have only an export would still accept Zenoh files from before the revocation.",
+            "This reason marks earlier certificates of renewed enclaves, and such enclaves keep "
+            "their rights: machines that have only an export would still accept Zenoh files from "
+            "before the revocation.",
             "Choose another reason, such as cessation_of_operation; or replace the certificate "
             "with `sros renew --revoke-old`.",
         )

@@ -351,7 +351,7 @@ def _target_stage(
     if ahead < 0:
         raise UsageError(
             f"the stage {to} is over",
-            f"The keystore is at {rotation.stage}, and a rotation cannot go back.",
+            f"The keystore is at the stage {rotation.stage}, and a rotation cannot go back.",
             f"Run `sros rotate_ca {quote(str(root))} --next`.",
         )
     return to
