@@ -799,7 +799,7 @@ def _lines(
 
 def _fleet_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
     """Yield sentences about the fleet as a whole."""
-    from sros_tool.keystore.fleet import FLEET_REMEDY
+    from sros_tool.keystore.fleet import fleet_edits_remedy
     from sros_tool.validity import elapsed
 
     status = compared_fleet.status
@@ -810,7 +810,7 @@ def _fleet_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
     publish += " --root-key FILE" if root_end and root_end <= compared_fleet.at else ""
     restored = f"`{publish} --restored`; docs/howto/keystore_is_lost.md has the other steps"
     if status.edited:
-        remedy = FLEET_REMEDY.replace("KEYSTORE", quote(str(status.keystore)))
+        remedy = fleet_edits_remedy(status.keystore, status.edited)
         yield f"perhaps not all robots are shown: the fleet file {status.edited}. {remedy}"
     if status.clock:
         yield f"{status.clock}: the age of the confirmations is not known. Set the clock"

@@ -27,7 +27,7 @@ from sros_tool.fleet.robots import (
     unrecorded_enclaves,
 )
 from sros_tool.keystore.layout import FLEET, FLEET_ROOT, remedy_in_closed_robot
-from sros_tool.keystore.ledger import Entry, Ledger
+from sros_tool.keystore.ledger import LEDGER_REMEDY, Entry, Ledger
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.policy.placeholders import has_placeholder
 from sros_tool.validity import iso
@@ -46,6 +46,7 @@ FLEET_REMEDY = (
     "policies of the fleet: `sros generate_artifacts -k KEYSTORE -p POLICY_FILE --fleet "
     "FLEET_FILE`."
 )
+_DAMAGED_LEDGER = "the ledger has lines that are missing or were changed"
 _MOST_SHOWN = 5
 
 
@@ -105,7 +106,7 @@ def checked_fleet(keystore: OpenedKeystore, without_it: Callable[[], str] = str)
         raise KeystoreError(
             f"'{keystore.root / FLEET}' {problem}",
             "It decides which enclaves belong to a robot, and which domains they may join.",
-            without_it() + FLEET_REMEDY.replace("KEYSTORE", quote(str(keystore.root))),
+            without_it() + fleet_edits_remedy(keystore.root, problem),
         )
     return load_fleet(keystore)
 
@@ -129,12 +130,26 @@ def fleet_edits_clause(keystore: OpenedKeystore, ledger: Ledger) -> str:
     return _edit_text(ledger, _read_fleet_file(keystore))
 
 
+def is_of_damaged_ledger(clause: str) -> bool:
+    """Return whether the cause of a clause of `fleet_edits_clause` is a damaged ledger."""
+    return clause.endswith(_DAMAGED_LEDGER)
+
+
+def fleet_edits_remedy(root: Path, clause: str) -> str:
+    """Return what to do about a clause of `fleet_edits_clause`."""
+    remedy = FLEET_REMEDY
+    if is_of_damaged_ledger(clause):
+        remedy = LEDGER_REMEDY.replace("POLICY_FILE", "POLICY_FILE --fleet FLEET_FILE")
+    return remedy.replace("KEYSTORE", quote(str(root)))
+
+
 def _edit_text(ledger: Ledger, data: bytes | None) -> str:
     # Only certain entries count, because others may have been added by somebody else.
     last = next((entry for entry in reversed(ledger.certain) if entry.what == "fleet"), None)
     if last is None and any(entry.what == "fleet" for entry in ledger.entries):
         state = "is missing" if data is None else "is perhaps not the file that sros wrote"
-        return f"{state}: the ledger was changed by another program"
+        why = _DAMAGED_LEDGER if ledger.gaps else "the ledger had missing or changed lines"
+        return f"{state}: {why}"
     if last is None:
         return "" if data is None else "was not written by sros"
     if data is None:

@@ -774,6 +774,24 @@ def test_a_fleet_file_that_was_edited_is_not_believed(field: Field) -> None:
     )
 
 
+def test_a_damaged_ledger_is_not_blamed_on_the_fleet_file(field: Field) -> None:
+    """Its remedy would sign everything again, and record the damage for good."""
+    ledger = field.root / "ledger.jsonl"
+    lines = ledger.read_text().splitlines(keepends=True)
+    ledger.write_text("".join([*lines[:5], *lines[6:]]))
+    restore = "Restore ledger.jsonl and ledger.p7s from the same backup. Without one, state all"
+    told = field.run("fleet", "status", "ks", status=1).out
+    assert f"the ledger has lines that are missing or were changed. {restore}" in told
+    assert restore in field.run("renew", "ks", "--robot", "r1", status=2).err
+    found = field.run("check", "ks", status=1).out
+    assert "keystore.ledger-damaged" in found and "keystore.fleet-edited" not in found
+    words = ("generate_artifacts", "-k", "ks", "-p", "policy.xml", "--fleet", "fleet.toml")
+    for dry_run in (["--dry-run"], []):
+        said = field.run(*words, *dry_run).err
+        assert "restore ledger.jsonl and ledger.p7s from it, and repeat the change" in said
+    assert "ledger" not in field.run("renew", "ks", "--all").err, "the damage is recorded now"
+
+
 def test_a_revoked_robot_of_which_only_a_copied_list_knows(field: Field) -> None:
     """A list that was taken from a robot, as after a backup was restored."""
     backup, crl = copy_of(field.root, field.folder / "backup"), "public/identity_ca.crl.pem"

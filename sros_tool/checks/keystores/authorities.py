@@ -20,7 +20,7 @@ from sros_tool.dds.decision.vendors import FAST_DDS, Vendor
 from sros_tool.errors import SrosError
 from sros_tool.faults import ORIGINAL_KEYSTORE
 from sros_tool.fleet.robots import Fleet
-from sros_tool.keystore.fleet import FLEET_REMEDY
+from sros_tool.keystore.fleet import FLEET_REMEDY, is_of_damaged_ledger
 from sros_tool.keystore.known_keys import unlisted_revocations
 from sros_tool.keystore.layout import (
     CRL,
@@ -33,6 +33,7 @@ from sros_tool.keystore.layout import (
     ca_key,
     key_path,
 )
+from sros_tool.keystore.ledger import LEDGER_REMEDY
 from sros_tool.keystore.loading import authority_refusals, refusals_text
 from sros_tool.keystore.settings import edit_remedy
 from sros_tool.keystore.template import is_ca_service
@@ -299,9 +300,7 @@ LEDGER_DAMAGED = FindingKind(
     "than the current ones.",
     "sros: each line of ledger.jsonl has the digest of the line before it; ledger.p7s has the "
     "digest of the last line.",
-    "Restore ledger.jsonl and ledger.p7s from the same backup. Without one, state all rights again "
-    "with `sros generate_artifacts -k KEYSTORE -p POLICY_FILE`, and replace the CAs with `sros "
-    "rotate_ca KEYSTORE --next`, so that files that the ledger lacks are no longer valid.",
+    LEDGER_REMEDY,
 )
 LEDGER_UNCHAINED = FindingKind(
     "keystore.ledger-unchained",
@@ -429,7 +428,7 @@ def _settings_and_ledger_findings(keystore: CheckedKeystore) -> Iterator[Finding
     edits, file = keystore.edits, keystore.shown(SETTINGS)
     if edits.settings:
         yield SETTINGS_EDITED.found("settings", "; ".join(edits.settings), file)
-    if keystore.fleet_edited:
+    if keystore.fleet_edited and not is_of_damaged_ledger(keystore.fleet_edited):
         clause = f"{FLEET} {keystore.fleet_edited}"
         yield FLEET_EDITED.found("fleet", clause, keystore.shown(FLEET))
     if keystore.fleet:

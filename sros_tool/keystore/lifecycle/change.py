@@ -499,6 +499,14 @@ class KeystoreChange:
                 f"{behind}: files that are made now are valid for too short a time. Set the clock."
             )
             self.notes.append(Note("keystore.clock", text))
+        if faults := self.keystore.ledger_file.reading_for_append().unrecorded:
+            text = (
+                f"the ledger is damaged ({'; '.join(fault.text for fault in faults)}), and this "
+                "change records that: the damage then stays visible until the CAs are replaced. If "
+                "a backup has the ledger, restore ledger.jsonl and ledger.p7s from it, and repeat "
+                "the change."
+            )
+            self.notes.append(Note("keystore.ledger-damaged", text))
         self.entries = _take_over_records(self.transaction, self.keystore, self.now, self.entries)
         append(
             self.transaction,
