@@ -86,6 +86,7 @@ from sros_tool.keystore.reader import OpenedKeystore, read_certificate
 from sros_tool.keystore.transaction import recover_keystore
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import (
+    key_digest,
     key_digest_of_ca,
     load_certificates,
     make_request,
@@ -224,7 +225,10 @@ class _Round:
         }
         # Remembered now, because installing closes the keys of changed enclaves to others.
         exposed = recent | dict.fromkeys(readable_keys, now)
-        self._state = replace(self._state, exposed=exposed)
+        digests = {key: self._key_digest(key) for key in readable_keys}
+        self._state = replace(
+            self._state, exposed=exposed, exposed_digests={**before.exposed_digests, **digests}
+        )
         installation, fetched = self._fetch_and_install(certain)
         if clock is not RobotClock.BEHIND and installation.made:
             clock = self._clock_next_to_release(installation.made) or clock
@@ -502,20 +506,30 @@ class _Round:
             )
 
     def _note_closed_keys(self, exposed: Mapping[str, datetime], now: datetime) -> None:
-        """Report for a day the keys that other users could read until the agent closed them."""
+        """Report for a day the keys that other users could read, until they are replaced."""
+        digests = self._state.exposed_digests
         closed = {
             key: exposed[key]
             for key in exposed.keys() - exposed_keys(self._folder, now)
             if (self._folder / key).exists()  # a removed enclave has no key
+            and self._key_digest(key) == (digests.get(key) or self._key_digest(key))
         }
-        self._state = replace(self._state, exposed=closed)
+        digests = {key: digest for key, digest in digests.items() if key in exposed}
+        self._state = replace(self._state, exposed=closed, exposed_digests=digests)
         if closed:
             self._problems.append(
                 f"Until {iso(max(closed.values()))}, others could read "
-                f"{counted(len(closed), 'private key')}: {first_few(sorted(closed), 3)}. The agent "
-                "set the mode to 0600. If anybody may have copied a key, run `sros renew KEYSTORE "
+                f"{counted(len(closed), 'private key')}: {first_few(sorted(closed), 3)}. The mode "
+                "is right now. If anybody may have copied a key, run `sros renew KEYSTORE "
                 "ENCLAVE --new-key --revoke-old` in the keystore."
             )
+
+    def _key_digest(self, path: str) -> str:
+        """Return the SHA-256 of the public key of a private key; "" if it cannot be read."""
+        with suppress(SrosError, OSError):
+            key = load_key(read_bytes(self._folder / path, "private key"), f"'{path}'")
+            return key_digest(key.public_key())
+        return ""
 
     def _install(self, release: Release, certain_time: datetime) -> Installation:
         settings, state = self._settings, self._state

@@ -61,8 +61,9 @@ class AgentState:
     files, in seconds since the start of the machine: setting the clock does not change these times.
     ``repaired`` is a sentence on files that differed from the release and were replaced at
     ``repaired_at``.  ``exposed`` maps paths of private keys that other users could read to the time
-    of the round in which the agent closed them; ``removed`` maps enclaves that the installed
-    release did not have to the time of the round that removed them.
+    of the last round that found them readable, and ``exposed_digests`` to the SHA-256 of their
+    public keys; ``removed`` maps enclaves that the installed release did not have to the time of
+    the round that removed them.
     """
 
     release: int = 0
@@ -83,6 +84,7 @@ class AgentState:
     replaced: Mapping[str, float] = field(default_factory=dict)
     list_replaced: Mapping[str, float] = field(default_factory=dict)
     exposed: Mapping[str, datetime] = field(default_factory=dict)
+    exposed_digests: Mapping[str, str] = field(default_factory=dict)
     removed: Mapping[str, datetime] = field(default_factory=dict)
     files: Mapping[str, str] = field(default_factory=dict)
 
@@ -137,6 +139,10 @@ def _state_from(value: Any) -> AgentState:
             _checked_text(path): parse_iso(_checked_text(moment))
             for path, moment in dict(value.get(moments, {})).items()
         }
+    value["exposed_digests"] = {
+        _checked_text(path): _checked_text(digest)
+        for path, digest in dict(value.get("exposed_digests", {})).items()
+    }
     for seconds in ("replaced", "list_replaced"):
         value[seconds] = {
             check_enclave_name(_checked_text(name)): _checked_uptime(moment)

@@ -541,6 +541,15 @@ def test_a_key_that_others_could_read_is_named_for_a_day_after_the_agent_closed_
     assert any("others could read" in problem for problem in r1.round(later).problems)
     assert not r1.round(moment() + timedelta(hours=25)).problems
     key.chmod(0o644)
+    r1.round()
+    present = key.read_bytes()
+    shutil.copyfile(
+        r1.folder / "enclaves/r1/b/key.pem", key
+    )  # as `distribute_key` brings a new key
+    key.chmod(0o600)
+    assert not any("others could read" in problem for problem in r1.round().problems)
+    key.write_bytes(present)
+    key.chmod(0o644)
     left = {path: data for path, data in home.renewed.files.items() if "/r1/a/" not in path}
     r1.release = home.release(left)
     problems = r1.round().problems
