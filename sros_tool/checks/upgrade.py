@@ -99,8 +99,8 @@ EXPIRED_PEERS = FindingKind(
     "upgrade.expired-peers",
     NOTE,
     "another effect of an expired certificate on running processes",
-    "With the one release, running processes lose each other when the certificate of one of them "
-    "expires. With the other, they keep communicating until they restart.",
+    "With one release, running processes lose each other when the certificate of one of them "
+    "expires. With the other release, they keep communicating until they restart.",
     "sros: measured with the named releases; CVE-2025-67108.",
     "Renew in time, and restart: `sros check KEYSTORE --needs-renewal 30d` says what is due. To "
     "stop an enclave, revoke it; do not wait until it expires.",

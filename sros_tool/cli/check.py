@@ -725,7 +725,7 @@ def _needs_renewal(root: Path, text: str, moment: datetime, form: str) -> int:
     else:
         lines = [describe_lifetime(enclave, moment) for enclave in expiring.due]
         lines += [f"{enclave.name}  unknown: {enclave.error}" for enclave in expiring.unreadable]
-        none_due = "the 1 enclave does not need" if expiring.lasting == 1 else ""
+        none_due = "the only enclave does not need" if expiring.lasting == 1 else ""
         none_due = (
             f"{none_due or f'none of {expiring.lasting} enclaves needs'} to be renewed ({text})"
         )

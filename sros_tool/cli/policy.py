@@ -990,7 +990,7 @@ def dropped_lines(head: AccessSource, dropped: Iterable[DroppedDenial]) -> list[
 def _dropped_text(dropped: DroppedDenial) -> str:
     right, name, moved_from = dropped
     if moved_from:
-        text = f"has a node of {moved_from} without its DENY {right.describe()}"
+        text = f"has a node of {moved_from}, but lacks its DENY {right.describe()}"
     else:
         text = f"DENY {right.describe()} is gone"
     text += f" for names such as {name}" if name else ""

@@ -306,7 +306,7 @@ def test_a_denial_that_a_node_leaves_behind_is_gone(change: Change) -> None:
     other = policy_text({"/d": publish("/x")})
     one, both = (policy_text({"/a": "", **more}) for more in ({}, {"/c": publish("/x") + denies}))
     change.base = change.commit({"robot.xml": both, "second.xml": other})
-    line = "! /d has a node of /c without its DENY request service /*erase: other policies may"
+    line = "! /d has a node of /c, but lacks its DENY request service /*erase: other policies may"
 
     def review_of(text: str, node: str, rights: str) -> Ended:
         profile = f'<profile ns="/" node="{node}">{rights}</profile>'
