@@ -704,12 +704,11 @@ def _simplified(
     certain_automata: frozenset[Automaton],
     possible_automata: frozenset[Automaton] | None,
 ) -> _Node | bool:
-    """Return a set in which automata are replaced by their known answers for some names.
+    """Return the set, simplified for certain names only; its exact names are left out.
 
-    Only some names count: all of ``certain_automata`` accept such a name, each of
-    ``possible_automata`` may accept it (None: each other automaton), and no other automaton does.
-    The exact names of the set are left out. The result is True if the set then has all of the names
-    that count, and False if the set has none of them.
+    All of ``certain_automata`` accept these names. Each of ``possible_automata`` may accept them
+    (None: any other automaton may), and no other automaton accepts them. The result is True if the
+    set has all of these names, and False if it has none of them.
     """
     if isinstance(node, _Union):
         if not certain_automata.isdisjoint(node.automata):

@@ -214,12 +214,12 @@ def end_with_starter() -> Callable[[], None]:
 
     starter = os.getpid()
 
-    def follow() -> None:
+    def end_with_this_starter() -> None:
         end_with_parent()
         if os.getppid() != starter:
             os._exit(1)
 
-    return follow
+    return end_with_this_starter
 
 
 def _exit_text(exit_code: int) -> str:

@@ -167,7 +167,9 @@ def parse(
 
 
 def require_child(root: etree._Element, tag: str, name: str, label: str) -> etree._Element:
-    """Return the child ``tag`` of the root ``<dds>`` of a document; ``name`` names it in errors.
+    """Return the child ``tag`` of the root ``<dds>`` of a document.
+
+    In errors, ``name`` names the document, and ``label`` its kind.
 
     Raises:
         DocumentError: the root has another name, or no such child.  DDS vendors compare names

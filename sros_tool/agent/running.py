@@ -30,7 +30,7 @@ from sros_tool.keystore.confirmation import (
     RobotLibrary,
     RunningFiles,
     Seen,
-    is_enclave_name,
+    is_enclave_below_root,
 )
 from sros_tool.keystore.layout import KEY_FILE, enclave_path
 from sros_tool.runtime.processes import (
@@ -150,7 +150,7 @@ def look_at_processes(
     removed = [
         process
         for process in readers
-        if process.label in without_files and is_enclave_name(_enclave_of(process))
+        if process.label in without_files and is_enclave_below_root(_enclave_of(process))
     ]
     complete = not (running.unseen or running.hidden or running.container) and all(
         process.enclave and not process.enclave.problem
@@ -202,7 +202,7 @@ def _can_read_key(process: Process, folder: Path) -> bool:
     if process.user in (0, folder.stat().st_uid):
         return True
     name, enclave = _enclave_of(process), process.enclave
-    if enclave and is_enclave_name(name):
+    if enclave and is_enclave_below_root(name):
         with suppress(OSError):
             place = enclave_path(folder, name)
             state, key = place.stat(), (place / KEY_FILE).stat()

@@ -647,7 +647,7 @@ def _check_nodes(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
     groups: dict[tuple[str, str], list[_NodeLackingRight]] = defaultdict(list)
     differs = cache(_is_not_shipped)
     for gap in lacking:
-        if gap.has_include:
+        if gap.needs_include:
             included = gap.included if gap.included and differs(gap.included) else ""
             groups[gap.finding.file, included].append(gap)
     for (_, included), gaps in groups.items():
@@ -740,7 +740,7 @@ class _NodeLackingRight:
     included: str
 
     @property
-    def has_include(self) -> bool:
+    def needs_include(self) -> bool:
         """Whether the remedy is to include ``common/node.xml``."""
         return not self.listener and self.finding.severity is ERROR
 

@@ -158,8 +158,8 @@ _VENDORS = (*(vendor.value for vendor in TESTED), ZENOH)
     "remaps",
     metavar="[NODE:]FROM:=TO",
     multiple=True,
-    help="With --requirements: remap a name of the file, as `sros merge_policy --remap` did in the "
-    "policy; also NODE:__node:=NAME.  Can be repeated.",
+    help="With --requirements: remap a name in the requirements file, as `sros merge_policy "
+    "--remap` did in the policy; NODE:__node:=NAME renames a node.  Can be repeated.",
 )
 @click.option(
     "--template",

@@ -519,12 +519,13 @@ def import_verb(
     dry_run: bool,
     as_json: bool,
 ) -> None:
-    """On a robot: install the answer in ANSWER (or -) next to the key in DIR, or change nothing.
+    """On a robot: install the answer of `sign_request` next to the key in DIR.
 
-    Before anything is installed, sros checks that the certificate belongs to the key, its chain,
-    the signatures, the validity, and that the archive has no other files.  The first answer sets
-    the CAs that the robot trusts: give --ca, or an attacker could replace this answer on its way.
-    Later answers must come from the same CAs.
+    ANSWER is the file with the answer, or - for standard input.  sros first checks the
+    certificate's key and chain, the signatures and the validity, and that the archive has no other
+    files.  If a check fails, nothing changes.  The first answer sets the CAs that the robot trusts:
+    give --ca, or an attacker could replace this answer on its way.  Later answers must come from
+    the same CAs.
 
     Example:
       $ sros import request.answer.tar.gz robot

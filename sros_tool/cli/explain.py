@@ -62,7 +62,7 @@ if TYPE_CHECKING:
     from sros_tool.zenoh.delivery import Check
 
 _OPERATIONS = ("publish", "subscribe", "call", "serve", "execute", "request", "reply", "join")
-_KIND_OF_NAME = {
+_KIND_BY_OPERATION = {
     **dict.fromkeys(("publish", "subscribe"), "topics"),
     **dict.fromkeys(("call", "serve", "request", "reply"), "services"),
     "execute": "actions",
@@ -88,7 +88,9 @@ def _complete_arguments(
         return [word for word in _OPERATIONS if word.startswith(incomplete)]
     if len(rest) == before + 1:
         root = Path(arguments[0]) if named else ctx.params.get("keystore")
-        names = _names_in_rights(ctx.params.get("policy") or root, _KIND_OF_NAME.get(rest[-1], ""))
+        names = _names_in_rights(
+            ctx.params.get("policy") or root, _KIND_BY_OPERATION.get(rest[-1], "")
+        )
         return [*completions(names, incomplete)]
     if rest:
         return []
@@ -263,9 +265,9 @@ def explain(
     keystore, sros decides by the permissions that the policy would give.
 
     The exit status is 0 if the operation is allowed (with --who: to at least one enclave), and 1 if
-    it is denied; with --log, 1 if the log reports a fault. An action is allowed only with all of
-    its services and topics. "in part" marks an enclave that has only some of them but can command
-    the action's server, for example by send_goal.
+    it is denied; with --log, 1 if the log reports a fault. An action is allowed only if all of its
+    services and topics are allowed. With --who, "in part" marks an enclave that has only some of
+    these rights, but can command the action's server, for example by send_goal.
 
     Example:
       $ sros explain keystore /talker publish /chatter --policy robot.xml

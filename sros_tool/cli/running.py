@@ -516,7 +516,8 @@ def units(
 
     A node runs in its enclave or not at all, sees the keys of no other enclave, and gets no
     privilege of the system that a ROS node does not need. COMMAND is the node's program; the
-    default is the file in /etc/sros/nodes that has the path of the enclave.
+    default is /etc/sros/nodes followed by the path of the enclave, such as
+    /etc/sros/nodes/arm/gripper.
 
     Examples:
       $ sros units keystore /talker units -- /opt/robot/talker.sh

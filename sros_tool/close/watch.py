@@ -113,7 +113,7 @@ def watch(robot: LocalRobot, words: Sequence[str]) -> list[str]:
     if os.path.lexists(robot.observed_policy):  # a file of an earlier watch
         remove_file(robot.observed_policy)
     without_enclave = [node.fqn for node in all_nodes if not node.enclaves and not is_tool(node)]
-    problems = [_without_enclave_text(robot, without_enclave)] if without_enclave else []
+    problems = [_text_on_nodes_without_enclave(robot, without_enclave)] if without_enclave else []
     lacking = _lacking_text(robot, nodes) if learned["dry_run"] else ""
     return problems + [lacking] * bool(lacking)
 
@@ -165,7 +165,7 @@ def _write_observation(robot: LocalRobot, document: str, observed: ObservedProce
     robot.remember(remembered.belonging_elsewhere(not_here))
 
 
-def _without_enclave_text(robot: LocalRobot, names: Sequence[str]) -> str:
+def _text_on_nodes_without_enclave(robot: LocalRobot, names: Sequence[str]) -> str:
     """Return a sentence that names the nodes which the graph shows without an enclave."""
     return (
         f"{first_few(names, MOST_NAMES)}: the participant has the identifier of a secured "

@@ -393,7 +393,7 @@ def _best_cast(
         )
         if unpaired:
             cast["guest"] = unpaired[0]
-        nested = [(g, a) for g, a in permutations(rights, 2) if _is_below(g, a)]
+        nested = [(g, a) for g, a in permutations(rights, 2) if _has_only_parts_of(g, a)]
         guest_and_admin = next(
             ((g, a) for g, a in nested if a in talkers and g not in talkers), None
         )
@@ -512,8 +512,11 @@ def _first_topic(rights: Mapping[str, Grant], cast: Mapping[str, str]) -> str:
     return next((t for t in own_topics if allows(rights[cast["listener"]], "subscribe", t)), "")
 
 
-def _is_below(short: str, long: str) -> bool:
-    """Return whether the path ``long`` is below the path ``short``."""
+def _has_only_parts_of(short: str, long: str) -> bool:
+    """Return whether the path ``long`` has all parts of the path ``short``, and further parts.
+
+    Cyclone DDS 0.10 compares the parts of subjects in this way, whatever their order.
+    """
     return set(short.strip("/").split("/")) < set(long.strip("/").split("/"))
 
 

@@ -52,7 +52,10 @@ class CycloneNode:
         return [ros_type(endpoint.type_name) for endpoint in endpoints if endpoint.topic == topic]
 
     def count(self, name: str, kind: str, on_count: Callable[[int], None]) -> str:
-        """Count the messages of a type."""
+        """Call ``on_count`` with the number of new messages of the type ``kind``, again and again.
+
+        The result is "", because counting is always possible.
+        """
         package, _, name_of_type = kind.rpartition("/")
         type_name = f"{package.replace('/', '::')}::dds_::{name_of_type}_"
         self._counters.append(

@@ -141,7 +141,11 @@ class _ZenohNode:
         return [(of[10], of[11]) for of in chunks if len(of) > 11 and of[9] == wire]
 
     def count(self, name: str, kind: str, on_count: Callable[[int], None]) -> str:
-        """Count the messages of a type, by its hashes in the graph."""
+        """Call ``on_count`` with 1 for each message of the type ``kind`` on the topic ``name``.
+
+        The topic's publishers announce the hashes of the type in the graph.  The result is "",
+        because counting is always possible.
+        """
         for typed in {typed for typed in self._types(name, "MP") if ros_type(typed[0]) == kind}:
             key = self._key_of(name, typed)
             self._keep(self._session.declare_subscriber(key, lambda _: on_count(1)))

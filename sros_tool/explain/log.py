@@ -200,7 +200,11 @@ class SearchedKeystore:
 
     @cached_property
     def zenoh_routers(self) -> frozenset[str]:
-        """The enclaves of Zenoh routers, by the settings or defaults, and by router files."""
+        """The enclaves of Zenoh routers.
+
+        These are the routers that the keystore's Zenoh settings name (without such settings: the
+        default router), and the enclaves with a router file.
+        """
         from sros_tool.zenoh.configuration import ZenohNetwork  # most logs do not come from Zenoh
 
         network = None
@@ -606,8 +610,8 @@ def _dropped_message_findings(
     """Yield a finding for each missing right for which Zenoh dropped messages.
 
     ``own_name`` is the enclave of the process that wrote the log, "" if unknown. If the process
-    drops a message to or from its router, the process itself lacks the right, because its rules for
-    the router are its own rights.
+    drops a message to or from its router, the process itself lacks the right: its configuration
+    allows the router only what the process's own rights need.
     """
     numbered = ((n, *labeled_line(line[:_MAX_LINE_LENGTH])) for n, line in enumerate(lines, 1))
     groups: dict[tuple[str, str, bool, str], list[DroppedMessage]] = {}

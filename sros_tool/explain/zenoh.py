@@ -324,7 +324,8 @@ class ZenohEvaluator:
         There is a single router, or there are several routers with connections to each other.
 
         Raises:
-            KeystoreError: there is no router, or it is not clear which messages its rules let pass.
+            KeystoreError: no router has a file, or the file of a router has no rules for another
+            router with a file (`check_routers`).
         """
         routers = {
             name: self._file(name, ROUTER_FILE)
@@ -413,7 +414,7 @@ class ZenohEvaluator:
     def with_parts(self, answer: ZenohAnswer, *, brief: bool) -> ZenohAnswer:
         """Return an answer with the parts of a denied action that the enclave may do.
 
-        For ``brief``, see `answer`.
+        For ``brief``, see `ZenohEvaluator.answer`.
         """
         if answer.outcome is not _Outcome.DROPPED:
             return answer

@@ -310,7 +310,7 @@ _SHOWN_KEYS = {"robots": "hosts", **_VARIABLES}
 """Word in a fleet file → word in an inventory, for messages."""
 
 _BUILT_IN_GROUPS = ("all", "ungrouped", "_meta")
-_MOST_DEPTH = 64
+_MAX_DEPTH = 64
 _MOST_STEPS = 200_000  # a host is counted once for each of its groups
 _WRITE_INVENTORY = (
     "Write it out with `ansible-inventory -i FILE --list > hosts.json`, and name hosts.json."
@@ -401,7 +401,7 @@ def _load_yaml(data: bytes, label: str) -> Any:
         for event in yaml.parse(data, Loader=loader):
             depth += isinstance(event, yaml.CollectionStartEvent)
             depth -= isinstance(event, yaml.CollectionEndEvent)
-            if depth > _MOST_DEPTH or isinstance(event, yaml.AliasEvent):
+            if depth > _MAX_DEPTH or isinstance(event, yaml.AliasEvent):
                 raise DocumentError(
                     f"{label} has an alias (*NAME), or is nested too deeply",
                     f"It is at {str(event.start_mark).strip()}.",
@@ -460,7 +460,7 @@ class _Inventory:
     ) -> None:
         """Read a group; it inherits ``variables`` from the ``parent_groups`` that contain it."""
         self._count_step()
-        if name in parent_groups or len(parent_groups) > _MOST_DEPTH:
+        if name in parent_groups or len(parent_groups) > _MAX_DEPTH:
             raise self._error(f"the group {name} contains itself, or is in too many other groups")
         if not isinstance(group, dict):
             group = {"hosts": group} if isinstance(group, list) else self._mapping(group, name)

@@ -258,7 +258,7 @@ def is_unusable(problem: str) -> bool:
     return f" {COULD_NOT_START}: " in problem
 
 
-def is_enclave_name(name: str) -> bool:
+def is_enclave_below_root(name: str) -> bool:
     """Return whether ``name`` is the name of an enclave other than /."""
     try:
         return check_enclave_name(name) != "/"
@@ -300,7 +300,7 @@ def make_confirmation(
     names = search_enclaves(root)[0] if unreadable else list_enclaves(root)
     with Folder(root) as folder:
         for name in names:
-            if name != "/" and not is_enclave_name(name):
+            if name != "/" and not is_enclave_below_root(name):
                 continue
             try:
                 contents = _confirmed_files(root, folder, name)
@@ -896,7 +896,7 @@ def _file_entries(value: Mapping[str, Any], key: str) -> Iterator[tuple[str, Any
 
 def _is_enclave_folder(folder: str) -> bool:
     top, slash, name = folder.partition("/")
-    return top == ENCLAVES and (not slash or is_enclave_name(f"/{name}"))
+    return top == ENCLAVES and (not slash or is_enclave_below_root(f"/{name}"))
 
 
 def _is_digest(value: object) -> bool:

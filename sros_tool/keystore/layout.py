@@ -270,10 +270,11 @@ _SIGN_POLICY = re.compile(r"un `sros generate_artifacts -k [^`]+ -p POLICY_FILE`
 
 
 def remedy_in_closed_robot(root: Path, remedy: str) -> str:
-    """Return a remedy with its commands adapted to ``root`` if this is in a closed robot's folder.
+    """Return a remedy, adapted to the closed robot's folder if ``root`` is in one.
 
-    There, `sros close` signs and exports.  The remedy is returned unchanged if that folder no
-    longer has the CA keys, or has no observation of the robot, as in an office.
+    In such a folder, `sros close` signs and exports. The remedy is returned unchanged if the folder
+    has no CA keys (the keystore was moved to another machine), or no `observed.json` (the folder is
+    the copy on that other machine).
     """
     robot = folder_of_closed_robot(root)
     is_here = robot and (robot / CLOSED_OBSERVATION).is_file()

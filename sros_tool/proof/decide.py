@@ -228,8 +228,8 @@ _NAME_MARK = "\0"
 
 
 @dataclass(frozen=True, slots=True)
-class _Part:
-    """A DDS topic that a right needs, by the text before and after the name."""
+class _TopicOfRight:
+    """One of the DDS topics that a right needs: the text before and after the ROS name."""
 
     writes: bool
     begin: str
@@ -245,23 +245,23 @@ class _Part:
 
 
 @lru_cache(maxsize=16)
-def _parts_of(right: str) -> tuple[_Part, ...]:
+def _parts_of(right: str) -> tuple[_TopicOfRight, ...]:
     """Return the DDS topics that a right needs."""
     names = dds_names(right, _NAME_MARK)
     return tuple(
-        _Part(writes, *topic.split(_NAME_MARK))
+        _TopicOfRight(writes, *topic.split(_NAME_MARK))
         for writes, topics in ((True, names.publish), (False, names.subscribe))
         for topic in topics
     )
 
 
 @lru_cache(maxsize=16)
-def _sufficient_parts(right: str) -> tuple[_Part, ...]:
+def _sufficient_parts(right: str) -> tuple[_TopicOfRight, ...]:
     """Return the DDS topics of a right that, each alone, are enough for a part of the right."""
     return tuple(part for part in _parts_of(right) if part.writes or right == "subscribe")
 
 
-def _topics_of_rights(rights: RightNames) -> Iterator[tuple[str, _Part, Topics]]:
+def _topics_of_rights(rights: RightNames) -> Iterator[tuple[str, _TopicOfRight, Topics]]:
     """Yield pairs of a right and one of its DDS topics, for some rights."""
     for right, names in rights:
         for name in names:
@@ -292,7 +292,7 @@ def restricted_enclaves(
     return ()
 
 
-def _use(enclave: str, right: str, part: _Part, topics: Topics, topic: str) -> Use:
+def _use(enclave: str, right: str, part: _TopicOfRight, topics: Topics, topic: str) -> Use:
     return Use(enclave, right, topics.ros_name(topic), topic, part.writes)
 
 
@@ -419,7 +419,7 @@ def _witness_against_at_most(
     other_uses: tuple[Use, ...] = ()
     for right, names in requirement.rights:
         for expression in names:
-            holders: dict[str, list[tuple[_Part, TopicUser]]] = {}
+            holders: dict[str, list[tuple[_TopicOfRight, TopicUser]]] = {}
             for part in _sufficient_parts(right):
                 for met in world.side(part.writes).users_of_topics(part.topics(expression), limit):
                     holders.setdefault(met.enclave, []).append((part, met))
@@ -444,7 +444,7 @@ def _witness_against_at_most(
 
 
 def _uses_of(
-    name: str, enclave: str, right: str, parts: Iterable[tuple[_Part, TopicUser]]
+    name: str, enclave: str, right: str, parts: Iterable[tuple[_TopicOfRight, TopicUser]]
 ) -> Iterator[Use]:
     """Yield the uses of a name by an enclave, one for each part of the right."""
     for part, met in parts:
@@ -455,7 +455,7 @@ def _uses_of(
 
 def _shared_by(
     world: World,
-    holders_by_part: Collection[Sequence[tuple[_Part, TopicUser]]],
+    holders_by_part: Collection[Sequence[tuple[_TopicOfRight, TopicUser]]],
     count: int,
     expression: str,
     limit: SearchLimit,
@@ -698,7 +698,9 @@ def _unused_names(
     return clauses, unnamed
 
 
-def _restricted_names(requirement: Requirement) -> Iterator[tuple[str, str, tuple[_Part, ...]]]:
+def _restricted_names(
+    requirement: Requirement,
+) -> Iterator[tuple[str, str, tuple[_TopicOfRight, ...]]]:
     """Yield each name whose use a requirement restricts: a right, the name, and parts of the right.
 
     For `Nobody` and `Protected`, uses at the other side of a name count as well.
@@ -783,7 +785,7 @@ def _named_right(right: str, name: str) -> str:
 
 
 def _is_used_by_anybody(
-    world: World, right_parts: Iterable[_Part], name: str, limit: SearchLimit
+    world: World, right_parts: Iterable[_TopicOfRight], name: str, limit: SearchLimit
 ) -> bool:
     """Return whether an enclave may use at least one DDS topic of a name."""
     for part in right_parts:

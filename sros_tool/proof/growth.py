@@ -1,7 +1,7 @@
 """Find access that HEAD grants and BASE does not, and the reverse, for all names.
 
 The rules of each vendor are compared as sets of topics.  The vendor's decision on each reported
-name confirms the result.  An empty result means that no name is added.
+name confirms the result.  If nothing is found, there is no such access for any name.
 
 A policy states no governance and, except for robots of a fleet, no domains; permissions state no
 governance.  If a side does not state these, the comparison assumes them, and names its assumptions.

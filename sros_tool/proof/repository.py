@@ -27,7 +27,7 @@ FILES = ("100644", "100755")
 _MOST_BYTES = 32 * 1024 * 1024
 """Size in bytes of the largest object that is read."""
 _BATCH_BYTES = 64 * 1024 * 1024
-_MOST_DEPTH = 200
+_MAX_DEPTH = 200
 _MOST_TAGS = 10
 _CACHE_SIZE = 1024
 _MOST_KNOWN_BYTES = 16 * 1024
@@ -580,8 +580,8 @@ def walk(
     count = depth = 0
     while level:
         depth += 1
-        if depth > _MOST_DEPTH:
-            raise DocumentError(f"the commit has more than {_MOST_DEPTH} levels of folders")
+        if depth > _MAX_DEPTH:
+            raise DocumentError(f"the commit has more than {_MAX_DEPTH} levels of folders")
         ids = [object_id for _, *pair in level for object_id in pair if object_id]
         folders = repository.folders(ids)
         below = []

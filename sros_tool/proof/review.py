@@ -1277,7 +1277,10 @@ def _variables_before_hosts(where: str) -> tuple[bool, str]:
 
 
 def _delivery_place(robot: Robot) -> str:
-    """Return the place to which a robot's keys are delivered: user and address, or its name."""
+    """Return the place to which a robot's keys are delivered, as text.
+
+    This is ``user@address``, the address alone, or "its name" if the robot has no address.
+    """
     return f"{robot.user}@{robot.address}" if robot.user else robot.address or "its name"
 
 

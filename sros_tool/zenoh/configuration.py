@@ -534,7 +534,8 @@ def _check_routers(network: ZenohNetwork) -> None:
     if network.mode is Mode.PEER:
         raise UsageError(
             "several routers need client mode",
-            "A session in peer mode would look for sessions of other hosts on its own host.",
+            "In peer mode, sessions listen only on their own host, so sessions on different hosts "
+            "would not find each other.",
             "Use client mode: `--mode client`.",
         )
     network.connects()

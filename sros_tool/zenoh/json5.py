@@ -14,7 +14,7 @@ from contextlib import suppress
 from typing import Any, NamedTuple
 
 MOST_BYTES = 16 * 1024 * 1024
-_MOST_DEPTH = 100
+_MAX_DEPTH = 100
 _MOST_DIGITS = 400
 _MOST_TOKENS = 2_000_000
 """Maximum number of tokens in a text; more tokens would take many seconds.
@@ -101,7 +101,7 @@ def parse_json(text: str) -> Any:
     except (ValueError, RecursionError):
         raise Json5Error("it is not JSON", 1) from None
     if _is_deep(value):
-        raise Json5Error(f"more than {_MOST_DEPTH} levels", 1)
+        raise Json5Error(f"more than {_MAX_DEPTH} levels", 1)
     return value
 
 
@@ -115,7 +115,7 @@ def _without_lines(members: list[tuple[str, Any]]) -> Json5Object:
 
 def _is_deep(value: Any) -> bool:
     level = [value]
-    for _ in range(_MOST_DEPTH):
+    for _ in range(_MAX_DEPTH):
         if not level:
             return False
         inner = [value.values() if isinstance(value, dict) else value for value in level
@@ -151,7 +151,7 @@ class _Reader:
         self._now = next(self._tokens)
 
     def document(self) -> Any:
-        value = self._value(_MOST_DEPTH)
+        value = self._value(_MAX_DEPTH)
         if self._now.kind != "end":
             raise self._unexpected_error()
         return value
@@ -162,7 +162,7 @@ class _Reader:
 
     def _value(self, depth: int) -> Any:
         if not depth:
-            raise Json5Error(f"more than {_MOST_DEPTH} levels", self._now.line)
+            raise Json5Error(f"more than {_MAX_DEPTH} levels", self._now.line)
         token = self._take()
         if token.text == "{":
             return self._object(token.line, depth)

@@ -181,7 +181,7 @@ def test_a_robot_in_another_domain_is_a_difference(made: Path) -> None:
     words = ("check", "ks", "--policy", "p.xml", "--include", "enclave.stale-permissions")
     sros(*words, cwd=made).ok()  # its own fleet fills in the placeholders
     drift = sros(*words, "--fleet", "moved.toml", cwd=made)
-    assert drift.status == 1 and "the fleet has r2 in domain 7, the permissions in 0" in drift.out
+    assert drift.status == 1 and "r2 in domain 7, but the permissions are for domain 0" in drift.out
 
 
 def test_findings_that_also_differ_in_other_robots_are_one_if_they_are_many() -> None:

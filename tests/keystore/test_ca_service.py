@@ -167,7 +167,7 @@ ANSWERS: dict[str, tuple[Callable[[x509.Name, Any], bytes], str]] = {
     "expired": (lambda s, k: made(s, k, begin=-9, days=-1), "not now"),
     "not yet valid": (lambda s, k: made(s, k, begin=1), "not now"),
     "weak": (lambda s, k: made(s, k, digest=hashes.SHA224()), "has a weak signature"),
-    "a long serial": (lambda s, k: made(s, k, serial=1 << 159), "revocation list can have"),
+    "a long serial": (lambda s, k: made(s, k, serial=1 << 159), "more than 159 bits"),
     "a serial of before": (
         lambda s, k: made(s, k, serial=7),
         "serial number that another certificate has",

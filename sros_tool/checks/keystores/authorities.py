@@ -305,7 +305,7 @@ LEDGER_DAMAGED = FindingKind(
 LEDGER_UNCHAINED = FindingKind(
     "keystore.ledger-unchained",
     NOTE,
-    "a ledger with lines that another version wrote, without a chain",
+    "a ledger with lines of an earlier sros, which no hash chain protects",
     "If one of these lines was removed, nothing shows it.",
     "sros: each line of ledger.jsonl has the digest of the line before it; ledger.p7s has the "
     "digest of the last line.",

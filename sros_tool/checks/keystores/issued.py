@@ -483,7 +483,10 @@ def check_policy(
     if robot and robot.domain is not None:
         signed, stated = grant.domains().closed(), DomainSet.of((robot.domain, robot.domain))
         if signed != stated:
-            text = f"the fleet has {robot.name} in domain {stated}, the permissions in {signed}"
+            text = (
+                f"the fleet has {robot.name} in domain {stated}, but the permissions are for "
+                f"domain {signed}"
+            )
             yield STALE.found(
                 name, text, enclave.file("permissions.p7s"), remedy=_SIGN_FOR_THE_FLEET
             )

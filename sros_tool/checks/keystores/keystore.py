@@ -215,9 +215,11 @@ def _enclave_findings(
     governance: bytes,
     vendors: Sequence[Vendor],
 ) -> Iterator[Finding]:
-    """Yield all findings in one enclave, except the refusals by the ``vendors`` of its nodes.
+    """Yield all findings in one enclave, except refusals by vendors (see `check_vendors`).
 
-    ``governance`` is a signed document whose findings are reported already.
+    ``vendors`` are the vendors that the enclave's nodes may use. ``governance`` is the keystore's
+    signed governance, or that of the first enclave of an export; its own findings are reported
+    already.
     """
     yield from check_enclave(enclave)
     yield from check_documents(enclave)

@@ -166,7 +166,9 @@ class VendorTraits:
     """If the first grant for a subject is not valid now, a later grant is used."""
     open_range: OpenRange = OpenRange.OPEN
     filters_own_domain: bool = True
-    """A participant itself ignores its rules for other domains, as peers always do."""
+    """A participant ignores those rules of its own permissions that are for domains other than
+    the one that it joins. (Its peers always ignore them.)
+    """
     relays_count_for_readers: bool = False
     """For a reader, peers look at the ``<subscribe>`` of a rule, and then at its ``<relay>``."""
     topic_decides: bool = False

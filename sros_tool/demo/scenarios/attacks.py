@@ -652,7 +652,7 @@ def revoked_enclave_row(enclave: str, has_list: bool) -> Row:
 
 # ── with certificates and keys ─────────────────────────────────────────────────────────────
 
-_DATES_CHECKED = "the attacker's DDS checks the dates of the certificate first"
+_DATES_CHECKED = "the attacker's own DDS checks the dates of its certificate before it joins"
 _NO_LIST = "without crl.pem, DDS does not check for revocation"
 
 _IDENTITY_ROWS: tuple[Row, ...] = (

@@ -338,10 +338,10 @@ def _roots(keystore: OpenedKeystore) -> Roots:
 
 
 def age_clause(keystore: OpenedKeystore) -> str:
-    """Return why the keystore is older than its robots, as a clause; "" if nothing shows this.
+    """Return what shows that the keystore is older than its robots, as a clause, or "".
 
-    Such a keystore was restored from a backup, or is a copy, and has not published with
-    ``--restored`` since.
+    A keystore is older than its robots if it was restored from a backup, or is a copy, and has not
+    published with ``--restored`` since. The result is "" if nothing shows this.
     """
     if restores_after_last_release(keystore):
         return "robots have files that it signed but does not know"

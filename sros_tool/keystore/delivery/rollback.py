@@ -145,7 +145,7 @@ def check_rollback(
     if foreign := _foreign_authorities(keystore, present, files):
         path, authority = next(iter(foreign.items()))
         raise KeystoreError(
-            f"'{target / path}' has no CA that the keystore has, or had by its ledger",
+            f"'{target / path}' has only CAs that are neither in the keystore nor in its ledger",
             f"It trusts {authority_text(authority)}, and the keystore's CA is "
             f"{_first_authority(files, path)}: the robot could no longer communicate with "
             "other robots of its keystore, and would lose its revocation list. Nothing was "

@@ -649,7 +649,7 @@ def _default_rights_notes(change: KeystoreChange, name: str) -> Iterator[Note]:
     Such an enclave had other rights before it was revoked or removed, or belongs to a robot of the
     fleet.
     """
-    root, fleet, last = quote(str(change.root)), change.fleet, change.recorded.last(name)
+    root, fleet, last = quote(str(change.root)), change.fleet, change.recorded_rights.last(name)
     had_others = last and last.policy != default_rights(change.template, name).digest
     of_robot = bool(fleet and robot_of(fleet, name))
     if had_others or of_robot:
@@ -679,7 +679,7 @@ def _earlier_rights(
             "These permissions belong to another certificate.",
             "State the rights with -p POLICY_FILE.",
         )
-    return change.recorded.rights_to_sign(name, earlier.digest, earlier.grant)
+    return change.recorded_rights.rights_to_sign(name, earlier.digest, earlier.grant)
 
 
 def _answer_files(keystore: OpenedKeystore, issued: Issued, zenoh: StagedZenoh) -> dict[str, bytes]:

@@ -242,5 +242,8 @@ def _certificate_problem(
             f"{iso(request.validity.not_after)}"
         )
     if not 0 < certificate.serial_number.bit_length() <= _MOST_SERIAL_BITS:
-        return "no revocation list can have its serial number"
+        return (
+            "its serial number is 0 or has more than 159 bits, so that no revocation list can "
+            "name the certificate"
+        )
     return weakness(certificate)

@@ -314,10 +314,11 @@ class EnclaveWriter:
     def would_change_only_dates(
         self, rights: StatedRights, certificate: x509.Certificate, validity: Window, text: bytes
     ) -> bool:
-        """Return whether `write` would change only dates, and the present expiry is late enough.
+        """Return whether `write` would change only the dates of permissions that can be kept.
 
-        ``text`` is the present document, with LF line ends.  The expiry is late enough until two
-        thirds of a new ``validity`` are over (`Window.can_be_kept`).
+        ``validity`` and ``text`` (with LF line ends) are those of the present permissions. They can
+        be kept while they are valid for more than a third of the validity that new permissions
+        would have (`Window.can_be_kept`).
 
         Raises:
             KeystoreError: the permissions would not decide as the policy does.

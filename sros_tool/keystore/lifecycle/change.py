@@ -264,7 +264,7 @@ class KeystoreChange:
         return KnownKeys(self.keystore)
 
     @cached_property
-    def recorded(self) -> RecordedRights:
+    def recorded_rights(self) -> RecordedRights:
         """The rights of enclaves that the ledger records."""
         return RecordedRights(self.keystore)
 
@@ -397,20 +397,21 @@ class KeystoreChange:
             given_list=self.crl,
         )
 
-    def revoke(
-        self, superseded: Sequence[Superseded], *, names: Sequence[str] | None = None
+    def revoke_superseded(
+        self, superseded: Sequence[Superseded], *, recipients: Sequence[str] | None = None
     ) -> None:
         """Revoke all earlier certificates of the enclaves whose certificates are ``superseded``.
 
-        The enclaves ``names`` (default: all) get the revocation list, and must be restarted.
+        The enclaves ``recipients`` get the revocation list, and their processes must be restarted.
+        The default is `RevocationListSigner.recipients`.
         """
         if not superseded:
             return
         lists = self.revocation_lists()
         revocations = lists.superseded(superseded)
-        if names is None:
-            names = lists.recipients()
-        self.restart = self.names if names is None else tuple(names)
+        if recipients is None:
+            recipients = lists.recipients()
+        self.restart = self.names if recipients is None else tuple(recipients)
         self.entries += lists.sign(revocations, self.restart, incomplete=False)[1]
         self.remarks += lists.remarks
         self.revoked = len(revocations)

@@ -800,7 +800,7 @@ def write_enclaves(
         *change.notes,
     ]
     superseded = [made.superseded for made in done.values() if made.superseded]
-    change.revoke(superseded)
+    change.revoke_superseded(superseded)
     change.stage_zenoh(
         writer.signed,
         replaced=[old.name for old in superseded],
@@ -975,7 +975,7 @@ class _EnclaveMaker:
         If the ledger does not record the lost permissions, their unsigned copy shows that the
         enclave had permissions.
         """
-        name, last = default.path, self._change.recorded.last(default.path)
+        name, last = default.path, self._change.recorded_rights.last(default.path)
         if last.policy == default.digest if last else "permissions.xml" not in existing_files:
             return
         text = (
@@ -1003,7 +1003,7 @@ class _EnclaveMaker:
             return False
         try:
             message = change.keystore.read(signed_path, "permissions document")
-            entry = change.recorded.latest(name, hashlib.sha256(message).hexdigest())
+            entry = change.recorded_rights.latest(name, hashlib.sha256(message).hexdigest())
             if entry is None:
                 return False
             signed = change.keystore.files.signed(message)
@@ -1014,7 +1014,7 @@ class _EnclaveMaker:
         text = signed.text
         return self._writer.would_change_only_dates(
             rights, certificate, validity, text
-        ) and _is_file(xml, text)
+        ) and _has_content(xml, text)
 
     def _identity(
         self, name: str, existing_files: set[str], *, replaced: bool
@@ -1064,7 +1064,7 @@ class _EnclaveMaker:
         for subject in _permissions_subjects(path, self._change.permissions.certificate):
             if common_name_of(subject) == common_name_of(own_subject):
                 message = self._change.keystore.read(path, "permissions document")
-                self._change.recorded.policy(name, hashlib.sha256(message).hexdigest())
+                self._change.recorded_rights.policy(name, hashlib.sha256(message).hexdigest())
                 return subject
         return own_subject
 
@@ -1130,7 +1130,7 @@ class _EnclaveMaker:
         return " ".join([*map(quote, left), *words])
 
 
-def _is_file(path: Path, content: bytes) -> bool:
+def _has_content(path: Path, content: bytes) -> bool:
     """Return whether there is a file at ``path`` with this content."""
     with suppress(SrosError):
         return read_bytes(path, "permissions document") == content

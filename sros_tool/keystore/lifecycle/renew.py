@@ -125,7 +125,7 @@ def renew(
             change.notes += change.known.shared_notes(renewed)
         change.entries += _marked_by_name(change, writer.entries, names)
         if revoke_old:
-            change.revoke(replaced)
+            change.revoke_superseded(replaced)
         if replaced:
             change.stage_zenoh(writer.signed, replaced=renewed if change.revoked else ())
         change.record()
@@ -216,7 +216,7 @@ class _Renewer:
     def _issuance(self, state: Credentials) -> Issuance:
         """Return the issuance for an enclave, after verifying the enclave's present files."""
         name = state.name
-        rights = checked_rights(state, self._change.authorities, self._change.recorded)
+        rights = checked_rights(state, self._change.authorities, self._change.recorded_rights)
         # If a unique subject made earlier permissions useless, they must not become useful again.
         unique = self._unique or has_unique_part(state.certificate.subject)
         subject = enclave_subject(name, unique=unique)

@@ -685,7 +685,7 @@ def _link_everywhere(transaction: Transaction, names: Sequence[str]) -> None:
 
 
 def another_ca_remedy(keystore: OpenedKeystore, purpose: str) -> str:
-    """Return the remedy, as a sentence, if DDS refuses the lists of the identity CA.
+    """Return, as a sentence, the remedy for an identity CA whose revocation lists DDS refuses.
 
     ``purpose`` is the command to repeat afterwards, such as "revoke".
     """

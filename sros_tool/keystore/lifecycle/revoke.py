@@ -186,8 +186,8 @@ def restore_revocations(
     The ledger also records that the keystore was restored.  This entry has a number that the
     keystore never used: the seconds since 1970, or the number of a later release that a robot has.
     Its ``reason`` is ``shown_by``.  Further entries name the enclaves ``rights_named``, so that a
-    later renewal of these enclaves counts as consent to their rights.  They are left out while
-    there are certificates to replace first.
+    later renewal of these enclaves counts as consent to their rights.  These further entries are
+    left out while there are certificates to replace first.
 
     Raises:
         KeystoreError: as `revoke`.

@@ -870,7 +870,7 @@ def _verified_rights(
             "They belong to another certificate.",
             f"Sign them again with `sros create_permission {quote(str(root))} {name} POLICY_FILE`.",
         )
-    return change.recorded.rights_to_sign(name, old.digest, old.grant)
+    return change.recorded_rights.rights_to_sign(name, old.digest, old.grant)
 
 
 # ── new CAs ────────────────────────────────────────────────────────────────────────────────

@@ -478,7 +478,7 @@ class _Updater:
         superseded = [document.old for document in reissued if document.old]
         revoked = self._revoke_old and bool(superseded)
         if revoked:
-            change.revoke(superseded, names=names)
+            change.revoke_superseded(superseded, recipients=names)
         change.notes += self._writer.notes if reissued else ()
         if done:
             replaced = [old.name for old in superseded] if revoked else ()
@@ -562,7 +562,7 @@ class _Updater:
     def _reissue_one(self, state: Credentials) -> _Reissued | None:
         name = state.name
         change = self._change
-        earlier = checked_rights(state, change.authorities, change.recorded)
+        earlier = checked_rights(state, change.authorities, change.recorded_rights)
         replaces_default = self._has_default_rights(state, earlier)
         certificate = self._certificates or self._changes_longest_validity(name)
         if not (self._permissions or replaces_default or certificate):
@@ -867,7 +867,7 @@ def _check_router(change: KeystoreChange, router: str) -> None:
         default_rights(replace(change.template, default_permissions=choice), router).digest
         for choice in (EVERYTHING, NODE_BASICS)
     }
-    if change.recorded.policy(router, digest) not in ("", *usual):
+    if change.recorded_rights.policy(router, digest) not in ("", *usual):
         raise UsageError(
             f"the enclave {router} has rights of its own",
             "The router forwards all messages, so a node in its enclave would have the rights of "
