@@ -55,6 +55,9 @@ from sros_tool.keystore.confirmation import (
     MESSAGE_FILE,
     MOST_REQUESTS,
     OF_SAME_NUMBER,
+    READABLE_KEYS,
+    REMOVED_ENCLAVES,
+    REPLACED_FILES,
     Confirmation,
     EnclaveExpiry,
     RobotClock,
@@ -484,7 +487,7 @@ class _Round:
             now = self._machine.now
             text = (
                 f"At {iso(now)}, {counted(len(paths), 'file')} of release {release} "
-                f"{'was' if len(paths) == 1 else 'were'} changed or missing here, and replaced: "
+                f"{'was' if len(paths) == 1 else 'were'} {REPLACED_FILES}"
                 f"{first_few(paths, 3)}. Find out who or what changes files on this robot."
             )
             self._state = replace(self._state, repaired=text, repaired_at=now)
@@ -499,7 +502,7 @@ class _Round:
         self._state = replace(self._state, removed=recent)
         if recent:
             self._problems.append(
-                f"The agent removed enclaves, the last at {iso(max(recent.values()))}, that the "
+                f"{REMOVED_ENCLAVES}the last at {iso(max(recent.values()))}, that the "
                 f"installed release lacks: {first_few(sorted(recent), 3)}. If they belong to "
                 "another robot, somebody may have copied their keys: run `sros renew KEYSTORE "
                 "ENCLAVE --new-key --revoke-old`."
@@ -518,7 +521,7 @@ class _Round:
         self._state = replace(self._state, exposed=closed, exposed_digests=digests)
         if closed:
             self._problems.append(
-                f"Until {iso(max(closed.values()))}, others could read "
+                f"Until {iso(max(closed.values()))}{READABLE_KEYS}"
                 f"{counted(len(closed), 'private key')}: {first_few(sorted(closed), 3)}. The mode "
                 "is right now. If anybody may have copied a key, run `sros renew KEYSTORE "
                 "ENCLAVE --new-key --revoke-old` in the keystore."

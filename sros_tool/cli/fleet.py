@@ -608,11 +608,13 @@ class ComparedFleet(NamedTuple):
 )
 @click.option(
     "--fail-on",
-    type=click.Choice(["delivery", "vulnerabilities"]),
+    type=click.Choice(["delivery", "unmended", "vulnerabilities"]),
     default="delivery",
     show_default=True,
-    help="`delivery`: the exit status is 1 only for problems with the delivery of files. "
-    "`vulnerabilities`: also for a DDS with known vulnerabilities that a later release fixes.",
+    help="`delivery`: the exit status is 1 only for problems with the delivery of files, and for "
+    "problems that agents report. `unmended`: not for problems that an agent has mended, and "
+    "reports for a day, such as a changed file. `vulnerabilities`: as `delivery`, and also for a "
+    "DDS with known vulnerabilities that a later release fixes.",
 )
 @output_option("Replace FILE atomically instead of printing.")
 @dry_run_option
@@ -661,8 +663,9 @@ def _status(
 
     The exit status is 0 if every robot that is not revoked has confirmed the files that it should
     have, no restart is due, no agent reports a problem, no published file is missing, and robots
-    still accept the published files. Otherwise it is 1. With --fail-on vulnerabilities, it is also
-    1 if a robot has a DDS to upgrade.
+    still accept the published files. Otherwise it is 1. With --fail-on unmended, problems that an
+    agent has mended do not count. With --fail-on vulnerabilities, it is also 1 if a robot has a DDS
+    to upgrade.
     """
     from sros_tool.checks.vulnerabilities import is_fixed_later, robot_findings
     from sros_tool.keystore.fleet_status import fleet_status
@@ -704,7 +707,8 @@ def _status(
 
     findings = robot_findings(reported, known, names) if html else robot_findings(reported, known)
     compared = ComparedFleet(moment, status, outdated, list(findings))
-    exit_status = 0 if status.complete and not (outdated and on_vulnerabilities) else 1
+    complete = status.mended if fail_on == "unmended" else status.complete
+    exit_status = 0 if complete and not (outdated and on_vulnerabilities) else 1
     if as_json:
         print_json(compared)
         return exit_status

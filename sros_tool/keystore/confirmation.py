@@ -239,6 +239,10 @@ OF_SAME_NUMBER = "of the installed release, but other files"
 """The agent's message on a release, or on published metadata, that the agent refuses."""
 COULD_NOT_START = "could not start"
 """A robot's words if no process would start in an enclave."""
+REPLACED_FILES = "changed or missing here, and replaced: "
+READABLE_KEYS = ", others could read "
+REMOVED_ENCLAVES = "The agent removed enclaves, "
+"""An agent's words on what it has mended, and reports for a day."""
 
 
 def concerns_key(problem: str) -> bool:
@@ -256,6 +260,11 @@ def shows_old_copy(problem: str) -> bool:
 def is_unusable(problem: str) -> bool:
     """Return whether a robot's problem is that no process would start in an enclave."""
     return f" {COULD_NOT_START}: " in problem
+
+
+def is_mended(problem: str) -> bool:
+    """Return whether a robot's problem is over: its agent mended it, and reports it for a day."""
+    return any(words in problem for words in (REPLACED_FILES, READABLE_KEYS, REMOVED_ENCLAVES))
 
 
 def is_enclave_below_root(name: str) -> bool:

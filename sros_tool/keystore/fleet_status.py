@@ -41,6 +41,7 @@ from sros_tool.keystore.confirmation import (
     certificate_digests,
     concerns_key,
     enclave_of,
+    is_mended,
     is_unusable,
     last_confirmation,
     refusals,
@@ -344,6 +345,12 @@ class RobotStatus:
         return self.state is State.NONE or (self.state is State.CURRENT and not self.problems)
 
     @property
+    def mended(self) -> bool:
+        """Whether the robot is `settled` except for problems that its agent has mended."""
+        is_over = self.state is State.CURRENT and all(map(is_mended, self.problems or ()))
+        return self.settled or is_over
+
+    @property
     def last_heard(self) -> datetime | None:
         """The time of the robot's last known message; None if it has sent no confirmation."""
         if self.fetches and self.received and self.clock:
@@ -468,7 +475,17 @@ class PublishedMetadata:
 
 
 @shows(
-    *("keystore", "complete", "stage", "counts", "unassigned", "overdue", "older", "clock"),
+    *(
+        "keystore",
+        "complete",
+        "mended",
+        "stage",
+        "counts",
+        "unassigned",
+        "overdue",
+        "older",
+        "clock",
+    ),
     *("edited", "revoked_until", "publication", "robots"),
     null_if_empty=("older", "clock", "edited"),
 )
@@ -559,15 +576,20 @@ class FleetStatus:
         reports a problem, robots can still fetch what was published, and nothing else casts doubt
         on the robots' files.  Robots whose enclaves were all revoked do not count.
         """
-        if (
-            self.overdue
-            or self.older
-            or self.clock
-            or self.edited
-            or (self.publication and not self.publication.is_in_order)
-        ):
-            return False
-        return all(robot.settled for robot in self.robots)
+        return self._is_in_order and all(robot.settled for robot in self.robots)
+
+    @property
+    def mended(self) -> bool:
+        """Like ``complete``, but problems that an agent has mended, and reports for a day, do not
+        count: files that it replaced, keys that others could read, and enclaves that it removed.
+        """
+        return self._is_in_order and all(robot.mended for robot in self.robots)
+
+    @property
+    def _is_in_order(self) -> bool:
+        """Whether nothing but the robots' own states makes the fleet incomplete."""
+        in_order = self.publication is None or self.publication.is_in_order
+        return in_order and not (self.overdue or self.older or self.clock or self.edited)
 
     def with_overdue(self, now: datetime, max_age: timedelta | None = None) -> FleetStatus:
         """Return a copy in which silent robots are offline, with the remedy for each robot.
@@ -1491,6 +1513,12 @@ def fleet_metrics(
             "1 if `sros fleet status` reports no problem of the robots, the keystore or the clock "
             "of its machine, otherwise 0. Known vulnerabilities do not count.",
             (Sample(int(status.complete), place),),
+        ),
+        Metric(
+            "sros_fleet_mended",
+            "Like sros_fleet_complete, but problems that an agent has mended, and reports for a "
+            "day, do not count.",
+            (Sample(int(status.mended), place),),
         ),
         Metric(
             "sros_fleet_robots",

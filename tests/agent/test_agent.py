@@ -30,6 +30,7 @@ from sros_tool.keystore.confirmation import (
     Confirmation,
     RobotClock,
     RunningFiles,
+    is_mended,
     parse_confirmation,
 )
 from sros_tool.keystore.delivery.release import Release
@@ -306,6 +307,7 @@ def test_enclaves_that_the_release_does_not_have(home: Home, r1: Robot) -> None:
     done = r1.round()
     assert done.removed == ("/r1/since",) and not any("newer" in each for each in done.problems)
     (problem,) = (each for each in r1.round().problems if "another robot, somebody" in each)
+    assert is_mended(problem)
     assert "lacks: /r1/damaged, /r2/x. If they" in problem, "for a day"
     late = r1.round(moment() + timedelta(days=1, minutes=1)).problems
     assert not any("another robot, somebody" in each for each in late)
@@ -351,7 +353,8 @@ def test_what_somebody_damaged_is_named_also_if_a_later_release_replaces_it(
     assert (done.release, done.changed) == (3, ("/r1/b", "/r1/c"))
     changed = f"1 file of release 1 was changed or missing here, and replaced: {path}. Find"
     assert sum(changed in problem for problem in done.problems) == 1
-    assert any(changed in problem for problem in r1.round().problems), "for a day"
+    (problem,) = (problem for problem in r1.round().problems if changed in problem)
+    assert is_mended(problem), "for a day"
 
 
 REFUSED = {
@@ -538,7 +541,8 @@ def test_a_key_that_others_could_read_is_named_for_a_day_after_the_agent_closed_
         assert key.stat().st_mode & 0o777 == 0o600
         assert any("others could read 1 private key: enclaves/r1/a/key.pem" in p for p in problems)
     later = moment() + timedelta(hours=23)
-    assert any("others could read" in problem for problem in r1.round(later).problems)
+    (problem,) = (each for each in r1.round(later).problems if "others could read" in each)
+    assert is_mended(problem)
     assert not r1.round(moment() + timedelta(hours=25)).problems
     key.chmod(0o644)
     r1.round()

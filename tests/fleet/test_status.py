@@ -762,6 +762,21 @@ def test_a_robot_that_is_ahead_of_a_restored_keystore(field: Field) -> None:
         field.run("fleet", "publish", "ks", "pub", *(["--restored"] if to_do == "publish" else []))
 
 
+def test_what_an_agent_mended_does_not_fail_a_job_that_asks_so(field: Field) -> None:
+    mended = (
+        "At 2026-11-29T12:00:00Z, 1 file of release 3 was changed or missing here, and replaced: x."
+    )
+    for problems, status in (((mended,), 0), ((mended, "the disk is full"), 1)):
+        field.send("r1", problems=problems)
+        found = field.status()
+        assert (found["complete"], found["mended"]) == (False, not status)
+        field.run("fleet", "status", "ks", "--fail-on", "unmended", status=status)
+        told = field.run("fleet", "status", "ks", "--prometheus", status=1).out
+        assert f'\nsros_fleet_mended{{keystore="{field.root}"}} {1 - status}\n' in told
+    field.send("r1", problems=(mended,), restart=["/r1/base"])
+    field.run("fleet", "status", "ks", "--fail-on", "unmended", status=1)
+
+
 def test_a_fleet_file_that_was_edited_is_not_believed(field: Field) -> None:
     path = field.root / "fleet.toml"
     path.write_text(path.read_text().replace("[robots.r3]", "").replace("r3 = {}", ""))
