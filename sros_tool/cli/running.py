@@ -599,14 +599,14 @@ def units(
     for job in jobs:
         files |= job_units(
             Job(job),
-            str(target or root.absolute()),
+            str(target or _without_dots(root)),
             user=user or _owner(root),
             sros=program or _this_program(),
-            passphrase=passphrase or "",
+            passphrase=_without_dots(Path(passphrase)) if passphrase else "",
             domain=domain_of(domain) or 0,
             writable=_inbox(root) if job == Job.AGENT else (),
-            inbox=str(inbox.absolute()) if inbox else "",
-            publishing=str(publishing.absolute()) if publishing else "",
+            inbox=_without_dots(inbox) if inbox else "",
+            publishing=_without_dots(publishing) if publishing else "",
             max_age=parse_duration(max_age) if max_age is not None else None,
         )
     changes = unit_changes(folder, files, force=force)
@@ -691,6 +691,13 @@ def _owner(root: Path) -> str:
         raise UsageError(
             f"the owner of keystore '{root}', user {number}, has no name", "", "Add --user NAME."
         ) from None
+
+
+def _without_dots(path: Path) -> str:
+    """Return an absolute path that can be written in a unit, where ``..`` is refused."""
+    absolute = path.absolute()
+    # A link is followed only if a ".." may follow it.
+    return str(absolute.resolve() if ".." in absolute.parts else absolute)
 
 
 def _this_program() -> str:

@@ -78,14 +78,15 @@ def test_a_node_is_verified_first_where_sros_is(made: Path, tmp_path: Path) -> N
 
 def test_jobs_are_of_this_keystore_and_its_owner(made: Path, tmp_path: Path) -> None:
     jobs = ("--job", "renew", "--job", "check", "--job", "metrics", "--job", "fleet")
-    words = ("--sros", "/usr/bin/sros", "--passphrase-file", "/etc/sros/pass")
-    sros("units", made, *jobs, tmp_path / "units", *words).ok()
+    (tmp_path / "work").mkdir()
+    words = ("--sros", "/usr/bin/sros", "--passphrase-file", "../pass")
+    sros("units", made, *jobs, tmp_path / "units", *words, cwd=tmp_path / "work").ok()
     names = {each.name for each in (tmp_path / "units").iterdir()}
     assert names == {f"sros-{job}.{end}" for job in jobs[1::2] for end in ("service", "timer")}
     renew = (tmp_path / "units/sros-renew.service").read_text()
     assert f"ExecStart=/usr/bin/sros renew {made} --all-expiring soon\n" in renew
     assert f"User={made.owner()}\n" in renew
-    assert "ca-passphrase:/etc/sros/pass\n" in renew
+    assert f"ca-passphrase:{tmp_path / 'pass'}\n" in renew
     fleet = (tmp_path / "units/sros-fleet.service").read_text()
     assert f"ExecStart=/usr/bin/sros fleet status {made} --prometheus -o {FLEET_FILE}\n" in fleet
     assert "\nSuccessExitStatus=1\n" in fleet
