@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
+
+_NUMBER = re.compile(r"(\d+)")
 
 
 def counted(number: int, noun: str, plural: str = "") -> str:
@@ -19,6 +22,11 @@ def first_few(
     """Return at most ``maximum`` texts and the number of the others: "a, b and 3 more"."""
     left_out = len(texts) - maximum
     return separator.join(texts[:maximum]) + (f"{joint}{left_out} more" if left_out > 0 else "")
+
+
+def natural_sort_key(name: str) -> list[tuple[int, str]]:
+    """Return the key that sorts r2 before r10."""
+    return [(int(part or 0), "") if part.isdigit() else (0, part) for part in _NUMBER.split(name)]
 
 
 def shortened(value: object) -> str:

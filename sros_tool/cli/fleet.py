@@ -49,7 +49,7 @@ from sros_tool.cli.program import VerbGroup
 from sros_tool.errors import NOT_DONE, Note, SrosError, UsageError
 from sros_tool.terminal import echo, echo_document, visible_line
 from sros_tool.values import file_change, shows
-from sros_tool.wording import counted, first_few
+from sros_tool.wording import counted, first_few, natural_sort_key
 
 if TYPE_CHECKING:
     from datetime import datetime
@@ -1101,14 +1101,9 @@ def _without_robot_name(text: str, robot: str) -> str:
     return re.sub(rf"(?<=/){re.escape(robot)}(?=[/\s,;.:]|$)", _ROBOT_PLACEHOLDER, text)
 
 
-def _natural_sort_key(name: str) -> list[tuple[int, str]]:
-    """Return the key that sorts r2 before r10."""
-    return [(int(part or 0), "") if part.isdigit() else (0, part) for part in _DIGITS.split(name)]
-
-
 def _is_next_number(before: str, name: str) -> bool:
     """Return whether ``name`` is ``before`` with one number increased by 1."""
-    pairs = zip(_natural_sort_key(before), _natural_sort_key(name), strict=False)
+    pairs = zip(natural_sort_key(before), natural_sort_key(name), strict=False)
     differing = [(first, second) for first, second in pairs if first != second]
     return (
         _DIGITS.sub("", before) == _DIGITS.sub("", name)
@@ -1119,7 +1114,7 @@ def _is_next_number(before: str, name: str) -> bool:
 
 def _robot_positions(robots: Iterable[str]) -> dict[str, int]:
     """Map the robots of a fleet to their positions, r2 before r10."""
-    return {name: place for place, name in enumerate(sorted(robots, key=_natural_sort_key))}
+    return {name: place for place, name in enumerate(sorted(robots, key=natural_sort_key))}
 
 
 def _robot_names(

@@ -31,7 +31,7 @@ from sros_tool.policy.placeholders import (
     sample,
 )
 from sros_tool.validity import parse_duration
-from sros_tool.wording import first_few
+from sros_tool.wording import first_few, natural_sort_key
 
 _Item = TypeVar("_Item")
 _Kind = TypeVar("_Kind", bound=Hashable)
@@ -39,6 +39,7 @@ MAX_ROBOTS = 100_000
 RENEWAL_ALLOWED, _RENEWAL_REFUSED = "allowed", "refused"
 ROUTERS = "/{robot}/router"
 """Default path of the enclave of each robot's Zenoh router."""
+_MOST_GROUP_MEMBERS = 5  # in an error
 _MAX_NAME = 64
 """Longest name of a robot or group in characters: longer ones fit into no enclave's name."""
 _MAX_HOST = 253
@@ -126,9 +127,11 @@ class Fleet:
         """
         if name in self.robots:
             return self.robots[name]
-        raise DocumentError(
-            f"the fleet has no robot {name!r}", remedy=_similar_names_remedy(name, self.robots)
-        )
+        remedy = _similar_names_remedy(name, self.robots)
+        if name in self.groups:
+            members = sorted((robot.name for robot in self.members(name)), key=natural_sort_key)
+            remedy = f"{name} is a group: {first_few(members, _MOST_GROUP_MEMBERS)}."
+        raise DocumentError(f"the fleet has no robot {name!r}", remedy=remedy)
 
     def members(self, group: str) -> tuple[Robot, ...]:
         """Return the robots of a group; "" stands for the whole fleet.
@@ -158,8 +161,9 @@ def _similar_names_remedy(name: str, known: Iterable[str]) -> str:
     """Return the remedy for an unknown name: similar known names, or else the first ones."""
     from difflib import get_close_matches
 
-    names = list(known)
+    names = sorted(known, key=natural_sort_key)
     similar = get_close_matches(name[:_MAX_NAME], names, n=3, cutoff=0.5) or names[:3]
+    similar.sort(key=natural_sort_key)
     return (
         f"It has {', '.join(similar)}{', ...' if len(names) > len(similar) else ''}."
         if similar

@@ -155,6 +155,9 @@ def test_the_keystore_knows_whose_enclave_is_whose(made: Path) -> None:
     unknown = sros("list_enclaves", "ks", "--robot", "r70", cwd=made)
     assert unknown.status == 2
     assert "no robot 'r70'. It has r7" in unknown.err
+    group = sros("list_enclaves", "ks", "--robot", "carriers", cwd=made).err
+    first = ", ".join(sorted(CARRIERS, key=lambda name: int(name[1:]))[:5])
+    assert f"has no robot 'carriers'. carriers is a group: {first}" in group
     exported = sros("list_enclaves", "r7", "--robot", "r7", cwd=made)
     assert "An export for a robot has the enclaves of that robot alone" in exported.err
 
