@@ -158,11 +158,11 @@ class AccessAnswer:
     created, and no peer matches it), "refused" (no node of the enclave starts) or "crashes". For
     Zenoh, it is "allowed", "dropped" (messages vanish) or "refused" (the process opens no session).
     ``reason`` is a clause for people.  ``expression`` is the DDS topic expression of the deciding
-    rule, or for Zenoh the key expression with a wildcard that allows it, or "".  ``policy_lines``
-    are the places ``FILE:LINE`` in the given policy that the rule comes from.  ``until`` is the
-    first expiry among the enclave's files, in UTC.  ``remedy`` says what to do if the cause of a
-    denial is not the policy.  ``counts_key`` says that the enclave's key is not here, and was
-    assumed to exist: on its robot, or in the keystore from which this copy was made.
+    rule, or for Zenoh the key expression with a wildcard that allows the access, or "".
+    ``policy_lines`` are the places ``FILE:LINE`` in the given policy that the rule comes from.
+    ``until`` is the first expiry among the enclave's files, in UTC.  ``remedy`` says what to do if
+    the cause of a denial is not the policy.  ``counts_key`` says that the enclave's key is not
+    here, and was assumed to exist: on its robot, or in the keystore from which this copy was made.
     """
 
     allowed: bool
@@ -686,10 +686,10 @@ def explain_access(
             release in ``distribution``), or another name that `sros explain --vendor` takes, such
             as "fastdds-3.2" or "zenoh".
         distribution: A ROS 2 distribution, such as "lyrical", whose release of ``vendor`` decides.
-        policy: The policy of the enclave, or its file, in which to find the ``policy_lines``.
-        domain: The ROS domain id; by default 0, or the first domain of the governance.
-        now: The time of the access; the current time by default.
-        zone: The time zone of the robot, in which some vendors read dates.
+        policy: The policy of the enclave, or the path of its file, in which to find the
+        ``policy_lines``. domain: The ROS domain id; by default 0, or the first domain of the
+        governance. now: The time of the access; the current time by default. zone: The time zone of
+        the robot, in which some vendors read dates.
 
     Raises:
         KeystoreError: The keystore or the enclave does not exist.
@@ -810,12 +810,12 @@ def check(
     """Return findings on errors and weaknesses in keystores, enclaves and policies, worst first.
 
     Args:
-        paths: Keystores, enclave folders, policy files, or folders of policy files.
-        policies: Policies, or their files, to compare the permissions of keystores with.
-        fleet: The file with the robots that the placeholders of policy files stand for.
-        severity: The lowest severity that is returned.
-        strict: Include the weaknesses that a keystore's template accepts.
-        distribution: The ROS 2 distribution, such as "lyrical", whose nodes and DDS the findings
+        paths: Keystores, enclave folders, policy files, or folders of policy files. policies:
+        Policies, or paths of policy files; the permissions of keystores are compared with these
+        policies. fleet: The file with the robots that the placeholders of policy files stand for.
+        severity: The lowest severity that is returned. strict: Include the weaknesses that a
+        keystore's template accepts. distribution: The ROS 2 distribution, such as "lyrical", whose
+        nodes and DDS the findings
             are for; by default the latest for nodes in policies, and the distributions in the
             keystore's settings.
         domain: The ROS domain id that the enclaves have to join.
@@ -890,7 +890,7 @@ def check_requirements(
             fleet, which count as one policy.
         requirements: The TOML file of the requirements, or several.
         fleet: The file with the robots that the placeholders of a policy and its requirements stand
-            for; a keystore has its own.
+            for; a keystore has its own fleet.
         template: The keystore template, by name or file, whose protection a policy gets. Without
             it, the default template is assumed where the policy states no protection, and a finding
             reports this.
@@ -1012,7 +1012,7 @@ def new_access(
 
 
 def _time_or_now(now: datetime | None) -> datetime:
-    """Return ``now``, which must have a time zone, or the current time if it is None."""
+    """Return ``now``, which must have a time zone, or the current time if ``now`` is None."""
     if now is None:
         return datetime.now(UTC)
     if now.tzinfo is None:
@@ -1023,7 +1023,7 @@ def _time_or_now(now: datetime | None) -> datetime:
 
 
 def _checked_domain(domain: int | None) -> int | None:
-    """Return the ROS domain id; raise `UsageError` if it is not a valid id."""
+    """Return the ROS domain id, or None; raise `UsageError` for an id that is not valid."""
     from sros_tool.dds.domains import DomainSet
 
     return None if domain is None else DomainSet.parse(str(domain), "domain").only()

@@ -246,7 +246,7 @@ class Automaton:
 
     @cached_property
     def suffix(self) -> str:
-        """The text that every accepted name ends with."""
+        """The text that every accepted name ends with, or ""."""
         if len(self.ends) != 1:
             return ""
         before: dict[int, list[tuple[Letters, int]]] = {}

@@ -210,7 +210,10 @@ def unknown_distribution_notes(environment: Mapping[str, str]) -> list[Note]:
 
 
 def _tested_vendor(product: str, version: str) -> Vendor:
-    """Return the tested vendor with a version's release, or with the latest earlier release."""
+    """Return the tested vendor of a version's release, or of the latest release before it.
+
+    If all tested releases are later, the result is the vendor of the first one.
+    """
     vendors = sorted(
         (vendor for vendor in TESTED if vendor.traits.product == product),
         key=lambda vendor: _numbers(vendor.release),

@@ -450,7 +450,11 @@ def _choose_domain(domains: DomainSet, wanted_domain: int | None, keystore: Open
 def _zenoh_domain(
     keystore: OpenedKeystore, zenoh: OpenedZenoh, wanted_domain: int | None, domains: DomainSet
 ) -> int | None:
-    """Return the ROS domain for a process, one of the domains of its Zenoh configuration.
+    """Return the ROS domain for a process, which its Zenoh configuration has to name.
+
+    Without ``wanted_domain``, it is preferably one of ``domains``.
+
+    If the configuration names no domain, the result is ``wanted_domain``, which may be None.
 
     Raises:
         KeystoreError: the configuration is not for ``wanted_domain``.
@@ -847,10 +851,10 @@ def other_node_notes(
 def _other_node_note(
     enclave: str, known: tuple[NodeName, ...], ns: str, name: str, *, all_known: bool
 ) -> Note | None:
-    """Return a note if a node is not among ``known``, the nodes of an enclave.
+    """Return a note if a node is not among ``known``, the nodes of an enclave; else None.
 
-    "" stands for any namespace or name.  Unless ``all_known`` is set, the enclave may have more
-    nodes: then a note is returned only if a known node has this name in another namespace.
+    "" stands for any namespace or name.  Without ``all_known``, the enclave may have more nodes. In
+    this case, a note is returned only if a known node has this name in another namespace.
     """
     from sros_tool.names import is_expression
     from sros_tool.policy.patterns import overlap

@@ -149,7 +149,9 @@ def new_files(root: Path, files: Mapping[str, bytes]) -> Iterator[Folder]:
 
 
 def write_new_folder(path: Path, files: Mapping[str, bytes]) -> None:
-    """Make the folder ``path`` with these files, as in `new_files`, whole or not at all.
+    """Make the folder ``path`` with these files, whole or not at all.
+
+    ``files`` maps paths to contents, as in `new_files`.
 
     Raises:
         OSError: the folder cannot be made, or ``path`` is something other than an empty folder.

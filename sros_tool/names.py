@@ -42,7 +42,10 @@ _NODE_SERVICE = re.compile(rf"(?P<node>/.+)/(?:{'|'.join(NODE_SERVICES)})\Z")
 
 
 def node_of_service(service: str) -> str:
-    """Return the full name of the node that offers a service of `NODE_SERVICES`; "" for others."""
+    """Return the full name of the node that offers a service.
+
+    The result is "" for services that are not in `NODE_SERVICES`.
+    """
     match = _NODE_SERVICE.match(service)
     return match["node"] if match else ""
 

@@ -130,8 +130,9 @@ def parse(
     ``instructions``, the document keeps its processing instructions.
 
     Raises:
-        DocumentError: the document is not well-formed, too large, or has a document type
-            declaration (entities could read other files), or with ``as_bytes`` another encoding.
+        DocumentError: the document is not well-formed or is too large; it has a document type
+        declaration (entities could read other files); or, with ``as_bytes``, it has another
+        encoding.
     """
     if not data.strip():
         raise DocumentError(f"{name} is empty", "An XML document was expected.")

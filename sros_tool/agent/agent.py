@@ -330,7 +330,7 @@ class _Round:
         return self._machine.clock()
 
     def _clock_next_to_release(self, made: datetime) -> RobotClock | None:
-        """Return that the clock is behind, with a problem, if a release was made later."""
+        """Return ``BEHIND``, and report it, if a release was made in the future; else None."""
         now = self._machine.now
         if made <= now + _CLOCK_TOLERANCE:
             return None
@@ -857,11 +857,11 @@ class _Round:
         return arrived
 
     def _list_to_send(self, names: Iterable[str]) -> str | None:
-        """Return a revocation list that the keystore may have lost; None if it has the list."""
+        """Return a revocation list that the keystore may have lost; None if nothing seems lost."""
         return self._replaced_list() if self._is_in_step else self._revocation_lists(names)
 
     def _seal_to_send(self) -> str | None:
-        """Return the seal of the installed release; None without one, or if it is too long."""
+        """Return the seal of the installed release; None without a seal, or for a seal too long."""
         with suppress(SrosError, ValueError):
             seal = read_seal(self._folder).decode("ascii")
             return seal if 0 < len(seal) <= LONGEST_SEAL else None
@@ -1076,7 +1076,7 @@ def send(
 
     Raises:
         UnavailableError: the inbox cannot be reached, or does not take the message; `RefusedError`
-            if it seems to refuse the client certificate.
+        if the inbox seems to refuse the client certificate.
     """
     if not inbox.startswith(("https://", "http://")):
         _write_message(Path(inbox), robot, message)
@@ -1168,7 +1168,7 @@ def _enclave_key(folder: Path, name: str, secrets: Secrets) -> PrivateKey:
 
 
 class Renewals(NamedTuple):
-    """The signing requests (PEM) for a message, and who has to sign it.
+    """The signing requests (PEM) for a message, and the enclave whose key has to sign the message.
 
     Only the current key of an enclave can vouch for its new key, by signing the message.  So a
     message has at most one request for a new key, which is from the enclave ``signer``.  Every

@@ -277,9 +277,9 @@ def _pinned_authorities(release: Release, pinned: frozenset[str]) -> Iterator[x5
 def _check_lists(name: str, files: Mapping[str, bytes], present: Mapping[str, bytes]) -> None:
     """Raise `KeystoreError` if a revocation list in the release is older than the list here.
 
-    ``files`` are the files of an enclave in the release, ``present`` its files here that may
-    contain lists. Only lists signed by a CA in the release count, because the owner of the folder
-    can write anything into it.
+    ``files`` are the files of an enclave in the release. ``present`` are the files of this enclave
+    on the robot that may contain lists. Only lists signed by a CA in the release count, because the
+    owner of the folder can write anything into the folder.
     """
     if older := older_list(present, files):
         here, new = older
@@ -308,12 +308,18 @@ def present_lists(folder: Folder, name: str) -> dict[str, bytes]:
 
 
 def release_time(release: Release) -> datetime | None:
-    """Return when the newest certificate or revocation list in a release began to be valid."""
+    """Return when the newest certificate or revocation list in a release began to be valid.
+
+    The result is None if no certificate and no list can be read.
+    """
     return _newest_validity_start(release.enclaves().values())
 
 
 def _newest_validity_start(enclaves: Iterable[Mapping[str, bytes]]) -> datetime | None:
-    """Return when the newest certificate or revocation list of enclaves began to be valid."""
+    """Return when the newest certificate or revocation list of enclaves began to be valid.
+
+    The result is None if no certificate and no list can be read.
+    """
     moments = []
     for files in enclaves:
         with suppress(SrosError):
@@ -479,10 +485,12 @@ def _read_file(folder: Folder, path: str) -> bytes | None:
 def _revocation_list_change(
     folder: Folder, name: str, files: Mapping[str, bytes], now: datetime
 ) -> _Change:
-    """Return the change that gives an enclave only its new revocation list, if the list fits it.
+    """Return the change that gives an enclave only its new revocation list, if the list fits.
 
-    The enclave must trust the same identity CAs as before, and have a certificate; the list must be
-    signed by one of them and valid.
+    Otherwise, the change is empty.
+
+    The enclave must trust the same identity CAs as before, and have a certificate. One of these CAs
+    must have signed the list, and the list must be valid.
     """
     place, change = enclave_folder(name), _Change()
     with suppress(SrosError, OSError):

@@ -181,7 +181,7 @@ _LIST_KEYS = {"authorities", "restart_if", "systemctl"}
 
 
 def settings_from(value: Mapping[str, Any], label: str) -> AgentSettings:
-    """Return the settings in a TOML document; ``label`` names it in errors.
+    """Return the settings in a TOML document; ``label`` names the document in errors.
 
     Raises:
         DocumentError: a key is missing, unknown or of another form.

@@ -47,23 +47,23 @@ class AgentState:
 
     ``release`` is the number of the release that is installed with all its enclaves, and
     ``accepted`` the highest number that was verified: an older release is refused.  ``sequence`` is
-    the number of the last message.  ``latest`` is the latest moment that has certainly passed:
-    verified documents begin to be valid then.  ``due`` are the enclaves whose processes were not
-    yet seen with the installed files since the machine started; ``boot`` identifies this start (see
-    `boot_id`).  ``unseen`` are the enclaves in ``due`` of which no process was seen.  ``restarted``
-    are the enclaves in ``due`` whose units were restarted after their files changed.  ``list_due``
-    are the enclaves whose processes may lack the revocation list.  ``files`` maps enclaves to two
-    digests at the end of the last round, as text: of all files, and of the files that decide whom
-    the enclave trusts.  A change of a digest, whoever wrote the files, makes a restart due;
-    ``list_since`` maps enclaves to the time since when the second digest is the same.  ``fetched``
-    and ``sent`` are when the source and the inbox were last reached. ``replaced`` and
-    ``list_replaced`` map enclaves of `due` and `list_due` to when the agent last replaced their
-    files, in seconds since the start of the machine: setting the clock does not change these times.
-    ``repaired`` is a sentence on files that differed from the release and were replaced at
-    ``repaired_at``.  ``exposed`` maps paths of private keys that other users could read to the time
-    of the last round that found them readable, and ``exposed_digests`` to the SHA-256 of their
-    public keys; ``removed`` maps enclaves that the installed release did not have to the time of
-    the round that removed them.
+    the number of the last message.  ``latest`` is the latest moment that has certainly passed,
+    because a verified document became valid at that moment.  ``due`` are the enclaves whose
+    processes were not yet seen with the installed files since the machine started; ``boot``
+    identifies this start (see `boot_id`).  ``unseen`` are the enclaves in ``due`` of which no
+    process was seen.  ``restarted`` are the enclaves in ``due`` whose units were restarted after
+    their files changed.  ``list_due`` are the enclaves whose processes may lack the revocation
+    list.  ``files`` maps enclaves to two digests at the end of the last round, as text: of all
+    files, and of the files that decide whom the enclave trusts.  A change of a digest, whoever
+    wrote the files, makes a restart due; ``list_since`` maps enclaves to the time since when the
+    second digest is the same.  ``fetched`` and ``sent`` are when the source and the inbox were last
+    reached. ``replaced`` and ``list_replaced`` map enclaves of `due` and `list_due` to when the
+    agent last replaced their files, in seconds since the start of the machine: setting the clock
+    does not change these times. ``repaired`` is a sentence on files that differed from the release
+    and were replaced at ``repaired_at``.  ``exposed`` maps paths of private keys that other users
+    could read to the time of the last round that found them readable, and ``exposed_digests`` to
+    the SHA-256 of their public keys; ``removed`` maps enclaves that the installed release did not
+    have to the time of the round that removed them.
     """
 
     release: int = 0
@@ -203,7 +203,7 @@ def read_seal(folder: Path) -> bytes:
 
 
 def write_seal(folder: Path, seal: bytes) -> None:
-    """Keep the seal of the release that is accepted.
+    """Write the seal of the accepted release into the folder.
 
     Raises:
         OSError: the seal cannot be written; the earlier seal stays.

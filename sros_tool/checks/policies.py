@@ -1393,8 +1393,8 @@ def _check_zenoh(enclaves: Iterable[Enclave]) -> Iterator[Finding]:
 def _shared_namespaces(fleet: Fleet, enclaves: Iterable[Enclave]) -> Iterator[str]:
     """Yield a clause for each namespace that several robots on one ROS domain share.
 
-    The computers of one robot may share a namespace: they are a group of their own, and no node
-    runs on two of them.
+    The computers of one robot may share a namespace, because no node runs on two of them: in the
+    fleet, they are a group that contains no other robots.
     """
     robots = {
         namespace: [fleet.robots[name] for name in names]
@@ -1500,7 +1500,7 @@ def _unreadable_policy_findings(path: Path, error: SrosError) -> Iterator[Findin
 
 
 def _split_place(error: SrosError) -> tuple[str, int, str]:
-    """Return the file and line that an error begins with ("" and 0 if none), and its text."""
+    """Return the file and line that an error begins with ("" and 0 without them), and the rest."""
     match = _PLACED_ERROR.match(error.what)
     return (match["file"], int(match["line"]), match["text"]) if match else ("", 0, error.what)
 

@@ -85,7 +85,10 @@ def enclave_lines(names: Sequence[str], text: str) -> Iterator[str]:
 
 
 def first_lines(lines: Sequence[str]) -> Iterator[str]:
-    """Yield 20 lines about enclaves and the number of the others, or all if steps are logged."""
+    """Yield the first lines about enclaves, and a line with the number of further enclaves.
+
+    If steps are logged, all lines are yielded.
+    """
     import logging
 
     if logging.getLogger("sros_tool").isEnabledFor(logging.INFO):

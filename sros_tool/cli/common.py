@@ -623,7 +623,8 @@ def moment_of(text: str | None) -> datetime:
     """Return the moment that ``--at`` names: a date, or a duration from now; now by default.
 
     Raises:
-        UsageError: ``text`` is neither, or its year is out of range.
+        UsageError: ``text`` is neither a date nor a duration, or the year of the date is out of
+        range.
     """
     from sros_tool.validity import parse_duration, parse_iso
 

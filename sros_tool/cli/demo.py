@@ -288,7 +288,7 @@ def _run_by_hand(
 
 
 def _list(backend: str, as_json: bool) -> None:
-    """Print the scenarios of a backend, or of all."""
+    """Print the scenarios of a backend, or of all backends ("auto")."""
     from sros_tool.demo.scenarios import SCENARIOS
     from sros_tool.demo.scenarios.on_zenoh import ZENOH_SCENARIOS
 

@@ -482,7 +482,10 @@ def _show_signed(
 
 
 def _policy(file: Path | None, fleet_file: Path | None) -> Policy | FleetPolicy | None:
-    """Return the policy in a file, for the robots of a fleet if one is named."""
+    """Return the policy in ``file``, or None without a file.
+
+    With ``fleet_file``, the robots in this file fill in the placeholders of the policy.
+    """
     from sros_tool.fleet.expansion import FleetPolicy
     from sros_tool.fleet.fleet_file import read_fleet
     from sros_tool.policy.document import read_policy

@@ -923,7 +923,7 @@ def _question_to_all(other_arguments: tuple[str, ...], kind: str | None) -> Ques
 def _print_answer_for_all(
     decider: Decider, question: Question, kind: str | None, where: _WhoContext, as_json: bool
 ) -> int:
-    """Print the decisions on all enclaves; return 0 if any enclave may do it, else 1."""
+    """Print the decisions on all enclaves; return 0 if any enclave may do the operation, else 1."""
     from sros_tool.explain.who import answer_for_all, note_on_callable_action, note_on_names_meant
 
     with progress("asking"):

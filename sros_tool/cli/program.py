@@ -169,7 +169,7 @@ class _Program(VerbGroup):
         return list(_VERBS)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """Import and return a verb, by its name or an alias."""
+        """Import and return a verb, by its name or an alias; None for an unknown name."""
         name = _VERB_OF_ALIAS.get(cmd_name.replace("-", "_"))
         if name is None:
             return None

@@ -277,7 +277,7 @@ def _with_router(network: ZenohNetwork, name: str, endpoint: str) -> ZenohNetwor
 
 
 def _parse_domains(text: str | None) -> str:
-    """Return domain ids with every range written out: ``3,4,5,9`` for ``3-5,9``."""
+    """Return domain ids with every range written out: ``3,4,5,9`` for ``3-5,9``; "" for no text."""
     from sros_tool.dds.domains import DomainSet
 
     return ",".join(map(str, DomainSet.parse(text, "--domain"))) if text else ""

@@ -95,7 +95,7 @@ def prepare(robot: LocalRobot, duration: str | None, *, partial: bool, dry_run: 
         robot.observed = robot.observed.belonging_elsewhere(robot.named_elsewhere)
         robot.observed = robot.observed.belonging_here(robot.named_here)
         if not dry_run:
-            robot.remember(robot.observed)
+            robot.write_processes(robot.observed)
     denied_before: Sequence[str] = ()
     if robot.export.exists() and robot.observation_file.exists():
         with suppress(SrosError):  # the steps report the error
@@ -104,7 +104,7 @@ def prepare(robot: LocalRobot, duration: str | None, *, partial: bool, dry_run: 
     ignored = [] if dry_run else _ignore_in_git(robot)
     removed = [] if dry_run or is_stopped else _remove_enclaves(robot)
     if not (dry_run or is_stopped):
-        _remember_later_processes(robot)
+        _write_later_processes(robot)
     state = current_state(robot, robot.read_policy())._replace(steps=done, dry_run=dry_run)
     if dry_run or is_stopped:
         return state._replace(problems=problems, changes=ignored)
@@ -147,7 +147,7 @@ def _ignore_in_git(robot: LocalRobot) -> list[FileChange]:
     return [FileChange("create", str(file))]
 
 
-def _remember_later_processes(robot: LocalRobot) -> None:
+def _write_later_processes(robot: LocalRobot) -> None:
     """Write changed commands of processes, and new processes, into the folder, and show them.
 
     Enclaves that neither the keystore nor the policy has any more are removed from the enclaves of
@@ -166,7 +166,7 @@ def _remember_later_processes(robot: LocalRobot) -> None:
                 f"{new.open_command(robot.domain)}; before: {old.open_command(robot.domain)}"
             )
     if now != robot.observed:
-        robot.remember(now)
+        robot.write_processes(now)
 
 
 def _with_renamed_enclaves(robot: LocalRobot, observed: ObservedProcesses) -> ObservedProcesses:

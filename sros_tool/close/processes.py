@@ -216,7 +216,7 @@ def command_without_enclave(command: Sequence[str], enclave: str) -> Sequence[st
 
 
 def _sros_word() -> str:
-    """Return ``sros``, or the path of the running sros if ``sros`` does not start it in a shell."""
+    """Return "sros", or the path of this program if the word does not start it in a shell."""
     running, found = shutil.which(sys.argv[0]), shutil.which("sros")
     if not running or Path(running).name != "sros" or (found and Path(found).samefile(running)):
         return "sros"

@@ -230,7 +230,7 @@ class LocalRobot:
             enclaves = sorted(names - self.not_here)
         return ("distribute_key", str(self.keystore), *enclaves, str(self.export), "--force")
 
-    def remember(self, observed: ObservedProcesses) -> None:
+    def write_processes(self, observed: ObservedProcesses) -> None:
         """Write the observed processes into the folder."""
         self.observed = observed
         content = f"{json.dumps(as_plain(observed), indent=2)}\n"

@@ -155,7 +155,9 @@ class RunningRobot:
         return process.user in (0, self.robot.export.stat().st_uid)
 
     def _why_not_current(self, process: Process, enclave: ProcessEnclave) -> str:
-        """Return why a process is not closed, as text before "the processes of X"; "" if it is."""
+        """Return why a process is not closed, as text before "the processes of X"; "" for a closed
+        one.
+        """
         if not self.may_use_files(process):
             return f"users other than the owner of the files ({user_text(process.user)}) run"
         if process.environment.get(STRATEGY) != "Enforce":

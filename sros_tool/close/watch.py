@@ -162,7 +162,7 @@ def _write_observation(robot: LocalRobot, document: str, observed: ObservedProce
     kept = [process for process in robot.processes.processes if process.enclave in absent]
     remembered = observed._replace(processes=[*observed.processes, *kept])
     replace_file(robot.observation_file, document.encode())
-    robot.remember(remembered.belonging_elsewhere(not_here))
+    robot.write_processes(remembered.belonging_elsewhere(not_here))
 
 
 def _text_on_nodes_without_enclave(robot: LocalRobot, names: Sequence[str]) -> str:

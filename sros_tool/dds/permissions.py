@@ -437,9 +437,10 @@ def _topics(criteria: Iterable[Criteria]) -> tuple[str, ...]:
 def _blocked_by_denials(
     denied: list[str], denied_too: set[str], is_allowed: OverlapTest
 ) -> list[str]:
-    """Return the expressions ``denied`` in one direction that `is_allowed` accepts for the other.
+    """Return the expressions ``denied`` in one direction that the other direction allows.
 
-    Expressions in ``denied_too``, which are denied in both directions, are left out.
+    ``is_allowed`` decides on the other direction. Expressions in ``denied_too``, which are denied
+    in both directions, are left out.
     """
     return [
         expression

@@ -499,9 +499,10 @@ def end_within(seconds: float, process: subprocess.Popen[bytes]) -> None:
 def _report(
     node: HandNode, pipe: int, say: Callable[[str], None], *, on_ready: Callable[[], None]
 ) -> Event | None:
-    """Pass the node's reports to ``say`` until the node ends, and return the last report.
+    """Pass the node's reports to ``say`` until the node ends, and return the last report or None.
 
-    ``on_ready`` is called when the node is ready: before that, it hears nothing in any case.
+    ``on_ready`` is called when the node is ready. Before that moment, the node hears nothing in any
+    case.
     """
     data, seen, event = b"", "", None
     is_ready = False

@@ -149,11 +149,11 @@ class UserKeystore(NamedTuple):
         return next((enclave for _, enclave in attackers & other_enclaves), "")
 
     def row_if_allowed(self, row: Row, topic: str) -> Row:
-        """Return the row; if the attacker's permissions allow the attack, it expects success.
+        """Return the row; if the attacker's permissions allow the attack, the row expects success.
 
-        ``topic`` is the attacked ROS topic.  A row that expects success has no party except those
-        of its claim: success needs no control, and another server could answer in place of the
-        attacker.
+        ``topic`` is the attacked ROS topic.  A row that expects success has no parties except the
+        parties of its claim: success needs no control, and another server could answer in place of
+        the attacker.
         """
         attacker = next((party for party in row.parties if party.intruder), None)
         if row.expected is not RowStatus.REFUSED or attacker is None:

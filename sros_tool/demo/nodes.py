@@ -221,7 +221,10 @@ class NodeRole:
             self.act()
 
     def _other_types(self, *, of_publishers: bool) -> OtherTypes | None:
-        """Begin to discover other endpoints on the topic of a node started by hand."""
+        """Begin to discover other endpoints on the topic of a node that was started by hand.
+
+        The result is None for any other node.
+        """
         options, node = self._options, self._node
         if not options.by_hand:
             return None

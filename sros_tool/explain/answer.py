@@ -255,7 +255,10 @@ def with_article(kind: str) -> str:
 
 
 def _role(topic: str, kind: str) -> str:
-    """Return the role of a DDS topic in a service or action, such as ``send_goal requests``."""
+    """Return the role of a DDS topic in a service or action, such as ``send_goal requests``.
+
+    The result is "" for a topic of neither.
+    """
     if kind == "topic":
         return ""
     service, begin = service_of(topic)
@@ -303,7 +306,7 @@ class PolicyLine(NamedTuple):
 
     @property
     def protection(self) -> Annotated[str, Words(("sign", "encrypt"))] | None:
-        """The minimum protection that the line demands, or null."""
+        """The minimum protection that the line demands; null if it demands none."""
         return self.group.protect.lower() if self.group.protect else None
 
     def __str__(self) -> str:
@@ -484,7 +487,10 @@ class Answer(NamedTuple):
 
     @property
     def denied_by(self) -> str:
-        """The vendor, peer or rule that denies the access, or null."""
+        """What denies the access: DDS in the process, peers, or a crash; null if it is allowed.
+
+        For a crash, the text begins with "nobody".
+        """
         match self.outcome:
             case Outcome.ALLOWED:
                 return ""
@@ -505,7 +511,7 @@ class Answer(NamedTuple):
 
     @property
     def rule(self) -> DecidingRule | None:
-        """The rule of the permissions that decided the answer, or null."""
+        """The rule of the permissions that decided the answer; null if no rule decided it."""
         decision, grant = self.decision, self.grant
         if decision.rule is None or grant is None:
             return None
@@ -514,7 +520,7 @@ class Answer(NamedTuple):
 
     @property
     def wildcard(self) -> str:
-        """The expression that matched, if it is a wildcard, or null."""
+        """The expression that matched, if it is a wildcard; otherwise null."""
         expression = self.decision.expression or ""
         return expression if is_expression(expression) else ""
 
@@ -534,7 +540,7 @@ class Answer(NamedTuple):
 
     @property
     def protection(self) -> AppliedProtection | None:
-        """The protection that the governance demands for the topic, or null."""
+        """The protection that the governance demands for the topic; null if no rule applies."""
         topic, domain = self.topic_rule, self.domain_rule
         if domain is None:
             return None
@@ -681,7 +687,9 @@ class Evaluator:
 
     @property
     def access(self) -> Access | None:
-        """Access of a process on this vendor; None if it cannot start or every peer refuses it."""
+        """Access of a process on this vendor; None if no process starts, or peers refuse each
+        process.
+        """
         return self._participant.access
 
     @property

@@ -79,7 +79,7 @@ def domains_decided_alike(
 
 
 def fleet_of(file: Path | None, keystore: OpenedKeystore | None) -> Fleet | None:
-    """Return the fleet in a file, or else the fleet of the keystore."""
+    """Return the fleet in ``file``, or else the fleet of the keystore; None if there is neither."""
     from sros_tool.keystore.fleet import load_fleet
 
     if file:
@@ -199,7 +199,7 @@ def is_policy(path: Path) -> bool:
 
 
 def policy_to_ask(file: Path, fleet: Fleet | None) -> tuple[Policy, Policy]:
-    """Return a policy as in its file, and with its placeholders filled in for a fleet."""
+    """Return a policy as its file states it, and with its placeholders filled in for a fleet."""
     from sros_tool.fleet.expansion import FleetPolicy
     from sros_tool.policy.document import read_policy
 

@@ -546,7 +546,10 @@ def _enclaves_of(
 
 @dataclass(frozen=True, slots=True)
 class _Judgement:
-    """The rights that a process would be denied in an enclave; ``refused`` if it cannot start."""
+    """The rights that a process would be denied in an enclave.
+
+    ``refused`` is the reason why the process cannot start in the enclave, or "".
+    """
 
     denied: tuple[DeniedRight, ...]
     refused: str = ""

@@ -84,7 +84,7 @@ def explain(evaluator: Evaluator, question: Question) -> Answer:
 
 
 def _provenance(enclave: LoadedEnclave, recorded: str) -> Provenance | None:
-    """Return whether permissions were made from the policy, according to the ledger."""
+    """Return how the ledger relates the permissions to the policy; None without a policy."""
     if enclave.policy is None:
         return None
     if not enclave.signed:

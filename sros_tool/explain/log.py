@@ -186,8 +186,8 @@ class SearchedKeystore:
     def has_other_side(self, right: Right) -> bool | None:
         """Return whether an enclave states, by exact name, the right that peers of ``right`` need.
 
-        Returns None if that is not known, as with unreadable permissions, or if an enclave has the
-        right only by a wildcard. In an export, the enclave with the right may be missing (see
+        Returns None if permissions cannot be read, so that this is not known, or if an enclave has
+        the right only by a wildcard. In an export, the enclave with the right may be missing (see
         `place`).
         """
         exact, expressions = self._allowed_names[PEER_RIGHT[right.right]]
@@ -761,7 +761,10 @@ class _Examiner:
         )
 
     def _other_folder_remedy(self, path: str, remedy: str) -> str:
-        """Return the remedy for a folder that a log reports missing and this keystore lacks."""
+        """Return the remedy for a folder that a log reports missing and this keystore lacks.
+
+        The result is "" if sros knows no remedy.
+        """
         place, inside, name = path.rpartition("/enclaves/")
         if not inside or self._keystore is None:
             return ""

@@ -519,7 +519,7 @@ class VendorOutcome(NamedTuple):
 
     @property
     def wildcard(self) -> str:
-        """The deciding expression, if it is a wildcard, or null."""
+        """The deciding expression, if it is a wildcard; otherwise null."""
         return self.expression if is_expression(self.expression) else ""
 
     @property

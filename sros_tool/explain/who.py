@@ -150,7 +150,7 @@ def answer_for_all(decider: Decider, question: Question, kind: str | None) -> An
 
 
 def note_on_callable_action(decider: Decider, question: Question) -> Note | None:
-    """Return a note if enclaves may call an action that has the name of a service."""
+    """Return a note, or None, that enclaves may call an action with the name of the service."""
     if (question.word, question.type) == ("call", "service"):
         action = ask("call", question.name, "action")
         outcomes = decider.outcomes(action)
@@ -165,7 +165,7 @@ def note_on_callable_action(decider: Decider, question: Question) -> Note | None
 def note_on_names_meant(
     decider: Decider, question: Question, enclaves: Container[str]
 ) -> Note | None:
-    """Return a note on similar names in the rights of ``enclaves``, for a mistyped name."""
+    """Return a note on names like a mistyped name in the rights of ``enclaves``, or None."""
     names = sorted(
         {
             right.name

@@ -671,7 +671,7 @@ class ZenohEvaluator:
         return checks
 
     def _rights(self, enclave: str, question: Question) -> tuple[Right, ...]:
-        """Return the rights that a question needs; () if it asks about joining."""
+        """Return the rights that a question needs; () for a question about joining."""
         return parts(Right(enclave, ALLOW, question.right, question.name)) if question.right else ()
 
     def _link_checks(
@@ -701,7 +701,7 @@ class ZenohEvaluator:
     def _graph_deliveries(
         self, process: ZenohProcess, other: ZenohProcess
     ) -> tuple[Delivery, Delivery]:
-        """Return the delivery of a token of ``process``, and the delivery of other tokens to it."""
+        """Return two deliveries: of a token of ``process``, and of other tokens to ``process``."""
         whole_domain = f"@ros2_lv/{self.domain}/**"
         router = self._router_of(process.name).process
         assert router

@@ -109,7 +109,7 @@ _INI_HOST = re.compile(rb"^[A-Za-z0-9_.-]+[ \t]*(?:$|[ \t][A-Za-z_]+=)", re.MULT
 
 
 def parse_fleet(data: bytes, label: str) -> Fleet:
-    """Return the fleet in a TOML document; ``label`` names it in errors.
+    """Return the fleet in a TOML document; ``label`` names the document in errors.
 
     Raises:
         DocumentError: the document is not TOML, or a value in it is not valid.

@@ -158,7 +158,10 @@ class Fleet:
 
 
 def _similar_names_remedy(name: str, known: Iterable[str]) -> str:
-    """Return the remedy for an unknown name: similar known names, or else the first ones."""
+    """Return the remedy for an unknown name: similar known names, or else the first known names.
+
+    The result is "" if no names are known.
+    """
     from difflib import get_close_matches
 
     names = sorted(known, key=natural_sort_key)

@@ -298,9 +298,9 @@ def make_confirmation(
     error; the confirmation leaves this enclave out.  Without ``unreadable``, the error is raised.
 
     Raises:
-        DocumentError: ``robot`` is not a robot's name.
-        KeystoreError: ``root`` is not a keystore, or a file in it is a link that leads out of it.
-        OSError: a file cannot be read; a confirmation without this file would be false.
+        DocumentError: ``robot`` is not a robot's name. KeystoreError: ``root`` is not a keystore,
+        or a file in ``root`` is a link that leads out of ``root``. OSError: a file cannot be read;
+        a confirmation without this file would be false.
     """
     if problem := name_problem(robot):
         raise DocumentError(f"{robot!r} is not the name of a robot", problem)

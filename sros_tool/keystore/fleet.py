@@ -94,7 +94,7 @@ def enclaves_of_several_distributions(keystore: OpenedKeystore) -> dict[tuple[st
 
 
 def checked_fleet(keystore: OpenedKeystore, without_it: Callable[[], str] = str) -> Fleet | None:
-    """Return the fleet as `load_fleet` does, after checking that nobody edited its file.
+    """Return the fleet, or None, as `load_fleet` does, after checking that nobody edited its file.
 
     Verbs that issue or send files by the fleet use this function.  ``without_it`` returns the
     beginning of the error's remedy: sentences on how to go on without the fleet.

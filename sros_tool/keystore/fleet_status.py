@@ -1462,7 +1462,7 @@ class _Stages:
         )
 
     def of(self, compared_robot: _ComparedRobot) -> str:
-        """Return the stage of the least advanced CA file of a robot; "" if it confirmed none."""
+        """Return the stage of a robot's least advanced CA file; "" without a confirmed CA file."""
         stages = {
             self._stage(kind, certificates)
             for kind, files in compared_robot.authorities.items()

@@ -256,9 +256,10 @@ def _known_authorities(keystore: OpenedKeystore, role: str) -> frozenset[str] | 
 def _may_be_issued_by_trusted_ca(keystore: OpenedKeystore, entry: Entry) -> bool:
     """Return whether a trusted CA may have issued the certificate of a ledger entry.
 
-    An entry after the entry of a trusted CA does not prove it: until the stage reissue of a
-    rotation, the previous CA goes on to issue.  The copy in the folder ``revoked`` shows the issuer
-    if it exists and has the recorded digest; without it, the result is True.
+    An entry after the entry of a trusted CA does not prove that this CA issued the certificate:
+    until the stage reissue of a rotation, the previous CA goes on to issue. A copy of the
+    certificate in the folder ``revoked``, with the recorded digest, shows the issuer. Without such
+    a copy, the result is True.
     """
     file = keystore.identity_file
     with suppress(SrosError):

@@ -17,9 +17,9 @@ its digest, and the end of the ledger.  Changes in other lines are noticed when 
 A change that makes the file longer than 16 MiB seals the file: it becomes the part
 ``ledger.0001.jsonl``, which is never written again, and ``ledger.jsonl`` becomes a link to the next
 part.  Each part begins with an entry ``sealed`` with the number and the SHA-256 of the part before.
-Sealed parts are only opened to read all lines, and only accepted as they were sealed; other
-questions get these lines from the index.  Versions of sros that do not know parts refuse to follow
-the link when they change a keystore.
+A sealed part is opened only to read all lines, and is refused if it was changed since it was
+sealed. All other questions get the lines of sealed parts from the index.  Versions of sros that do
+not know parts refuse to follow the link when they change a keystore.
 """
 
 from __future__ import annotations
@@ -415,12 +415,15 @@ class LedgerFile:
         return self._recorded
 
     def recorded_with(self, *parts: str) -> Collection[str] | None:
-        """Return the `recorded_enclaves` with one of ``parts`` in their names, unsorted."""
+        """Return the `recorded_enclaves` with one of ``parts`` in their names, unsorted.
+
+        The result is None without an index.
+        """
         index = self._opened().ledger_index
         try:
             return index.names(parts) if index else None
         except IndexDamagedError:
-            return self.recorded_with(*parts) if self._restore_index() else None
+            return self.recorded_with(*parts) if self._remove_damaged_index() else None
 
     @property
     def is_indexed(self) -> bool:
@@ -521,7 +524,7 @@ class LedgerFile:
             try:
                 lines = self._indexed_lines(files, terms)
             except IndexDamagedError:
-                if self._restore_index():
+                if self._remove_damaged_index():
                     continue
                 files, lines = files._replace(ledger_index=None), None
             if lines:
@@ -535,7 +538,7 @@ class LedgerFile:
                 return reading
             self._files = None
 
-    def _restore_index(self) -> bool:
+    def _remove_damaged_index(self) -> bool:
         """Remove a damaged index, once; return whether this call removed it.
 
         The process that locks the keystore makes the index again.
@@ -762,7 +765,7 @@ class LedgerFile:
         """Return the ledger file, or its part ``name``, open for reading; None if there is none.
 
         While a transaction is committed, the file is a link.  The process that has locked the
-        keystore does not follow the link, because it could lead out of the keystore.
+        keystore does not follow the link, because the link could lead out of the keystore.
         """
         path = self.root / name
         try:

@@ -302,7 +302,7 @@ _GOVERNANCE_REASONS = {
 
 
 def _crashes_before(problem: Problem, governed: GovernedDomain | Refusal) -> bool:
-    """Return whether the governance crashes a process before it finds the problem."""
+    """Return whether the governance crashes a process before the process finds the problem."""
     return (
         isinstance(governed, Refusal)
         and governed.outcome is Outcome.CRASHES

@@ -672,7 +672,7 @@ class OpenedEnclave:
 
     @cached_property
     def grant(self) -> Grant | None:
-        """The grant that DDS reads: the first one for the certificate's subject."""
+        """The first grant for the certificate's subject, which DDS reads; None without any."""
         return self.permissions.grant_of(self.subject) if self.permissions else None
 
     @property
@@ -896,7 +896,10 @@ class _EnclaveFiles:
         return self._read(KEY_URI_FILE) or b"" if os.path.lexists(path) else None
 
     def _token(self, data: bytes, key: bytes | None) -> TokenUri | None:
-        """Return the place that ``key.p11`` names; ``key`` is the content of ``key.pem``."""
+        """Return the place that ``key.p11`` names; None if the file is empty or faulty.
+
+        ``key`` is the content of ``key.pem``, or None. Faults are recorded.
+        """
         if key is not None:
             text = f"{KEY_FILE} is there, too"
             self._add(KEY_URI_FILE, text, Fault.KEY_TWICE)

@@ -333,6 +333,8 @@ def _router_links(
 ) -> RouterLinks | None:
     """Return the links between routers: the names that pass, and the router of each enclave.
 
+    The result is None for a single router.
+
     ``files`` maps enclaves to their folders.  ``sources`` maps these folders to the rights in their
     configurations.
     """
@@ -855,7 +857,8 @@ class SignedRights(NamedTuple):
     """The rights in signed permissions.
 
     ``policy`` is the SHA-256 of the policy from which they were made; "" if the ledger lacks it.
-    ``nodes`` are nodes of the policy that the permissions do not show, as in the ledger.
+    ``nodes`` are nodes of the policy that the permissions do not show, in the text form of the
+    ledger.
     """
 
     grant: Grant
@@ -933,7 +936,7 @@ class RecordedRights:
         return SignedRights(grant, self.policy(name, digest), self.nodes(name))
 
     def nodes(self, name: str) -> str:
-        """Return the nodes of an enclave's last permissions, as the text in the ledger."""
+        """Return the ledger's text with the nodes of an enclave's last permissions, or ""."""
         last = self.last(name)
         return last.nodes if last else ""
 

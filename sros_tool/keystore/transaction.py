@@ -431,7 +431,7 @@ class Transaction:
 
     @property
     def _added(self) -> str:
-        """The path in `_target_folder` for files in new folders; ends with "/"."""
+        """The path in `_target_folder` for files in new folders: "" or ending with "/"."""
         return "" if self._new_root else f"{STAGE}/{_ADDED}/"
 
     def on_failure(self, undo: Callable[[], None]) -> None:
@@ -715,7 +715,10 @@ class Transaction:
         return name == CRL_FILE and (folder.removeprefix(ENCLAVES) or "/") in self._linked
 
     def _present_description(self, path: str) -> str | None:
-        """Return the description of the present file at a path, in the form of `Move.before`."""
+        """Return what is at a path now, in the form of `Move.before`.
+
+        This is None for no file, "" for a regular file, or the target of a link.
+        """
         state = self._target_folder.state(path)
         if state is None:
             return None

@@ -1002,7 +1002,9 @@ def _allowed_announcements(
 
 
 def _example_nodes(enclave: str, control: AccessControl) -> set[tuple[str, ...]]:
-    """Return nodes that rules let an enclave announce, as in tokens: one for each wildcard.
+    """Return nodes that rules let an enclave announce: one example for each wildcard.
+
+    A node is a tuple of the three parts of a graph token that name it.
 
     The result is empty if the rights of the enclave deny all its nodes.
     """

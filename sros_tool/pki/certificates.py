@@ -735,7 +735,10 @@ def holds_at(form: CertificateForm, now: datetime) -> bool | None:
 
 @lru_cache(maxsize=256)  # certificates issued together share their dates
 def _validity_times(validity: bytes) -> tuple[str, str] | None:
-    """Return the start and the end of a validity (DER), as GeneralizedTime (RFC 5280, 4.1.2.5)."""
+    """Return the start and the end of a validity (DER), or None if they cannot be read.
+
+    Both have the form GeneralizedTime (RFC 5280, 4.1.2.5).
+    """
     with suppress(PkiError, ValueError):
         begin, end = map(_as_generalized_time, der.children(validity))
         return begin, end

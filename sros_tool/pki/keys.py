@@ -284,7 +284,8 @@ def _check_derivation(pem: bytes, name: str) -> None:
 def _derivation_cost(block: bytes) -> tuple[bool, list[int]]:
     """Return whether the key of a PEM block is derived by scrypt, and the cost parameters.
 
-    For scrypt, the parameters are N, r and p; for others, the number of rounds comes first.
+    For scrypt, the parameters are N, r and p. For any other function, the first parameter is the
+    number of rounds.
 
     Raises:
         ValueError, PkiError: the block is damaged.

@@ -482,7 +482,7 @@ def _take_optional(values: list[der.Value], place: int, tag: int) -> list[der.Va
 
 @_cached
 def _digest_of(identifier: der.Value) -> hashes.HashAlgorithm | None:
-    """Return the hash that an AlgorithmIdentifier names.
+    """Return the hash that an AlgorithmIdentifier names, or None if sros does not know it.
 
     As in OpenSSL, the parameters of the algorithm are ignored.
     """

@@ -259,7 +259,7 @@ class _TolerantList(_Signed):
         return len(self._entries)
 
     def get_revoked_certificate_by_serial_number(self, serial: int) -> _TolerantEntry | None:
-        """Return the entry for a serial number, if there is one."""
+        """Return the entry for a serial number, or None."""
         return next((entry for entry in self if entry.serial_number == serial), None)
 
 
@@ -468,7 +468,7 @@ class _LooseConstraints(x509.BasicConstraints):
 
     @property
     def path_length(self) -> int | None:
-        """The pathLenConstraint."""
+        """The pathLenConstraint; None without one."""
         return self._longest
 
 
@@ -486,12 +486,12 @@ class _LooseKeyIdentifier(x509.AuthorityKeyIdentifier):
 
     @property
     def authority_cert_issuer(self) -> list[x509.GeneralName] | None:
-        """The names of the CA that issued the authority's own certificate."""
+        """The names of the CA that issued the authority's own certificate; None if not stated."""
         return self._issuer_names
 
     @property
     def authority_cert_serial_number(self) -> int | None:
-        """The serial number of the authority's own certificate."""
+        """The serial number of the authority's own certificate; None if not stated."""
         return self._serial
 
 

@@ -726,7 +726,7 @@ class _Reader:
         return name
 
     def _written_name(self, element: etree._Element) -> str:
-        """Return the text of a name's element, as written."""
+        """Return the text of a name's element, as it stands in the file."""
         return element.text or ""
 
     def _example_name(

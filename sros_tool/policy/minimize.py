@@ -152,7 +152,7 @@ def minimize(
 
 
 def _protected_as_before(before: Policy, after: Policy) -> Policy:
-    """Return ``after`` with the protection levels that only removed names stated.
+    """Return ``after`` with the protection levels that ``before`` stated only at removed names.
 
     A level that one enclave states applies to all enclaves.  So other enclaves that keep a right to
     the name now have to state this level.

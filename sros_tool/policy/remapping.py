@@ -97,7 +97,9 @@ def parse_remapping(text: str) -> Remapping:
 
 
 def parse_remapping_of_names(text: str) -> Remapping:
-    """Return the rule in a text, for names without a node, as in requirements.
+    """Return the remapping rule in a text, for names that belong to no node.
+
+    The names in requirements are such names.
 
     Raises:
         UsageError: (or another error of `parse_remapping`) the text is not such a rule.

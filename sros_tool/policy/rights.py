@@ -160,7 +160,10 @@ def profile_rights(enclave: str, profile: Profile) -> Iterator[Right]:
 
 
 def parts(right: Right) -> tuple[Right, ...]:
-    """Return the rights to an action's five topics and services; of another right, itself."""
+    """Return the rights to an action's five topics and services.
+
+    A right to anything else is returned alone.
+    """
     part_rights = ACTION_PARTS.get(right.right)
     if part_rights is None:
         return (right,)
@@ -296,8 +299,8 @@ def renamed_enclaves(
 ) -> dict[str, str]:
     """Map enclaves that only ``first_rights`` have to their new names in ``second_rights``.
 
-    An enclave counts as renamed if an enclave that only ``second_rights`` have has the same rights,
-    and if no other enclave has them.
+    An enclave counts as renamed if an enclave that is only in ``second_rights`` has the same
+    rights, and no other enclave has these rights.
     """
     before, after = (_rights_by_enclave(side) for side in (first_rights, second_rights))
     gone: dict[frozenset[Right], list[str]] = defaultdict(list)
@@ -330,8 +333,8 @@ def compare(
 
     An action counts as its services and topics.  A right that only one side states is no difference
     if it is covered by wildcards that both sides state, because large permissions leave such rights
-    out.  There is one exception: if the whole action is a difference, a part of it that the other
-    side states is one, too.
+    out.  There is one exception: if the whole action is a difference, a part of the action that the
+    other side states also counts as a difference.
     """
     first, second = (
         join_actions(right for right in side if scope is None or right.enclave in scope)
@@ -440,7 +443,7 @@ def nodes_of_rights(rights: Iterable[Right]) -> tuple[NodeName, ...]:
 
 
 def denied_nodes(rights: Iterable[Right]) -> tuple[NodeName, ...]:
-    """Return the nodes whose standard services are allowed but then all denied.
+    """Return the nodes whose standard services are allowed by rules, but all denied by others.
 
     Nodes that may offer any of their standard services are left out.  If a denial matches some of
     the nodes that a wildcard allows, the result has all nodes that the denial matches.

@@ -200,7 +200,7 @@ class CommitFiles:
         """Return the tree entry at a path of the commit; None if the path does not exist."""
         return self.repository.find(self.commit, path)
 
-    def file(self, path: str) -> Path | None:
+    def write_file(self, path: str) -> Path | None:
         """Write the file at a path of the commit; return its new path, or None for a missing path.
 
         Raises:
@@ -213,7 +213,7 @@ class CommitFiles:
             raise self._not_a_file_error(path, entry)
         return self._write(path, entry, self.repository.content(entry.id))
 
-    def policies(self, path: str, *, placeholders: bool) -> list[Path]:
+    def write_policies(self, path: str, *, placeholders: bool) -> list[Path]:
         """Write the policies at a path, which is a file or a folder; return their new paths.
 
         Included files are written, too.  If the path does not exist, the result is empty.
@@ -236,7 +236,7 @@ class CommitFiles:
             texts = (folder.with_git_paths(part) for part in (error.what, error.why, error.remedy))
             raise DocumentError(*texts) from error
 
-    def tree(self, path: str) -> Path | None:
+    def write_tree(self, path: str) -> Path | None:
         """Write a folder with all its content, such as a keystore; return its new path, or None.
 
         Raises:
@@ -491,7 +491,7 @@ def is_whole_policy(content: bytes) -> bool:
 def files_used_whole(
     policies: Iterable[str], content: Callable[[str], bytes | None]
 ) -> dict[str, bool]:
-    """Map files that are used as a whole to whether their root element is used, too.
+    """Map each file that is used as a whole to whether its root element is used, too.
 
     Args:
         policies: the paths of the policies.

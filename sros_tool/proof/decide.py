@@ -327,7 +327,10 @@ def _uses_of_rights(
 
 
 def _shortest_use_as_witness(uses: Mapping[str, Sequence[Use]]) -> Witness | None:
-    """Return the shortest use as a witness, with a use of every other enclave."""
+    """Return the shortest use as a witness, with a use of every other enclave.
+
+    The result is None without uses.
+    """
     if not uses:
         return None
     best = min((use for enclave_uses in uses.values() for use in enclave_uses), key=_use_order)
@@ -343,7 +346,10 @@ def _shortest_use_as_witness(uses: Mapping[str, Sequence[Use]]) -> Witness | Non
 
 
 def _witness_against_must(requirement: Must, world: World, limit: SearchLimit) -> Witness | None:
-    """Return a witness with the shortest name for which an enclave lacks a part of its right."""
+    """Return a witness with the shortest name for which an enclave lacks a part of its right.
+
+    The result is None if the requirement holds.
+    """
     enclave = requirement.enclave
     lacking = []
     for right, names in requirement.rights:
@@ -380,7 +386,10 @@ def _is_on_other_domain(world: World, enclave: str, limit: SearchLimit) -> bool:
 def _use_blocked_by_routers(
     requirement: Must, world: World, limit: SearchLimit
 ) -> BlockedUse | None:
-    """Return a demanded use that does not reach enclaves at other routers that may receive it."""
+    """Return a demanded use that does not reach enclaves at other routers that may receive it.
+
+    The result is None if the routers block no demanded use.
+    """
     enclave = requirement.enclave
     for right, names in requirement.rights:
         for part, name in product(_parts_of(right), names):
@@ -411,6 +420,8 @@ def _witness_against_at_most(
     requirement: AtMost, world: World, limit: SearchLimit
 ) -> Witness | None:
     """Return a witness with a name that more enclaves may use than the requirement allows.
+
+    The result is None if the requirement holds.
 
     An enclave that may write one topic of an action can do a part of the action, so it counts.
     """
@@ -500,7 +511,10 @@ def _shared_by(
 def _witness_against_widest(
     requirement: Widest, world: World, limit: SearchLimit
 ) -> Witness | None:
-    """Return a witness with the shortest name that a wildcard allows beyond the requirement."""
+    """Return a witness with the shortest name that a wildcard allows beyond the requirement.
+
+    The result is None if the requirement holds.
+    """
     enclaves = sorted(_matching_enclaves(requirement.enclaves, world.enclaves))
     uses: defaultdict[str, list[Use]] = defaultdict(list)
     for right, names in requirement.rights:
@@ -526,7 +540,10 @@ _READ_BY_EVERY_NODE = NameSet((ROS_DISCOVERY_TOPIC, "rt/parameter_events"))
 def _witness_against_nothing_but(
     requirement: NothingBut, world: World, limit: SearchLimit
 ) -> Witness | None:
-    """Return a witness with the shortest name for which an enclave has another right."""
+    """Return a witness with the shortest name for which an enclave has another right.
+
+    The result is None if the requirement holds.
+    """
     enclaves = sorted(_matching_enclaves(requirement.enclaves, world.enclaves))
     uses: defaultdict[str, list[Use]] = defaultdict(list)
     for writes, ordinary in ((True, _WRITTEN_BY_EVERY_NODE), (False, _READ_BY_EVERY_NODE)):
@@ -548,7 +565,10 @@ def _witness_against_nothing_but(
 def _witness_against_not_both(
     requirement: NotBoth, world: World, limit: SearchLimit
 ) -> Witness | None:
-    """Return a witness with an enclave that has rights of both sets: the shortest uses."""
+    """Return a witness with the shortest uses of an enclave that has rights of both sets.
+
+    The result is None if the requirement holds.
+    """
     first, second = (
         _with_unauthenticated_uses(_uses_of_rights(rights, world, limit), world)
         for rights in (requirement.first, requirement.second)
@@ -580,7 +600,10 @@ def _with_unauthenticated_uses(
 def _witness_against_protected(
     requirement: Protected, world: World, limit: SearchLimit
 ) -> Witness | None:
-    """Return a witness with the shortest name that is protected less than demanded."""
+    """Return a witness with the shortest name that is protected less than demanded.
+
+    The result is None if the requirement holds.
+    """
     weak = world.weakly_protected(requirement.level)
     if weak is None:
         return None
@@ -618,7 +641,10 @@ def _topics_of_names(names: Iterable[tuple[str, str]]) -> Iterator[Topics]:
 
 
 def _witness_against_apart(requirement: Apart, world: World, limit: SearchLimit) -> Witness | None:
-    """Return a witness with a shortest chain from a source to a target, not through ``through``."""
+    """Return a witness with a shortest chain from a source to a target, not through ``through``.
+
+    The result is None if the requirement holds.
+    """
     through = _matching_enclaves(requirement.through, world.enclaves)
     sources = sorted(_matching_enclaves(requirement.sources, world.enclaves) - through)
     targets = _matching_enclaves(requirement.targets, world.enclaves) - through

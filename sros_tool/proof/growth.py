@@ -351,11 +351,11 @@ class NewAccess(NamedTuple):
 def compare_access(base: AccessSource, head: AccessSource) -> Growth:
     """Return the access that ``head`` adds to ``base``, and the access that ``head`` removes.
 
-    A policy counts as signed, with a governance that controls all access.  A policy as BASE stands
-    for encryption of all names for which it demands no other protection, so a keystore HEAD that
-    protects less has lost protection. A policy as HEAD lowers no protection of a keystore.  A
-    policy is for the domains of the other side; enclaves of a fleet's robots are for the domain of
-    their robot.
+    A policy counts as signed, with a governance that controls all access.  If BASE is a policy,
+    each name for which it demands no protection counts as encrypted: a keystore HEAD that does not
+    encrypt the name has lost protection. If HEAD is a policy, no protection of a keystore BASE
+    counts as lost.  A policy is for the domains of the other side; enclaves of a fleet's robots are
+    for the domain of their robot.
 
     Raises:
         DocumentError: the comparison cannot be decided, because there are too many wildcards or
@@ -942,7 +942,10 @@ class _Stated:
     def _example(
         self, names: NameSet, verb: AccessVerb, expression: str, place: _PlaceOfEnclave
     ) -> str | None:
-        """Return an example name; preferably the example of another world, or a stated name."""
+        """Return an example topic in ``names``, or None.
+
+        The example of another world comes first, then a topic that a rule states, then any topic.
+        """
         longest, known = place.world.longest, self._examples[place.enclave, verb, expression]
         example = _example(names, expression, place.world, place.limit)
         if example is None:
@@ -1013,7 +1016,10 @@ def _source(known: _Sources, side: AccessSource, right: Right | None) -> Source 
 
 
 def _example(names: NameSet, expression: str, world: _World, limit: SearchLimit) -> str | None:
-    """Return a topic of a set that an expression covers, preferably a topic with a ROS name."""
+    """Return a topic in ``names``, preferably one with a ROS name; None if there is none.
+
+    ``expression`` covers all of ``names``. Without wildcards, it is the only possible topic.
+    """
     if not is_expression(expression):
         return expression if expression in names else None
     example = names.example(limit, longest=world.longest)
@@ -1281,7 +1287,7 @@ def _enclaves_near(robots: _EnclavesByRobot, robot: str) -> dict[str, Profile]:
 
 
 def undenied_name(denied: Right, stated: Rules) -> str | None:
-    """Return a name that ``denied`` matches, and that no rule of ``stated`` matches.
+    """Return a name that ``denied`` matches, and no rule of ``stated`` matches; None without one.
 
     ``denied`` is not for an action.
     """
@@ -1392,7 +1398,10 @@ def _certified_domains(side: AccessSource) -> DomainSet:
 def _with_access_control(
     governance: Governance | None, more_domains: DomainSet
 ) -> Governance | None:
-    """Return a governance that controls all access, also in the domains ``more_domains``."""
+    """Return ``governance`` with control of all access, also in ``more_domains``.
+
+    The result is None if ``governance`` is None.
+    """
     if governance is None:
         return None
     strict = governance_for(strict_protection(), more_domains).domain_access_rules[0]

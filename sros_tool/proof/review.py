@@ -434,7 +434,7 @@ class _Review:
                 of_base = [
                     file
                     for path in asked.policies
-                    for file in self.base.policies(path, placeholders=base_fleet is not None)
+                    for file in self.base.write_policies(path, placeholders=base_fleet is not None)
                 ]
         named = " ".join(asked.policies)
         findings = partial(self._findings, of_head, head_fleet)
@@ -447,7 +447,7 @@ class _Review:
                 self.robots[path] = load_fleet(OpenedKeystore(keystore))
         base_keystores: dict[str, Path] = {}
         if self.base:
-            base_keystores = yield from _read_each("new-access", keystores, self.base.tree)
+            base_keystores = yield from _read_each("new-access", keystores, self.base.write_tree)
         before = cache(partial(load_policies, of_base, _BASE, base_fleet))
         earlier: dict[str, Callable[[], AccessSource]] = {
             path: partial(load_side, folder) for path, folder in base_keystores.items()
@@ -536,7 +536,7 @@ class _Review:
         """Map ``paths`` to files of BASE or HEAD; yield a step for each file that HEAD lacks."""
 
         def file_at(path: str) -> Path | None:
-            file = side.file(path)
+            file = side.write_file(path)
             if not file and side is self.head:
                 raise self._missing_file_error(path)
             return file
@@ -549,7 +549,7 @@ class _Review:
         """Return the policy files of BASE or HEAD; yield the steps that read the policies."""
 
         def files_at(path: str) -> Sequence[Path]:
-            files = side.policies(path, placeholders=fleet is not None)
+            files = side.write_policies(path, placeholders=fleet is not None)
             if not files:
                 raise self._missing_file_error(path, f" If it is renamed, {_BOTH_NAMES_REMEDY}.")
             return files
@@ -561,7 +561,7 @@ class _Review:
         """Map paths to keystores of BASE or HEAD; yield a step for each unreadable keystore."""
 
         def folder_at(path: str) -> Path:
-            folder = side.tree(path)
+            folder = side.write_tree(path)
             if not folder:
                 raise self._missing_file_error(path)
             if not is_keystore(folder):
@@ -760,7 +760,7 @@ class _Review:
         }
         for path in policies:
             with suppress(SrosError):
-                (file,) = self.head.policies(path, placeholders=fleet is not None)
+                (file,) = self.head.write_policies(path, placeholders=fleet is not None)
                 if rights.issuperset(policy_rights(read_policy_for(file, fleet))):
                     continue
             yield path
@@ -967,7 +967,7 @@ class _Review:
         if not base_paths:
             assert self.base
             for path in self.request.policies:  # raises the error of a file that was not read
-                self.base.policies(path, placeholders=base_fleet is not None)
+                self.base.write_policies(path, placeholders=base_fleet is not None)
             text = (
                 f"is new, so that all of its access is new; if it is renamed, {_BOTH_NAMES_REMEDY}"
             )
@@ -1159,7 +1159,7 @@ class _Review:
         return f"in {enumerated(namespaces)}" if namespaces else ""
 
     def _template(self) -> Template | None:
-        """Return the keystore template that the request names, as in HEAD; None without a template.
+        """Return the template that the request names, as it is in HEAD; None if it names none.
 
         Raises:
             DocumentError: HEAD lacks the template, or the template is malformed.
@@ -1167,7 +1167,7 @@ class _Review:
         choice = self.request.template
         if not choice or choice in template_names():
             return load_template(choice) if choice else None
-        if file := self.head.file(choice):
+        if file := self.head.write_file(choice):
             return read_template(file)
         raise self._missing_file_error(choice)
 
@@ -1182,7 +1182,7 @@ class _Review:
 
     def _keystore_fleet(self, path: str) -> Fleet | None:
         """Return the fleet of a keystore in BASE; None for a keystore without fleet."""
-        file = self.base.file(f"{path}/{FLEET}") if self.base else None
+        file = self.base.write_file(f"{path}/{FLEET}") if self.base else None
         return read_fleet(file) if file else None
 
     def _dropped_step(
@@ -1350,7 +1350,10 @@ def _fixed_or_moving_names(before: AccessSource, after: AccessSource) -> Iterato
 
 
 def _example_elsewhere(placed: PlacedRight) -> str:
-    """Return a name in another namespace that a DENY no longer denies, if it became absolute."""
+    """Return a name in another namespace that a DENY no longer denies because it became absolute.
+
+    The result is "" if the DENY is relative or has a wildcard.
+    """
     name = placed.right.name
     return f"/any_namespace{name}" if placed.written.startswith("/") and "*" not in name else ""
 
@@ -1444,6 +1447,8 @@ def _enclaves_by_node(enclaves: Iterable[Enclave]) -> dict[NodeName, set[str]]:
 
 def _without_left_robots(before: Fleet | None, after: FleetSource) -> Fleet | None:
     """Return the fleet ``before`` without the robots that ``after`` lacks.
+
+    If one of the two fleets is missing, the result is the other one, or None.
 
     So no requirement counts as dropped because its robot left the fleet. A group keeps its robots
     if all of them left.

@@ -657,8 +657,9 @@ _DOMAIN = re.compile(r"(?:0|[1-9][0-9]{0,8})\Z", re.ASCII)
 def _topics(key: str, domain: int, begin: str) -> NameSet:
     """Return the topics with a prefix that stand for the keys of a key expression.
 
-    Keys with a part that begins with "@" are left out, because no ROS name has such a part.  They
-    are keys of the graph, or of the history of a topic, which belongs to the right to the topic.
+    Keys with a part that begins with "@" are left out, because no ROS name has such a part.  Such
+    keys are about the graph, or about the history of a topic; the right to the topic includes its
+    history.
     """
     if "/@" in key:
         return NameSet()

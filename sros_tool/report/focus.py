@@ -189,7 +189,7 @@ class FocusFlow:
         )
 
     def _stages(self, edge: Edge) -> tuple[set[int], set[int]]:
-        """Return the columns in which the enclave of an edge may write, and may read, its name."""
+        """Return the columns where the edge's enclave may write, and may read, the edge's name."""
         writes: set[int] = set()
         reads: set[int] = set()
         before, after = self.before.get(edge.enclave, 0), self.after.get(edge.enclave, 0)

@@ -466,7 +466,7 @@ def _render_markdown(picture: Picture, *, everything: bool = False) -> str:
 
 
 def _remark_on_single_names(picture: Picture, name: Name, *, sends: bool) -> str:
-    """Return a remark on a wildcard if, on one side, enclaves may use only its known names."""
+    """Return a remark if enclaves on one side may use only known names of a wildcard; else ""."""
     single = (
         edge
         for edge in picture.edges

@@ -92,9 +92,9 @@ class Head(NamedTuple):
 class Scene:
     """Cards and the links between them.
 
-    ``shown`` is the number of names that are drawn, or counted on the card of their only enclave;
-    ``hidden`` is the number of names that are left out, because only rights that every node needs
-    are for these names.
+    ``shown`` is the number of names that are drawn, or counted on the card of the only enclave with
+    rights to them. ``hidden`` is the number of names that are left out, because all rights to these
+    names are rights that every node needs.
     """
 
     id: str

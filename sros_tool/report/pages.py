@@ -150,7 +150,9 @@ def _page_data(picture: Picture, scenes: tuple[Scene, ...], drawn: Picture) -> d
 
 
 def _requirements_json(requirements: Requirements | None) -> dict[str, Any] | None:
-    """Return the number of requirements that hold, and the violations of the others.
+    """Return the number of requirements that hold, and the violations of all others.
+
+    The result is None without requirements.
 
     Findings have further details.
     """
@@ -292,7 +294,7 @@ def without_folders(value: Any, folders: Sequence[str]) -> Any:
 
 
 def _sentence(text: str) -> str:
-    """Return ``text`` as a sentence in HTML, with a capital letter and a full stop."""
+    """Return ``text`` as a sentence in HTML, with a capital letter and a full stop; "" stays ""."""
     return _with_marks(f"{text[:1].upper()}{text[1:].rstrip('.')}.") if text else ""
 
 

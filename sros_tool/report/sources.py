@@ -613,7 +613,10 @@ def _with_keystore(source: PictureSource, sample: SampledKeystore, now: datetime
 
 
 def _joint_governance(governances: Iterable[Governance | None]) -> Governance | None:
-    """Return the union of all governance documents: access that any document opens is open."""
+    """Return the union of all governance documents, or None if there are none.
+
+    Access that any document opens is open in the union.
+    """
     distinct = [governance for governance in dict.fromkeys(governances) if governance is not None]
     if len(distinct) < 2:
         return distinct[0] if distinct else None

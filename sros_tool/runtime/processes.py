@@ -327,7 +327,7 @@ class ProcessTable:
         """
         begin = now - timedelta(seconds=time.clock_gettime(time.CLOCK_BOOTTIME))
         longest_advance = cache(partial(self._longest_clock_advance, begin))
-        self._reader.begin()
+        self._reader.forget_unread()
         before, self._looked = self._looked, {}
         processes: list[Process] = []
         closed: list[UnseenProcess] = []
@@ -698,7 +698,7 @@ _CHOSEN_BY_PROGRAM = "the program or its arguments choose the file, and sros doe
 
 
 def _configuration_of(process: Process) -> LoadedFile | None:
-    """Return the configuration file of a Zenoh process, without its content; None for others.
+    """Return the configuration file of a Zenoh process, without its content; else None.
 
     If the file is unknown, the result has the reason as ``problem``.
     """
@@ -936,7 +936,7 @@ class FileReader:
             self._left -= state.st_size
         return self._read[key]
 
-    def begin(self) -> None:
+    def forget_unread(self) -> None:
         """Forget files that were not read since the last call of this method."""
         self._left = _MOST_BYTES_OF_FILES
         self._before, self._read = self._read, {}
@@ -1120,7 +1120,10 @@ def _reason(error: OSError) -> str:
 
 
 def _writable_folder_clause(folders: list[tuple[str, os.stat_result]], user: int) -> str:
-    """Return a clause on a folder that users besides root, ``user`` and its owner can change."""
+    """Return a clause on the first folder that unexpected users can change, or "".
+
+    Expected users are root, ``user`` and the owner of the first of ``folders``.
+    """
     trusted = frozenset({0, user, folders[0][1].st_uid})
     for path, state in folders:
         if why := other_writers(state, trusted):
@@ -1135,7 +1138,7 @@ def _identity(folders: Sequence[tuple[str, os.stat_result]]) -> tuple[int, int]:
 
 
 def _path_if_same_folder(path: str, folders: Sequence[tuple[str, os.stat_result]]) -> Path | None:
-    """Return ``path`` if it is the same folder for this process as for the examined process."""
+    """Return ``path`` if this process and the examined one see the same folder there; else None."""
     with suppress(OSError, ValueError):
         if os.path.samestat(Path(path).stat(), folders[-1][1]):
             return Path(path)

@@ -221,7 +221,11 @@ def chosen_vendor(
 
 
 def shipped_vendor(rmw: str, environment: Mapping[str, str]) -> Vendor | None:
-    """Return the `vendor_of` an RMW, in the release that $ROS_DISTRO ships."""
+    """Return the `vendor_of` an RMW, in the release that $ROS_DISTRO ships.
+
+    If the distribution is unknown or does not ship the vendor, the result is `vendor_of`, perhaps
+    None.
+    """
     vendor, distribution = vendor_of(rmw), sourced_distribution(environment.get(ROS_DISTRO))
     shipped = (
         distribution.shipped_product(vendor.traits.product) if vendor and distribution else None

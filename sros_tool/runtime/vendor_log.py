@@ -115,7 +115,9 @@ def _first_refusal(refused: RefusedObject, text: str) -> str:
 
 
 def denied_topic(line: str) -> tuple[Vendor, re.Match[str]] | None:
-    """Return the vendor that denies a topic, and the match with group ``topic``.
+    """Return the vendor that denies a topic in ``line``, and the match with group ``topic``.
+
+    The result is None if the line denies no topic.
 
     Group ``rule`` is the denying rule, if the line names the rule; group ``neither`` is present if
     the line says that the topic may be used in neither direction.

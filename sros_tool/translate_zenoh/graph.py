@@ -224,7 +224,10 @@ class _Tokens:
 
 
 def _expressions_with_only_stars(name: str) -> list[str]:
-    """Return expressions with ``*`` as the only wildcard, or one wider expression for too many."""
+    """Return expressions that together match ``name``, with ``*`` as their only wildcard.
+
+    The result is empty if there would be too many.
+    """
     try:
         return listed_expressions(name, _MOST_TOKENS)
     # The keys of such a name cannot be listed either, so the right is refused elsewhere.

@@ -899,8 +899,8 @@ def _topic_keys(key: str) -> list[str]:
 def enclave_of(rights: RightsOfSubject) -> tuple[str, ...]:
     """Return the enclaves for which a subject stands, or ().
 
-    If a session limits itself, the enclave has the id of the subject as its name, because
-    zenoh_security_tools uses the node's name for both.
+    If a session limits itself, the id of its subject is the enclave's name: zenoh_security_tools
+    uses the node's name for both.
     """
     named = rights.names or ((f"/{rights.subject}",) if rights.self_limiting else ())
     return tuple(name for name in named if _is_enclave(name))

@@ -400,7 +400,7 @@ _CHUNK_BEGIN_LETTERS = ~Letters.of("/@")
 
 @lru_cache(maxsize=_CACHE_SIZE)
 def _automaton(expression: str) -> Automaton | None:
-    """Return an automaton for the keys that an expression includes; None if it is a single key."""
+    """Return an automaton for the keys that an expression includes; None for a single key."""
     if "*" not in expression:
         return None
     edges: list[tuple[int, Letters, int]] = []

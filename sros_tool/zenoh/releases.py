@@ -22,7 +22,8 @@ class RmwZenohRelease(NamedTuple):
 
     ``least`` is the first version that has `_LEAST_ZENOH` and reads ZENOH_CONFIG_OVERRIDE.
     ``below_topics`` are key expressions below the key of a topic.  If a publisher sees the graph
-    tokens of subscriptions, it sends to them also, or only, on these keys.
+    tokens of subscriptions, it sends to these subscriptions on these keys, in addition to the key
+    of the topic or instead of it.
     """
 
     distribution: str

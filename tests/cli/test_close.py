@@ -1392,10 +1392,10 @@ def test_one_run_at_a_time_writes_into_the_folder(robot: Robot) -> None:
     shell = Shell(close._run, print, os.environ, lambda: datetime.now(UTC), UTC)
     waits, works = (LocalRobot(robot.folder / "robot", None, shell) for _ in range(2))
     observed = works.processes
-    works.remember(observed.belonging_elsewhere(["/listener"]))
+    works.write_processes(observed.belonging_elsewhere(["/listener"]))
     with waits.locked():
         assert waits.not_here == {"/listener"}
-    works.remember(observed)
+    works.write_processes(observed)
     robot.close()
 
 

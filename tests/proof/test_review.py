@@ -544,7 +544,7 @@ def test_a_keystore_fits_on_a_disk(change: Change) -> None:
         with TemporaryDirectory() as folder:
             files = CommitFiles(Repository(change.folder), "HEAD", commit, Path(folder))
             with pytest.raises(DocumentError, match=said):
-                files.tree(name)
+                files.write_tree(name)
     deep = change.commit({f"{'d/' * 250}file": "x"})
     ended = change.review("--policy", "robot.xml")
     assert (ended.status, "more than 200 levels of folders" in ended.out) == (2, True), deep

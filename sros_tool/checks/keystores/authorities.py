@@ -535,7 +535,10 @@ def shared_ca_findings(
 
 
 def _separation_remedy(keystore: CheckedKeystore) -> str:
-    """Return a remedy: the commands that give identity CA and permissions CA separate keys."""
+    """Return a remedy: the commands that give identity CA and permissions CA separate keys.
+
+    The result is "" if the rotation cannot be read, or if both CAs share a file.
+    """
     from sros_tool.keystore.lifecycle.rotation import RotationStage, read_rotation
 
     try:

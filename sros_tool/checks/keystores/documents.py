@@ -423,7 +423,10 @@ class _Topics:
         return self._first_earlier(self._names.overlapping(topic), index)
 
     def _first_earlier(self, topics: Iterable[str], index: int) -> str:
-        """Return the first of ``topics`` in an earlier rule with a domain of the rule ``index``."""
+        """Return the first of ``topics`` that is in a rule before the rule ``index``, or "".
+
+        The two rules must have a domain in common.
+        """
         for topic in topics:
             for place in self._places[topic]:
                 if place < index and _share_domains(self._rules[place], self._rules[index]):

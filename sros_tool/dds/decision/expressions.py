@@ -95,8 +95,8 @@ class _FnmatchSets:
         """Return the characters of the set after ``[``, and the index after the set.
 
         An unknown class or symbol, or a range without an end, is an error: later members of the set
-        match nothing.  The ``[`` of an unclosed set stands for itself; but if an error comes before
-        the next ``[``, it matches nothing.
+        match nothing.  The ``[`` of an unclosed set stands for itself. But if an error comes before
+        the next ``[``, this ``[`` matches nothing.
         """
         index = start
         negated = text[index : index + 1] in ("!", "^")
@@ -117,7 +117,9 @@ class _FnmatchSets:
         return _set_of(members, negated), index + 1
 
     def _end_of(self, index: int, *, is_first: bool) -> tuple[bool, bool]:
-        """Return whether a set is closed after ``index``; else, whether its ``[`` matches itself.
+        """Return whether a set is closed after ``index``, and whether its ``[`` matches itself.
+
+        The second value counts only if the set is not closed.
 
         Results are cached, because many unclosed sets would otherwise take quadratic time.
         """
@@ -301,7 +303,7 @@ class ExpressionIndex:
         return sorted(places)
 
     def first(self, name: str) -> int | None:
-        """Return the position of the first expression that matches ``name``."""
+        """Return the position of the first expression that matches ``name``, or None."""
         matching_numbers = self.matching(name)
         return matching_numbers[0] if matching_numbers else None
 

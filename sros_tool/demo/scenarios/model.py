@@ -256,9 +256,9 @@ class Condition(StrEnum):
 class Variant:
     """The expected status of a row if all ``conditions`` are true.
 
-    ``open_because`` is the reason why an attack then succeeds ("": the attack fails), ``remedy``
-    what a user can do.  ``instead`` is a row to run instead, for a vendor that implements the
-    defense differently.
+    ``open_because`` is the reason why an attack succeeds under these conditions ("": the attack
+    fails). ``remedy`` is what a user can do.  ``instead`` is a row to run instead, for a vendor
+    that implements the defense differently.
     """
 
     conditions: tuple[Condition, ...]
@@ -492,7 +492,7 @@ def check_topic(topic: str) -> str:
 
 
 def is_name_of_demo_nodes(name: str) -> bool:
-    """Return whether the demo's own nodes have a topic or service, which no role can then use."""
+    """Return whether ``name`` is a topic or service of the demo's own nodes: no role can use it."""
     return name in _TOPICS_OF_NODES or bool(node_of_service(name))
 
 

@@ -372,7 +372,7 @@ def _set_plain_endpoint(endpoint: str) -> _Change:
 
 
 def tcp_next_to_tls(copy: KeystoreCopy) -> None:
-    """Let the router also listen without TLS, and everybody do everything there."""
+    """Let the router also listen without TLS, and let everybody do everything at the router."""
     host, _, port = copy.endpoint.rpartition(":")
     endpoint = f"tcp/{host}:{int(port) + 1}"
 

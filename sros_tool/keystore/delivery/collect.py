@@ -976,7 +976,7 @@ def _sign(
     changes: list[FileChange] = []
 
     def sign(robots: Sequence[Sequence[_DecidedRequest]]) -> SrosError | None:
-        """Sign the requests of some robots; return the error if this fails."""
+        """Sign the requests of some robots; return the error if this fails, or else None."""
         decided = [request for judged in robots for request in judged if request.request]
         requests = [request.request for request in decided if request.request]
         try:

@@ -268,7 +268,7 @@ def publish(
                 run.keep_changes(change)
         else:
             run.compose(keys)
-            run.keep_list()
+            run.write_list_of_published()
         if not dry_run:
             try:
                 run.write(keys)
@@ -317,7 +317,7 @@ def metadata_problem(keystore: OpenedKeystore) -> str:
         from sros_tool.keystore.delivery.repository import read_present
 
         roots = _roots(keystore)
-        roots.follow(folder)
+        roots.add_later_versions(folder)
         version = read_present(folder, roots).versions().get("timestamp")
     except ImportError:
         return ""
@@ -653,7 +653,7 @@ class _Publication:
         self.roots = _roots(keystore)
         own = len(self.roots.versions)
         self._published_before = bool(own)
-        self.roots.follow(folder)
+        self.roots.add_later_versions(folder)
         self._has_later_root = len(self.roots.versions) > own
         self._folder = folder
         self._earlier_folder = self.list.folder
@@ -1288,7 +1288,7 @@ class _Publication:
             change.transaction.write(FLEET_ROOT, document)
         change.transaction.write(PUBLISHED, self.list.document(self._now))
 
-    def keep_list(self) -> None:
+    def write_list_of_published(self) -> None:
         """Write the list of what is published, and change nothing else in the keystore."""
         path = self.keystore.root / PUBLISHED
         self._changes = file_change(path, existed=True)

@@ -121,7 +121,7 @@ class Roots:
         except (RepositoryError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise DocumentError("it is not a chain of root metadata", f"{error}.") from error
 
-    def follow(self, folder: Path) -> None:
+    def add_later_versions(self, folder: Path) -> None:
         """Add later versions in a publishing folder, verified by the last version's keys.
 
         A keystore that was restored from a backup does not have these versions, but robots do.

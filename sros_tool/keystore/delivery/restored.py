@@ -144,7 +144,7 @@ class LaterSeals:
         self._keystore = keystore
 
     def later_number(self, seal: str | None) -> int:
-        """Return the number in a seal if a CA signed it and the ledger lacks it; otherwise 0."""
+        """Return the number in a seal that a CA signed if the ledger lacks the number; else 0."""
         with suppress(SrosError):
             if seal:
                 number = sealed_robot(seal.encode()).number
@@ -266,9 +266,9 @@ def _has_earlier_key(
 ) -> bool:
     """Return whether the keystore's key of an enclave is older than the key in a certificate.
 
-    The seal shows this even if the keystore has lost the identity CA of the release.  If the
-    validity of both began at the same time, as at a fixed date, the older key is the one that the
-    ledger had first.
+    The seal shows this even if the keystore has lost the identity CA of the release.  If both keys
+    became valid at the same time (their settings may choose a date), the older key is the one that
+    the ledger had first.
     """
     own = keystore.certificate_of(name)
     later_key, own_key = (key_digest(each.public_key()) for each in (later, own))  # type: ignore[arg-type]

@@ -81,7 +81,9 @@ def retired_authorities(
 def older_list(
     present: Mapping[str, bytes], sent: Mapping[str, bytes]
 ) -> tuple[Revocations, Revocations] | None:
-    """Return the revocation lists of a CA in ``present`` and ``sent`` if the sent list is older.
+    """Return a CA's revocation lists in ``present`` and in ``sent`` if the sent list is older.
+
+    The result is None if no sent list is older.
 
     ``present`` and ``sent`` map names of an enclave's files to content.  A sent list with the same
     number but other revocations also counts as older.

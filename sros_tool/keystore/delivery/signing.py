@@ -404,7 +404,7 @@ class _RequestCertifier:
             refuse_less_protected(change.keystore, change.governance, stated_protections([stated]))
         present = change.keystore.certificate_of(name) if renew else None
         _check_requested_key(request, known, present)
-        if not self._keep_only_key_of(request):
+        if not self._remove_key_other_than(request):
             _check_same_key(change.keystore, request, present)
         if not renew and not named and known.revoked_before([name]):
             raise KeystoreError(
@@ -443,11 +443,12 @@ class _RequestCertifier:
         self._certified[name] = stated
         return issued
 
-    def _keep_only_key_of(self, request: SigningRequest) -> bool:
+    def _remove_key_other_than(self, request: SigningRequest) -> bool:
         """Remove the enclave's private key in the keystore unless it is the key of the request.
 
         This needs ``replace_keys``, or a restored keystore that certified the key of the request
-        after its backup.  Returns whether the keystore had a key file that fits or is removed.
+        after its backup.  Returns whether the keystore had a key file that fits the request, or
+        that is removed now.
         """
         keystore, name = self._change.keystore, request.name
         path = keystore.folder(name) / KEY_FILE

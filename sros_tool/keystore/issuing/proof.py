@@ -315,7 +315,7 @@ def _uniquely_matched_name(expression: str, known: list[str]) -> str | None:
 
 
 def _member_of_set(match: re.Match[str]) -> str:
-    """Return a character that a set such as ``[a-c]`` matches."""
+    """Return a character that a set such as ``[a-c]`` matches, or ""."""
     return next((c for c in _CHARACTERS if matches(match[0], c)), "")
 
 

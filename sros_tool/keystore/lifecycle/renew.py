@@ -58,11 +58,12 @@ def renew(
 ) -> Changed:
     """Renew the named enclaves, and the enclaves that are due by ``expiring``, all or nothing.
 
-    The new certificate is for the same key.  With ``new_key``, it is for a new key; with ``key``,
-    for a key on a token, as in `create_enclaves`.  The signed rights do not change.  All files are
-    replaced at once.  Whoever has the key can use a replaced certificate until it or its last
-    permissions expire, or until it is revoked.  With ``revoke_old``, all earlier certificates of
-    the renewed enclaves are revoked, and the new ones get subjects that no earlier permissions fit.
+    The new certificate is for the same key. With ``new_key``, it is for a new key. With ``key``, it
+    is for a key on a token; `create_enclaves` describes ``key``.  The signed rights do not change.
+    All files are replaced at once.  Whoever has the key can use a replaced certificate until this
+    certificate or the last permissions for it expire, or until it is revoked.  With ``revoke_old``,
+    all earlier certificates of the renewed enclaves are revoked, and the new ones get subjects that
+    no earlier permissions fit.
 
     Raises:
         KeystoreError: enclaves cannot be renewed (the error names all of them), or vendors would

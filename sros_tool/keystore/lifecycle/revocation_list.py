@@ -137,7 +137,8 @@ class LostRecords:
 
         The file may have certificates, too.  The keystore has to know a list that revokes
         certificates which the keystore's list lacks.  It also has to know a list that is not
-        earlier than its own: a robot that has such a list would refuse the keystore's next list.
+        earlier than its own list, because a robot with such a list would refuse the keystore's next
+        list.
         """
         sha256 = hashlib.sha256(document).digest()
         if sha256 in self._seen:
@@ -543,9 +544,9 @@ class RevocationListSigner:
     def _lost_revocations(self, expiries: Mapping[int, str]) -> list[Revoked]:
         """Return the unexpired revocations in the ledger that the present list lacks.
 
-        If the present list is not the last list in the ledger, all of them are returned.  If it is
-        the last one, it may lack certificates of replaced CAs, so only those revocations are
-        returned for which `unlisted_revocations` refuses an export.
+        If the present list is not the last list in the ledger, all these revocations are returned.
+        The last list may lack certificates of replaced CAs. So for the last list, only those
+        revocations are returned for which `unlisted_revocations` refuses an export.
         """
         entries = self._keystore.ledger_file.with_values("what", ("revocation", "crl")).entries
         count = max(
@@ -605,7 +606,7 @@ class RevocationListSigner:
         except KeystoreError as error:
             # The new CA has not issued anything yet; the next stage of the rotation signs its list.
             if not coming:
-                self._handle_missing_key(other, error, new_entries, old, incomplete=incomplete)
+                self._note_unsigned_list(other, error, new_entries, old, incomplete=incomplete)
             return None
         # In the next stage, this list replaces the present one, so its number must be higher.
         if coming:
@@ -632,7 +633,7 @@ class RevocationListSigner:
             )
         return Authority(certificate, key)
 
-    def _handle_missing_key(
+    def _note_unsigned_list(
         self,
         old_ca: x509.Certificate,
         error: KeystoreError,

@@ -286,8 +286,9 @@ def _replaced_keys(
 ) -> set[tuple[str, str]]:
     """Return (enclave, key) of each ``issued`` certificate that was replaced together with its key.
 
-    ``unknown`` are certificates that were issued after the backup.  They are valid unless
-    ``reasons``, the revoked serial numbers with reasons, has them; their keys are left out.
+    ``unknown`` are certificates that were issued after the backup.  Such a certificate is valid
+    unless its serial number is in ``reasons``, which maps revoked serial numbers to reasons. The
+    keys of valid ones are left out.
     """
     kept = {(of.enclave, of.key) for serial, of in unknown.items() if serial not in reasons}
     replaced = {(of.enclave, of.key) for s, of in issued.items() if reasons[s] == SUPERSEDED}
