@@ -55,6 +55,17 @@ ASSUMED = FindingKind(
     "keystore.",
     prominent=True,
 )
+HOLDS_ALONE = FindingKind(
+    "requirement.holds-alone",
+    NOTE,
+    "a requirement that no enclave of this policy can break",
+    "It has relative names, as the requirements of a package do, and only enclaves that users add "
+    "could break it.",
+    "The requirements file.",
+    "Check it with enclaves of others: `sros check ROBOT_POLICY --requirements FILE --namespace "
+    "NS`.",
+    prominent=True,
+)
 NOT_CROSSING = FindingKind(
     "requirement.not-crossing",
     NOTE,

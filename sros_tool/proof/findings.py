@@ -10,6 +10,7 @@ from sros_tool.automata import SearchLimit
 from sros_tool.checks.kind import Finding, RelatedPlace
 from sros_tool.checks.requirements import (
     ASSUMED,
+    HOLDS_ALONE,
     NOT_CROSSING,
     NOT_ON_ZENOH,
     OF_EXPORT,
@@ -142,7 +143,8 @@ class Decided:
     with a name whose protection the policy does not state.  ``blocked`` are requirements that hold,
     with a use that does not pass between Zenoh routers. ``unnamed`` are requirements that hold,
     with their names that no right states.  ``unjudged`` are enclaves that have to have rights, but
-    that an export lacks.
+    that an export lacks.  ``holding_alone`` are requirements with relative names that only further
+    enclaves could break, with the reasons.
     """
 
     violations: tuple[Violation, ...]
@@ -151,6 +153,7 @@ class Decided:
     blocked: tuple[tuple[Requirement, BlockedUse], ...] = ()
     unnamed: tuple[tuple[Requirement, tuple[str, ...]], ...] = ()
     unjudged: tuple[str, ...] = ()
+    holding_alone: tuple[tuple[Requirement, tuple[str, ...]], ...] = ()
 
 
 def decide_all(requirements: Sequence[Requirement], system: System) -> Decided:
@@ -159,7 +162,9 @@ def decide_all(requirements: Sequence[Requirement], system: System) -> Decided:
     Raises:
         DocumentError: there are too many wildcards to decide a requirement.
     """
-    violations, vacuous, assumed, blocked, unnamed = [], [], [], [], []
+    violations, assumed, blocked, unnamed = [], [], [], []
+    vacuous: list[tuple[Requirement, tuple[str, ...]]] = []
+    holding_alone: list[tuple[Requirement, tuple[str, ...]]] = []
     limit = SearchLimit(MOST_STEPS)
     worlds = Worlds(system.worlds)
     known = {enclave for world in system.worlds for enclave in world.enclaves}
@@ -189,7 +194,9 @@ def decide_all(requirements: Sequence[Requirement], system: System) -> Decided:
                 Violation(requirement, witness, steps, titles, missing, idle, other_steps)
             )
         if reasons := tuple(_never_fails([verdict for _, verdict in verdicts])):
-            vacuous.append((requirement, reasons))
+            needs_others = requirement.is_relative and isinstance(requirement, Only | AtMost)
+            is_alone = needs_others and all(verdict.always for _, verdict in verdicts)
+            (holding_alone if is_alone else vacuous).append((requirement, reasons))
         if not broken and (names := _texts_in_all(verdict.unnamed for _, verdict in verdicts)):
             unnamed.append((requirement, names))
         if not broken and (
@@ -200,7 +207,13 @@ def decide_all(requirements: Sequence[Requirement], system: System) -> Decided:
             :1
         ]
     return Decided(
-        tuple(violations), tuple(vacuous), tuple(assumed), tuple(blocked), tuple(unnamed), unjudged
+        violations=tuple(violations),
+        vacuous=tuple(vacuous),
+        assumed=tuple(assumed),
+        blocked=tuple(blocked),
+        unnamed=tuple(unnamed),
+        unjudged=unjudged,
+        holding_alone=tuple(holding_alone),
     )
 
 
@@ -301,6 +314,9 @@ def decided_findings(
     """Return the findings of decisions: broken requirements first, in order."""
     findings = [_violation_finding(violation) for violation in decided.violations]
     findings += [_vacuous_finding(requirement, why) for requirement, why in decided.vacuous]
+    for requirement, why in decided.holding_alone:
+        place, text = requirement.source, f"{'; '.join(why)}: {demand(requirement)}"
+        findings.append(HOLDS_ALONE.found(place.file, text, place.file, place.line))
     if decided.unnamed:
         allowed = [right for right in before if right.qualifier is ALLOW]
         findings += [_unnamed_finding(*unnamed, allowed) for unnamed in decided.unnamed]

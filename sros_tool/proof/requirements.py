@@ -924,9 +924,11 @@ class DroppedRequirement:
     def text(self) -> str:
         """Return a clause on the part of the requirement that the new file still demands."""
         if self.only_elsewhere:
+            names = {*_moving_names([self.requirement])} ^ {*_moving_names(self.kept)}
+            which = first_few(sorted(names), 3) if names else "a name"
             return (
-                "the new file demands less in another namespace (`sros check --namespace`): a name "
-                "moves with the namespace in only one of the files"
+                "the new file demands less in another namespace (`sros check --namespace`): "
+                f"{which} moves with the namespace in only one of the files"
             )
         text = f"the new file demands less: {'; '.join(self.now)}"
         if not self.kept:
@@ -937,6 +939,17 @@ class DroppedRequirement:
                 retired = _rights_text(tuple(gone))
                 text += f" (if nobody is to {retired} any more, write so in [[nobody]])"
         return text
+
+
+def _moving_names(requirements: Iterable[Requirement]) -> Iterator[str]:
+    """Yield the names in requirements about rights that are others in another namespace."""
+    for requirement in requirements:
+        elsewhere = requirement.elsewhere
+        if isinstance(requirement, RightsRequirement) and isinstance(elsewhere, RightsRequirement):
+            here, there = map(_single_rights, (requirement.rights, elsewhere.rights))
+            for (_, (name,)), (_, (moved,)) in zip(here, there, strict=True):
+                if name != moved:
+                    yield name
 
 
 def dropped_requirements(
@@ -986,8 +999,9 @@ def dropped_findings(
 ) -> list[Finding]:
     """Return a finding for each requirement that ``after`` does not fully demand.
 
-    The requirements that one table makes for several robots share a finding.  ``file`` is the path
-    of the requirements ``after``.
+    The requirements that one table makes for several robots share a finding.  Its place is a table
+    that still demands something about the same names; without one, it is ``file``, the path of the
+    requirements ``after``.
     """
     tables: dict[tuple[Source, bool, str], list[DroppedRequirement]] = {}
     for dropped in dropped_requirements(before, after):
@@ -998,7 +1012,7 @@ def dropped_findings(
         DROPPED.found(
             ": ".join(filter(None, (first.name, first.demand))),
             first.text() + _other_robots_text([other.requirement.robot for other in others]),
-            file,
+            *((first.kept[0].source.file, first.kept[0].source.line) if first.kept else (file, 0)),
             related=(RelatedPlace("required before", first.file, first.line or None),),
         )
         for first, *others in tables.values()

@@ -338,8 +338,8 @@ class StepResult(NamedTuple):
     status: int
     """Exit status of the step: 0, 1 or 2, as for the review."""
     allowed: bool
-    """Whether the step found something that is allowed, by an option or always (``signed``,
-    ``rights``, and private keys that were there before); the status is then 0.
+    """Whether the step found something that is allowed, by an option or always (``signed``, and
+    private keys that were there before); the status is then 0.
     """
     result: str
     """The result as a sentence, or the reason why the step could not be decided."""
@@ -411,7 +411,7 @@ class _Review:
             return self.request.allow_dropped_requirements
         # Authors of a policy seldom have the CA keys, so the keystore may be signed later.
         # Names that are new in another namespace fail the step on new access.
-        return kind in ("signed", "rights") or (
+        return kind == "signed" or (
             kind in ("new-access", "files") and self.request.allow_new_access
         )
 
@@ -1006,8 +1006,7 @@ class _Review:
         compared = compare_sources(first, second)
         if not compared and not (absolute or relative):
             return None
-        status = _FOUND if absolute or relative else _OK
-        return status, RightsChange(first, second, compared, absolute, relative)
+        return _OK, RightsChange(first, second, compared, absolute, relative)
 
     # ── requirements ───────────────────────────────────────────────────────────────────────
 
@@ -1204,7 +1203,9 @@ class _Review:
             return None
         assert self.base
         findings = [
-            finding._replace(
+            finding
+            if finding.file
+            else finding._replace(
                 file=str(self.head.folder / Path(place.file).relative_to(self.base.folder))
             )
             for finding in dropped_findings(earlier, wanted_requirements, "")

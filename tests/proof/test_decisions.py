@@ -237,6 +237,21 @@ def test_what_cannot_fail_is_said(required: str) -> None:
     assert [each for _, reasons in found.vacuous for each in reasons] == ([why] if why else [])
 
 
+@pytest.mark.parametrize(
+    "required",
+    [
+        '[[only]]\npublish = ["x"]\nenclaves = ["/r/*", "*/operator/*"]',
+        '[[at_most]]\npublish = ["x"]\nenclaves = 3',
+    ],
+)
+def test_a_requirement_of_a_package_may_be_about_the_enclaves_of_users(required: str) -> None:
+    """Twin: with the absolute names of a robot, it protects nothing."""
+    found = decided(ROBOT, required)
+    assert len(found.holding_alone) == 1 and not (found.violations or found.vacuous)
+    of_robot = decided(ROBOT, required.replace('"x"', '"/x"'))
+    assert len(of_robot.vacuous) == 1 and not of_robot.holding_alone
+
+
 READ_BY_ALL = {"/mux": may("publish", "/cmd_vel", "/arm_l/cmd"), "/rec": may("subscribe", "/*")}
 SLIPS = ("/cmd_vle", "/cmd_ve", "/cmd_vell", "/cmdvel", "/cnd_vel")
 OTHER_NAMES = ("/cmd_vel2", "/cmd_vel_raw", "/arm_r/cmd", "/robot/cmd_vel")

@@ -216,7 +216,7 @@ def test_dropping_a_requirement_is_a_consent_of_its_own(change: Change) -> None:
     words = ("--policy", "robot.xml", "--requirements", "robot.toml", "--new-access", "allow")
     failed = change.review(*words)
     lines = (
-        "  robot.toml: error: only /a may publish /x: the new file demands less: only /a, /b may "
+        "  robot.toml:1: error: only /a may publish /x: the new file demands less: only /a, /b may "
         f"publish /x [requirement.dropped] (required before: git:{change.base[:12]}:robot.toml:1)",
         "  robot.xml:6: error: /b: may publish /x, but only /a may publish /x "
         "[requirement.violated]",
@@ -244,7 +244,7 @@ def test_changed_rights_are_named_and_decided_over_all_policies(change: Change) 
         }
     )
     ended = change.review("--policy", "robot.xml\nsecond.xml")
-    said = ended.out.partition("\n[allowed] rights ")[2].splitlines()
+    said = ended.out.partition("\n[ok] rights ")[2].splitlines()
     assert "written rights gone, 1 name made absolute" in said[0], ended
     assert "  ! /c may subscribe /x, but no enclave may publish it any more" in said
     assert "  - /a ALLOW publish topic /x" in said
