@@ -96,6 +96,17 @@ def _mark_code(
     )
 
 
+def _give_captions_a_level(
+    _app: Sphinx, _page: str, _template: str, context: dict[str, Any], _tree: object
+) -> None:
+    """Give each heading of the table of contents the level that a screen reader needs."""
+    tree = context["furo_navigation_tree"]
+    context["furo_navigation_tree"] = tree.replace(
+        'role="heading"', 'role="heading" aria-level="2"'
+    )
+
+
 def setup(app: Sphinx) -> None:
     """Connect to Sphinx, which calls this."""
     app.connect("html-page-context", _mark_code)
+    app.connect("html-page-context", _give_captions_a_level, priority=900)  # after the theme

@@ -1,8 +1,11 @@
-// Ranks recipes first in the search of the site, and reference pages and manuals last.
+// Ranks pages whose title has a word of the search first, and recipes before other pages with the
+// word in a heading, then recipes and other pages that only mention it; references come last.
 var Scorer = {
-  score: ([page, , , , score]) => {
-    if (page.startsWith("docs/howto/")) return score + 20;
-    return /^docs\/(reference\/|man\/|json$)/.test(page) ? score - 20 : score;
+  score: ([page, title, , , score]) => {
+    const words = (new URLSearchParams(location.search).get("q") ?? "").toLowerCase().split(/\W+/);
+    const titled = words.some((word) => word && title.toLowerCase().includes(word)) ? 5 : 0;
+    if (page.startsWith("docs/howto/")) return score + titled + (score >= Scorer.title ? 20 : 5);
+    return (/^docs\/(reference\/|man\/|json$)/.test(page) ? score - 20 : score) + titled;
   },
   // The values of Sphinx.
   objNameMatch: 11,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 import subprocess
@@ -57,6 +58,33 @@ def test_the_site_builds_without_a_warning_and_loads_nothing_from_elsewhere(tmp_
         check=False,
     )
     assert loaded.stdout == ""
+
+
+def test_the_search_of_the_site_ranks_titles_and_recipes_first() -> None:
+    if (node := shutil.which("node")) is None:
+        pytest.skip("needs node")
+    hits = [
+        ["docs/reference/options", "Verbs and options", "", "", 15],
+        ["docs/howto/laptop", "A laptop in the fleet", "", "", 5],
+        ["docs/concepts", "Concepts", "", "", 5],
+        ["docs/howto/close", "Close", "", "", 15],  # with the word in a heading
+        ["docs/life_of_keys", "The life of keys", "", "", 15],
+        ["docs/howto/stolen_robot", "Revoke a stolen robot", "", "", 15],
+    ]
+    script = (PROJECT / "docs/scorer.js").read_text("utf-8")
+    script += f"""
+        globalThis.location = {{ search: "?q=revoke" }};
+        const hits = {json.dumps(hits)}.map((hit) => [Scorer.score(hit), hit[0]]);
+        console.log(hits.sort((a, b) => b[0] - a[0]).map((hit) => hit[1]).join(" "));"""
+    ranked = subprocess.run([node, "-e", script], capture_output=True, text=True, check=True).stdout
+    assert [page.rpartition("/")[2] for page in ranked.split()] == [
+        "stolen_robot",
+        "close",
+        "life_of_keys",
+        "laptop",
+        "concepts",
+        "options",
+    ]
 
 
 def test_the_reference_is_made_from_the_program() -> None:
