@@ -13,6 +13,7 @@ import hashlib
 import html
 import json
 import re
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime
@@ -366,12 +367,16 @@ def _open_rows(rows: Sequence[Json]) -> str:
             names.setdefault(reason, []).append(row["name"])
     here_first = sorted(names.items(), key=lambda item: item[0][0])
     items = "".join(
-        f'<li><span class="chip {"warning" if is_known else "error"}">{label}</span> '
-        f"<b>{'<br>'.join(map(escape, opened))}</b><br>"
+        f"<li>{''.join(_open_row(name, label, is_known=is_known) for name in opened)}"
         f"{_sentence(because)} {_sentence(remedy)}</li>"
         for (is_known, label, because, remedy), opened in here_first
     )
     return f'<ul class="open">{items}</ul>' if items else ""
+
+
+def _open_row(name: str, label: str, *, is_known: bool) -> str:
+    kind = "warning" if is_known else "error"
+    return f'<span class="chip {kind}">{label}</span> <b>{escape(name)}</b><br>'
 
 
 def _demo_vulnerabilities(result: Json) -> str:
@@ -558,17 +563,26 @@ def render_fleet_page(
         for to_do, remedy in remedies.items()
     )
     how = f"<h2>How to do it</h2><dl>{how}</dl>" if how else ""
-    findings = "".join(map(_dds_finding, status["findings"]))
+    builds = Counter(finding["subject"] for finding in status["findings"])
+    findings = "".join(
+        _dds_finding(finding, is_only_build=builds[finding["subject"]] == 1)
+        for finding in status["findings"]
+    )
     listed = f"<h2>Vulnerabilities of the DDS</h2>{findings}" if findings else ""
     body = f"<main>{head}<section>{table}{how}{listed}</section></main>"
     return _document(f"Fleet of {status['keystore']}", body, _asset("demo.css"))
 
 
-def _dds_finding(finding: Json) -> str:
-    """Return a finding on the DDS of robots; path and numbers are in a part that unfolds."""
+def _dds_finding(finding: Json, *, is_only_build: bool) -> str:
+    """Return a finding on the DDS of robots; path and numbers are in a part that unfolds.
+
+    Several builds of one release can be told apart only by their paths, which they then show.
+    """
     text, comma, rest = finding["text"].partition("; in '")
     folded = f"In '{rest}. {finding['remedy']}" if comma else ""
-    return _unfolding_html(f"{finding['subject']}: {text}", folded)
+    path = re.match(r".*'(?=: |$)", rest)
+    shown = f"{text}; in '{path[0]}" if path and not is_only_build else text
+    return _unfolding_html(f"{finding['subject']}: {shown}", folded)
 
 
 _FLEET_COLUMNS = ("State", "Robots", "To do", "Details", "Confirmed (UTC)", "First expiry")
@@ -587,7 +601,8 @@ def _fleet_row(row: Sequence[str], words: Mapping[str, str]) -> str:
         f'<td data-label="{label}">{_with_marks(text)}</td>' if text else "<td></td>"
         for label, text in zip(_FLEET_COLUMNS[2:], texts, strict=True)
     )
-    return f'<tr><td>{chip}</td><th scope="row">{escape(robots)}</th>{cells}</tr>'
+    names = escape(robots).replace("_", "_<wbr>")  # a line ends between words of a name
+    return f'<tr><td>{chip}</td><th scope="row">{names}</th>{cells}</tr>'
 
 
 def _urgency(state: str) -> int:

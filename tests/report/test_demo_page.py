@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -152,7 +153,7 @@ def test_what_is_open_comes_first_with_what_to_do_and_is_never_green() -> None:
     what_to_do = "Names are in clear. Keep secrets out of names."
     assert [item.text_content() for item in page.cssselect("ul.open li")] == [
         f"open in this keystore heard here{what_to_do}",
-        f"open names readsubjects read{what_to_do}",
+        f"open names readopen subjects read{what_to_do}",
     ]
     pills = [(pill.text, str(pill.get("class"))) for pill in page.cssselect("td:first-child .chip")]
     assert [text for text, _ in pills] == ["open", "open", "open", "differs", "open", "ok"]
@@ -180,16 +181,22 @@ def test_no_place_of_the_machine_is_written(tmp_path: Path) -> None:
     assert [place for place in places if str(place) in text] == []
 
 
-def fleet_page() -> str:
+def fleet_page(
+    robots: Sequence[str] = HOSTILE[:1], paths: Sequence[str] = (f"/opt/{60 * 'library'}",)
+) -> str:
     """A fleet's status with long and hostile names, in a state of each class."""
     name = HOSTILE[0]
-    text = f"1 known; on r1; in '/opt/{60 * 'library'}': CVE-1-2"
-    finding = {"subject": name, "text": text, "remedy": name}
+    findings = [
+        {"subject": name, "text": f"1 known; on r1; in '{path}': CVE-1-2", "remedy": name}
+        for path in paths
+    ]
     states = ("revoked", "earlier", "current")
     counts = {"current": 1, "earlier": 1, "revoked": 1}
     status: dict[str, Any] = {"keystore": name, "at": "2027-01-01T00:00:00Z", "counts": counts}
-    rows = [(state, name, "2027-01-01T00:00:00Z", "", "deliver", 60 * "file") for state in states]
-    status |= {"robots": states, "outdated_dds": ["r1"], "findings": [finding]}
+    rows = [
+        (state, robots[0], "2027-01-01T00:00:00Z", "", "deliver", 60 * "file") for state in states
+    ]
+    status |= {"robots": states, "outdated_dds": ["r1"], "findings": findings}
     deliver = f"`sros distribute_key --force` {name}"
     return render_fleet_page(
         status,
@@ -213,6 +220,11 @@ def test_a_fleet_begins_with_how_many_are_current_and_says_it_once() -> None:
     (library,) = page.cssselect("section > details")
     assert library.cssselect("summary")[0].text_content() == f"{HOSTILE[0]}: 1 known; on r1"
     assert "In '/opt/library" in library.text_content() and "CVE-1-2." in library.text_content()
+    assert "r_<wbr>1" in fleet_page(["r_1"])
+    # Builds of one release differ in their path only.
+    builds = html.fromstring(fleet_page(["r_1"], paths=("/opt/a", "/opt/b")))
+    said = [summary.text_content() for summary in builds.cssselect("section summary")]
+    assert said == [f"{HOSTILE[0]}: 1 known; on r1; in '/opt/{build}'" for build in "ab"]
     # A line of a phone does not end within an option: "--" and "force" are no words.
     assert [option.text for option in page.cssselect("dd code .id")] == ["--force"]
 

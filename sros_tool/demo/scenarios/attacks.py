@@ -1076,7 +1076,7 @@ def _misspelt_setting_row(
     mechanism = f"{why}: the talker runs unsecured"
     return known_open(
         _misconfiguration_row(name, identity, RowStatus.HEARD, mechanism),
-        "rcl ignores every other spelling, and the node does not warn",
+        "every other spelling is ignored by rcl, and the node does not warn",
         "start nodes with `sros run`, which sets the variables; `sros doctor` finds wrong values",
     )
 
