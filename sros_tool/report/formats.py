@@ -300,8 +300,11 @@ def _legend(picture: Picture, scene: Scene) -> Iterable[str]:
             )
             for level in levels
         )
-    rows = [('<path class="link" d="M0 -4h40"/>', "allowed")]
-    if any(link.wildcard for link in scene.links):
+    rows = []
+    allowed = [link for link in scene.links if link.qualifier is ALLOW]
+    if allowed:
+        rows.append(('<path class="link" d="M0 -4h40"/>', "allowed"))
+    if any(link.wildcard for link in allowed):
         rows.append(('<path class="link wild" d="M0 -4h40"/>', "allowed by a wildcard only"))
     if any(link.qualifier is not ALLOW for link in scene.links):
         rows.append(('<path class="link deny" d="M0 -4h40"/>', "denied"))

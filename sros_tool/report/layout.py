@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
+from textwrap import wrap
 from typing import NamedTuple
 
 from sros_tool.policy.model import ALLOW, Qualifier
@@ -36,7 +37,8 @@ _SIDE_WIDTH, _NAMES_WIDTH, _GUTTER = 184, 330, 110
 LINE, PAD, SMALL = 16, 7, 14
 """Height of a text line, padding of a card, and height of a note line, in pixels."""
 _GAP, _LEAD, _TOP, MARGIN = 9.0, 24.0, 34.0, 14
-_SIDE_LETTERS, _NAMES_LETTERS = 20, 35  # letters per line on a card
+_SIDE_LETTERS, _NAMES_LETTERS, _NOTE_LETTERS = 20, 35, 27  # letters per line on a card
+_TIP, _MOST_TIPS = 8, 20  # height of an arrowhead in pixels; the most that a card makes room for
 _ONLOOKER_LINES, _ONLOOKER_SHARE = 8, 0.3  # onlookers exceed both limits
 _MOST_ONLOOKERS = 26  # one for each letter
 _FEW_BUNDLES, _MOST_BUNDLES = 24, 80  # above: private names are only counted; bundles are joined
@@ -376,7 +378,7 @@ class _Draft:
             notes += _own_text(own_rights)
         notes += self._notes.get(node, ())
         notes += [
-            f"{reach} {counted(self._looking[node, right], 'name')}: see {tag}"
+            f"{reach} {counted(self._looking[node, right], 'name')} ({tag})"
             for (tagged, right), tag in self._tags.items()
             for reach in (_REACHES[right],)
             if tagged == node and SENDS[right] is sends
@@ -473,6 +475,7 @@ def side_card(
     group.
     """
     lines = _wrapped_name(label, _SIDE_LETTERS)
+    notes = [line for note in notes for line in wrap(note, _NOTE_LETTERS, break_on_hyphens=False)]
     return Card(
         id=card,
         role="enclave" if group else "group",
@@ -573,7 +576,8 @@ def links_of(cards: Mapping[str, Card], ties: Iterable[LinkedTie]) -> list[Link]
 def placed(scene: Scene, columns: int) -> Scene:
     """Return a scene with the positions of all cards, links and frames."""
     lines = sorted({(link.source, link.target) for link in scene.links})
-    cards = _stacked_cards(scene.cards, lines, columns)
+    tips = Counter(link.target for link in scene.links)
+    cards = _stacked_cards([_with_room_for(tips[c.id], c) for c in scene.cards], lines, columns)
     return replace(
         scene,
         height=max((card.y + card.height for card in cards.values()), default=0) + MARGIN,
@@ -581,6 +585,12 @@ def placed(scene: Scene, columns: int) -> Scene:
         links=_linked_cards(cards, scene.links),
         frames=tuple(_frames_of(cards.values())),
     )
+
+
+def _with_room_for(tips: int, card: Card) -> Card:
+    """Return the card, high enough for this number of arrowheads below each other."""
+    needed = 2 * PAD + _TIP * (min(tips, _MOST_TIPS) - 1)
+    return replace(card, height=max(card.height, needed))
 
 
 def _stacked_cards(

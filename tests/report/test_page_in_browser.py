@@ -119,10 +119,12 @@ def test_search_finds_enclaves_and_names_and_shows_who_may_do_what(
             "/cmd_vel_nav",
             "/cmd_vel_teleop",
         ]
+        assert "cmd_<wbr>vel" in page.inner_html("#results")  # a line ends between words of a name
         page.click("#results button:has-text('/cmd_vel') >> nth=0")
         text = details(page)
         assert "May publish (1)" in text and "/mobile_robot/velocity_mux" in text
         assert "May subscribe (3)" in text and "/mobile_robot/base" in text
+        assert "mobile_<wbr>robot/<wbr>base" in page.inner_html("#details")
         assert "encrypted" in text
         shown = "#map .card.enclave:not(.faded)"
         assert len(texts(page, shown)) == 4, texts(page, shown)
@@ -174,11 +176,15 @@ def test_filters_leave_what_fits(browser: Browser, robot_page: Path) -> None:
         assert lines(page) > 0
         page.click("#back")
         assert lines(page) == everything
+        assert page.evaluate("document.activeElement.matches('#map .card')"), "the button is gone"
         page.select_option("#filter-namespace", "/front_camera")
         shown = " ".join(texts(page, "#map .card.names"))
         assert "/front_camera/image_raw" in shown and "/scan" not in shown
         page.select_option("#filter-direction", "deny")
         assert page.locator("#map path.link.deny").count() == lines(page) > 0
+        assert "denied" in page.inner_text("#legend") and "allowed" not in page.inner_text(
+            "#legend"
+        )
 
 
 @pytest.fixture(scope="module")

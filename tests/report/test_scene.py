@@ -11,7 +11,7 @@ from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import DENY
 from sros_tool.policy.rights import policy_rights
 from sros_tool.report.compose import PictureSource, compose, overlay
-from sros_tool.report.layout import Scene, scenes_of
+from sros_tool.report.layout import Scene, scenes_of, side_card
 from sros_tool.report.picture import Picture, SourceTitle
 from tests.report.pictures import group, large_policy, mobile_robot, picture_of, source_of
 
@@ -62,6 +62,19 @@ def test_every_name_is_drawn_counted_or_left_out_once() -> None:
         assert len(drawn) == len({(c.kind, n) for c in scene.cards for n in c.members if c.kind})
         assert len(drawn) + counted == scene.shown
         assert scene.shown + scene.hidden == len(picture.names)
+
+
+def test_arrowheads_at_a_card_do_not_overlap_and_notes_fit_on_it() -> None:
+    scene = scenes_of(mobile_robot())[0]
+    ends: dict[str, list[int]] = {}
+    for link in scene.links:
+        ends.setdefault(link.target, []).append(link.y2)
+    assert max(map(len, ends.values())) > 10
+    for target, places in ends.items():
+        gaps = [below - above for above, below in itertools.pairwise(sorted(places))]
+        assert min(gaps, default=99) >= 7, target
+    card = side_card("s/a", 0, "a", ["subscribes to 1234567 names (A)"], ["/a"], "/")
+    assert card.notes == ("subscribes to 1234567 names", "(A)")
 
 
 def test_the_one_who_reads_everything_is_told_by_a_letter_and_its_denial_by_a_line() -> None:

@@ -231,7 +231,7 @@ export function fitted(scene, room) {
   const placed = columnsOf.map((cards, at) => {
     const left = x;
     x += widths[at] + gap;
-    return cards.map((card) => ({ ...rewrapped(card, widths[at], slim), x: left, frame: frameOf(card) }));
+    return cards.map((card) => ({ ...withRoomForTips(rewrapped(card, widths[at], slim), card), x: left, frame: frameOf(card) }));
   });
   settle(placed, scene.links);
   const cards = placed.flat();
@@ -331,6 +331,11 @@ function rewrapped(card, width, slim) {
   const notes = card.notes.flatMap((text) => inWords(text, Math.floor((width - (names && slim ? 34 : 18)) / SIZES.smallLetter)));
   const fit = { ...card, width, slim, lines, notes };
   return { ...fit, height: Math.max(height(fit), names && slim && card.lock ? 46 : 0) };
+}
+
+// A card that many arrows lead to stays as high as the drawing on paper has it.
+function withRoomForTips(card, before) {
+  return before.height > height(before) ? { ...card, height: Math.max(card.height, before.height) } : card;
 }
 
 const sumOf = (numbers) => numbers.reduce((total, number) => total + number, 0);

@@ -1,6 +1,6 @@
 // What is known of the enclave or the name that was chosen.
 
-import { counted, el } from "./dom.js";
+import { breakable, counted, el } from "./dom.js";
 import { byRight, sends } from "./model.js";
 import { KINDS, LEVELS, RECEIVES, SENDS, markText, noneText } from "./words.js";
 import { daysLeft, dateText, leftText } from "./timeline.js";
@@ -32,7 +32,7 @@ export function chips(model, tie) {
 }
 
 function link(text, onclick) {
-  return el("button", { type: "button", class: "link-button", text, onclick });
+  return el("button", { type: "button", class: "link-button", onclick }, breakable(text));
 }
 
 function section(title, ...content) {

@@ -208,8 +208,10 @@ function drawCard(group, card, problems) {
     group.append("text").attr("x", left).attr("y", y).text(`${text} `);
     y += 16;
   }
+  let kind = "small";
   for (const text of card.notes) {
-    const kind = names && /^(nobody|everybody) may /.test(text) ? "small lack" : "small";
+    // Its note stands last, perhaps in several lines.
+    if (names && /^(nobody|everybody) may\b/.test(text)) kind = "small lack";
     group.append("text").attr("class", kind).attr("x", left).attr("y", y - 1).text(`${text} `);
     y += 14;
   }
@@ -274,8 +276,9 @@ export function legend(scene, overlay, equal, make) {
     }
   }
   const line = (kind, text) => add(icon("M0 6h42", `link ${kind}`, true), text);
-  line("", "allowed");
-  if (scene.links.some((link) => link.wildcard)) line("wild", "by a wildcard only");
+  const allowed = scene.links.filter((link) => !link.deny);
+  if (allowed.length) line("", "allowed");
+  if (allowed.some((link) => link.wildcard)) line("wild", "by a wildcard only");
   if (scene.links.some((link) => link.deny)) line("deny", "denied");
   if (scene.links.some((link) => link.violates)) line("violates", "breaks a requirement");
   if (scene.links.some((link) => link.differs)) line("differs", "the equal ones do not have this right");

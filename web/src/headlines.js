@@ -73,7 +73,8 @@ function drivers(rows, opens, showTable) {
     const all = [...(row.all_send ? [row.everybody] : []), ...row.senders];
     const more = all.length > SHOWN ? ` and ${all.length - SHOWN} more` : "";
     const who = all.length ? `${all.slice(0, SHOWN).join(", ")}${more}` : noneText(row, row.receivers);
-    return el("p", {}, `May ${SENDS[row.kind]} `, nameButton(row.kind, name, opens), alike.length ? ` and ${alike.length} more` : "", `: ${who}`);
+    const moreNames = alike.length ? ` and ${alike.length} more: ` : " ";
+    return el("p", {}, `May ${SENDS[row.kind]} `, nameButton(row.kind, name, opens, alike.length ? "" : ":"), `${moreNames}${who}`);
   });
   const left = shown.length - said.length;
   return left ? [...said, el("p", {}, button(`and ${left} more in the table`, showTable))] : said;

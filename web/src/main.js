@@ -2,7 +2,7 @@
 
 import { MOST_BUNDLES, columns, fitted, flowScene } from "./arrange.js";
 import { cardDetails, enclaveDetails, equalDetails, findingItem, nameDetails } from "./details.js";
-import { byId, counted, el, isSmall, svg } from "./dom.js";
+import { breakable, byId, counted, el, isSmall, svg } from "./dom.js";
 import { drawScene, legend, onlookerText, withLocks } from "./draw.js";
 import { headlines } from "./headlines.js";
 import { Model } from "./model.js";
@@ -269,7 +269,7 @@ function search() {
   const text = byId("search").value;
   const { enclaves, names, more } = model.search(text, MOST_FOUND);
   const item = (kind, label, onclick) =>
-    el("li", {}, el("button", { type: "button", onclick }, el("span", { class: "kind", text: kind }), el("span", { class: "mono", text: label })));
+    el("li", {}, el("button", { type: "button", onclick }, el("span", { class: "kind", text: kind }), el("span", { class: "mono" }, breakable(label))));
   const items = [
     ...enclaves.map((enclave) => item("enclave", enclave.path, () => pick(() => act.enclave(enclave.path)))),
     ...names.map((name) => item(KINDS[name.kind], name.name, () => pick(() => act.name(name.kind, name.name)))),
@@ -391,6 +391,7 @@ function start() {
   byId("back").addEventListener("click", () => {
     if (isSmall()) close();
     setScene(state.scene);
+    document.querySelector("#map [tabindex='0']")?.focus({ preventScroll: true }); // the button is gone
   });
   byId("close").addEventListener("click", close);
   byId("sheet").addEventListener("click", () => unfoldSheet(document.body.classList.contains("with-title-only")));

@@ -52,9 +52,11 @@ function folded(items) {
   return [...items.slice(0, SHOWN), el("details", {}, el("summary", { text: `and ${rest.length} more` }), rest)];
 }
 
-export function nameButton(kind, name, opens) {
+// What stands directly after the name, such as a colon, never begins a line.
+export function nameButton(kind, name, opens, after = "") {
   const open = opens(kind, name);
-  return open ? el("button", { type: "button", class: "link-button", onclick: open }, breakable(name)) : el("code", {}, breakable(name));
+  const shown = [breakable(name), after && el("span", { class: "after", "aria-hidden": "true", text: after })].flat().filter(Boolean);
+  return open ? el("button", { type: "button", class: "link-button", onclick: open }, shown) : el("code", {}, shown);
 }
 
 // `opens(kind, name)` returns what shows a name, or nothing if only the table has it; `equal` are the
