@@ -310,10 +310,18 @@ def _renaming_advice(closed: CloseState, policy: Policy) -> str:
     )
 
 
+_NOT_PROVED = (
+    "  sros cannot see whether two nodes hear each other: look at what the nodes receive now, and "
+    "restart a node that receives nothing"
+)
+
+
 def _show_end(
     robot: LocalRobot, closed: CloseState, *, apply: bool, holds: bool, partial: bool
 ) -> None:
     """Print whether the robot is closed, the reasons, and what to do next."""
+    from sros_tool.close.state import TALK
+
     folder, observed = shlex.quote(str(robot.folder)), closed.observed
     ask = f"sros close {folder} --proof"
     idle = closed.stopped if closed.secured else {*observed.ended}
@@ -325,6 +333,8 @@ def _show_end(
         accept = " (--partial accepts this)" if proof.is_accepted_by_partial else ""
         accept = " (accepted: --partial)" if accept and partial else accept
         echo(f"{_ANSWERS[proof.holds]}: {proof.claim}: {proof.reason}{accept}")
+        if proof.holds and proof.claim == TALK:
+            echo(_NOT_PROVED)
     if closed.problems:
         echo(f"{_state_text(closed, apply=apply)}; fix this first:")
         for problem in closed.problems:

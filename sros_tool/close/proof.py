@@ -562,7 +562,10 @@ def _unseen_text(running: RunningRobot, node: str, enclave: str) -> str:
             )
     if not node or is_expression(node):
         return f"any node in {enclave}"
-    return f"{node} (if it is gone for good, remove its profile from '{running.robot.policy}')"
+    label = next((process.label for process, of in running.secured if of.name == enclave), "")
+    asking = f"{label} runs: ask again, or restart it; " if label else ""
+    gone = f"if it is gone for good, remove its profile from '{running.robot.policy}'"
+    return f"{node} ({asking}{gone})"
 
 
 def _lost_endpoints(

@@ -61,7 +61,10 @@ _PYTHON = (sys.executable, "-P")  # never import modules from the current folder
 _LEAN_PYTHON = (*_PYTHON, "-S")
 """Python without site packages: their start-up files can take longer than a node."""
 _WITHOUT_SHARED_MEMORY = {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}
-"""Environment variable that keeps Fast DDS from using shared memory, so packets can be seen."""
+"""Environment variable that keeps Fast DDS from using shared memory.
+
+Packets in shared memory cannot be captured, and do not pass between processes of different users.
+"""
 
 
 @cache
@@ -443,7 +446,10 @@ def run_by_hand(
         stopped.set()
         end_within(0 if again else _SECONDS_TO_STOP, process)
 
-    with subprocess.Popen(command, pass_fds=[writing], preexec_fn=end_with_starter()) as process:
+    environment = {**_WITHOUT_SHARED_MEMORY, **os.environ}
+    with subprocess.Popen(
+        command, pass_fds=[writing], preexec_fn=end_with_starter(), env=environment
+    ) as process:
         os.close(writing)
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             signal.signal(number, stop)

@@ -439,13 +439,15 @@ def test_a_robot_is_closed_proved_and_opened_again(robot: Robot) -> None:
     seen.write_text(json.dumps(twice))
     closed = robot.close("--apply")
     assert robot.restarts == ["daemon-reload", "restart listener.service talker.service"]
-    assert closed.out.splitlines()[-5:] == [
+    assert closed.out.splitlines()[-6:] == [
         "yes: every process was started in its enclave: 2 enclaves, and no open process in "
         "domain 0",
         "yes: the files are accepted: sros check finds no error: robot/export",
         "yes: the requirements hold: all of them: robot/requirements.toml",
         "yes: everything that talked can still talk: 2 nodes with 36 endpoints as before "
         "(types are not compared)",
+        "  sros cannot see whether two nodes hear each other: look at what the nodes receive now, "
+        "and restart a node that receives nothing",
         "yes: an open listener finds nothing: the observer that saw 2 nodes before sees none",
     ]
     renew = "Z; next: have them renewed before then (docs/howto/close.md, Renewal without hands), "
@@ -799,7 +801,8 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     robot.more = ()
     robot.remaining = (TALKER,)
     lost = "no: everything that talked can still talk: "
-    assert f"{lost}not seen: /listener (if it is g" in robot.close("--proof", status=1).out
+    runs = f"process {PID['/listener']} (run) runs: ask again, or restart it; if it is gone for"
+    assert f"{lost}not seen: /listener ({runs} good" in robot.close("--proof", status=1).out
     with monkeypatch.context() as patched:
         patched.setattr(close, "_run", ended_before_the_audit(robot, "/listener"))
         stopped = "/listener (process 4712 (run); start it again, or, if it does not always run, "
