@@ -8,7 +8,9 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Mapping
 from contextlib import suppress
+from dataclasses import replace
 from datetime import timedelta
 from pathlib import Path
 from types import SimpleNamespace
@@ -36,6 +38,24 @@ from tests.support.harness import sros
 
 _ANY_RELIABILITY = "qos_profile_sensor_data"
 TALKER = HandNode(Role.TALKER, "cyclone", "/chatter")
+
+
+@pytest.mark.parametrize(("chosen", "used"), [("", "UDPv4"), ("SHM", "SHM")])
+def test_a_node_hears_publishers_of_other_users(
+    chosen: str, used: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Their messages do not pass through shared memory; who chooses a transport keeps it."""
+    name = "FASTDDS_BUILTIN_TRANSPORTS"
+    monkeypatch.delenv(name, raising=False)
+    if chosen:
+        monkeypatch.setenv(name, chosen)
+
+    def started(*_: object, env: Mapping[str, str], **__: object) -> None:
+        raise OSError(env[name])
+
+    monkeypatch.setattr(backend.subprocess, "Popen", started)
+    with pytest.raises(OSError, match=f"^{used}$"):
+        run_by_hand(replace(TALKER, backend="rclpy"), lambda _: None)
 
 
 def test_a_node_says_whether_it_is_secured(keystore: Path) -> None:
