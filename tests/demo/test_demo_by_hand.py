@@ -53,7 +53,7 @@ def test_a_node_hears_publishers_of_other_users(
     def started(*_: object, env: Mapping[str, str], **__: object) -> None:
         raise OSError(env[name])
 
-    monkeypatch.setattr(backend.subprocess, "Popen", started)
+    monkeypatch.setattr(subprocess, "Popen", started)
     with pytest.raises(OSError, match=f"^{used}$"):
         run_by_hand(replace(TALKER, backend="rclpy"), lambda _: None)
 
