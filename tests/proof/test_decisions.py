@@ -14,7 +14,13 @@ from sros_tool.files import templates_dir
 from sros_tool.keystore.template import load_template
 from sros_tool.policy.document import read_policy
 from sros_tool.proof import decide as decisions
-from sros_tool.proof.findings import Decided, decide_all, requirement_findings, short_text
+from sros_tool.proof.findings import (
+    Decided,
+    decide_all,
+    decided_findings,
+    requirement_findings,
+    short_text,
+)
 from sros_tool.proof.requirements import Nobody, Only, Protected, Widest, parse_requirements
 from sros_tool.proof.suggestions import render_requirements, suggest
 from sros_tool.proof.system import System, load_system, policy_system
@@ -237,6 +243,9 @@ def test_what_cannot_fail_is_said(required: str) -> None:
     assert [each for _, reasons in found.vacuous for each in reasons] == ([why] if why else [])
 
 
+FOUND = frozenset({"requirement.holds-alone"})
+
+
 @pytest.mark.parametrize(
     "required",
     [
@@ -248,6 +257,8 @@ def test_a_requirement_of_a_package_may_be_about_the_enclaves_of_users(required:
     """Twin: with the absolute names of a robot, it protects nothing."""
     found = decided(ROBOT, required)
     assert len(found.holding_alone) == 1 and not (found.violations or found.vacuous)
+    (finding,) = decided_findings(found, robot(ROBOT))
+    assert {finding.id} == FOUND and "enclaves" in finding.text
     of_robot = decided(ROBOT, required.replace('"x"', '"/x"'))
     assert len(of_robot.vacuous) == 1 and not of_robot.holding_alone
 
