@@ -14,7 +14,13 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from sros_tool.errors import DocumentError
-from sros_tool.folders import Folder, make_folders, remove_folders, write_all
+from sros_tool.folders import (
+    Folder,
+    make_folders,
+    make_temporary_folder,
+    remove_folders,
+    write_all,
+)
 from sros_tool.terminal import log_step
 
 _MOST_LINKS = 40
@@ -113,11 +119,13 @@ def write_new_file(
 
 
 @contextlib.contextmanager
-def new_files(root: Path, files: Mapping[str, bytes]) -> Iterator[Folder]:
+def new_files(root: Path, files: Mapping[str, bytes]) -> Iterator[None]:
     """Write new files below the folder ``root``; remove the new files if the ``with`` body fails.
 
+    Even if the process is killed, each file is whole or not there.
+
     Args:
-        root: an existing folder, which is yielded.
+        root: an existing folder.
         files: the contents by path relative to ``root``; missing folders on the way are made.
 
     Raises:
@@ -127,19 +135,16 @@ def new_files(root: Path, files: Mapping[str, bytes]) -> Iterator[Folder]:
     made: list[str] = []
     with Folder(root) as folder:
         try:
-            for path, data in files.items():
-                for parent in reversed(PurePosixPath(path).parents[:-1]):
-                    if not folder.is_folder(str(parent)):
-                        folder.mkdir(str(parent), 0o755)
-                        made.append(str(parent))
-                handle = folder.create(path, 0o666)
-                made.append(path)
-                try:
-                    write_all(handle, data)
-                finally:
-                    os.close(handle)
+            with _written(folder, root, files) as spare:
+                for path in files:
+                    _make_parents(folder, path, made)
+                    if folder.state(path):
+                        name = str(root / path)
+                        raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), name)
+                    folder.replace(f"{spare}/{path}", path)
+                    made.append(path)
             folder.flush_file_system()
-            yield folder
+            yield
         except BaseException:
             for path in reversed(made):
                 with contextlib.suppress(OSError):
@@ -149,21 +154,51 @@ def new_files(root: Path, files: Mapping[str, bytes]) -> Iterator[Folder]:
 
 
 def write_new_folder(path: Path, files: Mapping[str, bytes]) -> None:
-    """Make the folder ``path`` with these files, whole or not at all.
-
-    ``files`` maps paths to contents, as in `new_files`.
+    """Make the folder ``path`` with these files, as in `new_files`, whole or not at all.
 
     Raises:
         OSError: the folder cannot be made, or ``path`` is something other than an empty folder.
     """
     paths = make_folders(path.parent)
-    spare = f".{path.name[:200]}.sros-{secrets.token_hex(4)}"
     try:
-        with new_files(path.parent, {f"{spare}/{file}": files[file] for file in files}) as parent:
+        with Folder(path.parent) as parent, _written(parent, path, files) as spare:
+            os.fchmod(parent.handle(spare), 0o755)
             parent.rename(spare, path.name)
     except BaseException:
         remove_folders(paths)
         raise
+
+
+@contextlib.contextmanager
+def _written(parent: Folder, target: Path, files: Mapping[str, bytes]) -> Iterator[str]:
+    """Write files into a temporary folder, and flush them to disk; yield the name of the folder.
+
+    The folder is in ``parent``, and is removed at the end if it is still there. ``target`` is the
+    place that the files are for.
+    """
+    spare, folder = make_temporary_folder(parent, f".{target.name[:200]}.sros-")
+    try:
+        for path, data in files.items():
+            try:
+                _make_parents(folder, path, [])
+                folder.write(path, data, 0o666)
+            except OSError as error:
+                error.filename = str(target / path)
+                raise
+        folder.flush_file_system()
+        yield spare
+    finally:
+        folder.close()
+        if parent.state(spare):
+            parent.remove_tree(spare)
+
+
+def _make_parents(folder: Folder, path: str, made: list[str]) -> None:
+    """Make the missing folders on the way to ``path``, and append them to ``made``."""
+    for parent in map(str, reversed(PurePosixPath(path).parents[:-1])):
+        if not folder.is_folder(parent):
+            folder.mkdir(parent, 0o755)
+            made.append(parent)
 
 
 def remove_file(path: Path) -> None:

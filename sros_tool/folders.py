@@ -10,8 +10,10 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import fcntl
 import os
 import re
+import secrets
 import stat
 import sys
 from collections.abc import Iterable, Iterator
@@ -410,6 +412,43 @@ def remove_folders(paths: list[Path]) -> None:
     for path in paths:
         with contextlib.suppress(OSError):
             path.rmdir()
+
+
+def make_temporary_folder(parent: Folder, prefix: str) -> tuple[str, Folder]:
+    """Make and lock a temporary folder in ``parent``, which only this user can open.
+
+    Temporary folders that killed processes of this user left with the same prefix are removed.
+
+    Returns:
+        The name of the folder, and the open folder: until it is closed, no process removes it.
+    """
+    for name in parent.names():
+        state = parent.state(name) if name.startswith(prefix) else None
+        if not state or not stat.S_ISDIR(state.st_mode) or state.st_uid != os.geteuid():
+            continue
+        with contextlib.suppress(KeystoreError, OSError), Folder(parent.path / name) as stale:
+            if try_lock(stale.handle("")):
+                parent.remove_tree(name)
+    while True:
+        name = f"{prefix}{secrets.token_hex(4)}"
+        parent.mkdir(name, 0o700)
+        # Until the folder is locked, another process may consider it stale and remove it.
+        with contextlib.suppress(FileNotFoundError):
+            folder = Folder(parent.path / name)
+            locked = try_lock(handle := folder.handle(""))
+            state = parent.state(name)
+            if locked and state and os.path.samestat(state, os.fstat(handle)):
+                return name, folder
+            folder.close()
+
+
+def try_lock(handle: int) -> bool:
+    """Lock an open file or folder; False if another process has locked it."""
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
 
 
 def write_all(handle: int, data: bytes) -> None:

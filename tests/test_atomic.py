@@ -6,12 +6,13 @@ import fcntl
 import os
 import stat
 import threading
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from sros_tool import folders
+from sros_tool import files, folders
 from sros_tool.errors import KeystoreError
 from sros_tool.files import new_files, replace_file, write_new_file, write_new_folder
 
@@ -152,3 +153,30 @@ def test_new_files_replace_nothing_follow_no_link_and_go_when_the_rest_fails(
     with new_files(inside, {"b/c": b"c"}):
         pass
     assert tree(inside) == {"a.xml": b"mine", "b/c": b"c"}
+
+
+def write_into(folder: Path, contents: Mapping[str, bytes]) -> None:
+    folder.mkdir(exist_ok=True)
+    with new_files(folder, contents):
+        pass
+
+
+@pytest.mark.parametrize("write", [write_into, write_new_folder])
+def test_a_killed_process_leaves_no_part_of_a_new_file(
+    write: Callable[[Path, Mapping[str, bytes]], None], tmp_path: Path
+) -> None:
+    """An empty drop-in of `sros close --apply` would be one that neither it nor --undo knows."""
+    inside, child = tmp_path / "in", os.fork()
+    if child == 0:
+        try:
+            die = lambda handle, _: os._exit(os.write(handle, b"x"))  # noqa: E731
+            vars(files)["write_all"] = vars(folders)["write_all"] = die
+            write(inside, FILES)
+        finally:
+            os._exit(70)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 1
+    assert [each for each in tree(tmp_path) if ".sros-" not in each] == []
+    assert tree(tmp_path), "nothing was written"
+    write(inside, FILES)
+    assert tree(tmp_path) == {f"in/{path}": data for path, data in FILES.items()}
+    assert sorted(each.name for each in inside.iterdir()) == ["a.xml", "common"]

@@ -25,13 +25,11 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import fcntl
 import hashlib
 import json
 import logging
 import os
 import re
-import secrets
 import signal
 import stat
 import time
@@ -44,7 +42,13 @@ from pathlib import Path
 from typing import NamedTuple, Self, TypeVar, overload
 
 from sros_tool.errors import KeystoreError, SrosError
-from sros_tool.folders import Folder, make_folders, remove_folders
+from sros_tool.folders import (
+    Folder,
+    make_folders,
+    make_temporary_folder,
+    remove_folders,
+    try_lock,
+)
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     CRL,
@@ -468,8 +472,8 @@ class Transaction:
                 )
             self._made_parents = make_folders(self.root.parent)
             with Folder(self.root.parent) as parent:
-                self._remove_stale_siblings(parent)
-                self._make_sibling(parent)
+                prefix = f".{self.root.name}.sros-"
+                self._sibling, self._folder = make_temporary_folder(parent, prefix)
             _LOG.info("began to create the keystore '%s'", self.root)
             return
         self._lock = KeystoreLock(self._target_folder)
@@ -522,34 +526,6 @@ class Transaction:
                 self._folder.close()
                 self._folder = None
             remove_folders(self._made_parents)
-
-    def _make_sibling(self, parent: Folder) -> None:
-        while not self._folder:
-            self._sibling = f"{self._sibling_prefix}{secrets.token_hex(4)}"
-            parent.mkdir(self._sibling, 0o700)
-            # Until the folder is locked, another process may consider it stale and remove it.
-            with contextlib.suppress(FileNotFoundError):
-                folder = Folder(parent.path / self._sibling)
-                if lock_own_folder(folder) and parent.state(self._sibling):
-                    self._folder = folder
-                else:
-                    folder.close()
-
-    def _remove_stale_siblings(self, parent: Folder) -> None:
-        """Remove the sibling folders that killed processes of this user left for this keystore."""
-        for name in parent.names():
-            if not name.startswith(self._sibling_prefix):
-                continue
-            state = parent.state(name)
-            if not state or not stat.S_ISDIR(state.st_mode) or state.st_uid != os.geteuid():
-                continue
-            with contextlib.suppress(KeystoreError, OSError), Folder(parent.path / name) as stale:
-                if lock_own_folder(stale):
-                    parent.remove_tree(name)
-
-    @property
-    def _sibling_prefix(self) -> str:
-        return f".{self.root.name}.sros-"
 
     # ── staging ──────────────────────────────────────────────────────────────────
 
@@ -1056,7 +1032,7 @@ class KeystoreLock:
         try:
             with _signals_held_back():
                 handle = self._folder.open_private(LOCK)
-                if stat.S_ISREG(os.fstat(handle).st_mode) and _try_lock(handle):
+                if stat.S_ISREG(os.fstat(handle).st_mode) and try_lock(handle):
                     if self._is_there(handle):
                         self._handle = handle
                         return True
@@ -1099,22 +1075,6 @@ class KeystoreLock:
                     break  # a file there now would be the lock of another process
             os.close(self._handle)
             self._handle = -1
-
-
-def lock_own_folder(folder: Folder) -> bool:
-    """Lock a folder that only this user can open; False if another process has locked it.
-
-    The lock lasts until the folder is closed.
-    """
-    return _try_lock(folder.handle(""))
-
-
-def _try_lock(handle: int) -> bool:
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    return True
 
 
 @contextlib.contextmanager

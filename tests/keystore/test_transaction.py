@@ -581,7 +581,7 @@ def test_a_lock_file_that_was_removed_before_it_was_locked_is_no_lock(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The process that held the lock removes the file, and a third process makes another one."""
-    lock, file = transactions._try_lock, tmp_path / LOCK
+    lock, file = folders.try_lock, tmp_path / LOCK
     removed: list[Path] = []
 
     def lose_the_first(handle: int) -> bool:
@@ -590,7 +590,7 @@ def test_a_lock_file_that_was_removed_before_it_was_locked_is_no_lock(
             file.unlink()
         return lock(handle)
 
-    monkeypatch.setattr(transactions, "_try_lock", lose_the_first)
+    monkeypatch.setattr(transactions, "try_lock", lose_the_first)
     with Folder(tmp_path) as folder:
         held = KeystoreLock(folder).acquire()
         assert (removed, file.exists()) == ([file], True)
@@ -607,7 +607,7 @@ def test_stale_stages_beside_a_keystore_are_removed_and_those_in_use_are_not(
     used = tmp_path / ".k[s]*.sros-87654321"
     used.mkdir()
     with Folder(used) as in_use:
-        assert transactions.lock_own_folder(in_use)
+        assert folders.try_lock(in_use.handle(""))
         create_keystore(tmp_path / "k[s]*", template=TEMPLATE, now=NOW)
     assert not stale.exists()
     assert used.exists()
@@ -617,16 +617,16 @@ def test_stale_stages_beside_a_keystore_are_removed_and_those_in_use_are_not(
 def test_a_stage_that_was_removed_before_it_was_locked_is_made_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    lock = transactions.lock_own_folder
+    lock = folders.try_lock
     removed: list[Path] = []
 
-    def lose_the_first(folder: Folder) -> bool:
+    def lose_the_first(handle: int) -> bool:
         if not removed:
-            removed.append(folder.path)
-            folder.path.rmdir()
-        return lock(folder)
+            removed.append(Path(os.readlink(f"/proc/self/fd/{handle}")))
+            removed[0].rmdir()
+        return lock(handle)
 
-    monkeypatch.setattr("sros_tool.keystore.transaction.lock_own_folder", lose_the_first)
+    monkeypatch.setattr(folders, "try_lock", lose_the_first)
     create_keystore(tmp_path / "ks", template=TEMPLATE, now=NOW)
     assert removed
     check_whole(tmp_path / "ks")
