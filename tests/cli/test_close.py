@@ -1201,7 +1201,7 @@ def test_a_program_that_starts_its_nodes_has_one_enclave(
     )
     robot.remaining = (LISTENER,)
     said = robot.close("--proof", status=1).out
-    assert "no: everything that talked can still talk: not seen: /talker (if it" in said
+    assert "no: everything that talked can still talk: not seen: /talker (process" in said
 
 
 def test_a_program_that_gives_its_processes_their_enclaves(

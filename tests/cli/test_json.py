@@ -244,7 +244,9 @@ def test_what_a_verb_prints(verb: str, made_folder: Path, tmp_path: Path) -> Non
     whole = drawn(verb, 1 / 4)
     for case in CASES[verb] if whole else CASES[verb][:1]:
         seen.check(verb, both_ways(verb, case, made_folder, tmp_path))
-    assert seen.unseen(verb) == [] or not whole
+    # Only a restored keystore has later changes: tests/agent/test_publish.py restores one.
+    later = "fleet_publish.json#/properties/later/items/"
+    assert not whole or [at for at in seen.unseen(verb) if not at.startswith(later)] == []
 
 
 @pytest.mark.parametrize("verb", WITH_A_GRAPH)
