@@ -138,10 +138,7 @@ def new_files(root: Path, files: Mapping[str, bytes]) -> Iterator[None]:
             with _written(folder, root, files) as spare:
                 for path in files:
                     _make_parents(folder, path, made)
-                    if folder.state(path):
-                        name = str(root / path)
-                        raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), name)
-                    folder.replace(f"{spare}/{path}", path)
+                    _move_to_new_name(folder, f"{spare}/{path}", path, root)
                     made.append(path)
             folder.flush_file_system()
             yield
@@ -191,6 +188,21 @@ def _written(parent: Folder, target: Path, files: Mapping[str, bytes]) -> Iterat
         folder.close()
         if parent.state(spare):
             parent.remove_tree(spare)
+
+
+def _move_to_new_name(folder: Folder, source: str, target: str, root: Path) -> None:
+    """Give the file ``source`` the name ``target``, which must be free, all below ``root``.
+
+    A hard link never replaces a file that somebody made meanwhile; file systems without hard links
+    have no such guarantee.
+    """
+    try:
+        folder.link(source, target)
+    except OSError as error:
+        if isinstance(error, FileExistsError) or folder.state(target):
+            name = str(root / target)
+            raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), name) from None
+        folder.replace(source, target)
 
 
 def _make_parents(folder: Folder, path: str, made: list[str]) -> None:

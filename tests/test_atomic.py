@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import os
 import stat
@@ -15,6 +16,7 @@ import pytest
 from sros_tool import files, folders
 from sros_tool.errors import KeystoreError
 from sros_tool.files import new_files, replace_file, write_new_file, write_new_folder
+from sros_tool.folders import Folder
 
 
 def test_a_file_keeps_its_mode_and_a_link_its_target(tmp_path: Path) -> None:
@@ -130,6 +132,29 @@ def test_a_new_folder_is_whole_or_not_there(tmp_path: Path) -> None:
         write_new_folder(tmp_path / "y/new", {**FILES, "a.xml/c": b""})
     assert [each.name for each in tmp_path.iterdir()] == ["x"]
     assert [each.name for each in (tmp_path / "x").iterdir()] == ["new"]
+
+
+def test_a_file_that_appears_meanwhile_is_not_replaced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Twin: a file system without hard links."""
+    link = Folder.link
+
+    def late(folder: Folder, source: str, target: str) -> None:
+        (tmp_path / target).write_bytes(b"of somebody else")
+        link(folder, source, target)
+
+    def missing(*_: object) -> None:
+        raise OSError(errno.EPERM, os.strerror(errno.EPERM))
+
+    monkeypatch.setattr(Folder, "link", late)
+    with pytest.raises(FileExistsError), new_files(tmp_path, {"a": b"a"}):
+        raise AssertionError
+    assert (tmp_path / "a").read_bytes() == b"of somebody else"
+    monkeypatch.setattr(Folder, "link", missing)
+    with new_files(tmp_path, {"b": b"b"}):
+        assert (tmp_path / "b").read_bytes() == b"b"
+    assert sorted(os.listdir(tmp_path)) == ["a", "b"]
 
 
 def test_new_files_replace_nothing_follow_no_link_and_go_when_the_rest_fails(
