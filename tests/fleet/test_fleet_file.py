@@ -184,7 +184,7 @@ def test_a_value_of_two_groups_is_settled_by_the_robot_or_if_they_agree() -> Non
 
 
 def test_an_unknown_robot_or_group_names_near_ones() -> None:
-    with pytest.raises(DocumentError, match=r"no robot 'r8'.* r7, r1"):
+    with pytest.raises(DocumentError, match=r"no robot 'r8'.* r1, r7"):
         fleet().robot("r8")
     with pytest.raises(DocumentError, match=r"no group 'carrier'.* carriers"):
         fleet().members("carrier")
