@@ -515,7 +515,7 @@ class _Round:
             key: exposed[key]
             for key in exposed.keys() - exposed_keys(self._folder, now)
             if (self._folder / key).exists()  # a removed enclave has no key
-            and self._key_digest(key) == (digests.get(key) or self._key_digest(key))
+            and (not digests.get(key) or digests[key] == self._key_digest(key))
         }
         digests = {key: digest for key, digest in digests.items() if key in exposed}
         self._state = replace(self._state, exposed=closed, exposed_digests=digests)

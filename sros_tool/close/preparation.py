@@ -328,19 +328,20 @@ def _problems_of(robot: LocalRobot, state: CloseState, *, partial: bool) -> Iter
             f"the export has {name}, which is not in the keystore and was not revoked there: "
             f"{remove}"
         )
-    yield from _copy_problems(robot)
+    running = RunningRobot(robot)
+    yield from _copy_problems(running)
     yield from _user_problems(robot, state.observed)
     yield from _launch_problems(robot, state.observed)
     if not partial:
-        yield from _unknown_process_problems(robot, state)
+        yield from _unknown_process_problems(running, state)
 
 
-def _copy_problems(robot: LocalRobot) -> Iterator[str]:
+def _copy_problems(running: RunningRobot) -> Iterator[str]:
     """Yield a text for each process in an enclave of the export with files of another folder."""
-    export = robot.export.absolute()
+    export = running.robot.export.absolute()
     copies = (
         process
-        for process in RunningRobot(robot).in_domain
+        for process in running.in_domain
         if process.enclave and has_other_files(process.enclave, export)
     )
     for finding in other_folder_findings(copies, export):
@@ -401,9 +402,10 @@ def _launch_problems(robot: LocalRobot, observed: ObservedProcesses) -> Iterator
             )
 
 
-def _unknown_process_problems(robot: LocalRobot, state: CloseState) -> Iterator[str]:
+def _unknown_process_problems(running: RunningRobot, state: CloseState) -> Iterator[str]:
     """Yield the processes without known nodes, and the nodes without a known process."""
-    observed, close = state.observed, robot.close_command
+    robot, observed = running.robot, state.observed
+    close = robot.close_command
     silent = "nobody would hear them any more (--partial accepts this)"
     if observed.unknown:
         processes = first_few(observed.unknown, MOST_NAMES)
@@ -423,7 +425,7 @@ def _unknown_process_problems(robot: LocalRobot, state: CloseState) -> Iterator[
             f"sros saw no node of {counted(len(observed.unknown), 'process', 'processes')}: "
             f"{processes}; {advice}; otherwise {silent}"
         )
-    routers = [process for process in RunningRobot(robot).open_processes if process.is_router]
+    routers = [process for process in running.open_processes if process.is_router]
     if routers and not any(process.is_router for process in observed.processes):
         yield (
             f"{routers[0].label} is a Zenoh router that did not run when sros watched, or does not "

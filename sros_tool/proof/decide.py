@@ -686,8 +686,9 @@ def _missing_enclaves_clauses(requirement: Requirement, world: World) -> Iterato
             patterns = (*requirement.sources, *requirement.targets, *requirement.through)
     for pattern in dict.fromkeys(patterns):
         name = pattern.removeprefix(EXCEPT)
-        if is_expression(name) and (pattern[0] == EXCEPT or requirement.is_relative):
-            continue  # for enclaves that do not exist yet, such as those of a package's users
+        is_allowed = isinstance(requirement, Only) and requirement.is_relative
+        if is_expression(name) and (pattern[0] == EXCEPT or is_allowed):
+            continue  # allows enclaves that do not exist yet, such as those of a package's users
         if not fnmatch.filter(world.enclaves, name):
             yield f"there is no enclave {pattern}{_meant_clause(name, [frozenset(world.enclaves)])}"
 

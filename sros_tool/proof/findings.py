@@ -30,6 +30,7 @@ from sros_tool.names import (
     service_of,
 )
 from sros_tool.policy.model import ALLOW, Level, Source
+from sros_tool.policy.patterns import covers
 from sros_tool.policy.remapping import Remapping, has_new_name
 from sros_tool.policy.rights import KIND_OF, Right
 from sros_tool.proof.decide import MOST_STEPS, BlockedUse, Use, Verdict, Witness, Worlds
@@ -194,8 +195,9 @@ def decide_all(requirements: Sequence[Requirement], system: System) -> Decided:
                 Violation(requirement, witness, steps, titles, missing, idle, other_steps)
             )
         if reasons := tuple(_never_fails([verdict for _, verdict in verdicts])):
-            needs_others = requirement.is_relative and isinstance(requirement, Only | AtMost)
-            is_alone = needs_others and all(verdict.always for _, verdict in verdicts)
+            is_alone = all(verdict.always for _, verdict in verdicts) and _users_may_break(
+                requirement
+            )
             (holding_alone if is_alone else vacuous).append((requirement, reasons))
         if not broken and (names := _texts_in_all(verdict.unnamed for _, verdict in verdicts)):
             unnamed.append((requirement, names))
@@ -214,6 +216,20 @@ def decide_all(requirements: Sequence[Requirement], system: System) -> Decided:
         unnamed=tuple(unnamed),
         unjudged=unjudged,
         holding_alone=tuple(holding_alone),
+    )
+
+
+def _users_may_break(requirement: Requirement) -> bool:
+    """Return whether further enclaves, of a package's users, could break a requirement."""
+    anywhere = requirement.elsewhere or requirement
+    if not requirement.is_relative:
+        return False
+    return isinstance(anywhere, AtMost) or (
+        isinstance(anywhere, Only)
+        and (
+            any(pattern.startswith(EXCEPT) for pattern in anywhere.enclaves)
+            or not any(covers(pattern, "/*") for pattern in anywhere.enclaves)
+        )
     )
 
 

@@ -29,7 +29,7 @@ from sros_tool.checks.keystores.issued import (
 from sros_tool.checks.keystores.opened import Circumstances
 from sros_tool.checks.kind import WARNING, ChosenFindings, Finding, FindingFilter
 from sros_tool.checks.policies import is_mended_by
-from sros_tool.checks.requirements import DROPPED, UNNAMED, VACUOUS, VIOLATED
+from sros_tool.checks.requirements import DROPPED, VACUOUS, VIOLATED
 from sros_tool.checks.targets import path_findings, policy_findings
 from sros_tool.errors import DocumentError, SrosError
 from sros_tool.faults import Fault
@@ -92,6 +92,8 @@ from sros_tool.proof.commit_files import (
 )
 from sros_tool.proof.decide import restricted_enclaves
 from sros_tool.proof.findings import (
+    decide_all,
+    decided_findings,
     left_out_robot_findings,
     requirement_findings,
     unused_remapping_findings,
@@ -1400,9 +1402,9 @@ def _failures(
 
     A name that no right states counts only if a right of ``before`` states it.
     """
-    findings = requirement_findings([requirement], system)
-    if before and any(finding.kind is UNNAMED for finding in findings):
-        findings = requirement_findings([requirement], system, before().rights)
+    decided = decide_all([requirement], system)
+    rights = before().rights if before and decided.unnamed else ()
+    findings = decided_findings(decided, system, rights)
     return [finding for finding in findings if finding.kind in (VIOLATED, VACUOUS)]
 
 

@@ -263,6 +263,19 @@ def test_a_requirement_of_a_package_may_be_about_the_enclaves_of_users(required:
     assert len(of_robot.vacuous) == 1 and not of_robot.holding_alone
 
 
+@pytest.mark.parametrize(
+    "required",
+    [
+        '[[only]]\npublish = ["x"]\nenclaves = ["*"]',
+        '[[nothing_but]]\npublish = ["x"]\nenclaves = ["/tpyo*"]',
+        '[[widest]]\npublish = ["x"]\nenclaves = ["/tpyo*"]',
+    ],
+)
+def test_a_requirement_of_a_package_that_users_cannot_break_either(required: str) -> None:
+    found = decided(ROBOT, required)
+    assert len(found.vacuous) == 1 and not found.holding_alone
+
+
 READ_BY_ALL = {"/mux": may("publish", "/cmd_vel", "/arm_l/cmd"), "/rec": may("subscribe", "/*")}
 SLIPS = ("/cmd_vle", "/cmd_ve", "/cmd_vell", "/cmdvel", "/cnd_vel")
 OTHER_NAMES = ("/cmd_vel2", "/cmd_vel_raw", "/arm_r/cmd", "/robot/cmd_vel")
