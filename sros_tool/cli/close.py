@@ -122,7 +122,7 @@ def close(
 
     Nothing is closed before --apply, which restarts the processes that are systemd units, and
     shows the commands for all others. --proof checks that every process was started in its enclave,
-    that the files of the enclaves have no error, that everything that talked can still talk, and
+    that the files of the enclaves have no error, that everything that talked may still talk, and
     that an open listener finds nothing. --apply also proves this, if nothing is left to do by hand.
     --undo makes the robot open again.
 
