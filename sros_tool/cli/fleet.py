@@ -557,6 +557,15 @@ def _published_lines(published: PublishedFleet, moment: datetime) -> Iterator[st
         )
     if published.versions.get("timestamp") == 1:
         yield f"robots pin {published.root}, SHA-256 {published.root_sha256}"
+    accepting = "robots accept"
+    if published.refused_by:
+        accepting = "robots that trust this CA accept"
+        yield (
+            "refused by robots that, by their last messages, do not trust the permissions CA of "
+            f"these files: {first_few(published.refused_by, _MOST_GROUPS)}. Bring their files by "
+            f"hand: `sros distribute_key {quote(str(published.keystore))} --robot NAME FOLDER "
+            "--force`"
+        )
     if published.expires:
         end, role = min((end, role) for role, end in published.expires.items())
         next_step = "publish again"
@@ -564,7 +573,7 @@ def _published_lines(published: PublishedFleet, moment: datetime) -> Iterator[st
             where = f"{quote(str(published.keystore))} {quote(str(published.folder))}"
             next_step = f"`sros fleet publish {where} --root-key FILE`"
         yield (
-            f"robots accept these files until {iso(end)}: {next_step} before then"
+            f"{accepting} these files until {iso(end)}: {next_step} before then"
             if end > moment
             else f"robots refuse these files, because the root metadata has expired: {next_step}"
         )

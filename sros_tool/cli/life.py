@@ -565,9 +565,6 @@ def rotate_ca(
             old_keys_elsewhere=step.kept_elsewhere,
             remarks=() if dry_run else rotation_status(OpenedKeystore(root), now=now()).remarks,
         )
-    elif not dry_run:
-        reached = rotation_status(OpenedKeystore(root), now=now())
-        _print_step(step, reached, together=finish, same_key=same_key)
     cannot = "could not" if dry_run else "cannot"
     cut_off = (
         f"cut off: {', '.join(step.cut_off)} {cannot} talk to robots with the files of this stage "
@@ -587,12 +584,19 @@ def rotate_ca(
             f"`sros distribute_key {quote(str(root))} --robot NAME FOLDER --force`, and bring "
             "FOLDER to the robot"
         )
-    print_changed(step, shown, after=[cut_off] if step.cut_off else (), restart=False)
+    done, to_do = "", list[str]()
+    if not (as_json or dry_run):
+        reached = rotation_status(OpenedKeystore(root), now=now())
+        done, to_do = _step_lines(step, reached, together=finish, same_key=same_key)
+    if step.cut_off:
+        to_do.insert(1, cut_off)  # after the delivery, before restarts
+    print_changed(step, shown, [done] if done else (), first=to_do, restart=False)
 
 
-def _print_step(
+def _step_lines(
     step: RotationStep, status: RotationStatus, *, together: bool, same_key: bool
-) -> None:
+) -> tuple[str, list[str]]:
+    """Return what a step of a rotation did, or "", and what to do next, in this order."""
     from sros_tool.keystore.expiry import ONE_BY_ONE
     from sros_tool.keystore.fleet import deliver_first_sentence
 
@@ -602,24 +606,23 @@ def _print_step(
             if status.rotation.stage == "none"
             else f"the keystore is at the stage {status.rotation.stage}"
         )
-        echo(f"nothing is left to do: {done}", err=True)
-        return
+        return "", [f"nothing is left to do: {done}"]
     if same_key:
-        echo("renewed the identity CA with the same key; certificates that it issued stay valid")
-        echo(
+        done = "renewed the identity CA with the same key; certificates that it issued stay valid"
+        return done, [
             f"All vendors: {ONE_BY_ONE} Certificates keep their expiry: `sros renew {step.root} "
-            "--all-expiring 30d` renews certificates that expire soon.",
-            err=True,
-        )
-        return
+            "--all-expiring 30d` renews certificates that expire soon."
+        ]
     reissued = any(change.path.endswith("/cert.pem") for change in step.changes)
     done = f"{_STAGE_DONE_TEXTS['reissue']}, and " if together and reissued else ""
-    echo(f"{done}{_STAGE_DONE_TEXTS[step.stage]}: {', '.join(step.files)}")
+    to_do = []
     if step.stage == "retire":
-        how = "Restart all processes together." if together else f"All vendors: {ONE_BY_ONE}"
-        echo(f"{how} {deliver_first_sentence(step.root)}", err=True)
-    for remark in status.remarks:
-        echo(remark, err=True)
+        how = "Then restart all processes together." if together else f"All vendors: {ONE_BY_ONE}"
+        to_do = [deliver_first_sentence(step.root), how]
+    return f"{done}{_STAGE_DONE_TEXTS[step.stage]}: {', '.join(step.files)}", [
+        *to_do,
+        *status.remarks,
+    ]
 
 
 def _unconfirmed_robots(keystore: OpenedKeystore) -> tuple[str, ...] | str:

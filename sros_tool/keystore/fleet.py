@@ -229,7 +229,7 @@ def deliver_first_sentence(root: Path) -> str:
     """Return a sentence on how to deliver new files to robots before restarting processes."""
     published = publish_command(root)
     before = f"For robots that fetch, first publish the files: {published}. " if published else ""
-    text = "If processes run from an export, export the enclaves again first."
+    text = "If processes run from an export, first export the enclaves again."
     return f"{before}{remedy_in_closed_robot(root, text)}"
 
 

@@ -540,15 +540,21 @@ def test_a_robot_that_missed_a_stage_gets_its_files_by_hand(field: Field) -> Non
     for robot in ROBOTS:
         field.send(robot, release=1)
     field.run("rotate_ca", "ks", "--next")
-    field.run("fleet", "publish", "ks", "pub")
+    assert "\nrobots accept" in field.run("fleet", "publish", "ks", "pub").out
     assert to_do() == "wait: it fetches"
+    field.deliver("r1")
+    field.send("r1", release=1)
     said = field.run("rotate_ca", "ks", "--next", "--allow-unconfirmed").err
     assert (
         "refuses all later releases: run `sros distribute_key ks --robot NAME FOLDER --force`"
         in said
     )
     assert to_do() == "wait: it fetches", "the published release is that of the earlier stage"
-    field.run("fleet", "publish", "ks", "pub")
+    places = [said.index(text) for text in ("first publish", "cut off", "all processes together")]
+    assert places == sorted(places), "what comes first is said first"
+    told = field.run("fleet", "publish", "ks", "pub").out
+    assert "do not trust the permissions CA of these files: r2, r3. Bring their" in told
+    assert "\nrobots that trust this CA accept these files until" in told
     assert to_do() == "deliver"
     refused = "Release 3 is not sealed by a CA that this robot trusts: it is not."
     field.send("r2", release=1, problems=(refused,))

@@ -247,12 +247,12 @@ def test_what_fast_dds_cannot_tell_apart_is_said(kind: str, separate: Path) -> N
     """ros2/sros2 makes CAs without identifiers; Fast DDS 2.9.1 was run with those."""
     rotate_ca(separate, now=NOW)
     rotate_ca(separate, now=NOW)
-    fast = rotation_status(OpenedKeystore(separate), now=NOW).remarks[0]
+    fast = rotation_status(OpenedKeystore(separate), now=NOW).remarks[1]
     assert fast.startswith("Fast DDS: restart the processes one by one")
     foreign = foreign_ca(kind)
     path = separate / "public/permissions_ca.cert.pem"
     path.write_bytes(path.read_bytes() + foreign)
-    fast = rotation_status(OpenedKeystore(separate), now=NOW).remarks[0]
+    fast = rotation_status(OpenedKeystore(separate), now=NOW).remarks[1]
     assert fast.startswith("Fast DDS: the old permissions CA has ")
     assert fast.endswith("Restart all processes together.")
 

@@ -73,13 +73,15 @@ from sros_tool.keystore.layout import (
     IDENTITY_CA_FILE,
     LIST_FILES,
     PERMISSIONS,
+    PERMISSIONS_CA_FILE,
     PUBLISHED,
+    RETIRED,
     ca_certificate,
     enclave_folder,
     enclave_path,
     fleet_key,
 )
-from sros_tool.keystore.ledger import PUBLISHING, REPORTED, Entry
+from sros_tool.keystore.ledger import PUBLISHING, REPORTED, SAME_KEY, Entry
 from sros_tool.keystore.lifecycle.change import KeystoreChange
 from sros_tool.keystore.lifecycle.revocation_list import LostRecords
 from sros_tool.keystore.lifecycle.revoke import (
@@ -175,6 +177,10 @@ class PublishedFleet(NamedTuple):
     """File in the publishing folder with the root metadata that robots should pin."""
     root_sha256: str
     """SHA-256 of the root metadata, in hexadecimal."""
+    refused_by: Sequence[str]
+    """Robots that refuse their release, because by their last message they do not trust the
+    permissions CA that sealed it: their files have to be brought by hand.
+    """
     later: Sequence[LaterChange]
     """With ``--restored``: changes from after the backup that the keystore lacks."""
     changes: FileChanges
@@ -1344,6 +1350,7 @@ class _Publication:
                 outcome = "refused" if why else "published"
                 outcomes[robot] = RobotRelease(robot, outcome, number, why)
         path, data = list(self.roots.files())[-1]
+        sealed = [name for name, done in outcomes.items() if done.outcome in ("published", "kept")]
         return PublishedFleet(
             self.keystore.root,
             self._dry_run,
@@ -1354,10 +1361,33 @@ class _Publication:
             {**self._composed.expires, "root": keys.roots.last.expires} if self._composed else {},
             self._folder / path,
             hashlib.sha256(data).hexdigest(),
+            list(_robots_without_ca(self.keystore, sorted(sealed))),
             self._later,
             self._changes,
             (*self._notes, *keys.notes),
         )
+
+
+def _robots_without_ca(keystore: OpenedKeystore, robots: Iterable[str]) -> Iterator[str]:
+    """Yield the robots that by their last message do not trust the CA that seals releases."""
+    if not (keystore.root / RETIRED).exists():  # no CA was ever replaced
+        return
+    sealing_ca = digest(keystore.authority(PERMISSIONS)[0])
+    issued = keystore.ledger_with("sha256", sealing_ca).entries
+    if any(entry.sha256 == sealing_ca and entry.reason == SAME_KEY for entry in issued):
+        return
+    for robot in robots:
+        with suppress(SrosError):  # `fleet status` reports a damaged confirmation
+            received = last_confirmation(keystore, robot)
+            certificates = received.confirmation.certificates if received else {}
+            trusted = [
+                sha256
+                for path, digests in certificates.items()
+                for sha256 in digests
+                if path.endswith(f"/{PERMISSIONS_CA_FILE}")
+            ]
+            if received and received.message and trusted and sealing_ca not in trusted:
+                yield robot
 
 
 def _files_digest(root: Path, names: Sequence[str]) -> str:

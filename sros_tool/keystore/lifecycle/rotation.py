@@ -278,11 +278,12 @@ def _restart_remarks(keystore: OpenedKeystore, rotation: Rotation) -> list[str]:
     files = [replacement.file for replacement in rotation.replacements]
     if rotation.stage is RotationStage.DISTRIBUTE:
         return [
-            f"All vendors: {ONE_BY_ONE} Continue when all have been restarted.",
             deliver_first_sentence(keystore.root),
+            f"All vendors: {ONE_BY_ONE} Continue when all have been restarted.",
         ]
     hindrance = _fast_dds_hindrance(keystore, files)
     remarks = [
+        deliver_first_sentence(keystore.root),
         f"Fast DDS: {hindrance} Restart all processes together."
         if hindrance
         else f"Fast DDS: {ONE_BY_ONE} Continue when all have been restarted.",
@@ -297,7 +298,7 @@ def _restart_remarks(keystore: OpenedKeystore, rotation: Rotation) -> list[str]:
             "Revocations at this stage are signed by both CAs, if the key of the old CA is "
             "available."
         )
-    return [*remarks, deliver_first_sentence(keystore.root)]
+    return remarks
 
 
 def are_crls_confusable(old: x509.Certificate, new: x509.Certificate) -> bool:
