@@ -362,6 +362,8 @@ def _show_end(
             stop = _started_together(processes)
             echo(f"stop {stop}, and start it with:" if stop else "start again with:")
             echo(f"  {command}")
+            if advice := processes[0].launch_advice(robot.folder.absolute()):
+                echo(f"  {advice}")
         answer = f"next: run these commands, and then {ask}"
         if not_starting := _advice_without_security(robot, closed):
             answer = f"no node would start by these commands yet; next: {not_starting}"

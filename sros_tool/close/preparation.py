@@ -39,7 +39,7 @@ from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.selection import revocation_of
 from sros_tool.policy.document import read_policy
 from sros_tool.runtime.environment import RMW_ZENOH, node_argument
-from sros_tool.runtime.processes import SEVERAL_USERS, launch_verb
+from sros_tool.runtime.processes import SEVERAL_USERS, without_launch_files
 from sros_tool.runtime.rmw import (
     RMW,
     no_security_text,
@@ -390,10 +390,17 @@ def _user_problems(robot: LocalRobot, observed: ObservedProcesses) -> Iterator[s
 
 
 def _launch_problems(robot: LocalRobot, observed: ObservedProcesses) -> Iterator[str]:
-    """Yield the processes that `ros2 launch` would not start in their enclaves."""
+    """Yield the processes that their launch would not start in their enclaves."""
     for process in observed.processes:
         command = process.command
-        if process.launch and not (node_argument(command) or launch_verb(command)):
+        by_launch = process.launch or process.container
+        if not by_launch and without_launch_files(command) != tuple(command):
+            yield (
+                f"the launch that started the process of {process.enclave} has ended, and with it "
+                "temporary files that the command of the process names. Start the launch again, "
+                f"and watch again: {robot.close_command} --for 1m"
+            )
+        if process.launch and not (node_argument(command) or process.is_launch):
             words = run_words(robot.export.absolute(), process.enclave, process.rmw)
             prefix = f"prefix='{' '.join(words)}'"
             yield (

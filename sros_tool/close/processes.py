@@ -14,7 +14,13 @@ from typing import Annotated, Any, NamedTuple, TypeVar
 from sros_tool.enclave_environment import RMWS
 from sros_tool.errors import DocumentError
 from sros_tool.policy.model import Policy
-from sros_tool.runtime.environment import RMW_ZENOH, ROS_ARGS, named_enclave
+from sros_tool.runtime.environment import (
+    REFUSING,
+    REFUSING_DDS,
+    RMW_ZENOH,
+    ROS_ARGS,
+    named_enclave,
+)
 from sros_tool.runtime.processes import (
     SERVICE_NAME,
     Process,
@@ -22,6 +28,8 @@ from sros_tool.runtime.processes import (
     RunningProcesses,
     launch_verb,
     process_origin,
+    program_of,
+    without_launch_files,
 )
 from sros_tool.runtime.rmw import RMW
 from sros_tool.runtime.variables import DOMAIN, ENCLAVE
@@ -56,7 +64,8 @@ class ClosedProcess(NamedTuple):
     ]
     """How sros knows that this process has the nodes of the enclave."""
     launch: Sequence[str] = ()
-    """The command of the `ros2 launch` that started it; empty for a process of its own."""
+    """The command of the launch that started it: `ros2 launch`, or a Python program that runs a
+    launch description; empty for a process of its own."""
     container: str = ""
     """The id of the Docker container in which it runs; empty outside of containers."""
     rmw: str = ""
@@ -92,6 +101,11 @@ class ClosedProcess(NamedTuple):
         return tuple(self.command[:2]) == ("sros", "demo")
 
     @property
+    def is_launch(self) -> bool:
+        """Whether the process itself runs a launch description, and has a node of its own."""
+        return bool(self.launch) and tuple(self.command) == tuple(self.launch)
+
+    @property
     def pids_text(self) -> str:
         """The id of the process, or the ids that fit equally, as text; "" if none runs."""
         if self.alike:
@@ -110,15 +124,19 @@ class ClosedProcess(NamedTuple):
     def fits(self, process: Process) -> bool:
         """Return whether a process has this command and RMW; all Zenoh routers fit each other.
 
-        The command may have the argument for the enclave that ``sros run`` adds.
+        The command may have the argument for the enclave that ``sros run`` adds, and the temporary
+        files of another launch.
         """
         if self.is_router and process.is_router:
             return True
         rmws = {self.rmw, _rmw_to_start(process)}
         if len(rmws - {""}) > 1 or rmws == {"", RMW_ZENOH}:  # a process that names no RMW is on DDS
             return False
-        words = command_without_enclave(_start_command(process), self.enclave)
-        return words == command_without_enclave(self.command, self.enclave)
+        started, known = (
+            without_launch_files(command_without_enclave(command, self.enclave))
+            for command in (_start_command(process), self.command)
+        )
+        return started == known
 
     def with_current_pid(
         self, running: RunningProcesses, domain: int, export: Path
@@ -171,23 +189,41 @@ class ClosedProcess(NamedTuple):
         """Return the shell command that starts the process, its launch or containers with security.
 
         ``folder`` is the folder of the closed robot, and ``launch_enclave`` the enclave of the node
-        of `ros2 launch` itself.
+        of the launch itself. A Python program that runs a launch description gets variables with
+        which none of its nodes starts, unless it secures them: see `launch_advice`.
         """
         if self.container:
             overlay = shlex.quote(str(folder / "start" / COMPOSE_FILE))
             return f"docker compose -f compose.yaml -f {overlay} up -d"
         words = (_sros_word(), *self.command[1:]) if self.is_demo else self.command
-        if self.launch:
-            after = launch_verb(self.launch) + 1
-            words = launch_words(folder, self.launch[:after], self.launch[after:])
+        variables = {RMW: self.rmw} if self.rmw else {}
+        if verb := launch_verb(self.launch):
+            words = launch_words(folder, self.launch[: verb + 1], self.launch[verb + 1 :])
+        elif self.launch:
+            words = self.launch
+            variables = {**variables, **(REFUSING if self.rmw == RMW_ZENOH else REFUSING_DDS)}
         elif self.lacks_enclave_argument:
             words = (*words, ROS_ARGS, "--enclave", self.enclave)
         enclave = launch_enclave if self.launch else self.enclave
         if enclave:
             words = (*run_words(folder / "export", enclave, self.rmw), *words)
-        elif self.rmw:
-            words = ("env", f"{RMW}={self.rmw}", *words)
+        elif variables:
+            words = ("env", *(f"{name}={value}" for name, value in variables.items()), *words)
         return f"cd {_shell_word(self.folder)} && {' '.join(map(_shell_word, words))}"
+
+    def launch_advice(self, folder: Path) -> str:
+        """Return what a Python program that starts the process by a launch description lacks.
+
+        Returns "" for a process that `ros2 launch` or no launch starts.
+        """
+        if not self.launch or self.container or launch_verb(self.launch):
+            return ""
+        given = f"keystore={str(folder / 'export')!r}, policy={str(folder / 'policy.xml')!r}"
+        return visible(
+            f"{program_of(tuple(self.launch))} runs a launch description itself. First put "
+            f"SecuredNodes({given}) from sros_tool.launch in front of its nodes, once "
+            "(docs/launch.md); without it, none of them starts."
+        )
 
 
 def _start_command(process: Process) -> tuple[str, ...]:
@@ -338,7 +374,7 @@ class ObservedProcesses(NamedTuple):
         launches = {
             tuple(process.launch): process.enclave
             for process in self.processes
-            if launch_verb(process.command)
+            if process.is_launch
         }
         commands: dict[str, list[ClosedProcess]] = {}
         for process in sorted(self.processes, key=lambda process: process.enclave != ROUTER):

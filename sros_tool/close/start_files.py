@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 import shutil
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
 
 from sros_tool.close.processes import COMPOSE_FILE, ClosedProcess, ObservedProcesses, launch_words
 from sros_tool.close.robot import LocalRobot
@@ -110,14 +111,14 @@ def _commands_text(robot: LocalRobot, state: CloseState) -> str:
         lines = [f"# Stop each of these processes, and start it {place}"]
     if not state.secured:
         lines = [*map(_warning_of_rmw, robot.rmws_without_security()), *lines]
-    lines = [*lines, *_commands(due)] if due else []
+    lines = [*lines, *_commands(due, folder)] if due else []
     for name in state.new:
         start = state.observed.command_of_new(robot.export.absolute(), name)
         why = "has ended" if name in state.observed.ended else "is new"
         lines += ["", f"# {name} {why}: COMMAND is what starts it", start]
     if rest:
         lines += ["", "# These processes run closed, with the current files."]
-    lines += _commands(rest)
+    lines += _commands(rest, folder)
     if shutil.which("ros2", path=robot.shell.environment.get("PATH")):
         launch = shlex.join(launch_words(folder, ("ros2", "launch"), ("PACKAGE", "FILE")))
         lines += ["", "# Any launch file; each process needs name= in it.", launch]
@@ -129,10 +130,12 @@ def _warning_of_rmw(rmw: str) -> str:
     return f"# NOT YET: {no_security_text(rmw)}. First find an RMW that enforces it: sros doctor"
 
 
-def _commands(by_hand: Mapping[str, Sequence[ClosedProcess]]) -> Iterator[str]:
+def _commands(by_hand: Mapping[str, Sequence[ClosedProcess]], folder: Path) -> Iterator[str]:
     """Yield the lines of commands, below comments with the enclaves of their processes."""
     for command, processes in by_hand.items():
-        yield from ("", f"# {', '.join(process.enclave for process in processes)}", command)
+        advice = processes[0].launch_advice(folder)
+        yield from ("", f"# {', '.join(process.enclave for process in processes)}")
+        yield from (*((f"# {advice}",) if advice else ()), command)
 
 
 def _text(lines: Iterable[str]) -> str:

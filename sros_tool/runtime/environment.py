@@ -83,12 +83,9 @@ def secured_environment(root: Path, name: str, domain: int) -> dict[str, str]:
     }
 
 
-REFUSING: Mapping[str, str] = {
-    KEYSTORE: "",
-    ENABLE: "true",
-    STRATEGY: "Enforce",
-    **REFUSING_ZENOH,
-}
+REFUSING_DDS: Mapping[str, str] = {KEYSTORE: "", ENABLE: "true", STRATEGY: "Enforce"}
+"""Variables that keep rcl from starting nodes."""
+REFUSING: Mapping[str, str] = {**REFUSING_DDS, **REFUSING_ZENOH}
 """Variables that keep rcl from starting nodes, and rmw_zenoh_cpp from starting a router."""
 
 

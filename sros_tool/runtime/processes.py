@@ -618,8 +618,9 @@ class ProcessOrigin(NamedTuple):
     """The way in which a process was started; unknown parts are empty.
 
     ``unit`` is the systemd system service, ``folder`` the working directory, ``launch`` the command
-    of the ``ros2 launch`` that started the process (or that is the process), and ``container`` the
-    id of its Docker or Podman container.
+    of the launch that started the process (or that is the process): ``ros2 launch``, or a Python
+    program that runs a launch description.  ``container`` is the id of its Docker or Podman
+    container.
     """
 
     unit: str = ""
@@ -636,16 +637,47 @@ def process_origin(pid: int, proc: Path = Path("/proc")) -> ProcessOrigin:
         unit = service[1] if (service := _SERVICE.search(text)) else ""
         container = named[1][:12] if (named := _CONTAINER.search(text)) else ""
         folder = str((proc / str(pid) / "cwd").readlink())
+    child: tuple[str, ...] = ()
     with suppress(OSError, IndexError, ValueError):
         while pid > 1:
             handle = os.open(proc / str(pid), os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
             try:
-                command, pid = tuple(_words(handle, "cmdline")), _stat(handle).parent
+                command, parent = tuple(_words(handle, "cmdline")), _stat(handle).parent
+                is_launch = launch_verb(command) or _runs_launch(handle, pid, command, child)
             finally:
                 os.close(handle)
-            if launch_verb(command):
+            if is_launch:
                 return ProcessOrigin(unit, folder, command, container)
+            child, pid = command, parent
     return ProcessOrigin(unit, folder, (), container)
+
+
+def _runs_launch(folder: int, pid: int, command: Sequence[str], child: Sequence[str]) -> bool:
+    """Return whether a Python program runs a launch description, by ``launch.LaunchService``.
+
+    A child process that launch_ros started shows it: ``child``, or a child of the main thread.
+    """
+    is_python = Path(command[0]).name.startswith("python")
+    if not is_python or without_launch_files(command) != tuple(command):
+        return False
+    children = [tuple(child)]
+    with suppress(OSError):  # the kernel may lack the list
+        for number in _read(folder, f"task/{pid}/children", _MOST_BYTES).decode().split():
+            with suppress(OSError):  # the child has ended
+                children.append(tuple(_words(folder, f"../{number}/cmdline")))
+    return any(without_launch_files(words) != words for words in children)
+
+
+def without_launch_files(command: Sequence[str]) -> tuple[str, ...]:
+    """Return a command without the names of the temporary files that launch_ros made for it.
+
+    These files have parameters, and a launch makes them again with other names (launch_ros 0.19 to
+    0.28, ``launch_ros/actions/node.py``).
+    """
+    return tuple(_LAUNCH_FILE.sub(r"\1*", word) for word in command)
+
+
+_LAUNCH_FILE = re.compile(r"(/launch_params_)[a-z0-9_]{8}\b")
 
 
 def launch_verb(command: Sequence[str]) -> int:

@@ -98,6 +98,8 @@ class Robot:
     launch: tuple[str, ...] = ()
     container: str = ""
     named: bool = False
+    launch_file: str = ""
+    """The temporary file that a launch gave its processes."""
     spelled: str = "robot/export"
     """How the processes name the export."""
     absent: set[str] = field(default_factory=set)
@@ -115,6 +117,8 @@ class Robot:
         command: tuple[str, ...] = ("/opt/run", enclave.strip("/"))
         if self.named:
             command += ("--ros-args", "-r", f"__node:={enclave.strip('/')}")
+        if self.launch_file:
+            command += ("--params-file", self.launch_file)
         libraries, now = frozenset({"libfastrtps"}), datetime.now(UTC)
         process = Process(PID[enclave], command, {}, now, libraries=libraries, user=os.geteuid())
         if not is_secured:
@@ -1759,3 +1763,30 @@ def test_a_process_that_was_launched_is_launched_secured(tmp_path: Path, robot: 
     undone = robot.close("--undo", status=1).out
     restart = "restart /listener and /talker open: cd /opt && /usr/bin/python3 /opt/ros/jazzy/bin"
     assert undone.count(restart) == undone.count("restart ") == 1
+
+
+def test_a_program_that_runs_a_launch_description_starts_no_open_node(robot: Robot) -> None:
+    """Its nodes have temporary files, so it is started itself, and has to secure its nodes."""
+    robot.named, robot.launch_file = True, "/tmp/launch_params_a1b2c3d4"
+    said = robot.close("--for", "1s", status=1).out
+    assert "the launch that started the process of /listener has ended, and with it" in said
+    robot.launch = ("python3", "bringup.py")
+    robot.close("--for", "1s")
+    robot.launch_file = "/tmp/launch_params_4d3c2b1a"  # as after a restart
+    place = robot.folder / "robot"
+    command = (
+        "cd /opt && env ROS_SECURITY_KEYSTORE= ROS_SECURITY_ENABLE=true "
+        "ROS_SECURITY_STRATEGY=Enforce python3 bringup.py\n"
+    )
+    advice = (
+        "bringup.py runs a launch description itself. First put SecuredNodes(keystore="
+        f"'{place}/export', policy='{place}/policy.xml') from sros_tool.launch in front of its "
+        "nodes, once (docs/launch.md); without it, none of them starts.\n"
+    )
+    said = robot.close("--apply", status=1).out
+    assert f"the launch of /listener and /talker, and start it with:\n  {command}  {advice}" in said
+    commands = (place / "start/commands.txt").read_text()
+    assert f"\n# /listener, /talker\n# {advice}{command}" in commands
+    assert "launch_params" not in commands
+    robot.by_hand = set(PID)
+    robot.close("--proof")

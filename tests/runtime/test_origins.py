@@ -79,6 +79,38 @@ def test_the_container_of_a_process(tmp_path: Path, path: str) -> None:
     assert process_origin(7, tmp_path) == ProcessOrigin("", "/opt", (), "0af0af0af0af")
 
 
+NODE = ("/opt/talker", "--ros-args", "--params-file", "/tmp/launch_params_a1_b2c3d")
+
+
+@pytest.mark.parametrize(
+    ("above", "children", "is_launch"),
+    [
+        (("/usr/bin/python3", "bringup.py"), [NODE], True),
+        (("python3.12", "-m", "robot.bringup"), [("/opt/listener",), NODE], True),
+        (("python3", "bringup.py"), [("sh", "-c", f"exec {' '.join(NODE)}")], True),
+        (("python3", "bringup.py"), [("/opt/listener", "--params-file", "/tmp/own.yaml")], False),
+        (("bash", "start.sh"), [NODE], False),
+    ],
+)
+def test_a_program_that_runs_a_launch_description(
+    tmp_path: Path, above: tuple[str, ...], children: list[tuple[str, ...]], is_launch: bool
+) -> None:
+    """launch_ros gives nodes with parameters files that a command cannot name again."""
+    made_up(tmp_path, 7, *above, parent=1)
+    (tmp_path / "7/task/7").mkdir(parents=True)
+    (tmp_path / "7/task/7/children").write_text("8 9 ")
+    for pid, command in enumerate(children, 8):
+        made_up(tmp_path, pid, *command, parent=7)
+    launch = above if is_launch else ()
+    assert (
+        process_origin(8, tmp_path)
+        == process_origin(7, tmp_path)
+        == ProcessOrigin("", "/opt", launch)
+    )
+    (tmp_path / "7/task/7/children").unlink()  # as on kernels without this list
+    assert process_origin(pid, tmp_path).launch == launch
+
+
 def made_up(proc: Path, pid: int, *command: str, parent: int, cgroup: str = "0::/\n") -> None:
     folder = proc / str(pid)
     folder.mkdir()
