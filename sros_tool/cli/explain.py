@@ -1099,48 +1099,45 @@ def _show_log(
     print_notes(explained.notes)
     if not explained.findings:
         lines = text.count("\n") + (not text.endswith("\n")) if text else 0
-        clause = "looks like a message of DDS Security, or of a denial by Zenoh"
-        echo(
-            f"none of {counted(lines, 'line')} {clause}: {_text_without_findings(text)}"
-            if lines
-            else "the log is empty: it shows nothing about its node. `sros check runtime` on the "
-            "node's machine shows how processes run",
-            err=True,
-        )
+        for line in _lines_without_findings(text, lines):
+            echo(line, err=True)
         if _ZENOH_TESTS in text:
             echo(_ONLY_TESTS, err=True)
     return 1 if explained.findings else 0
 
 
 _SILENT_ON_ZENOH = (
-    "on Zenoh, a denied node logs nothing: start it and the router with RUST_LOG=zenoh=trace for "
-    "another log, or ask about each name of the node: `sros explain KEYSTORE ENCLAVE "
-    "publish|subscribe|call|serve NAME --vendor zenoh`"
+    "on Zenoh, denials, which only logs with RUST_LOG=zenoh=trace have (without a log: `sros "
+    "explain KEYSTORE ENCLAVE publish NAME --vendor zenoh`)"
 )
 
 
-def _text_without_findings(log: str) -> str:
-    """Return what a log without a message of security shows, and what to do next."""
+def _lines_without_findings(log: str, count: int) -> Iterator[str]:
+    """Yield what was not found in a log of ``count`` lines, and what such a log does not show."""
     from sros_tool.checks.environment import is_zenoh
     from sros_tool.runtime.vendor_log import SECURITY_DIRECTORY
 
+    if not count:
+        yield (
+            "the log is empty: it shows nothing about its node. `sros check runtime` on the "
+            "node's machine shows how processes run"
+        )
+        return
+    not_found = f"no message of DDS Security, and no denial by Zenoh, in {counted(count, 'line')}"
+    runs_open = "whether a node runs open (`sros check runtime` on its machine)"
     if is_zenoh(os.environ):
-        return _SILENT_ON_ZENOH
-    match = SECURITY_DIRECTORY.search(log)
-    if match is None:
-        return (
-            "no line says 'Found security directory': on DDS, either the nodes ran open, or the "
-            "log "
-            "is incomplete. `sros check runtime` on the nodes' machine shows how processes run; "
+        yield not_found
+        yield f"not shown: {_SILENT_ON_ZENOH}"
+    elif match := SECURITY_DIRECTORY.search(log):
+        yield f"{not_found}; a node found its enclave '{match['folder']}'"
+        yield (
+            f"not shown: {runs_open}; whether peers drop its messages in silence (their logs, or "
+            "`sros check FOLDER OTHER`, which compares two folders of enclaves); "
             f"{_SILENT_ON_ZENOH}"
         )
-    return (
-        f"the log shows nothing that was refused to a node in '{match['folder']}'. If a file was "
-        "missing and the strategy was not Enforce, the node runs open: `sros check runtime` on its "
-        "machine shows this, and the clock. If it hears nothing, peers may refuse it "
-        "silently: explain their logs, run `sros check FOLDER OTHER` (CAs, revocation list, "
-        "governance, domains); on Zenoh, only logs with RUST_LOG=zenoh=trace have denials"
-    )
+    else:
+        yield f"{not_found}, and no line 'Found security directory'"
+        yield f"not shown: {runs_open}; {_SILENT_ON_ZENOH}"
 
 
 _ZENOH_TESTS = "caching permissions for `"
