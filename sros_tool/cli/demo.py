@@ -61,7 +61,8 @@ def _complete_scenario(
     multiple=True,
     metavar="NAME",
     shell_complete=_complete_scenario,
-    help="Scenario to run: a name from --list, `all`, or your own TOML file; can be repeated.",
+    help="Scenario to run: a name from --list, `all`, or your own TOML file (not on Zenoh); "
+    "can be repeated.",
 )
 @click.option("--list", "list_them", is_flag=True, help="List the scenarios.")
 @click.option(
@@ -172,8 +173,9 @@ def demo(
     Creates keystores, starts nodes with and without enclaves, and compares expected and observed
     results. The scenario `isolation` takes about 10 s on Cyclone DDS and 20 s on rclpy. The
     scenario `attacks` tries all attacks that sros knows, also without the defenses that stop them;
-    it takes about 30 s on Cyclone DDS and 60 s on rclpy. On Zenoh (--backend zenoh), all scenarios
-    run, in about 25 s.
+    it takes about 30 s on Cyclone DDS and 60 s on rclpy. On Zenoh (--backend zenoh), the demo has
+    scenarios of its own, and runs all of them by default, in about 25 s. A scenario file of yours
+    and --keystore work only on a DDS.
 
     With talker, listener or router, run only this node until Ctrl-C (or --for DURATION), with the
     current environment variables, so that you can see who hears whom. The node runs on Cyclone DDS,

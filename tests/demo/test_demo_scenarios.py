@@ -79,5 +79,6 @@ def test_scenarios_are_chosen_by_name() -> None:
     assert choose_scenarios(("all", "attacks")) == SCENARIOS
     names = [each.name for each in choose_scenarios(("actions", "services", "actions"))]
     assert names == ["actions", "services"]
-    with pytest.raises(UsageError, match=r"no scenario 'x'.*isolation, services"):
-        choose_scenarios(("x",))
+    for unknown in (("x",), ("all", "x")):  # `all` hides no other name
+        with pytest.raises(UsageError, match=r"no scenario 'x'.*isolation, services"):
+            choose_scenarios(unknown)

@@ -112,8 +112,9 @@ def test_scenarios_are_chosen_by_name() -> None:
     assert choose_scenarios(("attacks",), on_zenoh=True) == (ATTACKS,)
     with pytest.raises(UsageError, match="sros has isolation, services, routers, attacks on Zenoh"):
         choose_scenarios(("governance",), on_zenoh=True)
-    with pytest.raises(UsageError, match=r"own\.toml cannot run on Zenoh"):
-        choose_scenarios(("own.toml",), on_zenoh=True)
+    for names in (("own.toml",), ("all", "own.toml")):
+        with pytest.raises(UsageError, match=r"own\.toml cannot run on Zenoh.*explain KEYSTORE"):
+            choose_scenarios(names, on_zenoh=True)
 
 
 # ── the verdict ────────────────────────────────────────────────────────────────────────────

@@ -418,26 +418,26 @@ def choose_scenarios(names: Sequence[str], *, on_zenoh: bool = False) -> tuple[S
         UsageError: no scenario has a given name.
         DocumentError: a file is not a valid scenario.
     """
-    scenarios = ZENOH_SCENARIOS if on_zenoh else SCENARIOS
-    if ALL in names or (on_zenoh and not names):
-        return scenarios
-    known = {scenario.name: scenario for scenario in scenarios}
-    chosen = []
-    for name in dict.fromkeys(names or (_DEFAULT_SCENARIO,)):
-        if name.endswith(".toml"):
-            if on_zenoh:
-                raise UsageError(
-                    f"the scenario {name} cannot run on Zenoh",
-                    "Scenarios of your own run on a DDS.",
-                    f"Leave out --backend zenoh, or name {', '.join(known)}.",
-                )
-            chosen.append(read_scenario(Path(name)))
-            continue
-        if name not in known:
+    known = {scenario.name: scenario for scenario in (ZENOH_SCENARIOS if on_zenoh else SCENARIOS)}
+    chosen: dict[str, Scenario] = {}
+    for name in names or (ALL if on_zenoh else _DEFAULT_SCENARIO,):
+        if name == ALL:
+            chosen |= known
+        elif name.endswith(".toml") and on_zenoh:
+            raise UsageError(
+                f"the scenario {name} cannot run on Zenoh",
+                "Scenario files run only on a DDS; on Zenoh, the demo has scenarios of its own.",
+                f"Leave out --backend zenoh, or name {', '.join(known)}. What a policy of yours "
+                "allows there, `sros explain KEYSTORE ENCLAVE publish NAME --vendor zenoh` says.",
+            )
+        elif name.endswith(".toml"):
+            chosen[name] = read_scenario(Path(name))
+        elif name in known:
+            chosen[name] = known[name]
+        else:
             raise UsageError(
                 f"there is no scenario {name!r}",
                 f"sros has {', '.join(known)}{' on Zenoh' if on_zenoh else ''}.",
                 "Name one of them, `all`, or a TOML file.",
             )
-        chosen.append(known[name])
-    return tuple(chosen)
+    return tuple(chosen.values())
