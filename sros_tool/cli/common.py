@@ -806,19 +806,21 @@ def change_options(*, dry_run: bool, allow_refusal: Sequence[Vendor] = ()) -> Ch
     }
 
 
-def try_given_passphrase(root: Path, keyring: Keyring) -> None:
-    """Open the CA keys of a keystore if a passphrase is given, although nothing is to be signed.
+def try_passphrase(root: Path, keyring: Keyring) -> None:
+    """Open the CA keys of a keystore if nobody can be asked, although nothing is to be signed.
 
-    So a timer with a wrong passphrase fails today, and not when files are about to expire.
+    So a timer with a wrong passphrase, or without one, fails today, and not when files are about
+    to expire. Without a passphrase, keys may be missing, because they are elsewhere on purpose.
 
     Raises:
         SrosError: a key cannot be opened.
     """
     from sros_tool.keystore.reader import OpenedKeystore
 
-    if any(map(_taken.get, (_PASSPHRASE, _PASSPHRASE_FILE))):
+    is_given = any(map(_taken.get, (_PASSPHRASE, _PASSPHRASE_FILE)))
+    if is_given or not sys.stdin.isatty():
         keystore = OpenedKeystore(root)
-        keyring.try_files(keystore, keystore.template)
+        keyring.try_files(keystore, keystore.template, missing_ok=not is_given)
 
 
 def secrets() -> Callable[[str], str]:
@@ -855,8 +857,9 @@ class _Secrets:
                 value = ask_secret(name, confirm=confirm)
         if not value:
             names = _PIN_VARIABLE if is_pin else f"{_PASSPHRASE} or {_PASSPHRASE_FILE}"
+            unit = "" if is_pin else ", for units by `sros units --passphrase-file`"
             raise PkiError(
-                f"{name} is needed", "There is no terminal to prompt on.", f"Set {names}."
+                f"{name} is needed", "There is no terminal to prompt on.", f"Set {names}{unit}."
             )
         try:
             value.encode()

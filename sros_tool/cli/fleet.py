@@ -43,7 +43,7 @@ from sros_tool.cli.common import (
     robot_option,
     root_and_file,
     save,
-    try_given_passphrase,
+    try_passphrase,
 )
 from sros_tool.cli.program import VerbGroup
 from sros_tool.errors import NOT_DONE, Note, SrosError, UsageError
@@ -364,7 +364,7 @@ def _collect(
         if not any(robot.requests for robot in collected.robots):  # their lines name the reason
             echo(f"not signed: {collected.not_signed}", err=True)
         return NOT_DONE
-    try_given_passphrase(root, keys)
+    try_passphrase(root, keys)
     is_published = published is None or published.is_complete(moment)
     return 0 if collected.complete and is_published else 1
 

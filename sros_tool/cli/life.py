@@ -34,7 +34,7 @@ from sros_tool.cli.common import (
     progress,
     several_enclaves,
     split_root,
-    try_given_passphrase,
+    try_passphrase,
     verb,
 )
 from sros_tool.errors import SrosError, UsageError
@@ -130,7 +130,7 @@ def renew(
             **change_options(dry_run=dry_run, allow_refusal=allow_refusal),
         )
     if not result.outcomes:
-        try_given_passphrase(root, keyring())
+        try_passphrase(root, keyring())
     print_changed(
         result,
         json_form(result, "RenewedEnclaves") if as_json else None,

@@ -132,15 +132,19 @@ class Keyring:
         except (KeystoreError, PkiError) as error:
             raise KeystoreError(error.what, error.why, error.remedy) from error
 
-    def try_files(self, keystore: OpenedKeystore, template: Template) -> None:
-        """Open the key files of the CAs now, to find a wrong passphrase early.
+    def try_files(
+        self, keystore: OpenedKeystore, template: Template, *, missing_ok: bool = False
+    ) -> None:
+        """Open the key files of the CAs now, to find a wrong or missing passphrase early.
 
         Raises:
-            KeystoreError: a key file is missing, or cannot be opened.
+            KeystoreError: a key file cannot be opened, or, without ``missing_ok``, is missing.
         """
         for role in ROLES if template.separate_authorities else (IDENTITY,):
             place = self.place(role, template)
-            if not (is_token_uri(place) or is_ca_service(place)):
+            if is_token_uri(place) or is_ca_service(place):
+                continue
+            if not missing_ok or key_path(keystore.root, place).exists():
                 self.open(keystore, role, template)
 
     def make(
