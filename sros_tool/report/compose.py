@@ -33,6 +33,7 @@ from sros_tool.policy.rights import (
     join_actions,
     order,
     parts,
+    placed_rights,
     split_actions,
 )
 from sros_tool.reach import DomainRights
@@ -50,6 +51,7 @@ from sros_tool.report.picture import (
     Protection,
     Requirements,
     SourceTitle,
+    Spelling,
     Statement,
     UnreadUnits,
     Validity,
@@ -252,6 +254,8 @@ def _picture(
     stated = next((source.protections for source in reversed(sources) if source.protections), ())
     demanded = _DemandedProtection(() if governance else stated)
     names = sorted({(edge.kind, edge.name) for edge in edges})
+    policy = sources[0].policy if len(sources) == 1 else None
+    spellings = _spellings(policy) if policy else {}
     return Picture(
         title=" and ".join(source.origin.title for source in sources),
         origins=tuple(source.origin for source in sources),
@@ -265,6 +269,7 @@ def _picture(
                 or protection_of(governance, kind, name),
                 is_expression(name),
                 _lacking_side(protection, *sides(kind, name)),
+                spellings.get((kind, name), Spelling.UNKNOWN),
             )
             for kind, name in names
         ),
@@ -278,6 +283,17 @@ def _picture(
         join_needs_right=governance is not None
         and all(rule.enable_join_access_control for rule in governance.domain_access_rules),
     )
+
+
+def _spellings(policy: Policy) -> Mapping[tuple[str, str], Spelling]:
+    """Map kind and name to how a policy writes the name."""
+    relative: dict[tuple[str, str], set[bool]] = defaultdict(set)
+    for enclave in policy.enclaves:
+        for placed in placed_rights(enclave):
+            right = placed.right
+            relative[right.kind, right.name].add(not placed.written.startswith("/"))
+    spelling = {frozenset({False}): Spelling.ABSOLUTE, frozenset({True}): Spelling.RELATIVE}
+    return {name: spelling.get(frozenset(forms), Spelling.BOTH) for name, forms in relative.items()}
 
 
 def _senders_and_receivers(edges: Iterable[Edge]) -> Mapping[tuple[str, str], list[bool]]:

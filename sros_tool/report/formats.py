@@ -38,6 +38,7 @@ from sros_tool.report.picture import (
     Overlay,
     OverlaySide,
     Picture,
+    Spelling,
     WireLevel,
     lack_text,
 )
@@ -453,9 +454,11 @@ def _render_markdown(picture: Picture, *, everything: bool = False) -> str:
     lines = [f"### {plain(picture.title)}: who may do what", ""]
     lines += [f"- {plain(headline)}" for headline in picture.headlines]
     lines += ["", "| name | may publish or call | may subscribe or serve |", "| --- | --- | --- |"]
+    spellings = {known[row].spelling for row in rows}
     for (kind, name), ends in rows.items():
-        cells = [f"{KIND_NAMES[kind]} {code(name)}"]
         stated = known[kind, name]
+        moves = stated.spelling in _MOVING
+        cells = [f"{KIND_NAMES[kind]} {code(name)}" + f" ({stated.spelling})" * moves]
         controls = stated.protection.write_control, stated.protection.read_control
         sides = Lack.SENDER, Lack.RECEIVER
         for end, lack, controlled, sends in zip(ends, sides, controls, (True, False), strict=True):
@@ -465,7 +468,14 @@ def _render_markdown(picture: Picture, *, everything: bool = False) -> str:
             who = ", ".join(dict.fromkeys((*first, *end)))
             cells.append(who or _remark_on_single_names(picture, stated, sends=sends))
         lines.append(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |")
+    if not spellings.isdisjoint(_MOVING):
+        lines += ["", "A relative name moves with the namespace of its node; absolute names stay."]
+    elif spellings == {Spelling.ABSOLUTE}:
+        lines += ["", "All names are absolute: they stay in any namespace of their nodes."]
     return "\n".join((*lines, ""))
+
+
+_MOVING = (Spelling.RELATIVE, Spelling.BOTH)
 
 
 def _remark_on_single_names(picture: Picture, name: Name, *, sends: bool) -> str:

@@ -149,12 +149,22 @@ class Lack(StrEnum):
     RECEIVER = "receiver"
 
 
+class Spelling(StrEnum):
+    """How a policy writes a name; relative names move with the namespace of their node."""
+
+    UNKNOWN = ""
+    ABSOLUTE = "absolute"
+    RELATIVE = "relative"
+    BOTH = "relative for some nodes"
+
+
+@shows("kind", "name", "namespace", "protection", "wildcard", "lacks")
 @dataclass(frozen=True, slots=True)
 class Name:
     """A topic, service or action; or a ``wildcard`` that is drawn as a name.
 
     ``lacks`` is the side (senders or receivers) without an allowed enclave. The server of a service
-    is its receiver.
+    is its receiver. ``spelling`` is known in the picture of one policy.
     """
 
     kind: str
@@ -171,6 +181,7 @@ class Name:
     """The side that is missing because no enclave has the right; the server of a service is its
     receiver.
     """
+    spelling: Spelling = Spelling.UNKNOWN
 
 
 _VERBS = {

@@ -134,6 +134,24 @@ def test_no_cell_of_the_table_is_empty_where_a_denial_alone_names_something(tmp_
     assert "| topic `/arm/*` | nobody | nobody, `/z` is denied |" in table
 
 
+def test_a_table_says_which_names_move_with_the_namespace(tmp_path: Path) -> None:
+    relative = '<topics publish="ALLOW"><topic>width</topic><topic>/tf</topic></topics>'
+    absolute = '<topics subscribe="ALLOW"><topic>/width</topic></topics>'
+    action = '<actions execute="ALLOW"><action>grasp</action></actions>'
+    legend = "absolute names stay.\n"
+    for rights, rows, end in (
+        ({"/a": relative, "/b": absolute}, ("`/width` (relative for some nodes) |",), legend),
+        ({"/a": relative + action}, ("`/width` (relative) |", "`/grasp` (rel", "`/tf` |"), legend),
+        ({"/a": absolute}, (), "All names are absolute: they stay in any"),
+    ):
+        (tmp_path / "p.xml").write_text(policy_text(rights))
+        table = sros("view", tmp_path / "p.xml", "--format", "markdown").ok().out
+        assert all(row in table for row in (*rows, end)), table
+    (tmp_path / "permissions.xml").write_text(hostile_permissions())
+    signed = sros("view", tmp_path / "permissions.xml", "--format", "markdown").ok().out
+    assert "relative" not in signed and "absolute" not in signed  # DDS has only absolute names
+
+
 def test_a_table_has_every_right_that_not_every_node_needs(tmp_path: Path) -> None:
     picture = mobile_robot()
     table = sros("view", MOBILE_ROBOT, "--format", "markdown").ok().out
