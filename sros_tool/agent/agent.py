@@ -27,7 +27,13 @@ from cryptography.hazmat.primitives.serialization import Encoding
 
 from sros_tool.agent.connection import REFUSALS, GuardedConnection, is_tls_ended_by_server
 from sros_tool.agent.fetch import ClientCertificate, FetchError, FetchProblem, fetch_release
-from sros_tool.agent.install import Installation, install_release, present_lists, release_time
+from sros_tool.agent.install import (
+    Installation,
+    install_release,
+    present_lists,
+    release_time,
+    waits_for_answer,
+)
 from sros_tool.agent.running import (
     EnclaveProcesses,
     Systemd,
@@ -362,6 +368,9 @@ class _Round:
         """Fetch and install a release; return the changes, and whether the source was reached."""
         settings, state = self._settings, self._state
         changed_files, newer = self._changed_files(), self._newer_enclaves()
+        with Folder(self._folder) as opened:
+            here = search_enclaves(self._folder)[0]
+            waiting = {name for name in here if waits_for_answer(opened, name)}
 
         def fetch(certificate: ClientCertificate | None) -> Release | None:
             return self._machine.fetch(
@@ -401,8 +410,16 @@ class _Round:
             path
             for path, sha256 in (changed_files or {}).items()
             if enclave_of(path) in installation.changed
-            # Before a later release, somebody may have brought its files, or other new ones.
-            and not (is_later and (enclave_of(path) in newer or sha256 == published.get(path, "")))
+            # Before a later release, somebody may have brought its files, or other new ones, or
+            # removed an enclave to make a new key and request for it.
+            and not (
+                is_later
+                and (
+                    enclave_of(path) in newer
+                    or sha256 == published.get(path, "")
+                    or (not sha256 and enclave_of(path) in waiting)
+                )
+            )
         )
         self._note_repaired(state.accepted, tuple(repaired))
         if not is_later:

@@ -156,7 +156,7 @@ def install_release(
                 changes[name] = _revocation_list_change(opened, name, files, now)
         removed = []
         for name in present:
-            if name in enclaves or name in keep or _waits_for_answer(opened, name):
+            if name in enclaves or name in keep or waits_for_answer(opened, name):
                 continue
             try:
                 changes[name] = _enclave_removal(opened, name)
@@ -521,7 +521,7 @@ def _enclave_removal(folder: Folder, name: str) -> _Change:
     return _Change(remove=[path for path in paths if folder.state(path)])
 
 
-def _waits_for_answer(folder: Folder, name: str) -> bool:
+def waits_for_answer(folder: Folder, name: str) -> bool:
     """Return whether an enclave waits for the first answer to its signing request."""
     with suppress(SrosError, OSError):
         place = enclave_folder(name)

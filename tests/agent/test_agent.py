@@ -357,6 +357,26 @@ def test_what_somebody_damaged_is_named_also_if_a_later_release_replaces_it(
     assert is_mended(problem), "for a day"
 
 
+@pytest.mark.parametrize("is_asked_for", [True, False])
+def test_a_removed_enclave_with_a_new_key_is_not_named_as_damaged(
+    is_asked_for: bool, home: Home, r1: Robot, tmp_path: Path
+) -> None:
+    """docs/howto/rotate.md: its folder is removed, and its key made on the robot."""
+    r1.round()
+    root, place = tmp_path / "home", r1.folder / "enclaves/r1/b"
+    copy_of(home.root, root)
+    for file in place.iterdir() if is_asked_for else [place / "permissions.p7s"]:
+        file.unlink()
+    if is_asked_for:
+        sros("create_request", "/r1/b", r1.folder).ok()
+        (root / "enclaves/r1/b/key.pem").unlink()
+        sros("sign_request", root, place / "request.pem", "--no-answer", "--renew").ok()
+    r1.release = release_of(files_of(root), 4, home.authority)
+    done = r1.round()
+    assert "/r1/b" in done.changed
+    assert any("changed or missing" in problem for problem in done.problems) != is_asked_for
+
+
 REFUSED = {
     FetchProblem.UNREACHABLE: "cannot be reached",
     FetchProblem.EXPIRED: "expired",
