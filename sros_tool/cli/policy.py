@@ -1026,7 +1026,7 @@ def access_summary(
         for title, clauses in (
             ("not compared", growth.not_compared),
             ("assumed", growth.assumed),
-            ("left out", growth.left_out),
+            ("not covered", growth.left_out),
         )
         if clauses
     )

@@ -575,7 +575,8 @@ def _text(result: Review) -> list[str]:
         further = [f"and {len(lines_to_read) - _MAX_REASONS} more (--summary FILE has all)"]
         shown = lines_to_read[:_MAX_REASONS] + further * (len(lines_to_read) > _MAX_REASONS)
         lines += [f"  {result.with_shown_paths(line)}" for line in shown]
-    return [*lines, _verdict(result)]
+    not_covered = [f"not covered: {'; '.join(result.left_out)}"] if result.left_out else []
+    return [*lines, *not_covered, _verdict(result)]
 
 
 def _lines_to_read(step: ReviewStep) -> list[str]:
@@ -645,7 +646,7 @@ def _absolute_lines(change: RightsChange) -> Iterator[str]:
 
 
 def _verdict(result: Review) -> str:
-    """Return a sentence with the result and the parts that were not reviewed."""
+    """Return a sentence with the result."""
     counts = [sum(step.status == status for step in result.steps) for status in (1, 2)]
     words = [
         f"{counted(count, 'step')} {word}"
@@ -654,9 +655,8 @@ def _verdict(result: Review) -> str:
     ]
     if allowed := sum(step.allowed for step in result.steps):
         words.append(f"{counted(allowed, 'step')} found only allowed changes")
-    left_out = f"; but {'; '.join(result.left_out)}" if result.left_out else ""
     compared = f" compared with {result.base}" if result.base else ""
-    return f"{result.head}{compared}: {' and '.join(words) or 'nothing found'}{left_out}"
+    return f"{result.head}{compared}: {' and '.join(words) or 'nothing found'}"
 
 
 def _markdown(result: Review, request: ReviewRequest) -> str:
@@ -672,14 +672,12 @@ def _markdown(result: Review, request: ReviewRequest) -> str:
         f"{code(sentence)}"
         for step, sentence in _sentences(result, _sorted_by_weight(result))
     )
-    count = len(result.left_out)
-    out = f", but {count} thing{'s were' if count > 1 else ' was'} left out:" if count else ""
     sides = f"Commit {code(result.head)}"
     sides += f", compared with {code(result.base)}." if result.base else "."
     printed = "which `sros review` prints"
-    parts = [f"## Review: {plain(verdict)}{out}"]
-    parts += [bounded_list(map(code, result.left_out), 6000, printed)] if count else []
-    parts += [sides, bounded_list(lines, 12_000, printed)]
+    parts = [f"## Review: {plain(verdict)}", sides, bounded_list(lines, 12_000, printed)]
+    if result.left_out:
+        parts += ["Not covered:", bounded_list(map(code, result.left_out), 6000, printed)]
     characters_left = _MAX_MARKDOWN - sum(map(len, parts))
     for step in _sorted_by_weight(result):
         detail = result.with_shown_paths(_detail(result, step, request))

@@ -874,17 +874,16 @@ class _Review:
         """Yield clauses on the parts that were not reviewed."""
         asked = self.request
         if not asked.policies:
-            yield "no policy is named"
+            yield "policies: none is named"
         if not asked.requirements:
-            yield "no requirements are named"
+            yield "requirements: none are named"
         others = ""
         if self.compared_elsewhere:
-            others = f", and in {self.compared_elsewhere} only whether the change breaks them"
+            others = f", except whether the change breaks them in {self.compared_elsewhere}"
         if self.is_relative and not asked.namespaces:
             yield (
-                "requirements with names without '/' at the beginning were decided only in the "
-                f"namespace /{others} (--namespace NS, if the reviewed policies have their nodes "
-                "in NS)"
+                "requirements with names without '/' at the beginning, in other namespaces than /"
+                f"{others} (--namespace NS, if the reviewed policies have their nodes in NS)"
             )
         if not self.base:
             yield "nothing is compared with an earlier commit, as the options say"
@@ -1099,7 +1098,8 @@ class _Review:
             *elsewhere(),
             *unused_remapping_findings(files, system, asked.namespaces, asked.remaps),
         ]
-        chosen = FindingFilter().choose(findings)
+        # In several namespaces, a requirement with absolute names is decided several times.
+        chosen = FindingFilter().choose(dict.fromkeys(findings))
         return _status(chosen), chosen
 
     def _failing_elsewhere(

@@ -483,7 +483,7 @@ def test_settings_of_zenoh_are_compared(sound: Path, path: str, value: object, s
             "later enclaves: protection.rtps SIGN -> NONE: whole messages: no longer",
         ),
         (settings("unique_subject = true", "unique_subject = false"), 1, "fit every later"),
-        (settings('validity = "1d"', 'validity = "2d"'), 0, "left out: dates, "),
+        (settings('validity = "1d"', 'validity = "2d"'), 0, "not covered: dates, "),
         (without_settings, 1, "later enclaves: permissions.default node_basics -> everything"),
         (without_the_list, 1, "revoked -> trusted: /mux again trusts anyone who has its key"),
         (an_earlier_list, 1, "revoked -> trusted: 3 enclaves again trust anyone who has its key"),
