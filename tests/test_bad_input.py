@@ -308,6 +308,15 @@ POLICIES: dict[str, tuple[str | Callable[[], str], str]] = {
         _include('href="round.xml" xpointer="xpointer(/profile/*)"'),
         "back to itself",
     ),
+    "loose text that is included": (
+        _include(f'href="loose.xml" {_PARTS}'),
+        "loose.xml:2: <profile> contains loose text. 'chatter' is",
+    ),
+    "loose text in an include": (_include(f'href="part.xml" {_PARTS}', "x"), "loose text"),
+    "loose text in a fallback": (
+        _include('href="missing.xml"', f"<xi:fallback>x{publish('x')}</xi:fallback>"),
+        "<fallback> contains loose text",
+    ),
     "include of a broken file": (_include('href="broken.xml"'), "not well-formed"),
     "include of an entity": (_include('href="entity.xml"'), "document type"),
     "fallback that is wrong": (
@@ -354,6 +363,7 @@ def includes(tmp_path: Path) -> Path:
     (tmp_path / "outside.xml").write_text(f"<profile>{publish('x')}</profile>")
     (folder / "part.xml").write_text(f"<profile>{publish('x')}</profile>")
     (folder / "link.xml").symlink_to("../outside.xml")
+    (folder / "loose.xml").write_text(f"<!-- 1 -->\n<profile>{publish('x')}chatter</profile>")
     (folder / "broken.xml").write_text("<profile>")
     (folder / "entity.xml").write_text("<!DOCTYPE profile><profile/>")
     (folder / "round.xml").write_text(

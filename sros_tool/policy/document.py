@@ -245,6 +245,8 @@ class Includer:
             raise PolicyError(
                 f"{where}: an include can contain only one <fallback>", "", "Remove the rest."
             )
+        for part in (element, *inside):
+            _refuse_loose_text(part, where)
         href, pointer = element.get("href", ""), element.get("xpointer", "")
         file = self.target(element, place)
         if inside and not self._exists(file):
@@ -299,6 +301,9 @@ class Includer:
         selected: Iterable[tuple[etree._Element, IncludedFile]] = roots
         for depth, step in enumerate(steps):
             if depth:
+                for parent, at in selected:
+                    if tag_of(parent) not in _NAME_TAGS:
+                        _refuse_loose_text(parent, _line(parent, at))
                 selected = (child for parent in selected for child in self.children(*parent))
             selected = [child for child in selected if _matches_step(child[0], step)]
         if not selected:
@@ -350,6 +355,16 @@ def _check_instructions(root: etree._Element, file: Path) -> None:
                 f"{file}:{instruction.sourceline}: <?{_INSTRUCTION} ...?> is not in a name",
                 "Protection can be stated only in the element of a topic, service or action.",
                 _PROTECT_EXAMPLE,
+            )
+
+
+def _refuse_loose_text(element: etree._Element, where: str) -> None:
+    """Raise `PolicyError` if there is text between the elements in ``element``."""
+    for text in (element.text, *(child.tail for child in element)):
+        if text and not text.isspace():
+            raise PolicyError(
+                f"{where}: <{etree.QName(element).localname}> contains loose text",
+                f"{text.strip()[:40]!r} is between its elements.",
             )
 
 
@@ -774,12 +789,7 @@ class _Reader:
     def _read_children(
         self, element: etree._Element, place: IncludedFile
     ) -> list[tuple[etree._Element, IncludedFile]]:
-        for text in (element.text, *(child.tail for child in element)):
-            if text and not text.isspace():
-                raise PolicyError(
-                    f"{self._place_text(element, place)}: <{tag_of(element)}> contains loose text",
-                    f"{text.strip()[:40]!r} is between its elements.",
-                )
+        _refuse_loose_text(element, self._place_text(element, place))
         return list(self._includer.children(element, place))
 
     def _expect(
