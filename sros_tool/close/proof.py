@@ -467,14 +467,14 @@ class _TalkComparison:
         }
 
     def summary(self) -> str:
-        """Return text on the comparison, on rights that the policy denies now, and on new nodes."""
+        """Return text on the comparison, on rights that the policy takes away, and on new nodes."""
         before = self._nodes.nodes_to_compare(self._away)
         endpoints = len({*_endpoints_of(before.nodes)})
         text = f"{nodes_text(before.nodes)} with {endpoints} endpoints as before (types are not "
         text += "compared)"
         text += f", without {', '.join(sorted(self._away))}" if self._away else ""
         if denied := self._denied:
-            text += f", but for {counted(len(denied), 'right')} that the policy denies now: "
+            text += f"; the policy takes away {counted(len(denied), 'right')} that the robot used: "
             text += ", ".join(f"{right.right.enclave} {right.right.describe()}" for right in denied)
             lost = _without_counterpart(self._running.robot, [right.right for right in denied])
             text += f"; {first_few(lost, MOST_NAMES, '; ')}" if lost else ""

@@ -312,9 +312,9 @@ def test_a_policy_that_was_changed_stays_and_is_followed(robot: Robot) -> None:
     robot.close()
     robot.remaining = (TALKER, ros_node("listener", "04"))
     said = robot.close("--apply").out
-    assert "(types are not compared), but for 1 right that the policy denies now: " in said
+    assert "(types are not compared); the policy takes away 1 right that the robot used: " in said
     alone = "/talker may publish /chatter, but no enclave may subscribe to it any more"
-    assert f"denies now: /listener subscribe topic /chatter; {alone}\n" in said
+    assert f"used: /listener subscribe topic /chatter; {alone}\n" in said
 
 
 LOST = "robot/export/enclaves/lost"
