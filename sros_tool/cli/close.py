@@ -94,6 +94,13 @@ def _run(words: Sequence[str], shows_output: bool) -> tuple[int, str, str]:
     help="Remember that ENCLAVE belongs to this machine again, and export it: the opposite of "
     "--elsewhere. Can be repeated.",
 )
+@click.option(
+    "--brought",
+    metavar="ENCLAVE",
+    multiple=True,
+    help="Remember that the other machine of ENCLAVE runs with the files that the keystore has "
+    "now; sros asks again when these change. Can be repeated.",
+)
 @dry_run_option
 @json_option
 def close(
@@ -107,6 +114,7 @@ def close(
     without: tuple[str, ...],
     elsewhere: tuple[str, ...],
     here: tuple[str, ...],
+    brought: tuple[str, ...],
     dry_run: bool,
     as_json: bool,
 ) -> int:
@@ -150,16 +158,17 @@ def close(
         raise UsageError("--for is for watching an open robot", "", "Leave it out.")
     if prove and dry_run:
         raise UsageError("--proof changes nothing", "", "Leave --dry-run out.")
-    for option, enclaves in (("--elsewhere", elsewhere), ("--here", here)):
+    machines = (("--elsewhere", elsewhere), ("--here", here), ("--brought", brought))
+    for option, enclaves in machines:
         if enclaves and (prove or undo):
             raise UsageError(
-                f"{option} changes the export",
+                f"{option} changes what the folder remembers",
                 "",
                 f"First run `sros close {shlex.quote(str(folder))}` with {option} alone; "
                 "the folder remembers it.",
             )
     shell = Shell(_run, lambda line: echo(line, err=True), os.environ, now, local_zone(os.environ))
-    robot = LocalRobot(folder, domain_of(domain_text), shell, without, elsewhere, here)
+    robot = LocalRobot(folder, domain_of(domain_text), shell, without, elsewhere, here, brought)
     can_undo = undo and robot.export.exists()  # the export shows which processes are closed
     if (apply or prove or undo) and not (robot.observed or can_undo):
         if not folder.is_dir():
@@ -434,11 +443,14 @@ def _state_text(closed: CloseState, *, apply: bool) -> str:
 def _other_machines_advice(robot: LocalRobot, closed: CloseState) -> str:
     """Return which files other machines need; sros does not see whether the files are there."""
     needed = ", ".join(f"{name} ({iso(of)})" for name, of in closed.needed_elsewhere.items())
-    return needed and (
+    text = needed and (
         "; on other machines, replace files that are older than these times, and restart the "
         f"process: {needed}: sros distribute_key {shlex.quote(str(robot.keystore))} ENCLAVE FOLDER "
-        "--force"
+        f"--force; when a machine has them: {robot.close_command} --brought ENCLAVE"
     )
+    if brought := ", ".join(f"{name} ({iso(of)})" for name, of in closed.brought.items()):
+        text += f"; on other machines, as you said with --brought: the current files of {brought}"
+    return text
 
 
 def _validity_text(closed: CloseState) -> str:

@@ -90,10 +90,13 @@ def prepare(robot: LocalRobot, duration: str | None, *, partial: bool, dry_run: 
     _check_folder(robot)
     if not duration:
         robot.check_rmw()
-    if robot.observed and (robot.named_elsewhere or robot.named_here):
+    brought = robot.brought_now()
+    if robot.observed and (robot.named_elsewhere or robot.named_here or brought):
         robot.check_machines()
         robot.observed = robot.observed.belonging_elsewhere(robot.named_elsewhere)
         robot.observed = robot.observed.belonging_here(robot.named_here)
+        brought = {**robot.observed.brought, **brought}
+        robot.observed = robot.observed._replace(brought=brought)
         if not dry_run:
             robot.write_processes(robot.observed)
     denied_before: Sequence[str] = ()

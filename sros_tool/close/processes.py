@@ -289,6 +289,9 @@ class ObservedProcesses(NamedTuple):
     """Enclaves whose processes ended while sros watched."""
     not_here: Sequence[str] = ()
     """Enclaves that belong to other machines: those of `--elsewhere`."""
+    brought: Mapping[str, str] = {}
+    """Enclaves of `--brought`, and when their files in the keystore had changed last, in ISO 8601.
+    """
 
     @property
     def units(self) -> set[str]:
@@ -322,7 +325,9 @@ class ObservedProcesses(NamedTuple):
 
     def belonging_here(self, names: Iterable[str]) -> ObservedProcesses:
         """Return a copy in which the enclaves ``names`` belong to this machine again."""
-        return self._replace(not_here=sorted({*self.not_here}.difference(names)))
+        not_here = {*self.not_here}.difference(names)
+        brought = {name: of for name, of in self.brought.items() if name in not_here}
+        return self._replace(not_here=sorted(not_here), brought=brought)
 
     def within(self, policy: Policy) -> ObservedProcesses:
         """Return a copy without enclaves that the policy does not have any more."""
@@ -432,7 +437,7 @@ def _observed_from(value: Any) -> ObservedProcesses:
     processes = [ClosedProcess(**process) for process in value["processes"]]
     observed = ObservedProcesses(**value)._replace(processes=processes)
     names = (*observed.unknown, *observed.elsewhere, *observed.ended, *observed.not_here)
-    _check_types(names, (observed.domain,))
+    _check_types((*names, *observed.brought.values()), (observed.domain,))
     for process in processes:
         words = (process.enclave, process.folder, process.container, process.rmw)
         texts = (*words, *process.command, *process.launch, *process.shares)

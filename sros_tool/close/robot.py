@@ -24,6 +24,7 @@ from sros_tool.keystore.layout import (
     CLOSED_OBSERVER,
     CLOSED_POLICY,
     CLOSED_PROCESSES,
+    enclave_path,
     list_enclaves,
 )
 from sros_tool.keystore.reader import OpenedKeystore
@@ -33,6 +34,7 @@ from sros_tool.policy.model import Policy
 from sros_tool.runtime.environment import RMW_ZENOH
 from sros_tool.runtime.rmw import RMW, built_without_security, default_rmw
 from sros_tool.runtime.variables import domain_of
+from sros_tool.validity import time_of_file
 from sros_tool.values import as_plain
 from sros_tool.wording import first_few
 
@@ -100,9 +102,11 @@ class LocalRobot:
         without: Iterable[str] = (),
         elsewhere: Iterable[str] = (),
         here: Iterable[str] = (),
+        brought: Iterable[str] = (),
     ) -> None:
         self.folder, self.shell, self.without = folder, shell, sorted({*without})
         self.named_elsewhere, self.named_here = sorted({*elsewhere}), sorted({*here})
+        self.named_brought = sorted({*brought})
         self.close_command = f"sros close {shlex.quote(str(folder))}"
         self.policy, self.observer = folder / CLOSED_POLICY, folder / "observer.xml"
         self.requirements = folder / REQUIREMENTS
@@ -249,6 +253,30 @@ class LocalRobot:
                 "",
                 f"Leave --here out; `{self.close_command}` exports the enclave.",
             )
+
+    def changed_at(self, enclave: str) -> datetime | None:
+        """Return when the files of an enclave in the keystore changed last, and linked files."""
+        folder = enclave_path(self.keystore, enclave)
+        times = [file.stat().st_mtime for file in folder.glob("*") if file.is_file()]
+        return time_of_file(max(times)) if times else None
+
+    def brought_now(self) -> dict[str, str]:
+        """Map the enclaves of --brought to when their files in the keystore changed last.
+
+        Raises:
+            UsageError: an enclave belongs to this machine, or the keystore has no files of it.
+        """
+        brought = {}
+        for name in self.named_brought:
+            changed = self.changed_at(name) if name in self.not_here else None
+            if changed is None:
+                raise UsageError(
+                    f"--brought cannot name {name}",
+                    f"It is no enclave of another machine that has files in '{self.keystore}'.",
+                    f"First run `{self.close_command} --elsewhere {name}`, and bring the files.",
+                )
+            brought[name] = changed.isoformat()
+        return brought
 
     def check_rmw(self) -> None:
         """Raise `UsageError` if the robot runs on Zenoh and this shell uses DDS, or the reverse."""

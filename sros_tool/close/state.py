@@ -39,7 +39,6 @@ from sros_tool.runtime.processes import (
     user_text,
 )
 from sros_tool.runtime.variables import STRATEGY
-from sros_tool.validity import time_of_file
 from sros_tool.values import DryRun, FileChanges, Words, shows
 from sros_tool.wording import first_few
 
@@ -329,8 +328,12 @@ class CloseState(NamedTuple):
     needed_elsewhere: Mapping[str, datetime]
     """The enclaves of other machines, and when their files in the keystore changed last, in UTC. A
     machine with earlier files still trusts certificates that were revoked since, and needs the
-    current files. Without enclaves that the policy does not have: `problems` names them.
+    current files. Without enclaves that the policy does not have: `problems` names them. Without
+    `brought`.
     """
+    brought: Mapping[str, datetime]
+    """The other enclaves of other machines, with the same moment: `--brought` said that the other
+    machine has these files, which sros cannot see."""
     valid_until: datetime | None
     """When the first enclave of the export expires, in UTC; null without an export."""
     expires_soon: Sequence[str]
@@ -423,6 +426,16 @@ def current_state(robot: LocalRobot, policy: Policy | None) -> CloseState:
     }
     check_enclaves(robot.without, known | new | robot.not_here, "--without")
     outside = robot.enclaves_outside_policy() if policy else ()  # the policy may be broken
+    changed_at = {
+        name: changed
+        for name in sorted(robot.not_here.difference(outside))
+        if (changed := robot.changed_at(name))
+    }
+    brought = {
+        name: changed
+        for name, changed in changed_at.items()
+        if observed.brought.get(name) == changed.isoformat()
+    }
     return CloseState(
         folder=robot.folder,
         observed=observed,
@@ -437,10 +450,9 @@ def current_state(robot: LocalRobot, policy: Policy | None) -> CloseState:
         absent=sorted(absent - secured.keys()),
         without=robot.without,
         needed_elsewhere={
-            name: time_of_file(max(times))
-            for name in sorted(robot.not_here.difference(outside))
-            if (times := _file_times(enclave_path(robot.keystore, name)))
+            name: changed for name, changed in changed_at.items() if name not in brought
         },
+        brought=brought,
         valid_until=(until := _valid_until(robot)),
         expires_soon=_expiring(robot) if until else (),
         denied=(),
@@ -450,11 +462,6 @@ def current_state(robot: LocalRobot, policy: Policy | None) -> CloseState:
         dry_run=False,
         changes=(),
     )
-
-
-def _file_times(folder: Path) -> Sequence[float]:
-    """Return when each file in a folder, and each target of a link there, last changed."""
-    return [file.stat().st_mtime for file in folder.glob("*") if file.is_file()]
 
 
 def _valid_until(robot: LocalRobot) -> datetime | None:

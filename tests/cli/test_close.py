@@ -1498,6 +1498,16 @@ def test_what_is_exported_without_the_enclaves_of_other_machines(
         said = capsys.readouterr()
         assert ("fix this first" in said.out) is bool(problems)
         assert "restart the process: /b (2027-01-15T08:00:00Z): sros distr" in said.err
+    # Until the files change, their machine has those that --brought said are there.
+    when = state_now.needed_elsewhere
+    robot.named_brought = ["/b"]
+    robot.observed = moved._replace(brought=robot.brought_now())
+    for at, expected in ((revoked, ({}, when)), (revoked - 1, (when.keys(), {}))):
+        os.utime(shared, (0, at))
+        state_now = state.current_state(robot, None)
+        needed = state_now.needed_elsewhere
+        assert (needed and needed.keys(), state_now.brought) == expected
+    assert robot.observed.belonging_here(["/b"]).brought == {}
 
 
 def test_a_requirement_that_lost_its_right_is_told_before_a_review_fails(tmp_path: Path) -> None:
@@ -1606,6 +1616,13 @@ def test_an_enclave_that_belongs_to_another_machine(robot: Robot) -> None:
     assert said in ended.out
     assert "differs from the signed permissions" not in ended.out
     assert "talk: 2 nodes with 36 endpoints as before (types are not compared)\n" in ended.out
+    assert "--brought cannot name /talker" in robot.close("--brought", "/talker", status=2).err
+    brought = "; on other machines, as you said with --brought: the current files of /listener ("
+    for words in (("--brought", "/listener"), ("--proof",)):
+        said = robot.close(*words).err
+        assert brought in said and needed not in said
+    os.utime(shared)
+    assert "restart the process: /listener (" in robot.close().err
     robot.remaining = (TALKER,)
     said = robot.close("--proof", status=1).out
     assert (
