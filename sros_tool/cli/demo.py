@@ -202,7 +202,7 @@ def demo(
       $ sros run keystore /talker_listener/talker -- sros demo talker
       talker on Cyclone DDS, topic /chatter, domain 0: secured, in the enclave ...
       ready
-      sent   Hello World: 1
+      sent   Hello World from /talker_listener/talker: 1
 
     Exit status: 0 if every row is as expected or was skipped for a stated reason, else 1. A row
     marked "open" shows an attack that is known to succeed, and counts as expected. OPEN marks an

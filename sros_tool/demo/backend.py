@@ -25,7 +25,7 @@ from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import ProtectionKind
 from sros_tool.demo.casting import naming_arguments
-from sros_tool.demo.nodes import STRING
+from sros_tool.demo.nodes import STRING, NodeOptions
 from sros_tool.demo.scenarios.model import Condition, Role
 from sros_tool.errors import SrosError, UnavailableError, UsageError
 from sros_tool.keystore.template import EVERYTHING, Template
@@ -434,8 +434,12 @@ def run_by_hand(
     command = [sys.executable, "-P", "-m", module, node.role.value, "--period", "1"]
     if node.role is not Role.ROUTER:
         command += ["--topic", node.topic, "--by-hand", "--type", node.type]
-    if node.backend == ZENOH and os.environ.get(ENCLAVE):
-        command += ["--ros-args", "--enclave", os.environ[ENCLAVE], "--"]
+    is_secured = node.backend == ZENOH or os.environ.get(ENABLE) == "true"
+    enclave = os.environ.get(ENCLAVE, "") if is_secured else ""
+    if enclave and node.role is Role.TALKER:  # so that a listener shows whom it heard
+        command += ["--text", f"{NodeOptions.text} from {enclave}"]
+    if enclave and node.backend == ZENOH:
+        command += ["--ros-args", "--enclave", enclave, "--"]
     if node.backend == RCLPY:  # this process already prints each message
         command += ["--ros-args", "--log-level", "warn", "--"]
     command += ["--report", f"/proc/self/fd/{writing}"]

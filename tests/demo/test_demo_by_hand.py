@@ -58,7 +58,7 @@ def test_a_node_hears_publishers_of_other_users(
         run_by_hand(replace(TALKER, backend="rclpy"), lambda _: None)
 
 
-def test_a_node_says_whether_it_is_secured(keystore: Path) -> None:
+def test_a_node_says_whether_it_is_secured(keystore: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert security_line(TALKER, {}).endswith("/chatter, domain 0: WITHOUT security")
     variables = {
         "ROS_SECURITY_ENABLE": "true",
@@ -68,6 +68,16 @@ def test_a_node_says_whether_it_is_secured(keystore: Path) -> None:
         "ROS_DOMAIN_ID": "7",
     }
     assert security_line(TALKER, variables).endswith("domain 7: secured, in the enclave /a")
+
+    def started(command: list[str], **_: object) -> None:
+        raise OSError(" ".join(command))
+
+    monkeypatch.setattr(subprocess, "Popen", started)
+    for enable, names_itself in (("true", True), ("false", False)):
+        monkeypatch.setattr(os, "environ", {**variables, "ROS_SECURITY_ENABLE": enable})
+        with pytest.raises(OSError, match="--by-hand") as error:
+            run_by_hand(TALKER, lambda _: None)
+        assert ("--text Hello World from /a --report" in str(error.value)) == names_itself
     (keystore / "enclaves" / "a" / "key.pem").unlink()
     with pytest.raises(SrosError, match=r"key\.pem"):
         security_line(TALKER, variables)
