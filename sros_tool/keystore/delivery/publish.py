@@ -696,9 +696,9 @@ class _Publication:
             yield
         except SrosError as error:
             if self._restored_texts:
-                why = f"{error.why.rstrip('.')}. " if error.why else ""
+                remedy = f"{error.remedy.rstrip('.')}. " if error.remedy else ""
                 done = " ".join(self._restored_texts)
-                error.why = f"{why}The keystore was changed already. {done}"
+                error.remedy = f"{remedy}The keystore was changed already. {done}"
             raise
 
     def check_restored(self, restored: bool, new_folder: bool, keyring: Keyring) -> None:

@@ -9,7 +9,9 @@ publishes nor renews by itself, because this would bring back rights that were t
 from __future__ import annotations
 
 import hashlib
+import logging
 import re
+import textwrap
 from collections import defaultdict
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -53,9 +55,12 @@ from sros_tool.pki.certificates import (
 )
 from sros_tool.validity import iso
 from sros_tool.values import Words
-from sros_tool.wording import first_few
+from sros_tool.wording import counted, first_few
 
+_LOG = logging.getLogger(__name__)
 _SHOWN = 5
+_NAMED, _LONGEST = 3, 100
+"""Maximum number of names in a refusal, and of characters about the rights of an enclave."""
 _WAITING = frozenset({LATER_RELEASE, PUBLISHING})
 """The reasons of restores after which the keystore publishes only with ``--restored``."""
 
@@ -364,24 +369,20 @@ def refuse_lost_changes(
     for change in changes:
         names[change.change].append(change.enclave)
     what: list[str] = []
-    why: list[str] = []
     steps: list[str] = []
+
+    def shown(enclaves: Sequence[str]) -> str:
+        few = len(enclaves) <= _NAMED
+        return ", ".join(enclaves) if few else counted(len(enclaves), "enclave")
 
     def renew(enclaves: Sequence[str], options: str = "") -> str:
         return f"`sros renew {root} {' '.join(map(quote, enclaves))}{options}`"
 
     if certificates := names["certificate"]:
-        of = first_few(certificates, _SHOWN)
-        what.append(f"the certificates of {of} were replaced and revoked")
-        why.append("Robots would refuse the revoked certificates.")
+        what.append(f"the certificates of {shown(certificates)} were replaced and revoked")
         steps.append(f"Give new certificates: {renew(certificates)}.")
     if keys := names["key"]:
-        of = first_few(keys, _SHOWN)
-        what.append(
-            f"{of} got another key, which the keystore lacks, or the certificates of the "
-            "keystore's key were revoked"
-        )
-        why.append("Whoever has an earlier key could be trusted again.")
+        what.append(f"the keys of {shown(keys)} were replaced or revoked")
         on_robots = [name for name in keys if key_on_robot(keystore.folder(name))]
         if here := [name for name in keys if name not in on_robots]:
             steps.append(f"Give new keys: {renew(here, ' --new-key --revoke-old')}.")
@@ -396,19 +397,18 @@ def refuse_lost_changes(
         taken = [
             (e.enclave, f"{e.enclave}: {e.what}") for e in changes if e.change == "rights_taken"
         ]
-        texts = first_few([*folded(recorded_fleet(keystore), taken)], _SHOWN)
-        what.append(
-            f"rights of {first_few(rights, _SHOWN)} were taken away, which the keystore's "
-            f"permissions still give ({texts})"
-        )
-        why.append("The rights would come back.")
+        texts = [" ".join(text.split()) for text in folded(recorded_fleet(keystore), taken)]
+        for text in texts:
+            _LOG.info("right that was taken away after the backup: %s", text)
+        short = [textwrap.shorten(text, _LONGEST, placeholder=" ...") for text in texts[:_NAMED]]
+        lists_all = "; -v lists all" if short != texts else ""
+        what.append(f"rights of {shown(rights)} were taken away ({'; '.join(short)}{lists_all})")
         steps.append("Sign the present policy again, with `sros generate_artifacts`.")
         if not (certificates or keys or names["governance"]):
             steps.append(f"If the enclaves are to have these rights, run {renew(rights)}.")
     for change in changes:
         if change.change == "governance":
             what.append(f"the governance was changed{f' ({change.what})' if change.what else ''}")
-            why.append("Messages could be protected less.")
             again = f"`sros update_keystore {root} --set KEY=VALUE`"
             steps.append(
                 f"Change the governance again to what was published last, with {again}; make other "
@@ -417,7 +417,7 @@ def refuse_lost_changes(
     if what:
         raise KeystoreError(
             f"'{folder}' cannot be published yet: after the backup, {'; '.join(what)}",
-            " ".join(why),
+            "Publishing would undo this.",
             f"{' '.join(steps)} Then repeat this command, with --restored.",
         )
 
