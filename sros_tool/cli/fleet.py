@@ -1293,8 +1293,11 @@ def _file_details(robot: RobotStatus) -> Iterator[str]:
         owner_clause = f" of {file.robot or file.enclave}" if file.enclave else ""
         # Robots may have the list that a keystore restored from a backup has lost.
         is_lost = file.surplus and file.kind == "crl" and file.state == "unknown"
-        action = "find out who signed" if is_lost else file.action
-        yield f"  {action} {file.path}: {file.state}{issued}{owner_clause}"
+        action = "find out who signed " if is_lost else ""
+        if robot.to_do == "deliver" and not is_lost:  # other files come, or wait for their cause
+            action = f"{file.action} "
+        surplus = ", which it should not have" if file.surplus and not action else ""
+        yield f"  {action}{file.path}: {file.state}{issued}{owner_clause}{surplus}"
     if (more := len(pending) - _MOST_LINES) > 0:
         yield f"  and {more} more, see --json"
 

@@ -138,6 +138,8 @@ _KINDS_BY_ROLE = {"identity": ("certificate",), "permissions": _SIGNED_KINDS}
 """Maps the role of a CA to the kinds of files that the CA issues."""
 _OFFLINE_AFTER = timedelta(days=1)
 """Default age of the last message from which a robot that fetches counts as offline."""
+_CLOCK_AHEAD = timedelta(hours=1)
+"""How far ahead a clock has to be so that metadata seems to have expired because of it."""
 _FETCH_EXPECTED_WITHIN = timedelta(minutes=30)
 """Age of a fetching robot's last message from which sros says to check whether the robot is on.
 
@@ -392,7 +394,13 @@ class RobotStatus:
         if self.state is State.OFFLINE and self.received and self.clock:
             return self.received - self.clock > _OFFLINE_AFTER >= now - self.received
         others = (State.OFFLINE, State.BROKEN, State.REFUSED, *_SUSPICIOUS_STATES)
-        return self.is_behind and self.state not in others
+        is_ahead = (
+            any(EXPIRED_METADATA in problem for problem in self.problems or ())
+            and self.received is not None
+            and self.clock is not None
+            and self.clock - self.received > _CLOCK_AHEAD
+        )
+        return (self.is_behind or is_ahead) and self.state not in others
 
     def _to_do(self, now: datetime, is_accepted: bool) -> str:
         if self.state is State.REVOKED and not self.enclaves:
@@ -1583,8 +1591,15 @@ def fleet_metrics(
         ),
         Metric(
             "sros_fleet_agent_problems",
-            "Number of things that the agent of a robot could not do, for robots that report it.",
-            per_robot(lambda robot: None if robot.problems is None else len(robot.problems)),
+            "Number of problems of a robot that its agent has not mended, for robots that report "
+            "problems.",
+            per_robot(
+                lambda robot: (
+                    None
+                    if robot.problems is None
+                    else sum(not is_mended(problem) for problem in robot.problems)
+                )
+            ),
         ),
         Metric(
             "sros_fleet_clock_ahead_seconds",

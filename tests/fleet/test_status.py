@@ -542,6 +542,9 @@ def test_a_robot_that_missed_a_stage_gets_its_files_by_hand(field: Field) -> Non
     field.run("rotate_ca", "ks", "--next")
     assert "\nrobots accept" in field.run("fleet", "publish", "ks", "pub").out
     assert to_do() == "wait: it fetches"
+    certificates = f"{ENCLAVES}/r2/base/identity_ca.cert.pem: earlier of "
+    shown = field.run("fleet", "status", "ks", "--robot", "r2", status=1).out
+    assert f"\n  {certificates}" in shown, "nobody has to bring it"
     field.deliver("r1")
     field.send("r1", release=1)
     said = field.run("rotate_ca", "ks", "--next", "--allow-unconfirmed").err
@@ -561,6 +564,7 @@ def test_a_robot_that_missed_a_stage_gets_its_files_by_hand(field: Field) -> Non
     assert to_do() == "deliver"
     said = field.run("fleet", "status", "ks", "--robot", "r2", status=1).out
     assert "does not trust the CA that seals releases: fetching does not change this" in said
+    assert f"\n  deliver {certificates}" in said
     for days in (1 / 24, 2):
         field.age("r2", timedelta(days=days))
         assert to_do() == "deliver"
@@ -733,6 +737,9 @@ def test_messages_that_were_held_back_are_as_old_as_they_say(field: Field) -> No
     field.confirm("r2", time=iso(now - 25 * hours))
     field.send("r1", time=now + 25 * hours)
     assert field.states() == dict.fromkeys(ROBOTS, "current")
+    for ahead, to_do in ((hours / 2, "look into it"), (25 * hours, "check its clock")):
+        field.send("r1", time=now + ahead, problems=("The metadata in x has expired.",))
+        assert field.status()["robots"]["r1"]["to_do"] == to_do
 
 
 def test_a_report_does_not_replace_a_later_confirmation(field: Field) -> None:
@@ -779,6 +786,8 @@ def test_what_an_agent_mended_does_not_fail_a_job_that_asks_so(field: Field) -> 
         field.run("fleet", "status", "ks", "--fail-on", "unmended", status=status)
         told = field.run("fleet", "status", "ks", "--prometheus", status=1).out
         assert f'\nsros_fleet_mended{{keystore="{field.root}"}} {1 - status}\n' in told
+        labels = f'keystore="{field.root}",robot="r1"'
+        assert f"\nsros_fleet_agent_problems{{{labels}}} {status}\n" in told
     field.send("r1", problems=(mended,), restart=["/r1/base"])
     field.run("fleet", "status", "ks", "--fail-on", "unmended", status=1)
 
