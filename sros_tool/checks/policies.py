@@ -376,12 +376,12 @@ def _check_counterparts(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
 
 
 def _differ_only_by_namespace(statement_a: _Statement, statement_b: _Statement) -> bool:
-    """Return whether two names differ only by the namespace of a profile.
+    """Return whether two names differ only by a namespace.
 
-    If a policy writes the namespace or ``~`` itself, the difference is intended.
+    If the policy writes ``~``, the name of the node in the name is intended.
     """
     shorter, longer = sorted((statement_a, statement_b), key=lambda statement: len(statement.name))
-    return longer.name.endswith(shorter.name) and not {*"/~"} & {*longer.written}
+    return longer.name.endswith(shorter.name) and "~" not in longer.written
 
 
 def _candidates_text(candidates: Sequence[_Statement]) -> str:

@@ -127,7 +127,9 @@ def test_a_name_in_another_namespace(tmp_path: Path) -> None:
     ("heard", "sent", "warns"),
     [
         ("/cmd_vel", ["cmd_vel"], True),
-        ("/cmd_vel", ["/nav/cmd_vel"], False),
+        ("/cmd_vel", ["/nav/cmd_vel"], True),
+        ("/a/cmd_vel", ["/cmd_vel"], True),
+        ("/cmd_vel", ["/nav/cmd_vel", "/ui/cmd_vel"], False),
         ("/cmd_vel", ["cmd_vel", "/ui/cmd_vel"], False),
         ("/r1/cmd_vel", ["cmd_vel"], False),
     ],
@@ -135,7 +137,7 @@ def test_a_name_in_another_namespace(tmp_path: Path) -> None:
 def test_one_part_in_another_namespace(
     heard: str, sent: list[str], warns: bool, tmp_path: Path
 ) -> None:
-    """Where several names may be meant, or the namespace is written, they are named in a note."""
+    """Where several names may be meant, or both have a namespace, they are named in a note."""
     other = OTHER.replace('ns="/"', 'ns="/nav"')
     said = found(tmp_path / "p.xml", topics("subscribe", heard) + other + topics("publish", *sent))
     kind = "policy.name-misspelt" if warns else "policy.no-counterpart"
