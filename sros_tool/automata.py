@@ -972,7 +972,11 @@ class _ParallelAutomata:
         return lambda leaf: any(positions & self._ends[automaton] for automaton in leaf.automata)
 
     def longer_acceptance_test(self, positions: int) -> _Test:
-        """Return a function that says whether an automaton of a set may accept a longer text."""
+        """Return a function that says whether an automaton of a set accepts after more letters.
+
+        The automata are at ``positions``.  The result is True if an automaton accepts endless
+        texts from there, False if it accepts no text, and None if it accepts finite texts only.
+        """
 
         def ask(leaf: _Union) -> _Truth:
             if any(positions & self._endless[automaton] for automaton in leaf.automata):

@@ -57,7 +57,7 @@ def read_file(
         # The file type is checked first, because opening a pipe would wait for its writer.
         state, data = path.stat(), b""
         if stat.S_ISREG(state.st_mode) and 0 < state.st_size <= max_bytes:
-            state, data = _read_open(path, max_bytes)
+            state, data = _stat_and_read(path, max_bytes)
         if not stat.S_ISREG(state.st_mode):
             raise DocumentError(f"the {label} '{path}' is not a regular file")
         if owner not in (None, state.st_uid):
@@ -88,7 +88,7 @@ def why_unreadable(path: Path, number: int | None) -> str:
     return f"{os.strerror(number or errno.EIO)}."
 
 
-def _read_open(path: Path, max_bytes: int) -> tuple[os.stat_result, bytes]:
+def _stat_and_read(path: Path, max_bytes: int) -> tuple[os.stat_result, bytes]:
     """Return the fstat(2) of a file, and its first ``max_bytes`` + 1 bytes.
 
     The content is empty for anything but a regular file, such as a pipe that just replaced the

@@ -230,7 +230,7 @@ def test_the_verb_says_and_writes_what_it_can(tmp_path: Path) -> None:
     assert ended.status == 1
     assert ended.out.startswith(
         "talker.json5: the configuration of a session (mode peer)\n"
-        "the process itself (talker), by rules that bind only this process\n"
+        "the process itself (talker); no other process enforces these rules\n"
         "  may publish /chatter\n"
         "  may publish /chatter/*\n"
     )

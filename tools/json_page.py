@@ -22,8 +22,8 @@ when a key goes or changes its meaning. Keys may be added without that, so ignor
 do not know.
 
 - The exit status is the same as without `--json`; look at it first. After an error, standard \
-output is empty, and standard error has one paragraph. Only `env` then prints variables with which \
-no node starts.
+output is empty, and standard error has one paragraph. The exception is `env`: \
+after an error, it prints variables that keep every node from starting.
 - Notes and messages for people still go to standard error; `notes` has the notes, too.
 - With `--dry-run`, `dry_run` is true, and the object says what would be done.
 - Moments are in UTC, as `2027-05-21T12:50:48Z`; serial numbers and SHA-256 are lower-case \

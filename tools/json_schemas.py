@@ -124,7 +124,7 @@ VERBS: Mapping[str, str | Shapes] = {
             "certificates": f"{_DESCRIBE}:DescribedCertificates",
             "a revocation list": f"{_DESCRIBE}:DescribedList",
             "a private key": f"{_DESCRIBE}:DescribedKey",
-            "key on a token": f"{_DESCRIBE}:DescribedToken",
+            "key on a token": f"{_DESCRIBE}:DescribedKeyOnToken",
             "permissions": f"{_DESCRIBE}:DescribedPermissions",
             "governance": f"{_DESCRIBE}:DescribedGovernance",
             "a Zenoh configuration": f"{_DESCRIBE}:DescribedConfiguration",

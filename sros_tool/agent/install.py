@@ -540,7 +540,7 @@ def _has_certificate(folder: Folder, name: str) -> bool:
 
 
 def _apply_changes(folder: Path, changes: Mapping[str, _Change]) -> dict[str, str]:
-    """Make all changes at once; if that fails, change each enclave by itself, whole or not at all.
+    """Make all changes together; if that fails, change each enclave by itself, whole or not at all.
 
     Return the enclaves that could not be changed, and why.
 

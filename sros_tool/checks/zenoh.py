@@ -103,10 +103,9 @@ EVERYBODY = FindingKind(
 SELF_LIMITING = FindingKind(
     "zenoh.self-limiting",
     ERROR,
-    "a session whose rules bind only itself",
-    "No rule names another process: the rules state only the rights of this process, and no other "
-    "process enforces them. Any other process with a certificate of the CA publishes to it, and "
-    "reads from it.",
+    "a session whose rules no other process enforces",
+    "No rule names another process: the rules state only what this process itself may do. Any "
+    "other process with a certificate of the CA publishes to it, and reads from it.",
     "zenoh_security_tools writes such files; Zenoh 1.10.2, tested.",
     _WRITE_BY_SROS_REMEDY,
 )
@@ -544,7 +543,7 @@ class SubjectRights(NamedTuple):
     names: Sequence[str] | None
     """The common names of the subject's certificates; null for everybody."""
     own: bool
-    """Whether the rights are those of the process itself, by rules that bind only itself."""
+    """Whether these are the rights of the process itself, which no other process enforces."""
     rights: Sequence[AllowedName]
     """Rights of the subject."""
     unsaid: Sequence[KeyRight]

@@ -179,7 +179,7 @@ def demo(
 
     With talker, listener or router, run only this node until Ctrl-C (or --for DURATION), with the
     current environment variables, so that you can see who hears whom. The node runs on Cyclone DDS,
-    rclpy, or Zenoh, which also needs a router. The node says at once whether it is secured. In an
+    rclpy, or Zenoh, which also needs a router. The node first says whether it is secured. In an
     enclave, this node needs only the right for its topic; the node names in the enclave's policy do
     not matter. A listener reads std_msgs/msg/String, and counts the messages of any other type that
     the topic has; a talker reports if no node can read its type, and sends another type with

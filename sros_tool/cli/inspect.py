@@ -32,10 +32,10 @@ if TYPE_CHECKING:
         DescribedEnclave,
         DescribedGovernance,
         DescribedKey,
+        DescribedKeyOnToken,
         DescribedKeystore,
         DescribedList,
         DescribedPermissions,
-        DescribedToken,
         EnclaveFacts,
         GrantFacts,
         RemoteFacts,
@@ -343,7 +343,7 @@ def _token_place_text(place: TokenPlace) -> str:
     return f"key {place.object} on the token {place.token}{pin}"
 
 
-def _token_lines(described_token: DescribedToken) -> Iterator[str]:
+def _token_lines(described_token: DescribedKeyOnToken) -> Iterator[str]:
     yield f"{described_token.path}: {_token_place_text(described_token.place)}"
 
 

@@ -748,7 +748,7 @@ def update_keystore(
     KEY is a setting of sros.toml. Prints which settings become looser and which tighter; looser
     settings need --allow-looser. The enclaves keep their keys and their rights.
 
-    By default, everything changes at once. With --next, the change has two stages: first the
+    By default, everything changes together. With --next, the change has two stages: first the
     certificates and permissions, after which you can restart processes one by one (together, if
     files that they loaded have expired); then, with the same command, the governance. If the
     governance changes the protection of messages, processes with the old and with the new

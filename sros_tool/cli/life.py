@@ -401,7 +401,7 @@ _STAGE_DONE_TEXTS = {
     type=click.Choice(["distribute", "reissue", "retire"]),
     help="Perform this stage if it is the next one; if it is already done, change nothing.",
 )
-@click.option("--finish", is_flag=True, help="Perform all remaining stages at once.")
+@click.option("--finish", is_flag=True, help="Perform all remaining stages together.")
 @click.option(
     "--same-key",
     is_flag=True,
@@ -495,7 +495,7 @@ def rotate_ca(
       issued and signed everything with the new CA: identity_ca, permissions_ca
       $ sros rotate_ca keystore --next     # once they were restarted again
       retired the old CA: identity_ca, permissions_ca
-      $ sros rotate_ca keystore --finish   # or all at once; then restart all
+      $ sros rotate_ca keystore --finish   # or all together; then restart all
     """
     from sros_tool.keystore.fleet import publish_command
     from sros_tool.keystore.layout import IDENTITY, PERMISSIONS
@@ -672,7 +672,8 @@ def _show_status(status: RotationStatus, unconfirmed: Sequence[str] | str, as_js
 def _new_keys(identity: str | None, permissions: str | None, encrypt: bool) -> Keyring:
     """Return a keyring for new CA keys.
 
-    Only options name the places of new keys; environment variables name those of the current keys.
+    Only options state the places of new keys; environment variables state the places of the current
+    keys.
     """
     from dataclasses import replace
 

@@ -506,7 +506,7 @@ def generate_policy(
 def _present_policy(file: Path | None) -> Policy | None:
     """Return the policy in ``file``, or None without a file.
 
-    Called before observing, so that a broken policy is reported at once.
+    Called before observing, so that a broken policy is reported immediately.
     """
     from sros_tool.policy.document import read_policy
 

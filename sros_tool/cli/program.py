@@ -389,7 +389,7 @@ def _os_problem(error: OSError) -> str:
 
 
 def _outdated_dependency_advice() -> str:
-    """Return which required package is missing or too old, and what to do; else "".
+    """Return which required package is missing or too old, and what to do; "" if none is.
 
     colcon installs sros next to packages of the system without checking their versions.
     """

@@ -197,7 +197,7 @@ def view(
     written = _format("json" if as_json and not dry_run else form, output, graphviz)
     if written == "markdown" and (len(sources) > 1 or observed or hops):
         raise UsageError(
-            "a table takes one source, and neither --observed nor --hops",
+            "--format markdown takes one source, and neither --observed nor --hops",
             "",
             "`sros diff_policy A B --format markdown` compares two.",
         )

@@ -368,7 +368,7 @@ def _configuration_lines(
     for rights in subjects:
         if not (rights.rights or rights.unsaid or rights.denied):
             continue
-        obeys = ", by rules that bind only this process" if rights.self_limiting else ""
+        obeys = "; no other process enforces these rules" if rights.self_limiting else ""
         yield f"{_subject_text(rights)}{obeys}"
         for right in VERBS:
             for stated in (stated for stated in rights.rights if stated.right == right):
@@ -447,8 +447,8 @@ def _notes_on_lost_rules(subjects: Sequence[RightsOfSubject]) -> Iterator[Note]:
         )
     yield Note(
         "zenoh.node-names",
-        "Zenoh rules name no nodes: in the policy, the name of each node is the last part of its "
-        "enclave's name, and all names of topics and services are absolute. Write the real "
+        "Zenoh rules do not name nodes: in the policy, the name of each node is the last part of "
+        "its enclave's name, and all names of topics and services are absolute. Write the real "
         "namespaces and names of the nodes into it: on Zenoh, others do not see a node that "
         "the policy does not name.",
     )

@@ -136,7 +136,7 @@ def _is_named_by_command(process: Process, node: ObservedNode, _process_ids: obj
     return node_argument(process.command) == (node.ns, node.name)
 
 
-def _has_program_named_alike(process: Process, node: ObservedNode, _process_ids: object) -> bool:
+def _is_program_named_like_node(process: Process, node: ObservedNode, _process_ids: object) -> bool:
     """Return whether the program is called like the node."""
     return program_of(process.command).removesuffix(".py") == node.name
 
@@ -144,7 +144,7 @@ def _has_program_named_alike(process: Process, node: ObservedNode, _process_ids:
 _EVIDENCE_CHECKS: dict[str, Callable[[Process, ObservedNode, Mapping[str, int]], bool]] = {
     "process id": _states_process_id,
     "node name": _is_named_by_command,
-    "program": _has_program_named_alike,
+    "program": _is_program_named_like_node,
     "elimination": lambda _process, _node, _process_ids: True,
 }
 

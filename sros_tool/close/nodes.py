@@ -1,4 +1,4 @@
-"""The nodes that were observed on the open robot, in the enclaves that the policy has now."""
+"""The nodes observed on the open robot, with the enclaves and names of the current policy."""
 
 from __future__ import annotations
 

@@ -118,7 +118,7 @@ def _proof_of_files(robot: LocalRobot, expired: Sequence[str]) -> Proof:
     place = str(robot.export)
     status = robot.shell.check(place)
     holds = {0: True, 1: False}.get(status)
-    reason = "sros check finds no error" if holds else "they are not checked"
+    reason = "sros check finds no error" if holds else "sros could not check them"
     if expired:
         holds, reason = False, _expired_text(robot, expired)
     elif holds is False:
@@ -212,7 +212,7 @@ def _proof_of_requirements(robot: LocalRobot) -> Iterator[Proof]:
     if robot.not_here or (statuses != [2] and _demands_more_enclaves(robot)):
         statuses.append(robot.shell.check(str(robot.rights_source), *needed))
     status = 1 if 1 in statuses else max(statuses)
-    reasons = {0: "all of them", 1: "one is violated", 2: "sros could not check them"}
+    reasons = {0: "all of them", 1: "at least one is violated", 2: "sros could not check them"}
     holds = {0: True, 1: False}.get(status)
     yield Proof("the requirements hold", holds, f"{reasons[status]}: {robot.requirements}")
 

@@ -136,7 +136,7 @@ class DomainSet:
         return tuple(sorted(kinds.values()))
 
     @classmethod
-    def parts(cls, sets: Iterable[DomainSet]) -> tuple[DomainSet, ...]:
+    def partition(cls, sets: Iterable[DomainSet]) -> tuple[DomainSet, ...]:
         """Return groups of domains that belong to the same ``sets``, which must be closed.
 
         So a set contains either all domains of a group or no domain of it.

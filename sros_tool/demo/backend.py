@@ -489,7 +489,7 @@ def run_by_hand(
     elif last and last.stage is ProcessStage.ENDPOINT and os.environ.get(ENABLE) == "true":
         verb = "publish" if node.role is Role.TALKER else "subscribe"
         asked = shlex.join((os.environ.get(KEYSTORE, ""), os.environ.get(ENCLAVE) or "/", verb))
-        say(f"whether its enclave may do that: sros explain {asked} {node.topic}")
+        say(f"to see whether this enclave may do that: sros explain {asked} {node.topic}")
     elif status and node.backend == RCLPY:
         say("`sros doctor` says whether rclpy on this machine can be secured")
     return status
@@ -520,7 +520,7 @@ def _report(
         ready, _, _ = select.select([pipe], [], [], _SILENCE_SECONDS)
         if not ready:
             if not is_ready and node.backend != ZENOH:
-                say(f"not ready for {_SILENCE_SECONDS:.0f} s: the node still starts")
+                say(f"not ready after {_SILENCE_SECONDS:.0f} s: the node is still starting")
             elif not is_ready:
                 say(
                     f"not connected for {_SILENCE_SECONDS:.0f} s: no router runs (`sros demo "

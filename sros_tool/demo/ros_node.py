@@ -26,7 +26,7 @@ from sros_tool.demo.nodes import (
 from sros_tool.runtime.events import EventKind, EventWriter, ProcessStage
 
 _LOG_FLUSH_SECONDS = 0.3
-"""Seconds for Fast DDS to write its log: lines are lost if the process exits at once."""
+"""Seconds for Fast DDS to write its log: lines are lost if the process exits earlier."""
 
 _TICK_SECONDS = 0.1
 """Seconds between two checks for a signal."""

@@ -289,8 +289,8 @@ class Wiretap:
     """A capture of the packets of a demo row; ``problem`` says why it is not permitted, or "".
 
     ``texts`` maps parties to their texts; ``topic`` is the topic in the form of packets. The
-    capture starts at once, so create a wiretap in the network of the row, and in a running asyncio
-    loop.
+    capture starts immediately, so create a wiretap in the network of the row, and in a running
+    asyncio loop.
     """
 
     def __init__(self, texts: Mapping[str, str], topic: str, *, replayed: bool) -> None:

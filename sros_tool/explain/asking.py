@@ -74,7 +74,7 @@ def domains_decided_alike(
         rule.domains.closed() for rule in (governance.domain_access_rules if governance else ())
     ]
     sets += [rule.domains.closed() for rule in (grant.rules if grant else ())]
-    parts = DomainSet.parts(sets)
+    parts = DomainSet.partition(sets)
     return [part for part in parts if (part & joined).ranges]
 
 
@@ -303,7 +303,7 @@ def planned_enclave(
 def _action_meant(
     evaluator: Evaluator, question: Question, read_other_rights: Callable[[], Iterable[Right]]
 ) -> Question | None:
-    """Return the question about an action, if rights show an action of this name; else None.
+    """Return the question about an action; None if no right is about an action of this name.
 
     The rights of the enclave are read first.  If these deny the service, ``read_other_rights`` is
     called for more rights, such as the rights in the policy and in the keystore.

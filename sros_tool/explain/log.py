@@ -202,7 +202,7 @@ class SearchedKeystore:
     def zenoh_routers(self) -> frozenset[str]:
         """The enclaves of Zenoh routers.
 
-        These are the routers that the keystore's Zenoh settings name (without such settings: the
+        These are the routers listed in the keystore's Zenoh settings (without such settings: the
         default router), and the enclaves with a router file.
         """
         from sros_tool.zenoh.configuration import ZenohNetwork  # most logs do not come from Zenoh
@@ -502,7 +502,7 @@ def _log_hits(lines: Iterable[tuple[int, str]]) -> Iterator[_Hit]:
 
 
 def _rejoined_message(process: str, line: str, rest: str, following: str) -> str:
-    """Return a message that was broken into two lines, for instance by a terminal; else "".
+    """Return the joined message if ``line`` and ``following`` are its two halves; else "".
 
     ``line`` counts as broken if neither ``line`` nor ``following`` has a known meaning, but the
     joined lines have one.

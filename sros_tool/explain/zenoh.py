@@ -719,7 +719,10 @@ class ZenohEvaluator:
     def _reached_enclaves(
         self, zenoh_file: ZenohFile, wanted_rights: Sequence[Right]
     ) -> Iterator[Reached]:
-        """Yield the enclaves that have the matching right."""
+        """Yield the enclaves whose rules let them exchange the messages of ``wanted_rights``.
+
+        The other end is the process of ``zenoh_file``.
+        """
         for name in self.names if wanted_rights else ():
             if name == zenoh_file.enclave or name in self.routers:
                 continue

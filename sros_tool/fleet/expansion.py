@@ -106,7 +106,7 @@ class FleetPolicy(Mapping[str, Enclave]):
         return [e.path for e in self._policy.enclaves if not has_placeholder(e.path)]
 
     def policy(self) -> Policy:
-        """Return the policy with all enclaves expanded; raise `PolicyError` if there is none."""
+        """Return the policy with all enclaves expanded; raise `PolicyError` without an enclave."""
         if not self._of:
             raise PolicyError(f"'{self._policy.file}': the policy has no enclave for this fleet")
         return replace(self._policy, enclaves=tuple(self.values()))
@@ -378,7 +378,7 @@ def check_narrowed(policy: FleetPolicy, result: MinimizedPolicy, observed: Itera
         wrong += (right for right in used if not now.cover(right))
         if wrong:
             raise PolicyError(
-                "the policy cannot be narrowed for all robots at once",
+                "the policy cannot be narrowed for all robots together",
                 "A wildcard matches different names on different robots, so it is unclear which "
                 f"enclaves may {wrong[0].describe()}.",
                 "Replace the wildcard by the names that the robots use.",

@@ -246,7 +246,7 @@ _PLACEHOLDER_PATTERNS = {"robot": _PATH_PART, "namespace": f"(?:/{_PATH_PART})*"
 
 
 def pattern_problem(path: str) -> str:
-    """Return a sentence on why ``path`` is not a pattern for one enclave of each robot; else ""."""
+    """Return why ``path`` is not a pattern for one enclave of each robot; "" if it is one."""
     try:
         parts = parts_of(path)
         check_path(parts)

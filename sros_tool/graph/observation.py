@@ -7,8 +7,8 @@ unambiguous; `sros_tool.graph.learn` translates them to ROS names.
 graph through rclpy, so that a DDS that logs to standard output, refuses or crashes does no harm to
 its parent.  The observer process writes JSON, one object per line, to the file descriptor FD: first
 ``{"ready": RMW}`` or ``{"failed": STAGE, "reason": TEXT}``, then the graph after each change. The
-process reads the graph every PERIOD seconds, after a change at once, and exits when its standard
-input is closed.
+process reads the graph every PERIOD seconds, after a change immediately, and exits when its
+standard input is closed.
 """
 
 from __future__ import annotations

@@ -292,7 +292,8 @@ def make_confirmation(
 ) -> Confirmation:
     """Return a confirmation of all enclaves in ``root``, a keystore or a robot's security folder.
 
-    Folders without the name of an enclave are left out, because no process can run in them.
+    Folders whose name is not the name of an enclave are left out, because no process can run in
+    them.
 
     ``unreadable`` is called with the name of each enclave that has an unreadable file, and the
     error; the confirmation leaves this enclave out.  Without ``unreadable``, the error is raised.

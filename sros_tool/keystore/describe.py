@@ -372,7 +372,7 @@ class RemoteFacts(NamedTuple):
 
 
 class DescribedKeystore(NamedTuple):
-    """A keystore."""
+    """A keystore: its settings, CAs, shared documents and enclaves."""
 
     path: NamedPath
     template: str | None
@@ -444,7 +444,7 @@ class DescribedKey(NamedTuple):
 
 
 @shows(spread=("place",))
-class DescribedToken(NamedTuple):
+class DescribedKeyOnToken(NamedTuple):
     """The place of a key on a PKCS#11 token."""
 
     path: NamedPath
@@ -509,7 +509,7 @@ Described = (
     | DescribedCertificates
     | DescribedList
     | DescribedKey
-    | DescribedToken
+    | DescribedKeyOnToken
     | DescribedPermissions
     | DescribedGovernance
     | DescribedConfiguration
@@ -597,7 +597,7 @@ def _describe_file(
     if CRL_MARK in data:
         return DescribedList(path, _describe_revocation_list(load_crl(data, "in it"), now))
     if path.name == KEY_URI_FILE:
-        return DescribedToken(path, _describe_token(read_token_file(data)))
+        return DescribedKeyOnToken(path, _describe_token(read_token_file(data)))
     if holds_private_key(data):
         mode = path.stat().st_mode & 0o777
         return DescribedKey(path, algorithm(load_key(data, "in it")), f"{mode:04o}")

@@ -285,10 +285,12 @@ class RobotStatus:
     crl_in_force: bool | None
     """Whether the current revocation list is in force on the robot, or an earlier list that revokes
     the same: the robot has the list, which has not expired, says that no process may run with
-    another list or with earlier CAs, and is not ``offline``. False if this is not known, or the
-    keystore is older than its robots; null if the keystore has no list, or the robot has no
-    enclave. `sros agent` and plays know the processes that lack only new permissions, governance or
-    certificates of their own; for other robots, any restart that is due counts."""
+    another list or with earlier CAs, and is not ``offline``. False if this is not known, or if the
+    keystore was restored from a backup and lacks what its robots have; null if the keystore has no
+    list, or the robot has no enclave. `sros agent` and plays know the processes that lack only new
+    permissions, governance or certificates of their own; for other robots, any restart that is due
+    counts.
+    """
     expiry: Mapping[Annotated[str, Words(_EXPIRING_KINDS)], datetime]
     """The first expiry of the files that the robot confirmed, by kind, in UTC, from the ledger."""
     dds: RobotDds | None
@@ -514,7 +516,7 @@ class FleetStatus:
     """The robots whose last confirmation is older than --max-age, sorted by name; without that
     option, the robots that fetch and have sent nothing for more than a day."""
     older: str = ""
-    """Why the keystore is older than its robots, as a clause: the keystore was restored from a
+    """Why the keystore lacks what its robots have, as a clause: the keystore was restored from a
     backup, or is a copy, and has not yet published with ``--restored``.  Null if nothing shows
     this.
     """

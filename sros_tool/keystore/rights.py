@@ -249,7 +249,7 @@ def _divide_by_rules(
         yield listed[0], rights
         return
     stated: set[Right] = set()
-    for domains in DomainSet.parts(listed):
+    for domains in DomainSet.partition(listed):
         rules = (rule for rule in grant.rules if (rule.domains.closed() & domains).ranges)
         granted_rights = grant_rights(enclave, grant._replace(rules=tuple(rules)))
         yield domains, granted_rights
@@ -364,8 +364,8 @@ def check_routers(keystore: OpenedKeystore, known: Mapping[str, Collection[str]]
             raise KeystoreError(
                 f"keystore '{keystore.root}' has the files of several routers that are not "
                 "connected",
-                f"{ROUTER_FILE} of {name} has no rules for {', '.join(strangers[:5])}, so it is "
-                "not known which file the router uses.",
+                f"{ROUTER_FILE} of {name} has no rules for {', '.join(strangers[:5])}, so sros "
+                "cannot tell which of these files are in use.",
                 "Remove the files that no process uses, or write all files again: "
                 f"`sros zenoh {quote(str(keystore.root))}`.",
             )

@@ -3,7 +3,7 @@
 New files are written to the stage, the folder ``.sros-transaction`` in the keystore.  The commit
 (`Transaction.commit`) changes existing files in three steps.  First, each path becomes a link to
 ``.sros-transaction/live/<name>``, where ``live`` is a link to ``before``, so that the content is
-still the old one.  Then ``live`` becomes a link to ``after``, which changes all files at once.
+still the old one.  Then ``live`` becomes a link to ``after``, which replaces all files in one step.
 Finally plain files replace the links, and new folders move to their places (`_recover`).  If the
 machine stops at any moment, DDS finds either all old files or all new files, and the next
 transaction recovers: it completes a committed transaction, and undoes an uncommitted one.  Each

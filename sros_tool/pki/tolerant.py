@@ -502,7 +502,7 @@ class UnreadableName(x509.GeneralName):
 
 
 class ContradictoryPoint(x509.ExtensionType):
-    """An issuingDistributionPoint that is limited to two kinds of certificates at once."""
+    """An issuingDistributionPoint that is limited to two kinds of certificates, a contradiction."""
 
     oid = ExtensionOID.ISSUING_DISTRIBUTION_POINT
 

@@ -345,7 +345,7 @@ class EditedText:
     # ── layout of the text ────────────────────────────────────────────────────────────────
 
     def indent_of(self, element: PlacedElement) -> str | None:
-        """Return the white space before an element at the start of a line; else None."""
+        """Return the indent of an element; None if the element does not begin its line."""
         line = max(self.text.rfind("\n", 0, element.start), self.text.rfind("\r", 0, element.start))
         before = self.text[line + 1 : element.start].removeprefix("\ufeff")
         if before.strip(" \t") or (line < 0 and element is not self.root):

@@ -416,7 +416,8 @@ def _stated_tables(data: bytes, file: str) -> list[_Table]:
             raise DocumentError(
                 f"{file}: {kind} is not written as tables",
                 "Every requirement needs a header line, whose number findings state.",
-                f"Write [[{kind}]] before every requirement, and no such line in a text.",
+                f"Write [[{kind}]] on a line of its own before every requirement, and not inside a "
+                "multi-line string.",
             )
         tables += [
             _Table(kind, table, Source(file, line), keys)
@@ -648,7 +649,7 @@ def _filled_tables(table: _Table, fleet: FleetSource) -> Iterator[_Table]:
             for key in _WORD_KEYS
             if key in filled.values
         }
-        of_robots = tuple(_plural_names(table, members, robot))
+        of_robots = tuple(_names_of_plural_placeholders(table, members, robot))
         yield replace(
             filled, values={**filled.values, **words}, robot=robot.name, of_robots=of_robots
         )
@@ -738,7 +739,7 @@ def _filled_names(
     return [begin + "".join(map(str, name_parts)) for name_parts in filled]
 
 
-def _plural_names(
+def _names_of_plural_placeholders(
     table: _Table, members: Mapping[str, Sequence[Robot]], robot: Robot
 ) -> Iterator[RobotNames]:
     """Yield the names for which each name with a plural placeholder in a table stands."""

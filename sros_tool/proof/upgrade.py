@@ -2,7 +2,7 @@
 
 The signed files stay the same, but another release of DDS reads the files. For each enclave, the
 rules of both releases decide whether the enclave joins and which topics it may use, for all names
-at once.
+together.
 """
 
 from __future__ import annotations

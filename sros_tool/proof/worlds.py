@@ -571,10 +571,10 @@ def ros_access(stated_rights: Iterable[StatedRight]) -> TopicAccess:
 
 
 def enforced_access(enforcers: Iterable[Enforcement], enclave: str, domain: int) -> TopicAccess:
-    """Return the topics that stand for the keys that an enclave may write and read on Zenoh.
+    """Return an enclave's access on Zenoh, as the DDS topics that correspond to its keys.
 
-    ``enforcers`` are the access control of the processes that the enclave has links to: it is
-    enough that one process passes a message.
+    ``enforcers`` are the access control of the processes that the enclave connects to.  A topic is
+    included if at least one of these processes lets its messages pass.
     """
     remote = Remote(enclave)
 
@@ -655,7 +655,7 @@ _DOMAIN = re.compile(r"(?:0|[1-9][0-9]{0,8})\Z", re.ASCII)
 
 @lru_cache(maxsize=65536)
 def _topics(key: str, domain: int, begin: str) -> NameSet:
-    """Return the topics with a prefix that stand for the keys of a key expression.
+    """Return the topics with a prefix that correspond to the keys of a key expression.
 
     Keys with a part that begins with "@" are left out, because no ROS name has such a part.  Such
     keys are about the graph, or about the history of a topic; the right to the topic includes its

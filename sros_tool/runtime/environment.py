@@ -269,7 +269,7 @@ def nodes_with_rules(command: Sequence[str]) -> list[str]:
 
 
 def _node_rules(command: Sequence[str]) -> tuple[dict[str, str], dict[str, str]]:
-    """Return two maps from nodes, as remapping rules name them: to new names, and to namespaces.
+    """Return two maps from the nodes in remapping rules: to new names, and to namespaces.
 
     The key "" stands for every node.  The rules are ``-r __node:=NAME`` and ``-r __ns:=NAMESPACE``
     behind ``--ros-args``.  The order is the order in the command: rcl takes the first rule that

@@ -730,7 +730,7 @@ _CHOSEN_BY_PROGRAM = "the program or its arguments choose the file, and sros doe
 
 
 def _configuration_of(process: Process) -> LoadedFile | None:
-    """Return the configuration file of a Zenoh process, without its content; else None.
+    """Return the configuration file of a process, without its content; None if it uses none.
 
     If the file is unknown, the result has the reason as ``problem``.
     """
@@ -776,7 +776,7 @@ SEVERAL_USERS = 0xFFFFFFFF
 
 def user_text(user: int) -> str:
     """Return text that names the user who can control a process, such as ``user 1000``."""
-    return "several users at once" if user == SEVERAL_USERS else f"user {user}"
+    return "several users" if user == SEVERAL_USERS else f"user {user}"
 
 
 _OWN_PID = re.compile(rb"^NSpid:(?:\s+\d+)*\s+(\d+)$", re.MULTILINE)
@@ -1059,7 +1059,7 @@ class ProcessRoot:
                         continue
                     raise OSError(errno.ENAMETOOLONG, os.strerror(errno.ENAMETOOLONG))
                 above, within = folders[-1] if folders else ("", self._handle)
-                handle = _open_part(part, within)
+                handle = _open_path_part(part, within)
                 folders.append((f"{above}/{part}", handle))
                 state = os.fstat(handle)
                 way.append((f"{above}/{part}", state))
@@ -1086,7 +1086,7 @@ def _is_of_size(state: os.stat_result, size: int) -> bool:
     return stat.S_ISREG(state.st_mode) and state.st_size == size
 
 
-def _open_part(name: str, folder: int) -> int:
+def _open_path_part(name: str, folder: int) -> int:
     try:
         return os.open(name, os.O_PATH | os.O_NOFOLLOW | os.O_CLOEXEC, dir_fd=folder)
     except ValueError as error:  # a NUL in the name

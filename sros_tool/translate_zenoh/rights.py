@@ -703,7 +703,7 @@ def rights_of_subjects(document: ConfigurationDocument) -> tuple[RightsOfSubject
 
 
 def is_self_limiting(document: ConfigurationDocument) -> bool:
-    """Return whether the rules of a session name no process, so that they limit only itself."""
+    """Return whether a session's rules name no process, so that no other process enforces them."""
     access = document.access
     used = [subject for subject in access.subjects if access.rules_of(subject.id)]
     return (

@@ -206,7 +206,7 @@ def render_configuration(
     revoked: str = "",
     settings: SettingsEdition = SettingsEdition.RULES_ONCE,
 ) -> bytes:
-    """Return the file of `Configuration.render`, from rendered rights of remote enclaves."""
+    """Return the bytes of `Configuration.render`, from rights that are already rendered."""
     control = _access_control_text([*rights], once=settings is SettingsEdition.RULES_ONCE)
     without_control = _text_without_control(mode, listen, connect, revoked, settings)
     return f"{without_control}{_CONTROL_BEGIN}{control}".encode()

@@ -844,7 +844,9 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     assert "no: the files are accepted: sros check finds 1 error, the first in rob" in ended.out
     assert "next: correct the problems above, and ask again with sros close robot --pr" in ended.err
     assert "`; then run `sros close robot`, and restart the processes: robot/export\n" in ended.out
-    assert "no: the requirements hold: one is violated: robot/requirements.toml\n" in ended.out
+    assert (
+        "no: the requirements hold: at least one is violated: robot/requirements.toml" in ended.out
+    )
     assert "/talker: may publish /chatter" in ended.err
     needed.write_text(kept)
     robot.remaining = ()

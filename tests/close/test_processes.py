@@ -256,7 +256,7 @@ def test_an_enclave_is_closed_only_if_all_its_processes_are(tmp_path: Path) -> N
         ((replace(fresh, user=4321),), "users other than the owner of the files (user 4321) run"),
         (
             (replace(fresh, user=SEVERAL_USERS),),
-            "users other than the owner of the files (several users at once) run",
+            "users other than the owner of the files (several users) run",
         ),
         (
             (replace(fresh, configuration=unread),),

@@ -73,7 +73,7 @@ def test_a_wildcard_that_differs_between_robots_is_not_narrowed(folder: Path) ->
     (folder / "seen.xml").write_text(policy_text({"/r1/base": publish("/r1/x")}))
     ended = sros(*WORDS, "-o", "narrow.xml", cwd=folder)
     assert (ended.status, ended.out) == (2, "")
-    assert "cannot be narrowed for all robots at once" in ended.err
+    assert "cannot be narrowed for all robots together" in ended.err
     assert "which enclaves may publish topic " in " ".join(ended.err.split())
     assert not (folder / "narrow.xml").exists()
 

@@ -505,7 +505,7 @@ def test_a_rotation_goes_on_when_every_robot_has_confirmed_its_stage(field: Fiel
 
 def test_a_rotation_goes_on_without_robots_if_that_is_chosen(field: Field) -> None:
     refused = field.run("rotate_ca", "ks", "--finish", status=2).err
-    assert "several stages at once would cut off every robot: r1, r2, r3. " in refused
+    assert "several stages together would cut off every robot: r1, r2, r3. " in refused
     assert "confirm the files" not in refused and "add --allow-unconfirmed" in refused
     assert "does not accept a published release" in refused
     alone = ("rotate_ca", "ks", "--finish", "--identity")

@@ -93,7 +93,7 @@ FOLDER_OPEN = FindingKind(
     "keystore.folder-open",
     WARNING,
     "a folder of keys that others may enter",
-    "If a tool writes a key there with a mode that is too open, others can read it at once.",
+    "If a tool writes a key there with a mode that is too open, others can read it immediately.",
     "ros2/sros2 0.13 makes private/ with 0755; sros with 0700.",
     "Run `chmod 700` on the folder.",
 )

@@ -140,7 +140,7 @@ class Refusal(NamedTuple):
 def choose_grant(
     traits: VendorTraits, permissions: Permissions, subject: str, *, moment: datetime, zone: tzinfo
 ) -> int | Refusal:
-    """Return the index of the grant that decides for ``subject``, or a refusal without a grant."""
+    """Return the index of the grant that decides for ``subject``, or a `Refusal` if none does."""
     if not subject and traits.crashes_on_empty_subject:
         text = f"{traits.title} fails with an error on a certificate with an empty subject."
         return Refusal("empty-subject", text, Outcome.CRASHES)

@@ -70,7 +70,7 @@ def _read(
 
 @lru_cache(maxsize=8)  # all enclaves of a keystore have the same governance
 def canonical_governance(document: bytes) -> Governance | None:
-    """Return the governance in a document that has exactly the bytes that sros writes; else None.
+    """Return the governance in a document; None unless it has exactly the bytes that sros writes.
 
     All vendors read such a document alike.
     """

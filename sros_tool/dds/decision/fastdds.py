@@ -279,7 +279,7 @@ class _Sequence:
 
 
 def _read_text(element: XmlElement) -> str | None:
-    """Return the text of an element whose first node, apart from comments, is text; else None."""
+    """Return the first node of an element apart from comments; None if that node is not text."""
     for child in element.children:
         if child is not NodeMark.COMMENT:
             return child if isinstance(child, str) else None

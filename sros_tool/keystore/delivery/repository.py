@@ -136,7 +136,7 @@ class Roots:
 
     @property
     def last(self) -> Root:
-        """The current root metadata."""
+        """The root metadata of the last version."""
         return self.versions[-1].signed
 
     def as_json(self) -> list[dict[str, object]]:

@@ -2,9 +2,9 @@
 
 The order is the same for every verb: lock and recover, open the keystore once, note files that were
 edited by hand, determine the new state, prove, sign and stage it, update Zenoh configurations,
-write the ledger, check that vendors accept the enclaves, and put everything in place at once.  A
-verb determines the new state; this module does the rest.  Because Zenoh configurations are updated
-in the same transaction, DDS and Zenoh enforce the same rights at any moment.
+write the ledger, check that vendors accept the enclaves, and put everything in place in one step.
+A verb determines the new state; this module does the rest.  Because Zenoh configurations are
+updated in the same transaction, DDS and Zenoh enforce the same rights at any moment.
 """
 
 from __future__ import annotations

@@ -60,10 +60,10 @@ def renew(
 
     The new certificate is for the same key. With ``new_key``, it is for a new key. With ``key``, it
     is for a key on a token; `create_enclaves` describes ``key``.  The signed rights do not change.
-    All files are replaced at once.  Whoever has the key can use a replaced certificate until this
-    certificate or the last permissions for it expire, or until it is revoked.  With ``revoke_old``,
-    all earlier certificates of the renewed enclaves are revoked, and the new ones get subjects that
-    no earlier permissions fit.
+    All files are replaced in one step.  Whoever has the key can use a replaced certificate until
+    this certificate or the last permissions for it expire, or until it is revoked.  With
+    ``revoke_old``, all earlier certificates of the renewed enclaves are revoked, and the new ones
+    get subjects that no earlier permissions fit.
 
     Raises:
         KeystoreError: enclaves cannot be renewed (the error names all of them), or vendors would

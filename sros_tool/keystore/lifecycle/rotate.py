@@ -276,7 +276,7 @@ def _cut_off_error(
         refuses = ", and it does not accept a published release" * seals
         by_hand = f" by hand (`sros distribute_key {where} --robot NAME FOLDER --force`)" * seals
         return KeystoreError(
-            f"several stages at once would cut off every robot: {names}",
+            f"several stages together would cut off every robot: {names}",
             "A robot trusts the new CA only once it has the new files, and its processes were "
             "restarted: before that, it cannot communicate with robots that have the "
             f"files{refuses}.",
@@ -565,7 +565,7 @@ class _Rotator:
                     "keystore does not know",
                     "Every process trusts this CA, and would still trust it during the rotation.",
                     f"Restore '{self._root}/{ca_certificate(role)}' from a backup; or, if all "
-                    "processes may be restarted together, replace the CAs at once with --finish.",
+                    "processes may be restarted together, replace the CAs with --finish.",
                 )
         successors = _make_successors(self._change, wanted, next_to=next_to)
         for successor in successors:

@@ -159,7 +159,10 @@ class NewKeystore(NamedTuple):
 def shown_keystore(
     result: Creation, imported_cas: Mapping[str, bytes], notes: Sequence[Note]
 ) -> NewKeystore:
-    """Return the value for a new keystore; ``imported_cas`` maps roles to existing CAs (PEM)."""
+    """Return what `create_keystore --json` prints.
+
+    ``imported_cas`` maps roles to existing CAs (PEM).
+    """
     authorities = []
     separate = result.template.separate_authorities
     for roles in [(role,) for role in ROLES] if separate else [ROLES]:
@@ -246,7 +249,7 @@ class KeystoreZenoh(NamedTuple):
 def shown_zenoh(
     result: Creation, network: ZenohNetwork | None, changed: Collection[str]
 ) -> KeystoreZenoh:
-    """Return the value for a keystore's Zenoh files; ``changed`` are the paths of changed files."""
+    """Return what `zenoh --json` prints; ``changed`` are the paths of changed files."""
     settings = None
     if network:
         settings = NetworkSettings(
@@ -435,7 +438,7 @@ def shown_lists(
     expires_soon: bool,
     dry_run: bool,
 ) -> KeystoreLists:
-    """Return the value for revocation lists; ``enclaves`` maps serial numbers to enclaves."""
+    """Return what `crl --json` prints; ``enclaves`` maps serial numbers to enclaves."""
     lists = keystore.revocation_lists
     first = lists[0] if lists else None
     return KeystoreLists(
@@ -489,7 +492,10 @@ class RotationState(NamedTuple):
 
 
 def shown_status(status: RotationStatus, unconfirmed: Sequence[str] | None) -> RotationState:
-    """Return the value for the state of a rotation; ``unconfirmed`` is None if it is not known."""
+    """Return what `rotate_ca --status --json` prints.
+
+    ``unconfirmed`` is None if the unconfirmed robots are not known.
+    """
     return RotationState(
         status.rotation.stage,
         status.rotation.next_stage(),

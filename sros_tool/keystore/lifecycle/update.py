@@ -220,9 +220,9 @@ def _checked_target(
         wanted, place = getattr(target, name), getattr(present_settings.settings, name)
         if wanted and wanted != place:
             raise UsageError(
-                f"the settings name '{wanted}' as the place of a CA key, but it is at "
+                f"the new settings put a CA key at '{wanted}', but the key is at "
                 f"'{place or PRIVATE}'",
-                "An update moves no CA key.",
+                "update_keystore does not move CA keys.",
                 f"Leave authorities.{name} out; `sros rotate_ca --{name.replace('_', '-')}` makes "
                 "a CA with a key elsewhere.",
             )
