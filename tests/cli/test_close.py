@@ -1041,8 +1041,8 @@ def test_a_renamed_node_is_compared_and_a_new_one_is_named(
     policy = robot.folder / "robot/policy.xml"
     text = policy.read_text().replace('ns="/" node="rear_', 'ns="/nav" node="stern_')
     policy.write_text(text.replace(">cmd_vel<", ">/cmd_vel<").replace("<topic>plan</topic>", ""))
-    said, denied = robot.close().out, "denies now: /listener publish topic /plan"
-    assert said.count("used when sros watched") == 1 and f": {denied[12:]} (/nav/stern_c" in said
+    said, denied = robot.close().out, "used: /listener publish topic /plan"
+    assert said.count("used when sros watched") == 1 and f"{denied[4:]} (/nav/stern_c" in said
     moved = "publish rt/nav/stern_camera/image", "publish rt/nav/odom"
     stern_camera = ros_node("nav/stern_camera", of, *moved, kept[0])
     ghost = ("/", "/", "ghost_node", of, ["publish rt/rosout"])
@@ -1050,8 +1050,8 @@ def test_a_renamed_node_is_compared_and_a_new_one_is_named(
     said = robot.close("--apply").out
     talk = "everything that talked can still talk: "
     assert (
-        f"yes: {talk}3 nodes with 57 endpoints as before (types are not compared), "
-        "but for 1 right that the policy " in said
+        f"yes: {talk}3 nodes with 57 endpoints as before (types are not compared); "
+        "the policy takes away 1 right that the robot " in said
     )
     assert f"{denied}; new, without a profile: /ghost_node in /listener; compared " in said
     renamed = "compared under a new name: /rear_camera as /nav/stern_camera, with /odom as /nav/o"
