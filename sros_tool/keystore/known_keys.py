@@ -451,6 +451,11 @@ class KnownKeys:
                 "A key that was revoked may be certified again.",
             )
 
+    def revoked_enclaves(self) -> list[str]:
+        """Return the revoked enclaves that the keystore no longer has, sorted by name."""
+        names = {entry.enclave for entry in self._revocations if entry.enclave}
+        return sorted(self.revoked_before(names.difference(self._keystore.names)))
+
     def revoked_before_notes(self, names: Iterable[str]) -> Iterator[Note]:
         """Yield a note for each new enclave in ``names`` that was revoked before."""
         names = tuple(names)

@@ -77,8 +77,9 @@ class PictureSource:
     of nodes; ``enclaves`` has the enclaves with data of their certificates; ``scope`` has the paths
     of the enclaves that the source describes, None for all.  ``protections`` are the protection
     levels that a policy states, and ``policy`` is that policy. ``keystore`` is the keystore from
-    which the source was read; ``unread`` are units of the keystore that were only compared with
-    other units. ``in_domains`` has the rights by ROS domain; empty if the source states no domains.
+    which the source was read; ``revoked`` are revoked enclaves that it no longer has, and
+    ``unread`` units of the keystore that were only compared with other units. ``in_domains`` has
+    the rights by ROS domain; empty if the source states no domains.
     """
 
     origin: SourceTitle
@@ -92,6 +93,7 @@ class PictureSource:
     protections: tuple[StatedProtection, ...] = ()
     policy: Policy | None = None
     keystore: OpenedKeystore | None = None
+    revoked: tuple[str, ...] = ()
     unread: tuple[UnreadUnits, ...] = ()
     in_domains: DomainRights = field(default_factory=dict)
 
@@ -279,6 +281,7 @@ def _picture(
         ),
         findings=tuple(dict.fromkeys(finding for source in sources for finding in source.findings)),
         exports=tuple(source.origin.title for source in sources if source.is_export),
+        revoked=tuple(sorted({name for source in sources for name in source.revoked})),
         unread=tuple(units for source in sources for units in source.unread),
         join_needs_right=governance is not None
         and all(rule.enable_join_access_control for rule in governance.domain_access_rules),

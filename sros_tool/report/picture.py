@@ -496,6 +496,7 @@ class DifferentUnit(NamedTuple):
 @shows(
     *("title", "origins", "enclaves", "names", "edges", "overlay", "differences", "validities"),
     *("findings", "focus", "requirements", "equal", "different", "exports"),
+    "revoked",
 )
 @dataclass(frozen=True, slots=True)
 class Picture:
@@ -533,6 +534,8 @@ class Picture:
     """Units that differ slightly from equal units."""
     exports: tuple[str, ...] = ()
     """The sources that are exports, which may lack enclaves of their keystore."""
+    revoked: tuple[str, ...] = ()
+    """Revoked enclaves that a keystore no longer has, which are not drawn."""
     unread: tuple[UnreadUnits, ...] = ()
     join_needs_right: bool = False
     """Whether an enclave can join only the ROS domains in which it has a right."""
@@ -557,12 +560,19 @@ class Picture:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Sentences without a full stop: on units that are drawn once, and on units that differ."""
+        """Sentences without a full stop: on units drawn once or that differ, and revocations."""
         equal = (f"{units.title} are drawn as one" for units in self.equal)
         more = len(self.different) - _MOST_IN_HEADLINES
         different = [unit.sentence() for unit in self.different[:_MOST_IN_HEADLINES]]
         different += [f"{more} more differ"] if more > 0 else []
-        return (*equal, *different)
+        revoked = [self.revoked_sentence] if self.revoked else []
+        return (*equal, *different, *revoked)
+
+    @property
+    def revoked_sentence(self) -> str:
+        """A sentence without a full stop on revoked enclaves; "" if there are none."""
+        names = first_few(self.revoked, _MOST_IN_HEADLINES)
+        return f"revoked, and therefore not drawn: {names}" if self.revoked else ""
 
     def _unread_sentences(self) -> Iterator[str]:
         if not self.unread:

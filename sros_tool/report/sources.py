@@ -10,6 +10,7 @@ import os
 import re
 from collections import defaultdict
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence, Set
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime, tzinfo
 from pathlib import Path
@@ -25,6 +26,7 @@ from sros_tool.fleet.robots import Fleet, Robot, robot_of
 from sros_tool.graph.learn import learn
 from sros_tool.graph.observation import observation_from_json
 from sros_tool.keystore.fleet import load_fleet
+from sros_tool.keystore.known_keys import KnownKeys
 from sros_tool.keystore.layout import PUBLIC, ROUTER_FILE, is_keystore
 from sros_tool.keystore.participant import evaluated
 from sros_tool.keystore.protection import governance_with_stated
@@ -601,9 +603,13 @@ def _with_keystore(source: PictureSource, sample: SampledKeystore, now: datetime
         validities |= set(_authorities(keystore))
     except SrosError as error:
         findings.append(PicturedFinding("view.no-authorities", "error", str(error)))
+    revoked: Sequence[str] = ()
+    with suppress(SrosError):  # `check` reports a ledger that cannot be read
+        revoked = KnownKeys(keystore).revoked_enclaves()
     return replace(
         source,
         keystore=keystore,
+        revoked=tuple(revoked),
         unread=sample.unread,
         enclaves=tuple(enclaves),
         governance=governance,

@@ -139,6 +139,10 @@ def test_a_keystore_tells_validity_protection_and_findings(robot_keystore: Path)
     assert "CN=/mobile_robot/camera" in camera["subject"]
     assert camera["key"].startswith("EC")
     assert not camera["problems"]
+    assert found["revoked"] == ["/spare"]
+    for form in ("html", "markdown"):
+        drawn = sros("view", robot_keystore, "--format", form).ok().out
+        assert "evoked, and therefore not drawn: /spare" in drawn
 
 
 @pytest.mark.parametrize("kind", some(["a keystore", "an enclave", "drift", "use"], 2))
