@@ -399,9 +399,9 @@ def _launch_problems(robot: LocalRobot, observed: ObservedProcesses) -> Iterator
         by_launch = process.launch or process.container
         if not by_launch and without_launch_files(command) != tuple(command):
             yield (
-                f"the launch that started the process of {process.enclave} has ended, and with it "
-                "temporary files that the command of the process names. Start the launch again, "
-                f"and watch again: {robot.close_command} --for 1m"
+                f"the launch that started the process of {process.enclave} has ended, and the "
+                "command of the process names temporary files of that launch. Start the launch "
+                f"again, and watch again: {robot.close_command} --for 1m"
             )
         if process.launch and not (node_argument(command) or process.is_launch):
             words = run_words(robot.export.absolute(), process.enclave, process.rmw)

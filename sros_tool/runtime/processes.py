@@ -671,8 +671,8 @@ def _runs_launch(folder: int, pid: int, command: Sequence[str], child: Sequence[
 def without_launch_files(command: Sequence[str]) -> tuple[str, ...]:
     """Return a command without the names of the temporary files that launch_ros made for it.
 
-    These files have parameters, and a launch makes them again with other names (launch_ros 0.19 to
-    0.28, ``launch_ros/actions/node.py``).
+    These files have parameters, and each launch makes new ones (launch_ros 0.26,
+    ``actions/node.py`` and ``parameter_descriptions.py``).
     """
     return tuple(_LAUNCH_FILE.sub(r"\1*", word) for word in command)
 

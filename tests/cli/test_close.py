@@ -1788,7 +1788,7 @@ def test_a_program_that_runs_a_launch_description_starts_no_open_node(robot: Rob
     """Its nodes have temporary files, so it is started itself, and has to secure its nodes."""
     robot.named, robot.launch_file = True, "/tmp/launch_params_a1b2c3d4"
     said = robot.close("--for", "1s", status=1).out
-    assert "the launch that started the process of /listener has ended, and with it" in said
+    assert "the launch that started the process of /listener has ended, and the comma" in said
     robot.launch = ("python3", "bringup.py")
     robot.close("--for", "1s")
     robot.launch_file = "/tmp/launch_params_4d3c2b1a"  # as after a restart
