@@ -17,9 +17,9 @@ _BEGINNING = """\
 # What `--json` prints
 
 Every verb but `run`, `completion`, `fleet inventory` and `fleet report` takes `--json`, and \
-prints one JSON object on standard output. Its first key is `version`, which is 1: it is raised \
-when a key goes or changes its meaning. Keys may be added without that, so ignore those that you \
-do not know.
+prints one JSON object on standard output. Its first key is `version`, which is 1: the \
+number is raised when a key is removed or changes its meaning. It stays the same when a key is \
+added, so ignore keys that you do not know.
 
 - The exit status is the same as without `--json`; look at it first. After an error, standard \
 output is empty, and standard error has one paragraph. The exception is `env`: \
@@ -29,9 +29,9 @@ after an error, it prints variables that keep every node from starting.
 - Moments are in UTC, as `2027-05-21T12:50:48Z`; serial numbers and SHA-256 are lower-case \
 hexadecimal.
 
-Each verb has a JSON Schema (draft 2020-12) in `sros_tool/schemas/`, from which this page is made \
-by `python -m tools.json_page`; it is closed, and fits the sros that it ships with. A key followed \
-by `?` is left out where it has nothing to say; \
+Each verb has a JSON Schema (draft 2020-12) in `sros_tool/schemas/`. A schema allows no other \
+keys, and fits the sros with which it ships. `python -m tools.json_page` makes this page from the \
+schemas. A key followed by `?` is left out if it has no value; \
 `[]` stands for each element of a list, `*` for each key of an object.
 
 <!-- not run: jq is not part of sros; tests/cli/test_json.py compares outputs and schemas -->

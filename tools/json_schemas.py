@@ -176,8 +176,8 @@ VERBS: Mapping[str, str | Shapes] = {
 _DIALECT = "https://json-schema.org/draft/2020-12/schema"
 _VERSION = {
     "const": 1,
-    "description": "The version of the shape: raised when a key goes or changes its meaning, "
-    "not when one is added.",
+    "description": "The version of the format. It is raised if a key is removed or changes its "
+    "meaning, but not if a key is added.",
 }
 _PLAIN = {str: "string", int: "integer", float: "number", bool: "boolean", type(None): "null"}
 

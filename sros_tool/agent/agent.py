@@ -146,11 +146,11 @@ class Round(NamedTuple):
     release: int
     """Number of the release that is installed with all its enclaves; 0 for none."""
     accepted: int
-    """Highest number of a release that was verified; if it is higher than ``release``, some
-    enclaves wait for it.
+    """Highest number of a verified release; if this number is higher than ``release``, some
+    enclaves wait for that release.
     """
     fetched: bool
-    """Whether the source was reached and could be trusted."""
+    """Whether the agent reached the source, and trusted its metadata."""
     changed: Sequence[str]
     """Enclaves of which a file changed."""
     removed: Sequence[str]
@@ -166,7 +166,7 @@ class Round(NamedTuple):
     sent: bool
     """Whether the message reached the inbox."""
     problems: Sequence[str]
-    """What could not be done, and what is wrong, as sentences."""
+    """What the agent could not do, and what is wrong, as sentences."""
 
 
 @dataclass(frozen=True, slots=True)

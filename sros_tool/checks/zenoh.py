@@ -549,7 +549,7 @@ class SubjectRights(NamedTuple):
     unsaid: Sequence[KeyRight]
     """Rights to keys that no ROS name states exactly."""
     denied: Sequence[KeyRight]
-    """Denied keys; a wildcard may get past a denial."""
+    """Denied keys; a message with a wildcard may bypass a denial."""
 
 
 class ReadConfiguration(NamedTuple):

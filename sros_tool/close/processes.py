@@ -49,28 +49,31 @@ class ClosedProcess(NamedTuple):
     enclave: str
     """The enclave of the process."""
     pid: int
-    """Its id; 0 if it ended while sros watched, or is restarted by hand, and no process with its
-    command runs any more."""
+    """The id of the process; 0 if no process with its command runs any more, and it ended while
+    sros watched or is restarted by hand.
+    """
     command: Sequence[str]
     """Its command with the arguments."""
     folder: str
     """Its working directory."""
     user: int
-    """The id of the user who runs it; 4294967295 if several users have a say in it."""
+    """The id of the user who runs the process; 4294967295 if several users can control it."""
     unit: str
     """The systemd unit that starts it alone; empty for a process that is restarted by hand."""
     known_by: Annotated[
         str, Words(("process id", "node name", "program", "elimination", "enclave", "command"))
     ]
-    """How sros knows that this process has the nodes of the enclave."""
+    """The evidence that this process has the nodes of the enclave."""
     launch: Sequence[str] = ()
-    """The command of the launch that started it: `ros2 launch`, or a Python program that runs a
-    launch description; empty for a process of its own."""
+    """The command of the launch that started the process: `ros2 launch`, or a Python program that
+    runs a launch description; empty if no launch started it.
+    """
     container: str = ""
     """The id of the Docker container in which it runs; empty outside of containers."""
     rmw: str = ""
     """rmw_zenoh_cpp for a process on Zenoh; otherwise the RMW that its environment names; empty if
-    it names none, or one that enforces no security."""
+    the environment names no RMW, or an RMW that enforces no security.
+    """
     shares: Sequence[str] = ()
     """The other enclaves whose processes the same command starts, as `multiprocessing` does."""
     chooses: bool = False
@@ -288,7 +291,7 @@ class ObservedProcesses(NamedTuple):
     ended: Sequence[str] = ()
     """Enclaves whose processes ended while sros watched."""
     not_here: Sequence[str] = ()
-    """Enclaves that belong to other machines: those of `--elsewhere`."""
+    """Enclaves that belong to other machines (`--elsewhere`)."""
     brought: Mapping[str, str] = {}
     """Enclaves of `--brought`, and when their files in the keystore had changed last, in ISO 8601.
     """

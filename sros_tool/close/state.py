@@ -273,8 +273,9 @@ class CloseStep(NamedTuple):
     command: str
     """The command line that does the same."""
     state: Annotated[str, Words(("done", "kept", "findings", "open"))]
-    """Whether the step was done now, was kept because its result existed, found something, or
-    is not done."""
+    """Whether the step was done now, was not repeated because its result existed, found something,
+    or is not done.
+    """
 
 
 class Proof(NamedTuple):
@@ -311,8 +312,9 @@ class CloseState(NamedTuple):
     steps: Sequence[CloseStep]
     """The steps in their order."""
     secured: Mapping[str, bool]
-    """The enclaves in which a process of the robot runs now, and whether with the current files;
-    otherwise it has to be restarted."""
+    """The enclaves in which a process of the robot runs now, and whether this process has the
+    current files; otherwise it has to be restarted.
+    """
     outdated: Mapping[str, str]
     """Why the processes of these enclaves have to be restarted, as text before "the processes of"
     and the enclave."""
@@ -320,9 +322,9 @@ class CloseState(NamedTuple):
     """The ids of the processes that have to be restarted, by these enclaves, in the order in which
     they should be restarted."""
     new: Sequence[str]
-    """The enclaves of the policy without a process: none was observed, and none runs now."""
+    """The enclaves of the policy without a process: no process of them was observed or runs now."""
     absent: Sequence[str]
-    """The enclaves whose process is started by a unit, and does not run."""
+    """The enclaves whose process a unit starts, but whose process does not run."""
     without: Sequence[str]
     """The enclaves of `--without`, of which no process has to run."""
     needed_elsewhere: Mapping[str, datetime]
@@ -332,8 +334,9 @@ class CloseState(NamedTuple):
     `brought`.
     """
     brought: Mapping[str, datetime]
-    """The other enclaves of other machines, with the same moment: `--brought` said that the other
-    machine has these files, which sros cannot see."""
+    """The other enclaves of other machines, also with the last change of their files: `--brought`
+    says that the other machine has these files, which sros cannot see.
+    """
     valid_until: datetime | None
     """When the first enclave of the export expires, in UTC; null without an export."""
     expires_soon: Sequence[str]

@@ -609,9 +609,9 @@ class DemoResult:
     names: tuple[str, ...]
     """The topics, services and actions that the rows use, such as `topic /chatter`."""
     own_network: bool
-    """Whether the demo ran in a network namespace of its own."""
+    """Whether the demo ran in a separate network namespace."""
     network_reason: str
-    """Reason that the demo had no network namespace of its own, or an empty string."""
+    """Why the demo did not run in a separate network namespace, or an empty string."""
     scenarios: tuple[ScenarioResult, ...]
     """Results of the scenarios."""
     left_out: int = 0

@@ -288,9 +288,12 @@ class AuditResult(NamedTuple):
     refused: Sequence[RefusedEnclave]
     """Enclaves in which no process would start."""
     unseen: Sequence[EnclaveNode]
-    """The nodes of the policy or keystore that were not seen, and so not judged."""
+    """The nodes of the policy or keystore that were not seen, so that their rights were not
+    judged.
+    """
     unjudged: Sequence[str]
-    """Observed things that were not judged, as counts in words with some names; ``notes`` has more.
+    """Observed parts that were not judged, as texts with a number and some names; ``notes`` has
+    more.
     """
     observation: Observation
     settled: bool
@@ -298,8 +301,7 @@ class AuditResult(NamedTuple):
     partial: bool
     """Whether ``--partial`` accepted nodes that were not seen."""
     unjudged_accepted: bool
-    """Whether ``--unjudged`` accepted things that were not judged, and a graph that kept changing.
-    """
+    """Whether ``--unjudged`` accepted parts that were not judged, or a graph that kept changing."""
     patch: Path | None
     """The policy with the rights to add that was written (``--patch``), or null."""
     dry_run: DryRun

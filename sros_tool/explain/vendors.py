@@ -497,8 +497,8 @@ class VendorOutcome(NamedTuple):
     opened: AccessWithoutIdentity = AccessWithoutIdentity()
     """The rights that the enclave's governance gives to processes without an identity."""
     in_part: Sequence[str] = ()
-    """The parts of an action, such as ``send_goal``, by which the enclave can command the server
-    (with call) or inform the clients (with execute), without the whole right.
+    """If the enclave does not have the whole right: the parts of an action, such as ``send_goal``,
+    by which it can command the server (with call) or inform the clients (with execute).
     """
     by_permissions_of: Sequence[str] = ()
     """The other enclaves whose permissions fit the certificate of this enclave and allow the
@@ -556,8 +556,9 @@ class WhoByVendor(NamedTuple):
 
     @property
     def anybody_in_part(self) -> tuple[str, ...]:
-        """The parts by which processes without an identity can command the server or inform the
-        clients, without the whole right."""
+        """If processes without an identity do not have the whole right: the parts by which they can
+        command the server or inform the clients.
+        """
         return AccessWithoutIdentity.joined(outcome.opened for outcome in self.enclaves).parts
 
     @property

@@ -250,9 +250,7 @@ class FollowedReach(NamedTuple):
     path: Path
     """Path of the keystore or policy."""
     left_out: Sequence[str]
-    """Topics that do not count, and services (as */NAME) whose requests change nothing, and
-    therefore do not count.
-    """
+    """Names that do not count: topics, and services (as */NAME) whose requests change nothing."""
     domain: int | None
     """The ROS domain in which information flows; null for every domain."""
     reach: Reach

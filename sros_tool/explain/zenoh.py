@@ -189,8 +189,8 @@ class ZenohAnswer:
     """The deciding files that the permissions CA has not signed."""
     domains: str = ""
     in_part: tuple[str, ...] = ()
-    """The parts of an action, such as ``send_goal``, by which the enclave can command the server
-    (with call) or inform the clients (with execute), without the whole right.
+    """If the enclave does not have the whole right: the parts of an action, such as ``send_goal``,
+    by which it can command the server (with call) or inform the clients (with execute).
     """
 
     @property
@@ -269,8 +269,8 @@ class ZenohEnclaveOutcome(NamedTuple):
     domains: str
     """The ROS domains in which the enclave has the right, such as ``10`` or ``10,20``, or null."""
     in_part: Sequence[str] = ()
-    """The parts of an action, such as ``send_goal``, by which the enclave can command the server
-    (with call) or inform the clients (with execute), without the whole right.
+    """If the enclave does not have the whole right: the parts of an action, such as ``send_goal``,
+    by which it can command the server (with call) or inform the clients (with execute).
     """
 
 

@@ -112,7 +112,7 @@ class CertificateFacts(NamedTuple):
 
 
 class RevocationListFacts(NamedTuple):
-    """A revocation list; once it has expired, DDS refuses all certificates of its CA."""
+    """A revocation list; after it has expired, DDS refuses all certificates of its CA."""
 
     issuer: str
     """Subject of the CA that signed the list."""
@@ -303,7 +303,9 @@ class NetworkFacts(NamedTuple):
     routers: Sequence[RouterFacts]
     """Further routers, on robots or other hosts."""
     crossing: Sequence[str]
-    """The names that may pass between routers; empty for all to which enclaves have rights."""
+    """The names that may pass between routers; empty if all names to which enclaves have rights may
+    pass.
+    """
 
 
 class SignerFacts(NamedTuple):

@@ -190,9 +190,7 @@ class ConfirmedFile:
     since: str = ""
     """When the keystore issued the robot's file, in UTC; null if the ledger does not record it."""
     enclave: str = ""
-    """The enclave to which the robot's file belongs, if it is not the enclave of the path; else
-    null.
-    """
+    """The enclave to which the robot's file belongs; null if it is the enclave of the path."""
     robot: str = ""
     """The robot to which ``enclave`` belongs, or null."""
     surplus: bool = False
@@ -583,8 +581,8 @@ class FleetStatus:
     def complete(self) -> bool:
         """Whether nothing is left to do for the fleet; if false, the exit status is 1.  True if
         every robot with enclaves confirmed the current files in time, no restart is due, no agent
-        reports a problem, robots can still fetch what was published, and nothing else casts doubt
-        on the robots' files.  Robots whose enclaves were all revoked do not count.
+        reports a problem, robots can still fetch the published releases, and there is no other
+        doubt about the robots' files.  Robots whose enclaves were all revoked do not count.
         """
         return self._is_in_order and all(robot.settled for robot in self.robots)
 

@@ -133,16 +133,16 @@ class Entry(NamedTuple):
     policy: str = ""
     """SHA-256 of the policy with its includes from which the permissions were made."""
     reason: str = ""
-    """Reason of a revocation; fault that a gap records; what showed a restore; why a
-    document was signed again; or how a certificate became known, if the keystore did not issue it
-    with this line.
+    """The reason of a revocation; the fault that a gap records; what showed a restore; why a
+    document was signed again; or, if the keystore did not issue the certificate with this line, how
+    the certificate became known.
     """
     key: str = ""
     """SHA-256 of the public key (DER) of the certificate, or of the revoked certificate."""
     number: int = 0
-    """Number of an answer or of releases (later ones have higher numbers); last line of a gap;
-    number of the sealed part; or a number above all that the keystore gave before it was restored.
-    Otherwise 0.
+    """The number of an answer or of releases (later ones have higher numbers); the last line of a
+    gap; the number of the sealed part; after a restore, a number above all numbers that the
+    keystore gave before. Otherwise 0.
     """
     settings: str = ""
     """The settings of the keystore, as TOML."""

@@ -69,7 +69,9 @@ class EnclaveResult(NamedTuple, Generic[Outcome]):
     sha256: str | None
     """SHA-256 of the certificate (DER), in hexadecimal; null without a certificate."""
     valid_until: datetime | None
-    """First expiry of certificate and permissions, in UTC; null if ``serial`` is null."""
+    """When the certificate or the permissions expire, whichever is first, in UTC; null if
+    ``serial`` is null.
+    """
 
 
 def enclave_result(

@@ -626,8 +626,8 @@ class PolicyDifference(NamedTuple):
     protections: Sequence[DifferentProtection]
     """Protection that only one of two policies demands."""
     unanswered: Sequence[Right]
-    """Rights of B whose counterpart, such as the right of the subscriber, was in A, but is not in
-    B.
+    """Rights of B that lost their counterpart, such as the right of the subscriber: A has the
+    counterpart, B does not.
     """
     domains: Sequence[DifferentDomains]
     """Enclaves of both sides with different ROS domains; only enclaves for which both sides state

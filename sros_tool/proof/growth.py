@@ -245,7 +245,7 @@ class Growth:
     new_nodes: tuple[NewNode, ...]
     """Nodes that HEAD assigns to an enclave of BASE, and that thereby get more rights."""
     dropped_denials: tuple[DroppedDenial, ...]
-    """Denials that HEAD drops or narrows without allowing their names; this is no new access."""
+    """Denials that HEAD drops or narrows, without allowing their names; this is not new access."""
 
     @property
     def new_access(self) -> bool:

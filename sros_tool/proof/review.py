@@ -340,8 +340,8 @@ class StepResult(NamedTuple):
     status: int
     """Exit status of the step: 0, 1 or 2, as for the review."""
     allowed: bool
-    """Whether the step found something that is allowed, by an option or always (``signed``, and
-    private keys that were there before); the status is then 0.
+    """Whether the step found something that an option allows, or that is always allowed
+    (``signed``, and private keys that were there before); the status is then 0.
     """
     result: str
     """The result as a sentence, or the reason why the step could not be decided."""

@@ -161,7 +161,7 @@ class Spelling(StrEnum):
 @shows("kind", "name", "namespace", "protection", "wildcard", "lacks")
 @dataclass(frozen=True, slots=True)
 class Name:
-    """A topic, service or action; or a ``wildcard`` that is drawn as a name.
+    """A topic, service or action, or a ``wildcard`` that is drawn as a name.
 
     ``lacks`` is the side (senders or receivers) without an allowed enclave. The server of a service
     is its receiver. ``spelling`` is known in the picture of one policy.
@@ -178,8 +178,8 @@ class Name:
     wildcard: bool = False
     """Whether the name is a wildcard, drawn as a name because no right to a known name shows it."""
     lacks: Lack = Lack.NOTHING
-    """The side that is missing because no enclave has the right; the server of a service is its
-    receiver.
+    """The side (senders or receivers) of which no enclave has the right; the server of a service is
+    its receiver.
     """
     spelling: Spelling = Spelling.UNKNOWN
 
@@ -445,7 +445,7 @@ class EqualUnits(NamedTuple):
     members: tuple[str, ...]
     """Names of the units."""
     domains: str = ""
-    """ROS domains of the units, if other units have other domains; else empty."""
+    """ROS domains of the units; empty unless other units have other domains."""
 
     @property
     def title(self) -> str:

@@ -730,7 +730,7 @@ class ImportedAnswer(NamedTuple):
     authorities_verified: bool
     """Whether ``--ca`` or an earlier answer verified the CAs; if not, compare their SHA-256."""
     restart_zenoh: Sequence[str]
-    """The enclave, if its processes on Zenoh have to be restarted; else empty."""
+    """The enclave, if its processes on Zenoh have to be restarted; otherwise empty."""
     changes: FileChanges
     notes: Notes
 

@@ -43,8 +43,8 @@ if TYPE_CHECKING:
 
 Rights = Annotated[
     Sequence[ReplacedRights],
-    "What enclaves gain and lose with their new permissions; enclaves without a change are left "
-    "out.",
+    "The rights that enclaves gain and lose with their new permissions; enclaves without a change "
+    "are left out.",
 ]
 TrustRevoked = Annotated[
     Sequence[str],
@@ -119,7 +119,7 @@ CreatedEnclaves = Annotated[
     "The enclaves that were created, or existed.",
 ]
 ChangedEnclave = Annotated[
-    _EnclaveCreation[Annotated[str, Words(("changed",)), "Its permissions were replaced."]],
+    _EnclaveCreation[Annotated[str, Words(("changed",)), "It got new permissions."]],
     "The enclave with its new permissions.",
 ]
 MadeEnclaves = _EnclaveCreation[
@@ -203,7 +203,9 @@ class NetworkSettings(NamedTuple):
     routers: Sequence[RouterFacts]
     """Further routers, on robots or other hosts."""
     crossing: Sequence[str]
-    """The names that may pass between routers; empty for all to which enclaves have rights."""
+    """The names that may pass between routers; empty if all names to which enclaves have rights may
+    pass.
+    """
 
 
 class ZenohFileState(NamedTuple):
@@ -282,8 +284,8 @@ class RenewedEnclaves(NamedTuple):
     ]
     """The renewed enclaves."""
     replaced_work_until: datetime | None
-    """Until when the last of these enclaves' earlier certificates in the ledger works, in UTC:
-    until it or the last permissions that fit it expire; null if all have expired or were revoked.
+    """When the last of these enclaves' earlier certificates in the ledger stops working, in UTC:
+    when it expires, or the last permissions for it. Null if all have expired or were revoked.
     """
     may_work_longer: bool
     """Whether certificates that the ledger lacks may work longer, because the keystore is older
@@ -361,8 +363,8 @@ class UpdatedKeystore(NamedTuple):
     ]
     """Enclaves that got a certificate or permissions."""
     replaced_work_until: datetime | None
-    """Until when the replaced certificates work with their permissions, in UTC; null if none was
-    replaced or all were revoked.
+    """When the replaced certificates stop working with their permissions, in UTC; null if no
+    certificate was replaced, or all were revoked.
     """
     revoked: int
     """The number of revoked certificates."""
