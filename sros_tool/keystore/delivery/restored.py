@@ -401,8 +401,8 @@ def refuse_lost_changes(
         for text in texts:
             _LOG.info("right that was taken away after the backup: %s", text)
         short = [textwrap.shorten(text, _LONGEST, placeholder=" ...") for text in texts[:_NAMED]]
-        lists_all = "; -v lists all" if short != texts else ""
-        what.append(f"rights of {shown(rights)} were taken away ({'; '.join(short)}{lists_all})")
+        more = "; -v shows more" if short != texts else ""
+        what.append(f"rights of {shown(rights)} were taken away ({'; '.join(short)}{more})")
         steps.append("Sign the present policy again, with `sros generate_artifacts`.")
         if not (certificates or keys or names["governance"]):
             steps.append(f"If the enclaves are to have these rights, run {renew(rights)}.")
