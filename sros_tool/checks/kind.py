@@ -231,7 +231,7 @@ _MODULES = (
     *("policies", "requirements", "keystores.files", "keystores.authorities"),
     *("keystores.enclaves", "keystores.vendors", "keystores.documents", "keystores.topic_names"),
     *("keystores.issued", "keystores.trust", "keystores.zenoh_files", "zenoh", "upgrade"),
-    *("environment", "runtime", "processes", "vulnerabilities", "review"),
+    *("environment", "runtime", "processes", "connections", "vulnerabilities", "review"),
 )
 """The modules of checks, in the order in which their kinds are listed."""
 

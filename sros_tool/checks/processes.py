@@ -17,6 +17,11 @@ from cryptography import x509
 from cryptography.exceptions import UnsupportedAlgorithm
 from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 
+from sros_tool.checks.connections import (
+    connection_findings,
+    connections_between,
+    started_before,
+)
 from sros_tool.checks.environment import (
     OWN_CONFIGURATION,
     PROCESS_OPEN,
@@ -689,6 +694,9 @@ def process_findings(
     starts_nodes = is_secured_here and bool(environment.get(ENCLAVE))
     yield from _mixed_vendor_findings(secured, environment if starts_nodes else None)
     yield from _other_keystore_findings(secured, environment if is_secured_here else None)
+    for _, processes in _group_by_authorities(secured):
+        connections = connections_between(started_before(processes, now))
+        yield from connection_findings(connections.missing)
     if is_secured_here and environment.get(KEYSTORE):
         root = Path(environment[KEYSTORE])
         copies = (node for node in nodes if node.enclave and has_other_files(node.enclave, root))

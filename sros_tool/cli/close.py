@@ -329,7 +329,7 @@ def _show_end(
     robot: LocalRobot, closed: CloseState, *, apply: bool, holds: bool, partial: bool
 ) -> None:
     """Print whether the robot is closed, the reasons, and what to do next."""
-    from sros_tool.close.state import TALK
+    from sros_tool.close.state import CONNECTED, TALK
 
     folder, observed = shlex.quote(str(robot.folder)), closed.observed
     ask = f"sros close {folder} --proof"
@@ -342,7 +342,8 @@ def _show_end(
         accept = " (--partial accepts this)" if proof.is_accepted_by_partial else ""
         accept = " (accepted: --partial)" if accept and partial else accept
         echo(f"{_ANSWERS[proof.holds]}: {proof.claim}: {proof.reason}{accept}")
-        if proof.holds and proof.claim == TALK:
+        claims = {proof.claim for proof in closed.proofs}
+        if proof.holds and proof.claim == TALK and CONNECTED not in claims:
             echo(_NOT_PROVED)
     if closed.problems:
         echo(f"{_state_text(closed, apply=apply)}; fix this first:")

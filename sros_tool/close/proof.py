@@ -9,6 +9,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from sros_tool.checks.connections import (
+    CONNECTING_TIME,
+    PROCESS_NOT_CONNECTED,
+    Connections,
+    connection_findings,
+    connections_between,
+)
 from sros_tool.checks.keystores.issued import STALE
 from sros_tool.checks.kind import NOTE, Finding
 from sros_tool.checks.processes import PROCESS_NOT_SEEN, process_findings
@@ -16,6 +23,7 @@ from sros_tool.close.nodes import MovedEndpoint, ObservedNodes, node_name, nodes
 from sros_tool.close.processes import ObservedProcesses
 from sros_tool.close.robot import MOST_NAMES, OBSERVER, LocalRobot
 from sros_tool.close.state import (
+    CONNECTED,
     SILENCE,
     TALK,
     CloseState,
@@ -107,7 +115,14 @@ def proofs_of(robot: LocalRobot, state: CloseState, patience: float) -> list[Pro
         options = " ".join(f"--without {name}" for name in present)
         talk = talk._replace(reason=f"{talk.reason}; if they may be away, add {options}")
     silence = _proof_of_silence(robot, nodes.nodes_to_compare(away), hears=talk.holds is not None)
-    return [proof, _proof_of_files(robot, expired), *_proof_of_requirements(robot), talk, silence]
+    return [
+        proof,
+        _proof_of_files(robot, expired),
+        *_proof_of_requirements(robot),
+        talk,
+        *_proof_of_connections(robot),
+        silence,
+    ]
 
 
 def _proof_of_files(robot: LocalRobot, expired: Sequence[str]) -> Proof:
@@ -223,6 +238,36 @@ def _demands_more_enclaves(robot: LocalRobot) -> bool:
     return not demanded.issubset(list_enclaves(robot.export))
 
 
+def _proof_of_connections(robot: LocalRobot) -> Iterator[Proof]:
+    """Prove that processes have connected to each other, if sros can see this of some.
+
+    Waits until all have connected, or had enough time.
+    """
+    started = [process.started for process, _ in RunningRobot(robot).secured]
+    now = robot.shell.now()
+    patience = min(max(started, default=now) + CONNECTING_TIME - now, CONNECTING_TIME)
+    running = wait_until(
+        robot, lambda seen: not _connections(seen).missing, patience.total_seconds()
+    )
+    connections = _connections(running)
+    if findings := [*connection_findings(connections.missing)]:
+        texts = [f"{finding.subject}: {finding.text}" for finding in findings]
+        reason = f"{first_few(texts, MOST_NAMES, '; ')}. {findings[0].remedy.rstrip('.')}"
+        yield Proof(CONNECTED, False, reason)
+    elif len(connections.compared) > 1:
+        number = counted(len(connections.compared), "process", "processes")
+        reason = f"{number} of Fast DDS have all connected to each other"
+        if unknown := [process.label for process in connections.unknown]:
+            reason += f"; sros cannot see this of {first_few(unknown, MOST_NAMES)}"
+        yield Proof(CONNECTED, True, reason)
+
+
+def _connections(running: RunningRobot) -> Connections:
+    return connections_between(
+        process for process, enclave in running.secured if enclave.name != OBSERVER
+    )
+
+
 def _proof_of_silence(robot: LocalRobot, before: Observation, *, hears: bool) -> Proof:
     """Prove that an open listener sees no node of the robot.
 
@@ -281,7 +326,11 @@ def _process_findings(running: RunningRobot) -> list[Finding]:
     environment = {**robot.shell.environment, **robot.variables(OBSERVER), ENCLAVE: ""}
     examined = replace(running.processes, processes=tuple(running.in_domain))
     findings = process_findings(environment, examined, now=robot.shell.now(), zone=robot.shell.zone)
-    return [finding for finding in findings if finding.severity > NOTE]
+    return [
+        finding
+        for finding in findings
+        if finding.severity > NOTE and finding.kind is not PROCESS_NOT_CONNECTED
+    ]
 
 
 def _unexpected_processes(running: RunningRobot) -> Iterator[str]:

@@ -55,6 +55,12 @@ _DDS_LIBRARIES = re.compile(
     re.MULTILINE,
 )
 """Matches a mapped DDS library at a line's start: a process may map thousands of files."""
+_MEMORY_PORTS = re.compile(
+    rb"^\S+ \S+ \S+ (\S+) (\d+) +/[^\n]*/fast(?:rtps|dds)_port(\d{1,5})$", re.MULTILINE
+)
+"""Matches a port of Fast DDS in shared memory that is mapped, and not deleted."""
+_OWN_PORT = re.compile(r"/fast(?:rtps|dds)_port(\d{1,5})_el\Z", re.ASCII)
+"""Matches the file that a process keeps locked while it alone reads a port of Fast DDS."""
 _PRODUCTS = {b"fastrtps": "Fast DDS", b"fastdds": "Fast DDS", b"ddsc": "Cyclone DDS"}
 _THREE_NUMBERS = re.compile(r"\.so\.(\d+\.\d+\.\d+)(?:\.\d+)?\Z", re.ASCII)
 _MOST_ENTRIES = 10_000
@@ -107,6 +113,18 @@ class MappedLibrary(NamedTuple):
         return self.path.startswith(("/usr/lib/", "/lib/"))
 
 
+class MemoryPort(NamedTuple):
+    """A port of Fast DDS in shared memory.
+
+    ``number`` is its port number. ``memory`` is the file system of the shared memory, and ``file``
+    is the inode there, which is another one when a process opens the port again.
+    """
+
+    number: int
+    memory: str
+    file: int
+
+
 @dataclass(frozen=True, slots=True)
 class Process:
     """A running process that uses ROS 2, DDS or Zenoh.
@@ -121,7 +139,8 @@ class Process:
     program, if that process started this one. ``own_pid`` is the id that the process itself sees;
     in a container, this id differs from ``pid``. ``user`` is the id of the user who runs the
     process; for a set-user-ID program, of the user who started it; `SEVERAL_USERS` if several users
-    can control the process.
+    can control the process. ``own_ports`` are the ports of Fast DDS that only this process reads,
+    and ``mapped_ports`` also those to which it has sent.
     """
 
     pid: int
@@ -137,6 +156,8 @@ class Process:
     forked_by: tuple[int, tuple[str, ...]] = (0, ())
     own_pid: int = 0
     clock_advanced: timedelta = timedelta()
+    own_ports: frozenset[MemoryPort] = frozenset()
+    mapped_ports: frozenset[MemoryPort] = frozenset()
 
     @property
     def program(self) -> tuple[int, tuple[str, ...]]:
@@ -526,6 +547,11 @@ def _examine(pid: int, folder: int, command: tuple[str, ...], started: datetime)
     if not libraries and not _uses_ros_or_zenoh(command):
         return None
     network, status = os.readlink("ns/net", dir_fd=folder), _read(folder, "status", _MOST_BYTES)
+    ports = frozenset(
+        MemoryPort(int(number), memory.decode("utf-8", "replace"), int(file))
+        for memory, file, number in _MEMORY_PORTS.findall(maps)
+    )
+    own = _own_port_numbers(folder) if ports else set()
     return Process(
         pid,
         command,
@@ -537,7 +563,23 @@ def _examine(pid: int, folder: int, command: tuple[str, ...], started: datetime)
         dds=_mapped_dds(maps),
         forked_by=_forked_by(folder, command),
         own_pid=_number(_OWN_PID, status) or pid,
+        own_ports=frozenset(port for port in ports if port.number in own),
+        mapped_ports=ports,
     )
+
+
+def _own_port_numbers(folder: int) -> set[int]:
+    """Return the numbers of the ports of Fast DDS that a process alone reads."""
+    handle = os.open("fd", os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC, dir_fd=folder)
+    try:
+        numbers = set[int]()
+        for name in os.listdir(handle)[:_MOST_ENTRIES]:
+            with suppress(FileNotFoundError):  # closed since
+                match = _OWN_PORT.search(os.readlink(name, dir_fd=handle))
+                numbers |= {int(match[1])} if match else set()
+        return numbers
+    finally:
+        os.close(handle)
 
 
 def _forked_by(folder: int, command: tuple[str, ...]) -> tuple[int, tuple[str, ...]]:

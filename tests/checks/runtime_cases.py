@@ -18,6 +18,7 @@ from sros_tool.pki.certificates import pem
 from sros_tool.runtime.processes import (
     FileReader,
     MappedLibrary,
+    MemoryPort,
     Process,
     ProcessRoot,
     RunningProcesses,
@@ -186,6 +187,17 @@ def _among_strangers(state: RuntimeState, bench: Bench) -> RuntimeState:
     return running(0, **{KEYSTORE: str(other)})(state, bench)
 
 
+def _not_connected(state: RuntimeState, _: Bench) -> RuntimeState:
+    """Two processes of one keystore, with ports in shared memory that the other has not mapped."""
+    node = replace(state.running.processes[0], libraries=frozenset({"libfastrtps"}))
+    ports = [frozenset({MemoryPort(7411 + 2 * number, "00:1b", number)}) for number in (1, 2)]
+    nodes = [
+        replace(node, pid=number, own_ports=own, mapped_ports=own)
+        for number, own in enumerate(ports, start=21)
+    ]
+    return replace(with_processes(state, *nodes), now=state.now + timedelta(minutes=1))
+
+
 def _from_an_older_copy(state: RuntimeState, bench: Bench) -> RuntimeState:
     older = bench.root.parent / "older"
     shutil.copytree(state.environment[KEYSTORE], older)
@@ -266,6 +278,7 @@ CASES: dict[str, Change] = {
     "runtime.process-expired": lambda state, _: replace(state, now=state.now + 9000 * DAY),
     "runtime.process-permissive": running(0, **{STRATEGY: "Permissive"}),
     "runtime.process-other-keystore": _among_strangers,
+    "runtime.process-not-connected": _not_connected,
     "runtime.process-other-folder": _from_an_older_copy,
     "runtime.process-local-time": lambda state, bench: _at_the_end(state, bench, TZ="Asia/Tokyo"),
     "runtime.process-files-replaceable": _others_can_write,

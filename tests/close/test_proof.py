@@ -15,6 +15,7 @@ from sros_tool.close.nodes import MovedEndpoint
 from sros_tool.close.proof import (
     _abandoned_names,
     _endpoints_without_peer,
+    _proof_of_connections,
     _proof_of_requirements,
     _unseen_text,
     _without_counterpart,
@@ -27,6 +28,7 @@ from sros_tool.policy.model import ALLOW
 from sros_tool.policy.rights import Right
 from sros_tool.runtime.processes import Process, ProcessEnclave
 from sros_tool.validity import Window
+from tests.checks.test_connections import robot
 from tests.close.test_assignment import node
 from tests.support.harness import policy_text, publish
 
@@ -121,6 +123,30 @@ def test_a_demand_for_an_enclave_that_the_export_lacks_is_judged_by_the_keystore
     )
     (said,) = _proof_of_requirements(robot)
     assert said.holds is False
+
+
+@pytest.mark.parametrize(
+    ("processes", "holds", "says"),
+    [
+        (robot(1, 2, 3), True, "3 processes of Fast DDS have all connected to each other"),
+        (robot(1, 2, 3, deaf=[(1, 2)]), False, "neither hears the other. If another finding"),
+        ([*robot(1, 2), replace(robot(3)[0], own_ports=frozenset())], True, "of process 3 (node3)"),
+        ([replace(process, own_ports=frozenset()) for process in robot(1, 2)], None, ""),
+        (robot(1), None, ""),
+    ],
+)
+def test_processes_that_have_not_connected_fail_the_proof(
+    processes: list[Process], holds: bool | None, says: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where sros sees no connections, it proves nothing, and `close` says so."""
+    secured = [(process, ProcessEnclave("/export", "/node")) for process in processes]
+    running: Any = SimpleNamespace(secured=secured)
+    monkeypatch.setattr(proof, "RunningRobot", lambda *_: running)
+    monkeypatch.setattr(proof, "wait_until", lambda *_: running)
+    shell = SimpleNamespace(now=lambda: datetime.now(UTC))
+    proofs = [*_proof_of_connections(cast(Any, SimpleNamespace(shell=shell)))]
+    assert [said.holds for said in proofs] == [holds] * (holds is not None)
+    assert says in "".join(said.reason for said in proofs)
 
 
 def test_a_node_that_others_do_not_see_on_zenoh_needs_its_enclave_in_its_command() -> None:

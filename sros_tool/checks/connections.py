@@ -1,0 +1,133 @@
+"""Which processes of Fast DDS have connected to each other, as their shared memory shows it.
+
+A process of Fast DDS receives from the processes of its machine through a port in shared memory. A
+process that sends to it maps this port. Every node of rmw_fastrtps sends its part of the ROS graph
+to all others as soon as they have accepted its certificate. So two processes that have not mapped
+each other's port do not hear each other.
+
+Sources: Fast DDS 2.6.9 to 3.6.0 (SharedMemGlobal.hpp, SecurityManager.cpp). Fast DDS gives up
+after ten messages of the handshake (14 s), without a line in the log, and does not try again as
+long as both processes run.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from datetime import datetime, timedelta
+from itertools import combinations
+from typing import NamedTuple
+
+from sros_tool.checks.kind import WARNING, Finding, FindingKind
+from sros_tool.dds.decision.vendors import FAST_DDS
+from sros_tool.runtime.processes import MemoryPort, Process, plain
+from sros_tool.wording import first_few
+
+CONNECTING_TIME = timedelta(seconds=30)
+"""Time after the start of a process within which it connects to the others, or never does."""
+
+PROCESS_NOT_CONNECTED = FindingKind(
+    "runtime.process-not-connected",
+    WARNING,
+    "secured processes that have not connected to each other",
+    "They do not hear each other, and do not log why. Fast DDS gives up if the handshake takes "
+    "longer than 14 s, as on a busy machine, and does not try again.",
+    "Fast DDS 2.6 to 3.6 (SecurityManager.cpp); tested with 2.14.5.",
+    "If another finding names one of these processes, follow that first. Otherwise, restart the "
+    "process that this finding names.",
+    vendors=FAST_DDS,
+)
+_REMEDY_FOR_USERS = (
+    "Run these processes as one user, or start those of one user with "
+    "FASTDDS_BUILTIN_TRANSPORTS=UDPv4 (ROS 2 Jazzy and newer): Fast DDS cannot use the shared "
+    "memory of another user."
+)
+_MOST_NAMES = 4
+
+_FIRST_PORT, _PORTS_OF_DOMAIN, _FIRST_OF_PARTICIPANT = 7400, 250, 11
+"""The port for user data of participant N in domain D is 7400 + 250 * D + 11 + 2 * N (DDSI-RTPS
+2.5, 9.6.2.3)."""
+
+
+class Connections(NamedTuple):
+    """The connections between processes of one machine.
+
+    ``missing`` are the pairs of processes that do not hear each other. ``compared`` are the
+    processes that sros can compare with each other; of ``unknown`` ones, sros sees no connections.
+    """
+
+    missing: Sequence[tuple[Process, Process]]
+    compared: Sequence[Process]
+    unknown: Sequence[Process]
+
+
+class _Place(NamedTuple):
+    """Where processes connect: a network namespace, a shared memory and a domain."""
+
+    network: str
+    memory: str
+    domain: int
+
+
+def connections_between(processes: Iterable[Process]) -> Connections:
+    """Return the connections between processes that run the nodes of one robot."""
+    processes = [*processes]
+    ports = {process.pid: _ports_by_place(process) for process in processes}
+    number = Counter(place for by_place in ports.values() for place in by_place)
+    main = max(number, key=lambda place: number[place], default=None)
+    missing = [
+        (first, second)
+        for first, second in combinations(processes, 2)
+        for place in ports[first.pid].keys() & ports[second.pid].keys()
+        if not ports[first.pid][place] <= second.mapped_ports
+        or not ports[second.pid][place] <= first.mapped_ports
+    ]
+    return Connections(
+        missing,
+        compared=[process for process in processes if main in ports[process.pid]],
+        unknown=[process for process in processes if main not in ports[process.pid]],
+    )
+
+
+def _ports_by_place(process: Process) -> Mapping[_Place, set[MemoryPort]]:
+    """Return the ports on which a process receives the data of nodes."""
+    ports: dict[_Place, set[MemoryPort]] = {}
+    for port in process.own_ports:
+        domain, offset = divmod(port.number - _FIRST_PORT, _PORTS_OF_DOMAIN)
+        if domain >= 0 and offset >= _FIRST_OF_PARTICIPANT and offset % 2:
+            ports.setdefault(_Place(process.network, port.memory, domain), set()).add(port)
+    return ports
+
+
+def restarts(missing: Sequence[tuple[Process, Process]]) -> Iterator[tuple[Process, list[Process]]]:
+    """Yield processes whose restart can connect all pairs, each with its peers.
+
+    Takes the process with the most missing connections first, so that few have to restart.
+    """
+    pairs = [*missing]
+    while pairs:
+        number = Counter(process.pid for pair in pairs for process in pair)
+        (pid, _), *_ = number.most_common(1)
+        of_process = [pair for pair in pairs if any(process.pid == pid for process in pair)]
+        process = next(process for process in of_process[0] if process.pid == pid)
+        yield process, [first if second is process else second for first, second in of_process]
+        pairs = [pair for pair in pairs if pair not in of_process]
+
+
+def started_before(processes: Iterable[Process], now: datetime) -> Iterator[Process]:
+    """Yield the processes that had enough time to connect."""
+    return (process for process in processes if process.started + CONNECTING_TIME <= now)
+
+
+def connection_findings(missing: Sequence[tuple[Process, Process]]) -> Iterator[Finding]:
+    """Yield findings about secured processes that trust the same CA, and are not connected."""
+    for process, peers in restarts(missing):
+        names = first_few([f"{peer.label}{_place_text(peer)}" for peer in peers], _MOST_NAMES)
+        text = f"it{_place_text(process)} has not connected to {names}: neither hears the other"
+        users = {process.user, *(peer.user for peer in peers)}
+        remedy = _REMEDY_FOR_USERS if len(users) > 1 else ""
+        yield PROCESS_NOT_CONNECTED.found(process.label, text, remedy=remedy)
+
+
+def _place_text(process: Process) -> str:
+    return f" in {plain(process.enclave.name)}" if process.enclave else ""

@@ -1,0 +1,94 @@
+"""Which pairs of processes have not connected, and which restarts are proposed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+from datetime import UTC, datetime
+from typing import Any
+
+import pytest
+
+from sros_tool.checks.connections import connection_findings, connections_between, restarts
+from sros_tool.runtime.processes import MemoryPort, Process
+
+FIRST_OF_DOMAIN_77 = 26661
+STARTED = datetime(2026, 1, 1, tzinfo=UTC)
+
+
+def port(pid: int, *, domain: int = 77, file: int = 0) -> MemoryPort:
+    """Return the port of a process whose id is also its number in the domain."""
+    number = FIRST_OF_DOMAIN_77 + 250 * (domain - 77) + 2 * pid
+    return MemoryPort(number, "00:1b", file or number)
+
+
+def robot(*pids: int, deaf: Iterable[tuple[int, int]] = ()) -> list[Process]:
+    """Return processes that have mapped the ports of all others, except those of the pairs."""
+    pairs = {*deaf, *((second, first) for first, second in deaf)}
+    return [
+        Process(
+            pid,
+            (f"node{pid}",),
+            {},
+            STARTED,
+            own_ports=frozenset({port(pid), MemoryPort(7000 + pid, "00:1b", pid)}),
+            mapped_ports=frozenset(port(peer) for peer in pids if (pid, peer) not in pairs),
+        )
+        for pid in pids
+    ]
+
+
+def missing_pairs(processes: Iterable[Process]) -> set[tuple[int, int]]:
+    return {(one.pid, other.pid) for one, other in connections_between(processes).missing}
+
+
+def test_a_pair_that_has_not_mapped_each_others_port_is_missing() -> None:
+    assert missing_pairs(robot(1, 2, 3)) == set()
+    assert missing_pairs(robot(1, 2, 3, deaf=[(1, 3)])) == {(1, 3)}
+
+
+def test_one_direction_is_enough_to_be_missing() -> None:
+    first, second = robot(1, 2)
+    assert missing_pairs([first, replace(second, mapped_ports=second.own_ports)]) == {(1, 2)}
+
+
+def test_a_port_that_the_other_process_opened_again_does_not_count() -> None:
+    """A process that restarts has the number of before, and another file."""
+    first, second = robot(1, 2)
+    again = frozenset({port(2, file=9)})
+    second = replace(second, own_ports=again, mapped_ports=frozenset({port(1)}) | again)
+    assert missing_pairs([first, second]) == {(1, 2)}
+
+
+@pytest.mark.parametrize(
+    ("change", "unknown"),
+    [
+        ({}, []),
+        ({"own_ports": frozenset()}, [3]),  # another DDS, or no shared memory
+        ({"network": "net:[1]"}, [3]),
+        ({"own_ports": frozenset({port(3, domain=78)})}, [3]),
+        ({"own_ports": frozenset({port(3)._replace(memory="00:2c")})}, [3]),
+        ({"own_ports": frozenset({port(3)._replace(number=FIRST_OF_DOMAIN_77 + 5)})}, [3]),
+    ],
+)
+def test_what_cannot_be_compared_is_unknown(change: dict[str, Any], unknown: list[int]) -> None:
+    first, second, third = robot(1, 2, 3, deaf=[(1, 3), (2, 3)])
+    connections = connections_between([first, second, replace(third, **change)])
+    assert [process.pid for process in connections.unknown] == unknown
+    assert bool(connections.missing) is not bool(unknown)
+
+
+def test_few_processes_are_named_for_a_restart() -> None:
+    pairs = [(2, 12), (3, 6), (3, 12), (3, 14), (4, 8), (5, 8), (6, 12)]
+    missing = connections_between(robot(*range(2, 15), deaf=pairs)).missing
+    proposed = {process.pid: {peer.pid for peer in peers} for process, peers in restarts(missing)}
+    assert proposed == {12: {2, 3, 6}, 3: {6, 14}, 8: {4, 5}}
+
+
+def test_processes_of_two_users_need_one_user_rather_than_a_restart() -> None:
+    first, second = robot(1, 2, deaf=[(1, 2)])
+    (same,) = connection_findings([(first, second)])
+    assert same.text == "it has not connected to process 2 (node2): neither hears the other"
+    assert "restart the process" in same.remedy
+    (different,) = connection_findings([(first, replace(second, user=1000))])
+    assert different.remedy.startswith("Run these processes as one user")
