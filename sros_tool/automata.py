@@ -82,7 +82,7 @@ class Letters:
         return any(low <= ord(letter) <= high for low, high in self.ranges)
 
     def single(self) -> str:
-        """Return the character if the set has only one, else ""."""
+        """Return the only character of the set; "" if it does not have exactly one."""
         if len(self.ranges) == 1 and self.ranges[0][0] == self.ranges[0][1]:
             return chr(self.ranges[0][0])
         return ""
@@ -117,7 +117,7 @@ class Automaton:
 
     @classmethod
     def sequence(cls, pieces: Iterable[Letters | None]) -> Automaton:
-        """Return an automaton for a sequence of letters, in which None matches any text."""
+        """Return an automaton for a sequence of letters; None in the sequence matches any text."""
         at = 0
         loops: set[int] = set()
         edges: list[tuple[int, Letters, int]] = []

@@ -851,7 +851,7 @@ def other_node_notes(
 def _other_node_note(
     enclave: str, known: tuple[NodeName, ...], ns: str, name: str, *, all_known: bool
 ) -> Note | None:
-    """Return a note if a node is not among ``known``, the nodes of an enclave; else None.
+    """Return a note if a node is not in ``known``, the nodes of an enclave; otherwise None.
 
     "" stands for any namespace or name.  Without ``all_known``, the enclave may have more nodes. In
     this case, a note is returned only if a known node has this name in another namespace.

@@ -336,7 +336,7 @@ class _Round:
         return self._machine.clock()
 
     def _clock_next_to_release(self, made: datetime) -> RobotClock | None:
-        """Return ``BEHIND``, and report it, if a release was made in the future; else None."""
+        """Return ``BEHIND``, and report it, if a release is from the future; otherwise None."""
         now = self._machine.now
         if made <= now + _CLOCK_TOLERANCE:
             return None
@@ -911,7 +911,7 @@ class _Round:
                 remove_file(agent_folder(self._folder) / _REPLACED_LIST)
 
     def _revocation_lists(self, names: Iterable[str]) -> str | None:
-        """Return the newest revocation list of each CA of these enclaves as PEM; None without one.
+        """Return the newest list of each CA of these enclaves as PEM; None without a list.
 
         In a rotation, the list of the second CA is in the file of the CAs.
         """

@@ -500,7 +500,7 @@ def _why_impossible(name: str) -> str:
 
 
 def _kind_of_ros_name(statement: _Statement) -> str:
-    """Return the kind that ROS 2 gives to a name, if the policy states another kind; else "".
+    """Return the kind that ROS 2 gives to a name; "" if the policy states this kind.
 
     The kind is "topics" or "services".
     """
@@ -746,7 +746,7 @@ class _NodeLackingRight:
 
 
 def _common_folder(profile: Profile) -> str:
-    """Return the folder of the ``common/node.xml`` that a profile includes, or "" without one."""
+    """Return the folder of the ``common/node.xml`` that a profile includes, or ""."""
     next_to_it = Path(profile.source.file).parent / COMMON
     for group in profile.groups:
         for folder in Path(group.source.file).parents:

@@ -450,7 +450,7 @@ def _reason_for_zenoh(vendor: str | None, keystore: OpenedKeystore | None) -> st
 def _open_enclave(
     keystore: OpenedKeystore | None, name: str, policy: Path | None, asking: AskingContext
 ) -> AskedEnclave:
-    """Open an enclave of a keystore, in its folder, or in a policy alone."""
+    """Open an enclave of a keystore, in a folder, or of a policy without a keystore."""
     from sros_tool.explain.asking import is_enclave, open_to_ask
 
     if keystore is None and not policy and not is_enclave(Path(name)):

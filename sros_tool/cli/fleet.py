@@ -857,7 +857,7 @@ def _fleet_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
 
 
 def _revocation_list_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
-    """Yield the number of robots on which the revocation list is in force, if there is one."""
+    """Yield the number of robots on which the revocation list is in force, if a list exists."""
     status = compared_fleet.status
     if numbers := _list_in_force(status):
         in_force, robots = numbers

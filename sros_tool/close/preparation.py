@@ -76,7 +76,7 @@ class CommandStep(NamedTuple):
 
     @property
     def command(self) -> str:
-        """The command line that does the same."""
+        """The command line that does the step."""
         redirected = f" > {shlex.quote(str(self.into))}" if self.into else ""
         return f"sros {shlex.join(self.words)}{redirected}"
 

@@ -298,7 +298,7 @@ class ObservedProcesses(NamedTuple):
 
     @property
     def units(self) -> set[str]:
-        """The systemd units that start a process alone."""
+        """The systemd units that each start a single process."""
         return {process.unit for process in self.processes} - {""}
 
     def with_current_pids(self, running: RunningProcesses, export: Path) -> ObservedProcesses:
@@ -375,7 +375,7 @@ class ObservedProcesses(NamedTuple):
         )[1]
 
     def commands_by_hand(self, folder: Path) -> Mapping[str, Sequence[ClosedProcess]]:
-        """Map shell commands to the processes that they start and that no unit starts alone.
+        """Map shell commands to the processes that they start, without those with their own unit.
 
         A Zenoh router comes first: nodes wait for it.
         """

@@ -116,7 +116,7 @@ class Question(NamedTuple):
 
     @property
     def parts(self) -> tuple[Part, ...]:
-        """The endpoints that the right needs; none for joining."""
+        """The endpoints that the right needs; empty for joining."""
         if self.only or not self.right:
             return self.only
         names = dds_names(self.right, self.name)
@@ -462,12 +462,12 @@ class Answer(NamedTuple):
 
     @property
     def documented_only(self) -> bool:
-        """Whether the vendor's behavior is known from its documentation alone, not from tests."""
+        """Whether the vendor's behavior is known only from its documentation, not from tests."""
         return self.vendor.documented_only
 
     @property
     def as_documented(self) -> bool:
-        """Whether this answer relies on the vendor's documentation alone, not on tests."""
+        """Whether this answer relies only on the vendor's documentation, not on tests."""
         return self.vendor.documented_only and not self.problems
 
     @property

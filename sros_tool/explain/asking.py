@@ -159,7 +159,7 @@ def is_enclave(folder: Path) -> bool:
 def open_to_ask(
     keystore: OpenedKeystore | None, name: str, policy_file: Path | None, asking: AskingContext
 ) -> AskedEnclave:
-    """Return an enclave to ask about, from a keystore, a folder ``name``, or a policy alone.
+    """Return an enclave to ask about: of a keystore, in a folder ``name``, or only of a policy.
 
     Raises:
         KeystoreError: the keystore does not have the enclave.

@@ -404,7 +404,7 @@ def remapping_clause(name: str, meant: str) -> str:
 
 
 def meaning_of_other_kind(right: Right, named: Iterable[Right]) -> str:
-    """Return a clause if ``named`` have the service as an action, or the reverse; else ""."""
+    """Return a clause if ``named`` has a service as an action, or the reverse; otherwise ""."""
     for other in named:
         if other.name == right.name and {other.kind, right.kind} == {"services", "actions"}:
             kind = "an action" if other.kind == "actions" else "a service"

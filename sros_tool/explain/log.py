@@ -168,7 +168,7 @@ class SearchedKeystore:
         self._keystore = keystore
 
     def peer(self, guid: str) -> str:
-        """Return the enclave of the participant with a GUID, as a vendor prints it; or ""."""
+        """Return the enclave of a participant by its GUID, as a vendor prints it, or ""."""
         identity = guid.replace(".", "")
         if ":" in guid:
             identity = "".join(word.zfill(8) for word in guid.split(":"))
@@ -502,7 +502,7 @@ def _log_hits(lines: Iterable[tuple[int, str]]) -> Iterator[_Hit]:
 
 
 def _rejoined_message(process: str, line: str, rest: str, following: str) -> str:
-    """Return the joined message if ``line`` and ``following`` are its two halves; else "".
+    """Return the joined message if ``line`` and ``following`` are its halves; otherwise "".
 
     ``line`` counts as broken if neither ``line`` nor ``following`` has a known meaning, but the
     joined lines have one.

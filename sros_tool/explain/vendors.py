@@ -368,7 +368,7 @@ def _other_name_notes(answer: Answer, asked_enclave: AskedEnclave) -> Iterator[N
 
 
 def _notes_on_files(enclave: LoadedEnclave) -> Iterator[Note]:
-    """Yield notes on a key that root alone can read, and a revocation list that is left out."""
+    """Yield notes on a key that only root can read, and a revocation list that is left out."""
     for problem in enclave.state.problems if enclave.state else ():
         if problem.fault is Fault.CRL_LEFT_OUT:
             text = f"{problem}: nodes of the enclave continue to communicate with revoked enclaves."
@@ -563,7 +563,7 @@ class WhoByVendor(NamedTuple):
 
     @property
     def documented_only(self) -> bool:
-        """Whether the vendor's behavior is known from its documentation alone, not from tests."""
+        """Whether the vendor's behavior is known only from its documentation, not from tests."""
         return self.vendor.documented_only
 
 

@@ -782,7 +782,7 @@ class ZenohEvaluator:
             yield DecidingWildcard(wide, tuple(enclaves))
 
     def _wildcard(self, check: Check) -> str:
-        """Return the key expression that allows the data, if its name has a wildcard; else ""."""
+        """Return the key expression that allows the data; "" if its name has no wildcard."""
         if check.message not in (Message.PUT, Message.QUERY) or not check.decision.rules:
             return ""
         file = self._file(check.enforcer, self._file_of(check.enforcer))

@@ -615,7 +615,7 @@ class NamedEnclaves(NamedTuple):
 
 
 def enclave_per_node(observation: Observation) -> NamedEnclaves:
-    """Return the observation with an enclave for each process that the graph shows without one.
+    """Return the observation, with a new enclave for each process that has no enclave in the graph.
 
     The enclave has the namespace and name of the process's node.  If a process has several nodes,
     its enclave is named after the component container, or else after the node with the shortest

@@ -154,7 +154,7 @@ class RosGraph:
         self._output.close()
 
     def _line(self, seconds: float) -> dict[str, Any] | None:
-        """Return the next JSON object of the observer, or None after ``seconds`` without one."""
+        """Return the next JSON object of the observer, or None if none comes within ``seconds``."""
         deadline = time.monotonic() + seconds
         with selectors.DefaultSelector() as selector:
             selector.register(self._report, selectors.EVENT_READ)

@@ -230,7 +230,7 @@ def due_enclaves(
 def refuse_unreadable(
     unreadable: tuple[UnreadableEnclave, ...], verb: str, *, takes_names: bool = True
 ) -> None:
-    """Raise an error that names all ``unreadable`` enclaves; return if there are none.
+    """Raise an error that names all ``unreadable`` enclaves, if there are any.
 
     ``verb`` is a past participle for the message, such as "renewed".  ``takes_names`` says whether
     the user could run the command for the other enclaves alone.

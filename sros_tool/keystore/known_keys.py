@@ -304,7 +304,7 @@ class IssuedEarlier:
         ]
 
     def permissions_until(self, name: str) -> datetime | None:
-        """Return when the last permissions of an enclave stop working; None if there are none."""
+        """Return when the last permissions of an enclave stop working; None without permissions."""
         last = max((until for _, until in self.permissions(name)), default="")
         return parse_iso(last) if last else None
 

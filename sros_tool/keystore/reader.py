@@ -318,7 +318,7 @@ class OpenedKeystore:
 
     @_ReadOnceProperty
     def template(self) -> Template:
-        """The settings of the keystore; if it has none, the template for ros2/sros2."""
+        """The settings of the keystore; without settings, the template for ros2/sros2."""
         from sros_tool.keystore.template import decode_template, load_template
 
         if not self.has(SETTINGS):

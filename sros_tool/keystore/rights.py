@@ -774,7 +774,7 @@ def _plain_routers(source: RightsSource) -> set[str]:
 
 
 def is_plain_router(settings: Template | None, name: str, rights: Iterable[Right]) -> bool:
-    """Return whether an enclave is the Zenoh router that sros made, without rights of its own."""
+    """Return whether an enclave is the Zenoh router that sros made, without any other rights."""
     routers = settings.zenoh.router_names() if settings and settings.zenoh else ()
     return name in routers and are_basic(rights)
 
@@ -915,7 +915,7 @@ class RecordedRights:
         )
 
     def _ledger_part(self, name: str) -> _LedgerPermissions:
-        """Return a part of the ledger with all lines about an enclave, and perhaps others."""
+        """Return a part of the ledger with all lines about an enclave, and perhaps other lines."""
         file, are_few = self._keystore.ledger_file, len(self._looked_up) < _MOST_LOOKUPS
         if self._whole or "_whole_ledger" in self.__dict__ or not file.is_indexed:
             return self._whole_ledger

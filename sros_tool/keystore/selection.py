@@ -155,7 +155,7 @@ def _revocation_by_name(keystore: OpenedKeystore, robots: Sequence[str]) -> str:
 def _possible_enclaves(
     keystore: OpenedKeystore, fleet: Fleet, robots: Sequence[str]
 ) -> Sequence[str]:
-    """Return all enclaves that may belong to ``robots``, and perhaps others.
+    """Return all enclaves that may belong to ``robots``, and perhaps other enclaves.
 
     Without an index of the ledger, these are all enclaves.  With an index, they are the enclaves in
     the folders of the robots, and enclaves in the ledger whose path has the name of a robot or of

@@ -543,7 +543,7 @@ def _read_topic_protection(table: _Table, default: TopicProtection) -> TopicProt
 
 
 class _Table:
-    """A reader of a TOML table: each method removes a key, and `finish` refuses the others."""
+    """A reader of a TOML table: each method removes a key, and `finish` refuses remaining keys."""
 
     def __init__(self, values: object, path: str) -> None:
         if not isinstance(values, dict):

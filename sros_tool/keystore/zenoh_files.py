@@ -699,7 +699,7 @@ _XML_DECLARATION = b'<?xml version="1.0" encoding="UTF-8"?>'
 
 
 def enclaves_with_rights(keystore: OpenedKeystore, names: Collection[str]) -> set[str]:
-    """Return the enclaves that may have a right to one of ``names``, and perhaps others.
+    """Return all enclaves that may have a right to one of ``names``, and perhaps other enclaves.
 
     No signature is verified and no XML parsed: the bytes of the permissions are searched for the
     names.

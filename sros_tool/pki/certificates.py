@@ -452,7 +452,7 @@ def likely_issued(certificate: x509.Certificate, authority: x509.Certificate) ->
 
 
 def is_for_pss(certificate: x509.Certificate) -> bool:
-    """Return whether the key of a certificate is an RSA key for RSA-PSS alone (RFC 4055, 1.2)."""
+    """Return whether the key of a certificate is an RSA key only for RSA-PSS (RFC 4055, 1.2)."""
     return _key_algorithm(certificate)[0].content == _OID_RSA_PSS
 
 

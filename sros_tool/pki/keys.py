@@ -135,7 +135,7 @@ def load_any_key(
 
 
 def is_key_for_pss(pem: bytes) -> bool:
-    """Return whether the first key of a PEM file is for RSA-PSS alone (RFC 4055, 1.2)."""
+    """Return whether the first key of a PEM file is only for RSA-PSS (RFC 4055, 1.2)."""
     with suppress(PkiError, ValueError):
         block = next(pem_file.blocks(_key_block(pem, "")))
         _, identifier, *_ = der.children(der.first_value(block.content).content)

@@ -476,7 +476,7 @@ def _checked_parts(value: der.Value, *tags: int) -> list[der.Value]:
 
 
 def _take_optional(values: list[der.Value], place: int, tag: int) -> list[der.Value]:
-    """Remove ``values[place]`` if it has the tag, and return it in a list; else return []."""
+    """Remove ``values[place]`` and return it in a list; return [] if it does not have the tag."""
     return [values.pop(place)] if len(values) > place and values[place].tag == tag else []
 
 

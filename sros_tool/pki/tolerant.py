@@ -468,7 +468,7 @@ class _LooseConstraints(x509.BasicConstraints):
 
     @property
     def path_length(self) -> int | None:
-        """The pathLenConstraint; None without one."""
+        """The pathLenConstraint; None if the certificate has none."""
         return self._longest
 
 

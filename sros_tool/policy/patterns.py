@@ -491,7 +491,7 @@ def _search(wanted: tuple[str, ...], unwanted_names: tuple[str, ...], absolute: 
 
 
 class TooManyNames(Exception):  # noqa: N818 - the caller makes an error of it
-    """Raised if an expression stands for too many names to list."""
+    """Raised if an expression matches too many names to list."""
 
 
 def listed_expressions(expression: str, maximum: int) -> list[str]:

@@ -1,4 +1,4 @@
-"""Placeholders in policy names, which stand for names that differ between robots of a fleet.
+"""Placeholders in policy names, for names that differ between the robots of a fleet.
 
 ``{robot}`` and ``{namespace}`` stand for the name and the ROS namespace of a robot. A name with
 ``{robots}`` or ``{namespaces}`` stands for several names: a name for each robot.

@@ -355,7 +355,7 @@ def _more_denials(
     ns: str,
     node: str,
 ) -> Iterator[Group]:
-    """Yield a group with the additional names that a DENY of ``group`` must deny, if any.
+    """Yield a group with the additional names, if any, that a DENY of ``group`` must deny.
 
     These are the new names in ``moved_names``, and the names in ``by_wildcards`` that no node has
     as its new name.

@@ -384,7 +384,7 @@ class NodeName(NamedTuple):
     name: str
 
     def is_within(self, wider: NodeName) -> bool:
-        """Return whether ``wider`` stands for all nodes for which this name stands."""
+        """Return whether ``wider`` includes all nodes that this name means."""
         in_root = (wider.ns, self.ns) == ("/*", "/")
         return covers(wider.ns, self.ns) and covers(wider.name, self.name) and not in_root
 
@@ -443,7 +443,7 @@ def nodes_of_rights(rights: Iterable[Right]) -> tuple[NodeName, ...]:
 
 
 def denied_nodes(rights: Iterable[Right]) -> tuple[NodeName, ...]:
-    """Return the nodes whose standard services are allowed by rules, but all denied by others.
+    """Return the nodes whose standard services some rules allow, and other rules all deny.
 
     Nodes that may offer any of their standard services are left out.  If a denial matches some of
     the nodes that a wildcard allows, the result has all nodes that the denial matches.

@@ -130,7 +130,7 @@ class Gain:
 
     @property
     def denied_by(self) -> Right | None:
-        """The right that denies the name on the other side; null without one."""
+        """The right that denies the name on the other side; null if no right denies it."""
         return self.denied
 
 
@@ -1016,7 +1016,7 @@ def _source(known: _Sources, side: AccessSource, right: Right | None) -> Source 
 
 
 def _example(names: NameSet, expression: str, world: _World, limit: SearchLimit) -> str | None:
-    """Return a topic in ``names``, preferably one with a ROS name; None if there is none.
+    """Return a topic in ``names``, preferably with a ROS name; None if ``names`` is empty.
 
     ``expression`` covers all of ``names``. Without wildcards, it is the only possible topic.
     """
@@ -1287,7 +1287,8 @@ def _enclaves_near(robots: _EnclavesByRobot, robot: str) -> dict[str, Profile]:
 
 
 def undenied_name(denied: Right, stated: Rules) -> str | None:
-    """Return a name that ``denied`` matches, and no rule of ``stated`` matches; None without one.
+    """Return a name that ``denied`` matches, but no rule of ``stated``; None if there is no such
+    name.
 
     ``denied`` is not for an action.
     """
@@ -1304,7 +1305,7 @@ def undenied_name(denied: Right, stated: Rules) -> str | None:
 
 
 def _with_default_domains_and_governance(side: AccessSource, other: AccessSource) -> AccessSource:
-    """Return a side, completed with default domains and a default governance if it states none.
+    """Return a side, with default domains and a default governance if the side states none.
 
     Enclaves of robots are for the domain of their robot.  A side without a governance gets access
     control of everything, in the domains of both sides.

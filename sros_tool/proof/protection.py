@@ -41,7 +41,7 @@ from sros_tool.zenoh.configuration import ZenohNetwork
 
 @lru_cache(maxsize=1)
 def strict_protection() -> DomainProtection:
-    """Return the protection of the template production, which stands for a missing governance.
+    """Return the protection of the template production, which replaces a missing governance.
 
     Whole RTPS messages only have to be signed, as in the template development, because their
     content is encrypted separately.
@@ -52,7 +52,7 @@ def strict_protection() -> DomainProtection:
 def _demanded_governance(
     stated_protections: Sequence[StatedProtection], domains: DomainSet
 ) -> Governance:
-    """Return the weakest governance that a policy allows: strict, except where it states a level.
+    """Return the weakest governance that a policy allows: strict, except for stated levels.
 
     If a policy states both levels for a name, the stronger level counts.
     """

@@ -103,7 +103,7 @@ class Requirement:
     elsewhere: Requirement | None = field(default=None, compare=False, repr=False)
 
     def __str__(self) -> str:
-        """Return the requirement's own name, or else its demand as a sentence."""
+        """Return the requirement's name; if it has none, its demand as a sentence."""
         return self.name or demand(self)
 
 
@@ -335,7 +335,7 @@ def unused_remappings(
     namespaces: Sequence[str],
     remaps: Iterable[Remapping],
 ) -> list[Remapping]:
-    """Return the rules without which the requirements in files are the same.
+    """Return the remapping rules that do not change any requirement in the files.
 
     Raises:
         SrosError: as `read_requirements`.
@@ -742,7 +742,7 @@ def _filled_names(
 def _names_of_plural_placeholders(
     table: _Table, members: Mapping[str, Sequence[Robot]], robot: Robot
 ) -> Iterator[RobotNames]:
-    """Yield the names for which each name with a plural placeholder in a table stands."""
+    """Yield, for each name with a plural placeholder in a table, the names that it stands for."""
     values = [value for key, value in table.values.items() if key not in _WORD_KEYS]
     for name in filter(has_placeholder, _names_in(values)):
         if name.startswith(EXCEPT):

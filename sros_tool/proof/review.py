@@ -857,7 +857,9 @@ class _Review:
     def _paths_of(
         self, entries: Iterable[tuple[str, TreeEntry]], fits: Callable[[bytes], bool]
     ) -> list[str]:
-        """Return the sorted paths of the files that are not left out, and whose content fits."""
+        """Return the sorted paths of the files that are not left out, and for which ``fits`` is
+        true.
+        """
         wanted = {
             path: entry
             for path, entry in entries
@@ -1109,7 +1111,7 @@ class _Review:
         system: System,
         sources: Callable[[], tuple[AccessSource, AccessSource]] | None,
     ) -> Iterator[Finding]:
-        """Yield a finding for each requirement that fails in another namespace by the change alone.
+        """Yield findings on requirements that fail in another namespace only because of the change.
 
         A requirement fails if it is broken, or if it names only what no right names any more.
         Users may put the nodes of a package, and its requirements, into their own namespaces.
@@ -1160,7 +1162,7 @@ class _Review:
         return f"in {enumerated(namespaces)}" if namespaces else ""
 
     def _template(self) -> Template | None:
-        """Return the template that the request names, as it is in HEAD; None if it names none.
+        """Return the template that the request names, as it is in HEAD; None without a template.
 
         Raises:
             DocumentError: HEAD lacks the template, or the template is malformed.
@@ -1373,7 +1375,7 @@ def _moved_rights(enclave: Enclave) -> Iterator[tuple[PlacedRight, Right]]:
 
 
 def _namespaces_to_try(before: AccessSource, after: AccessSource) -> list[str]:
-    """Return namespaces in which requirements may be broken that hold in ``/``.
+    """Return namespaces in which requirements that hold in ``/`` may be broken.
 
     The first namespace is in no right, and stands for all other such namespaces. It is followed by
     the namespaces in names that do not move with the namespace, and by namespaces that wildcards in

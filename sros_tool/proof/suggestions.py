@@ -48,7 +48,7 @@ _MAX_JOINED_NAMES = 50
 
 
 class Suggestions(NamedTuple):
-    """Requirements that hold, and comments on names that move a robot and that nothing reserves."""
+    """Requirements that hold, and comments on names that move a robot without a requirement."""
 
     requirements: Sequence[Requirement]
     comments: Sequence[str]
@@ -110,7 +110,7 @@ def _comment_on_unmet(requirement: Requirement) -> str:
 
 
 def _joined_requirement(requirement: Requirement, other: Requirement) -> Requirement | None:
-    """Return a requirement that demands the same as two requirements, or None if there is none."""
+    """Return one requirement that demands the same as two, or None if that is not possible."""
     match requirement, other:
         case (
             Nobody(rights=(("request", names),)),
@@ -170,7 +170,7 @@ def _candidates(stated_rights: _Stated, worlds: Sequence[World]) -> Iterator[Req
 
 
 def _few_holders(stated_rights: _Stated, right: str) -> Iterator[Only]:
-    """Yield a requirement for each group of up to three enclaves that alone use the same names.
+    """Yield a requirement for each group of up to three enclaves that are the only users of names.
 
     Names that move the robot get a requirement for any number of enclaves, even without a known
     receiver.

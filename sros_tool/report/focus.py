@@ -256,7 +256,7 @@ class _System:
         self._paths: list[HopPath] = []
 
     def names_meant(self, word: str) -> Iterator[tuple[str, str]]:
-        """Yield kind and name of every name or enclave that ``word`` can stand for.
+        """Yield kind and name of every name or enclave that ``word`` can mean.
 
         An exact name counts if a right states it, or if the wildcard of a right matches it.
 

@@ -479,7 +479,7 @@ _MOVING = (Spelling.RELATIVE, Spelling.BOTH)
 
 
 def _remark_on_single_names(picture: Picture, name: Name, *, sends: bool) -> str:
-    """Return a remark if enclaves on one side may use only known names of a wildcard; else ""."""
+    """Return a remark if enclaves on one side may use only known names of a wildcard, or ""."""
     single = (
         edge
         for edge in picture.edges

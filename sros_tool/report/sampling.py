@@ -33,7 +33,7 @@ _UNIT_MARKS = "\x01\x02"
 
 
 class SampledKeystore(NamedTuple):
-    """The enclaves of a keystore to read in full, and the units of all others."""
+    """The enclaves of a keystore to read in full, and the units of all other enclaves."""
 
     keystore: OpenedKeystore
     enclaves: tuple[str, ...]

@@ -532,7 +532,7 @@ class _TooLongError(OSError):
 
 
 def _examine(pid: int, folder: int, command: tuple[str, ...], started: datetime) -> Process | None:
-    """Return a process if it uses ROS 2, DDS or Zenoh; else None.
+    """Return a process that uses ROS 2, DDS or Zenoh; None for any other process.
 
     Raises:
         OSError: The process cannot be examined, or has ended.
@@ -1212,7 +1212,7 @@ def _identity(folders: Sequence[tuple[str, os.stat_result]]) -> tuple[int, int]:
 
 
 def _path_if_same_folder(path: str, folders: Sequence[tuple[str, os.stat_result]]) -> Path | None:
-    """Return ``path`` if this process and the examined one see the same folder there; else None."""
+    """Return ``path`` if sros and the examined process see the same folder there, or None."""
     with suppress(OSError, ValueError):
         if os.path.samestat(Path(path).stat(), folders[-1][1]):
             return Path(path)

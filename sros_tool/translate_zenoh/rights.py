@@ -570,7 +570,7 @@ def _right_keys(rule: AclRule) -> Iterator[tuple[str, str]]:
 
 
 def ros_names(key: str) -> tuple[str, ...]:
-    """Return the ROS names, perhaps with wildcards, for a key expression; perhaps none.
+    """Return the ROS names, perhaps with wildcards, for a key expression; () if no name fits.
 
     The first chunk is the ROS domain, and the last two are the type and its hash.
     """

@@ -578,7 +578,7 @@ class Enforcement:
         )
 
     def unclear_reason(self) -> str:
-        """Return a clause on why the common name alone does not decide, or ""."""
+        """Return a clause on why not only the common name decides, or ""."""
         for subject in self.subjects:
             stated = {name for name in PROPERTIES if getattr(subject, name) is not None}
             if subject.cert_common_names is not None and len(stated) > 1:

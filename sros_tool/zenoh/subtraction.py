@@ -412,7 +412,7 @@ class _LetterSearch:
                 states += self._following(state)
 
     def _following(self, state: _SearchState) -> Iterable[_SearchState]:
-        """Return the next states of a state; () if all its names are kept or denied by now."""
+        """Return the next states of a state; () if all its names are already kept or denied."""
         read, wide, denied, _ = state
         self.effort -= sum(map(len, denied)) + len(denied) * len(wide) + len(read)
         if self.effort < 0:

@@ -135,7 +135,7 @@ class CheckedKeystore:
 
     @cached_property
     def crl(self) -> RevocationList | None:
-        """The revocation list of the identity CA; None if there is none, or it cannot be read."""
+        """The revocation list of the identity CA; None if it is missing or cannot be read."""
         return self._part(CRL, lambda: self.opened.revocation_list, None)
 
     @cached_property

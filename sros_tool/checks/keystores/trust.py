@@ -202,7 +202,7 @@ def _stranger_findings(
 def _refused_roles(
     parties: Sequence[_Party], other_parties: Sequence[_Party], roles: range
 ) -> tuple[int, ...]:
-    """Return the roles of the CAs for which the enclaves of two groups refuse each other.
+    """Return the roles of the CAs because of which the enclaves of two groups refuse each other.
 
     Of all pairs with one enclave of each group, the pair with the fewest refused roles decides. The
     result is () if the enclaves of a pair accept each other, or if no enclave can be read.

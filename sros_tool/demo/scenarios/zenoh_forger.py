@@ -83,7 +83,7 @@ def _tls(document: _Document) -> _Document:
 
 
 def through_the_router(copy: KeystoreCopy) -> None:
-    """Let the sessions connect to the router alone."""
+    """Let the sessions connect only to the router."""
     start_network(copy.root, copy.router, copy.endpoint, Mode.CLIENT, copy.now)
 
 
@@ -133,12 +133,12 @@ FAR_ROUTER = "/far/router"
 
 
 def far_router(copy: KeystoreCopy) -> None:
-    """Give the listener's host a router of its own, and let the topic pass between the routers."""
+    """Give the listener's host its own router, and let the topic pass between the routers."""
     _add_far_router(copy, copy.topic)
 
 
 def far_router_without_the_topic(copy: KeystoreCopy) -> None:
-    """Give the listener's host a router of its own, and let another name pass between them."""
+    """Give the listener's host its own router, and let only another name pass."""
     _add_far_router(copy, f"{copy.topic}/other")
 
 
@@ -250,7 +250,7 @@ def tokens_of_any_enclave(copy: KeystoreCopy) -> None:
 
 
 def tokens_of_any_name(copy: KeystoreCopy) -> None:
-    """Let every enclave announce any node and any name, under the name of its own enclave."""
+    """Let every enclave announce any node and any name, but only under the enclave's own name."""
 
     def of_enclave(key: str) -> str:
         chunks = key.split("/")
@@ -261,7 +261,7 @@ def tokens_of_any_name(copy: KeystoreCopy) -> None:
 
 
 def tokens_of_any_name_through_the_router(copy: KeystoreCopy) -> None:
-    """Let the sessions connect to the router alone, and announce any node and any name."""
+    """Let the sessions connect only to the router, and announce any node and any name."""
     through_the_router(copy)
     tokens_of_any_name(copy)
 

@@ -149,7 +149,7 @@ class LaterSeals:
         self._keystore = keystore
 
     def later_number(self, seal: str | None) -> int:
-        """Return the number in a seal that a CA signed if the ledger lacks the number; else 0."""
+        """Return the number in a seal if a CA signed it and the ledger lacks the number, or 0."""
         with suppress(SrosError):
             if seal:
                 number = sealed_robot(seal.encode()).number

@@ -478,7 +478,7 @@ def _permissions(
 def _early_expiry_note(
     label: str, wanted_validity: Window, authority: x509.Certificate, root: Path
 ) -> Note | None:
-    """Return a note if the CA's expiry shortens the chosen validity by more than 1 %; else None."""
+    """Return a note if the CA's expiry shortens the validity by more than 1 %; otherwise None."""
     end = validity_of(authority).not_after
     lost = wanted_validity.not_after - end
     if lost <= max(

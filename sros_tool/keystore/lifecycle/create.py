@@ -939,12 +939,12 @@ class _EnclaveMaker:
     def _recorded_credentials(
         self,
     ) -> tuple[str, Mapping[str, tuple[set[int], list[str]]], frozenset[str] | None]:
-        """Return why the ledger may lack entries, what it has, and the subjects since a restore.
+        """Return three values: a clause, the ledger's entries, and the subjects since a restore.
 
-        The first value is a clause, or "" if the ledger is complete.  The second value maps
-        enclaves to the serial numbers of their certificates and to the subjects of their
-        permissions; expired and revoked certificates are left out.  The third value is that of
-        `subjects_since_restore`.
+        The first value says why the ledger may lack entries ("" if the ledger is complete).  The
+        second value maps enclaves to the serial numbers of their certificates and to the subjects
+        of their permissions; expired and revoked certificates are left out.  The third value is the
+        result of `subjects_since_restore`.
         """
         keystore, now = self._change.keystore, iso(self._change.now)
         working: dict[str, tuple[set[int], list[str]]] = {}

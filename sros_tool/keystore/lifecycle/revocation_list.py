@@ -411,7 +411,7 @@ class RevocationListSigner:
     # ── the lists ──────────────────────────────────────────────────────────────────────────
 
     def _list_if_authentic(self, crl: RevocationList | None) -> RevocationList | None:
-        """Return ``crl`` if a trusted identity CA signed it; else None, with a remark.
+        """Return ``crl`` if a trusted identity CA signed it; otherwise None, with a remark.
 
         Without this check, whoever can write the file but not sign it could make the CA sign
         entries that revoke other enclaves, or that prevent a revocation.
