@@ -371,9 +371,7 @@ def _domains_by_enclave(rights: DomainRights) -> dict[str, list[DomainSet | None
 def _common_domain_set(
     first: DomainSet | None, second: DomainSet | None
 ) -> tuple[DomainSet | None] | tuple[()]:
-    """Return the ROS domains that two sets have in common, in a tuple; () without common
-    domains.
-    """
+    """Return the common ROS domains of two sets, in a tuple; () without common domains."""
     if first is None or second is None or first is second:
         return (second if first is None else first,)
     return _common_domains(first, second)

@@ -1287,8 +1287,7 @@ def _enclaves_near(robots: _EnclavesByRobot, robot: str) -> dict[str, Profile]:
 
 
 def undenied_name(denied: Right, stated: Rules) -> str | None:
-    """Return a name that ``denied`` matches, but no rule of ``stated``; None if there is no such
-    name.
+    """Return a name, if any, that ``denied`` matches, but no rule of ``stated`` matches.
 
     ``denied`` is not for an action.
     """

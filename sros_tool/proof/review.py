@@ -857,9 +857,7 @@ class _Review:
     def _paths_of(
         self, entries: Iterable[tuple[str, TreeEntry]], fits: Callable[[bytes], bool]
     ) -> list[str]:
-        """Return the sorted paths of the files that are not left out, and for which ``fits`` is
-        true.
-        """
+        """Return the sorted paths of files that are not left out, and whose content ``fits``."""
         wanted = {
             path: entry
             for path, entry in entries
