@@ -33,7 +33,7 @@ def install(pattern: str, lock: int | None = None) -> bool:
 
 
 def install_all(patterns: Sequence[str], lock: int | None = None) -> list[str]:
-    """Install several packages at once; return the patterns that could not be installed."""
+    """Install several packages together; return the patterns that could not be installed."""
     prefix = root_prefix()
     if prefix is None or not available():
         return list(patterns)

@@ -302,7 +302,7 @@ def explain(
         raise UsageError(
             "--log takes either a keystore or a policy",
             "A process decides by the signed permissions of its keystore.",
-            f"Leave --policy out; or name the policy alone: `sros explain {quote(str(policy))} "
+            f"Leave --policy out; or name only the policy: `sros explain {quote(str(policy))} "
             f"--log {quote(logs[0])}`.",
         )
     names_policy = root is not None and is_policy(root)

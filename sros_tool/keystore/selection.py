@@ -233,7 +233,7 @@ def _enclaves_of_robots(
     if fleet is None and not any(map(keystore.has, (PRIVATE, SETTINGS))):
         raise KeystoreError(
             f"'{root}' is not a keystore with a fleet, so it has no robot {robots[0]!r}",
-            "An export for a robot has the enclaves of that robot alone, and not the fleet.",
+            "An export for a robot has only the enclaves of that robot, and not the fleet.",
             "Leave --robot out, choose enclaves with --match, or name the keystore from which it "
             "was exported.",
         )

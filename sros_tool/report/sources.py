@@ -341,7 +341,7 @@ def _check_no_governance(sources: Sequence[Path], sources_read: Sequence[Picture
                 f"--template does not fit '{path}'",
                 f"It is {'an' if kind == 'enclave' else 'a'} {kind}, which is drawn with its own "
                 "governance; a template is for policies, which have no governance.",
-                "Leave --template out, or name the policy alone.",
+                "Leave --template out, or name only the policy.",
             )
 
 

@@ -159,7 +159,7 @@ def test_the_keystore_knows_whose_enclave_is_whose(made: Path) -> None:
     first = ", ".join(sorted(CARRIERS, key=lambda name: int(name[1:]))[:5])
     assert f"has no robot 'carriers'. carriers is a group: {first}" in group
     exported = sros("list_enclaves", "r7", "--robot", "r7", cwd=made)
-    assert "An export for a robot has the enclaves of that robot alone" in exported.err
+    assert "An export for a robot has only the enclaves of that robot" in exported.err
 
 
 def copied(made: Path, folder: Path) -> Path:

@@ -345,8 +345,8 @@ def _target_stage(
         raise UsageError(
             f"the stage {to} is not the next stage",
             f"The next stage is {rotation.next_stage()}; after it, restart the processes.",
-            f"Run `sros rotate_ca {quote(str(root))} --next`, or `--finish` to do all stages at "
-            "once.",
+            f"Run `sros rotate_ca {quote(str(root))} --next`, or `--finish` to do all stages "
+            "together.",
         )
     if ahead < 0:
         raise UsageError(
