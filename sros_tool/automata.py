@@ -651,7 +651,7 @@ class Superset:
 def _superset_of(node: _Node, rank: Callable[[Superset], tuple[int, int]]) -> Superset | None:
     """Return a simple set with all names of ``node``, or None if none is found.
 
-    If several sets are found, the result is the one with the lowest ``rank``.
+    If several sets are found, the set with the lowest ``rank`` is returned.
     """
     match node:
         case _Union():

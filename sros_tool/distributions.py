@@ -54,7 +54,7 @@ class Distribution(NamedTuple):
     """A ROS 2 distribution.
 
     ``until`` is the month in which its support ends.  ``stands_for`` is an unsupported distribution
-    in whose place this one is used, or "".
+    that this distribution replaces, or "".
     """
 
     name: str

@@ -51,11 +51,11 @@ def _prepare_labeled(self: Any, context: LaunchContext, action: Action) -> None:
 class SecuredNodes(Action):  # type: ignore[misc]  # launch has no types where it is missing
     """Launch action that starts every later process with ``sros run --policy``, in its enclave.
 
-    The action sets the prefix of commands, in front of an existing prefix such as that of a
-    debugger.  Processes with a prefix of their own get environment variables with which no node
-    starts.  Launch itself has a node if it talks to other nodes, such as lifecycle nodes and
-    composable nodes: this node starts in ``enclave``, by default the enclave in which the policy
-    has the node ``launch_ros_*``.
+    The action sets the prefix of commands, in front of an existing prefix, such as a debugger.
+    Processes with a prefix of their own get environment variables with which no node starts.
+    Launch itself has a node if it talks to other nodes, such as lifecycle nodes and composable
+    nodes: this node starts in ``enclave``, by default the enclave in which the policy has the node
+    ``launch_ros_*``.
     """
 
     def __init__(

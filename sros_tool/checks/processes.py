@@ -1061,7 +1061,7 @@ def runtime_metrics(
 ) -> tuple[Metric, ...]:
     """Return the metrics of the running processes, compared with the environment of this shell.
 
-    ``advisories`` are the known vulnerabilities; None for those that ship with sros.
+    ``advisories`` are the known vulnerabilities; None means the advisories that ship with sros.
     """
     security = Counter(_security_of(process) for process in running.processes)
     findings = process_findings(environment, running, now=now, zone=zone)

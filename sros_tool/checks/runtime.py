@@ -27,8 +27,8 @@ class RuntimeState:
     ``now`` is the moment to check for; ``clock`` is the host's clock, or None if it is ``now``.
     ``rmws`` are the installed RMWs; ``insecure_rmws`` maps an RMW that was tested and does not
     enforce security to the result of the test.  ``zone`` is the host's time zone.  ``libraries``
-    are installed DDS libraries, in addition to those of the processes, and ``advisories`` the
-    known vulnerabilities; None for those that ship with sros.
+    are installed DDS libraries, in addition to the libraries of the processes.  ``advisories`` are
+    the known vulnerabilities; None means the advisories that ship with sros.
     """
 
     environment: Mapping[str, str]

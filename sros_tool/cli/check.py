@@ -679,8 +679,8 @@ def _machine_findings(
     """Return the runtime findings on this machine, for the environment variables given.
 
     ``insecure_rmws`` maps RMWs that were found not to enforce security to the evidence.
-    ``libraries`` are installed DDS libraries, and ``advisories`` are the
-    known vulnerabilities; None for those that ship with sros.
+    ``libraries`` are installed DDS libraries, and ``advisories`` are the known vulnerabilities;
+    None means the advisories that ship with sros.
     """
     from sros_tool.checks.runtime import RuntimeState, runtime_findings
     from sros_tool.cli.common import local_zone

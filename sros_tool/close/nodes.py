@@ -197,7 +197,7 @@ class ObservedNodes:
     def divide_by_profile(
         self, nodes: Iterable[ObservedNode]
     ) -> tuple[list[ObservedNode], list[ObservedNode]]:
-        """Divide nodes into those with a profile in the policy, and those without."""
+        """Return the nodes that have a profile in the policy, and the nodes that have none."""
         profiles = [
             profile for enclave in self.policy.enclaves for profile in enclave.all_profiles()
         ]

@@ -451,7 +451,7 @@ def _remedy(robot: LocalRobot, difference: str) -> str:
 
 
 class _TalkComparison:
-    """A comparison of the nodes of the open robot with those that an observer audited now.
+    """A comparison of the nodes of the open robot with the nodes that an observer audited now.
 
     ``audited`` is the JSON of `sros audit`; the other arguments are as in `_proof_of_talk`.
     """

@@ -182,7 +182,7 @@ def _observed_processes(
     ended_participants: Collection[str],
     started: _StartedProcesses,
 ) -> ObservedProcesses:
-    """Return the processes of the observed nodes, including those that ended while sros watched."""
+    """Return the processes of the observed nodes, also processes that ended while sros watched."""
     processes, domain = running.in_domain, running.robot.domain
     pids = [
         process.own_pid or process.pid for process in processes if "libddsc" in process.libraries

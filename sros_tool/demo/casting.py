@@ -413,9 +413,9 @@ def _sorted_by_fitness(
 ) -> list[str]:
     """Return ``chosen`` sorted by how well an enclave suits a demo of the ``right`` to ``topic``.
 
-    Enclaves that are not in ``other_enclaves`` come first.  Among equal enclaves, those whose
-    permissions name the topic come first.  Last are enclaves with a rule that denies the other
-    direction, because Cyclone DDS 0.10 then denies both directions.
+    Enclaves that are not in ``other_enclaves`` come first.  Then come enclaves whose permissions
+    name the topic.  Last are enclaves with a rule that denies the other direction, because Cyclone
+    DDS 0.10 then denies both directions.
     """
     return sorted(
         (name for name in rights if name in chosen),

@@ -136,8 +136,8 @@ class DemoOptions:
     template of that keystore, or production; the default ``topic`` is a topic that the cast may
     use. ``only`` has words, and selects the rows whose names contain such a word.  ``accept_open``
     names the rows of attacks that may succeed because of the user's keystore.  ``advisories`` are
-    the known DDS vulnerabilities; None for those that ship with sros.  ``secrets`` returns the
-    passphrases of the CA keys in ``keystore``.
+    the known DDS vulnerabilities; None means the advisories that ship with sros.  ``secrets``
+    returns the passphrases of the CA keys in ``keystore``.
     """
 
     template: Template | None = None

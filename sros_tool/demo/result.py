@@ -693,7 +693,7 @@ def used_libraries(
 ) -> tuple[UsedLibrary, ...]:
     """Return the DDS libraries that processes of the rows had loaded, sorted.
 
-    ``advisories`` are the known vulnerabilities; None for those that ship with sros.
+    ``advisories`` are the known vulnerabilities; None means the advisories that ship with sros.
     """
     used = set()
     for library in {library for row in rows for library in row.libraries}:

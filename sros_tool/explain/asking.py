@@ -280,8 +280,8 @@ def planned_enclave(
 ) -> LoadedEnclave:
     """Return the enclave as the policy would create it, with the keystore's governance.
 
-    Without a keystore, the governance is the one of the default template, with the protection that
-    the policy demands.
+    Without a keystore, the enclave gets the governance of the default template, with the protection
+    that the policy demands.
     """
     from sros_tool.keystore.participant import plan_enclave
     from sros_tool.keystore.protection import governance_with_stated

@@ -322,14 +322,14 @@ def as_learned(
 ) -> Learned:
     """Return the proposed rights as profiles.
 
-    With ``enclave``, only that enclave gets rights: those of denials that name it or no enclave.
-    ``node`` (namespace and name) names the profile. Without ``node``, the rights go to the node
-    whose standard services were denied, else to the only profile of the enclave in ``policy``, else
-    to a profile for any node: DDS checks only the enclave. If ``policy`` does not have the enclave,
-    the last part of its name is assumed to be the node's name, and a note says so. A node that is
-    not in the policy gets a note instead of rights. ``common`` are the rights that every node
-    needs. A node that has none of these rights gets all of them in two cases: one of these rights
-    was denied to the node, or the profile is new in a policy that is ``written``.
+    With ``enclave``, only this enclave gets rights: from denials that name this enclave, or no
+    enclave. ``node`` (namespace and name) names the profile. Without ``node``, the rights go to the
+    node whose standard services were denied, else to the only profile of the enclave in ``policy``,
+    else to a profile for any node: DDS checks only the enclave. If ``policy`` does not have the
+    enclave, the last part of its name is assumed to be the node's name, and a note says so. A node
+    that is not in the policy gets a note instead of rights. ``common`` are the rights that every
+    node needs. A node that has none of these rights gets all of them in two cases: one of these
+    rights was denied to the node, or the profile is new in a policy that is ``written``.
 
     Raises:
         UsageError: The log does not name the enclave of a denial, and ``enclave`` is "".

@@ -1085,7 +1085,9 @@ class _Examiner:
     def _causes(
         self, enclave: LoadedEnclave, answer: Answer, faults: tuple[Fault, ...]
     ) -> Iterator[tuple[str, str]]:
-        """Yield faults of the enclave with remedies: those in ``faults``, or else all faults."""
+        """Yield the enclave's ``faults`` with remedies; all its faults if it has none of
+        ``faults``.
+        """
         fitting = [problem for problem in answer.problems if problem.fault in faults]
         for problem in fitting or answer.problems:
             yield str(problem), remedy(problem.fault, self._root, enclave.name, problem.file)

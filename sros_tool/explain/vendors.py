@@ -286,7 +286,7 @@ def _provenance_notes(answer: Answer) -> Iterator[Note]:
 
 
 def _export_notes(answer: Answer) -> Iterator[Note]:
-    """Yield a note if an export denies what its keystore may allow by now."""
+    """Yield a note if an export denies an access that its keystore may already allow."""
     if answer.change and answer.is_of_export:
         text = (
             "these files are from an export. If the policy of the keystore already allows this, "

@@ -337,7 +337,7 @@ def _connection_settings(data: bytes, label: str, *, is_json: bool) -> dict[str,
 
     The settings of the fleet itself are left out (`_table_from_inventory`).  If a group has
     variables, the members of the group are added, too.  If a value is a template, all values are
-    returned.  Parameters and errors are those of `_table_from_inventory`.
+    returned.  Parameters and errors are the same as for `_table_from_inventory`.
     """
     values = dict(_inventory_leaves(_load_inventory(data, label, is_json=is_json)))
     known = {*_VARIABLES.values(), _ROBOT_VARIABLE}

@@ -234,7 +234,7 @@ def deliver_first_sentence(root: Path) -> str:
 
 
 class EnclaveDomains(NamedTuple):
-    """The ROS domains of enclaves: the domain of their robot, or else those of the keystore."""
+    """The ROS domains of enclaves: the domain of their robot, or all domains of the keystore."""
 
     keystore: DomainSet
     fleet: Fleet | None = None

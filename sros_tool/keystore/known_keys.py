@@ -59,7 +59,7 @@ def other_enclave(keystore: OpenedKeystore, name: str, certificate: x509.Certifi
 
 
 def revoked_serials(keystore: OpenedKeystore) -> frozenset[int]:
-    """Return the serial numbers of all revoked certificates, also of those that were replaced."""
+    """Return the serial numbers of all revoked certificates, also of replaced certificates."""
     entries = keystore.ledger_with("what", "revocation").entries
     recorded = {int(entry.serial, 16) for entry in entries if entry.what == "revocation"}
     listed = {entry.serial for crl in keystore.revocation_lists for entry in crl.revoked}

@@ -100,7 +100,7 @@ class PresentSettings(NamedTuple):
         return self.governance.domains().closed()
 
     def without_edits(self) -> Template:
-        """Return the settings without edits: those in the ledger, or else `settings_to_change`.
+        """Return the settings without edits, from the ledger, or else from `settings_to_change`.
 
         Raises:
             KeystoreError: as `settings_to_change`.

@@ -204,7 +204,7 @@ def _holds_key(parsed: TokenUri, secrets: Secrets) -> bool:
 def open_token_key(uri: str, secrets: Secrets, *, named: bool) -> TokenKey:
     """Return the key that ``uri`` names.
 
-    Arguments and errors are those of `holds_token_key`.
+    It has the arguments and errors of `holds_token_key`.
     """
     return _open_key(_usable_uri(uri, named=named), secrets, create=False)
 

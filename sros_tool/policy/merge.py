@@ -104,7 +104,7 @@ class MergePlan:
 
 
 def plan_merge(before: Policy, additions: Policy) -> MergePlan:
-    """Return the plan for adding those rights of ``additions`` that ``before`` lacks.
+    """Return the plan for adding the rights of ``additions`` that ``before`` lacks.
 
     Left out are rights that any profile or wildcard of the enclave already allows, and rights that
     the enclave completely denies.

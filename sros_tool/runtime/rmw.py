@@ -180,9 +180,9 @@ def vendor_here(
 ) -> tuple[Vendor, str]:
     """Return the DDS vendor of this machine, and the reason as a short text.
 
-    The vendor is that of $RMW_IMPLEMENTATION.  If the variable is not set, it is that of an
-    installed RMW, or else Fast DDS.  The release is the one that $ROS_DISTRO ships.  With
-    ``distribution``, the release is the one that this distribution ships, and installed RMWs do not
+    $RMW_IMPLEMENTATION decides on the vendor; if it is not set, an installed RMW decides, or else
+    the vendor is Fast DDS.  The release is the release that $ROS_DISTRO ships.  With
+    ``distribution``, it is the release that this distribution ships, and installed RMWs do not
     count.  The text also warns if the RMW was built without DDS Security, or if the release was not
     tested.
     """

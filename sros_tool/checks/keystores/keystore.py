@@ -218,8 +218,8 @@ def _enclave_findings(
     """Yield all findings in one enclave, except refusals by vendors (see `check_vendors`).
 
     ``vendors`` are the vendors that the enclave's nodes may use. ``governance`` is the keystore's
-    signed governance, or that of the first enclave of an export; findings about this governance are
-    reported already.
+    signed governance; in an export, the governance of the first enclave; findings about this
+    governance are reported already.
     """
     yield from check_enclave(enclave)
     yield from check_documents(enclave)

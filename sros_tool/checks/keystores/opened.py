@@ -75,7 +75,7 @@ class Circumstances:
     fleet: Fleet | None = None
     """The robots that placeholders in policies stand for, whose domains are compared, too."""
     advisories: tuple[Advisory, ...] | None = None
-    """Known DDS vulnerabilities; None for those that ship with sros."""
+    """Known DDS vulnerabilities; None means the advisories that ship with sros."""
     sample: Sequence[str] | None = None
     """Names of the enclaves to check together with the keystore itself; None for all."""
     on_robot: bool = False

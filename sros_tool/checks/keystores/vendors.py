@@ -1,7 +1,7 @@
 """Check how each DDS vendor decides on an enclave: whether a node can start, and its rights.
 
-The decision engine is the one of `sros explain`.  A vendor's refusal is not reported if another
-finding already names its cause.
+The decision engine is the same as for `sros explain`.  A vendor's refusal is not reported if
+another finding already names its cause.
 """
 
 from __future__ import annotations

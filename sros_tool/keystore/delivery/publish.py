@@ -2,7 +2,7 @@
 
 Robots find complete files at every moment, because of the order of writing.  First come the new
 archives, which no metadata names yet.  Then the keystore's transaction writes ledger, keys and the
-list of what is published.  The metadata comes last, and its last file is the timestamp.
+list of published files.  The metadata comes last, and its last file is the timestamp.
 """
 
 from __future__ import annotations
@@ -313,7 +313,7 @@ def metadata_problem(keystore: OpenedKeystore) -> str:
     missing.  Expiry is not considered.
 
     Raises:
-        DocumentError: the list of what is published is damaged.
+        DocumentError: the list of published files is damaged.
     """
     known = read_published(keystore)
     if not known.folder or not keystore.has(FLEET_ROOT):
@@ -1156,7 +1156,7 @@ class _Publication:
     def release(self, changed_robots: Sequence[_ChangedRobot], change: KeystoreChange) -> None:
         """Write the archives of new releases, which no metadata names yet.
 
-        ``changed_robots`` are those that seemed changed before the keystore was locked.
+        ``changed_robots`` are the robots that seemed changed before the keystore was locked.
         """
         changed = self.changed_robots(changed_robots)
         unused = change.keystore.ledger_file.next_number()
@@ -1284,7 +1284,7 @@ class _Publication:
                 yield from (path for path in paths if _REMOVABLE.fullmatch(path))
 
     def stage(self, change: KeystoreChange, keys: _RoleKeys) -> None:
-        """Stage the keys, the versions of the root, and the list of what is published."""
+        """Stage the keys, the versions of the root, and the list of published files."""
         if not self._dry_run:
             keys.write_new_key_outside()
         for path, data in keys.new.items():
@@ -1295,7 +1295,7 @@ class _Publication:
         change.transaction.write(PUBLISHED, self.list.document(self._now))
 
     def write_list_of_published(self) -> None:
-        """Write the list of what is published, and change nothing else in the keystore."""
+        """Write the list of published files, and change nothing else in the keystore."""
         path = self.keystore.root / PUBLISHED
         self._changes = file_change(path, existed=True)
         if not self._dry_run:

@@ -223,13 +223,13 @@ def certify_requests(
 ) -> SignedRequests:
     """Certify the keys of several requests (PEM, one after the other), all or none.
 
-    The arguments are those of `sign_request`, but no answers are made: an export without keys
-    brings the enclaves to their robots.  Unless ``renew`` is set, an enclave whose key is already
-    certified stays as it is.  ``only_enclaves`` are the enclaves for which there must be requests;
-    empty for any.  With ``replace_keys``, an enclave's private key in the keystore is removed if
-    the request has another key: from then on, the enclave's key is on its robot.  ``vouching`` maps
-    enclaves to the serial numbers of the certificates that vouch for their requests: the enclave
-    must still have one of them, and none of them may be revoked.
+    The arguments are the same as for `sign_request`.  But no answers are made: an export without
+    keys brings the enclaves to their robots.  Unless ``renew`` is set, an enclave whose key is
+    already certified stays as it is.  ``only_enclaves`` are the enclaves for which there must be
+    requests; empty for any.  With ``replace_keys``, an enclave's private key in the keystore is
+    removed if the request has another key: from then on, the enclave's key is on its robot.
+    ``vouching`` maps enclaves to the serial numbers of the certificates that vouch for their
+    requests: the enclave must still have one of them, and none of them may be revoked.
 
     Raises:
         PkiError: a request is not valid.
