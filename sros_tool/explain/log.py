@@ -1085,8 +1085,8 @@ class _Examiner:
     def _causes(
         self, enclave: LoadedEnclave, answer: Answer, faults: tuple[Fault, ...]
     ) -> Iterator[tuple[str, str]]:
-        """Yield the enclave's ``faults`` with remedies; all its faults if it has none of
-        ``faults``.
+        """Yield faults in ``faults`` with remedies; if there are none, all faults of the
+        enclave.
         """
         fitting = [problem for problem in answer.problems if problem.fault in faults]
         for problem in fitting or answer.problems:
