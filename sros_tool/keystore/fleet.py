@@ -410,7 +410,7 @@ def notes_on_lost_enclaves(keystore: OpenedKeystore, before: Fleet, after: Fleet
         shown = first_few(sorted(enclaves), _MOST_SHOWN)
         yield Note(
             "fleet.left-enclaves",
-            f"the robot {name} {why}: {shown} {stay} valid. To take them back, run `sros revoke "
+            f"the robot {name} {why}: {shown} {stay} valid. To revoke them, run `sros revoke "
             f"{quote(str(keystore.root))} {arguments_for(keystore, sorted(enclaves))}`.",
         )
 

@@ -365,9 +365,9 @@ class Focus:
     receivers: tuple[str, ...]
     """Enclaves that may subscribe to, serve, execute or read the name."""
     influencing: tuple[Influence, ...]
-    """Enclaves that influence the senders, or the enclave; direct influence has 2 hops."""
+    """Enclaves that influence the senders, or the enclave; `hops` is 2 for direct influence."""
     influenced: tuple[Influence, ...] = ()
-    """Enclaves that the enclave influences; direct influence has 1 hop."""
+    """Enclaves that the enclave influences; `hops` is 1 for direct influence."""
 
 
 class PicturedUse(NamedTuple):
@@ -553,7 +553,7 @@ class Picture:
 
     @property
     def other_answers(self) -> tuple[str, ...]:
-        """The answers except those on requirements."""
+        """All answers except answers about requirements."""
         focus = (focus.sentence for focus in self.focus)
         exports = map(_sentence_on_export, self.exports)
         return (*focus, *exports, *self._unread_sentences())

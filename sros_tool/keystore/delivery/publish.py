@@ -779,7 +779,7 @@ class _Publication:
 
     @property
     def _command(self) -> str:
-        """The command that publishes, in backquotes; `fleet collect` lacks its options."""
+        """The command `sros fleet publish` for this folder, in backquotes, without options."""
         where = f"{quote(str(self.keystore.root))} {quote(str(self._folder))}"
         return f"`sros fleet publish {where}`"
 
