@@ -1200,7 +1200,7 @@ class _KeystoreRecords:
         template = self._keystore.template
         return tuple(sorted(name for name in names if template.longest_validity(name) is not None))
 
-    def validity(self, compared_robot: _ComparedRobot) -> dict[str, _Expiring]:
+    def first_expiring(self, compared_robot: _ComparedRobot) -> dict[str, _Expiring]:
         """Map each kind of file to the robot's file that expires first, by the ledger."""
         first: dict[str, _Expiring] = {}
         for kind, digests in compared_robot.expiring.items():
@@ -1360,7 +1360,7 @@ def _robot_status(
     is_restarted = compared_robot.crl_restart() == ()
     fetches = bool(received and received.message)
     has_release = bool(different) and records.has_release(compared_robot)
-    validity = records.validity(compared_robot)
+    validity = records.first_expiring(compared_robot)
     status = RobotStatus(
         compared_robot.robot.name,
         state,

@@ -308,7 +308,7 @@ def _folder_findings(
     keys = {os.path.join(root, ENCLAVES, name[1:], KEY_FILE) for name in keystore.names}
     keys |= {os.path.join(root, ENCLAVES, KEY_FILE)}
     keys |= set(map(_real_path_in_mounted_secret, keys))
-    original = keystore.is_original
+    is_original = keystore.is_original
     unread: list[OSError] = []
     for parent, folders, files in os.walk(start, onerror=unread.append):
         folders.sort()
@@ -322,7 +322,7 @@ def _folder_findings(
                 yield from links.check(path)
                 continue
             yield from _write_access_findings(path, info, trusted_users)
-            yield from _open_folder_findings(path, root, info.st_mode, original)
+            yield from _open_folder_findings(path, root, info.st_mode, is_original)
         if parent == root and AGENT in folders:
             folders.remove(AGENT)  # the folder of `sros agent` is closed to others
         inside = os.path.relpath(parent, root)
@@ -342,14 +342,14 @@ def _folder_findings(
                 if name == KEY_URI_FILE or name.endswith("_ca.cert.pem"):
                     with suppress(OSError):  # `check_enclave` reports an unreadable one
                         if _holds_key(keystore, path, info):
-                            yield from _stray_file_findings(keystore, path, info, original)
+                            yield from _stray_file_findings(keystore, path, info, is_original)
             elif keystore.looks_like_original and _is_key_of_ca_or_revoked_enclave(
                 keystore, path, info
             ):
                 kept_names.append(os.path.relpath(path, root))
                 yield from key_mode_findings(path, info.st_mode)
             else:
-                yield from _stray_file_findings(keystore, path, info, original)
+                yield from _stray_file_findings(keystore, path, info, is_original)
     for error in unread:
         yield _unread_path_finding(error, root)
 
@@ -392,10 +392,10 @@ def _interrupted_change_finding(parent: Path, root: str) -> Finding:
     return INTERRUPTED.found(root, text, str(parent / STAGE))
 
 
-def _open_folder_findings(path: str, root: str, mode: int, original: bool) -> Iterator[Finding]:
+def _open_folder_findings(path: str, root: str, mode: int, is_original: bool) -> Iterator[Finding]:
     inside = Path(path).relative_to(root)
     # Below a closed top folder, other users cannot enter any folder.
-    asked = inside.parts[0] in _KEY_FOLDERS and (len(inside.parts) == 1 or not original)
+    asked = inside.parts[0] in _KEY_FOLDERS and (len(inside.parts) == 1 or not is_original)
     if asked and mode & 0o077 and not mode & stat.S_IWOTH:
         text, remedy = f"its mode is {stat.S_IMODE(mode):04o}", f"Run `chmod 700 {quote(path)}`."
         yield FOLDER_OPEN.found(path, text, path, remedy=remedy)
@@ -491,7 +491,7 @@ def _is_key_of_ca_or_revoked_enclave(
 
 
 def _stray_file_findings(
-    keystore: CheckedKeystore, path: str, info: os.stat_result, original: bool
+    keystore: CheckedKeystore, path: str, info: os.stat_result, is_original: bool
 ) -> Iterator[Finding]:
     """Yield findings about a file that belongs to no enclave, such as a misplaced key."""
     root = os.fspath(keystore.root)
@@ -504,7 +504,7 @@ def _stray_file_findings(
         return
     if holds_key:
         yield from key_mode_findings(path, info.st_mode)
-        if place == PRIVATE or not original:
+        if place == PRIVATE or not is_original:
             text = "it contains a private key that belongs to no enclave"
             yield CA_KEY_ON_ROBOT.found(path, text, path)
         else:
