@@ -517,7 +517,7 @@ def test_two_cas_do_not_become_one(root: Path) -> None:
 
 def test_a_key_is_not_moved(root: Path) -> None:
     target = replace(load_template("production"), identity_key="file:/elsewhere.pem")
-    with pytest.raises(UsageError, match="moves no CA key"):
+    with pytest.raises(UsageError, match="does not move CA keys"):
         to(root, target)
 
 
