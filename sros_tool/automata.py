@@ -974,8 +974,8 @@ class _ParallelAutomata:
     def longer_acceptance_test(self, positions: int) -> _Test:
         """Return a function that says whether an automaton of a set accepts after more letters.
 
-        The automata are at ``positions``.  The result is True if an automaton accepts endless
-        texts from there, False if it accepts no text, and None if it accepts finite texts only.
+        The automata are at ``positions``.  The result is True if an automaton accepts every further
+        text from there, False if it accepts none, and None if this depends on the text.
         """
 
         def ask(leaf: _Union) -> _Truth:

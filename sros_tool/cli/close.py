@@ -128,11 +128,11 @@ def close(
     command, which is printed. Existing files are kept: edit policy.xml and requirements.toml, and
     run the verb again.
 
-    Nothing is closed before --apply, which restarts the processes that are systemd units, and
-    shows the commands for all others. --proof checks that every process was started in its enclave,
-    that the files of the enclaves have no error, that everything that talked may still talk, and
-    that an open listener finds nothing. --apply also proves this, if nothing is left to do by hand.
-    --undo makes the robot open again.
+    Nothing is closed before --apply, which restarts the processes that are systemd units, and shows
+    the commands for all others. --proof checks four claims: every process was started in its
+    enclave, the files of the enclaves have no error, everything that talked may still talk, and an
+    open listener finds nothing. --apply also proves this, if nothing is left to do by hand. --undo
+    makes the robot open again.
 
     Example:
       $ sros close robot --for 5m

@@ -128,13 +128,13 @@ def _inventory(root: Path, as_yaml: bool, as_list: bool) -> None:
 def _report(folder: Path, robot: str, restarted: bool) -> None:
     """On a robot, print a report of its enclaves' files and its DDS, for `fleet confirm`.
 
-    The report is JSON. It has the time, the SHA-256 of each file of the enclaves in DIR except
-    their keys, the DDS libraries that processes have loaded or that are installed, and the enclaves
-    whose processes still run with earlier files. Run the command as root, who can see all
-    processes. The problems in the report are enclaves in which no process could start, for example
-    because the key does not fit the certificate, files that other users can read or change, and
-    what `sros check runtime` finds in the processes of these enclaves. docs/json.md describes the
-    report under "confirmation".
+    The report is JSON. It has the time, and the SHA-256 of each file of the enclaves in DIR except
+    their keys. It also has the loaded and the installed DDS libraries, and the enclaves whose
+    processes still run with earlier files. Run the command as root, who can see all processes. The
+    report names these problems: enclaves in which no process could start, for example because the
+    key does not fit the certificate; files that other users can read or change; and findings of
+    `sros check runtime` on the processes of these enclaves. docs/json.md describes the report under
+    "confirmation".
 
     Example:
       $ ssh root@r7 sros fleet report /etc/sros/keystore --robot r7 |
@@ -654,10 +654,10 @@ def _status(
     of the same major version fixes, by the advisories of sros; --advisories FILE lists them, and so
     does --robot NAME with --fail-on vulnerabilities.
 
-    The revocation list is in force on a robot if the robot has the list, or an earlier list that
-    revokes the same certificates, and confirms that no process has to restart for it. `sros agent`
-    and `sros fleet report` confirm for each process whether the process lacks the list. In other
-    confirmations, every restart that is due counts as a restart for the list.
+    The revocation list is in force on a robot if the robot has the list, and confirms that no
+    process has to restart for it. An earlier list that revokes the same certificates counts, too.
+    `sros agent` and `sros fleet report` confirm for each process whether the process lacks the
+    list. In other confirmations, every restart that is due counts as a restart for the list.
 
     Example:
       $ sros fleet status keystore

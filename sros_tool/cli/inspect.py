@@ -84,10 +84,10 @@ def inspect(
 
     PATH is a keystore, an enclave's folder, a file of certificates, a revocation list, a private
     key, a Zenoh configuration or a signed document (.p7s). The exit status is 1 if an enclave
-    cannot run, a signature does not verify or is missing (in a .p7s file, or with --ca), or a Zenoh
-    configuration does not fit its signature or its enclave. It is also 1 if the keystore's ledger
-    lacks a CA, a certificate or a signed document, if lines of the ledger are missing or were
-    changed, or, with --policy, if nothing was signed from that file.
+    cannot run, or a signature does not verify or is missing (in a .p7s file, or with --ca). It is 1
+    if a Zenoh configuration does not fit its signature or its enclave. It is also 1 if the
+    keystore's ledger lacks a CA, a certificate or a signed document, or if lines of the ledger are
+    missing or were changed. With --policy, it is 1 if nothing was signed from that file.
 
     Example:
       $ sros inspect keystore/enclaves/talker/permissions.p7s

@@ -262,14 +262,14 @@ def diff_policy(
     The exit status is 1 if they differ, or if DDS would refuse A or B.
 
     With --no-new-access, A and B can also be folders of policies, and policies at a git revision,
-    as git:REVISION:PATH. The exit status is 0 only if B gives no enclave access that A does not
-    give, for any vendor, domain or name, assigns no node to an enclave with more rights, and
-    protects nothing less. It is 2 if sros cannot decide this. sros assumes that a policy is signed
-    with a governance that controls all access. If A is a policy, a keystore B that protects less
-    than the template production counts as giving more access; a policy B never lowers the
-    protection. The last line says what is assumed and what is left out, such as dates. "!" marks a
-    DENY of A that B lacks, for names that B does not allow. A missing DENY alone gives no access,
-    so the exit status is 0, but `sros review` fails.
+    as git:REVISION:PATH. The exit status is 0 only if, for every vendor, domain and name, B gives
+    no enclave access that A does not give. Also, B must not assign a node to an enclave with more
+    rights, or protect anything less. The exit status is 2 if sros cannot decide this. sros assumes
+    that a policy is signed with a governance that controls all access. If A is a policy, and B is a
+    keystore that protects less than the template production, this counts as more access. If B is a
+    policy, it never lowers the protection. The last line says what is assumed and what is left out,
+    such as dates. "!" marks a DENY of A that B lacks, for names that B does not allow. If only a
+    DENY is missing, nobody gets access, so the exit status is 0, but `sros review` fails.
 
     Example:
       $ sros diff_policy robot.xml keystore

@@ -440,7 +440,7 @@ def _remedy(robot: LocalRobot, difference: str) -> str:
     policy, restart = f"'{robot.policy}'", f"run `{robot.close_command}`, and restart these nodes"
     remedies = {
         "denied": f"if a node needs this, add it to its profile in {policy}, and {restart}; if a "
-        "name was changed in the policy alone, start the node with this name, too",
+        "name was changed only in the policy, start the node with this name, too",
         "gone": f"if the node uses another name now, write that name into its profile in {policy} "
         f"in place of this one, also into the profiles of the nodes that it talks to, and "
         f"{restart}; if not, start the node as before ({robot.commands_file})",

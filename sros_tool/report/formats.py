@@ -344,8 +344,8 @@ def _card_legend(picture: Picture, scene: Scene) -> Iterable[str]:
     if rows:
         yield _legend_row(rows)
     for units in picture.equal[:_MOST_LABELS]:
-        of_each = f"each of {len(units.members)} {units.what}s, which are equal but for their names"
-        yield _legend_row([("", f"{units.label}: {of_each}")])
+        of_each = f"each of {len(units.members)} {units.what}s, which are equal except for their"
+        yield _legend_row([("", f"{units.label}: {of_each} names")])
     if any(word in line for word in OTHERS for card in scene.cards for line in card.lines):
         yield _legend_row(
             [("", f"{{1 {OTHERS[0]} …}}: this name of one other robot, namespace or enclave")]

@@ -215,7 +215,7 @@ export function equalDetails(card, act) {
   return [
     el("p", { class: "kind", text: `${counted(card.members.length, "enclave")} alike` }),
     el("h2", { text: card.lines.map((text) => text.trim()).join(""), tabindex: "-1" }),
-    el("p", { class: "soft", text: "Their rights are equal but for their own names." }),
+    el("p", { class: "soft", text: "Their rights are equal except for their own names." }),
     section("Enclaves", longList(items)),
   ];
 }

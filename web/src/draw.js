@@ -289,7 +289,7 @@ export function legend(scene, overlay, equal, make) {
   if (overlay && scene.links.some((link) => link.mark === "second")) line("second", overlay.second);
   for (const units of equal) {
     if (!scene.cards.some((card) => [...card.lines, card.group ?? ""].some((text) => text.includes(units.label)))) continue;
-    const text = `${units.label}: each of ${units.members.length} ${units.what}s, which are equal but for their names`;
+    const text = `${units.label}: each of ${units.members.length} ${units.what}s, which are equal except for their names`;
     items.push(make.el("li", {}, make.el("span", { class: "label", text })));
   }
   if (scene.cards.some((card) => card.lines.some((text) => /{\d+ others? of /.test(text)))) {
