@@ -21,7 +21,7 @@ from typing import NamedTuple
 from sros_tool.checks.kind import WARNING, Finding, FindingKind
 from sros_tool.dds.decision.vendors import FAST_DDS
 from sros_tool.runtime.processes import MemoryPort, Process, plain
-from sros_tool.wording import first_few
+from sros_tool.wording import counted, enumerated, first_few
 
 CONNECTING_TIME = timedelta(seconds=30)
 """Time after the start of a process within which it connects to the others, or never does."""
@@ -122,12 +122,27 @@ def started_before(processes: Iterable[Process], now: datetime) -> Iterator[Proc
 def connection_findings(missing: Sequence[tuple[Process, Process]]) -> Iterator[Finding]:
     """Yield findings about secured processes that trust the same CA, and are not connected."""
     for process, peers in restarts(missing):
-        names = first_few([f"{peer.label}{_place_text(peer)}" for peer in peers], _MOST_NAMES)
-        text = f"it{_place_text(process)} has not connected to {names}: neither hears the other"
-        users = {process.user, *(peer.user for peer in peers)}
-        remedy = _REMEDY_FOR_USERS if len(users) > 1 else ""
-        yield PROCESS_NOT_CONNECTED.found(process.label, text, remedy=remedy)
+        names = first_few([_named(peer) for peer in peers], _MOST_NAMES)
+        text = f"it has not connected to {names}: neither hears the other"
+        yield PROCESS_NOT_CONNECTED.found(_named(process), text, remedy=_remedy(process, peers))
 
 
-def _place_text(process: Process) -> str:
-    return f" in {plain(process.enclave.name)}" if process.enclave else ""
+def missing_text(missing: Sequence[tuple[Process, Process]]) -> str:
+    """Return text on pairs of processes that do not hear each other, with the remedy."""
+    first, second = map(_named, missing[0])
+    more = f" and {counted(len(missing) - 1, 'other pair')}" if missing[1:] else ""
+    to_restart = [*restarts(missing)]
+    remedy = next(filter(None, (_remedy(process, peers) for process, peers in to_restart)), "")
+    if not remedy:
+        names = enumerated([_named(process) for process, _ in to_restart])
+        remedy = f"restart {names}, one after the other, and ask again"
+    return f"{first} and {second}{more} do not hear each other; {remedy[0].lower()}{remedy[1:]}"
+
+
+def _remedy(process: Process, peers: Iterable[Process]) -> str:
+    """Return the remedy for processes of several users; "" otherwise."""
+    return _REMEDY_FOR_USERS if {peer.user for peer in peers} != {process.user} else ""
+
+
+def _named(process: Process) -> str:
+    return f"{process.label}{f' in {plain(process.enclave.name)}' if process.enclave else ''}"

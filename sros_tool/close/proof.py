@@ -13,8 +13,8 @@ from sros_tool.checks.connections import (
     CONNECTING_TIME,
     PROCESS_NOT_CONNECTED,
     Connections,
-    connection_findings,
     connections_between,
+    missing_text,
 )
 from sros_tool.checks.keystores.issued import STALE
 from sros_tool.checks.kind import NOTE, Finding
@@ -250,10 +250,8 @@ def _proof_of_connections(robot: LocalRobot) -> Iterator[Proof]:
         robot, lambda seen: not _connections(seen).missing, patience.total_seconds()
     )
     connections = _connections(running)
-    if findings := [*connection_findings(connections.missing)]:
-        texts = [f"{finding.subject}: {finding.text}" for finding in findings]
-        reason = f"{first_few(texts, MOST_NAMES, '; ')}. {findings[0].remedy.rstrip('.')}"
-        yield Proof(CONNECTED, False, reason)
+    if connections.missing:
+        yield Proof(CONNECTED, False, missing_text(connections.missing))
     elif len(connections.compared) > 1:
         number = counted(len(connections.compared), "process", "processes")
         reason = f"{number} of Fast DDS have all connected to each other"

@@ -9,7 +9,12 @@ from typing import Any
 
 import pytest
 
-from sros_tool.checks.connections import connection_findings, connections_between, restarts
+from sros_tool.checks.connections import (
+    connection_findings,
+    connections_between,
+    missing_text,
+    restarts,
+)
 from sros_tool.runtime.processes import MemoryPort, Process
 
 FIRST_OF_DOMAIN_77 = 26661
@@ -92,3 +97,13 @@ def test_processes_of_two_users_need_one_user_rather_than_a_restart() -> None:
     assert "restart the process" in same.remedy
     (different,) = connection_findings([(first, replace(second, user=1000))])
     assert different.remedy.startswith("Run these processes as one user")
+
+
+def test_a_summary_names_a_pair_and_all_restarts() -> None:
+    missing = connections_between(robot(*range(2, 15), deaf=[(2, 12), (3, 6), (3, 12)])).missing
+    assert missing_text(missing) == (
+        "process 2 (node2) and process 12 (node12) and 2 other pairs do not hear each other; "
+        "restart process 12 (node12) and process 3 (node3), one after the other, and ask again"
+    )
+    different = [(first, replace(second, user=1000)) for first, second in missing]
+    assert "; run these processes as one user" in missing_text(different)

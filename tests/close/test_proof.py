@@ -129,7 +129,7 @@ def test_a_demand_for_an_enclave_that_the_export_lacks_is_judged_by_the_keystore
     ("processes", "holds", "says"),
     [
         (robot(1, 2, 3), True, "3 processes of Fast DDS have all connected to each other"),
-        (robot(1, 2, 3, deaf=[(1, 2)]), False, "neither hears the other. If another finding"),
+        (robot(1, 2, 3, deaf=[(1, 2)]), False, "do not hear each other; restart process 1"),
         ([*robot(1, 2), replace(robot(3)[0], own_ports=frozenset())], True, "of process 3 (node3)"),
         ([replace(process, own_ports=frozenset()) for process in robot(1, 2)], None, ""),
         (robot(1), None, ""),
