@@ -438,7 +438,8 @@ def _observed_from(value: Any) -> ObservedProcesses:
         ValueError, TypeError, KeyError: the value has another form.
     """
     processes = [ClosedProcess(**process) for process in value["processes"]]
-    observed = ObservedProcesses(**value)._replace(processes=processes)
+    observed = ObservedProcesses(**value)
+    observed = observed._replace(processes=processes, brought=dict(observed.brought))
     names = (*observed.unknown, *observed.elsewhere, *observed.ended, *observed.not_here)
     _check_types((*names, *observed.brought.values()), (observed.domain,))
     for process in processes:

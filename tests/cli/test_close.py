@@ -1352,7 +1352,9 @@ def test_a_robot_that_cannot_be_watched_is_refused(robot: Robot) -> None:
     other_unit = text.replace('"unit": ""', '"unit": "../x.service"')
     other_user = re.sub(r'"user": \d+', '"user": "a"', text, count=1)
     other_name = text.replace('"ended": []', '"ended": [{}]')
+    other_map = text.replace('"brought": {}', '"brought": 5')
     number = text.replace('"enclave": "/talker"', '"enclave": 5')
+    assert len({text, other_unit, other_user, other_name, other_map, number}) == 6
     file.write_text(text.replace('"rmw": ""', '"rmw": "rmw_zenoh_cpp"'))
     for words in ((), ("--proof",), ("--apply",)):
         said = robot.close(*words, status=2).err
@@ -1362,7 +1364,7 @@ def test_a_robot_that_cannot_be_watched_is_refused(robot: Robot) -> None:
         file.write_text(text.replace('"rmw": ""', f'"rmw": "{rmw}"'))
         said = robot.close("--proof", status=2, RMW_IMPLEMENTATION="rmw_zenoh_cpp").err
         assert "this robot runs on DDS. " in said and f" {remedy}{rmw}" in said
-    for wrong in (other_unit, other_user, other_name, number, "{}", "[" * 100_000):
+    for wrong in (other_unit, other_user, other_name, other_map, number, "{}", "[" * 100_000):
         file.write_text(wrong)
         assert "is not a list of processes" in robot.close(status=2).err
 
