@@ -109,7 +109,8 @@ class Verdict:
     """The decision on a requirement in one world.
 
     ``witness`` is None if the requirement holds.  ``empty`` are clauses on enclaves in the
-    requirement that do not exist, and on names that no enclave may use.  ``always`` is a clause
+    requirement that do not exist, and on names that no enclave may use.  ``waiting`` are clauses on
+    names that no enclave may use yet, but whose other side an enclave has. ``always`` is a clause
     that says why the requirement cannot fail whatever rights enclaves get, or "".  ``assumed`` is a
     name whose protection is assumed because the policy does not state it, or "".  ``blocked`` is a
     demanded use whose messages do not pass between Zenoh routers, or None. ``unnamed`` are names in
@@ -119,6 +120,7 @@ class Verdict:
     requirement: Requirement
     witness: Witness | None
     empty: tuple[str, ...] = ()
+    waiting: tuple[str, ...] = ()
     always: str = ""
     assumed: str = ""
     blocked: BlockedUse | None = None
@@ -191,14 +193,16 @@ def decide(requirement: Requirement, world: World, limit: SearchLimit | None = N
             raise AssertionError(requirement)
     if witness:
         _confirm(requirement, witness, world)
-    unused, unnamed = _unused_names(requirement, world, limit)
+    unused, waiting, unnamed = _unused_names(requirement, world, limit)
     empty = (*_missing_enclaves_clauses(requirement, world), *unused)
     always = "" if witness or empty else _why_never_fails(requirement, world)
     assumed = "" if witness else _assumed_protection(requirement, world, limit)
     blocked = None
     if isinstance(requirement, Must) and not witness and world.crossing:
         blocked = _use_blocked_by_routers(requirement, world, limit)
-    return Verdict(requirement, witness, empty, always, assumed, blocked, tuple(unnamed))
+    return Verdict(
+        requirement, witness, empty, tuple(waiting), always, assumed, blocked, tuple(unnamed)
+    )
 
 
 def _confirm(requirement: Requirement, witness: Witness, world: World) -> None:
@@ -695,15 +699,17 @@ def _missing_enclaves_clauses(requirement: Requirement, world: World) -> Iterato
 
 def _unused_names(
     requirement: Requirement, world: World, limit: SearchLimit
-) -> tuple[list[str], list[str]]:
-    """Return clauses on unused names in a requirement, and the names that no right states.
+) -> tuple[list[str], list[str], list[str]]:
+    """Return clauses on unused names, clauses on names that wait for users, and unstated names.
+
+    A name waits for users if an enclave has its other side, such as the server of a service.
 
     A name that no right states can still be used by a wildcard, and `Nobody` demands that nobody
     uses it.  So such a name counts as unused only if a right states another name that differs by
     one typing error, as in ``/cmd_vle``, or if the name is in use as another kind (service or
     action).
     """
-    clauses, unnamed = [], []
+    clauses, waiting, unnamed = [], [], []
     for right, name, parts in _restricted_names(requirement):
         verb = "use" if isinstance(requirement, Nobody | Protected) else right
         named = _named_right(right, name)
@@ -716,13 +722,19 @@ def _unused_names(
                 meant = f", but some enclaves may {other} {_named_right(other, name)}"
             if isinstance(requirement, Nobody) and not meant:
                 unnamed.append(named)
+            elif (
+                known
+                and not meant
+                and _is_used_by_anybody(world, _sufficient_parts(PEER_RIGHT[right]), name, limit)
+            ):
+                waiting.append(f"no enclave may {verb} {named}")
             else:
                 clauses.append(f"no enclave may {verb} {named}{meant}")
         elif meant:
             clauses.append(f"only wildcards match {named}{meant}")
         elif not known:
             unnamed.append(named)
-    return clauses, unnamed
+    return clauses, waiting, unnamed
 
 
 def _restricted_names(
@@ -792,7 +804,7 @@ def _why_never_fails(requirement: Requirement, world: World) -> str:
     match requirement:
         case Only(enclaves=enclaves) if any(map(is_expression, enclaves)):
             if len(_matching_enclaves(enclaves, world.enclaves)) == count:
-                return f"the listed names match all {count} enclaves"
+                return "every enclave matches the list"
         case AtMost(most=most) if most >= count:
             return f"there are only {count} enclaves"
         case Widest(rights=rights):

@@ -194,11 +194,10 @@ def decide_all(requirements: Sequence[Requirement], system: System) -> Decided:
             violations.append(
                 Violation(requirement, witness, steps, titles, missing, idle, other_steps)
             )
-        if reasons := tuple(_never_fails([verdict for _, verdict in verdicts])):
-            is_alone = all(verdict.always for _, verdict in verdicts) and _users_may_break(
-                requirement
-            )
-            (holding_alone if is_alone else vacuous).append((requirement, reasons))
+        empty, reasons = _why_never_fails([verdict for _, verdict in verdicts])
+        if empty or reasons:
+            is_alone = not empty and _users_may_break(requirement)
+            (holding_alone if is_alone else vacuous).append((requirement, (*empty, *reasons)))
         if not broken and (names := _texts_in_all(verdict.unnamed for _, verdict in verdicts)):
             unnamed.append((requirement, names))
         if not broken and (
@@ -224,7 +223,7 @@ def _users_may_break(requirement: Requirement) -> bool:
     anywhere = requirement.elsewhere or requirement
     if not requirement.is_relative:
         return False
-    return isinstance(anywhere, AtMost) or (
+    return isinstance(anywhere, AtMost | NotBoth) or (
         isinstance(anywhere, Only)
         and (
             any(pattern.startswith(EXCEPT) for pattern in anywhere.enclaves)
@@ -240,12 +239,17 @@ def _step(use: Use, world: World, system: System) -> Step:
     return Step(use, system.places.find(stating), holder)
 
 
-def _never_fails(verdicts: Sequence[Verdict]) -> Iterator[str]:
-    """Yield clauses that say why a requirement, or a part of it, cannot fail in any world."""
-    if empty := _texts_in_all(verdict.empty for verdict in verdicts):
-        yield _listed_names(empty)
-    if all(verdict.always for verdict in verdicts):
-        yield verdicts[0].always
+def _why_never_fails(verdicts: Sequence[Verdict]) -> tuple[list[str], list[str]]:
+    """Return clauses that say why a requirement, or a part of it, cannot fail in any world.
+
+    The first list names what no enclave has. What the second list says can change with further
+    enclaves.
+    """
+    empty = _texts_in_all(verdict.empty for verdict in verdicts)
+    reasons = [verdicts[0].always] if all(verdict.always for verdict in verdicts) else []
+    if waiting := _texts_in_all(verdict.waiting for verdict in verdicts):
+        reasons = [_listed_names(waiting)]
+    return [_listed_names(empty)] if empty else [], reasons
 
 
 def _texts_in_all(lists: Iterable[Sequence[str]]) -> tuple[str, ...]:
@@ -329,13 +333,13 @@ def decided_findings(
 ) -> list[Finding]:
     """Return the findings of decisions: broken requirements first, in order."""
     findings = [_violation_finding(violation) for violation in decided.violations]
-    findings += [_vacuous_finding(requirement, why) for requirement, why in decided.vacuous]
-    for requirement, why in decided.holding_alone:
+    findings += [_vacuous_finding(requirement, why) for requirement, why in _once(decided.vacuous)]
+    for requirement, why in _once(decided.holding_alone):
         place, text = requirement.source, f"{'; '.join(why)}: {demand(requirement)}"
         findings.append(HOLDS_ALONE.found(place.file, text, place.file, place.line))
     if decided.unnamed:
         allowed = [right for right in before if right.qualifier is ALLOW]
-        findings += [_unnamed_finding(*unnamed, allowed) for unnamed in decided.unnamed]
+        findings += [_unnamed_finding(*unnamed, allowed) for unnamed in _once(decided.unnamed)]
     findings += [_assumption_finding(*assumption) for assumption in decided.assumed]
     findings += [_not_crossing_finding(*blocked_use) for blocked_use in decided.blocked]
     if system.is_export:
@@ -350,6 +354,14 @@ def decided_findings(
         text = f"{error.what}: {error.why}" if error.why else error.what
         findings.append(NOT_ON_ZENOH.found(system.file, text, system.file))
     return findings
+
+
+def _once(
+    decided: Iterable[tuple[Requirement, tuple[str, ...]]],
+) -> Iterable[tuple[Requirement, tuple[str, ...]]]:
+    """Return requirements with reasons, once if only the namespaces of the enclaves differ."""
+    pairs = reversed([*decided])
+    return reversed({(r.source, r.robot, why): (r, why) for r, why in pairs}.values())
 
 
 def _text(violation: Violation) -> str:
