@@ -695,7 +695,7 @@ def explain_access(
         KeystoreError: The keystore or the enclave does not exist.
         PolicyError: The policy does not have the enclave.
         UsageError: The action is unknown or does not fit ``kind``, the name, vendor,
-            distribution or domain is not valid, or Zenoh is asked by a policy alone.
+            distribution or domain is not valid, or Zenoh is asked about a policy only.
 
     Example:
         >>> answer = sros_tool.explain_access(keystore, "/talker", "publish", "/chatter")

@@ -515,7 +515,7 @@ class NameSet:
 
     @classmethod
     def union(cls, sets: Iterable[NameSet]) -> NameSet:
-        """Return the names that are in one of several sets."""
+        """Return the names that are in at least one of several sets."""
         other_nodes: list[_Node] = []
         exact: set[str] = set()
         automata: set[Automaton] = set()

@@ -655,7 +655,7 @@ def _check_mounted(keystore: OpenedKeystore, enclave: str, target: Path) -> None
         raise KeystoreError(
             f"the folder of enclave {enclave} also has {', '.join(inner[:3])}",
             "The container would get the private keys of all these enclaves.",
-            f"Export this enclave alone, {export}, and name DIR as the keystore.",
+            f"Export only this enclave, {export}, and name DIR as the keystore.",
         )
     if keystore.is_original and target == keystore.root.absolute():
         raise KeystoreError(

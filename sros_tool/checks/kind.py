@@ -197,7 +197,7 @@ class Finding(NamedTuple):
 
 
 def group_by_cause(findings: Sequence[Finding]) -> Iterator[tuple[Finding, ...]]:
-    """Yield groups of findings that share a cause, and each finding without a cause alone."""
+    """Yield groups of findings that share a cause; a finding without a cause is a group of one."""
     groups: dict[Cause, list[Finding]] = {}
     for finding in findings:
         if finding.cause:

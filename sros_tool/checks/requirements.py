@@ -48,7 +48,7 @@ ASSUMED = FindingKind(
     "requirement.assumed",
     NOTE,
     "a protection that the policy does not state",
-    "The governance of the keystore protects topics, and a policy alone has none. A keystore's "
+    "The governance of the keystore protects topics, and a policy has no governance. A keystore's "
     "template can protect less than the default template.",
     "The requirements file.",
     "Name the keystore's template with --template, write protect= in the policy, or check the "

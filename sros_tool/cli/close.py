@@ -164,7 +164,7 @@ def close(
             raise UsageError(
                 f"{option} changes what the folder remembers",
                 "",
-                f"First run `sros close {shlex.quote(str(folder))}` with {option} alone; "
+                f"First run `sros close {shlex.quote(str(folder))}` with only {option}; "
                 "the folder remembers it.",
             )
     shell = Shell(_run, lambda line: echo(line, err=True), os.environ, now, local_zone(os.environ))

@@ -573,8 +573,8 @@ def _imported_lines(imported_enclave: ImportedEnclave, *, pinned: bool) -> Itera
         yield f"  and {_ca_text(imported_enclave.permissions_ca)}"
     if imported_enclave.first and not pinned:
         yield (
-            "  compare both with the output of sign_request, or use --ca: import alone does not "
-            "verify them"
+            "  compare both with the output of sign_request, or use --ca: without it, import does "
+            "not verify them"
         )
 
 

@@ -59,7 +59,7 @@ class ClosedProcess(NamedTuple):
     user: int
     """The id of the user who runs the process; 4294967295 if several users can control it."""
     unit: str
-    """The systemd unit that starts it alone; empty for a process that is restarted by hand."""
+    """The systemd unit that starts only this process; empty if it is restarted by hand."""
     known_by: Annotated[
         str, Words(("process id", "node name", "program", "elimination", "enclave", "command"))
     ]
@@ -215,7 +215,7 @@ class ClosedProcess(NamedTuple):
         return f"cd {_shell_word(self.folder)} && {' '.join(map(_shell_word, words))}"
 
     def launch_advice(self, folder: Path) -> str:
-        """Return what a Python program that starts the process by a launch description lacks.
+        """Return what to change in a Python program whose launch description starts the process.
 
         Returns "" for a process that `ros2 launch` or no launch starts.
         """

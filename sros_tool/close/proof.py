@@ -69,7 +69,7 @@ _START_SECONDS = 3.0
 """How long processes that were restarted by hand may take until they run in their enclaves."""
 
 _MOST_TRIES = 3
-"""How often the observer looks until the nodes do what they did on the open robot."""
+"""Maximum number of looks of the observer, until the nodes do what they did on the open robot."""
 
 
 def prove(robot: LocalRobot) -> CloseState:
@@ -239,7 +239,7 @@ def _demands_more_enclaves(robot: LocalRobot) -> bool:
 
 
 def _proof_of_connections(robot: LocalRobot) -> Iterator[Proof]:
-    """Prove that processes have connected to each other, if sros can see this of some.
+    """Yield the proof that processes have connected to each other, if sros can compare several.
 
     Waits until all have connected, or had enough time.
     """

@@ -46,7 +46,7 @@ _LONGEST_PATH = 300
 """Most characters that a text shows of a path that another process chose."""
 
 _LOOK_SECONDS = 0.2
-"""How often processes are looked at until they are as they should be."""
+"""Seconds between two looks at the processes, until they are as they should be."""
 
 _TOOLS = ("ros2", "sros", "sros_tool")
 """Programs, and packages of Python modules, with which a person tries an enclave."""
@@ -331,8 +331,8 @@ class CloseState(NamedTuple):
     needed_elsewhere: Mapping[str, datetime]
     """The enclaves of other machines, and when their files in the keystore changed last, in UTC. A
     machine with earlier files still trusts certificates that were revoked since, and needs the
-    current files. Without enclaves that the policy does not have: `problems` names them. Without
-    `brought`.
+    current files. Enclaves that the policy does not have are in `problems` instead, and enclaves
+    whose current files were brought are in `brought`.
     """
     brought: Mapping[str, datetime]
     """The other enclaves of other machines, also with the last change of their files: `--brought`

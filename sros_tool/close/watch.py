@@ -37,7 +37,7 @@ from sros_tool.runtime.variables import DOMAIN
 from sros_tool.wording import counted, enumerated, first_few
 
 _LOOK_SECONDS = 1.0
-"""How often processes are looked at while the robot is watched; shorter ones can be missed."""
+"""Seconds between two looks at the processes; a process that runs for less can be missed."""
 _MOST_COMMANDS = 10_000
 """Number of commands of processes that are kept; of others, the start command is not known."""
 _SHELL_VARIABLES = re.compile(

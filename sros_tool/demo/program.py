@@ -346,7 +346,7 @@ def _user_keystore(options: DemoOptions, now: datetime) -> UserKeystore | None:
             raise UsageError(
                 f"the scenario {scenario.name} cannot run in a keystore of yours",
                 "It needs enclaves with the rights of the scenario's policy.",
-                "Use --keystore with --scenario attacks alone.",
+                "Use --keystore only with --scenario attacks.",
             )
     topic = "" if options.topic is None else check_topic(options.topic)
     user = open_user_keystore(options.keystore, topic, options.scenarios[0], now)

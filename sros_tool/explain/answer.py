@@ -281,7 +281,7 @@ class Provenance(StrEnum):
     CHANGED = "changed"
     """The policy file states other rights than the permissions have."""
     UNKNOWN = "unknown"
-    """The permissions were made from another version or another file with the same rights."""
+    """No ledger says from which policy the permissions were made."""
     PLANNED = "planned"
     """The answer is about the policy; nothing is signed yet."""
 

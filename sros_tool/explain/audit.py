@@ -167,7 +167,11 @@ def audited_enclaves(
         )
     if rights.kind == "keystore":
         if other_paths:
-            raise UsageError("a keystore is audited alone", "", f"Leave '{other_paths[0]}' out.")
+            raise UsageError(
+                "a keystore cannot be audited together with other paths",
+                "",
+                f"Leave '{other_paths[0]}' out.",
+            )
         names = enclave_names(path)
         with_nodes = [
             name for name in names if not (enclave_path(path, name) / ROUTER_FILE).exists()

@@ -399,7 +399,8 @@ def likely_meaning(right: Right, used: Collection[Right], named: Iterable[Right]
 def remapping_clause(name: str, meant: str) -> str:
     """Return which remapping the node or the policy may lack, as a clause."""
     return (
-        f"the node may lack a remapping, -r {name}:={meant}, or the policy, --remap {meant}:={name}"
+        f"the node may lack the remapping -r {name}:={meant}, or the policy may lack "
+        f"--remap {meant}:={name}"
     )
 
 

@@ -273,7 +273,7 @@ def _provenance_notes(answer: Answer) -> Iterator[Note]:
             )
         case Provenance.UNKNOWN:
             why = (
-                "an export has no ledger, which would"
+                "an export has no ledger, so sros cannot"
                 if answer.is_of_export
                 else "the ledger does not"
             )
@@ -362,8 +362,11 @@ def _other_name_notes(answer: Answer, asked_enclave: AskedEnclave) -> Iterator[N
         kind, does = ("not-used", "needs")
         if question.right in OFFERING_RIGHT:
             kind, does = ("not-offered", "offers")
-        text = f"no enclave that was read may {needed} {question.name} by its name: perhaps nobody "
-        text += f"{does} it, and the node lacks a remapping, or a wildcard allows it."
+        text = (
+            f"no enclave that was read has a right to {needed} exactly {question.name}, but a "
+            f"right with a wildcard may match it. If none does, perhaps no other node {does} "
+            f"{question.name}, and this node lacks a remapping."
+        )
         yield Note(f"explain.{kind}", text)
 
 
@@ -666,9 +669,9 @@ class VendorOfPolicy(NamedTuple):
 
 
 _MAX_DECIDED_ALONE = 100
-"""Maximum number of enclaves that are decided on alone; for more, sros decides on all enclaves.
+"""If more enclaves than this are asked about, sros decides on all enclaves of the keystore.
 
-Other enclaves matter because their permissions may also fit.
+For fewer, it decides on these and on enclaves whose permissions may also fit.
 """
 
 

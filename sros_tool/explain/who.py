@@ -165,7 +165,7 @@ def note_on_callable_action(decider: Decider, question: Question) -> Note | None
 def note_on_names_meant(
     decider: Decider, question: Question, enclaves: Container[str]
 ) -> Note | None:
-    """Return a note on names like a mistyped name in the rights of ``enclaves``, or None."""
+    """Return a note on names of ``enclaves`` that are similar to a mistyped name, or None."""
     names = sorted(
         {
             right.name

@@ -506,7 +506,7 @@ class ZenohEvaluator:
     def _enclaves_to_check(self, answer: ZenohAnswer, ends: set[str]) -> set[str]:
         """Return the enclaves on whose rights an answer depends.
 
-        A denial depends on the enclave's own rights alone.  ``ends`` are the enclaves at the other
+        A denial depends only on the enclave's own rights.  ``ends`` are the enclaves at the other
         end.
         """
         if not answer.allowed and not answer.of_router:

@@ -218,7 +218,7 @@ class FleetPolicy(Mapping[str, Enclave]):
 def check_choice(policies: Sequence[FleetPolicy], fleet: Fleet, robots: Collection[str]) -> None:
     """Raise `PolicyError` if the policies lack a chosen robot, or some of its enclaves.
 
-    ``policies`` are all policies of the fleet, expanded for the chosen ``robots`` alone.
+    ``policies`` are all policies of the fleet, expanded only for the chosen ``robots``.
     """
     owners = {policy.stated(path)[1] for policy in policies for path in policy}
     patterns = [pattern for policy in policies for pattern in policy.patterns]

@@ -261,7 +261,7 @@ def _parts_of(right: str) -> tuple[_TopicOfRight, ...]:
 
 @lru_cache(maxsize=16)
 def _sufficient_parts(right: str) -> tuple[_TopicOfRight, ...]:
-    """Return the DDS topics of a right that, each alone, are enough for a part of the right."""
+    """Return the DDS topics of a right, each of which is enough for a part of the right."""
     return tuple(part for part in _parts_of(right) if part.writes or right == "subscribe")
 
 

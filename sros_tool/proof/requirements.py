@@ -943,7 +943,7 @@ class DroppedRequirement:
 
 
 def _moving_names(requirements: Iterable[Requirement]) -> Iterator[str]:
-    """Yield the names in requirements about rights that are others in another namespace."""
+    """Yield the names in requirements about rights, if these names change with the namespace."""
     for requirement in requirements:
         elsewhere = requirement.elsewhere
         if isinstance(requirement, RightsRequirement) and isinstance(elsewhere, RightsRequirement):

@@ -242,7 +242,7 @@ class StepFindings:
 
     @property
     def lines(self) -> tuple[tuple[str, str], ...]:
-        """The findings that make the step fail, followed by those that are only shown."""
+        """The findings that make the step fail, followed by the findings that are only shown."""
         return self.failing + self.shown_only
 
 
@@ -1282,7 +1282,7 @@ def _variables_before_hosts(where: str) -> tuple[bool, str]:
 def _delivery_place(robot: Robot) -> str:
     """Return the place to which a robot's keys are delivered, as text.
 
-    This is ``user@address``, the address alone, or "its name" if the robot has no address.
+    This is ``user@address``, only the address, or "its name" if the robot has no address.
     """
     return f"{robot.user}@{robot.address}" if robot.user else robot.address or "its name"
 

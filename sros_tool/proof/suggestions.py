@@ -36,7 +36,7 @@ _OF_EVERY_NODE = frozenset({"/rosout", "/parameter_events"})
 _SENDING_RIGHTS = ("publish", "call", "request")
 """The rights with which an enclave sends without being asked, in the order of the proposals."""
 _ENCLAVES_OF_PEOPLE = "/operator/*"
-"""The enclaves of people, such as those that sros ships: `ros2 topic echo` needs wildcards."""
+"""The enclaves of people in the policies that sros ships; `ros2 topic echo` needs wildcards."""
 _MAX_HOLDERS = 3
 """Maximum number of enclaves with a right to a name that are proposed as its only users."""
 _MAX_CANDIDATES = 1000

@@ -439,7 +439,7 @@ def _enclaves_text(enclaves: Collection[str], *, partial: bool) -> str:
     if len(enclaves) > _MOST_NAMED:
         return counted(len(enclaves), "enclave")
     alone = len(enclaves) == 1 and not partial
-    return enumerated(sorted(enclaves)) + (" alone" if alone else "")
+    return ("only " if alone else "") + enumerated(sorted(enclaves))
 
 
 HOPS = 2

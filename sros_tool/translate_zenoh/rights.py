@@ -529,12 +529,12 @@ _NOWHERE = Source("", 0)
 def _differences_in(
     rules: Sequence[AclRule], enclave: str
 ) -> Mapping[tuple[str, int], Sequence[Right]]:
-    """Map (right, domain) to the rights and denials behind rules that list only allowed names.
+    """Map (right, domain) to the rights and denials behind rules that only allow.
 
-    The names are in the rules for graph tokens.  These names count only if sros would list exactly
-    the key expressions of the rules for these names. Without this step, each key expression would
-    be read as a separate ROS name, which matches more names: ``$*b$*/**`` has the b in the first
-    part, but ``/*b*`` in any part.
+    The names are read from the rules for graph tokens. These names count only if sros would list
+    exactly the key expressions of the rules for these names. Without this step, each key expression
+    would be read as a separate ROS name, which matches more names: ``$*b$*/**`` has the b in the
+    first part, but ``/*b*`` in any part.
     """
     keys: dict[tuple[str, int], set[str]] = {}
     denied = set()

@@ -83,7 +83,7 @@ class RemoteRights:
     )
 
     def mirrored(self, common_name: str) -> RemoteRights:
-        """Return the rights that the remote process must give to this one for the same messages.
+        """Return the rights that the remote process must give this process for the same messages.
 
         ``common_name`` is the common name of this process.
         """

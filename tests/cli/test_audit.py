@@ -226,7 +226,10 @@ def test_a_name_that_the_policy_may_mean_is_named(program: Program, tmp_path: Pa
     node = ("/", "/", "talker", "01", ["publish rt/chater", *services])
     ended = program(graph(node), "robot.xml", *SHORT)
     assert "publish rt/chater; perhaps the policy means /chatter (the node may " in ended.out
-    assert "(the node may lack a remapping, -r /chater:=/chatter, or the policy, --" in ended.out
+    assert (
+        "(the node may lack the remapping -r /chater:=/chatter, or the policy may lack --"
+        in ended.out
+    )
     assert "; the policy has it as a service (request)\n" in ended.out
     both = ("/", "/", "talker", "01", ["publish rt/chatter", "publish rt/chater"])
     ended = program(graph(both), "robot.xml", *SHORT)

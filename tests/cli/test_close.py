@@ -296,9 +296,9 @@ def test_a_policy_that_was_changed_stays_and_is_followed(robot: Robot) -> None:
     again = robot.close("--for", "1s", status=1)
     assert policy.read_text() == changed
     assert "nothing is closed yet; fix this first:\n  'robot/policy.xml' stays as it " in again.out
-    remapped = "perhaps the policy means /old/chatter (the node may lack a remapping, -r "
+    remapped = "perhaps the policy means /old/chatter (the node may lack the remapping -r "
     assert f"lacks 1 right seen now (/listener subscribe /chatter); {remapped}" in again.out
-    assert "-r /chatter:=/old/chatter, or the policy, --remap /old/chatter:=" in again.out
+    assert "-r /chatter:=/old/chatter, or the policy may lack --remap /old/chatter:=" in again.out
     assert (
         "; if the node lacks this, restart the node with it, and watch again: "
         "sros close robot --for 1m;" in again.out

@@ -85,9 +85,10 @@ def ids(found: Audit) -> list[str]:
 
 def lacks(used: str, allowed: str) -> str:
     """The hint at a remapping from the name that is used to one like it that is allowed."""
-    node = f"the node may lack a remapping, -r {used}:={allowed}"
+    node = f"the node may lack the remapping -r {used}:={allowed}"
     return (
-        f"; perhaps the policy means {allowed} ({node}, or the policy, --remap {allowed}:={used})"
+        f"; perhaps the policy means {allowed} ({node}, or the policy may lack "
+        f"--remap {allowed}:={used})"
     )
 
 

@@ -741,12 +741,14 @@ def test_a_change_is_for_the_node_that_the_permissions_are_for(whole: Path) -> N
     meant = explain(whole, ENCLAVE, "serve", "/elsewhere/get_parameters")
     assert f"note [explain.likely-name]: the enclave may serve {own}" in meant.err
     assert "may publish /chatter: " in explain(whole, ENCLAVE, "publish", "/chater").err
-    rules = "-r /front/chatter:=/chatter, or the policy, --remap /chatter:=/front/chatter)."
+    rules = "-r /front/chatter:=/chatter, or the policy may lack --remap /chatter:=/front/chatter)."
     assert rules in explain(whole, ENCLAVE, "publish", "/front/chatter").err
     assert "may publish /chatter: " in explain(whole, "--who", "publish", "/chater").err
     assert "likely-name" not in found.err
-    unused = "[explain.not-used]: no enclave that was read may subscribe /nothing by its name"
-    assert unused in found.err and "the node lacks a remapping" in found.err
+    unused = (
+        "[explain.not-used]: no enclave that was read has a right to subscribe exactly /nothing"
+    )
+    assert unused in found.err and "this node lacks a remapping" in found.err
     assert "not-used" not in explain(whole, ENCLAVE, "publish", "/rosout").err
 
 

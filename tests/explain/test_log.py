@@ -1263,9 +1263,9 @@ def test_the_other_side_of_a_name_tells_whether_a_remapping_may_be_forgotten(
         assert all(fact in found for fact in facts) and "subscribe" in found
         assert "-r /rear/image" not in found
         notes = sros("explain", keystore, "/weed", "subscribe", topic).err
-        assert ("not-offered]: no enclave that was read may publish /odom" in notes) is (
-            len(facts) == 2
-        )
+        assert (
+            "not-offered]: no enclave that was read has a right to publish exactly /odom" in notes
+        ) is (len(facts) == 2)
         assert ("[explain.likely-name]" in notes) is (len(facts) == 1)
     export = tmp_path / "export"
     sros("distribute_key", keystore, "/weed", export).ok()

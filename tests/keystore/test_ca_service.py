@@ -262,7 +262,7 @@ def test_the_service_signs_the_revocation_list(site: Path) -> None:
     others = 4711  # of another site
     before = snapshot(site)
     for crl, words in (
-        (b"", rf"it alone signs .*\({serial:x}\), and give its list with --crl FILE"),
+        (b"", rf"only this service signs .*\({serial:x}\), and give its list with --crl FILE"),
         (listed(others), f"It does not revoke {serial:x}"),
         (listed(serial, key=OTHER), "did not sign it"),
         (listed(serial, days=-1), "not now"),
@@ -333,7 +333,7 @@ def test_python_takes_a_service_and_the_list_that_it_signed(
     sros_tool.create_enclaves(made, ["/talker", "/listener"])
     first = certificate(made.path / "enclaves/talker/cert.pem")
     assert first.issuer == CA.subject
-    with pytest.raises(sros_tool.KeystoreError, match="it alone signs revocation lists"):
+    with pytest.raises(sros_tool.KeystoreError, match="only this service signs revocation lists"):
         sros_tool.revoke(made, ["/talker"])
     with pytest.raises(sros_tool.DocumentError, match=r"none\.pem"):
         sros_tool.revoke(made, ["/talker"], crl=tmp_path / "none.pem")
@@ -345,7 +345,7 @@ def test_what_a_service_cannot_do_is_refused(site: Path, tmp_path: Path) -> None
     before = snapshot(site)
     with pytest.raises(KeystoreError, match="does not revoke earlier certificates"):
         renew(site, ["/talker"], now=now(), revoke_old=True)
-    with pytest.raises(UsageError, match="Replace the permissions CA alone"):
+    with pytest.raises(UsageError, match="Replace only the permissions CA"):
         rotate_ca(site, now=now())
     assert snapshot(site) == before
     rotate_ca(site, now=now(), roles=["permissions"], finish=True)

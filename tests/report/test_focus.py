@@ -49,7 +49,7 @@ CHAIN = {
 def test_the_answer_is_a_sentence_and_only_what_leads_to_the_name_is_drawn(tmp_path: Path) -> None:
     picture = seen(tmp_path, CHAIN, "/cmd_vel")
     assert picture.headlines == (
-        "/mux alone may publish /cmd_vel; /base and /recorder may subscribe to it; "
+        "only /mux may publish /cmd_vel; /base and /recorder may subscribe to it; "
         "2 other enclaves influence the publisher, 1 of them directly",
     )
     assert {name.name for name in picture.names} == {"/cmd_vel", "/plan", "/goal"}
@@ -88,14 +88,14 @@ def test_an_enclave_is_a_focus_with_both_directions(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("word", "sentence"),
     [
-        ("/odom", "/base alone may publish /odom; /recorder alone may subscribe to it; 3 other"),
-        ("/image", "/camera alone may publish /image; /recorder alone may subscribe to it; no"),
+        ("/odom", "only /base may publish /odom; only /recorder may subscribe to it; 3 other"),
+        ("/image", "only /camera may publish /image; only /recorder may subscribe to it; no"),
         (
             "/unknown",
             "no right states /unknown itself, but wildcards match it: no enclave may publish "
-            "/unknown; /recorder alone may subscribe to it",
+            "/unknown; only /recorder may subscribe to it",
         ),
-        ("/web/*", "/web alone may publish /web/*; /recorder alone may subscribe to it; no other"),
+        ("/web/*", "only /web may publish /web/*; only /recorder may subscribe to it; no other"),
     ],
 )
 def test_names_with_and_without_wildcards(tmp_path: Path, word: str, sentence: str) -> None:
@@ -109,7 +109,7 @@ def test_denials_of_the_name_are_drawn(tmp_path: Path) -> None:
         "/recorder": CHAIN["/recorder"] + group("topics", "subscribe", "/cmd*", qualifier="DENY")
     }
     picture = seen(tmp_path, denied, "/cmd_vel")
-    assert "/base alone may subscribe" in picture.headlines[0]
+    assert "only /base may subscribe" in picture.headlines[0]
     assert [
         (str(link.qualifier), link.target)
         for link in flow_scene(picture).links
@@ -220,12 +220,12 @@ def test_what_is_not_there_is_refused_with_a_likely_name() -> None:
 def test_every_format_has_the_answer(tmp_path: Path) -> None:
     picture = seen(tmp_path, CHAIN, "/cmd_vel")
     scene = flow_scene(picture, with_places=False)
-    assert "/mux alone may publish /cmd_vel" in render_dot(picture, scene)
-    assert "/mux alone may publish /cmd_vel" in render_mermaid(picture, scene)
+    assert "only /mux may publish /cmd_vel" in render_dot(picture, scene)
+    assert "only /mux may publish /cmd_vel" in render_mermaid(picture, scene)
     ended = sros("view", MOBILE_ROBOT, "--focus", "/cmd_vel", "--format", "svg").ok()
-    assert f"{MUX} alone may publish /cmd_vel" in ended.err
+    assert f"only {MUX} may publish /cmd_vel" in ended.err
     words = " ".join(etree.fromstring(ended.out.encode()).itertext())
-    assert f"{MUX} alone may publish /cmd_vel" in words and "2 HOPS BEFORE" in words
+    assert f"only {MUX} may publish /cmd_vel" in words and "2 HOPS BEFORE" in words
 
 
 def test_an_export_may_lack_enclaves(keystore: Path, tmp_path: Path) -> None:
@@ -237,7 +237,7 @@ def test_an_export_may_lack_enclaves(keystore: Path, tmp_path: Path) -> None:
         asked = ("view", source, "--focus", right.name)
         ended = sros(*asked, "--format", "markdown").ok()
         for text in (ended.err, ended.out):
-            assert (f"/a alone may publish {right.name}" in text.replace("\\", "")) is alone
+            assert (f"only /a may publish {right.name}" in text.replace("\\", "")) is alone
             assert (f"of the enclaves in {source.name}, /a may" in text) is not alone
             assert ("is an export, which may lack enclaves" in text) is (source == robot)
     sros("view", robot, "-o", page).ok()

@@ -674,7 +674,7 @@ def test_a_focus_says_its_answer_and_shows_what_leads_to_it(
     sros("view", robot_keystore, "--focus", "/cmd_vel", "-o", path).ok()
     with opened(browser, path) as page:
         said = page.inner_text("#headlines")
-        assert said.startswith("/mobile_robot/velocity_mux alone may publish /cmd_vel; ")
+        assert said.startswith("only /mobile_robot/velocity_mux may publish /cmd_vel; ")
         assert texts(page, "#map .card.chosen") == {"/cmd_vel"}
         assert "/scan" not in " ".join(texts(page, "#map .card"))
         assert {"2 HOPS BEFORE", "MAY PUBLISH", "MAY SUBSCRIBE"} == texts(page, "#map text.head")

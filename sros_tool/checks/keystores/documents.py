@@ -172,7 +172,7 @@ BLANKS = FindingKind(
     "Fast DDS takes them for a part of the name, so the rule matches no topic of a node; Cyclone "
     "DDS strips them.",
     "Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; tested.",
-    "Write the name alone between the tags: <topic>rt/chatter</topic>.",
+    "Write only the name between the tags: <topic>rt/chatter</topic>.",
     vendors=FAST_DDS,
 )
 EMPTY_TOPIC = FindingKind(
@@ -588,7 +588,7 @@ GOVERNANCE_OPEN_RANGE = FindingKind(
     "governance.open-range",
     WARNING,
     "a range of domains without an end, which counts as one domain",
-    "Fast DDS and Cyclone DDS read a range without <max> as the domain <min> alone; by the "
+    "Fast DDS and Cyclone DDS read a range without <max> as only the domain <min>; by the "
     "standard, the range has no end.",
     "DDS-Security 1.1, 9.4.1.2; Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; tested.",
     "Write <id>, or <min> and <max> up to 230.",

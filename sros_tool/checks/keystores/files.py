@@ -160,7 +160,7 @@ ARCHIVE = FindingKind(
     "an archive or a container of keys in the wrong place",
     "The file may contain private keys: a backup of the keystore, for instance, contains its CA "
     "keys. sros does not open the file.",
-    "ROS 2 keystore layout: private/ alone is for keys of CAs.",
+    "ROS 2 keystore layout: only private/ is for keys of CAs.",
     "Look into the file, and move it to a safe place. If others had access to a CA key in it, "
     "replace the CA (`sros rotate_ca`).",
 )

@@ -55,11 +55,11 @@ class OpenRange(Enum):
     """The meaning of a range of domains with only a minimum or only a maximum."""
 
     OPEN = auto()
-    """``min N`` alone means N and above; ``max N`` alone means 0 to N."""
+    """``min N`` without a maximum means N and above; ``max N`` without a minimum means 0 to N."""
     SINGLE = auto()
-    """``min N`` alone means only N; ``max N`` alone means 0 to N (Fast DDS)."""
+    """``min N`` without a maximum means N; ``max N`` without a minimum means 0 to N (Fast DDS)."""
     CRASHES = auto()
-    """``min N`` alone means only N; ``max N`` alone crashes the process (Cyclone DDS)."""
+    """``min N`` without a maximum means N; without a minimum, the process crashes (Cyclone DDS)."""
 
 
 class TopicNames(Enum):

@@ -421,7 +421,7 @@ _CONNECTION_ROWS = (
         _refused_connection_row(
             "TCP instead of TLS",
             zenoh_forger.plain_tcp,
-            "the router listens with TLS alone",
+            "the router listens only with TLS",
             "InvalidContentType",
         ),
         _accepted_connection_row(

@@ -308,7 +308,7 @@ def check_imported_keys(roles: Iterable[str], keyring: Keyring, template: Templa
             raise UsageError(
                 "a keystore with one CA for both roles accepts no separate permissions CA",
                 "",
-                "Give --identity-ca alone, or add --ca-layout separate.",
+                "Give only --identity-ca, or add --ca-layout separate.",
             )
 
 

@@ -682,7 +682,7 @@ def refuse_less_protected(
     """Raise `KeystoreError` if a policy demands more protection than the governance gives.
 
     This check is for signing requests, where the governance must not change, because all robots
-    would need the new one.
+    would need the new governance.
     """
     root = keystore.root
     for name, level in less_protected(governance, stated_protections):

@@ -72,8 +72,8 @@ class ReplacedRights:
     gained_domains: str = ""
     """ROS domains for which the enclave has permissions now, but had none before."""
     may_work_longer: bool = False
-    """Whether permissions that the ledger lacks may work longer, because the keystore is older than
-    its robots, or was restored from a backup.
+    """Whether permissions that the ledger lacks may work longer, because the keystore is an old
+    copy, or was restored from a backup.
     """
 
     def revoked(self) -> ReplacedRights:
@@ -255,7 +255,7 @@ def certificates_until(
 def may_lack_entries(keystore: OpenedKeystore) -> bool:
     """Return whether the ledger may lack certificates and permissions that the keystore issued.
 
-    If so, the keystore is older than its robots, or was restored from a backup.
+    If so, the keystore is an old copy, or was restored from a backup.
     """
     return bool(restored_at(keystore) or may_have_later_releases(keystore))
 

@@ -516,8 +516,8 @@ class RevocationListSigner:
         )
         if not self._given:
             raise KeystoreError(
-                f"the identity CA of keystore '{self._root}' is a CA service, and it alone signs "
-                "revocation lists",
+                f"the identity CA of keystore '{self._root}' is a CA service, and only this "
+                "service signs revocation lists",
                 "Nothing was changed.",
                 remedy,
             )

@@ -180,8 +180,8 @@ def restore_revocations(
     certificate is revoked, too, unless a certificate that the ledger lacked has the same key.  If a
     revoked key vouched for later keys, these keys are also revoked.
 
-    Certificates that the ledger lacks are recorded, so that they can be revoked.  Those of a
-    revoked enclave are revoked immediately.
+    Certificates that the ledger lacks are recorded, so that they can be revoked.  Certificates
+    of a revoked enclave are revoked immediately.
 
     The ledger also records that the keystore was restored.  This entry has a number that the
     keystore never used: the seconds since 1970, or the number of a later release that a robot has.
@@ -288,7 +288,7 @@ def _replaced_keys(
 
     ``unknown`` are certificates that were issued after the backup.  Such a certificate is valid
     unless its serial number is in ``reasons``, which maps revoked serial numbers to reasons. The
-    keys of valid ones are left out.
+    keys of valid certificates are left out.
     """
     kept = {(of.enclave, of.key) for serial, of in unknown.items() if serial not in reasons}
     replaced = {(of.enclave, of.key) for s, of in issued.items() if reasons[s] == SUPERSEDED}

@@ -922,7 +922,7 @@ def _make_successors(
         raise UsageError(
             f"the identity CA of keystore '{change.root}' is a CA service",
             "sros cannot replace its CA.",
-            "Replace the permissions CA alone, with --permissions. If the service has a later "
+            "Replace only the permissions CA, with --permissions. If the service has a later "
             "certificate for the same key, import it with --same-key --identity-ca FILE; for "
             "another key, make a new keystore.",
         )

@@ -244,7 +244,7 @@ class KeystoreZenoh(NamedTuple):
     restart: Sequence[str]
     """The enclaves whose processes have to be restarted, because their rules changed."""
     changes: FileChanges
-    """The files that were written; with ``--dry-run`` or ``--check``, those that would be."""
+    """The files that were written, or would be without ``--dry-run`` or ``--check``."""
     notes: Notes
 
 
@@ -288,8 +288,8 @@ class RenewedEnclaves(NamedTuple):
     when it expires, or the last permissions for it. Null if all have expired or were revoked.
     """
     may_work_longer: bool
-    """Whether certificates that the ledger lacks may work longer, because the keystore is older
-    than its robots, or was restored from a backup.
+    """Whether certificates that the ledger lacks may work longer, because the keystore is an old
+    copy, or was restored from a backup.
     """
     revoked: int
     """Number of certificates that were revoked (``--revoke-old``)."""
