@@ -545,7 +545,7 @@ def revoke(
         keystore: The keystore, or its path.
         enclaves: The names of the enclaves.
         reason: Why, as RFC 5280 names reasons: ``keyCompromise``, ``cessationOfOperation``, ...
-        crl: The revocation list (PEM) of a CA service, which alone can sign it.
+        crl: The revocation list (PEM) of a CA service; only the service can sign it.
         secrets: Called for the passphrase of an encrypted CA key, or the PIN of a token.
         now: The time of the revocation; the current time by default.
         dry_run: Report the changes without making them.

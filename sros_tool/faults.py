@@ -62,7 +62,7 @@ _REPAIR_GOVERNANCE = (
     "{root}/public/permissions_ca.cert.pem -inkey {root}/private/permissions_ca.key.pem`."
 )
 _INTACT_IN_KEYSTORE = (_SIGN_PERMISSIONS, _CREATE_MISSING_FILE, REPLACE, _REPAIR_GOVERNANCE)
-"""Remedies for faults that an export mostly has alone: files that were edited, damaged or lost."""
+"""Remedies for faults that mostly only an export has: files that were edited, damaged or lost."""
 _REPLACE_CA = (
     "Replace the CA and the files that expired: `sros rotate_ca {root} --finish && sros renew "
     "{root} --all-expiring 30d`; then restart all processes together."

@@ -233,7 +233,7 @@ def refuse_unreadable(
     """Raise an error that names all ``unreadable`` enclaves, if there are any.
 
     ``verb`` is a past participle for the message, such as "renewed".  ``takes_names`` says whether
-    the user could run the command for the other enclaves alone.
+    the user could run the command for only the other enclaves.
     """
     if len(unreadable) == 1:
         raise unreadable[0].error

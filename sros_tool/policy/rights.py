@@ -162,7 +162,7 @@ def profile_rights(enclave: str, profile: Profile) -> Iterator[Right]:
 def parts(right: Right) -> tuple[Right, ...]:
     """Return the rights to an action's five topics and services.
 
-    A right to anything else is returned alone.
+    For a right to anything else, the result has only this right.
     """
     part_rights = ACTION_PARTS.get(right.right)
     if part_rights is None:

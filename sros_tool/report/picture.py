@@ -91,7 +91,7 @@ class Protection:
 
 
 UNKNOWN = Protection(WireLevel.UNKNOWN)
-"""The protection without a known governance, such as for a policy alone."""
+"""The protection without a known governance, such as for a policy without a keystore."""
 
 
 @shows(

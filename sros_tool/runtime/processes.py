@@ -60,7 +60,7 @@ _MEMORY_PORTS = re.compile(
 )
 """Matches a port of Fast DDS in shared memory that is mapped, and not deleted."""
 _OWN_PORT = re.compile(r"/fast(?:rtps|dds)_port(\d{1,5})_el\Z", re.ASCII)
-"""Matches the file that a process keeps locked while it alone reads a port of Fast DDS."""
+"""Matches the file that a process keeps locked while only it reads a port of Fast DDS."""
 _PRODUCTS = {b"fastrtps": "Fast DDS", b"fastdds": "Fast DDS", b"ddsc": "Cyclone DDS"}
 _THREE_NUMBERS = re.compile(r"\.so\.(\d+\.\d+\.\d+)(?:\.\d+)?\Z", re.ASCII)
 _MOST_ENTRIES = 10_000
@@ -569,7 +569,7 @@ def _examine(pid: int, folder: int, command: tuple[str, ...], started: datetime)
 
 
 def _own_port_numbers(folder: int) -> set[int]:
-    """Return the numbers of the ports of Fast DDS that a process alone reads."""
+    """Return the numbers of the ports of Fast DDS that only this process reads."""
     handle = os.open("fd", os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC, dir_fd=folder)
     try:
         numbers = set[int]()

@@ -855,7 +855,7 @@ def _revoke_again(
 
     Returns the same as `_sign`.  Certificates that the ledger lacks are recorded.  If the lists
     cannot be signed, no request is signed.  But for lists of a CA service there is only a note,
-    because this service alone signs its lists and knows its certificates.
+    because only this service signs its lists and knows its certificates.
     """
     is_later = bool(forgotten_lists.later_number)
     unknown = forgotten_lists.unknown_certificates(OpenedKeystore(root))

@@ -326,7 +326,7 @@ def without_agreed_changes(
 ) -> list[LaterChange]:
     """Return ``changes`` without rights and governance that were signed again on purpose.
 
-    Rights count as agreed to if publishing was refused because of rights alone, and their enclave
+    Rights count as agreed to if publishing was refused only because of rights, and their enclave
     was then renewed by name.  Other commands that sign rights, such as a rotation, agree to none.
     A governance counts as agreed to only if nothing shows the difference to the published
     governance.
