@@ -486,7 +486,7 @@ def zenoh_documents(
         now: the current time; if None, permissions that have expired count, too.
         change: what a transaction changes.
         existing: the enclaves of the keystore; None searches for them.
-        only_enclaves: the enclaves whose configurations are made, and which alone count as
+        only_enclaves: the enclaves whose configurations are made; only these count as
             existing; () for all.
         among: the enclaves whose rights are written to these configurations; () for all.
     """

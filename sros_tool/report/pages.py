@@ -424,7 +424,7 @@ def _untried_attempts(scenario: Json) -> Sequence[str]:
 
 
 def _demo_scenario(scenario: Json, *, is_only: bool) -> str:
-    """Return a scenario's section, folded unless it is short and the only one, or needs attention."""
+    """Return a section, folded unless its scenario is short and the only one or needs attention."""
     rows = scenario["rows"]
     good, not_tried = _number_as_expected(rows), _untried_attempts(scenario)
     opened = sum(bool(row.get("open_because")) for row in rows)
