@@ -404,8 +404,8 @@ class _Review:
     """The fleet of the policy or keystore that a step examines, by subject of the step."""
     is_relative: bool = False
     """Whether a requirement has a name that moves with the namespace."""
-    compared_elsewhere: str = "other namespaces"
-    """The namespaces in which the review decided which requirements the change breaks."""
+    decided_elsewhere: str = "whether the change breaks them"
+    """What the review decided about requirements in other namespaces; "" for nothing."""
 
     def _allows(self, kind: str) -> bool:
         """Return whether findings of a kind of step are allowed, by the request or always."""
@@ -878,12 +878,12 @@ class _Review:
         if not asked.requirements:
             yield "requirements: none are named"
         others = ""
-        if self.compared_elsewhere:
-            others = f", except whether the change breaks them in {self.compared_elsewhere}"
+        if self.decided_elsewhere:
+            others = f", where sros decided only {self.decided_elsewhere}"
         if self.is_relative and not asked.namespaces:
             yield (
-                "requirements with names without '/' at the beginning, in other namespaces than /"
-                f"{others} (--namespace NS, if the reviewed policies have their nodes in NS)"
+                "requirements with relative names in other namespaces than / (--namespace NS "
+                f"decides them in NS){others}"
             )
         if not self.base:
             yield "nothing is compared with an earlier commit, as the options say"
@@ -1119,13 +1119,15 @@ class _Review:
         if not any(requirement.is_relative for requirement in requirements):
             return
         if asked.namespaces or asked.fleet or not sources:
-            self.compared_elsewhere = ""
+            self.decided_elsewhere = ""
             return
         base, head = sources()
         namespaces = _namespaces_to_try(base, head)
-        if len(namespaces) > _MOST_NAMESPACES and self.compared_elsewhere:
-            of_all = f"{_MOST_NAMESPACES} of {len(namespaces)}"
-            self.compared_elsewhere = f"{of_all} other namespaces (those of changed names first)"
+        if len(namespaces) > _MOST_NAMESPACES and self.decided_elsewhere:
+            self.decided_elsewhere = (
+                f"whether the change breaks them in {_MOST_NAMESPACES} of {len(namespaces)} "
+                "namespaces (those of changed names first)"
+            )
         left = {
             at
             for at, here in enumerate(requirements)

@@ -1292,13 +1292,13 @@ def test_requirements_of_a_package_are_decided_in_a_namespace(
     change.commit({"other": "1"})
     asked = ("--policy", "robot.xml", "--requirements", "robot.toml")
     ended = change.review(*asked).ok()
-    assert "in other namespaces than /, except whether the change breaks them in" in ended.out
+    assert "other namespaces than / (--namespace NS decides them in NS), where sros" in ended.out
     with monkeypatch.context() as patched:
         patched.setattr(review, "_MOST_NAMESPACES", 1)
-        some = "the change breaks them in 1 of 2 other namespaces (those of changed names first) ("
+        some = "the change breaks them in 1 of 2 namespaces (those of changed names first)"
         assert some in change.review(*asked).ok().out
     assert (
-        "in other namespaces than / (--namespace NS, "
+        "(--namespace NS decides them in NS); nothing"
         in sros("review", "--base", "none", *asked, cwd=change.folder).out
     )
     ended = change.review(*asked, "--namespace", "/l", "--namespace", "/")
