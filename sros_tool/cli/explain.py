@@ -265,7 +265,8 @@ def explain(
     keystore, sros decides by the permissions that the policy would give.
 
     The exit status is 0 if the operation is allowed (with --who: to at least one enclave), and 1 if
-    it is denied; with --log, 1 if the log reports a fault. An action is allowed only if all of its
+    it is denied. With --log, it is 1 if the log reports a fault, or if no line says that a node
+    runs secured in ENCLAVE (Zenoh logs no such line). An action is allowed only if all of its
     services and topics are allowed. With --who, "in part" marks an enclave that has only some of
     these rights, but can command the action's server, for example by send_goal.
 
@@ -1083,6 +1084,7 @@ def _show_log(
 ) -> int:
     """Print explanations of a DDS log, or of standard input for "-"; return 1 if there are any."""
     from sros_tool.explain.log import explain_log_of
+    from sros_tool.runtime.rmw import RMW
 
     if len(other_arguments) > 1:
         named = Path(other_arguments[0])
@@ -1090,26 +1092,34 @@ def _show_log(
             raise UsageError(f"'{named}' does not exist", "", "Name a keystore, or a policy.")
         raise UsageError("--log takes at most a keystore and an enclave")
     text = read_log(log)
-    explained = explain_log_of(log, text, keystore, "".join(other_arguments), asking, policy)
+    explained = explain_log_of(
+        log, text, keystore, "".join(other_arguments), asking, policy, os.environ.get(RMW, "")
+    )
+    status = 1 if explained.findings or explained.secured is False else 0
     if as_json:
         print_json(explained)
-        return 1 if explained.findings else 0
+        return status
+    print_notes([note for note in explained.notes if note.id == "log.other-folder"])
     for finding in explained.findings:
         _echo_answer(_finding_lines(finding))
-    print_notes(explained.notes)
-    if not explained.findings:
+    print_notes([note for note in explained.notes if note.id != "log.other-folder"])
+    if explained.secured is False and not explained.findings:
+        echo(_NOT_SHOWN_SECURED)
+    elif not explained.findings:
         lines = text.count("\n") + (not text.endswith("\n")) if text else 0
         for line in _lines_without_findings(text, lines):
             echo(line, err=True)
         if _ZENOH_TESTS in text:
             echo(_ONLY_TESTS, err=True)
-    return 1 if explained.findings else 0
+    return status
 
 
-_SILENT_ON_ZENOH = (
-    "on Zenoh, denials, which only logs with RUST_LOG=zenoh=trace have (without a log: `sros "
-    "explain KEYSTORE ENCLAVE publish NAME --vendor zenoh`)"
+_NOT_SHOWN_SECURED = (
+    "no line of the log says that a node runs secured in this enclave ('Found security directory', "
+    "at level info): perhaps it runs open. Start it with `sros run KEYSTORE ENCLAVE -- COMMAND`, "
+    "and log all its output from the start"
 )
+_SILENT_ON_ZENOH = "denials on Zenoh, which only logs with RUST_LOG=zenoh=trace have"
 
 
 def _lines_without_findings(log: str, count: int) -> Iterator[str]:
@@ -1124,20 +1134,21 @@ def _lines_without_findings(log: str, count: int) -> Iterator[str]:
         )
         return
     not_found = f"no message of DDS Security, and no denial by Zenoh, in {counted(count, 'line')}"
-    runs_open = "whether a node runs open (`sros check runtime` on its machine)"
     if is_zenoh(os.environ):
         yield not_found
         yield f"not shown: {_SILENT_ON_ZENOH}"
     elif match := SECURITY_DIRECTORY.search(log):
         yield f"{not_found}; a node found its enclave '{match['folder']}'"
         yield (
-            f"not shown: {runs_open}; whether peers drop its messages in silence (their logs, or "
-            "`sros check FOLDER OTHER`, which compares two folders of enclaves); "
-            f"{_SILENT_ON_ZENOH}"
+            "not shown: whether peers drop its messages (explain their logs, or compare both "
+            f"keystores: `sros check FOLDER OTHER`); {_SILENT_ON_ZENOH}"
         )
     else:
         yield f"{not_found}, and no line 'Found security directory'"
-        yield f"not shown: {runs_open}; {_SILENT_ON_ZENOH}"
+        yield (
+            "not shown: whether a node runs open (`sros check runtime` on its machine); "
+            f"{_SILENT_ON_ZENOH}"
+        )
 
 
 _ZENOH_TESTS = "caching permissions for `"

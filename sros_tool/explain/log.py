@@ -42,6 +42,7 @@ from sros_tool.graph.observation import PUBLISH, SUBSCRIBE
 from sros_tool.keystore.known_keys import enclaves_by_identity
 from sros_tool.keystore.layout import (
     ROUTER_FILE,
+    ZENOH_SIGNED,
     is_keystore,
     is_original_keystore,
     remedy_in_closed_robot,
@@ -64,6 +65,7 @@ from sros_tool.policy.model import ALLOW, PEER_RIGHT, Enclave, Policy, policy_in
 from sros_tool.policy.patterns import Names, covers
 from sros_tool.policy.remapping import Remapping, renamed_action_text
 from sros_tool.policy.rights import Right, placed_rights
+from sros_tool.runtime.environment import RMW_ZENOH
 from sros_tool.runtime.log_texts import (
     CHANGE_OWNER_REMEDY,
     EXPORT_FOR_USER_REMEDY,
@@ -157,6 +159,10 @@ class ExplainedLog(NamedTuple):
     """Path of the log."""
     findings: Sequence[LogFinding]
     """The different security messages."""
+    secured: bool | None
+    """Whether a line says that a node of the named enclave ran secured; null if no enclave is named
+    or on Zenoh, where no line says so.
+    """
     notes: Sequence[Note]
     """Notes, which text output prints on standard error."""
 
@@ -321,12 +327,14 @@ def explain_log_of(
     name: str,
     asking: AskingContext,
     policy_file: Path | None = None,
+    rmw: str = "",
 ) -> ExplainedLog:
     """Return the explained messages of a log; examines the enclaves that the log names.
 
     ``name`` is the enclave, or its folder, whose processes wrote the log; "" if the log names the
     enclave, or if ``keystore`` is the folder of a single enclave.  With ``policy_file``, there is
-    no keystore, and only denials are examined: by the rights in the policy.
+    no keystore, and only denials are examined: by the rights in the policy. ``rmw`` is the RMW of
+    the environment, or "".
 
     Raises:
         UsageError: ``name`` is an enclave, and there is no keystore.
@@ -382,7 +390,45 @@ def explain_log_of(
         SearchedKeystore(keystore) if keystore and is_keystore(keystore.root) else None,
         policy,
     )
-    return ExplainedLog(log, findings, _NOTES if any(e.found for e in findings) else ())
+    plain = plain_text(text)
+    started = [(m["enclave"] or "/", m["folder"]) for m in SECURITY_DIRECTORY.finditer(plain)]
+
+    def is_named(enclave: str) -> bool:
+        if policy:
+            return policy.place(enclave)[1] == policy.place(name)[1]
+        loaded = find(enclave)
+        return loaded is not None and named is not None and loaded.folder == named.folder
+
+    secured = None
+    if name and not _is_of_zenoh(plain, rmw, named):
+        secured = any(is_named(enclave) for enclave, _ in started)
+    examined = named.folder if named and not keystore else keystore and keystore.root
+    notes = [*_other_folder_notes(examined, [folder for _, folder in started])] if examined else []
+    notes += _NOTES if any(finding.found for finding in findings) else ()
+    return ExplainedLog(log, findings, secured, notes)
+
+
+def _is_of_zenoh(log: str, rmw: str, named: LoadedEnclave | None) -> bool:
+    """Return whether a log may be of a node on Zenoh, which logs nothing about its security."""
+    if any(ZENOH_LINE.search(labeled_line(line)[1]) for line in log_lines(log)):
+        return True
+    if rmw:
+        return rmw.startswith(RMW_ZENOH)
+    folder = named.folder if named else None
+    return folder is not None and any((folder / file).exists() for file in ZENOH_SIGNED)
+
+
+def _other_folder_notes(examined: Path, folders: Iterable[str]) -> Iterator[Note]:
+    """Yield a note if a log names folders of enclaves outside of the ``examined`` folder."""
+    inside = examined.resolve()
+    other = [
+        folder
+        for folder in dict.fromkeys(folders)
+        if Path(folder).is_absolute() and not Path(folder).resolve().is_relative_to(inside)
+    ]
+    if other:
+        shown = first_few(other, _MAX_PEERS)
+        yield Note("log.other-folder", f"the log names another folder than {examined}: {shown}")
 
 
 _NOTES = (

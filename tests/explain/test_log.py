@@ -278,7 +278,8 @@ def test_cyclone_says_nothing_of_a_whole_enclave(keystore: Path, tmp_path: Path)
     done = python(program, Enclave(keystore).folder)
     assert done.stdout == "joined\n", done
     (tmp_path / "robot.log").write_text(done.stdout + done.stderr)
-    assert sros("explain", keystore, ENCLAVE, "--log", tmp_path / "robot.log").status == 0
+    ended = sros("explain", keystore, ENCLAVE, "--log", tmp_path / "robot.log")
+    assert ended.out.startswith("no line of the log says that a node runs secured")
 
 
 # ── texts ──────────────────────────────────────────────────────────────────────────────────
@@ -666,19 +667,66 @@ def test_nothing_found_is_said_of_what_was_read(tmp_path: Path) -> None:
         ended = sros("explain", "--log", tmp_path / "robot.log").ok()
         assert ended.err.startswith(said)
     assert "\nnot shown: whether a node runs open (`sros check runtime` on its machi" in ended.err
-    assert "on Zenoh, denials, which only logs with RUST_LOG=zenoh=trace have" in ended.err
+    assert "denials on Zenoh, which only logs with RUST_LOG=zenoh=trace have" in ended.err
     variables = {"RMW_IMPLEMENTATION": "rmw_zenoh_cpp"}
     on_zenoh = sros("explain", "--log", tmp_path / "robot.log", env=variables)
-    assert "in 1 line\nnot shown: on Zenoh, denials, which only" in on_zenoh.ok().err
+    assert "in 1 line\nnot shown: denials on Zenoh, which only" in on_zenoh.ok().err
     for found in ("[INFO] [1.0] [rcl]: Found", "[talker]"):  # rcl, and a node of `sros demo`
         line = f"{found} security directory: /k/enclaves/talker\n"
         (tmp_path / "robot.log").write_text(line)
         ended = sros("explain", "--log", tmp_path / "robot.log").ok()
         first, second = ended.err.splitlines()
         assert first == f"{none} 1 line; a node found its enclave '/k/enclaves/talker'"
-        assert second.startswith("not shown: whether a node runs open (`sros check runtime`")
+        assert second.startswith("not shown: whether peers drop its messages (explain their logs,")
         assert "`sros check FOLDER OTHER`" in second
-        assert len(second) < 360
+        assert len(second) < 200
+
+
+STARTED = "[INFO] [1.0] [rcl]: Found security directory: {}/enclaves{}\n"
+OF_ZENOH = "2027-01-01T00:00:00Z DEBUG ThreadId(01) zenoh::net::runtime: Zenoh Rust API v1.10.2\n"
+
+
+def test_a_log_of_an_enclave_has_to_show_that_its_node_runs_secured(
+    keystore: Path, tmp_path: Path
+) -> None:
+    log, policy = tmp_path / "robot.log", policies_dir() / "talker_listener.xml"
+    node = "[INFO] [1.0] [talker]: up\n"
+    own, folder = STARTED.format(keystore, ENCLAVE), f"{keystore}/enclaves{ENCLAVE}"
+    moved = STARTED.format("/k", f"/left{ENCLAVE}")
+    zenoh = {"RMW_IMPLEMENTATION": "rmw_zenoh_cpp"}
+    for asked, text, variables, secured in (
+        ([keystore, ENCLAVE], own + node, {}, True),
+        ([keystore, ENCLAVE], node, {}, False),
+        ([keystore, ENCLAVE], "", {}, False),
+        ([keystore, ENCLAVE], STARTED.format(keystore, "/other") + node, {}, False),
+        ([folder], own + node, {}, True),
+        ([folder], node, {}, False),
+        ([policy, ENCLAVE], moved + node, {}, True),
+        ([policy, ENCLAVE], node, {}, False),
+        ([keystore, ENCLAVE], node, zenoh, None),
+        ([keystore, ENCLAVE], OF_ZENOH + node, {}, None),
+        ([keystore], node, {}, None),
+    ):
+        log.write_text(text)
+        ended = sros("explain", *asked, "--log", log, env=variables)
+        whole = sros("explain", *asked, "--log", log, "--json", env=variables)
+        assert json.loads(whole.out)["secured"] is secured, (asked, text)
+        assert ended.status == whole.status == (secured is False), (asked, text)
+        assert ("perhaps it runs open" in ended.out) is (secured is False)
+    (Path(folder) / "session.json5").write_text("{}")
+    assert sros("explain", keystore, ENCLAVE, "--log", log).status == 0
+    dds = {"RMW_IMPLEMENTATION": "rmw_fastrtps_cpp"}
+    assert sros("explain", keystore, ENCLAVE, "--log", log, env=dds).status == 1
+
+
+def test_a_log_that_names_another_folder_is_said_to_do_so(keystore: Path, tmp_path: Path) -> None:
+    (tmp_path / "robot.log").write_text(STARTED.format("/robot", ENCLAVE))
+    ended = sros("explain", keystore, ENCLAVE, "--log", tmp_path / "robot.log").ok()
+    named = f"the log names another folder than {keystore}: /robot/enclaves{ENCLAVE}\n"
+    assert ended.err.startswith(f"note [log.other-folder]: {named}")
+    (tmp_path / "robot.log").write_text(STARTED.format(keystore, ENCLAVE))
+    ended = sros("explain", keystore, ENCLAVE, "--log", tmp_path / "robot.log").ok()
+    assert "other-folder" not in ended.err
 
 
 def test_what_the_nodes_of_the_demo_print_names_the_topic() -> None:
