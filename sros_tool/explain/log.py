@@ -1063,18 +1063,26 @@ class _Examiner:
         if other := meaning_of_other_kind(denied, named_rights(asked)):
             return [f"{other}, but {name} is {with_article(question.type)}"], ""
         is_used = self._keystore.has_other_side(denied) if self._keystore else None
-        # A name that peers have a right to is no mistake.
-        names = () if is_used else likely_names(asked)
+        names = likely_names(asked)
+        if is_used:  # a name that peers have a right to is probably no mistake
+            names = tuple(other for other in names if _last_part(other) == _last_part(name))
         own = [right.name for right in named_rights(asked) if right.right == denied.right]
         meant = names[0] if names else own[0] if len(own) == 1 else "NEW"
         rule = Remapping("", name, meant)
         add, renamed = f", add `--ros-args -r {quote(str(rule))}`.", ""
+        new_name = (
+            f" If the node is started with `-r OLD:={quote(name)}`, its policy needs the same "
+            f"remapping: `sros merge_policy POLICY OTHER --remap OLD:={quote(name)}`."
+        )
         if question.type == "action" and not is_used:
             add = f": {renamed_action_text(rule)}"
             renamed = f" If the node's command renames the action{add}"
         if names:
             is_meant = f"{' and '.join(names)}: perhaps that is meant"
-            return [f"the enclave may {question.word} {is_meant}"], (
+            facts = [f"the enclave may {question.word} {is_meant}"]
+            if is_used:
+                return facts, f"{remedy} Or, if the node lacks a remapping that its policy has{add}"
+            return facts, (
                 f"If the node lacks a remapping{add} If the policy lacks a remapping that the node "
                 f"has, write {name} in place of {meant}, or merge it with `--remap "
                 f"{quote(meant)}:={quote(name)}`. Otherwise, {remedy}"
@@ -1084,10 +1092,10 @@ class _Examiner:
             return [f"no enclave of the {place} may {PEER_RIGHT[denied.right]} {name}"], (
                 "If another name is meant, the node perhaps lacks a remapping: compare its command "
                 "with the one that the robot starts (after `sros close`: start/commands.txt). "
-                f"Otherwise, {remedy}{renamed}"
+                f"Otherwise, {remedy}{renamed or new_name}"
             )
         newer = "Perhaps the node is newer than its policy: "
-        return [], f"{newer}{remedy}{renamed}" if renamed else ""
+        return [], f"{newer}{remedy}{renamed}" if renamed else f"{remedy}{new_name}"
 
     def _how_to_ask(self, denial: Denial, name: str) -> str:
         """Return the commands that show which rights a policy lacks for a denied topic."""
@@ -1230,6 +1238,10 @@ def _nodes_clause(answer: Answer) -> tuple[str, ...]:
     if nodes:
         return (f"its permissions are for {_listed_nodes(nodes)}",)
     return (f"its permissions lack {_EVERY_NODE}",)
+
+
+def _last_part(name: str) -> str:
+    return name.rpartition("/")[2]
 
 
 def _served_names(answer: Answer) -> tuple[str, ...]:
