@@ -46,7 +46,7 @@ _STABLE_FOR = timedelta(seconds=2)
 
 
 def apply(robot: LocalRobot, prepared: CloseState, *, dry_run: bool) -> CloseState:
-    """Restart the systemd units that do not run in their enclaves, with drop-ins.
+    """Restart the units that do not run in their enclaves, with drop-ins; return the new state.
 
     Proves that the robot is closed, if nothing is left to do by hand.
     """
@@ -92,7 +92,10 @@ def _write_drop_ins(
 
 
 def undo(robot: LocalRobot, *, dry_run: bool) -> CloseState:
-    """Remove the drop-ins of this folder, restart their units, and say what to do by hand."""
+    """Remove the drop-ins of this folder, and restart their units; return the new state.
+
+    Says what is left to do by hand.
+    """
     running = RunningRobot(robot)
     observed = running.with_later_processes(robot.processes)
     drop_ins = _drop_ins_of(robot, observed)

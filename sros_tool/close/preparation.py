@@ -82,7 +82,7 @@ class CommandStep(NamedTuple):
 
 
 def prepare(robot: LocalRobot, duration: str | None, *, partial: bool, dry_run: bool) -> CloseState:
-    """Run the steps whose results are missing, and write how each process is started.
+    """Run the steps whose results are missing, write how each process is started; return the state.
 
     Raises:
         SrosError: the robot cannot be watched, or the keystore was brought to another machine.

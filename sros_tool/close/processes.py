@@ -241,7 +241,7 @@ def _rmw_to_start(process: Process) -> str:
 
 
 def _shell_word(word: str) -> str:
-    """Quote a word for a shell, by `printf` if it could control a terminal or is not UTF-8."""
+    """Return a word quoted for a shell, by `printf` if it may control a terminal or is no UTF-8."""
     if visible(word) == word:
         return shlex.quote(word)
     octal = re.sub(rb"[^A-Za-z0-9_./ ]", lambda byte: b"\\%03o" % ord(byte[0]), os.fsencode(word))

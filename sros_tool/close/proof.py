@@ -73,7 +73,7 @@ _MOST_TRIES = 3
 
 
 def prove(robot: LocalRobot) -> CloseState:
-    """Prove that the robot is closed."""
+    """Prove that the robot is closed; return its state with the proofs."""
     robot.shell.check_open()
     robot.check_rmw()
     state = current_state(robot, robot.read_policy())
@@ -82,7 +82,7 @@ def prove(robot: LocalRobot) -> CloseState:
 
 
 def proofs_of(robot: LocalRobot, state: CloseState, patience: float) -> list[Proof]:
-    """Wait until each process runs in its enclave, and prove that the robot is closed.
+    """Wait until each process runs in its enclave, and return the proofs that the robot is closed.
 
     If the enclave of the observer has expired, only the files are examined.
     """
@@ -126,7 +126,7 @@ def proofs_of(robot: LocalRobot, state: CloseState, patience: float) -> list[Pro
 
 
 def _proof_of_files(robot: LocalRobot, expired: Sequence[str]) -> Proof:
-    """Prove that `check` finds no error in the files that the processes use.
+    """Return the proof that `check` finds no error in the files that the processes use.
 
     The enclaves ``expired`` of the export have expired.
     """
@@ -215,9 +215,9 @@ def _errors_text(robot: LocalRobot) -> str:
 
 
 def _proof_of_requirements(robot: LocalRobot) -> Iterator[Proof]:
-    """Decide the requirements for the enclaves that the processes use.
+    """Yield the proof that the requirements hold for the enclaves that the processes use.
 
-    Also decide them for the enclaves of the keystore (or policy) if processes run on other
+    They are also decided for the enclaves of the keystore (or policy) if processes run on other
     machines, or a requirement names an enclave that the export does not have.
     """
     if not robot.requirements.exists():
@@ -267,7 +267,7 @@ def _connections(running: RunningRobot) -> Connections:
 
 
 def _proof_of_silence(robot: LocalRobot, before: Observation, *, hears: bool) -> Proof:
-    """Prove that an open listener sees no node of the robot.
+    """Return the proof that an open listener sees no node of the robot.
 
     Before the robot was closed, the listener saw the nodes ``before``. Seeing none now proves
     something only if the observer ``hears`` the robot in its enclave.
@@ -289,7 +289,7 @@ def _proof_of_silence(robot: LocalRobot, before: Observation, *, hears: bool) ->
 
 
 def _proof_of_processes(running: RunningRobot, number: int) -> Proof:
-    """Prove that no process runs open, and that none has findings.
+    """Return the proof that no process runs open, and that no process has findings.
 
     ``number`` enclaves have a process with the current files.
     """
@@ -401,7 +401,7 @@ def _why_missing(running: RunningRobot, missing: Sequence[str], observed: Observ
 
 
 def _proof_of_talk(running: RunningRobot, nodes: ObservedNodes, away: Collection[str]) -> Proof:
-    """Prove that an observer in an enclave sees the same nodes as on the open robot.
+    """Return the proof that an observer in an enclave sees the same nodes as on the open robot.
 
     Processes of the enclaves ``away`` do not run; ``running`` are the processes of the other
     enclaves at the beginning of the proof.

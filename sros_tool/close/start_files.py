@@ -87,7 +87,8 @@ def _compose_text(
         container = Container(process.enclave, object_name(process.enclave), variables, files)
         services += render_container(container, COMPOSE).splitlines()[1:]
     heading = (
-        "# Rename the services to those of your own file; give both files to Docker Compose 2."
+        "# Give these services the names that they have in your own file, and give both files to "
+        "Docker Compose 2."
     )
     return _text([heading, *(["services:"] if services else []), *services])
 

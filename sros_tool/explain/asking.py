@@ -63,7 +63,7 @@ class AskingContext(NamedTuple):
 def domains_decided_alike(
     joined: DomainSet, governance: Governance | None, grant: Grant | None, domain: int | None
 ) -> Sequence[DomainSet]:
-    """Divide the ROS domains that an enclave may join into sets with the same rules.
+    """Return the ROS domains that an enclave may join, in sets of domains with the same rules.
 
     With ``domain``, only that domain is returned.
     """

@@ -347,8 +347,8 @@ class ZenohEvaluator:
             )
         raise KeystoreError(
             f"keystore '{self.root}' has no Zenoh configurations",
-            "Without them its enclaves cannot open a session, and rmw_zenoh with files of its own "
-            "runs without any access control.",
+            "Without these files, nodes in its enclaves cannot open a session; with the default "
+            "files of rmw_zenoh, nodes run without any access control.",
             f"Write them. {remedy_in_keystore(self.root, '`sros zenoh KEYSTORE`.')}",
         )
 
@@ -857,7 +857,7 @@ def _domains(keystore: OpenedKeystore, now: datetime) -> DomainSet:
 
 
 def _with_equal_rules(evaluator: ZenohEvaluator, domains: DomainSet) -> Iterator[DomainSet]:
-    """Divide ``domains`` into parts; routers have the same rules in all domains of a part."""
+    """Yield parts of ``domains``; routers have the same rules in all domains of a part."""
     keys: dict[str, set[object]] = defaultdict(set)
     for router, file in evaluator.routers.items():
         for rule, expressions in _rules(file.process.access) if file.process else ():

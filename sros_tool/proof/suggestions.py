@@ -57,7 +57,7 @@ class Suggestions(NamedTuple):
 def suggest(
     rights: Iterable[Right], worlds: Sequence[World], fleet: Fleet | None = None
 ) -> Suggestions:
-    """Propose requirements that hold in all worlds, by the allowed ``rights``.
+    """Return proposals of requirements that hold in all worlds, from the allowed ``rights``.
 
     Proposals and comments that apply to all robots of ``fleet``, or of a group, are written once,
     with placeholders.

@@ -394,7 +394,7 @@ def _keystore_system(keystore: OpenedKeystore, at: Circumstances) -> System:
         raise KeystoreError(
             f"keystore '{root}' has more than {_MOST_GOVERNANCES} different governances",
             "",
-            f"`sros check {quote(str(root))}` shows them; a keystore has one.",
+            f"`sros check {quote(str(root))}` shows them. A keystore must have only one.",
         )
     listed = {
         rule.domains

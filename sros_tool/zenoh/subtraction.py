@@ -161,7 +161,7 @@ def _around_wildcards(chunks: Chunks) -> tuple[Chunks, Chunks]:
 
 
 def _parts(wide: Chunks, denied: Iterable[Chunks]) -> Iterator[Chunks]:
-    """Split ``wide`` so that its ``**`` overlaps no fixed start or end of a denied expression.
+    """Yield parts of ``wide`` whose ``**`` overlaps no fixed start or end of a denied expression.
 
     So a part can be compared with a denied expression chunk by chunk, first from the start, then
     from the end.

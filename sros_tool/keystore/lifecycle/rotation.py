@@ -217,7 +217,7 @@ def rotation_status(keystore: OpenedKeystore, *, now: datetime) -> RotationStatu
 def _count_enclaves(
     keystore: OpenedKeystore, role: str, authorities: tuple[x509.Certificate, ...]
 ) -> Counter[int]:
-    """Count the enclaves of each CA, by its index in ``authorities``.
+    """Return the number of enclaves of each CA, by the CA's index in ``authorities``.
 
     An enclave belongs to the identity CA that issued its certificate, and to the permissions CA
     that signed its permissions.  A folder without a certificate belongs to no CA: it waits for a
