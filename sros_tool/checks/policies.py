@@ -778,7 +778,7 @@ def _denied_start_actions_sentence(lacking: Sequence[_NodeLackingRight]) -> str:
         if kinds[kind]
     ]
     return (
-        f"{names_text(nodes)} may not {'; '.join(verbs)}. A node exits at its start if this is "
+        f"{names_text(nodes)} may not {', '.join(verbs)}. A node exits at its start if this is "
         "denied."
     )
 
