@@ -197,7 +197,7 @@ def test_facts_named_as_variables_are_refused(monkeypatch: pytest.MonkeyPatch) -
 
     for inject, refused in ((True, "my_keystore"), (True, "sros_robot"), (False, "sros_robot")):
         monkeypatch.setattr(constants, "INJECT_FACTS_AS_VARS", inject)
-        with pytest.raises(RefusedError, match=f"take the place of variables \\({refused}\\)"):
+        with pytest.raises(RefusedError, match=f"replace variables \\({refused}\\)"):
             check_facts(task("distribution", refused) if not inject else task(refused))
     check_facts(task("distribution", "my_keystore"))
 
@@ -211,6 +211,6 @@ def test_facts_that_set_ssh_at_home_are_refused(fact: str) -> None:
     from ansible_collections.sros.fleet.plugins.plugin_utils.facts import check_facts
 
     assert connection_loader.get("ssh", class_only=True)
-    with pytest.raises(RefusedError, match=f"take the place of variables \\({fact}\\)"):
+    with pytest.raises(RefusedError, match=f"replace variables \\({fact}\\)"):
         check_facts({f"ansible_{fact}": "x", "ansible_facts": {fact: "x", "distribution": "x"}})
     check_facts({"ansible_distribution": "x", "ansible_facts": {"distribution": "x"}})

@@ -219,7 +219,7 @@ def test_robots_that_lie_in_many_ways(tmp_path: Path) -> None:
     assert "in the path: /dispatcher/r4. If" in flat, text
     assert "processes: /dispatcher, /dispatcher/r4." in flat, text
     assert "The revocation list did not get to r2, r3, r5, r6, r7, r8," in flat, text
-    assert "This robot has facts that take the place of variables (sros_robot)" in flat, text
+    assert "This robot has facts that replace variables (sros_robot)" in flat, text
     assert "This robot named no folder for files of Ansible" in flat, text
 
 

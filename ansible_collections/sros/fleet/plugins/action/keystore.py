@@ -11,7 +11,7 @@ from ansible_collections.sros.fleet.plugins.plugin_utils.facts import check_fact
 
 
 class ActionModule(ActionBase):  # type: ignore[misc]
-    """Run the module, unless facts of a robot take the place of variables."""
+    """Run the module, unless facts of a robot replace variables."""
 
     _supports_check_mode = True
     _supports_async = False

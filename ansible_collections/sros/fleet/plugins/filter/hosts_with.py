@@ -13,7 +13,7 @@ name: hosts_with
 short_description: The hosts for which a play set a variable
 description:
   - Returns the hosts that have a variable, by which a play noted what was done for them.
-  - A host whose facts take the place of variables is left out, so that no robot can say itself that
+  - A host whose facts replace variables is left out, so that no robot can say itself that
     something was done for it.
 options:
   _input:

@@ -15,7 +15,7 @@ name: own_keys
 short_description: The enclaves whose keys are made on robots
 description:
   - Returns the enclaves in C(sros_own_keys) of all hosts.
-  - A host whose facts take the place of variables is refused by name.
+  - A host whose facts replace variables is refused by name.
 options:
   _input:
     description: The variables of all hosts (C(hostvars)).

@@ -14,7 +14,7 @@ short_description: The hosts that mean the same robot
 description:
   - Returns the hosts whose C(sros_robot) is that of another one, each of which would get the keys
     of that robot. Hosts with C(sros_patterns) do not choose enclaves by a robot.
-  - A host whose facts take the place of variables is left out, so that none can hold up another;
+  - A host whose facts replace variables is left out, so that none can hold up another;
     it gets nothing.
 options:
   _input:

@@ -224,7 +224,7 @@ class Place:
                 except BlockingIOError:
                     if time.monotonic() > end:
                         raise RefusedError(
-                            f"Another process is changing '{self.path}'. Run it again later."
+                            f"Another process is changing '{self.path}'. Run the play again later."
                         ) from None
                     time.sleep(0.2)
             self._recover()
@@ -326,7 +326,7 @@ class Place:
     def _move_in(self, new: int, present: int) -> None:
         """Move the files of the open folder ``new`` to those of the same name in ``present``."""
         if os.fstat(present).st_uid != self._uid:
-            raise RefusedError(f"Somebody is changing '{self.path}' meanwhile. Run it again.")
+            raise RefusedError(f"Somebody changed '{self.path}' meanwhile. Run the play again.")
         os.fchmod(present, 0o700)
         there = set(os.listdir(present))
         for name in os.listdir(new):

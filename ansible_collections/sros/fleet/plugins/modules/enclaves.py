@@ -241,7 +241,7 @@ def _run(module: AnsibleModule, now: float) -> dict:
         more = len(with_key) - _MOST_PROBLEMS
         remarks.append(
             "This robot had keys of {}{}, which are not its enclaves in the keystore; they {}"
-            " removed. If they are enclaves of another robot, give that one new keys: `sros renew"
+            " removed. If they are enclaves of another robot, give that robot new keys: `sros renew"
             " KEYSTORE --robot ROBOT --new-key --revoke-old`.".format(
                 ", ".join(with_key[:_MOST_PROBLEMS]),
                 f" and {more} more" if more > 0 else "",
@@ -319,8 +319,8 @@ def _install(
     if known and not known & new and not asked["replace_authorities"]:
         raise RefusedError(
             f"This robot has enclaves of another keystore: no CA of '{place.path}' signed the new"
-            " ones. Nothing was changed. If the robot is to change over, set replace_authorities"
-            " (sros_replace_authorities)."
+            " enclaves. Nothing was changed. If the robot should get the new keystore,"
+            " set replace_authorities (sros_replace_authorities)."
         )
     changed = changed_enclaves(before, after)
     removed = sorted(set(enclaves_in(before)) - set(enclaves_in(after)))

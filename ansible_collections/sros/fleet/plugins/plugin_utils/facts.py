@@ -1,4 +1,4 @@
-"""Facts of robots, which must not take the place of variables."""
+"""Facts of robots, which must not replace variables."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ _MOST_SHOWN = 200
 
 
 def check_facts(variables: Mapping[str, Any]) -> None:
-    """Refuse to do anything for a robot whose facts take the place of variables.
+    """Refuse to do anything for a robot whose facts replace variables.
 
-    The plays of this collection take no facts from robots. But those of other plays, or of a cache,
-    take the place of variables of the inventory unless ``inject_facts_as_vars`` is off: so a robot
+    The plays of this collection take no facts from robots. But facts of other plays, or of a cache,
+    replace variables of the inventory unless ``inject_facts_as_vars`` is off: so a robot
     could choose the command that runs on the keystore machine, or whose keys it gets.
 
     Args:
@@ -34,7 +34,7 @@ def check_facts(variables: Mapping[str, Any]) -> None:
     if found := _replacing(variables):
         shown = harmless(", ".join(found), most=_MOST_SHOWN)
         raise RefusedError(
-            f"This robot has facts that take the place of variables ({shown}): so it could choose"
+            f"This robot has facts that replace variables ({shown}). With them, it could choose"
             " the commands that run on the keystore machine, or get the keys of another robot."
             " Nothing was done for it. Set inject_facts_as_vars = false in ansible.cfg, or delete"
             " the facts if they are cached (ansible-playbook --flush-cache). If they are named as"
