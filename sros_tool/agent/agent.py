@@ -976,35 +976,49 @@ class _Round:
         Raises:
             SrosError, OSError: the error of ``ask``, for the last enclave if all were refused.
         """
-        certificates: Sequence[ClientCertificate | None] = [None]
-        if place.startswith("https://"):
-            certificates = self._client_certificates() or certificates
-        *earlier_certificates, last = certificates
-        for certificate in earlier_certificates:
+        secure = place.startswith("https://")
+        certificates = self._client_certificates() if secure else []
+        for certificate in certificates[:-1]:
             try:
                 return ask(certificate)
-            except RefusedError:
-                continue
-            except FetchError as error:
-                if error.problem is not FetchProblem.REFUSED:
+            except (FetchError, RefusedError) as error:
+                if not _is_refusal(error):
                     raise
-        return ask(last)
+        try:
+            return ask(certificates[-1] if certificates else None)
+        except (FetchError, RefusedError) as error:
+            if certificates or not secure or not _is_refusal(error):
+                raise
+            raise UnavailableError(
+                f"{place} refuses this robot, which has no certificate to identify itself with",
+                "No enclave here has a certificate with its key (a key on a token cannot be used "
+                "for this).",
+                "On the keystore machine, run `sros distribute_key KEYSTORE --robot "
+                f"{self._settings.robot} FOLDER --force`, and bring the files here.",
+            ) from error
 
     def _client_certificates(self) -> list[ClientCertificate]:
         """Return the enclaves' certificates and keys for TLS, sorted by expiry, the latest first.
 
-        At most `_MOST_CERTIFICATES` are returned.
+        At most `_MOST_CERTIFICATES` are returned.  An enclave whose key does not belong to its
+        certificate, or cannot be read, is left out: `unusable_sentences` reports it.
         """
         certificates_by_expiry: list[tuple[datetime, ClientCertificate]] = []
         for name in self._enclaves():
             place = enclave_path(self._folder, name)
             with suppress(SrosError, OSError):
-                until = validity_of(read_certificate(place / CERTIFICATE_FILE)).not_after
-                if (place / KEY_FILE).exists():
-                    files = ClientCertificate(place / CERTIFICATE_FILE, place / KEY_FILE)
-                    certificates_by_expiry.append((until, files))
+                files = ClientCertificate(place / CERTIFICATE_FILE, place / KEY_FILE)
+                certificate = read_certificate(files.certificate)
+                key = load_key(read_bytes(files.key, "private key"), f"'{files.key}'")
+                if key.public_key() == certificate.public_key():
+                    certificates_by_expiry.append((validity_of(certificate).not_after, files))
         certificates_by_expiry.sort(key=lambda pair: pair[0], reverse=True)
         return [files for _, files in certificates_by_expiry[:_MOST_CERTIFICATES]]
+
+
+def _is_refusal(error: FetchError | RefusedError) -> bool:
+    """Return whether a server perhaps refuses the client's certificate."""
+    return isinstance(error, RefusedError) or error.problem is FetchProblem.REFUSED
 
 
 def _since_boot() -> float:

@@ -64,8 +64,8 @@ _STREAM = Path("-")
 @click.option(
     "--keyless",
     is_flag=True,
-    help="Also export enclaves whose keys were made on their robots, without the keys. Keys in "
-    "KEYSTORE are exported in any case.",
+    help="Also export enclaves whose keys were made on their robots, without the keys, as --robot "
+    "does. Keys in KEYSTORE are exported in any case.",
 )
 @dry_run_option
 @json_option
@@ -95,10 +95,11 @@ def distribute_key(
     from sros_tool.keystore.delivery.archive import SUFFIXES
     from sros_tool.keystore.delivery.export import (
         distribute,
+        included_keys_notes,
         pack_enclaves,
         select_enclaves_to_export,
     )
-    from sros_tool.keystore.layout import enclave_folder
+    from sros_tool.keystore.layout import enclave_folder, key_on_robot
     from sros_tool.keystore.outcomes import changes_below
     from sros_tool.keystore.reader import OpenedKeystore
 
@@ -110,7 +111,8 @@ def distribute_key(
     keystore = OpenedKeystore(root)
     _check_target(keystore, names_and_target[-1])
     chosen = chosen_enclaves(keystore, names, patterns, robots)
-    selection = select_enclaves_to_export(keystore, chosen, names, keyless=keyless)
+    every = keyless or bool(robots)  # a robot with only a part of its new files could not run
+    selection = select_enclaves_to_export(keystore, chosen, names, keyless=every)
     notes: tuple[Note, ...] = ()
     kept: list[str] = []
     if target == _STREAM:
@@ -118,7 +120,7 @@ def distribute_key(
             _refuse_json(as_json)
             _refuse_terminal()
         with progress("exporting"):
-            packed = pack_enclaves(keystore, selection.names, now=now(), keyless=keyless)
+            packed = pack_enclaves(keystore, selection.names, now=now(), keyless=every)
         changes = tuple(FileChange("send", path) for path in packed.paths)
         notes = packed.notes
         if not dry_run:
@@ -135,7 +137,7 @@ def distribute_key(
                 target,
                 now=now(),
                 force=force,
-                keyless=keyless,
+                keyless=every,
                 dry_run=dry_run,
             )
         where, done = f"'{target}'", bool(export.changes) and not dry_run
@@ -155,6 +157,8 @@ def distribute_key(
                 echo(f"{word} {change.path}", err=True)
         if done:
             print_closed(below, export.changes, keystore=root)
+    if keyless:
+        notes += tuple(included_keys_notes(keystore, selection.names))
     exported = [name for name in selection.names if name not in kept]
     for name in exported if done and not as_json else ():
         echo(f"exported enclave {name} to {where}", err=target == _STREAM)
@@ -170,6 +174,9 @@ def distribute_key(
         print_json(ExportedEnclaves(root, dry_run, target, outcomes, left_out, changes, notes))
     else:
         print_notes(notes)
+    for name in exported if done else ():
+        if key_on_robot(keystore.folder(name)):
+            echo(f"{name}: without its key, which was made on its robot and stays there", err=True)
     for name in selection.left_out:
         echo(f"left out enclave {name}: its key was made on its robot", err=True)
 

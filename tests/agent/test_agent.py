@@ -277,6 +277,32 @@ def test_a_server_that_refuses_one_certificate_of_the_robot(
     (problem,) = r1.round().problems
     assert problem == "The source refuses this robot." and sorted(r1.tried) == sorted(NAMES)
 
+    # A key that does not belong to its certificate, or is damaged, is not offered.
+    r1.refused, r1.release = [], None
+    keys = {name: r1.folder / f"enclaves{name}/key.pem" for name in NAMES}
+    last = NAMES[-1]
+    for name, changed in {first: keys[last].read_bytes(), last: b"damaged"}.items():
+        saved = keys[name].read_bytes()
+        keys[name].write_bytes(changed)
+        r1.tried[:] = []
+        (problem,) = r1.round().problems
+        assert problem.startswith(f"{name} could not start: key.pem: "), problem
+        assert r1.tried and r1.tried != [name]
+        keys[name].write_bytes(saved)
+
+
+def test_a_server_that_refuses_a_robot_without_a_certificate(home: Home, r1: Robot) -> None:
+    """Such as one whose enclaves were removed, to make keys of its own."""
+    r1.settings = replace(r1.settings, source="https://home/pub")
+    for place in (r1.folder / "enclaves").glob("**/cert.pem"):
+        place.unlink()
+    r1.release = FetchError(FetchProblem.REFUSED, "the source refuses this robot")
+    said = [each for each in r1.round().problems if "refuses this robot" in each]
+    assert len(said) == 1 and "which has no certificate to identify itself with" in said[0], said
+    assert "sros distribute_key KEYSTORE --robot r1 FOLDER --force" in said[0]
+    r1.release = FetchError(FetchProblem.UNREACHABLE, "it does not answer")
+    assert "It does not answer." in r1.round().problems
+
 
 def test_enclaves_that_the_release_does_not_have(home: Home, r1: Robot) -> None:
     """Those of another robot go in the next round; what was brought since the release stays."""

@@ -25,6 +25,7 @@ from sros_tool.keystore.delivery.archive import unpack
 from sros_tool.keystore.delivery.export import (
     ExportSelection,
     distribute,
+    included_keys_notes,
     pack_enclaves,
     select_enclaves_to_export,
 )
@@ -270,14 +271,13 @@ def test_a_certificate_for_an_earlier_key_of_the_robot_is_not_exported(
 def test_an_export_with_keyless_says_which_private_keys_it_has(fleet: Path, tmp_path: Path) -> None:
     """Its name reads as if it left all keys out."""
     keystore = OpenedKeystore(fleet)
-    names = [BORN, "/base"]
-    for notes in (
-        distribute(keystore, names, tmp_path / "robot", now=NOW, keyless=True).notes,
-        pack_enclaves(keystore, names, now=NOW, keyless=True).notes,
-    ):
-        (said,) = (note.text for note in notes if note.id == "export.keys-included")
-        assert "the export has /base with its private key: " in said
-    assert not distribute(keystore, ["/base"], tmp_path / "other", now=NOW).notes
+    (said,) = included_keys_notes(keystore, [BORN, "/base"])
+    assert "the export has /base with its private key: " in said.text
+    assert not list(included_keys_notes(keystore, [BORN]))
+    for words, noted in ((("--all",), False), (("--all", "--keyless"), True)):
+        for target in ("-", "robot"):
+            ended = sros("distribute_key", fleet, *words, target, "--dry-run", cwd=tmp_path).ok()
+            assert ("export.keys-included" in ended.err) == noted
 
 
 # ── selection ──────────────────────────────────────────────────────────────────────────────

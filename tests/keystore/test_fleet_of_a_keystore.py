@@ -268,3 +268,39 @@ def test_many_enclaves_are_counted_with_the_next_step(tmp_path: Path) -> None:
     left = "/r1, /r10, /r11, /r12, /r13 and 16 more (-v lists all)"
     sros("create_enclave", root, "/spare").ok()
     assert sros("revoke", root, "--all").ok().out == f"revoked 21 enclaves: {left}\n"
+
+
+def test_a_robot_with_keys_of_its_own_gets_all_files_after_a_rotation(
+    made: Path, tmp_path: Path
+) -> None:
+    """One of its two enclaves made its key on the robot, and it missed the rotation."""
+    root, robot = copy_of(made / "ks", tmp_path / "ks"), tmp_path / "robot"
+    (tmp_path / "policy.xml").write_text(policy_text({"/{robot}/own": publish("x")}))
+    words = ("-p", tmp_path / "policy.xml", "--fleet", made / "fleet.toml")
+    sros("generate_artifacts", "-k", root, *words).ok()
+    sros("revoke", root, "/a/own").ok()
+    sros("distribute_key", root, "/a", robot).ok()
+    sros("create_request", "/a/own", robot).ok()
+    request = robot / "enclaves/a/own/request.pem"
+    sros("sign_request", root, request, "--no-answer", *words, "--enclave", "/a/own").ok()
+    copy = tmp_path / "copy"
+    for target in (robot, copy):
+        said = sros("distribute_key", root, "--robot", "a", target, "--force").ok().err
+        assert "/a/own: without its key, which was made on its robot and stays there" in said
+        assert "[export.keys-included]" not in said
+        assert (target / "enclaves/a/own/cert.pem").exists()
+    sros("rotate_ca", root, "--finish", "--allow-unconfirmed").ok()
+
+    for name, why in (
+        ("/a", "contains enclaves that trust a CA of this keystore that was replaced"),
+        ("/a/own", "Add --keyless"),
+    ):
+        refused = sros("distribute_key", root, name, robot, "--force")
+        assert (refused.status, why in refused.err) == (2, True), refused
+    sros("sign_request", root, request, "--renew", "-o", answer := tmp_path / "a.tar.gz").ok()
+    refused = sros("import", answer, robot)
+    assert "is not from a CA that this robot trusts" in refused.err
+    assert "sros distribute_key KEYSTORE --robot NAME FOLDER --force" in refused.err
+
+    sros("distribute_key", root, "--robot", "a", robot, "--force").ok()
+    assert sros("verify", robot).out.count("  loadable in domain") == 2

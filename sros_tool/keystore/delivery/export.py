@@ -31,7 +31,6 @@ from sros_tool.keystore.delivery.archive import (
 )
 from sros_tool.keystore.delivery.robot import check_same_authority
 from sros_tool.keystore.delivery.rollback import (
-    ANSWER_AGAIN,
     ROLES_OF_FILES,
     check_own_keys,
     check_rollback,
@@ -85,6 +84,10 @@ from sros_tool.wording import first_few
 from sros_tool.xml import read_bytes
 
 _MOST_SHOWN = 5
+_ADD_KEYLESS = (
+    "Add --keyless to export the other files, which belong next to the key on the robot. If the "
+    "robot has a new key since, first sign its request.pem with `sros sign_request --renew`."
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,7 +133,7 @@ def select_enclaves_to_export(
         raise KeystoreError(
             f"the keys of {', '.join(left_out)} are not in keystore '{keystore.root}'",
             "They were made on their robots and stay there.",
-            ANSWER_AGAIN,
+            _ADD_KEYLESS,
         )
     return ExportSelection(tuple(chosen), tuple(left_out))
 
@@ -156,7 +159,7 @@ def distribute(
             ``target`` has other content, which only ``force`` replaces.
     """
     files = exported_files(keystore, names, now, keyless=keyless)
-    notes = (*_key_notes(files, keyless), *unrecorded_notes(keystore, load_fleet(keystore), names))
+    notes = (*_token_notes(files), *unrecorded_notes(keystore, load_fleet(keystore), names))
     if target.name.endswith(SUFFIXES):
         changes = _write_archive(keystore, target, files, now=now, force=force, dry_run=dry_run)
         return Export(target, tuple(names), changes, notes)
@@ -166,16 +169,20 @@ def distribute(
     return Export(target, tuple(names), changes, notes)
 
 
-def _key_notes(files: Mapping[str, bytes], keyless: bool) -> Iterator[Note]:
-    """Yield notes on private keys in a ``keyless`` export, and on keys on tokens."""
-    if keyless and (keys := [path for path in files if path.endswith(f"/{KEY_FILE}")]):
+def included_keys_notes(keystore: OpenedKeystore, names: Iterable[str]) -> Iterator[Note]:
+    """Yield a note on enclaves that an export with ``--keyless`` has with their private keys."""
+    keys = [name for name in names if (keystore.folder(name) / KEY_FILE).exists()]
+    if keys:
         their = "its private key" if len(keys) == 1 else "their private keys"
         yield Note(
             "export.keys-included",
-            f"the export has {first_few(list(map(enclave_of, keys)), _MOST_SHOWN)} with {their}: "
-            "--keyless leaves out nothing, it adds enclaves whose keys were made on their robots. "
-            "Releases of `sros fleet publish` have no private key.",
+            f"the export has {first_few(keys, _MOST_SHOWN)} with {their}: --keyless leaves out no "
+            "key that the keystore has. Releases of `sros fleet publish` have no private key.",
         )
+
+
+def _token_notes(files: Mapping[str, bytes]) -> Iterator[Note]:
+    """Yield notes on keys on tokens."""
     for path in files:
         folder, _, file = path.rpartition("/")
         if file == KEY_URI_FILE:
@@ -259,7 +266,7 @@ def pack_enclaves(
         KeystoreError: an enclave does not exist, or cannot run.
     """
     files = exported_files(keystore, names, now, keyless=keyless)
-    return PackedEnclaves(pack(files), tuple(files), tuple(_key_notes(files, keyless)))
+    return PackedEnclaves(pack(files), tuple(files), tuple(_token_notes(files)))
 
 
 def exported_files(
@@ -283,7 +290,7 @@ def exported_files(
             raise KeystoreError(
                 f"the key of enclave {name} is not in keystore '{keystore.root}'",
                 "It was made on its robot and stays there, so an export could not run.",
-                ANSWER_AGAIN,
+                _ADD_KEYLESS,
             )
         evaluation = _evaluate_enclave(keystore, name, now)
         if evaluation.problems:
@@ -544,7 +551,7 @@ def _write_folder(
             "Choose another folder.",
         )
     with Transaction(target, new_keystore=True, dry_run=dry_run) as transaction:
-        check_same_authority(target, files)
+        check_same_authority(target, files, earlier=_recorded_authorities(keystore))
         _check_robot(keystore, target, files)
         check_rollback(keystore, target, trusted_in(target, files), files, now)
         check_own_keys(target, files)
@@ -567,6 +574,12 @@ def _write_folder(
             transaction.remove(path)
         transaction.commit()
     return transaction.changes
+
+
+def _recorded_authorities(keystore: OpenedKeystore) -> frozenset[str]:
+    """Return the SHA-256 of all CAs that the keystore has or had, as the ledger records them."""
+    entries = keystore.ledger_with("what", "ca").entries
+    return frozenset(entry.sha256 for entry in entries if entry.what == "ca")
 
 
 def _check_robot(keystore: OpenedKeystore, target: Path, files: Mapping[str, bytes]) -> None:

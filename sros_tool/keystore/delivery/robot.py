@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
@@ -230,7 +230,9 @@ def _trusted_certificates(folder: Path, file: str) -> list[x509.Certificate]:
     return list(certificates.values())
 
 
-def check_same_authority(target: Path, files: Mapping[str, bytes]) -> None:
+def check_same_authority(
+    target: Path, files: Mapping[str, bytes], *, earlier: Collection[str] = ()
+) -> None:
     """Check that the enclaves in ``target`` and the new files trust the same identity CA.
 
     Enclaves of two keystores in one folder could not communicate with each other.
@@ -238,6 +240,7 @@ def check_same_authority(target: Path, files: Mapping[str, bytes]) -> None:
     Args:
         target: the security folder of a robot.
         files: the content of the new files, by their paths relative to ``target``.
+        earlier: the SHA-256 of CAs that the keystore of the new files has or had.
 
     Raises:
         KeystoreError: an enclave in ``target`` trusts none of the identity CAs in ``files``.
@@ -251,11 +254,16 @@ def check_same_authority(target: Path, files: Mapping[str, bytes]) -> None:
             continue
         present_authorities = _certificates(ca_file)
         if new_authorities.isdisjoint(map(digest, present_authorities)):
+            replaced = any(digest(authority) in earlier for authority in present_authorities)
+            whose = "that trust a CA of this keystore that was replaced"
             raise KeystoreError(
-                f"'{target}' contains enclaves of another keystore",
+                f"'{target}' contains enclaves {whose if replaced else 'of another keystore'}",
                 f"They trust {subject_text(present_authorities[0].subject)}, and could not "
                 "communicate with the new enclaves.",
-                "Choose another folder.",
+                "Export all enclaves of the folder together: with --robot NAME, or all of them by "
+                "name, with --keyless if their keys were made on the robot."
+                if replaced
+                else "Choose another folder.",
             )
 
 
@@ -567,9 +575,12 @@ def _check_known_authority(
     """
     if known and (problem := _answer_seal_problem(answer, known)):
         raise KeystoreError(
-            f"the answer for enclave {answer.name} comes from another keystore",
-            f"The permissions CA that '{folder}' trusts has not signed it: {problem.rstrip('.')}.",
-            "To move this robot to the other keystore, add --force.",
+            f"the answer for enclave {answer.name} is not from a CA that this robot trusts",
+            f"The permissions CA that '{folder}' trusts has not signed it: {problem.rstrip('.')}. "
+            "Either the CA was replaced since, or the answer comes from another keystore.",
+            "If the CA was replaced, export all enclaves of the robot: `sros distribute_key "
+            "KEYSTORE --robot NAME FOLDER --force` (without a fleet: ENCLAVE... and --keyless in "
+            "place of --robot NAME). To move this robot to another keystore, add --force.",
         )
     check_same_authority(folder, answer.files)
 

@@ -53,7 +53,7 @@ from sros_tool.validity import iso
 from sros_tool.wording import counted
 from sros_tool.xml import read_bytes
 
-ANSWER_AGAIN = (
+_ANSWER_AGAIN = (
     "Sign the request.pem in the enclave's folder with `sros sign_request --renew`, and send the "
     "answer to the robot."
 )
@@ -337,7 +337,7 @@ def check_own_keys(target: Path, files: Mapping[str, bytes]) -> None:
                 f"the certificate is not for the key in '{target / folder}'",
                 "No process would start with it. The keystore knows only an earlier key, perhaps "
                 "because it comes from a backup. Nothing was changed.",
-                f"{ANSWER_AGAIN} If the keystore's certificate is right, remove the key first.",
+                f"{_ANSWER_AGAIN} If the keystore's certificate is right, remove the key first.",
             )
 
 
