@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import subprocess
 import tomllib
 from pathlib import Path
 
@@ -24,6 +25,7 @@ DOCUMENTS = sorted(
         *PROJECT.glob("policies/*.md"),
     )
 )
+CI_PAGE = "docs/howto/ci.md"
 FENCE = re.compile(r"^```.*?^```$", re.DOTALL | re.MULTILINE)
 
 
@@ -114,9 +116,34 @@ def test_the_files_that_a_contributor_is_sent_to_are_there() -> None:
 
 def test_examples_install_a_release_that_has_what_they_use() -> None:
     version = tomllib.loads(read("pyproject.toml"))["project"]["version"]
-    for page in ("docs/pull_requests.md", "docs/howto/ci.md"):
+    for page in ("docs/pull_requests.md", CI_PAGE):
         installed = re.findall(r"\b(?:v|sros_tool==)(\d+\.\d+\.\d+)", read(page))
         assert set(installed) == {version.partition(".dev")[0]}, page
+
+
+@pytest.mark.parametrize(
+    ("build", "status"),
+    [
+        ("cp -r policies/. $INSTALLED", 0),
+        ("echo new >policies/p.xml; cp -r policies/. $INSTALLED", 1),
+        ("cp -r policies/. $INSTALLED; echo new >policies/p.xml", 1),
+        ("cp -r policies/. $INSTALLED; echo new >$INSTALLED/p.xml", 1),
+        ("touch policies/new.xml; cp -r policies/. $INSTALLED", 1),
+    ],
+)
+def test_the_workflow_of_a_package_sees_other_policies(
+    build: str, status: int, tmp_path: Path
+) -> None:
+    """The lines of the workflow, with a ``colcon`` that installs policies as ``build`` does."""
+    lines = re.findall(r"^ +(cp -r policies .*|colcon build|diff -r .*)$", read(CI_PAGE), re.M)
+    assert [line.split()[0] for line in lines] == ["cp", "colcon", "diff", "diff"]
+    installed = "install/gripper_driver/share/gripper_driver/policies"
+    colcon = f"colcon() {{ mkdir -p {installed}; {build.replace('$INSTALLED', installed)}; }}"
+    (tmp_path / "policies").mkdir()
+    (tmp_path / "policies/p.xml").write_text("reviewed\n")
+    script = "\n".join([colcon, *lines]).replace("/tmp/reviewed", f"{tmp_path}/reviewed")
+    done = subprocess.run(["bash", "-ec", script], cwd=tmp_path, capture_output=True, check=False)
+    assert done.returncode == status, done
 
 
 def test_the_changelog_is_about_this_version() -> None:
