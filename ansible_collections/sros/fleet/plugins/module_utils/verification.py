@@ -152,8 +152,9 @@ def check_authorities(before: Files, after: Files, spare: str) -> None:
             if any(_start(block, spare) < newest for block in added):
                 raise RefusedError(
                     f"This robot has a later CA in {file} of {name} than the keystore. It would"
-                    " trust the earlier CA again, and everything that was revoked since. Nothing was"
-                    " changed. The keystore may come from a backup: docs/howto/keystore_is_lost.md of sros"
+                    " trust the earlier CA again, and everything that was revoked since. Nothing"
+                    " was changed. The keystore may come from a backup:"
+                    " docs/howto/keystore_is_lost.md of sros"
                     " says how to go on. If the keystore's CA is right, set replace_authorities"
                     " (sros_replace_authorities)."
                 )
