@@ -24,6 +24,7 @@ from typing import NamedTuple
 from cryptography import x509
 
 from sros_tool.agent.fetch import OLD_COPY
+from sros_tool.dds.permissions import parse_permissions
 from sros_tool.errors import KeystoreError, SrosError
 from sros_tool.folders import Folder
 from sros_tool.keystore.confirmation import KEY_NOT_HERE, OF_OTHER_CA, OLDER_THAN_INSTALLED
@@ -46,6 +47,7 @@ from sros_tool.keystore.layout import (
     OPTIONAL_FILES,
     PERMISSIONS,
     PERMISSIONS_CA_FILE,
+    PERMISSIONS_FILE,
     PRIVATE,
     PUBLIC,
     REQUEST,
@@ -56,6 +58,7 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.reader import OpenedEnclave, open_enclave, weaknesses
 from sros_tool.keystore.transaction import Transaction, recover_keystore
+from sros_tool.pki import smime
 from sros_tool.pki.certificates import (
     authority_text,
     digest,
@@ -308,17 +311,14 @@ def present_lists(folder: Folder, name: str) -> dict[str, bytes]:
 
 
 def release_time(release: Release) -> datetime | None:
-    """Return when the newest certificate or revocation list in a release began to be valid.
-
-    The result is None if no certificate and no list can be read.
-    """
+    """Return when the newest document in a release began to be valid; None if none can be read."""
     return _newest_validity_start(release.enclaves().values())
 
 
 def _newest_validity_start(enclaves: Iterable[Mapping[str, bytes]]) -> datetime | None:
-    """Return when the newest certificate or revocation list of enclaves began to be valid.
+    """Return when the newest document of enclaves began to be valid; None if none can be read.
 
-    The result is None if no certificate and no list can be read.
+    The documents are certificates, revocation lists and permissions, which the caller has verified.
     """
     moments = []
     for files in enclaves:
@@ -327,6 +327,10 @@ def _newest_validity_start(enclaves: Iterable[Mapping[str, bytes]]) -> datetime 
             moments += [validity_of(certificate).not_before for certificate in certificates]
             lists = read_lists(files[CRL_FILE], CRL_FILE) if CRL_FILE in files else ()
             moments += [last_update(crl) for crl in lists]
+        with suppress(SrosError):
+            document = smime.parse(files.get(PERMISSIONS_FILE, b"")).document
+            grants = parse_permissions(document).grants
+            moments += [grant.validity.not_before for grant in grants]
     return max(moments, default=None)
 
 

@@ -1602,6 +1602,16 @@ def fleet_metrics(
             ),
         ),
         Metric(
+            "sros_fleet_agent_mended",
+            "Number of problems of a robot that its agent has mended in the last day, such as a "
+            "file that was changed, for robots that report problems.",
+            per_robot(
+                lambda robot: (
+                    None if robot.problems is None else sum(map(is_mended, robot.problems))
+                )
+            ),
+        ),
+        Metric(
             "sros_fleet_clock_ahead_seconds",
             "How far the clock of a robot was ahead when its confirmation was received.",
             per_robot(

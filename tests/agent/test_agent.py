@@ -648,6 +648,21 @@ def test_on_a_wrong_clock_nothing_is_installed_that_is_not_valid_then(
     assert r1.round().changed == NAMES
 
 
+def test_permissions_prove_time_as_certificates_do(home: Home, r1: Robot) -> None:
+    """A release that brings only new permissions, before and after it is installed."""
+    path = "enclaves/r1/a/permissions.p7s"
+    r1.round()
+    early = read_state(r1.folder).latest
+    r1.release = home.release({**home.first.files, path: home.renewed.files[path]})
+    for changed, said in (((), "the published release was made at"), (("/r1/a",), "")):
+        done = r1.round(early + timedelta(minutes=5) if early and not changed else None)
+        assert done.changed == changed and said in "".join(done.problems[:1]), done.problems
+    r1.release = None
+    assert early
+    problems = r1.round(early + timedelta(minutes=5)).problems
+    assert "but verified documents were made at" in problems[0], problems
+
+
 def test_a_clock_at_home_that_was_ahead_locks_no_robot_out(home: Home, r1: Robot) -> None:
     """What is not valid yet proves no time, by which all that is published would have expired."""
     r1.release = home.revoked
@@ -655,7 +670,7 @@ def test_a_clock_at_home_that_was_ahead_locks_no_robot_out(home: Home, r1: Robot
     done = r1.round(early + timedelta(minutes=5))
     assert any("/r1/a keeps its files" in problem for problem in done.problems)
     assert done.changed, "the revocation list"
-    wrong = "min behind, unless the clock of the keystore machine was ahead"
+    wrong = " behind, unless the clock of the keystore machine was ahead"
     status = agent_status(r1.folder, now=early + timedelta(minutes=5), oldest=timedelta(days=1))
     assert wrong in done.problems[0] and wrong in status.problems[0], "or the clock here is wrong"
     assert r1.message().clock is RobotClock.BEHIND

@@ -788,6 +788,7 @@ def test_what_an_agent_mended_does_not_fail_a_job_that_asks_so(field: Field) -> 
         assert f'\nsros_fleet_mended{{keystore="{field.root}"}} {1 - status}\n' in told
         labels = f'keystore="{field.root}",robot="r1"'
         assert f"\nsros_fleet_agent_problems{{{labels}}} {status}\n" in told
+        assert f"\nsros_fleet_agent_mended{{{labels}}} 1\n" in told
     field.send("r1", problems=(mended,), restart=["/r1/base"])
     field.run("fleet", "status", "ks", "--fail-on", "unmended", status=1)
 
@@ -1541,7 +1542,7 @@ def test_the_alerts_of_the_page_name_metrics_that_are_written(field: Field) -> N
     alerts = [rule["expr"] for rule in yaml.safe_load(rules)["groups"][0]["rules"]]
     named = {name for alert in alerts for name in re.findall(r"sros_\w+", alert)}
     metrics = fleet_metrics(fleet_status(OpenedKeystore(field.root)), now=datetime.now(UTC))
-    assert len(named) == len(alerts) == 10 and named <= {metric.name for metric in metrics}
+    assert len(named) == len(alerts) == 11 and named <= {metric.name for metric in metrics}
 
 
 def test_metrics_and_the_page(field: Field) -> None:
