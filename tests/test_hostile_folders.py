@@ -796,7 +796,7 @@ def test_the_name_of_a_file_becomes_no_command_in_a_remedy(keystore: Path) -> No
         for each in findings
         if each.file == str(copied) and each.kind.id == "keystore.key-readable"
     }
-    command = remedy.removeprefix("Run `").removesuffix("`.")
+    command = remedy.removeprefix("Run `").partition("`. If others may")[0]
     assert shlex.split(command) == ["chmod", "600", str(copied)]
     odd = keystore.parent / "x; touch owned; '; touch owned; '"  # unquoted, or in quotes
     keystore.rename(odd)

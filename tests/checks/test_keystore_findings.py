@@ -206,6 +206,28 @@ def test_a_ca_key_elsewhere_that_others_can_read(mode: int, found: bool, tmp_pat
     assert shown == wanted | plain
 
 
+@pytest.mark.parametrize(
+    ("key", "exported", "replaced_by"),
+    [
+        ("enclaves/base/key.pem", False, "`sros renew {root} /base --new-key --revoke-old`"),
+        ("enclaves/base/key.pem", True, "`sros renew KEYSTORE /base --new-key --revoke-old`"),
+        ("private/identity_ca.key.pem", False, "`sros rotate_ca {root} --finish --delete-old-key`"),
+    ],
+)
+def test_a_key_that_others_may_have_copied_is_to_be_replaced(
+    bench: Bench, key: str, exported: bool, replaced_by: str
+) -> None:
+    """chmod helps nothing against a copy."""
+    if exported:
+        bench.export()
+    (bench.checked / key).chmod(0o644)
+    found = keystore_findings(OpenedKeystore(bench.checked), Circumstances(bench.now))
+    (readable,) = (each for each in found if each.id == "keystore.key-readable")
+    assert readable.remedy.startswith(f"Run `chmod 600 {bench.checked / key}`. If others may have")
+    assert f": {replaced_by.format(root=bench.checked)}. Then export the" in readable.remedy
+    assert "that has the CA keys: `" in readable.remedy or not exported
+
+
 @pytest.mark.parametrize(("mode", "noted"), [(0o755, False), (0o1777, False), (0o777, True)])
 def test_a_new_keystore_that_others_can_replace_is_noted(
     mode: int, noted: bool, tmp_path: Path

@@ -481,7 +481,7 @@ def _ca_key_findings(
         if not os.access(path, os.R_OK if path != inside else os.F_OK):
             continue  # on a medium that is not there now, or for another user only
         if path != inside:
-            yield from key_mode_findings(str(path), path.stat().st_mode)
+            yield from key_mode_findings(keystore, str(path), path.stat().st_mode)
         try:
             pem = keystore.opened.read(path, "key")
             key = load_key(pem, f"'{path}'", _locked)

@@ -13,6 +13,7 @@ from shlex import quote
 from sros_tool.checks.keystores.opened import CheckedKeystore
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind, names_text
 from sros_tool.errors import KeystoreError, SrosError
+from sros_tool.faults import ORIGINAL_KEYSTORE
 from sros_tool.keystore.layout import (
     AGENT,
     CONFIRMED,
@@ -49,8 +50,10 @@ KEY_READABLE = FindingKind(
     "key of a CA can act as any enclave. Neither rcl nor DDS checks file modes, and ros2/sros2 "
     "creates keys with mode 0644.",
     "ros2/sros2 0.13; rcl 9, Fast DDS 2.14.5 and Cyclone DDS 0.10.2 check no modes.",
-    "Run `chmod 600` on the key. If others had access, revoke the enclave, or "
-    "replace the CA (`sros rotate_ca`).",
+    "Run `chmod 600` on the key. If others may have copied it, replace it: the key of an enclave "
+    "with `sros renew KEYSTORE ENCLAVE --new-key --revoke-old`, the key of a CA with `sros "
+    "rotate_ca KEYSTORE --finish --delete-old-key`. Then export the enclaves again, and restart "
+    "all processes.",
 )
 WORLD_WRITABLE = FindingKind(
     "keystore.world-writable",
@@ -337,7 +340,7 @@ def _folder_findings(
                 continue
             yield from _write_access_findings(path, info, trusted_users)
             if path in keys:
-                yield from key_mode_findings(path, info.st_mode)
+                yield from key_mode_findings(keystore, path, info.st_mode)
             elif name in _KNOWN_FILES and inside.startswith(ENCLAVES) and name != KEY_FILE:
                 if name == KEY_URI_FILE or name.endswith("_ca.cert.pem"):
                     with suppress(OSError):  # `check_enclave` reports an unreadable one
@@ -347,7 +350,7 @@ def _folder_findings(
                 keystore, path, info
             ):
                 kept_names.append(os.path.relpath(path, root))
-                yield from key_mode_findings(path, info.st_mode)
+                yield from key_mode_findings(keystore, path, info.st_mode)
             else:
                 yield from _stray_file_findings(keystore, path, info, is_original)
     for error in unread:
@@ -412,13 +415,34 @@ def _write_access_findings(
         yield OTHERS_WRITE.found(path, why, path)
 
 
-def key_mode_findings(path: str, mode: int) -> Iterator[Finding]:
+def key_mode_findings(keystore: CheckedKeystore, path: str, mode: int) -> Iterator[Finding]:
     """Yield a finding if others can read a private key, or only root can."""
     text, remedy = f"its mode is {stat.S_IMODE(mode):04o}", f"Run `chmod 600 {quote(path)}`."
     if mode & 0o077:
+        remedy += f" If others may have copied the key, {_how_to_replace_key(keystore, path)}"
         yield KEY_READABLE.found(path, text, path, remedy=remedy)
     elif is_for_root_alone(mode):
         yield UNREADABLE.found(path, f"{text}: only root can read it", path, remedy=remedy)
+
+
+def _how_to_replace_key(keystore: CheckedKeystore, path: str) -> str:
+    """Return, as a clause and a sentence, how to replace the key of an enclave or of a CA."""
+    root, where = quote(os.fspath(keystore.root)), ""
+    if not keystore.looks_like_original:
+        root, where = "KEYSTORE", f" in the {ORIGINAL_KEYSTORE}"
+    folder, *inside, name = Path(os.path.relpath(path, keystore.root)).parts
+    enclave = "/" + "/".join(part for part in inside if not part.startswith(".."))  # a mount
+    if folder == "..":  # sros deletes no key outside of the keystore
+        how = f"replace the CA{where}: `sros rotate_ca {root} --finish`; delete the old key"
+    elif folder == PRIVATE:
+        how = f"replace the CAs{where}: `sros rotate_ca {root} --finish --delete-old-key`"
+    elif folder == RETIRED:
+        how = f"finish the rotation{where}: `sros rotate_ca {root} --status` shows its stage"
+    elif folder == ENCLAVES and name == KEY_FILE and enclave in keystore.names:
+        how = f"replace it{where}: `sros renew {root} {quote(enclave)} --new-key --revoke-old`"
+    else:
+        return "replace it."
+    return f"{how}. Then export the enclaves again, and restart all processes."
 
 
 class _Links:
@@ -503,7 +527,7 @@ def _stray_file_findings(
         yield _unread_path_finding(error, root)
         return
     if holds_key:
-        yield from key_mode_findings(path, info.st_mode)
+        yield from key_mode_findings(keystore, path, info.st_mode)
         if place == PRIVATE or not is_original:
             text = "it contains a private key that belongs to no enclave"
             yield CA_KEY_ON_ROBOT.found(path, text, path)
