@@ -126,19 +126,17 @@ def proofs_of(robot: LocalRobot, state: CloseState, patience: float) -> list[Pro
 
 
 def _proof_of_files(robot: LocalRobot, expired: Sequence[str]) -> Proof:
-    """Return the proof that `check` finds no error in the files that the processes use.
+    """Return the proof that `check` finds no error in the used files, or in the keystore.
 
     The enclaves ``expired`` of the export have expired.
     """
-    place = str(robot.export)
-    status = robot.shell.check(place)
+    status = robot.shell.check(str(robot.export))
     holds = {0: True, 1: False}.get(status)
     reason = "sros check finds no error" if holds else "sros could not check them"
     if expired:
         holds, reason = False, _expired_text(robot, expired)
     elif holds is False:
-        reason = f"{_errors_text(robot)}; then run `{robot.close_command}`, and restart the "
-        reason += "processes"
+        reason = _errors_text(robot, robot.export)
     if holds and robot.keystore.exists():  # an outdated export has no error of its own
         try:
             _, value = robot.shell.read_json((*robot.export_words(), "--dry-run", "--json"))
@@ -157,7 +155,19 @@ def _proof_of_files(robot: LocalRobot, expired: Sequence[str]) -> Proof:
                 reason += f"not; `{robot.close_command}` says how to revoke or keep this"
                 holds = False
     unsigned = _unsigned_policy_text(robot) if status == 0 else ""
-    return Proof("the files are accepted", holds, f"{reason}: {robot.export}{unsigned}")
+    examined = f"{robot.export}"
+    if robot.keystore.exists() and not expired:
+        examined += f" and {robot.keystore}"
+        if status_there := robot.shell.check(str(robot.keystore)):
+            fails = status_there == 1
+            told = (
+                _errors_text(robot, robot.keystore)
+                if fails
+                else "sros could not check the keystore"
+            )
+            reason = told if holds else f"{reason}; {told}"
+            holds = False if fails or holds is False else None
+    return Proof("the files are accepted", holds, f"{reason}: {examined}{unsigned}")
 
 
 def _expired_enclaves(robot: LocalRobot, root: Path) -> list[str]:
@@ -202,16 +212,19 @@ def _unsigned_policy_text(robot: LocalRobot) -> str:
     )
 
 
-def _errors_text(robot: LocalRobot) -> str:
-    """Return how many errors `check` finds in the export, and the first one with its remedy."""
-    words = ("check", str(robot.export), "--fail-on", "error", "--json")
+def _errors_text(robot: LocalRobot, place: Path) -> str:
+    """Return how many errors `check` finds in a keystore or export, and how to mend the first."""
+    words = ("check", str(place), "--fail-on", "error", "--json")
     _, output, _ = robot.shell.run(words, False)
     findings = json.loads(output)["findings"]
     errors = [finding for finding in findings if finding["severity"] == "error"]
     if not errors:  # the files changed since `check` found some
         return "sros check found an error, and then none: run the proof again"
     first = "{file}: {text}. {remedy}".format_map(errors[0]).rstrip(".")
-    return f"sros check finds {counted(len(errors), 'error')}, the first in {first}"
+    text = f"sros check finds {counted(len(errors), 'error')}, the first in {first}"
+    if robot.close_command in text:
+        return text
+    return f"{text}; then run `{robot.close_command}`, and restart the processes"
 
 
 def _proof_of_requirements(robot: LocalRobot) -> Iterator[Proof]:

@@ -446,7 +446,7 @@ def test_a_robot_is_closed_proved_and_opened_again(robot: Robot) -> None:
     assert closed.out.splitlines()[-6:] == [
         "yes: every process was started in its enclave: 2 enclaves, and no open process in "
         "domain 0",
-        "yes: the files are accepted: sros check finds no error: robot/export",
+        "yes: the files are accepted: sros check finds no error: robot/export and robot/keystore",
         "yes: the requirements hold: all of them: robot/requirements.toml",
         "yes: everything that talked can still talk: 2 nodes with 36 endpoints as before "
         "(types are not compared)",
@@ -467,7 +467,7 @@ def test_a_robot_is_closed_proved_and_opened_again(robot: Robot) -> None:
     proved = robot.close("--proof", status=1).out
     assert "no: everything that talked can still talk: denied: /listener subscribe /ch" in proved
     differs = "differs from the signed permissions of /listener, which the processes use: bring"
-    assert f"finds no error: robot/export; 'robot/policy.xml' {differs} the signed" in proved
+    assert f"robot/export; 'robot/policy.xml' {differs} the signed" in proved
     policy.write_text(signed)
     assert "yes: everything that talked can still talk: 2 nodes" in robot.close("--proof").out
     refused = robot.close("--apply", status=2).err
@@ -836,14 +836,24 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     needed.write_text("[[only]]\n")
     assert "[[only]] names no right" in robot.close("--proof", status=2).err
     needed.write_text('[[only]]\npublish = ["/chatter"]\nenclaves = ["/listener"]\n')
-    key.chmod(0o644)
+    ca_key = robot.folder / "robot/keystore/private/identity_ca.key.pem"
+    for readable in (key, ca_key):
+        readable.chmod(0o644)
     ended = robot.close("--proof", status=1)
-    key.chmod(0o600)
+    for readable in (key, ca_key):
+        readable.chmod(0o600)
     named = f"process 4711 (run): the mode of '{key}' is 0644\n"
     assert f"no: every process was started in its enclave: {named}" in ended.out
     assert "no: the files are accepted: sros check finds 1 error, the first in rob" in ended.out
     assert "next: correct the problems above, and ask again with sros close robot --pr" in ended.err
-    assert "`; then run `sros close robot`, and restart the processes: robot/export\n" in ended.out
+    assert (
+        "; sros check finds 1 error, the first in robot/keystore/private/identity_ca" in ended.out
+    )
+    for replace_it in ("renew robot/keystore /talker --new-key --revoke-old", "rotate_ca robot/k"):
+        assert f"If others may have copied the key, replace {replace_it}" in re.sub(
+            "(?<=replace )[^`]*`sros ", "", ended.out
+        )
+    assert "`, and restart all processes: robot/export and robot/keystore\n" in ended.out
     assert (
         "no: the requirements hold: at least one is violated: robot/requirements.toml" in ended.out
     )
@@ -876,8 +886,9 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     policy.write_text(policy.read_text().replace("chatter", "old/chatter", 1))
     ended = robot.close("--proof", "--partial")
     assert (
-        ": robot/export; 'robot/policy.xml' differs from the signed permissions of /listener, "
-        "which the processes use: `sros close robot` checks and signs it\n" in ended.out
+        ": robot/export and robot/keystore; 'robot/policy.xml' differs from the signed "
+        "permissions of /listener, which the processes use: `sros close robot` checks and signs "
+        "it\n" in ended.out
     )
     assert (
         "not checked: every process was started in its enclave: processes: process 9 (?) may be a "
