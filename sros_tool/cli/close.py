@@ -230,6 +230,8 @@ def _show(robot: LocalRobot, closed: CloseState) -> None:
     for why in dict.fromkeys(closed.outdated.values()):
         names = [name for name, other in closed.outdated.items() if other == why]
         echo(f"  restart, because {why} the processes of {enumerated(names)}")
+    for process_text in closed.not_observed:
+        echo(f"  not observed before: {process_text}; if it does not belong there, stop it")
     for name in closed.new:
         why = "has ended" if name in closed.observed.ended else "new"
         start = closed.observed.command_of_new(robot.export.absolute(), name)

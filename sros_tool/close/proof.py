@@ -323,6 +323,8 @@ def _proof_of_processes(running: RunningRobot, number: int) -> Proof:
         texts = [f"{finding.subject}: {finding.text}" for finding in wrong or findings]
         return Proof(_CLAIM_STARTED, False if wrong else None, first_few(texts, MOST_NAMES, "; "))
     guests = "".join(f"; {guest}" for guest in _unexpected_processes(running))
+    if more := running.not_observed():
+        guests += f"; not observed before: {first_few(more, MOST_NAMES)} (stop what is not yours)"
     summary = f"{counted(number, 'enclave')}, and no open process in domain {robot.domain}"
     return Proof(_CLAIM_STARTED, True, f"{summary}{guests}")
 

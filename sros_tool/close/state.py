@@ -181,6 +181,25 @@ class RunningRobot:
             return f"{warning}{_ACCEPTS_REVOKED}"
         return f"{warning}{newer} changed, or got another mode, after the start of"
 
+    def not_observed(self) -> Sequence[str]:
+        """Return the processes in enclaves, as text, that are none of the observed processes.
+
+        Another process with an observed command is one, too. An enclave without an observed process
+        may have one process. Programs of `ros2` and sros do not count.
+        """
+        programs: dict[tuple[str, int], Process] = {}
+        for process, enclave in sorted(self.secured, key=lambda secured: secured.process.started):
+            if enclave.name != OBSERVER and not _is_tool(process):
+                programs.setdefault((enclave.name, process.program[0]), process)
+        count, texts = Counter[tuple[str, Sequence[int]]](), []
+        for (name, _), process in programs.items():
+            known = [known for known in self.robot.processes.processes if known.enclave == name]
+            fitting = tuple(place for place, like in enumerate(known) if like.fits(process))
+            count[name, fitting] += 1
+            if count[name, fitting] > (len(fitting) if known else 1):
+                texts.append(f"{process.label} in {name}")
+        return texts
+
     def with_later_processes(self, observed: ObservedProcesses) -> ObservedProcesses:
         """Return the observed processes with their present commands, and processes of new enclaves.
 
@@ -322,6 +341,9 @@ class CloseState(NamedTuple):
     outdated_pids: Mapping[str, Sequence[int]]
     """The ids of the processes that have to be restarted, by these enclaves, in the order in which
     they should be restarted."""
+    not_observed: Sequence[str]
+    """Processes that run in enclaves of the robot, and are none of the observed processes, or one
+    more with the same command, as "process 123 (talker) in /talker"."""
     new: Sequence[str]
     """The enclaves of the policy without a process: no process of them was observed or runs now."""
     absent: Sequence[str]
@@ -450,6 +472,7 @@ def current_state(robot: LocalRobot, policy: Policy | None) -> CloseState:
             name: [*dict.fromkeys(process.program[0] for process, _ in processes)]
             for name, processes in outdated.items()
         },
+        not_observed=running.not_observed(),
         new=sorted(new),
         absent=sorted(absent - secured.keys()),
         without=robot.without,

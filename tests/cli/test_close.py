@@ -575,6 +575,7 @@ def test_what_systemd_does_not_start_is_done_by_hand(
     robot.absent = {"/talker"}
     robot.more += (replace(robot.more[0], pid=14, command=("/opt/c",)),)
     ended = robot.close()
+    assert "\n  not observed before: process 14 (c) in /talker; if it does not belong" in ended.out
     kept = "runs by a new command; sros keeps the observed command (to replace it, watch "
     assert (
         f"  /talker: {kept}" in ended.out and "sros remembers: cd /opt && /opt/b" not in ended.err
@@ -801,7 +802,13 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     robot.absent = set()
     seven = Process(5, ("guest",), {"ROS_DOMAIN_ID": "7"}, datetime.now(UTC))
     robot.more = (seven, replace(seven, command=("inner",), network="net:[1]"))
-    assert "in domain 0; process 5 (guest) runs open in domain 7\n" in robot.close("--proof").out
+    robot.more += tuple(
+        replace(talker, pid=pid, command=command, started=talker.started + timedelta(pid))
+        for pid, command in ((6, ("/tmp/thief",)), (7, talker.command), (8, ("ros2", "topic")))
+    )
+    more = "; not observed before: process 6 (thief) in /talker, process 7 (run) in /talker ("
+    guest = "in domain 0; process 5 (guest) runs open in domain 7"
+    assert f"{guest}{more}stop what is not yours)\n" in robot.close("--proof").out
     robot.more = ()
     robot.remaining = (TALKER,)
     lost = "no: everything that talked can still talk: "
