@@ -343,7 +343,10 @@ def _show_end(
     for proof in closed.proofs:
         accept = " (--partial accepts this)" if proof.is_accepted_by_partial else ""
         accept = " (accepted: --partial)" if accept and partial else accept
-        echo(f"{_ANSWERS[proof.holds]}: {proof.claim}: {proof.reason}{accept}")
+        answer = _ANSWERS[proof.holds]
+        if proof.holds and proof.denied:
+            answer += ", except for what the policy takes away"
+        echo(f"{answer}: {proof.claim}: {proof.reason}{accept}")
         claims = {proof.claim for proof in closed.proofs}
         if proof.holds and proof.claim == TALK and CONNECTED not in claims:
             echo(_NOT_PROVED)

@@ -6,6 +6,7 @@ import json
 import shlex
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -78,7 +79,7 @@ def prove(robot: LocalRobot) -> CloseState:
     robot.check_rmw()
     state = current_state(robot, robot.read_policy())
     proofs = proofs_of(robot, state, _START_SECONDS)
-    return state._replace(proofs=proofs)
+    return state._replace(proofs=proofs, denied=[*chain(*(proof.denied for proof in proofs))])
 
 
 def proofs_of(robot: LocalRobot, state: CloseState, patience: float) -> list[Proof]:
@@ -441,11 +442,11 @@ def _proof_of_talk(running: RunningRobot, nodes: ObservedNodes, away: Collection
         }
         if not reasons:
             renamed = _renamed_text(nodes, comparison.current, fails=False)
-            return Proof(TALK, True, f"{comparison.summary()}{renamed}")
+            return Proof(TALK, True, f"{comparison.summary()}{renamed}", comparison.denied)
     first, *others = reasons
     texts = f"{reasons[first]}{_remedy(robot, first)}", *(f"also {reasons[why]}" for why in others)
     renamed = _renamed_text(nodes, comparison.current, fails=True)
-    return Proof(TALK, False, f"{'; '.join(texts)}{renamed}")
+    return Proof(TALK, False, f"{'; '.join(texts)}{renamed}", comparison.denied)
 
 
 def _remedy(robot: LocalRobot, difference: str) -> str:
@@ -479,6 +480,11 @@ class _TalkComparison:
         self.current = observation_from_json(audited)
         self._running, self._nodes, self._away, self._audited = running, nodes, away, audited
         self._denied = nodes.denied_rights(nodes.expected(self.current))
+
+    @property
+    def denied(self) -> Sequence[str]:
+        """The rights, as sentences, that the nodes used and the keystore denies."""
+        return [str(right) for right in self._denied]
 
     def differences(self) -> Mapping[str, Sequence[str]]:
         """Return the differences from the open robot, by kind, such as "not seen"."""
@@ -531,7 +537,8 @@ class _TalkComparison:
     def summary(self) -> str:
         """Return text on the comparison, on rights that the policy takes away, and on new nodes."""
         before = self._nodes.nodes_to_compare(self._away)
-        endpoints = len({*_endpoints_of(before.nodes)})
+        as_now = self._nodes.nodes_to_compare(self._away, self.current)
+        endpoints = len({*_endpoints_of(as_now.nodes)} - _denied_endpoints(self._denied))
         text = f"{nodes_text(before.nodes)} with {endpoints} endpoints as before (types are not "
         text += "compared)"
         text += f", without {', '.join(sorted(self._away))}" if self._away else ""
@@ -539,7 +546,7 @@ class _TalkComparison:
             text += f"; the policy takes away {counted(len(denied), 'right')} that the robot used: "
             text += ", ".join(f"{right.right.enclave} {right.right.describe()}" for right in denied)
             lost = _without_counterpart(self._running.robot, [right.right for right in denied])
-            text += f"; {first_few(lost, MOST_NAMES, '; ')}" if lost else ""
+            text += f"; left without a partner: {first_few(lost, MOST_NAMES, '; ')}" if lost else ""
         known = {*map(node_name, before.nodes)}
         with_profile, without_profile = self._nodes.divide_by_profile(self.current.nodes)
         new = sorted(

@@ -307,6 +307,9 @@ class Proof(NamedTuple):
     """Whether the claim holds; null if it could not be tested."""
     reason: str
     """What was seen, or why the claim could not be tested."""
+    denied: Sequence[str] = ()
+    """The rights, as sentences, that the robot used when sros watched, and that the keystore now
+    denies. The claim holds except for these."""
 
     @property
     def fails(self) -> bool:

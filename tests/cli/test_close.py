@@ -312,9 +312,13 @@ def test_a_policy_that_was_changed_stays_and_is_followed(robot: Robot) -> None:
     robot.close()
     robot.remaining = (TALKER, ros_node("listener", "04"))
     said = robot.close("--apply").out
-    assert "(types are not compared); the policy takes away 1 right that the robot used: " in said
-    alone = "/talker may publish /chatter, but no enclave may subscribe to it any more"
-    assert f"used: /listener subscribe topic /chatter; {alone}\n" in said
+    except_for = "yes, except for what the policy takes away: everything that talked can still "
+    assert f"{except_for}talk: 2 nodes with 35 endpoints as before (types are not compared)" in said
+    alone = "left without a partner: /talker may publish /chatter, but no enclave may subscribe to "
+    alone = f"1 right that the robot used: /listener subscribe topic /chatter; {alone}it any more"
+    assert f"; the policy takes away {alone}\n" in said
+    (denied,) = json.loads(robot.close("--proof", "--json").out)["denied"]
+    assert denied.startswith("/listener subscribe topic /chatter (/listener): ")
 
 
 LOST = "robot/export/enclaves/lost"
@@ -1066,9 +1070,9 @@ def test_a_renamed_node_is_compared_and_a_new_one_is_named(
     ghost = ("/", "/", "ghost_node", of, ["publish rt/rosout"])
     robot.remaining = (TALKER, LISTENER, stern_camera, ghost)
     said = robot.close("--apply").out
-    talk = "everything that talked can still talk: "
+    talk = "yes, except for what the policy takes away: everything that talked can still talk: "
     assert (
-        f"yes: {talk}3 nodes with 57 endpoints as before (types are not compared); "
+        f"{talk}3 nodes with 56 endpoints as before (types are not compared); "
         "the policy takes away 1 right that the robot " in said
     )
     assert f"{denied}; new, without a profile: /ghost_node in /listener; compared " in said
@@ -1088,13 +1092,13 @@ def test_a_renamed_node_is_compared_and_a_new_one_is_named(
     with monkeypatch.context() as patched:
         patched.setattr(nodes, "audit", counted_audit)
         said = robot.close("--proof").out
-    assert f"yes: {talk}3 nodes with 57 endpoints as before" in said and f"{renamed}dom (w" in said
+    assert f"{talk}3 nodes with 56 endpoints as before" in said and f"{renamed}dom (w" in said
     assert len(audits) == 2, "one of all possible names, one of the nodes"
     policy.write_text(renamed_alone)
     robot.close()
     robot.remaining = (TALKER, LISTENER, ros_node("nav/stern_camera", of, *moved))
     said = robot.close("--proof", status=1).out
-    assert f"no: {talk}gone: /nav/stern_camera publish /cmd_vel; if the node uses" in said
+    assert f"no: {talk[44:]}gone: /nav/stern_camera publish /cmd_vel; if the node uses" in said
     assert f"{renamed}dom" in said
     copied = re.sub(r'( *<profile ns="/nav" node=")stern(.*?</profile>)', r"\1stern\2\n\1bow\2",
                     policy.read_text(), flags=re.DOTALL)  # fmt: skip
