@@ -579,7 +579,10 @@ def _answer_lines(answer: Answer, why: str) -> Iterator[str]:
     name = answer.enclave.name
     may = f"yes: {name} may" if answer.allowed else f"no: {name} may not"
     documented = ", as documented" if answer.as_documented else ""
-    yield f"{may} {answer.question}, on {answer.vendor.title} ({why}{documented})"
+    domains = answer.enclave.state.domains() if answer.enclave.state else None
+    has_several = domains is not None and domains.only() is None
+    where = f" in domain {answer.domain}" if has_several and answer.question.right else ""
+    yield f"{may} {answer.question}{where}, on {answer.vendor.title} ({why}{documented})"
     yield _labeled_row("why", decision.clause)
     if answer.counts_key:
         yield _labeled_row("key", "missing here; the answer assumes that the process has the key")

@@ -415,7 +415,7 @@ class Answer(NamedTuple):
     """The decision of a DDS vendor on a question.
 
     ``decision`` has the outcome; ``part`` is the endpoint that was decided on, or None for joining.
-    ``grant`` and ``domain_rule`` are the parts of the documents that apply.
+    ``grant`` and ``domain_rule`` are the parts of the documents that apply in the ROS ``domain``.
 
     `sros_tool.explain.explanation` fills in the other fields.  ``lines`` are the lines of the
     policy file from which the deciding rule comes, and ``provenance`` says whether the permissions
@@ -436,6 +436,7 @@ class Answer(NamedTuple):
     """Faults that keep the vendor from loading the enclave."""
     grant: Grant | None = None
     domain_rule: DomainRule | None = None
+    domain: int = 0
     until: datetime | None = None
     """The earliest expiry of the enclave's files, in UTC, or null."""
     until_file: str = ""
@@ -747,6 +748,7 @@ class Evaluator:
             problems=self._participant.problems,
             grant=grant,
             domain_rule=self._domain_rule(),
+            domain=self.context.domain,
             until=self._until,
             until_file=self._until_file,
         )

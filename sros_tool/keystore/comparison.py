@@ -120,7 +120,11 @@ def compare_governance(old: Governance, new: Governance) -> tuple[SettingChange,
 def _governance_changes(old: Governance, new: Governance) -> Iterator[SettingChange]:
     before, after = old.domains().closed(), new.domains().closed()
     for effect, domains, meaning in (
-        (Effect.LOOSER, _remaining_domains(after, before), "enclaves may also join domain {}"),
+        (
+            Effect.LOOSER,
+            _remaining_domains(after, before),
+            "enclaves may also join domain {}, unless their permissions are for other domains only",
+        ),
         (
             Effect.TIGHTER,
             _remaining_domains(before, after),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import http.client
+import re
 import socket
 import ssl
 import subprocess
@@ -21,6 +22,7 @@ from sros_tool.keystore.confirmation import MAX_BYTES, MESSAGE_FILE
 from tests.support.harness import policy_text, publish, sros
 from tests.support.messages import said_by, signed_message
 from tests.support.nginx import NGINX, certify_server, nginx_of_page
+from tests.support.pages import PROJECT
 
 pytestmark = pytest.mark.skipif(not Path(NGINX).exists(), reason="nginx is needed")
 
@@ -172,6 +174,29 @@ def test_a_robot_reads_what_is_published_and_writes_nothing_there(
     assert server.ask("r1", "GET", "/pub/") == 403, "nothing is listed"
     with pytest.raises(SrosError):
         fetch_release(tmp_path, f"{server.address}/pub", "r1", now=now, tls_ca=server.tls_ca)
+
+
+def test_the_robot_that_a_subject_names() -> None:
+    """The map of the page, for subjects as nginx writes them."""
+    page = (PROJECT / "docs/fetching.md").read_text()
+    (written,) = re.findall(r'"~(\^.*CN=.*\$)" \$name;', page)
+    expression = re.compile(written.replace("(?<", "(?P<").removesuffix("$") + r"\Z")
+    unique = "0123456789abcdef"
+    for subject, robot in {
+        "CN=/r1/base": "r1",
+        "CN=/office1": "office1",
+        f"OU={unique},CN=/r1/arm/left": "r1",
+        f"CN=/office1,OU={unique}": "office1",
+        "CN=/r1/": None,
+        "CN=/": None,
+        "CN=r1": None,
+        "CN=/r2,CN=/r1": None,
+        "CN=/r2/x,O=/r1": None,
+        "CN=/r1.base": None,
+        "CN=/r1\n/base": None,
+    }.items():
+        found = expression.search(subject)
+        assert (found and found["name"]) == robot, subject
 
 
 def test_who_has_no_certificate_of_the_keystore(server: Server) -> None:

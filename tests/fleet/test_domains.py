@@ -81,6 +81,11 @@ def test_who_may_do_it_in_which_domain(halls: Path) -> None:
         "/f01/guard",
         "1 of 8 enclaves may publish topic /hall/estop in domain 10",
     ]
+    for domain, enclave in (("10", "/f01/guard"), ("20", "/f02/guard")):
+        for words in ((), ("--domain", domain)):
+            asked = sros("explain", "ks", enclave, "publish", "/hall/estop", *words, cwd=halls)
+            named = f"yes: {enclave} may publish topic /hall/estop in domain {domain}, on "
+            assert asked.ok().out.startswith(named), asked
     assert said("/plan") == ["/desk", "1 of 8 enclaves may publish topic /plan"]
     router = "/router  in domain 10,20"
     assert said("/hall/estop", "--vendor", "zenoh")[:-1] == [*guards, router]

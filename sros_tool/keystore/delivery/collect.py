@@ -793,7 +793,9 @@ class _Renewals:
         if robot.renewal != RENEWAL_ALLOWED:
             return (
                 "not_allowed",
-                f'the fleet file does not say renewal = "allowed" for {robot.name}',
+                'the keystore\'s copy of the fleet file does not say renewal = "allowed" for '
+                f"{robot.name}. If your file says it: `sros generate_artifacts -k "
+                f"{quote(str(self._keystore.root))} -p POLICY_FILE --fleet FILE`",
             )
         if not same_key and message.enclave != name:
             raise _RefusedError(
