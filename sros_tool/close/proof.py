@@ -65,6 +65,7 @@ from sros_tool.runtime.variables import ENCLAVE
 from sros_tool.wording import counted, enumerated, first_few
 
 _CLAIM_STARTED = "every process was started in its enclave"
+_CLAIM_REQUIRED = "the requirements hold"
 
 _START_SECONDS = 3.0
 """How long processes that were restarted by hand may take until they run in their enclaves."""
@@ -119,7 +120,7 @@ def proofs_of(robot: LocalRobot, state: CloseState, patience: float) -> list[Pro
     return [
         proof,
         _proof_of_files(robot, expired),
-        *_proof_of_requirements(robot),
+        _proof_of_requirements(robot),
         talk,
         *_proof_of_connections(robot),
         silence,
@@ -228,14 +229,15 @@ def _errors_text(robot: LocalRobot, place: Path) -> str:
     return f"{text}; then run `{robot.close_command}`, and restart the processes"
 
 
-def _proof_of_requirements(robot: LocalRobot) -> Iterator[Proof]:
-    """Yield the proof that the requirements hold for the enclaves that the processes use.
+def _proof_of_requirements(robot: LocalRobot) -> Proof:
+    """Return the proof that the requirements hold for the enclaves that the processes use.
 
     They are also decided for the enclaves of the keystore (or policy) if processes run on other
     machines, or a requirement names an enclave that the export does not have.
     """
     if not robot.requirements.exists():
-        return
+        missing = f"{robot.requirements} is missing; restore it, or run `{robot.close_command}`, "
+        return Proof(_CLAIM_REQUIRED, None, f"{missing}which writes the requirements that hold now")
     needed = ("--requirements", str(robot.requirements), "--include", "requirement.*")
     statuses = [robot.shell.check(str(robot.export), *needed)]
     if robot.not_here or (statuses != [2] and _demands_more_enclaves(robot)):
@@ -243,7 +245,7 @@ def _proof_of_requirements(robot: LocalRobot) -> Iterator[Proof]:
     status = 1 if 1 in statuses else max(statuses)
     reasons = {0: "all of them", 1: "at least one is violated", 2: "sros could not check them"}
     holds = {0: True, 1: False}.get(status)
-    yield Proof("the requirements hold", holds, f"{reasons[status]}: {robot.requirements}")
+    return Proof(_CLAIM_REQUIRED, holds, f"{reasons[status]}: {robot.requirements}")
 
 
 def _demands_more_enclaves(robot: LocalRobot) -> bool:
