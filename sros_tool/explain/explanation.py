@@ -161,6 +161,8 @@ _FAULT_OF_REASON: dict[str, str | Fault] = {
 }
 """Reason of a denial that no change of the policy can resolve → the fault, or a remedy."""
 
+_NOT_VALID_NOW = ("expired", "not-yet-valid")
+"""Reasons of a denial that only the validity of the grant causes."""
 _VALIDITY_FAULTS = (Fault.PERMISSIONS_EXPIRED, Fault.PERMISSIONS_NOT_YET_VALID)
 _GOVERNANCE_FAULTS = (Fault.GOVERNANCE_MALFORMED, Fault.GOVERNANCE_DOMAIN)
 
@@ -295,7 +297,7 @@ def _present_rights(policy: Enclave | None, name: str, answer: Answer) -> set[Ri
     rights: Iterable[Right] = ()
     if policy:
         rights = (r for profile in policy.all_profiles() for r in profile_rights(name, profile))
-    elif answer.grant:
+    else:
         rights = _granted_rights(name, answer)
     return {right for right in rights if right.kind != "dds"}
 
@@ -354,11 +356,15 @@ def _node_names(policy: Enclave | None, answer: Answer) -> Iterator[tuple[str, s
 
 
 def _granted_rights(name: str, answer: Answer) -> Iterator[Right]:
-    """Yield the rights in the grant of an enclave."""
+    """Yield the rights in the grant of an enclave, even if the grant is not valid now."""
     from sros_tool.translate import grant_rights  # only denied questions need it
 
-    if answer.grant:
-        yield from grant_rights(name, answer.grant)
+    grant, enclave = answer.grant, answer.enclave
+    if answer.reason in _NOT_VALID_NOW:
+        with suppress(SrosError):
+            grant = parse_permissions(enclave.permissions).grant_of(enclave.subject)
+    if grant:
+        yield from grant_rights(name, grant)
 
 
 _LEAST_SIMILARITY = 0.9

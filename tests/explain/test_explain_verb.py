@@ -229,7 +229,16 @@ def test_expired_at_a_moment_to_come(whole: Path) -> None:
     assert told["until_file"] == "cert.pem" or told["until_file"] == "permissions.p7s"
     assert explain(*asked, "--at", told["until"].replace("2036", "2035")).status == 0
     late = explain(*asked, "--at", "20y")
-    assert late.status == 1 and "expired at" in late.out and "sros ren" in late.out + "sros ren"
+    assert late.status == 1 and "expired" in late.out and "`sros renew" in late.out
+
+
+def test_an_expired_right_is_renewed_and_not_added(keystore: Path) -> None:
+    """Twin: a right that the expired permissions lack is also missing in the policy."""
+    BREAKAGES["permissions expired"](Enclave(keystore))
+    for name, is_there in (("/chatter", True), ("/other", False)):
+        said = explain(keystore, ENCLAVE, "publish", name).out
+        assert f"grant '{ENCLAVE}' expired at " in said
+        assert ("sros renew" in said, "merge_policy" in said) == (is_there, not is_there), said
 
 
 def test_a_clock_in_the_first_year(whole: Path, monkeypatch: pytest.MonkeyPatch) -> None:
