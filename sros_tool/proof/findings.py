@@ -411,15 +411,17 @@ def _violation_finding(violation: Violation) -> Finding:
 
 def _edit_text(violation: Violation) -> str:
     """Return a sentence on the edit that makes a requirement accept its violation, or ""."""
-    requirement = violation.requirement
+    requirement, steps, effect = violation.requirement, violation.steps, ""
     match requirement:
         case Only(enclaves=listed):
             key, enclaves = "enclaves", [violation.steps[0].use.enclave, *violation.alike]
             enclaves += [steps[0].use.enclave for steps in violation.differing]
         case Apart(through=listed, sources=sources):
-            key, enclaves = "through", [violation.steps[-2].use.enclave]
+            # The narrowest exception: the first enclave that passes on what the source sends.
+            key, enclaves = "through", [steps[2 if len(steps) > 2 else 0].use.enclave]
             if enclaves[0] in sources:  # the source would no longer be kept apart from anything
                 return ""
+            effect = f"; it then passes on all that reaches {enclaves[0]}" * (len(steps) > 2)
         case _:
             return ""
     if not requirement.as_written or any(name.startswith(EXCEPT) for name in listed):
@@ -428,7 +430,7 @@ def _edit_text(violation: Violation) -> str:
     return (
         "Change the policy at the named lines; or, if this is wanted, add "
         f"{first_few(quoted, _MOST_SHOWN)} to `{key}` of the requirement at "
-        f"{place.file}:{place.line}."
+        f"{place.file}:{place.line}{effect}."
     )
 
 

@@ -151,6 +151,18 @@ def test_in_short_a_violation_says_who_breaks_it_by_what() -> None:
             'add "/b" to `through` of the requirement at r.toml:1.',
             '"/d"',
         ),
+        (
+            {
+                "/web": may("publish", "/x"),
+                "/nav": may("subscribe", "/x") + may("publish", "/y"),
+                "/mux": may("subscribe", "/y") + may("publish", "/z"),
+                "/base": may("subscribe", "/z"),
+            },
+            '[[apart]]\nfrom = ["/web"]\nto = ["/base"]\nthrough = ["/d"]\n',
+            'add "/nav" to `through` of the requirement at r.toml:1; it then passes on all that '
+            "reaches /nav.",
+            '"/d"',
+        ),
     ],
 )
 def test_after_the_edit_that_a_finding_names_the_requirement_holds(
