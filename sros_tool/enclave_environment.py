@@ -66,7 +66,7 @@ def loadable_environment(
     environment: Mapping[str, str],
     now: datetime,
     zone: tzinfo,
-    accept_key: bool = False,
+    accept_key: bool | None = None,
     target: Path | None = None,
 ) -> EnclaveEnvironment:
     """Return the environment of an enclave after checking that a process can run in it.
@@ -79,7 +79,8 @@ def loadable_environment(
         environment: the variables of the process as they are.
         now: the current time.
         zone: the time zone of this machine.
-        accept_key: accept a private key, or the PIN of its token, that other users can read.
+        accept_key: accept a private key, or the PIN of its token, that other users can read; None
+            if the verb has no option for this.
         target: the absolute path of the keystore where the process will run; None stands for this
             machine. A key that was made on the other machine need not be on this one.
 
@@ -146,15 +147,16 @@ def loadable_environment(
             "; ".join(str(problem).rstrip(".") for problem in problems) + ".",
             " ".join(dict.fromkeys(filter(None, remedies))),
         )
+    how_to_accept = "" if accept_key is None else _ACCEPT_ADVICE
     if state.token:
         _check_token_used(state.token, name, used)
         if not (accept_key or target):
-            _check_pin(state.token, name)
+            _check_pin(state.token, name, how_to_accept)
     elif not accept_key and not (target and state.key_on_robot):
-        _check_key_closed(folder / KEY_FILE, keystore, name)
+        _check_key_closed(folder / KEY_FILE, keystore, name, how_to_accept)
     if not target:
         if not accept_key:
-            _check_folders_closed(keystore, folder, name)
+            _check_folders_closed(keystore, folder, name, how_to_accept)
         if not zenoh:
             vendor = shipped_vendor(used, environment) or vendor_here(environment)[0]
             _check_dates_here(name, keystore, vendor, JoinContext(domain, now, zone))
@@ -194,7 +196,10 @@ def loadable_environment(
     return EnclaveEnvironment(variables, notes, needs_pin=not state.token.pin_source)
 
 
-def _check_key_closed(key: Path, keystore: OpenedKeystore, name: str) -> None:
+_ACCEPT_ADVICE = " To run it nevertheless, add --accept-readable-key."
+
+
+def _check_key_closed(key: Path, keystore: OpenedKeystore, name: str, how_to_accept: str) -> None:
     """Raise `KeystoreError` if users other than the owner can read the enclave's private key."""
     mode = stat.S_IMODE(key.stat().st_mode)
     if mode & 0o077:
@@ -203,12 +208,13 @@ def _check_key_closed(key: Path, keystore: OpenedKeystore, name: str) -> None:
             f"others can read the private key of enclave {name}",
             f"The mode of '{key}' is {mode:04o}: whoever has read the key can act as the enclave.",
             f"Run `chmod 600 {quote(str(key))}`. If others had access, give the enclave another "
-            f"key. {remedy_in_keystore(keystore.root, renew)} To run it nevertheless, add "
-            "--accept-readable-key.",
+            f"key. {remedy_in_keystore(keystore.root, renew)}{how_to_accept}",
         )
 
 
-def _check_folders_closed(keystore: OpenedKeystore, folder: Path, name: str) -> None:
+def _check_folders_closed(
+    keystore: OpenedKeystore, folder: Path, name: str, how_to_accept: str
+) -> None:
     """Raise `KeystoreError` if other users can write to the enclave's folders."""
     trusted = frozenset({0, os.geteuid(), keystore.root.stat().st_uid})
     for path in (folder, *folder.parents):
@@ -217,7 +223,7 @@ def _check_folders_closed(keystore: OpenedKeystore, folder: Path, name: str) -> 
                 f"others can replace the files of enclave {name}",
                 f"'{path}': {why}. Whoever replaces files decides whom the process trusts.",
                 f"Run `chmod go-w {quote(str(path))}`, then `sros verify "
-                f"{quote(str(keystore.root))}`. To run it nevertheless, add --accept-readable-key.",
+                f"{quote(str(keystore.root))}`.{how_to_accept}",
             )
         if path == keystore.root:
             return
@@ -301,7 +307,7 @@ def _check_token_used(place: TokenUri, name: str, rmw: str) -> None:
         )
 
 
-def _check_pin(place: TokenUri, name: str) -> None:
+def _check_pin(place: TokenUri, name: str, how_to_accept: str) -> None:
     """Raise `KeystoreError` if other users can read a token's PIN file, or this user cannot."""
     from sros_tool.pki.token import pin_file_problem
 
@@ -309,7 +315,7 @@ def _check_pin(place: TokenUri, name: str) -> None:
         raise KeystoreError(
             f"the PIN for the key of enclave {name} is missing or not protected",
             f"{problem[:1].upper()}{problem[1:]}.",
-            "To run it nevertheless, add --accept-readable-key.",
+            how_to_accept.lstrip(),
         )
 
 

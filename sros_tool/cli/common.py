@@ -692,7 +692,7 @@ def enclave_environment(
     domain: str | None = None,
     rmw: str | None = None,
     *,
-    accept_key: bool = False,
+    accept_key: bool | None = None,
     target: Path | None = None,
 ) -> EnclaveEnvironment:
     """Return the environment of an enclave, after checking that a process can start in it now."""
