@@ -648,12 +648,14 @@ def _to_do_lines(answer: Answer) -> Iterator[str]:
 def _requirements_forbidding(answer: Answer) -> Sequence[Requirement]:
     """Return the requirements that forbid the change.
 
-    They are next to the keystore of a closed robot.
+    They are next to the keystore, or the policy, of a closed robot.
     """
     from sros_tool.keystore.layout import folder_of_closed_robot
 
-    root, change = answer.enclave.root, answer.change
-    robot = folder_of_closed_robot(root) if root else None
+    policy, place, change = answer.enclave.policy, answer.enclave.root, answer.change
+    if policy and not place:
+        place = Path(policy.source.file)
+    robot = folder_of_closed_robot(place) if place else None
     if not (robot and change and change.document) or answer.enclave.has_placeholders:
         return ()
     from sros_tool.close.rights import requirements_broken_by

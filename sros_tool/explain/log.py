@@ -1090,9 +1090,9 @@ class _Examiner:
         if is_used is False and self._keystore:
             place = self._keystore.place
             return [f"no enclave of the {place} may {PEER_RIGHT[denied.right]} {name}"], (
-                "If another name is meant, the node perhaps lacks a remapping: compare its command "
-                "with the one that the robot starts (after `sros close`: start/commands.txt). "
-                f"Otherwise, {remedy}{renamed or new_name}"
+                "If another name is meant, the node perhaps lacks a remapping, or has a wrong one: "
+                "compare its command with the one that the robot starts (after `sros close`: "
+                f"start/commands.txt). Otherwise, {remedy}{renamed or new_name}"
             )
         newer = "Perhaps the node is newer than its policy: "
         return [], f"{newer}{remedy}{renamed}" if renamed else f"{remedy}{new_name}"

@@ -534,9 +534,11 @@ def test_what_systemd_does_not_start_is_done_by_hand(
     elsewhere = sros("env", root, "/talker", "--domain", "5", cwd=robot.folder).err
     add = "add the domain to its keystore, with `sros update_keystore robot/keystore --domain 0,5"
     assert add in elsewhere
-    denied = sros("explain", root, "/listener", "publish", "/chatter", cwd=robot.folder).out
     forbids = r"robot/requirements\.toml:\d+ forbids this: only /talker may publish /chatter\n$"
-    assert re.search(forbids, denied) and "allow.xml" not in denied
+    for source in (root, "robot/policy.xml"):
+        asked = "explain", source, "/listener", "publish", "/chatter"
+        denied = sros(*asked, cwd=robot.folder).out
+        assert re.search(forbids, denied) and "allow.xml" not in denied, source
     robot.by_hand = {"/talker"}
     ended = robot.close()
     assert "/talker: process 4711: closed\n" in ended.out

@@ -1302,7 +1302,10 @@ def test_the_other_side_of_a_name_tells_whether_a_remapping_may_be_forgotten(
         ("/frnt/image", ("-r /frnt/image:=/front/image",)),
         (
             "/odometry",
-            ("no enclave of the keystore may publish /odometry\n", "perhaps lacks a remapping: "),
+            (
+                "no enclave of the keystore may publish /odometry\n",
+                "perhaps lacks a remapping, or has a wrong one: ",
+            ),
         ),
     ):
         log.write_text(f"rt{topic} topic not found in allow rule. check_create_datareader\n")
@@ -1320,7 +1323,7 @@ def test_the_other_side_of_a_name_tells_whether_a_remapping_may_be_forgotten(
     sros("distribute_key", keystore, "/weed", export).ok()
     found = sros("explain", export, "--log", log, "/weed").out
     assert "no enclave of the export may publish /odometry\n" in found
-    assert "perhaps lacks a remapping: " in found
+    assert "perhaps lacks a remapping, or has a wrong one: " in found
     (keystore / "enclaves/camera/permissions.p7s").write_text("damaged")
     found = sros("explain", keystore, "/weed", "--log", log).out
     assert "no enclave" not in found  # nothing follows for the name
