@@ -153,10 +153,10 @@ def loadable_environment(
         if not (accept_key or target):
             _check_pin(state.token, name, how_to_accept)
     elif not accept_key and not (target and state.key_on_robot):
-        _check_key_closed(folder / KEY_FILE, keystore, name, how_to_accept)
+        _refuse_key_readable_by_others(folder / KEY_FILE, keystore, name, how_to_accept)
     if not target:
         if not accept_key:
-            _check_folders_closed(keystore, folder, name, how_to_accept)
+            _refuse_folders_writable_by_others(keystore, folder, name, how_to_accept)
         if not zenoh:
             vendor = shipped_vendor(used, environment) or vendor_here(environment)[0]
             _check_dates_here(name, keystore, vendor, JoinContext(domain, now, zone))
@@ -199,7 +199,9 @@ def loadable_environment(
 _ACCEPT_ADVICE = " To run it nevertheless, add --accept-readable-key."
 
 
-def _check_key_closed(key: Path, keystore: OpenedKeystore, name: str, how_to_accept: str) -> None:
+def _refuse_key_readable_by_others(
+    key: Path, keystore: OpenedKeystore, name: str, how_to_accept: str
+) -> None:
     """Raise `KeystoreError` if users other than the owner can read the enclave's private key."""
     mode = stat.S_IMODE(key.stat().st_mode)
     if mode & 0o077:
@@ -212,7 +214,7 @@ def _check_key_closed(key: Path, keystore: OpenedKeystore, name: str, how_to_acc
         )
 
 
-def _check_folders_closed(
+def _refuse_folders_writable_by_others(
     keystore: OpenedKeystore, folder: Path, name: str, how_to_accept: str
 ) -> None:
     """Raise `KeystoreError` if other users can write to the enclave's folders."""
@@ -653,7 +655,10 @@ def container_text(
 
 
 def _check_mounted(keystore: OpenedKeystore, enclave: str, target: Path) -> None:
-    """Raise `KeystoreError` if mounting the enclave's folder would also mount other enclaves."""
+    """Raise `KeystoreError` if a container cannot use the mounted folder of an enclave.
+
+    The folder has other enclaves below it, or links to other files of the keystore.
+    """
     from sros_tool.keystore.layout import enclaves_below
 
     export = f"`sros distribute_key {quote(str(keystore.root))} {quote(enclave)} DIR`"

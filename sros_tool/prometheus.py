@@ -30,7 +30,7 @@ class Metric:
     """A Prometheus gauge with its help text and its samples.
 
     Raises:
-        ValueError: a name is not of lower-case letters, digits and ``_``.
+        ValueError: a name has other characters than lower-case letters, digits and ``_``.
     """
 
     name: str

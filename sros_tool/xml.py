@@ -94,26 +94,26 @@ def _stat_and_read(path: Path, max_bytes: int) -> tuple[os.stat_result, bytes]:
     The content is empty for anything but a regular file, such as a pipe that just replaced the
     file.
     """
-    handle = _handle_at_once(path)
+    descriptor = _nonblocking_descriptor(path)
     try:
-        state = os.fstat(handle)
+        state = os.fstat(descriptor)
         if not stat.S_ISREG(state.st_mode):
             return state, b""
         parts, left = [], max_bytes + 1
-        while left and (part := os.read(handle, min(left, max(state.st_size + 1, 4096)))):
+        while left and (part := os.read(descriptor, min(left, max(state.st_size + 1, 4096)))):
             parts.append(part)
             left -= len(part)
         return state, b"".join(parts)
     finally:
-        os.close(handle)
+        os.close(descriptor)
 
 
-def open_at_once(path: Path) -> BinaryIO:
+def open_without_waiting(path: Path) -> BinaryIO:
     """Open a file for reading without waiting, even a pipe without a writer."""
-    return open(_handle_at_once(path), "rb")
+    return open(_nonblocking_descriptor(path), "rb")
 
 
-def _handle_at_once(path: Path) -> int:
+def _nonblocking_descriptor(path: Path) -> int:
     return os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
 
 

@@ -947,7 +947,7 @@ def _other_keystore_findings(
 
 
 def other_folder_findings(processes: Iterable[Process], folder: Path) -> Iterator[Finding]:
-    """Yield a finding for each process in an enclave of ``folder`` with files of another folder."""
+    """Yield a finding for each process: it loaded its enclave from elsewhere than ``folder``."""
     for process in processes:
         assert process.enclave
         root = _plain_path(process.enclave.keystore)

@@ -79,7 +79,7 @@ DEFAULT_ALLOW = FindingKind(
     "A query or a put with a wildcard bypasses a deny rule, and if a process matches two subjects, "
     "a name is denied only if both subjects deny it.",
     _TESTED_SOURCE,
-    'Write "default_permission": "deny", and rules that allow.',
+    'Write "default_permission": "deny", and use only allow rules.',
 )
 NOTHING_ALLOWED = FindingKind(
     "zenoh.nothing-allowed",
@@ -93,7 +93,7 @@ NOTHING_ALLOWED = FindingKind(
 EVERYBODY = FindingKind(
     "zenoh.subject-of-everybody",
     ERROR,
-    "a subject without a name",
+    "a subject that applies to everybody",
     "A subject matches any value of a property that it does not state. Interfaces and protocols "
     "are not identities, and a process chooses its own zid. So the rules apply to everyone who "
     "gets a connection.",
@@ -125,7 +125,7 @@ DENY_OVERRULED = FindingKind(
     "a deny rule without effect, because another subject of the access control allows the name",
     "If a process matches two subjects, one of them is enough to allow a message.",
     "Zenoh 1.6.2 and 1.10.2, tested.",
-    "Use one subject for each name, and rules that allow.",
+    "Put each certificate common name into one subject only, and use only allow rules.",
 )
 OVERLAPPING = FindingKind(
     "zenoh.overlapping-subjects",
@@ -135,7 +135,7 @@ OVERLAPPING = FindingKind(
     "one "
     "subject only.",
     "Zenoh 1.5.1 (issue 2137 of zenoh) and 1.10.2, tested.",
-    "Use one subject for each name.",
+    "Put each certificate common name into one subject only.",
 )
 UNUSED = FindingKind(
     "zenoh.unused",
@@ -320,7 +320,7 @@ def _router_name_findings(document: ConfigurationDocument) -> Iterator[Finding]:
     ]
     access = document.access
     if unverified and (
-        not access.enabled or access.allows_by_default or _allowing_subjects_without_name(document)
+        not access.enabled or access.allows_by_default or _allowing_subjects_of_everybody(document)
     ):
         text = f"verify_name_on_connect is off for {unverified[0].text}"
         yield _finding_at(document, NAME_NOT_VERIFIED, f"{_TLS}/verify_name_on_connect", text)
@@ -368,8 +368,8 @@ def _rule_findings(document: ConfigurationDocument) -> Iterator[Finding]:
         yield UNUSED.found(name, f"no policy names {name}", document.name, line)
 
 
-def _allowing_subjects_without_name(document: ConfigurationDocument) -> list[AclSubject]:
-    """Return the subjects without a name that have a rule that allows something."""
+def _allowing_subjects_of_everybody(document: ConfigurationDocument) -> list[AclSubject]:
+    """Return the subjects that apply to everybody, and have an allow rule."""
     access = document.access
     return [
         subject
@@ -381,13 +381,13 @@ def _allowing_subjects_without_name(document: ConfigurationDocument) -> list[Acl
 
 def _subject_findings(document: ConfigurationDocument) -> Iterator[Finding]:
     access = document.access
-    open_to_all = _allowing_subjects_without_name(document)
+    open_to_all = _allowing_subjects_of_everybody(document)
     if open_to_all and is_self_limiting(document):
-        text = f"no subject has a name: {_ids_text(open_to_all)}"
+        text = f"no subject states certificate common names: {_ids_text(open_to_all)}"
         yield SELF_LIMITING.found(document.mode.value, text, document.name, open_to_all[0].line)
     else:
         for subject in open_to_all:
-            text = f"subject {subject.id} has {_described_subject(subject)}, and rules that allow"
+            text = f"subject {subject.id} has {_described_subject(subject)}, and allow rules"
             yield EVERYBODY.found(f"subject {subject.id}", text, document.name, subject.line)
     pairs = list(islice(_overlapping_subjects(access.subjects), _MOST_PAIRS + 1))
     if pairs:

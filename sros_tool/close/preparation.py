@@ -340,7 +340,7 @@ def _problems_of(robot: LocalRobot, state: CloseState, *, partial: bool) -> Iter
 
 
 def _copy_problems(running: RunningRobot) -> Iterator[str]:
-    """Yield a text for each process in an enclave of the export with files of another folder."""
+    """Yield a problem for each process that loaded an enclave of the export from elsewhere."""
     export = running.robot.export.absolute()
     copies = (
         process

@@ -233,11 +233,14 @@ class RunningRobot:
             if not (is_in_domain(process, robot.domain) or process.network or process.is_daemon):
                 domains.setdefault(process.domain, []).append(process.label)
         close = "sros close ANOTHER_FOLDER" if robot.observed else robot.close_command
-        return "; ".join(
-            f"in domain {domain}, not {robot.domain}: {first_few(labels, MOST_NAMES)}; "
-            f"to close that, {close} --domain {domain}"
-            for domain, labels in sorted(domains.items())
-        )
+        texts = []
+        for domain, labels in sorted(domains.items()):
+            runs, these = ("runs", "it") if len(labels) == 1 else ("run", "them")
+            texts.append(
+                f"{first_few(labels, MOST_NAMES)} {runs} in domain {domain}, not in "
+                f"{robot.domain}; to close {these}, run `{close} --domain {domain}`"
+            )
+        return "; ".join(texts)
 
 
 def wait_until(

@@ -60,8 +60,8 @@ def note_on_earlier_permissions(
         text = (
             f"the rights in earlier permissions of {first_few(names, 3)} are not known here: they "
             "were signed from another policy. Whoever kept these permissions and the key has the "
-            f"rights until {max(ends.values())}. To end that, run `sros renew {root} {which} "
-            "--revoke-old`."
+            f"rights until {max(ends.values())}. To end these rights, run `sros renew {root} "
+            f"{which} --revoke-old`."
         )
         yield Note("explain.earlier-permissions", text)
 

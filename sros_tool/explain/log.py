@@ -569,7 +569,7 @@ def _meaning_of(line: str, rest: str) -> tuple[LogText, re.Match[str] | None]:
     """Return the meaning of a line, and its match, if any; ``rest`` is the line without label."""
     if meaning := matching_zenoh_text(line):
         return meaning
-    if ZENOH_LINE.search(rest):  # other lines of Zenoh are no security problem
+    if ZENOH_LINE.search(rest):  # other lines of Zenoh's log are no security problem
         return UNKNOWN, None
     if meaning := matching_text(line):
         return meaning

@@ -236,7 +236,8 @@ def check_choice(policies: Sequence[FleetPolicy], fleet: Fleet, robots: Collecti
         if not has_enclave:
             raise PolicyError(
                 f"the policies have no enclave for the robot {name}",
-                "No path with a placeholder is for all robots, or for a group of this robot.",
+                "They have neither an enclave path with {robot}, nor one with {robot:GROUP} for a "
+                "group of this robot.",
                 "Choose another robot, correct the robot's groups in the fleet file, or name the "
                 "policy that has its enclaves.",
             )

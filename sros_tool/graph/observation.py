@@ -243,8 +243,9 @@ class GraphObserver(Protocol):
 def report_graph(observer: GraphObserver, report: Any, period: float, *, ordered: bool) -> None:
     """Report the graph after each change until standard input is closed.
 
-    A changed graph is read again soon, because a node that is not complete yet may leave.
-    ``ordered`` says that the nodes are listed by ascending participant.
+    After a change, the graph is read again immediately, not after ``period`` seconds: a node may
+    not show all its endpoints yet, and may exit before the next regular reading.  ``ordered`` says
+    that the nodes are listed by ascending participant.
     """
     before: object = None
     while True:

@@ -340,7 +340,7 @@ def _settings_changes(old: Template, new: Template, now: datetime) -> Iterator[S
             yield SettingChange(effect, key, first, second, words[effect is Effect.TIGHTER])
     yield from _zenoh_changes(old.zenoh, new.zenoh)
     rotated = "applies to the CAs that `sros rotate_ca` makes"
-    listed = "applies to the next revocation list, also of `sros crl --refresh`"
+    listed = "applies to the next revocation list that is signed, also by `sros crl --refresh`"
     for key, first, second, meaning in (
         (
             "authorities.validity",

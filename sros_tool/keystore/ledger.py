@@ -58,7 +58,7 @@ from sros_tool.keystore.layout import (
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import digest, subject_text, validity_of
 from sros_tool.validity import Window, elapsed, iso, parse_iso
-from sros_tool.xml import open_at_once, read_bytes
+from sros_tool.xml import open_without_waiting, read_bytes
 
 if TYPE_CHECKING:
     from sros_tool.keystore.ledger_index import IndexUpdate, LedgerIndex, Posting
@@ -770,7 +770,7 @@ class LedgerFile:
         path = self.root / name
         try:
             if self._follow_link:
-                return _check_regular(open_at_once(path))
+                return _check_regular(open_without_waiting(path))
             from sros_tool.folders import Folder  # reading alone does not import modules that write
 
             with Folder(self.root) as folder:

@@ -29,8 +29,8 @@ from sros_tool.errors import PkiError
 from sros_tool.pki import der, tolerant
 from sros_tool.pki import pem as pem_file
 from sros_tool.pki.distinguished_names import (
+    check_name_readable,
     may_be_read_error,
-    read_name,
     reading,
     same_name,
     short_names,
@@ -384,7 +384,7 @@ def _read_in_full(certificate: x509.Certificate) -> x509.Certificate:
 
 def _read_names(certificate: x509.Certificate) -> x509.Certificate:
     for name in (certificate.subject, certificate.issuer):
-        read_name(name)
+        check_name_readable(name)
         subject_text(name)
     validity_of(certificate)  # raises an error if the certificate expires before it begins
     return certificate

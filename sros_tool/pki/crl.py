@@ -28,8 +28,8 @@ from sros_tool.pki.certificates import (
 )
 from sros_tool.pki.distinguished_names import (
     canonical,
+    check_name_readable,
     may_be_read_error,
-    read_name,
     reading,
     same_name,
 )
@@ -224,7 +224,7 @@ def _load_list(content: bytes) -> x509.CertificateRevocationList:
 
 
 def _read_in_full(crl: x509.CertificateRevocationList) -> x509.CertificateRevocationList:
-    read_name(crl.issuer)
+    check_name_readable(crl.issuer)
     subject_text(crl.issuer)
     _ = last_update(crl), next_update(crl), crl.signature_hash_algorithm, list_number(crl)
     for entry in crl:

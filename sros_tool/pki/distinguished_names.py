@@ -115,18 +115,18 @@ def may_be_read_error(error: BaseException) -> bool:
     return isinstance(error, Exception) or type(error).__name__ == "PanicException"
 
 
-def read_name(name: x509.Name) -> None:
-    """Parse every part of a distinguished name that sros shows, compares or copies.
+def check_name_readable(name: x509.Name) -> None:
+    """Raise an error if a part of a distinguished name cannot be parsed.
 
     Raises one of the errors that `reading` handles, also for a value of a type that OpenSSL does
     not read in names, such as a time.
     """
     name.rfc4514_string()
-    read_name_der(name.public_bytes())
+    check_name_der_readable(name.public_bytes())
 
 
-def read_name_der(name: bytes) -> None:
-    """Parse every part of a distinguished name in DER, as `read_name` does."""
+def check_name_der_readable(name: bytes) -> None:
+    """Raise an error if a part of a distinguished name in DER cannot be parsed."""
     canonical_der(name)
     whole = der.first_value(name)
     parts = der.children(whole.content)

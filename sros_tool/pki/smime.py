@@ -30,7 +30,11 @@ from sros_tool.errors import PkiError, SrosError
 from sros_tool.pki import der, tolerant
 from sros_tool.pki.certificates import digest as fingerprint
 from sros_tool.pki.certificates import is_for_pss, load_der_certificate
-from sros_tool.pki.distinguished_names import canonical_der, canonical_issuer, read_name_der
+from sros_tool.pki.distinguished_names import (
+    canonical_der,
+    canonical_issuer,
+    check_name_der_readable,
+)
 from sros_tool.pki.keys import PrivateKey
 from sros_tool.pki.pem import ENCRYPTED_MESSAGE, SIGNED_MESSAGE, kind_of
 
@@ -579,7 +583,7 @@ def _signature(signer: der.Value) -> Signature:
 @_cached
 def _issuer_and_serial(identifier: der.Value) -> tuple[tuple[bytes, ...], int]:
     issuer, serial = _checked_parts(identifier, der.SEQUENCE, der.INTEGER)
-    read_name_der(issuer.whole)
+    check_name_der_readable(issuer.whole)
     return canonical_der(issuer.whole), der.integer(serial)
 
 

@@ -24,7 +24,7 @@ from cryptography.x509.oid import CRLEntryExtensionOID, ExtensionOID, ObjectIden
 
 from sros_tool.errors import PkiError
 from sros_tool.pki import der
-from sros_tool.pki.distinguished_names import read_name_der, short_names
+from sros_tool.pki.distinguished_names import check_name_der_readable, short_names
 
 _TIME_FORMATS = {der.UTC_TIME: "%y%m%d%H%M%SZ", der.GENERALIZED_TIME: "%Y%m%d%H%M%SZ"}
 """The forms of dates that OpenSSL compares (X509_cmp_time), by type."""
@@ -61,7 +61,7 @@ class TolerantName:
     """A distinguished name with values that their declared string types do not allow."""
 
     def __init__(self, data: bytes) -> None:
-        read_name_der(data)
+        check_name_der_readable(data)
         self._data = data
 
     def public_bytes(self) -> bytes:
@@ -349,7 +349,7 @@ def _name(data: bytes) -> x509.Name:
     with suppress(ValueError):
         name = _certificate_with(subject=data).subject
         name.rfc4514_string()
-        read_name_der(data)
+        check_name_der_readable(data)
         return name
     return cast(x509.Name, TolerantName(data))
 

@@ -242,8 +242,9 @@ def _step(use: Use, world: World, system: System) -> Step:
 def _why_never_fails(verdicts: Sequence[Verdict]) -> tuple[list[str], list[str]]:
     """Return clauses that say why a requirement, or a part of it, cannot fail in any world.
 
-    The first list names what no enclave has. What the second list says can change with further
-    enclaves.
+    The first list is about enclaves that do not exist, and about names that no enclave may use. The
+    second list has the other reason: names of which enclaves have only one side, or else a clause
+    that holds whatever rights enclaves get.
     """
     empty = _texts_in_all(verdict.empty for verdict in verdicts)
     reasons = [verdicts[0].always] if all(verdict.always for verdict in verdicts) else []

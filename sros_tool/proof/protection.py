@@ -417,7 +417,7 @@ def looser_router_rules(
             f"rules of router {router} for router {other}",
             "without",
             f"with {names[0]}",
-            "it may pass between them",
+            f"{names[0]} may pass between them",
         )
 
 

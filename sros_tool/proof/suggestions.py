@@ -202,7 +202,10 @@ def _unused_services(stated_rights: _Stated) -> Iterator[Nobody]:
 
 
 def _gate_requirements(world: World) -> Iterator[Apart]:
-    """Yield requirements that all influence on an enclave passes through its only influencer."""
+    """Yield a requirement for each enclave that exactly one enclave influences directly.
+
+    The requirement: all influence on the enclave passes through this influencer.
+    """
     for target, sources in sorted(influencers(world, SearchLimit()).items()):
         if len(sources) == 1:
             yield Apart(source=_NOWHERE, sources=("*",), targets=(target,), through=tuple(sources))

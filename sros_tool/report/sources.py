@@ -528,7 +528,7 @@ def _with_findings(
     }
     places = _file_names(path)
     attached = tuple(
-        _without_paths(_attach_to_known_enclave(finding, known), places) for finding in findings
+        _without_paths(_without_unknown_enclave(finding, known), places) for finding in findings
     )
     return replace(source, findings=tuple(dict.fromkeys((*source.findings, *attached))))
 
@@ -696,7 +696,7 @@ def _authorities(keystore: OpenedKeystore) -> Iterator[Validity]:
 # ── removing paths of this machine ─────────────────────────────────────────────────────────
 
 
-def _attach_to_known_enclave(finding: PicturedFinding, known: Set[str]) -> PicturedFinding:
+def _without_unknown_enclave(finding: PicturedFinding, known: Set[str]) -> PicturedFinding:
     if not finding.enclave or finding.enclave in known:
         return finding
     return replace(finding, enclave="", text=f"{finding.enclave}: {finding.text}")

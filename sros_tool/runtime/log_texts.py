@@ -139,9 +139,9 @@ CHANGE_OWNER_REMEDY = (
 )
 """The remedy if an export has a folder that rcl did not find."""
 EXPORT_FOR_USER_REMEDY = (
-    f"{_SHOW_MODES} It is next to the CA keys, which no node should be able to read: export the "
-    "enclave into a folder of the user of the node. If the folder was made after the node started, "
-    "restart the node."
+    f"{_SHOW_MODES} This keystore has the CA keys, which no node should be able to read: export "
+    "the enclave into a folder of the user of the node. If the folder was made after the node "
+    "started, restart the node."
 )
 """The remedy if a keystore with CA keys has a folder that rcl did not find."""
 _SET_DOMAIN = (

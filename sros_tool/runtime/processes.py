@@ -1002,7 +1002,7 @@ class FileReader:
             if not stat.S_ISREG(state.st_mode):
                 raise OSError(errno.EINVAL, "it is not a regular file")
             if state.st_size > min(_MOST_FILE_BYTES, self._left):
-                raise OSError(errno.EFBIG, "it is larger than sros reads")
+                raise OSError(errno.EFBIG, "it is larger than the limit of sros")
             # Opened by the link of the handle, so that it is certainly the same file.
             opened = os.open(f"/proc/self/fd/{handle}", os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
             with open(opened, "rb") as file:

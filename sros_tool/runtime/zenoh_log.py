@@ -198,7 +198,7 @@ ZENOH_TEXTS: tuple[LogText, ...] = (
 
 
 def matching_zenoh_text(line: str) -> tuple[LogText, re.Match[str]] | None:
-    """Return the text that explains a line of Zenoh, with its match, or None."""
+    """Return the text that explains a line of Zenoh's log, with its match, or None."""
     for text in ZENOH_TEXTS:
         if match := text.pattern.search(line):
             return text, match

@@ -1360,7 +1360,8 @@ def test_a_robot_that_cannot_be_watched_is_refused(robot: Robot) -> None:
     assert "process 4711 (run) speaks DDS, but this shell is set up for Zenoh. Run `unset " in said
     robot.more, robot.nodes = (Process(5, ("a",), {"ROS_DOMAIN_ID": "7"}, datetime.now(UTC)),), ()
     ended = robot.close(status=2)
-    there = "in domain 7, not 0: process 5 (a); to close that, sros close robot --domain 7"
+    run = "run `sros close robot --domain 7`"
+    there = f"process 5 (a) runs in domain 7, not in 0; to close it, {run}"
     assert f"to close: no node was observed in domain 0. {there}. Otherwise start the" in ended.err
     robot.more = ()
     assert not (robot.folder / "robot").exists()

@@ -1252,7 +1252,7 @@ def test_a_folder_that_is_there_has_the_right_name(keystore: Path, tmp_path: Pat
             assert f"`namei -l {place}` shows who may enter. " in found
             gives = f"`sudo chown -R USER {export}`" in found
             assert gives is (place == exported), "nobody gets the CA keys"
-            assert ("next to the CA keys" in found) is not gives
+            assert ("This keystore has the CA keys" in found) is not gives
             assert "the folder is here\n" in found and "restart the node" in found
             assert "Correct the name" not in found and "has to be" not in found
             assert ("RUNS UNSECURED" in found) is ("with `sros run`" in found) is unsecured

@@ -590,7 +590,7 @@ def _nodes_to_try(grant: Grant, wanted: str) -> Iterator[str]:
 
 
 def _allowed_to_publish(grant: Grant) -> Iterator[str]:
-    """Yield the topic expressions that allow rules let the enclave publish."""
+    """Yield the topic expressions in the publish criteria of the grant's allow rules."""
     for rule in grant.rules:
         for criteria in rule.publish if rule.allow else ():
             yield from criteria.topics

@@ -1076,7 +1076,8 @@ def _misspelt_setting_row(
     mechanism = f"{why}: the talker runs unsecured"
     return known_open(
         _misconfiguration_row(name, identity, RowStatus.HEARD, mechanism),
-        "every other spelling is ignored by rcl, and the node does not warn",
+        "rcl knows only the spellings `true` and `Enforce`, and ignores any other value without a "
+        "warning",
         "start nodes with `sros run`, which sets the variables; `sros doctor` finds wrong values",
     )
 

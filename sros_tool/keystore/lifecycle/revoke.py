@@ -109,9 +109,9 @@ def revoke(
     if reason == SUPERSEDED:
         raise UsageError(
             f"{SUPERSEDED} is not a reason to revoke an enclave",
-            "This reason marks earlier certificates of renewed enclaves, and such enclaves keep "
-            "their rights: machines that have only an export would still accept Zenoh files from "
-            "before the revocation.",
+            "sros uses this reason for earlier certificates of renewed enclaves. A machine that "
+            "has only an export would take the enclave for renewed, not revoked, and still accept "
+            "Zenoh files from before the revocation.",
             "Choose another reason, such as cessation_of_operation; or replace the certificate "
             "with `sros renew --revoke-old`.",
         )
