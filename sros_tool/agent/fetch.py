@@ -356,8 +356,10 @@ def _fetch_error(error: Exception, source: str, now: datetime) -> FetchError:
     return FetchError(
         FetchProblem.NOT_SIGNED,
         f"the files in {source} are not signed with the trusted keys",
-        why,
+        f"{why} Somebody changed them, or all keys of `sros fleet publish` were made again. "
         "Nothing was changed.",
+        "If the keys were made again, run `sros agent init` with --force and the new root.json "
+        "(docs/howto/keystore_is_lost.md).",
     )
 
 

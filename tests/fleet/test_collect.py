@@ -42,6 +42,7 @@ from sros_tool.keystore.delivery.collect import (
     _DecidedRequest,
     collect,
 )
+from sros_tool.keystore.delivery.publish import age_clause
 from sros_tool.keystore.delivery.publish import publish as publish_releases
 from sros_tool.keystore.delivery.published import read_published, releases_in
 from sros_tool.keystore.delivery.release import seal_releases
@@ -1167,6 +1168,35 @@ def test_only_the_seal_of_a_later_release_keeps_a_keystore_from_publishing(
         home.send("r3", DUE + timedelta(minutes=minute), seal=signed.decode())
         assert bool(home.collect(DUE).notes) is noted
     assert OpenedKeystore(home.root).ledger.next_number() > number, "robots refuse a lower number"
+
+
+def test_a_late_message_from_before_a_published_restore_shows_no_other_restore(home: Home) -> None:
+    """Status would call the keystore older than its robots, though nothing is to publish."""
+    home.run("fleet", "publish", "ks", "pub")
+    backup = copy_of(home.root, home.folder / "backup")
+    home.run("renew", "ks", "/r1/base")
+    home.run("distribute_key", "ks", "--robot", "r1", "r1", "--force")
+    later = home.certificate("/r1/base")
+    home.run("fleet", "publish", "ks", "pub")
+    *_, last = sorted(releases_in(home.folder / "pub", 3), key=lambda release: release.number)
+    seal = last.seal.decode()
+    for path in (home.root, home.folder / "pub"):
+        shutil.rmtree(path)
+    backup.rename(home.root)
+    home.send("r2", seal=seal)
+    assert [note.id for note in home.collect().notes] == ["fleet.later-release"]
+    publish_releases(home.root, home.folder / "pub", now=NOW, restored=True, new_folder=True)
+    kept = copy_of(home.root, home.folder / "kept")
+    for more in ({"seal": seal}, {}):
+        shutil.rmtree(home.root)
+        copy_of(kept, home.root)
+        assert not age_clause(OpenedKeystore(home.root))
+        home.send("r1", **more)
+        assert "not in the ledger" in home.of("r1").why
+        keystore = OpenedKeystore(home.root)
+        assert bool(age_clause(keystore)) is not bool(more), "without a seal, it may be later"
+        serials = {entry.serial for entry in keystore.ledger_with("what", "certificate").entries}
+        assert f"{later.serial_number:x}" in serials
 
 
 def test_a_new_key_that_a_robot_reports_before_the_list_is_not_revoked(home: Home) -> None:

@@ -236,7 +236,11 @@ def collect(
                 robots_with_seals.append(message.robot.name)
                 forgotten.later_number = max(number, forgotten.later_number)
             if message.signer_certificate:
-                forgotten.add_certificate(message.signer_certificate, REPORTED)
+                forgotten.add_certificate(
+                    message.signer_certificate,
+                    REPORTED,
+                    explained=seals.explains(message.seal, message.signer_certificate),
+                )
             if message.received:
                 path = confirmation_file(message.robot.name)
                 action = "replace" if (root / path).exists() else "create"

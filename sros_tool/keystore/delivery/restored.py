@@ -143,8 +143,9 @@ class LaterSeals:
         self._known = {entry.number for entry in entries if entry.what == "release"}
         # A restore that the keystore waits for, or published, explains all lower numbers; a restore
         # that only a revocation list showed keeps the keystore from nothing.
-        marks = (e.number for e in entries if e.what == RESTORED and e.reason in _WAITING)
-        self._explained = max(marks, default=0)
+        marks = [e for e in entries if e.what == RESTORED and e.reason in _WAITING]
+        self._explained = max((mark.number for mark in marks), default=0)
+        self._restored = max((mark.time for mark in marks), default="")
         self._authorities = keystore.authority(PERMISSIONS)
         self._keystore = keystore
 
@@ -158,6 +159,17 @@ class LaterSeals:
                 if is_unknown and not signed.problem_for(self._authorities):
                     return 0 if self._has_issued(signed.text) else number
         return 0
+
+    def explains(self, seal: str | None, certificate: x509.Certificate) -> bool:
+        """Return whether a known restore explains that the ledger lacks a robot's certificate.
+
+        This is so if the robot's release, by its seal, and the certificate are from before it.
+        """
+        with suppress(SrosError):
+            if seal and iso(validity_of(certificate).not_before) <= self._restored:
+                is_earlier = sealed_robot(seal.encode()).number <= self._explained
+                return is_earlier and not smime.parse(seal.encode()).problem_for(self._authorities)
+        return False
 
     def _has_issued(self, sealed: bytes) -> bool:
         """Return whether the keystore issued all files that a seal lists, except certificates.

@@ -90,6 +90,8 @@ class LostRecords:
         self.certificates: dict[str, Entry] = {}
         self.later_number = 0
         """Highest number of a robot's release that the keystore sealed and does not know, or 0."""
+        self.explained: set[str] = set()
+        """Serial numbers of certificates from before a restore that is known already."""
         self._now = now
         self._issuing = keystore.ca_certificate(IDENTITY)
         self._authorities = keystore.authority(IDENTITY)
@@ -98,11 +100,14 @@ class LostRecords:
         self._latest = own if own and signed_by(own.list, self._issuing) else None
         self._seen: set[bytes] = set()
 
-    def add_certificate(self, certificate: x509.Certificate, reason: str = "") -> bool:
+    def add_certificate(
+        self, certificate: x509.Certificate, reason: str = "", *, explained: bool = False
+    ) -> bool:
         """Add an enclave's certificate, unless it has expired; return whether it was added.
 
         `restore_revocations` records the certificate if the ledger lacks it.  ``reason`` is
         `REPORTED` if no seal of the keystore shows that the certificate belongs to this keystore.
+        An ``explained`` certificate shows no new restore.
         """
         try:
             name = check_enclave_name(common_name_of(certificate.subject))
@@ -113,6 +118,8 @@ class LostRecords:
         if not ours or entry.not_after < iso(self._now) or not entry.serial.strip("-0"):
             return False
         self.certificates.setdefault(entry.serial, entry)
+        if explained:
+            self.explained.add(entry.serial)
         return True
 
     def unknown_certificates(self, keystore: OpenedKeystore) -> dict[str, Entry]:

@@ -258,8 +258,14 @@ def restore_revocations(
         replaced = _key_revoked_by_enclave(change, revoked, {key for _, key in replaced_keys}, gone)
         mark = Entry(iso(change.now), RESTORED, number=number, reason=shown_by)
         named = sorted({*rights_named} - gone) if not replaced else ()
-        change.entries = [mark, *(mark._replace(enclave=name) for name in named)]
-        change.entries += unknown.values()
+        shows_restore = (
+            shown_by
+            or forgotten_lists.lists
+            or reasons
+            or unknown.keys() - forgotten_lists.explained
+        )
+        marks = [mark, *(mark._replace(enclave=name) for name in named)]
+        change.entries = [*(marks if shows_restore else ()), *unknown.values()]
         if revocations or forgotten_lists.lists:
             change.restart = tuple(name for name in change.names if name not in gone)
             _, entries = lists.sign(
