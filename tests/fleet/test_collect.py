@@ -1187,14 +1187,14 @@ def test_a_late_message_from_before_a_published_restore_shows_no_other_restore(h
     assert [note.id for note in home.collect().notes] == ["fleet.later-release"]
     publish_releases(home.root, home.folder / "pub", now=NOW, restored=True, new_folder=True)
     kept = copy_of(home.root, home.folder / "kept")
-    for more in ({"seal": seal}, {}):
+    for sent in (seal, None):
         shutil.rmtree(home.root)
         copy_of(kept, home.root)
         assert not age_clause(OpenedKeystore(home.root))
-        home.send("r1", **more)
+        home.send("r1", seal=sent)
         assert "not in the ledger" in home.of("r1").why
         keystore = OpenedKeystore(home.root)
-        assert bool(age_clause(keystore)) is not bool(more), "without a seal, it may be later"
+        assert bool(age_clause(keystore)) is not bool(sent), "without a seal, it may be later"
         serials = {entry.serial for entry in keystore.ledger_with("what", "certificate").entries}
         assert f"{later.serial_number:x}" in serials
 
