@@ -314,10 +314,9 @@ def _renaming_advice(closed: CloseState, policy: Policy) -> str:
         return ""
     folder = closed.folder
     return (
-        f"{enumerated(several)}: named after one of several nodes; to choose another name, replace "
-        f"the name in {folder / 'policy.xml'} and {folder / 'requirements.toml'} now, because "
-        "closed "
-        "processes would need a restart"
+        f"{enumerated(several)}: named after one of several nodes; to choose another name, change "
+        f"`path=` of the enclave (not `node=`) in {folder / 'policy.xml'}, and the name in "
+        f"{folder / 'requirements.toml'}, before the first process runs closed"
     )
 
 
@@ -342,11 +341,11 @@ def _show_end(
         )
     for proof in closed.proofs:
         accept = " (--partial accepts this)" if proof.is_accepted_by_partial else ""
-        accept = " (accepted: --partial)" if accept and partial else accept
+        accept = " (accepted by --partial)" if accept and partial else accept
         answer = _ANSWERS[proof.holds]
         if proof.holds and proof.denied:
             answer += ", except for what the policy takes away"
-        echo(f"{answer}: {proof.claim}: {proof.reason}{accept}")
+        echo(f"{answer}{accept}: {proof.claim}: {proof.reason}")
         claims = {proof.claim for proof in closed.proofs}
         if proof.holds and proof.claim == TALK and CONNECTED not in claims:
             echo(_NOT_PROVED)
@@ -442,7 +441,12 @@ def _state_text(closed: CloseState, *, apply: bool) -> str:
         else "open"
         for name in closed.pending
     }
-    exceptions = ", ".join(f"{name} ({word})" for name, word in words.items())
+    exceptions = ", ".join(
+        f"{enumerated([name for name in words if words[name] == word])} ({word})"
+        for word in dict.fromkeys(words.values())
+    )
+    if len(words) > 1 and not any(closed.secured.values()):
+        return f"restart all {len(words)} processes: {exceptions}"
     return f"the processes run in their enclaves{', except for ' * bool(words)}{exceptions}"
 
 

@@ -109,9 +109,11 @@ def proofs_of(robot: LocalRobot, state: CloseState, patience: float) -> list[Pro
     away = {*missing} | may_be_away | not_here.intersection(robot.without)
     proof = _proof_of_processes(running, len(expected) - len(missing))
     absence = "not seen" if running.processes.unseen or running.processes.hidden else "not running"
-    for label, names in ((absence, missing), ("of other machines", sorted(not_here))):
+    for names, where in ((missing, absence), (sorted(not_here), "on other machines")):
         if names:
-            proof = proof._replace(reason=f"{proof.reason}; {label}: {', '.join(names)}")
+            proof = proof._replace(
+                reason=f"{proof.reason}; not counted: {', '.join(names)} ({where})"
+            )
     talk = _proof_of_talk(running, nodes, away)
     if talk.fails and (present := sorted(not_here - away)):
         options = " ".join(f"--without {name}" for name in present)
@@ -323,7 +325,10 @@ def _proof_of_processes(running: RunningRobot, number: int) -> Proof:
         robot.shell.say(f"{finding.subject}: {finding.text}. {remedy}")
     wrong = [finding for finding in findings if finding.id != PROCESS_NOT_SEEN.id]
     if findings:
-        texts = [f"{finding.subject}: {finding.text}" for finding in wrong or findings]
+        texts = [
+            finding.text if finding.subject == "processes" else f"{finding.subject}: {finding.text}"
+            for finding in wrong or findings
+        ]
         return Proof(_CLAIM_STARTED, False if wrong else None, first_few(texts, MOST_NAMES, "; "))
     guests = "".join(f"; {guest}" for guest in _unexpected_processes(running))
     if more := running.not_observed():
@@ -382,15 +387,17 @@ def _why_missing(running: RunningRobot, missing: Sequence[str], observed: Observ
         if (enclave := process.enclave)
     }
     enclaves = ", ".join(f"{name} ({causes[name]})" if name in causes else name for name in absent)
-    reasons = [
-        f"no secured process of {enclaves} runs; start it as {robot.commands_file} says; if it "
-        f"ended, look at its log: sros explain {shlex.quote(str(robot.export))} --log ITS_LOG"
-    ] * bool(absent)
+    reasons, advice = [f"no secured process of {enclaves} runs"] * bool(absent), ""
+    if absent:
+        log = f"`sros explain {shlex.quote(str(robot.export))} --log ITS_LOG`"
+        advice = (
+            f". Start each as {robot.commands_file} says. If one ended, its log says why: {log}"
+        )
     if may_end := [name for name in absent if name not in {*has_start, *robot.without}]:
         options = " ".join(f"--without {name}" for name in may_end)
-        reasons.append(f"if it does not always run, add {options}")
+        advice += f". If it does not always run, add {options}"
     if absent and (in_other_domains := running.in_other_domains()):
-        reasons.append(in_other_domains)
+        advice += f". Also {in_other_domains}"
     for why in dict.fromkeys(why for processes in outdated.values() for _, why in processes):
         pids = {
             name: [str(process.pid) for process, cause in outdated[name] if cause == why]
@@ -415,7 +422,7 @@ def _why_missing(running: RunningRobot, missing: Sequence[str], observed: Observ
         if not process.is_daemon and process.program[0] not in named
     ]:
         reasons.append(f"also open: {first_few(others, MOST_NAMES)}; stop these processes, too")
-    return "; ".join(reasons)
+    return f"{'; '.join(reasons)}{advice}"
 
 
 def _proof_of_talk(running: RunningRobot, nodes: ObservedNodes, away: Collection[str]) -> Proof:

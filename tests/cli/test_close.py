@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -525,7 +526,7 @@ def test_what_systemd_does_not_start_is_done_by_hand(
     assert ended.err.endswith("next: run these commands, and then sros close robot --proof\n")
     assert (
         "no: every process was started in its enclave: no secured process of /listener (stop "
-        "process 4712, which is open), /talker (stop process 4711, which is open) runs; "
+        "process 4712, which is open), /talker (stop process 4711, which is open) runs. "
     ) in robot.close("--proof", status=1).out
     for root in ("robot/keystore", "robot/export"):
         denied = sros("explain", root, "/talker", "publish", "/x", cwd=robot.folder).out
@@ -712,10 +713,10 @@ def test_a_node_that_does_not_run_always(robot: Robot) -> None:
     robot.by_hand, robot.absent, robot.remaining = {"/talker"}, {"/listener"}, (TALKER,)
     ended = robot.close("--proof", status=1)
     assert (
-        "no: every process was started in its enclave: no secured process of /listener runs; st"
+        "no: every process was started in its enclave: no secured process of /listener runs. St"
         in ended.out
     )
-    assert "if it does not always run, add --without /listener\n" in ended.out
+    assert "If it does not always run, add --without /listener\n" in ended.out
     assert ended.out == robot.close("--proof", "--partial", status=1).out
     assert "has no enclave /x. It has /l" in robot.close("--proof", "--without", "/x", status=2).err
     without = "--proof", "--without", "/listener"
@@ -724,7 +725,7 @@ def test_a_node_that_does_not_run_always(robot: Robot) -> None:
     assert (
         "yes: every process was started in its enclave: 1 enclave, and no open process in "
         "domain 0; "
-        "not running: /listener\n"
+        "not counted: /listener (not running)\n"
     ) in ended.out
     assert (
         "talk: 1 node with 18 endpoints as before (types are not compared), without /listener\n"
@@ -733,7 +734,7 @@ def test_a_node_that_does_not_run_always(robot: Robot) -> None:
     assert "the robot is closed, without a process of /listener; the files are" in ended.err
     robot.unseen = (UnseenProcess(9, (), "/proc hides it", speaks=False),)
     ended = robot.close(*without, "--partial")
-    assert "; not seen: /listener (accepted: --partial)\n" in ended.out
+    assert "; not counted: /listener (not seen)\n" in ended.out
     robot.unseen = ()
     robot.absent, robot.by_hand = set(), {"/listener", "/talker"}  # it is compared, too
     assert "no: everything that talked can still t" in robot.close(*without, status=1).out
@@ -904,8 +905,8 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
         "it\n" in ended.out
     )
     assert (
-        "not checked: every process was started in its enclave: processes: process 9 (?) may be a "
-        "node, but cannot be examined (/proc hides it) (accepted: --partial)\n"
+        "not checked (accepted by --partial): every process was started in its enclave: process 9 "
+        "(?) may be a node, but cannot be examined (/proc hides it)\n"
     ) in ended.out
     assert "closed, except for the claims that were not checked" in ended.err
 
@@ -987,7 +988,7 @@ def test_a_unit_that_does_not_run_is_not_called_open(
     robot.absent = {"/listener"}
     unit = robot.units["/listener"]
     said = robot.close("--proof", status=1).out
-    assert f"of /listener ({unit} does not run it: systemctl status {unit}) runs; start it" in said
+    assert f"of /listener ({unit} does not run it: systemctl status {unit}) runs. Start " in said
     assert "--without" not in said
     ended = robot.close()
     assert "  /listener: not running: --apply restarts" in ended.out
@@ -1049,7 +1050,8 @@ def test_nothing_is_closed_of_what_is_not_understood(robot: Robot) -> None:
     ended, in_1 = robot.close("--for", "1s"), "in domain 1, not 0: process 6 (other); to cl"
     assert "process 6" not in ended.out and in_1 in ended.err
     assert (
-        f"; {in_1}ose that, sros close ANOTHER_FOLDER --d" in robot.close("--proof", status=1).out
+        f". Also {in_1}ose that, sros close ANOTHER_FOLDER --d"
+        in robot.close("--proof", status=1).out
     )
     robot.close("--apply")
 
@@ -1641,7 +1643,9 @@ def test_an_enclave_that_belongs_to_another_machine(robot: Robot) -> None:
     assert needed in robot.close().err
     ended = robot.close("--proof")
     assert needed in ended.err
-    said = "1 enclave, and no open process in domain 0; of other machines: /listener\n"
+    said = (
+        "1 enclave, and no open process in domain 0; not counted: /listener (on other machines)\n"
+    )
     assert said in ended.out
     assert "differs from the signed permissions" not in ended.out
     assert "talk: 2 nodes with 36 endpoints as before (types are not compared)\n" in ended.out
@@ -1704,9 +1708,9 @@ def test_an_enclave_that_gets_another_name_keeps_its_process(robot: Robot) -> No
     robot.remaining = robot.nodes
     said = robot.close()
     policy = robot.folder / "robot/policy.xml"
-    named = "\n/logger: named after one of several nodes; to choose another name, replace the name"
-    files = "in robot/policy.xml and robot/requirements.toml now, because"
-    assert f"{named} {files} closed processes would" in said.out
+    named = "\n/logger: named after one of several nodes; to choose another name, change `path="
+    files = "` of the enclave (not `node=`) in robot/policy.xml, and the name in robot/requirements"
+    assert f"{named}{files}.toml, before the first process runs closed\n" in said.out
     for file in (policy, robot.folder / "robot/requirements.toml"):
         file.write_text(file.read_text().replace('"/logger"', '"/mission"'))
     said = robot.close(status=1)
@@ -1836,3 +1840,22 @@ def test_a_program_that_runs_a_launch_description_starts_no_open_node(robot: Rob
     assert "launch_params" not in commands
     robot.by_hand = set(PID)
     robot.close("--proof")
+
+
+@pytest.mark.parametrize(
+    ("secured", "says"),
+    [
+        ({"/a": True}, "the processes run in their enclaves, except for /b and /c (open)"),
+        ({"/a": True, "/b": True, "/c": True}, "the processes run in their enclaves"),
+        (
+            {"/a": False, "/b": False},
+            "restart all 3 processes: /a and /b (with earlier files or other settings), /c (open)",
+        ),
+    ],
+)
+def test_the_state_says_first_what_to_do_if_no_process_is_as_it_should_be(
+    secured: dict[str, bool], says: str
+) -> None:
+    pending = [name for name in ("/a", "/b", "/c") if not secured.get(name)]
+    closed: Any = SimpleNamespace(secured=secured, pending=pending, stopped=set())
+    assert close._state_text(closed, apply=False) == says
