@@ -579,10 +579,7 @@ def _answer_lines(answer: Answer, why: str) -> Iterator[str]:
     name = answer.enclave.name
     may = f"yes: {name} may" if answer.allowed else f"no: {name} may not"
     documented = ", as documented" if answer.as_documented else ""
-    domains = answer.enclave.state.domains() if answer.enclave.state else None
-    has_several = domains is not None and domains.only() is None
-    where = f" in domain {answer.domain}" if has_several and answer.question.right else ""
-    yield f"{may} {answer.question}{where}, on {answer.vendor.title} ({why}{documented})"
+    yield f"{may} {answer.question}{_domain_clause(answer)}, on {answer.vendor.title} ({why}{documented})"
     yield _labeled_row("why", decision.clause)
     if answer.counts_key:
         yield _labeled_row("key", "missing here; the answer assumes that the process has the key")
@@ -623,6 +620,13 @@ def _answer_lines(answer: Answer, why: str) -> Iterator[str]:
         then = "; then running nodes lose their peers" if dropped else ""
         yield _labeled_row("until", f"{iso(answer.until)}, when {answer.until_file} expires{then}")
     yield from _to_do_lines(answer)
+
+
+def _domain_clause(answer: Answer) -> str:
+    """Return in which ROS domain the question was decided, if the governance has several."""
+    domains = answer.enclave.state.domains() if answer.enclave.state else None
+    has_several = domains is not None and domains.only() is None
+    return f" in domain {answer.domain}" if has_several and answer.question.right else ""
 
 
 def _to_do_lines(answer: Answer) -> Iterator[str]:
@@ -717,7 +721,6 @@ def _change_lines(answer: Answer) -> Iterator[str]:
 
 def _table_lines(compared: Comparison) -> Iterator[str]:
     """Yield the question, one line for each answer, and the vendors that decide differently."""
-    yield f"may {compared.asked.enclave} {compared.asked.question}?"
     rows = [
         (answer.vendor.title, "", answer, " (as documented)" if answer.as_documented else "")
         for answer in compared.vendors or ()
@@ -725,6 +728,8 @@ def _table_lines(compared: Comparison) -> Iterator[str]:
     for reply in compared.distributions or ():
         remark = "" if reply.measured else f" (assumed to decide as {reply.decided_as.title})"
         rows.append((reply.shipped.distribution.title, f"  {reply.release}", reply.answer, remark))
+    where = _domain_clause(rows[0][2])
+    yield f"may {compared.asked.enclave} {compared.asked.question}{where}?"
     widths = [max(len(row[column]) for row in rows) for column in (0, 1)]
     for name, release, answer, remark in rows:
         row = f"{name:{widths[0]}}{release:{widths[1]}}"
