@@ -579,7 +579,8 @@ def _answer_lines(answer: Answer, why: str) -> Iterator[str]:
     name = answer.enclave.name
     may = f"yes: {name} may" if answer.allowed else f"no: {name} may not"
     documented = ", as documented" if answer.as_documented else ""
-    yield f"{may} {answer.question}{_domain_clause(answer)}, on {answer.vendor.title} ({why}{documented})"
+    asked = f"{answer.question}{_domain_clause(answer)}"
+    yield f"{may} {asked}, on {answer.vendor.title} ({why}{documented})"
     yield _labeled_row("why", decision.clause)
     if answer.counts_key:
         yield _labeled_row("key", "missing here; the answer assumes that the process has the key")
