@@ -52,6 +52,7 @@ from sros_tool.names import (
     GLOBAL_TOPICS,
     NODE_SERVICES,
     PARAMETER_SERVICES,
+    READING_SERVICES,
     action_part,
     expand,
     has_type_descriptions,
@@ -212,7 +213,7 @@ NO_COUNTERPART = FindingKind(
     "No enclave, in any ROS domain, may publish this subscribed topic, or serve this called "
     "service or action. The name may have a typing error, or its counterpart is in a policy that "
     "was not checked in the same command. Names that many nodes share are left out, such as /tf, "
-    "/clock and /diagnostics.",
+    "/clock and /diagnostics, and questions to any node, such as /*/get_state.",
     "sros: compares the rights of all enclaves in the policies that are checked together.",
     "Compare the names that senders and receivers have after remapping, and name all policies of "
     "the robot in one command.",
@@ -369,6 +370,8 @@ def _check_counterparts(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
     for statement in checked_policy.statements:
         other, name = OFFERING_RIGHT.get(statement.right.right), statement.name
         if other not in ("publish", "reply") or not statement.allows or not is_expression(name):
+            continue
+        if name.removeprefix("/*/") in READING_SERVICES:  # a question to any node, if it answers
             continue
         if not sides[other].overlaps(name) and ACTION_SEPARATOR not in name:
             text = f"no enclave may {other} a name that {name} matches"

@@ -96,6 +96,8 @@ CASES = [
     Case("policy.sets-clock", topics("publish", "/clock"), topics("subscribe", "/clock")),
     Case("policy.no-counterpart", topics("subscribe", "a"),
          f"{topics('subscribe', 'a')}{topics('publish', 'a')}"),
+    Case("policy.no-counterpart", services("request", "/*/get_sate"),
+         services("request", "/*/get_state")),
     Case("policy.name-misspelt",
          services("request", "gripper/set") + OTHER + services("reply", "griper/set"),
          services("request", "gripper/set") + OTHER + services("reply", "gripper/set")),
