@@ -86,9 +86,10 @@ def test_who_may_do_it_in_which_domain(halls: Path) -> None:
             asked = sros("explain", "ks", enclave, "publish", "/hall/estop", *words, cwd=halls)
             named = f"yes: {enclave} may publish topic /hall/estop in domain {domain}, on "
             assert asked.ok().out.startswith(named), asked
-        words = (enclave, "publish", "/hall/estop", "--all-vendors")
-        asked = sros("explain", "ks", *words, cwd=halls).ok()
-        assert asked.out.startswith(f"may {enclave} publish topic /hall/estop in domain {domain}?")
+        asked = sros("explain", "ks", "--all-vendors", enclave, "publish", "/hall/estop", cwd=halls)
+        assert asked.ok().out.startswith(
+            f"may {enclave} publish topic /hall/estop in domain {domain}?"
+        )
     assert said("/plan") == ["/desk", "1 of 8 enclaves may publish topic /plan"]
     router = "/router  in domain 10,20"
     assert said("/hall/estop", "--vendor", "zenoh")[:-1] == [*guards, router]
