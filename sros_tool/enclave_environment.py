@@ -135,7 +135,7 @@ def loadable_environment(
     state = keystore.enclave(name, now=now, domain=domain)
     if not with_zenoh:
         vendor = vendor_of(used) if target else shipped_vendor(used, environment)
-        state = _check_joining(name, folder, state, vendor, JoinContext(domain, now, zone))
+        state = _with_join_faults(name, folder, state, vendor, JoinContext(domain, now, zone))
     problems = state.problems_in_keystore if target else state.problems
     if problems:
         from sros_tool.explain.explanation import remedy
@@ -231,7 +231,7 @@ def _refuse_folders_writable_by_others(
             return
 
 
-def _check_joining(
+def _with_join_faults(
     name: str, folder: Path, state: OpenedEnclave, vendor: Vendor | None, context: JoinContext
 ) -> OpenedEnclave:
     """Return an enclave with its faults for a DDS vendor; for all vendors if ``vendor`` is None.

@@ -175,7 +175,8 @@ NO_MUTUAL_TLS = FindingKind(
     "zenoh.no-mutual-tls",
     ERROR,
     "a listener that asks for no certificate",
-    "Everybody gets a connection without a certificate, so rules cannot require a name.",
+    "Everybody gets a connection without a certificate, so rules cannot require a certificate "
+    "common name.",
     _TESTED_SOURCE,
     'Write "enable_mtls": true in transport/link/tls.',
 )

@@ -215,7 +215,7 @@ class _RemainingProcesses:
             self._robot.shell.say(f"{process.enclave} {state}{start} open{under}: {command}")
 
     def secured_in_unobserved_enclaves(self) -> Iterator[str]:
-        """Yield processes in enclaves of the export for which no process was observed."""
+        """Yield a text for each enclave that runs a process, but in which none was observed."""
         known = {process.enclave for process in self._observed.processes}
         for enclave in sorted(self._secured.keys() - known):
             guest = self._secured[enclave]

@@ -465,7 +465,7 @@ class _Inventory:
         if not isinstance(group, dict):
             group = {"hosts": group} if isinstance(group, list) else self._mapping(group, name)
         inside = (*parent_groups, name)
-        set_here = self._check_keys(group.get("vars"), f"{name}.vars")
+        set_here = self._used_variables(group.get("vars"), f"{name}.vars")
         variables = {
             **variables,
             **{key: (len(parent_groups), value) for key, value in set_here.items()},
@@ -498,8 +498,8 @@ class _Inventory:
                 "A range such as r[1:50] is only read by Ansible.",
                 _WRITE_INVENTORY,
             )
-        values = self._own.setdefault(host, self._check_keys(self._of_list.get(host), host))
-        values |= self._check_keys(own, host)
+        values = self._own.setdefault(host, self._used_variables(self._of_list.get(host), host))
+        values |= self._used_variables(own, host)
         inherited = self._inherited.setdefault(host, {})
         unclear = self._unclear.setdefault(host, set())
         for key, (depth, value) in variables.items():
@@ -513,7 +513,7 @@ class _Inventory:
             if group not in _BUILT_IN_GROUPS:
                 self._groups[group].add(host)
 
-    def _check_keys(self, value: Any, at: object) -> dict[str, Any]:
+    def _used_variables(self, value: Any, at: object) -> dict[str, Any]:
         """Return the variables that a fleet uses; other variables are left out."""
         values = self._mapping(value, at)
         return {

@@ -770,13 +770,13 @@ class LedgerFile:
         path = self.root / name
         try:
             if self._follow_link:
-                return _check_regular(open_without_waiting(path))
+                return _checked_regular_file(open_without_waiting(path))
             from sros_tool.folders import Folder  # reading alone does not import modules that write
 
             with Folder(self.root) as folder:
                 target = folder.link_target(name) or ""
                 file = target if SEALED_LEDGER.fullmatch(target) else name
-                return _check_regular(folder.open(file))
+                return _checked_regular_file(folder.open(file))
         except FileNotFoundError:
             return None
         except (OSError, SrosError) as error:
@@ -977,7 +977,7 @@ def _not_entries_fault(last: int, count: int) -> _Fault:
     return _Fault(last, f"lines {last - count + 1} to {last} are not entries")
 
 
-def _check_regular(file: BinaryIO) -> BinaryIO:
+def _checked_regular_file(file: BinaryIO) -> BinaryIO:
     """Return ``file``; close it and raise OSError if it is too large or not a regular file."""
     state, error = os.fstat(file.fileno()), None
     if not stat.S_ISREG(state.st_mode):

@@ -855,8 +855,10 @@ class _EnclaveFiles:
         """Check the identity; return the certificates of enclave and CA, and the public key."""
         identity_ca = self._certificate(IDENTITY_CA_FILE, files)
         certificate = self._certificate(CERTIFICATE_FILE, files)
-        public_key = self._check_identity(certificate, identity_ca, files)
-        files[CRL_FILE] = self._check_revocation(certificate, identity_ca, files[IDENTITY_CA_FILE])
+        public_key = self._checked_public_key(certificate, identity_ca, files)
+        files[CRL_FILE] = self._checked_revocation_list(
+            certificate, identity_ca, files[IDENTITY_CA_FILE]
+        )
         return certificate, identity_ca, public_key
 
     def _add(self, file: str, text: str, fault: Fault) -> None:
@@ -934,7 +936,7 @@ class _EnclaveFiles:
         elif self._now < validity.not_before:
             self._add(name, f"it is not valid before {iso(validity.not_before)}", not_yet_valid)
 
-    def _check_identity(
+    def _checked_public_key(
         self,
         certificate: x509.Certificate | None,
         ca: x509.Certificate | None,
@@ -990,7 +992,7 @@ class _EnclaveFiles:
         if refusal := chain_fault(certificate, chain, moment=self._now):
             self._add(CERTIFICATE_FILE, f"it is refused: {refusal}", Fault.CERTIFICATE_ISSUER)
 
-    def _check_revocation(
+    def _checked_revocation_list(
         self,
         certificate: x509.Certificate | None,
         ca: x509.Certificate | None,

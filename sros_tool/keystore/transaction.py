@@ -280,7 +280,7 @@ _STAGE_ENTRY = re.compile(
 _STAGED_NAME = re.compile(r"[0-9a-f]{16}")
 
 
-def _check_stage(folder: Folder) -> str | None:
+def _checked_stage_target(folder: Folder) -> str | None:
     """Return the target of the link ``live`` (_BEFORE or _AFTER); None if nothing was changed yet.
 
     Whoever can write to the keystore, or packed it into an archive, could forge a stage, so that
@@ -326,9 +326,9 @@ def check_interrupted(folder: Folder) -> tuple[str | None, tuple[Move, ...]]:
     """Return the target of ``live`` in a stage, and the moves to complete or undo.
 
     Raises:
-        KeystoreError: as `_check_stage` and `_read_manifest`.
+        KeystoreError: as `_checked_stage_target` and `_read_manifest`.
     """
-    to = _check_stage(folder)
+    to = _checked_stage_target(folder)
     return to, _read_manifest(folder) if to else ()
 
 

@@ -381,14 +381,14 @@ def _untried_verdict(why: str) -> ProbeVerdict:
 
 _LOG_FLUSH_SECONDS = 0.3
 
-Ask = Callable[[str, str], None]
+CreateEndpoint = Callable[[str, str], None]
 """A function that creates an endpoint ("writer" or "reader") on a ROS topic ("/chatter")."""
 
 Close = Callable[[], None]
 """A function that leaves the domain."""
 
 
-def _join_rclpy() -> tuple[Ask, Close]:
+def _join_rclpy() -> tuple[CreateEndpoint, Close]:
     """Join as a node of rclpy with the RMW of ``RMW_IMPLEMENTATION``, or rclpy's default.
 
     Return a function that creates an endpoint, and a function that leaves.
@@ -399,7 +399,7 @@ def _join_rclpy() -> tuple[Ask, Close]:
     rclpy.init()
     node = rclpy.create_node("talker")
 
-    def ask(kind: str, topic: str) -> None:
+    def create_endpoint(kind: str, topic: str) -> None:
         if kind == "writer":
             node.create_publisher(String, topic, 10)
         else:
@@ -409,26 +409,26 @@ def _join_rclpy() -> tuple[Ask, Close]:
         node.destroy_node()
         rclpy.try_shutdown()
 
-    return ask, close
+    return create_endpoint, close
 
 
-def _join_cyclone() -> tuple[Ask, Close]:
+def _join_cyclone() -> tuple[CreateEndpoint, Close]:
     """Join as a participant with the libddsc that `sros_tool.runtime.cyclone` loads.
 
     The result is as for `_join_rclpy`.
     """
     participant = Participant(domain_of(os.environ), choose_enclave(os.environ).enclave)
 
-    def ask(kind: str, topic: str) -> None:
+    def create_endpoint(kind: str, topic: str) -> None:
         if kind == "writer":
             participant.writer(f"rt{topic}")
         else:
             participant.reader(f"rt{topic}")
 
-    return ask, participant.close
+    return create_endpoint, participant.close
 
 
-def _join_with_cyclonedds_package() -> tuple[Ask, Close]:
+def _join_with_cyclonedds_package() -> tuple[CreateEndpoint, Close]:
     """Join as a participant of the Python package ``cyclonedds``, with its own libddsc.
 
     The result is as for `_join_rclpy`.
@@ -443,14 +443,14 @@ def _join_with_cyclonedds_package() -> tuple[Ask, Close]:
     participant = domain.DomainParticipant(domain_of(os.environ), qos)
     string = idl.make_idl_struct("String_", "std_msgs.msg.dds_.String_", {"data": str})
 
-    def ask(kind: str, topic: str) -> None:
+    def create_endpoint(kind: str, topic: str) -> None:
         made = topics.Topic(participant, f"rt{topic}", string)
         (pub.DataWriter if kind == "writer" else sub.DataReader)(participant, made)
 
-    return ask, lambda: None
+    return create_endpoint, lambda: None
 
 
-_JOINS: dict[str, Callable[[], tuple[Ask, Close]]] = {
+_JOINS: dict[str, Callable[[], tuple[CreateEndpoint, Close]]] = {
     "rclpy": _join_rclpy,
     "cyclone": _join_cyclone,
     "cyclonedds": _join_with_cyclonedds_package,
@@ -468,7 +468,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         enter_isolation()
     events = EventWriter(Path(report))
     try:
-        ask, close = _JOINS[kind]()
+        create_endpoint, close = _JOINS[kind]()
     except Exception as error:
         stage = ProcessStage.IMPORT if isinstance(error, ImportError) else ProcessStage.PARTICIPANT
         events.report(EventKind.SEEN, _dds_in_memory())
@@ -478,7 +478,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     events.report(EventKind.READY, stage=ProcessStage.PARTICIPANT)
     for what, topic in (("writer", allowed), ("writer", denied), ("reader", denied)):
         try:
-            ask(what, topic)
+            create_endpoint(what, topic)
         except Exception as error:
             _report_failure(events, error, ProcessStage.ENDPOINT, f"{what} {topic}")
         else:
