@@ -901,7 +901,7 @@ DENY_BLOCKS = FindingKind(
     WARNING,
     "a topic that is denied in one direction and allowed in the other: Cyclone DDS 0.10 denies "
     "both",
-    "Cyclone DDS 0.10 does not create a topic of which one direction is denied; Fast DDS and "
+    "Cyclone DDS 0.10 does not create a topic that is denied in one direction; Fast DDS and "
     "Cyclone DDS 11 create it.",
     "Cyclone DDS 0.10.2 and 11.0.1 (access_control.c), Fast DDS 2.6 to 3.6; tested.",
     "Remove the deny rule (everything that no rule allows is denied anyway), or deny only names "
@@ -1107,7 +1107,7 @@ REDUNDANT_RULE = FindingKind(
 HALF_ACTION = FindingKind(
     "policy.action-in-part",
     ERROR,
-    "an action of which only a part is allowed",
+    "an action that is allowed only in part",
     "An action consists of three services and two topics. The client or server of an action "
     "creates all five when it starts, and fails if one of them is denied.",
     "ROS 2 design, Actions; rcl_action 9 (rcl_action_client_init, rcl_action_server_init).",

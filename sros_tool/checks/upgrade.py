@@ -90,7 +90,7 @@ VULNERABILITIES = FindingKind(
     "sros compares the latest release that each of the two distributions ships; `sros check "
     "runtime` "
     "examines the libraries that processes have loaded.",
-    "Advisories in the OSV format: those of sros, and of --advisories FILE.",
+    "Advisories in the OSV format, which ship with sros or are in --advisories FILE.",
     "Take new vulnerabilities into account before the update. Against vulnerabilities that no "
     "release fixes, keep strangers out of the network.",
     prominent=True,

@@ -24,7 +24,7 @@ KNOWN_VULNERABILITIES = FindingKind(
     "a DDS with known vulnerabilities",
     "Through some vulnerabilities, anyone on the network can crash a process with one packet, even "
     "on a secured robot. The version is from the library that the process has loaded.",
-    "Advisories in the OSV format: those of sros, and of --advisories FILE.",
+    "Advisories in the OSV format, which ship with sros or are in --advisories FILE.",
     "Upgrade the package of the library to a release with the fixes, and restart the processes. "
     "Against vulnerabilities that no release fixes, keep strangers out of the network.",
 )
@@ -46,7 +46,7 @@ UNCLEAR_VULNERABILITIES = FindingKind(
     "a DDS without known vulnerabilities, but with advisories that do not mention its release line",
     "If the history of a release line does not mention a vulnerability, either the line is not "
     "affected, or the vulnerability is not fixed there.",
-    "Advisories in the OSV format: those of sros, and of --advisories FILE.",
+    "Advisories in the OSV format, which ship with sros or are in --advisories FILE.",
     "Look the numbers up in the advisories of the product.",
 )
 VERSION_UNKNOWN = FindingKind(

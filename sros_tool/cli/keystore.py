@@ -964,8 +964,7 @@ def _replaced_lines(update: KeystoreUpdate) -> Iterator[str]:
         yield (
             "the replaced certificates and permissions, with their earlier rights, work until "
             f"{iso(update.works_until)} for anyone who kept copies of these files and of the key. "
-            "To "
-            f"end this, {ends}."
+            f"To revoke the certificates, {ends}."
         )
 
 

@@ -190,7 +190,7 @@ class UncastError(KeystoreError):
 
 _SERVICE_OF_TWO = "an enclave that offers a service of its own, and another that may call it"
 _NEEDED_ENCLAVES = {
-    "guest": "a third enclave, besides those of the talker and the listener",
+    "guest": "a third enclave, next to the enclaves of the talker and the listener",
     "admin": "two more enclaves: one that may not publish the topic, and one below it that may, as"
     " /arm and /arm/tool",
     "server": _SERVICE_OF_TWO,

@@ -320,6 +320,6 @@ def lasting_text(root: Path, replaced_rights: Sequence[ReplacedRights]) -> str:
     others = "" if len(names) <= _ENCLAVES_SHOWN else " (or with --robot NAME, or --all)"
     return (
         f"{lost} {work} for whoever kept {kept}, and in {processes} until they are restarted. To "
-        f"end that, run `sros renew {quote(str(root))} {which} --revoke-old`{others}, and restart "
-        f"all processes, first those of {owner}."
+        f"end these rights, run `sros renew {quote(str(root))} {which} --revoke-old`{others}, and "
+        f"restart all processes, first those of {owner}."
     )
