@@ -1127,8 +1127,8 @@ def _show_log(
 
 _NOT_SHOWN_SECURED = (
     "no line of the log says that a node runs secured in this enclave ('Found security directory', "
-    "at level info): perhaps it runs open. Start it with `sros run KEYSTORE ENCLAVE -- COMMAND`, "
-    "and log all its output from the start"
+    "at level info): perhaps the node runs open. Start it with `sros run KEYSTORE ENCLAVE -- "
+    "COMMAND`, and log all its output from the start"
 )
 _SILENT_ON_ZENOH = "denials on Zenoh, which only logs with RUST_LOG=zenoh=trace have"
 

@@ -390,7 +390,7 @@ def _zenoh_rights(path: Path, document: ConfigurationDocument) -> RightsSource:
             text = "it allows everything that no rule denies, to everybody."
         notes.append(Note("rights.zenoh-open", f"{path}: {text}"))
     if any(subject.cert_common_names is None for subject in access.subjects):
-        text = "its rules for processes without a name are left out, because these are no enclaves"
+        text = "its rules for subjects without certificate common names are left out"
         notes.append(Note("rights.zenoh-nameless", f"{path}: {text}; `sros check` shows them."))
     if unclear := document.open_link():
         text = (

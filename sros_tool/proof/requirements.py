@@ -415,7 +415,7 @@ def _stated_tables(data: bytes, file: str) -> list[_Table]:
         if not plain or len(requirements) != len(lines):
             raise DocumentError(
                 f"{file}: {kind} is not written as tables",
-                "Every requirement needs a header line, whose number findings state.",
+                "Every requirement needs a header line: findings state its number.",
                 f"Write [[{kind}]] on a line of its own before every requirement, and not inside a "
                 "multi-line string.",
             )

@@ -490,7 +490,7 @@ def _check_last_document(keystore: OpenedKeystore, name: str, path: Path, data: 
         raise KeystoreError(
             f"'{path}' is an earlier document than the last one that was signed",
             f"Somebody put it back, and robots would get the earlier {kind}.",
-            f"Find out who did: `sros check {quote(str(keystore.root))}` says what to do.",
+            f"Find out who put it back: `sros check {quote(str(keystore.root))}` says what to do.",
         )
 
 

@@ -497,9 +497,9 @@ class KeystoreChange:
             self._check_certificates_of_service()
         if behind := self.keystore.ledger_file.clock_behind(self.now):
             text = (
-                f"{behind}. If it is wrong, set it: files that are made now are valid for too "
-                "short a time. If it is right, it was ahead at the last change, and nothing is to "
-                "do: the ledger now has an entry with the right time."
+                f"{behind}. If the clock is wrong, set it: files that are made now are valid for "
+                "too short a time. If it is right, it was ahead at the last change, and there is "
+                "nothing to do: the ledger now has an entry with the right time."
             )
             self.notes.append(Note("keystore.clock", text))
         if faults := self.keystore.ledger_file.reading_for_append().unrecorded:

@@ -925,7 +925,7 @@ class _EnclaveMaker:
         if since_restore is not None and subject not in since_restore:
             return (
                 "the keystore was restored from a backup, so permissions that its ledger lacks may "
-                "fit the present certificates; none fit the new ones"
+                "fit the present certificates; none of them fits the new certificates"
             )
         if (
             has_unique_part(certificate.subject)
