@@ -16,12 +16,33 @@ VIOLATED = FindingKind(
 VACUOUS = FindingKind(
     "requirement.vacuous",
     WARNING,
-    "a requirement, or a part of one, that cannot fail",
-    "Such a requirement protects nothing: perhaps a name is misspelled or was changed, or the "
+    "a requirement that protects less than it states",
+    "The named part protects nothing: perhaps a name is misspelled or was changed, or the "
     "exceptions cover every enclave.",
     "The requirements file.",
     "Correct the name or its kind (service or action), here or in the policy (was a topic "
-    "renamed?), or remove the requirement. For a name that is to stay unused, write [[nobody]].",
+    "renamed?), or name fewer exceptions. For a name that is to stay unused, write [[nobody]].",
+)
+UNKNOWN_ENCLAVE = FindingKind(
+    "requirement.unknown-enclave",
+    NOTE,
+    "a requirement with an exception for an enclave that does not exist",
+    "The requirement protects as much without this enclave. Perhaps the enclave is only on other "
+    "robots, or its name is misspelled.",
+    "The requirements file.",
+    "Compare the name with those of the robot's enclaves; ignore this finding if only other robots "
+    "have the enclave.",
+    prominent=True,
+)
+MISSPELLED_ENCLAVE = FindingKind(
+    "requirement.misspelled-enclave",
+    WARNING,
+    "a requirement with an exception for an enclave whose name is probably misspelled",
+    "No enclave has this name, but an enclave has almost the same name. The requirement makes no "
+    "exception for that enclave.",
+    "The requirements file.",
+    "Correct the name in the requirement. If both enclaves are meant, and only other robots have "
+    "the missing one, leave this finding out: `--exclude requirement.misspelled-enclave`.",
 )
 UNNAMED = FindingKind(
     "requirement.unnamed",

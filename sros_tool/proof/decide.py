@@ -108,8 +108,9 @@ class Witness:
 class Verdict:
     """The decision on a requirement in one world.
 
-    ``witness`` is None if the requirement holds.  ``empty`` are clauses on enclaves in the
-    requirement that do not exist, and on names that no enclave may use.  ``waiting`` are clauses on
+    ``witness`` is None if the requirement holds.  ``empty`` are clauses on enclaves under the
+    requirement that do not exist, and on names that no enclave may use.  ``absent`` are the
+    exceptions (enclaves or patterns) that fit no enclave.  ``waiting`` are clauses on
     names that no enclave may use yet, but whose other side an enclave has. ``always`` is a clause
     that says why the requirement cannot fail whatever rights enclaves get, or "".  ``assumed`` is a
     name whose protection is assumed because the policy does not state it, or "".  ``blocked`` is a
@@ -125,6 +126,7 @@ class Verdict:
     assumed: str = ""
     blocked: BlockedUse | None = None
     unnamed: tuple[str, ...] = ()
+    absent: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,14 +196,23 @@ def decide(requirement: Requirement, world: World, limit: SearchLimit | None = N
     if witness:
         _confirm(requirement, witness, world)
     unused, waiting, unnamed = _unused_names(requirement, world, limit)
-    empty = (*_missing_enclaves_clauses(requirement, world), *unused)
+    missing, exceptions = _missing_enclaves(requirement, world)
+    empty = (*(missing_enclave_clause(name, world.enclaves)[0] for name in missing), *unused)
     always = "" if witness or empty else _why_never_fails(requirement, world)
     assumed = "" if witness else _assumed_protection(requirement, world, limit)
     blocked = None
     if isinstance(requirement, Must) and not witness and world.crossing:
         blocked = _use_blocked_by_routers(requirement, world, limit)
     return Verdict(
-        requirement, witness, empty, tuple(waiting), always, assumed, blocked, tuple(unnamed)
+        requirement,
+        witness,
+        empty,
+        tuple(waiting),
+        always,
+        assumed,
+        blocked,
+        tuple(unnamed),
+        absent=tuple(exceptions),
     )
 
 
@@ -680,21 +691,38 @@ _RIGHT_OF_OTHER_KIND = {
 """
 
 
-def _missing_enclaves_clauses(requirement: Requirement, world: World) -> Iterator[str]:
-    """Yield clauses on enclaves in a requirement that do not exist."""
-    patterns: tuple[str, ...] = ()
+def _missing_enclaves(requirement: Requirement, world: World) -> tuple[list[str], list[str]]:
+    """Return the patterns of enclaves that fit no enclave: restricted enclaves, and exceptions.
+
+    Left out are patterns for enclaves that do not exist yet, such as those of a package's users.
+    """
+    restricted: tuple[str, ...] = ()
+    exceptions: tuple[str, ...] = ()
     match requirement:
-        case Only() | Widest() | NothingBut():
-            patterns = requirement.enclaves
+        case Only():
+            exceptions = requirement.enclaves
+        case Widest() | NothingBut():
+            restricted = requirement.enclaves
         case Apart():
-            patterns = (*requirement.sources, *requirement.targets, *requirement.through)
-    for pattern in dict.fromkeys(patterns):
-        name = pattern.removeprefix(EXCEPT)
-        is_allowed = isinstance(requirement, Only) and requirement.is_relative
-        if is_expression(name) and (pattern[0] == EXCEPT or is_allowed):
-            continue  # allows enclaves that do not exist yet, such as those of a package's users
-        if not fnmatch.filter(world.enclaves, name):
-            yield f"there is no enclave {pattern}{_meant_clause(name, [frozenset(world.enclaves)])}"
+            restricted = (*requirement.sources, *requirement.targets)
+            exceptions = requirement.through
+    is_of_package = isinstance(requirement, Only) and requirement.is_relative
+    missing: tuple[list[str], list[str]] = ([], [])
+    for is_exception, patterns in enumerate((restricted, exceptions)):
+        for pattern in dict.fromkeys(patterns):
+            name = pattern.removeprefix(EXCEPT)
+            is_excluded = name != pattern
+            if is_expression(name) and (is_excluded or is_of_package):
+                continue
+            if not fnmatch.filter(world.enclaves, name):
+                missing[is_exception != is_excluded].append(pattern)
+    return missing
+
+
+def missing_enclave_clause(pattern: str, enclaves: Iterable[str]) -> tuple[str, bool]:
+    """Return a clause on a missing enclave, and whether the clause names a similar enclave."""
+    meant = _meant_clause(pattern.removeprefix(EXCEPT), [frozenset(enclaves)])
+    return f"there is no enclave {pattern}{meant}", bool(meant)
 
 
 def _unused_names(

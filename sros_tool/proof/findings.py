@@ -7,15 +7,17 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from sros_tool.automata import SearchLimit
-from sros_tool.checks.kind import Finding, RelatedPlace
+from sros_tool.checks.kind import Finding, FindingKind, RelatedPlace
 from sros_tool.checks.requirements import (
     ASSUMED,
     HOLDS_ALONE,
+    MISSPELLED_ENCLAVE,
     NOT_CROSSING,
     NOT_ON_ZENOH,
     OF_EXPORT,
     REMAPPING_UNUSED,
     ROBOTS_LEFT_OUT,
+    UNKNOWN_ENCLAVE,
     UNNAMED,
     VACUOUS,
     VIOLATED,
@@ -33,7 +35,15 @@ from sros_tool.policy.model import ALLOW, Level, Source
 from sros_tool.policy.patterns import covers
 from sros_tool.policy.remapping import Remapping, has_new_name
 from sros_tool.policy.rights import KIND_OF, Right
-from sros_tool.proof.decide import MOST_STEPS, BlockedUse, Use, Verdict, Witness, Worlds
+from sros_tool.proof.decide import (
+    MOST_STEPS,
+    BlockedUse,
+    Use,
+    Verdict,
+    Witness,
+    Worlds,
+    missing_enclave_clause,
+)
 from sros_tool.proof.requirements import (
     EXCEPT,
     Apart,
@@ -138,14 +148,15 @@ def _are_alike(uses: Sequence[Use], witness: Witness) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Decided:
-    """The decisions on all requirements: broken requirements, and reasons why others cannot fail.
+    """The decisions on all requirements: broken requirements, and reasons why parts cannot fail.
 
     ``assumed`` are requirements that hold only with the assumed protection of the default template,
     with a name whose protection the policy does not state.  ``blocked`` are requirements that hold,
     with a use that does not pass between Zenoh routers. ``unnamed`` are requirements that hold,
     with their names that no right states.  ``unjudged`` are enclaves that have to have rights, but
     that an export lacks.  ``holding_alone`` are requirements with relative names that only further
-    enclaves could break, with the reasons.
+    enclaves could break, with the reasons.  ``absent`` are requirements with exceptions for
+    enclaves that do not exist, as clauses; ``misspelled`` those with a similar name that exists.
     """
 
     violations: tuple[Violation, ...]
@@ -155,6 +166,8 @@ class Decided:
     unnamed: tuple[tuple[Requirement, tuple[str, ...]], ...] = ()
     unjudged: tuple[str, ...] = ()
     holding_alone: tuple[tuple[Requirement, tuple[str, ...]], ...] = ()
+    absent: tuple[tuple[Requirement, tuple[str, ...]], ...] = ()
+    misspelled: tuple[tuple[Requirement, tuple[str, ...]], ...] = ()
 
 
 def decide_all(requirements: Sequence[Requirement], system: System) -> Decided:
@@ -166,6 +179,8 @@ def decide_all(requirements: Sequence[Requirement], system: System) -> Decided:
     violations, assumed, blocked, unnamed = [], [], [], []
     vacuous: list[tuple[Requirement, tuple[str, ...]]] = []
     holding_alone: list[tuple[Requirement, tuple[str, ...]]] = []
+    absent: list[tuple[Requirement, tuple[str, ...]]] = []
+    misspelled: list[tuple[Requirement, tuple[str, ...]]] = []
     limit = SearchLimit(MOST_STEPS)
     worlds = Worlds(system.worlds)
     known = {enclave for world in system.worlds for enclave in world.enclaves}
@@ -198,6 +213,9 @@ def decide_all(requirements: Sequence[Requirement], system: System) -> Decided:
         if empty or reasons:
             is_alone = not empty and _users_may_break(requirement)
             (holding_alone if is_alone else vacuous).append((requirement, (*empty, *reasons)))
+        for pattern in _texts_in_all(verdict.absent for _, verdict in verdicts):
+            clause, has_similar = missing_enclave_clause(pattern, known)
+            (misspelled if has_similar else absent).append((requirement, (clause,)))
         if not broken and (names := _texts_in_all(verdict.unnamed for _, verdict in verdicts)):
             unnamed.append((requirement, names))
         if not broken and (
@@ -215,6 +233,8 @@ def decide_all(requirements: Sequence[Requirement], system: System) -> Decided:
         unnamed=tuple(unnamed),
         unjudged=unjudged,
         holding_alone=tuple(holding_alone),
+        absent=tuple(absent),
+        misspelled=tuple(misspelled),
     )
 
 
@@ -334,10 +354,13 @@ def decided_findings(
 ) -> list[Finding]:
     """Return the findings of decisions: broken requirements first, in order."""
     findings = [_violation_finding(violation) for violation in decided.violations]
-    findings += [_vacuous_finding(requirement, why) for requirement, why in _once(decided.vacuous)]
-    for requirement, why in _once(decided.holding_alone):
-        place, text = requirement.source, f"{'; '.join(why)}: {demand(requirement)}"
-        findings.append(HOLDS_ALONE.found(place.file, text, place.file, place.line))
+    findings += [_part_finding(VACUOUS, each, why) for each, why in _once(decided.vacuous)]
+    for kind, decisions in (
+        (MISSPELLED_ENCLAVE, decided.misspelled),
+        (UNKNOWN_ENCLAVE, decided.absent),
+        (HOLDS_ALONE, decided.holding_alone),
+    ):
+        findings += [_part_finding(kind, requirement, why) for requirement, why in _once(decisions)]
     if decided.unnamed:
         allowed = [right for right in before if right.qualifier is ALLOW]
         findings += [_unnamed_finding(*unnamed, allowed) for unnamed in _once(decided.unnamed)]
@@ -524,10 +547,12 @@ def _listed_names(names: Sequence[str]) -> str:
     return f"{', '.join(first)} and {last}" if first else last
 
 
-def _vacuous_finding(requirement: Requirement, why: Sequence[str], remedy: str = "") -> Finding:
+def _part_finding(
+    kind: FindingKind, requirement: Requirement, why: Sequence[str], remedy: str = ""
+) -> Finding:
     place = requirement.source
     text = f"{'; '.join(why)}: {demand(requirement)}"
-    return VACUOUS.found(place.file, text, place.file, place.line, remedy)
+    return kind.found(place.file, text, place.file, place.line, remedy)
 
 
 _GONE_REMEDY = (
@@ -539,7 +564,6 @@ _GONE_REMEDY = (
 def _unnamed_finding(
     requirement: Requirement, names: Sequence[str], allowed_before: Iterable[Right]
 ) -> Finding:
-    place = requirement.source
     # That a forbidden right is gone shows no renaming.
     forbidden = (
         {right for right, _ in requirement.rights} if isinstance(requirement, Nobody) else ()
@@ -551,9 +575,8 @@ def _unnamed_finding(
     }
     if gone := [name for name in names if name in known_before]:
         why = f"no right names {_listed_names(gone)} any more"
-        return _vacuous_finding(requirement, [why], _GONE_REMEDY)
-    text = f"no right names {_listed_names(names)}: {demand(requirement)}"
-    return UNNAMED.found(place.file, text, place.file, place.line)
+        return _part_finding(VACUOUS, requirement, [why], _GONE_REMEDY)
+    return _part_finding(UNNAMED, requirement, [f"no right names {_listed_names(names)}"])
 
 
 def _assumption_finding(requirement: Requirement, name: str) -> Finding:

@@ -29,7 +29,13 @@ from sros_tool.checks.keystores.issued import (
 from sros_tool.checks.keystores.opened import Circumstances
 from sros_tool.checks.kind import WARNING, ChosenFindings, Finding, FindingFilter
 from sros_tool.checks.policies import is_mended_by
-from sros_tool.checks.requirements import DROPPED, VACUOUS, VIOLATED
+from sros_tool.checks.requirements import (
+    DROPPED,
+    MISSPELLED_ENCLAVE,
+    UNKNOWN_ENCLAVE,
+    VACUOUS,
+    VIOLATED,
+)
 from sros_tool.checks.targets import path_findings, policy_findings
 from sros_tool.errors import DocumentError, SrosError
 from sros_tool.faults import Fault
@@ -1216,7 +1222,7 @@ class _Review:
             for place in finding.related
         ]
         broken = requirement_findings(dropped, system)
-        chosen = FindingFilter(exclude=(VACUOUS.id,)).choose([*findings, *left, *broken])
+        chosen = FindingFilter(exclude=_NOT_OF_DROPPED).choose([*findings, *left, *broken])
         return _FOUND, DroppedRequirements(len(dropped) + len(left), chosen)
 
     # ── keystores ──────────────────────────────────────────────────────────────────────────
@@ -1395,6 +1401,10 @@ def _namespaces_to_try(before: AccessSource, after: AccessSource) -> list[str]:
     while any(ordinary in right.name for right in (*before.rights, *after.rights)):
         ordinary += "_"
     return [*dict.fromkeys([ordinary, *namespaces])]
+
+
+_NOT_OF_DROPPED = tuple(kind.id for kind in (VACUOUS, MISSPELLED_ENCLAVE, UNKNOWN_ENCLAVE))
+"""Findings that a dropped requirement does not need."""
 
 
 def _failures(

@@ -60,6 +60,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 CASES = {
     "requirement.violated",
     "requirement.vacuous",
+    "requirement.unknown-enclave",
+    "requirement.misspelled-enclave",
     "requirement.dropped",
     "requirement.assumed",
     "requirement.unnamed",
@@ -114,11 +116,23 @@ def test_what_holds_and_what_cannot_fail(folder: Path, tmp_path: Path) -> None:
     held.write_text('[[only]]\npublish = ["/cmdvel"]\nenclaves = ["/mix"]\n')
     ended = sros(*ONLY, "--requirements", held, cwd=folder)
     assert ended.status == 1
-    assert f"{held}:1: warning: a requirement, or a part of one, that cannot fail" in ended.out
-    empty = "there is no enclave /mix (perhaps /mux is meant) and no enclave may publish topic "
-    empty += "/cmdvel (perhaps /cmd_vel is meant)"
+    assert f"{held}:1: warning: a requirement that protects less than it states" in ended.out
+    assert "there is no enclave /mix (perhaps /mux is meant): only /mix may publish" in ended.out
+    empty = "no enclave may publish topic /cmdvel (perhaps /cmd_vel is meant)"
     assert f"{empty}: only /mix may publish" in ended.out
-    sros(*ONLY, "--requirements", held, "--exclude", "requirement.vacuous", cwd=folder).ok()
+    held.write_text(held.read_text().replace("/cmdvel", "/cmd_vel"))
+    ended = sros(*ONLY, "--requirements", held, cwd=folder)
+    assert "[requirement.violated]" in ended.out and "[requirement.vacuous]" not in ended.out
+    held.write_text('[[only]]\npublish = ["/cmd_vel"]\nenclaves = ["/mux", "/web", "/mix"]\n')
+    misspelled = "requirement.misspelled-enclave"
+    ended = sros(*ONLY, "--requirements", held, cwd=folder)
+    assert ended.status == 1 and f"[{misspelled}]" in ended.out
+    sros(*ONLY, "--requirements", held, "--exclude", misspelled, cwd=folder).ok()
+    held.write_text(held.read_text().replace("/mix", "/teleop"))
+    ended = sros(*ONLY, "--requirements", held, cwd=folder)
+    ended.ok()
+    assert f"{held}:1: note: a requirement with an exception for an enclave that" in ended.out
+    assert "there is no enclave /teleop: only /mux, /web, /teleop may publish" in ended.out
 
 
 def test_an_action_that_is_a_service(tmp_path: Path) -> None:

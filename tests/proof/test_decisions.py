@@ -311,6 +311,36 @@ def test_a_requirement_of_a_package_that_users_cannot_break_either(required: str
     assert len(found.vacuous) == 1 and not found.holding_alone
 
 
+NO_OTHERS = frozenset[str]()
+ABSENT, MISSPELLED = "requirement.unknown-enclave", "requirement.misspelled-enclave"
+VACUOUS, VIOLATED = "requirement.vacuous", "requirement.violated"
+
+
+@pytest.mark.parametrize(
+    ("required", "ids"),
+    [
+        ('[[only]]\npublish = ["/x"]\nenclaves = ["/r/a", "/ops"]', {ABSENT}),
+        ('[[only]]\npublish = ["/x"]\nenclaves = ["/r/a", "*/ops/*"]', {ABSENT}),
+        ('[[only]]\npublish = ["x"]\nenclaves = ["/r/a", "*/ops/*"]', NO_OTHERS),
+        ('[[only]]\npublish = ["/x"]\nenclaves = ["/ops"]', {ABSENT, VIOLATED}),
+        ('[[only]]\nrequest = ["reset"]\nenclaves = ["/ops"]', {ABSENT, *FOUND}),
+        ('[[only]]\nrequest = ["/reset"]\nenclaves = ["/ops"]', {ABSENT, VACUOUS}),
+        ('[[only]]\npublish = ["/x"]\nenclaves = ["/r/a", "/rr/a"]', {MISSPELLED}),
+        ('[[only]]\npublish = ["/x"]\nenclaves = ["*", "!/ops"]', {VACUOUS}),
+        ('[[apart]]\nfrom = ["/r/c"]\nto = ["/r/b"]\nthrough = ["/gate"]', {ABSENT}),
+        ('[[apart]]\nfrom = ["/r/c"]\nto = ["/r/b"]\nthrough = ["/g?"]', {ABSENT}),
+        ('[[apart]]\nfrom = ["/ops"]\nto = ["/r/b"]', {VACUOUS}),
+        ('[[apart]]\nfrom = ["*", "!/r/a", "!/ops"]\nto = ["/r/b"]', {ABSENT}),
+        ('[[widest]]\nenclaves = ["/ops"]\npublish = []', {VACUOUS}),
+    ],
+)
+def test_an_exception_for_an_enclave_that_does_not_exist(required: str, ids: set[str]) -> None:
+    """Twin: of enclaves that a requirement restricts, nothing is protected."""
+    system = robot(PACKAGE)
+    requirements = parse_requirements(required.encode(), "r.toml")
+    assert {finding.id for finding in requirement_findings(requirements, system)} == ids
+
+
 READ_BY_ALL = {"/mux": may("publish", "/cmd_vel", "/arm_l/cmd"), "/rec": may("subscribe", "/*")}
 SLIPS = ("/cmd_vle", "/cmd_ve", "/cmd_vell", "/cmdvel", "/cnd_vel")
 OTHER_NAMES = ("/cmd_vel2", "/cmd_vel_raw", "/arm_r/cmd", "/robot/cmd_vel")

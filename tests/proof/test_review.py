@@ -1303,7 +1303,7 @@ def test_requirements_of_a_package_are_decided_in_a_namespace(
     )
     ended = change.review(*asked, "--namespace", "/l", "--namespace", "/")
     assert ended.status == 1 and "decided only" not in ended.out, ended
-    assert "requirements robot.xml: 1 error, 1 warning in /l and /" in ended.out, ended
+    assert "requirements robot.xml: 1 error, 1 note in /l and /" in ended.out, ended
     assert "/b: may publish /l/x, but only /l/a may publish /l/x" in ended.out
     ended = change.review(*asked, "--namespace", "/l", "--remap", "x:=/x")
     assert "/a: may publish /x, but only /l/a may" in ended.out and "/l/x" not in ended.out, ended
