@@ -379,9 +379,9 @@ def _check_counterparts(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
 
 
 def _differ_only_by_namespace(statement_a: _Statement, statement_b: _Statement) -> bool:
-    """Return whether two names differ only by a namespace.
+    """Return whether the longer name is the shorter one with a namespace in front of it.
 
-    If the policy writes ``~``, the name of the node in the name is intended.
+    Returns False if the policy writes the longer name with ``~``, and so intends the namespace.
     """
     shorter, longer = sorted((statement_a, statement_b), key=lambda statement: len(statement.name))
     return longer.name.endswith(shorter.name) and "~" not in longer.written

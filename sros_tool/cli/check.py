@@ -251,10 +251,11 @@ def check(
 ) -> int:
     r"""Find errors and weaknesses in policies, keystores and the runtime.
 
-    PATH is a policy, a folder of policies, a keystore or an enclave. The type of PATH is detected,
-    unless the first word is `policy` or `keystore`; a keystore here whose name is that word is
-    checked, too. Without PATH, the keystore of $ROS_SECURITY_KEYSTORE and the runtime are checked.
-    The runtime is the environment and the processes of this machine.
+    PATH is a policy, a folder of policies, a keystore or an enclave. sros detects the type, unless
+    the word `policy` or `keystore` before the first PATH states it. A keystore in this folder that
+    is named `keystore` is checked by `sros check keystore`. Without PATH, the keystore of
+    $ROS_SECURITY_KEYSTORE and the runtime are checked: the environment and the processes of this
+    machine.
 
     Example:
       $ sros check robot.xml keystore

@@ -321,11 +321,11 @@ class PolicyLine(NamedTuple):
 
 @shows("source", "xml", spread=("source",))
 class GroupEdit(NamedTuple):
-    """A group of a policy, such as ``<topics>``, that a change replaces or removes."""
+    """An element of a policy, such as ``<topics>``, that a change replaces or removes."""
 
     source: Source
     xml: str
-    """New XML of the group; empty to remove the group."""
+    """New XML of the element; empty to remove the element."""
 
 
 @shows(null_if_empty=("document",))
@@ -342,7 +342,7 @@ class PolicyChange(NamedTuple):
     document: str
     """A policy with the rights to add, for ``sros merge_policy``, or null."""
     edits: tuple[GroupEdit, ...]
-    """Groups of the policy to change."""
+    """Elements of the policy to replace or remove, such as ``<topics publish="ALLOW">``."""
 
 
 # ── what JSON shows of an answer ───────────────────────────────────────────────────────────

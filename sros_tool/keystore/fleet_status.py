@@ -408,14 +408,14 @@ class RobotStatus:
         if self._shows_wrong_clock(now):
             return "check its clock"
         if self.state in (State.CURRENT, State.NONE):
-            look = "look at its `from`" if self.got_earlier_release else "look into it"
+            look = "check its server" if self.got_earlier_release else "look into it"
             return look if self.problems else ""
         if self.is_ahead and (self.release or 0) > (self.published or 0):
             return "publish"
         if self.lacks_ca and self.state not in (State.BROKEN, *_SUSPICIOUS_STATES):
             return "deliver"
         if self.state is State.RESTART and self.got_earlier_release:
-            return "look at its `from`"  # the state says the restart
+            return "check its server"  # the state says the restart
         if self.state in _TASKS_BY_STATE and not self.is_ahead:
             return _TASKS_BY_STATE[self.state]
         if self.state is State.UNUSABLE:
@@ -427,7 +427,7 @@ class RobotStatus:
         if not is_accepted:
             return "publish"
         if self.got_earlier_release:
-            return "look at its `from`"
+            return "check its server"
         if (self.published or 0) == (self.release or 0):
             return "find out why" if self.is_published else "publish"
         is_silent = self.received is None or now - self.received > _FETCH_EXPECTED_WITHIN

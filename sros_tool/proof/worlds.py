@@ -554,7 +554,7 @@ def dds_access(access: Access) -> TopicAccess:
 
 
 def ros_access(stated_rights: Iterable[StatedRight]) -> TopicAccess:
-    """Return the topics of the ROS names that rights allow and denials leave allowed."""
+    """Return the topics of the ROS names that a right allows and no denial covers."""
     names: dict[tuple[bool, str, bool], list[NameSet]] = defaultdict(list)
     for right in (right.right for right in stated_rights):
         for writes, topic in topics_of(right):

@@ -297,12 +297,12 @@ def test_a_robot_whose_server_has_an_old_copy(problem: str, field: Field) -> Non
     field.run("fleet", "publish", "ks", "pub")
     field.send("r1", problems=[problem], release=1)
     found = field.status()["robots"]["r1"]
-    assert (found["state"], found["to_do"]) == ("earlier", "look at its `from`")
+    assert (found["state"], found["to_do"]) == ("earlier", "check its server")
     assert found["problems"] == [problem] and field.status()["older"] is None
     field.deliver("r1")
     field.send("r1", problems=[problem], release=2, restart=["/r1/base"])
     found = field.status()["robots"]["r1"]
-    assert (found["state"], found["to_do"]) == ("restart", "look at its `from`")
+    assert (found["state"], found["to_do"]) == ("restart", "check its server")
     assert "was restored" in field.run("fleet", "publish", "ks", "pub", "--restored", status=2).err
 
 
@@ -1241,7 +1241,7 @@ def test_what_is_to_be_done_for_robots_that_do_not_fetch_what_is_published(field
     )
     rows = said()
     assert rows["r1"][0] == "deliver" and "lacks the key" in rows["r1"][1], "it has no file"
-    assert rows["r2"][0] == "look at its `from`" and "its agent has an old copy." in rows["r2"][1]
+    assert rows["r2"][0] == "check its server" and "its agent has an old copy." in rows["r2"][1]
     assert rows["r3"][0] == "deliver"
     metrics = field.run("fleet", "status", "ks", "--prometheus", status=1).out
     assert re.search(r'agent_problems\{.*robot="r2"\} 1', metrics)

@@ -536,7 +536,8 @@ def _stray_file_findings(
         return
     name = Path(path).name
     if _ARCHIVES.search(name) and place not in (PRIVATE, REVOKED, RETIRED):
-        yield ARCHIVE.found(path, "a keystore contains no archive and no container of keys", path)
+        text = "by its name, it is an archive or a container of keys, which does not belong here"
+        yield ARCHIVE.found(path, text, path)
         return
     known = (
         (inside == "." and (is_layout_path(name) or name in (LEDGER_INDEX, LOCK)))
