@@ -61,10 +61,17 @@ from sros_tool.names import (
     right_to_use,
 )
 from sros_tool.pki.certificates import IDENTITY_DIGITS
-from sros_tool.policy.model import ALLOW, PEER_RIGHT, Enclave, Policy, policy_in_namespace
+from sros_tool.policy.model import (
+    ALLOW,
+    PEER_RIGHT,
+    Enclave,
+    Policy,
+    below_namespace,
+    policy_in_namespace,
+)
 from sros_tool.policy.patterns import Names, covers
 from sros_tool.policy.remapping import Remapping, renamed_action_text
-from sros_tool.policy.rights import Right, placed_rights
+from sros_tool.policy.rights import Right, placed_rights, policy_rights
 from sros_tool.runtime.environment import RMW_ZENOH
 from sros_tool.runtime.log_texts import (
     CHANGE_OWNER_REMEDY,
@@ -305,6 +312,31 @@ class AskedPolicy:
             if allows and denied.name.endswith(own.name):
                 return denied.name.removesuffix(own.name)
         return ""
+
+    def possible_namespace(self, name: str, enclave: str) -> str:
+        """Return the namespace of a name that may be a relative name on the robot, or "".
+
+        "" if the policy itself has a name in this namespace.  The node's own name is no part of the
+        namespace of its private names.
+        """
+        space = name.rpartition("/")[0]
+        stated = self.policy.enclave(self.place(enclave)[1])
+        for profile in stated.all_profiles() if stated else ():
+            space = space.removesuffix(f"/{profile.node}")
+        names = {right.name for right in policy_rights(self.policy)}
+        return "" if any(name.startswith(f"{space}/") for name in names) else space
+
+    def enclaves_for(self, node: str, enclave: str) -> tuple[str, ...]:
+        """Return the enclaves, under their paths on the robot, that the policy has for a node.
+
+        ``enclave`` is the path on the robot of the enclave in which the node runs.
+        """
+        robot_ns = self.place(enclave)[0]
+        if not node.startswith(f"{robot_ns}/"):
+            return ()
+        ns, _, name = node.removeprefix(robot_ns).rpartition("/")
+        fitting = self.policy.enclaves_of_node(ns, name)
+        return tuple(below_namespace(stated.path, robot_ns) for stated in fitting)
 
     def enclave(self, enclave: str) -> Enclave | None:
         """Return the policy's enclave, under its path on the robot; None if the policy lacks it."""
@@ -969,8 +1001,8 @@ class _Examiner:
             elsewhere, remedy = self._other_folder_cause(denial, enclave)
             facts += elsewhere
             remedy = remedy or (
-                "The process loaded permissions of another policy: an earlier one, an edited one, "
-                "or one that was merged with --remap, while the process lacks that remapping. "
+                "The process loaded permissions of another policy. Perhaps that policy is earlier "
+                "or edited. Or it was merged with --remap, and the process lacks the remapping. "
                 "Ask for the robot's policy, and name it in place of this one. If this is the "
                 "robot's policy, sign it, export the enclave, and restart the process."
                 if self._policy
@@ -979,7 +1011,7 @@ class _Examiner:
             )
         elif not denial.direction:
             facts = [answer.decision.text for answer in answers]
-            remedy = finding.remedy
+            remedy = self._remedy_in_a_namespace(denial, name, finding.remedy)
         elif ns:
             facts = [answer.decision.text, f"the enclave may {right} {ns}{name}"]
             remedy = (
@@ -999,9 +1031,25 @@ class _Examiner:
                     "of `sros merge_policy`). If so, rcl's line `Found security directory` in the "
                     f"whole log names an enclave in {likely}. Otherwise, {finding.remedy}"
                 )
+            elif not other:
+                better = self._remedy_in_a_namespace(denial, name, better or finding.remedy)
             facts = [answer.decision.text, *other]
             remedy = better or finding.remedy
         return replace(finding, found=tuple(facts), checked=True, remedy=remedy)
+
+    def _remedy_in_a_namespace(self, denial: Denial, name: str, remedy: str) -> str:
+        """Return a remedy that asks for the namespace, if only the policy of a package is known."""
+        if not self._policy or denial.folder or denial.by_rule:
+            return remedy
+        space = self._policy.possible_namespace(name, denial.enclave)
+        if not space:
+            return remedy
+        return (
+            f"Perhaps {space} is the namespace of the node: then write "
+            f"{name.removeprefix(f'{space}/')} in the policy, without a / at its beginning. Ask "
+            "for the whole log: rcl's line `Found security directory` shows the namespace. "
+            f"Otherwise: {remedy}"
+        )
 
     def _namespace_clause(self, enclave: LoadedEnclave) -> str:
         """Return a clause that names the policy's enclave for an enclave in a namespace, or ""."""
@@ -1029,15 +1077,19 @@ class _Examiner:
         """Return causes and a remedy if the permissions are for a node with another name."""
         node, nodes = node_denied_own_service(denial), _served_names(answer)
         if node and not any(covers(own_node, node) for own_node in nodes):
-            enclaves = self._keystore.enclaves_for(node) if self._keystore else ()
+            enclaves: tuple[str, ...] = ()
+            if self._keystore:
+                enclaves = self._keystore.enclaves_for(node)
+            elif self._policy:
+                enclaves = self._policy.enclaves_for(node, denial.enclave)
             beginning = f"the permissions are for {_listed_nodes(nodes)}, and " if nodes else ""
             if enclaves:
                 return [
                     f"{beginning}this is the node {node}, for which there is "
                     f"{_enclaves_text(enclaves)}"
                 ], (
-                    f"Start it in the enclave that is for it: `sros run {quote(self._root)} "
-                    f"{quote(enclaves[0])} -- COMMAND`."
+                    "Start it in the enclave that is for it: `sros run "
+                    f"{quote(self._root or 'KEYSTORE')} {quote(enclaves[0])} -- COMMAND`."
                 )
             if nodes:
                 advice = _renaming_advice(nodes, node, denial.enclave)

@@ -1071,9 +1071,7 @@ def test_a_log_of_a_robot_that_has_the_policy_in_a_namespace(
     assert "Write x in the policy, without a / at its beginning: the robot of the log has" in said
     assert "no rule allows publish rt/left/x" in said
     assert "the policy allows it to /a, which is /left/a in namespace /left\n" in said
-    assert (
-        "merged with --remap, while the process lacks that remapping. Ask for the robot's" in said
-    )
+    assert "merged with --remap, and the process lacks the remapping. Ask for the robot's" in said
 
 
 @pytest.mark.parametrize(
@@ -1130,6 +1128,52 @@ def test_a_log_without_the_namespace_that_its_names_show(tmp_path: Path) -> None
     policy.write_text(policy_text({"/a": publish("/y")}))
     said = sros("explain", policy, "/a", "--log", log).out
     assert "in the namespace" not in said and "remedy    If the node lacks a remapping" in said
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("left/speed", "Perhaps /left is the namespace of the node: then write speed in"),
+        ("left/n/speed", "Perhaps /left is the namespace of the node: then write n/speed in"),
+        *((name, "") for name in ("n/speed", "speed", "fixed/speed")),
+    ],
+)
+@pytest.mark.parametrize("side", ["check_create_datawriter", "check_create"])
+def test_a_new_name_in_a_log_without_the_namespace(
+    side: str, name: str, said: str, tmp_path: Path
+) -> None:
+    """An absolute name in a package would be one name for all instances. Twin: rcl's line."""
+    policy, log = tmp_path / "p.xml", tmp_path / "robot.log"
+    policy.write_text(policy_text({"/a": publish("width", "/fixed/x")}))
+    line = f"[SECURITY Error] rt/{name} topic not found in allow rule. -> {side}\n"
+    log.write_text(line)
+    found = sros("explain", policy, "/a", "--log", log).out
+    assert f"sros explain {policy} /a publish /{name}`" in found
+    assert (f"remedy    {said}" in found) if said else "is the namespace of" not in found
+    log.write_text(f"[rcl]: Found security directory: /k/enclaves/a\n{line}")
+    assert "is the namespace of" not in sros("explain", policy, "/a", "--log", log).out
+
+
+@pytest.mark.parametrize("namespace", ["", "/front"])
+def test_a_node_in_another_enclave_of_a_policy_without_a_keystore(
+    namespace: str, tmp_path: Path
+) -> None:
+    policy, log = tmp_path / "p.xml", tmp_path / "robot.log"
+    served = "".join(f"<service>~/{name}</service>" for name in PARAMETER_SERVICES)
+    reply = f'<services reply="ALLOW">{served}</services>'
+    text = policy_text({"/blade": reply, "/guard": reply})
+    for node in ("blade", "guard"):
+        text = text.replace('node="n"', f'node="{node}"', 1)
+    policy.write_text(text)
+    log.write_text(
+        f"[INFO] [1.0] [rcl]: Found security directory: /k/enclaves{namespace}/guard\n"
+        f"[SECURITY Error] rq{namespace}/blade/get_parametersRequest topic not found in allow rule."
+        " -> check_create_datareader\n"
+    )
+    found = sros("explain", policy, "/guard", "--log", log).out
+    where = f"{namespace}/blade"
+    assert f"this is the node {where}, for which there is the enclave {where}" in found
+    assert f"enclave that is for it: `sros run KEYSTORE {where} -- COMMAND`" in found
 
 
 def test_a_denial_by_a_rule_is_not_said_to_miss_something(tmp_path: Path) -> None:
