@@ -367,7 +367,7 @@ def _make_folders(folder: Folder, path: str) -> None:
 ATTRIBUTES_FILE = ".gitattributes"
 EXPORT_IGNORE = "export-ignore"
 """The attribute by which git leaves a file or folder out of archives."""
-_CONVERTING = (EXPORT_IGNORE, "working-tree-encoding", "ident", "export-subst")
+_CONVERTING = (EXPORT_IGNORE, "working-tree-encoding", "ident", "export-subst", "filter")
 """Attributes by which git changes or drops files in a checkout or archive."""
 _MOST_PATTERNS = 100
 

@@ -697,6 +697,7 @@ sub/robot.xml ident
         b"rob[o]t.xml ident",
         b"ro\\bot.xml ident",
         b'"robot.xml" ident',
+        b"*.xml filter=lfs",
         b"[attr]odd ident\n*.xml odd",
     ],
 )
