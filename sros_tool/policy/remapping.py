@@ -21,7 +21,6 @@ from typing import NamedTuple
 from sros_tool.errors import Note, UsageError
 from sros_tool.names import (
     ACTION_PARTS,
-    NODE_SERVICES,
     check_namespace,
     expand,
     expression_problem,
@@ -212,7 +211,7 @@ def remapped_policies(
 def _notes_on_requirements(
     policies: Iterable[Policy], rules: Iterable[Remapping]
 ) -> Iterator[Note]:
-    """Yield a note on names that no node has any more, except services of every node.
+    """Yield a note on names that no node has any more.
 
     A requirement for such a name would hold, regardless of who may use the new name.  Rules for
     namespaces are ignored, because `sros check` puts requirements into a namespace, too.
@@ -230,15 +229,19 @@ def _notes_on_requirements(
         for side in (policies, [policy for policy, _ in remapped])
     )
     moved = {name for _, name in before - after}
-    gone = {name for name in moved if name.rpartition("/")[2] not in NODE_SERVICES}
+    nodes = {use.old for _, uses in remapped for use in uses if not use.kind}
+    # A requirement may also name what is below a node's name, but is in no right.
+    gone = {
+        next((f"{node}/*" for node in nodes if name.startswith(f"{node}/")), name)
+        for name in moved
+    }
     if gone:
         # These rules are for `parse_remapping_of_names`, where no node is named.
         options = {
             str(use.rule._replace(node=use.node if use.rule.depends_on_node else ""))
             for _, uses in remapped
             for use in uses
-            if use.old in gone
-            or (not use.kind and any(name.startswith(f"{use.old}/") for name in moved))
+            if use.old in gone or f"{use.old}/*" in gone
         }
         text = (
             f"requirements that name {first_few(sorted(gone), _MOST_SHOWN)} do not apply to the "

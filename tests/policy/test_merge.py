@@ -208,6 +208,7 @@ def test_names_that_are_exchanged_are_denied_as_before() -> None:
 def test_what_nodes_remap_otherwise_is_noted() -> None:
     """Only rcl_action 9.2.8 (Jazzy), or of Kilted and later, remaps the name of an action."""
     nodes = [one(group("actions", "plan", execute="ALLOW"), node=node) for node in ("n", "hand")]
+    own = group("services", "~/arm ~/set_parameters", reply="ALLOW")
     parts = ("cancel_goal", "get_result", "send_goal", "feedback", "status")
     rules = " ".join(f"-r plan/_action/{part}:=/arm/plan/_action/{part}" for part in parts)
     for texts, ids, told in (
@@ -218,10 +219,13 @@ def test_what_nodes_remap_otherwise_is_noted() -> None:
         ),
         (["__node:=x"], ["merge.remapped-nodes"], "name to the nodes hand and n. Choose the node"),
         (["n:__node:=x"], [], ""),
+        # All names below a node's name move, also those of no right.
+        (["base:__node:=x"], [OF_REQUIREMENTS], "that name /base/* do not apply"),
         (["__ns:=/left"], [], ""),
         (["/plan:=/y"], ["merge.remapped-action", OF_REQUIREMENTS], "that name /plan do not apply"),
     ):
-        _, notes = remapped_policies(nodes, texts)
+        base = [one(own, node="base")] if "base" in texts[0] else []
+        _, notes = remapped_policies([*nodes, *base], texts)
         assert [note.id for note in notes] == ids
         assert told in "".join(note.text for note in notes)
 
