@@ -232,8 +232,7 @@ def _notes_on_requirements(
     nodes = {use.old for _, uses in remapped for use in uses if not use.kind}
     # A requirement may also name what is below a node's name, but is in no right.
     gone = {
-        next((f"{node}/*" for node in nodes if name.startswith(f"{node}/")), name)
-        for name in moved
+        next((f"{node}/*" for node in nodes if name.startswith(f"{node}/")), name) for name in moved
     }
     if gone:
         # These rules are for `parse_remapping_of_names`, where no node is named.
