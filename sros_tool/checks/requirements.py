@@ -30,8 +30,8 @@ UNKNOWN_ENCLAVE = FindingKind(
     "The requirement protects as much without this enclave. Perhaps the enclave is only on other "
     "robots, or its name is misspelled.",
     "The requirements file.",
-    "Compare the name with those of the robot's enclaves; ignore this finding if only other robots "
-    "have the enclave.",
+    "Compare the name with those of the robot's enclaves; ignore this finding if only other "
+    "robots, or robots of a package's users, have the enclave.",
     prominent=True,
 )
 MISSPELLED_ENCLAVE = FindingKind(

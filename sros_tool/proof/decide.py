@@ -197,7 +197,8 @@ def decide(requirement: Requirement, world: World, limit: SearchLimit | None = N
         _confirm(requirement, witness, world)
     unused, waiting, unnamed = _unused_names(requirement, world, limit)
     missing, exceptions = _missing_enclaves(requirement, world)
-    empty = (*(missing_enclave_clause(name, world.enclaves)[0] for name in missing), *unused)
+    meant = ((name, similar_enclave_clause(name, world.enclaves)) for name in missing)
+    empty = (*(f"there is no enclave {name}{clause}" for name, clause in meant), *unused)
     always = "" if witness or empty else _why_never_fails(requirement, world)
     assumed = "" if witness else _assumed_protection(requirement, world, limit)
     blocked = None
@@ -719,10 +720,9 @@ def _missing_enclaves(requirement: Requirement, world: World) -> tuple[list[str]
     return missing
 
 
-def missing_enclave_clause(pattern: str, enclaves: Iterable[str]) -> tuple[str, bool]:
-    """Return a clause on a missing enclave, and whether the clause names a similar enclave."""
-    meant = _meant_clause(pattern.removeprefix(EXCEPT), [frozenset(enclaves)])
-    return f"there is no enclave {pattern}{meant}", bool(meant)
+def similar_enclave_clause(pattern: str, enclaves: Iterable[str]) -> str:
+    """Return a clause with an enclave that is perhaps meant by a missing enclave, or ""."""
+    return _meant_clause(pattern.removeprefix(EXCEPT), [frozenset(enclaves)])
 
 
 def _unused_names(

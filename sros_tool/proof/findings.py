@@ -42,7 +42,7 @@ from sros_tool.proof.decide import (
     Verdict,
     Witness,
     Worlds,
-    missing_enclave_clause,
+    similar_enclave_clause,
 )
 from sros_tool.proof.requirements import (
     EXCEPT,
@@ -211,11 +211,16 @@ def decide_all(requirements: Sequence[Requirement], system: System) -> Decided:
             )
         empty, reasons = _why_never_fails([verdict for _, verdict in verdicts])
         if empty or reasons:
-            is_alone = not empty and _users_may_break(requirement)
-            (holding_alone if is_alone else vacuous).append((requirement, (*empty, *reasons)))
-        for pattern in _texts_in_all(verdict.absent for _, verdict in verdicts):
-            clause, has_similar = missing_enclave_clause(pattern, known)
-            (misspelled if has_similar else absent).append((requirement, (clause,)))
+            if empty or not _users_may_break(requirement):
+                vacuous.append((requirement, (*empty, *reasons)))
+            elif not broken:
+                holding_alone.append((requirement, tuple(reasons)))
+        exceptions = _texts_in_all(verdict.absent for _, verdict in verdicts)
+        meant = {name: similar_enclave_clause(name, known) for name in exceptions}
+        if misspelled_names := [f"{name}{clause}" for name, clause in meant.items() if clause]:
+            misspelled.append((requirement, (_no_enclave_clause(misspelled_names),)))
+        if absent_names := [name for name, clause in meant.items() if not clause]:
+            absent.append((requirement, (_no_enclave_clause(absent_names),)))
         if not broken and (names := _texts_in_all(verdict.unnamed for _, verdict in verdicts)):
             unnamed.append((requirement, names))
         if not broken and (
@@ -250,6 +255,10 @@ def _users_may_break(requirement: Requirement) -> bool:
             or not any(covers(pattern, "/*") for pattern in anywhere.enclaves)
         )
     )
+
+
+def _no_enclave_clause(names: Sequence[str]) -> str:
+    return f"there is no enclave {_listed_names(names, 'or')}"
 
 
 def _step(use: Use, world: World, system: System) -> Step:
@@ -540,11 +549,11 @@ def _other_violators(violation: Violation) -> str:
     return text + (f"; {more} more break it in other ways" if more else "")
 
 
-def _listed_names(names: Sequence[str]) -> str:
+def _listed_names(names: Sequence[str], word: str = "and") -> str:
     if len(names) > _MOST_SHOWN:
         names = (*names[:_MOST_SHOWN], f"{len(names) - _MOST_SHOWN} more")
     *first, last = names
-    return f"{', '.join(first)} and {last}" if first else last
+    return f"{', '.join(first)} {word} {last}" if first else last
 
 
 def _part_finding(

@@ -324,6 +324,11 @@ VACUOUS, VIOLATED = "requirement.vacuous", "requirement.violated"
         ('[[only]]\npublish = ["x"]\nenclaves = ["/r/a", "*/ops/*"]', NO_OTHERS),
         ('[[only]]\npublish = ["/x"]\nenclaves = ["/ops"]', {ABSENT, VIOLATED}),
         ('[[only]]\nrequest = ["reset"]\nenclaves = ["/ops"]', {ABSENT, *FOUND}),
+        # What is broken is not also called a requirement that no enclave can break.
+        (
+            '[[only]]\npublish = ["x"]\nrequest = ["reset"]\nenclaves = ["/o", "/p"]',
+            {ABSENT, VIOLATED},
+        ),
         ('[[only]]\nrequest = ["/reset"]\nenclaves = ["/ops"]', {ABSENT, VACUOUS}),
         ('[[only]]\npublish = ["/x"]\nenclaves = ["/r/a", "/rr/a"]', {MISSPELLED}),
         ('[[only]]\npublish = ["/x"]\nenclaves = ["*", "!/ops"]', {VACUOUS}),
@@ -338,7 +343,8 @@ def test_an_exception_for_an_enclave_that_does_not_exist(required: str, ids: set
     """Twin: of enclaves that a requirement restricts, nothing is protected."""
     system = robot(PACKAGE)
     requirements = parse_requirements(required.encode(), "r.toml")
-    assert {finding.id for finding in requirement_findings(requirements, system)} == ids
+    found = requirement_findings(requirements, system)
+    assert {finding.id for finding in found} == ids and len(found) == len(ids)
 
 
 READ_BY_ALL = {"/mux": may("publish", "/cmd_vel", "/arm_l/cmd"), "/rec": may("subscribe", "/*")}
