@@ -1,7 +1,8 @@
 """Fetching the release of this robot from a publishing folder, by The Update Framework (TUF).
 
 The folder is an untrusted place: a web server, a bucket, a CDN or a USB stick.  `tuf` verifies its
-metadata from the pinned root on, and so refuses files that are old, mixed, withheld or not signed.
+metadata from the pinned root on, and so refuses files that are old, withheld or not signed, or
+come from different versions of the folder.
 Whether the permissions CA sealed the release is verified where it is installed.
 """
 

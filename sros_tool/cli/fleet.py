@@ -88,7 +88,7 @@ def fleet() -> None:
     "--list",
     "as_list",
     is_flag=True,
-    help="Print the format of Ansible's dynamic inventory scripts.",
+    help="Print the inventory in the format of Ansible's dynamic inventory scripts.",
 )
 def _inventory(root: Path, as_yaml: bool, as_list: bool) -> None:
     """Print the robots of KEYSTORE as an Ansible inventory.
@@ -480,9 +480,9 @@ def _publish(
     PUB has plain files for any web server, bucket or USB stick, and no private key. For each
     robot, PUB has an archive with the files of the robot's enclaves, signed by the permissions CA.
     PUB also has metadata of The Update Framework, with which `sros agent` on the robot refuses
-    old, mixed or forged files. Run this verb after each change, and before the time that it prints,
-    for example each hour. Archives of unchanged robots stay; archives of robots that were revoked
-    or left the fleet are removed.
+    old files, forged files, and files from different versions of PUB. Run this verb after each
+    change, and before the time that it prints, for example each hour. Archives of unchanged robots
+    stay; archives of robots that were revoked or left the fleet are removed.
 
     The keys that sign PUB are in KEYSTORE/private.  The root key only signs the list of the other
     keys.  Move the root key away from the keystore.  Name it with --root-key to replace a key, and
@@ -621,9 +621,9 @@ class ComparedFleet(NamedTuple):
     default="delivery",
     show_default=True,
     help="`delivery`: the exit status is 1 only for problems with the delivery of files, and for "
-    "problems that agents report. `unmended`: not for problems that an agent has mended, and "
-    "reports for a day, such as a changed file. `vulnerabilities`: as `delivery`, and also for a "
-    "DDS with known vulnerabilities that a later release fixes.",
+    "problems that agents report. `unmended`: as `delivery`, but problems that an agent has mended "
+    "(such as a changed file; agents report them for a day) do not count. `vulnerabilities`: as "
+    "`delivery`, and also for a DDS with known vulnerabilities that a later release fixes.",
 )
 @output_option("Replace FILE atomically instead of printing.")
 @dry_run_option

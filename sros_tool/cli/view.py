@@ -185,7 +185,7 @@ def view(
       $ sros view keystore keystore/enclaves/router/router.json5 -o zenoh.html
     """
     from sros_tool.report.formats import render
-    from sros_tool.report.sources import Drawing, draw
+    from sros_tool.report.sources import PictureRequest, draw
 
     check_one_format()
     if hops and not focus:
@@ -209,7 +209,7 @@ def view(
         )
     if output:
         check_output(output, force=force or dry_run)
-    drawing = Drawing(
+    request = PictureRequest(
         sources,
         moment,
         local_zone(os.environ),
@@ -224,7 +224,7 @@ def view(
         robots=robots,
     )
     with progress("drawing"), _without_collection():
-        picture, folding = draw(drawing)
+        picture, folding = draw(request)
         if written == "json":
             document = json_text(versioned(as_plain(picture))) + "\n"
         else:

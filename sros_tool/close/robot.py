@@ -272,7 +272,7 @@ class LocalRobot:
             if changed is None:
                 raise UsageError(
                     f"--brought cannot name {name}",
-                    f"It is no enclave of another machine that has files in '{self.keystore}'.",
+                    f"Either it belongs to this machine, or '{self.keystore}' has no files of it.",
                     f"First run `{self.close_command} --elsewhere {name}`, and bring the files.",
                 )
             brought[name] = changed.isoformat()

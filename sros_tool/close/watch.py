@@ -80,7 +80,9 @@ def check_watchable(robot: LocalRobot) -> None:
 
 
 def watch(robot: LocalRobot, words: Sequence[str]) -> list[str]:
-    """Watch the robot by a verb, and write its nodes and processes into the folder.
+    """Watch the robot with a command of sros, and write its nodes and processes into the folder.
+
+    ``words`` are the words of the command (`generate_policy`).
 
     Return sentences on nodes without an enclave, and on observed rights that the existing policy
     lacks.

@@ -277,8 +277,9 @@ class SearchedKeystore:
 
 @dataclass(frozen=True, slots=True)
 class AskedPolicy:
-    """The policy that explains a log, perhaps of a robot that uses the policy in a namespace.
+    """The policy by which sros explains a log.
 
+    The robot that wrote the log may use the policy in a namespace.
     ``file`` is the path of the policy, and ``name`` the enclave that the user named, or "".
     """
 

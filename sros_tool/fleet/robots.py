@@ -487,10 +487,11 @@ def grouped_by_robot(
 ) -> dict[tuple[_Kind, bool], dict[str, list[_Item]]]:
     """Group items that differ only in one robot: kind -> robot -> items.
 
-    The first list of an item has pairs of a kind and a robot: the item differs from other items of
-    the kind only in this robot.  The item is put into the kind with the most robots.  The second
-    list has pairs with wider kinds, whose items also differ in other robots.  A wider kind is used,
-    and marked by True in the result, if it joins more than ``most`` groups.
+    Each item comes with two lists of pairs of a kind and a robot.  The first list has narrow kinds:
+    the items of such a kind differ only in this robot.  The second list has wide kinds: their items
+    also differ in other robots.  Of each list, the kind with the most robots is used.  A wide kind
+    replaces its narrow kinds if it joins more than ``most`` of them; its key in the result has
+    True.
     """
     robots: dict[_Kind, set[str]] = defaultdict(set)
     read = list(items)

@@ -401,7 +401,7 @@ def _check_file(path: Path) -> None:
     state = path.lstat()
     regular = stat.S_ISREG(state.st_mode) and state.st_nlink == 1
     if not regular or state.st_uid != os.geteuid() or state.st_mode & 0o022:
-        raise IndexDamagedError(f"'{path}' is not a file of this user alone")
+        raise IndexDamagedError(f"'{path}' is not a regular file that only this user can change")
 
 
 def _connect(path: Path, mode: str, *, is_new: bool = False) -> sqlite3.Connection:

@@ -177,15 +177,15 @@ def _unrecorded_notes(
     if below:
         yield Note(
             "fleet.revoked-unrecorded",
-            f"Also revoked, although the fleet does not record it: {_names_text(below)}, in the "
-            "folder of a robot that you revoke.",
+            "Enclaves in the folder of a robot that you revoke are also revoked, although the "
+            f"fleet does not record them: {_names_text(below)}.",
         )
     if left:
         yield Note(
             "fleet.unrecorded-enclaves",
-            f"Still valid: {_names_text(left)}, with the name of a robot that you revoke in the "
-            "path. The fleet does not record which robot has such a key. If the key was on that "
-            "robot, "
+            "Enclaves whose path contains the name of a robot that you revoke are still valid: "
+            f"{_names_text(left)}. The fleet does not record which robot has their keys. If the "
+            "keys were on that robot, "
             f"run `sros revoke {quote(str(keystore.root))} {arguments_for(keystore, left)}`.",
         )
 
@@ -210,9 +210,9 @@ def _other_computers_notes(
             command = f"sros revoke {quote(str(keystore.root))} --robot {' --robot '.join(others)}"
             yield Note(
                 "fleet.same-namespace",
-                f"Still valid: the enclaves of {', '.join(others)}, with the namespace "
-                f"{namespace}, too. If this is a computer of the same robot, and somebody may have "
-                f"its keys, run `{command}`.",
+                f"The enclaves of {', '.join(others)} are still valid, and use the namespace "
+                f"{namespace} of a robot that you revoke. If they are for other computers of this "
+                f"robot, and somebody may have their keys, run `{command}`.",
             )
 
 

@@ -1177,7 +1177,7 @@ def _move_revoked_folder(folder: Folder, certificate: str, to: str) -> None:
 
 
 def _undo(folder: Folder, moves: Sequence[Move]) -> None:
-    """Restore the files that links into the stage replaced."""
+    """Restore the files that were replaced by links into the stage."""
     for path, before, *_ in moves:
         if not _leads_into_stage(folder, path):
             continue

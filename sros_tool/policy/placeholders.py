@@ -83,8 +83,8 @@ def _place_problem(placeholder: Placeholder, before: str, after: str) -> str:
         )
     if placeholder.value == "namespace" and (before.endswith("/") or after[:1] not in ("", "/")):
         return (
-            f"{placeholder} begins with '/' and is a whole namespace: no '/' may stand before it, "
-            f"and nothing but '/' after it, as in {placeholder}/scan."
+            f"{placeholder} begins with '/' and is a whole namespace: write no '/' directly "
+            f"before it; if text follows, it has to begin with '/', as in {placeholder}/scan."
         )
     return ""
 

@@ -218,7 +218,9 @@ def decide(requirement: Requirement, world: World, limit: SearchLimit | None = N
 
 
 def _confirm(requirement: Requirement, witness: Witness, world: World) -> None:
-    """Check that the engine of the world decides on each use of a witness as the witness says.
+    """Check a witness with the decision engine of the world.
+
+    The engine has to allow each use in the witness, or, for a `Must`, deny each use.
 
     Raises:
         AssertionError: the engine decides otherwise.

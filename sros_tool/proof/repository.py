@@ -397,7 +397,9 @@ class Repository:
             if words[-1:] == ["missing"]:
                 continue
             if len(words) != 3 or not words[2].isdecimal():
-                raise DocumentError(f"git cannot read it: {line[:200].decode(errors='replace')}")
+                raise DocumentError(
+                    f"unexpected answer of git: {line[:200].decode(errors='replace')}"
+                )
             content = data[at : at + int(words[2])]
             at += len(content) + 1
             if _digest(words[1], content, len(object_id)) != object_id:
@@ -520,8 +522,8 @@ class Repository:
             raise DocumentError(f"git does not answer within {wait} seconds") from error
         error_text = done.stderr[:500].decode(errors="replace").strip()
         if done.returncode and (error_text or not quiet):
-            why = error_text.removeprefix("fatal: ") or f"it ended with status {done.returncode}"
-            raise DocumentError(f"git cannot read it: {why}")
+            why = error_text.removeprefix("fatal: ") or f"exit status {done.returncode}"
+            raise DocumentError(f"git failed: {why}")
         if error_text and not done.returncode and environment is None:
             raise DocumentError(f"git warns: {error_text}", "Its answer may be incomplete.")
         return done.stdout
@@ -553,7 +555,7 @@ def _contents_of_kind(
     for object_id in ids:
         if object_id not in objects:
             raise DocumentError(
-                f"git cannot read it: the object {object_id} is not in the repository",
+                f"the object {object_id} is not in the repository",
                 "",
                 "Fetch the whole commit, not a partial clone: `git fetch --refetch`.",
             )

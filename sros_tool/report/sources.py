@@ -83,8 +83,8 @@ _AUTHORITY_FILES = "*_ca.cert.pem"
 
 
 @dataclass(frozen=True, slots=True)
-class Drawing:
-    """The content of a picture: one source, or two sources to compare, and options.
+class PictureRequest:
+    """What a picture should show: one source, or two sources to compare, and options.
 
     ``sources`` are paths of policies, permissions, enclaves, keystores or observations;
     ``observed`` are paths of observations to compare with a single source.  ``template`` is the
@@ -111,7 +111,7 @@ class Drawing:
     robots: Sequence[str] = ()
 
 
-def draw(drawing: Drawing) -> tuple[Picture, Folding]:
+def draw(request: PictureRequest) -> tuple[Picture, Folding]:
     """Return a picture, and the same picture with equal units drawn once.
 
     Equal units are robots, namespaces or enclaves that differ only in their names.
@@ -120,22 +120,22 @@ def draw(drawing: Drawing) -> tuple[Picture, Folding]:
         UsageError: there are too many sources, or an option does not fit them.
         SrosError: a source or the requirements cannot be read.
     """
-    sources, fleets = drawing.sources, drawing.fleets
-    if len(sources) > 2 or (drawing.observed and len(sources) > 1):
+    sources, fleets = request.sources, request.fleets
+    if len(sources) > 2 or (request.observed and len(sources) > 1):
         raise UsageError(
             "at most two sources can be compared",
             "",
             "Name one SOURCE and --observed, or two SOURCEs.",
         )
-    titles = _titles([*sources, *drawing.observed])
+    titles = _titles([*sources, *request.observed])
     read = [
-        _read(path, fleet, drawing, title).titled(title)
+        _read(path, fleet, request, title).titled(title)
         for path, fleet, title in zip(sources, fleets, titles, strict=False)
     ]
-    observed = [read_source(path, now=drawing.now) for path in drawing.observed]
-    if drawing.template:
+    observed = [read_source(path, now=request.now) for path in request.observed]
+    if request.template:
         _check_no_governance(sources, read)
-        protection = load_template(drawing.template).protection
+        protection = load_template(request.template).protection
         read = [
             source
             if source.governance
@@ -146,12 +146,12 @@ def draw(drawing: Drawing) -> tuple[Picture, Folding]:
     for path, fleet, source in zip(sources, fleets, read, strict=False):
         robots |= _robots(path, fleet, source)
     places = {enclave: robot.name for enclave, robot in robots.items()}
-    hosts = places | _hosts(drawing.hosts)
+    hosts = places | _hosts(request.hosts)
     if observed:
         observation = union(list(map(PictureSource.titled, observed, titles[len(read) :])))
         enclave_of = enclaves_of_nodes(observation.nodes, read[0].nodes)
         read.append(observation.moved_to_homes(enclave_of))
-    picture = _compared_picture(read, hosts, use=bool(drawing.observed))
+    picture = _compared_picture(read, hosts, use=bool(request.observed))
     governed = [source.governance for source in read if source.governance]
     if len(governed) == 2 and governed[0] != governed[1]:
         text = (
@@ -170,11 +170,11 @@ def draw(drawing: Drawing) -> tuple[Picture, Folding]:
         text += "."
         finding = PicturedFinding("view.domains", "note", text)
         picture = replace(picture, findings=(*picture.findings, finding))
-    if drawing.focus:
+    if request.focus:
         routers = max(_routers(source.keystore) for source in read)
-        picture = focused_picture(picture, read, drawing.focus, routers)
-    if drawing.requirements:
-        picture = _with_requirements(picture, drawing.requirements, drawing, read[0].keystore)
+        picture = focused_picture(picture, read, request.focus, routers)
+    if request.requirements:
+        picture = _with_requirements(picture, request.requirements, request, read[0].keystore)
     folding = Folding.of(picture, robots)
     return replace(picture, equal=folding.equal, different=folding.different), folding
 
@@ -216,8 +216,8 @@ def _compared_picture(
     return overlay(first, second, "drift", hosts)
 
 
-def _read(path: Path, fleet: Fleet | None, drawing: Drawing, title: str) -> PictureSource:
-    """Read a source, with findings of ``sros check`` if ``drawing`` asks for them.
+def _read(path: Path, fleet: Fleet | None, request: PictureRequest, title: str) -> PictureSource:
+    """Read a source, with findings of ``sros check`` if ``request`` asks for them.
 
     A source that ``sros check`` does not read has the finding ``view.not-checked`` instead.
     Findings name files with the folders that ``title`` has.
@@ -227,9 +227,9 @@ def _read(path: Path, fleet: Fleet | None, drawing: Drawing, title: str) -> Pict
     def shown(file: str) -> str:
         return folders + os.path.relpath(file, path.parent) if folders else _file_name(file)
 
-    sample = _sample(path, drawing)
-    source = read_source(path, now=drawing.now, fleet=fleet, sample=sample)
-    if not drawing.checked:
+    sample = _sample(path, request)
+    source = read_source(path, now=request.now, fleet=fleet, sample=sample)
+    if not request.checked:
         return source
     if source.origin.kind == "observation":
         text = "`sros check` does not check what was observed."
@@ -239,7 +239,7 @@ def _read(path: Path, fleet: Fleet | None, drawing: Drawing, title: str) -> Pict
     from sros_tool.checks.targets import path_findings
 
     at = Circumstances(
-        drawing.now, drawing.zone, fleet=fleet, sample=sample.enclaves if sample else None
+        request.now, request.zone, fleet=fleet, sample=sample.enclaves if sample else None
     )
     if source.keystore:
         at.opened[path] = source.keystore
@@ -260,31 +260,31 @@ def _not_checked(text: str) -> PicturedFinding:
     return PicturedFinding("view.not-checked", "note", text)
 
 
-def _sample(path: Path, drawing: Drawing) -> SampledKeystore | None:
+def _sample(path: Path, request: PictureRequest) -> SampledKeystore | None:
     """Return the enclaves of a keystore to read in full; None for sources of other kinds.
 
     Raises:
-        UsageError: ``drawing`` names a robot that the keystore lacks.
+        UsageError: ``request`` names a robot that the keystore lacks.
     """
     if not (path.is_dir() and is_keystore(path)):
-        if drawing.robots:
+        if request.robots:
             raise UsageError("--robot is for a keystore only", "", "Leave it out.")
         return None
     keystore = OpenedKeystore(path)
     fleet = load_fleet(keystore)
     robots = _robots_of(fleet, keystore.names) if fleet else {}
     known = {unit.name for unit in units_of(keystore.names, robots)}
-    for name in drawing.robots:
+    for name in request.robots:
         if name not in known:
             raise UsageError(
                 f"'{path}' has no enclaves of a robot {name!r}",
                 "",
                 f"It has {first_few(sorted(known, key=name_order), 5)}." if known else "",
             )
-    draw_whole = not drawing.sampled or drawing.focus or drawing.requirements or drawing.observed
-    if draw_whole or len(drawing.sources) > 1:
+    draw_whole = not request.sampled or request.focus or request.requirements or request.observed
+    if draw_whole or len(request.sources) > 1:
         return SampledKeystore(keystore, keystore.names)
-    return sample_of(keystore, robots, drawing.robots)
+    return sample_of(keystore, robots, request.robots)
 
 
 def drawn_difference(
@@ -384,7 +384,7 @@ def _robots_of(fleet: Fleet, enclaves: Iterable[str]) -> dict[str, Robot]:
 
 
 def _with_requirements(
-    picture: Picture, file: Path, drawing: Drawing, keystore: OpenedKeystore | None
+    picture: Picture, file: Path, request: PictureRequest, keystore: OpenedKeystore | None
 ) -> Picture:
     """Return the picture with the rights that break requirements, as ``sros check`` decides.
 
@@ -402,13 +402,13 @@ def _with_requirements(
     from sros_tool.proof.requirements import Must, demand, read_requirements
     from sros_tool.proof.system import load_system
 
-    if len(drawing.sources) > 1:
+    if len(request.sources) > 1:
         raise UsageError("--requirements takes one policy or keystore", "", "Name only one SOURCE.")
-    at = Circumstances(drawing.now, drawing.zone, fleet=drawing.fleets[0])
+    at = Circumstances(request.now, request.zone, fleet=request.fleets[0])
     if keystore:
-        at.opened[drawing.sources[0]] = keystore
-    template = load_template(drawing.template) if drawing.template else None
-    system = load_system(drawing.sources[0], at, template)
+        at.opened[request.sources[0]] = keystore
+    template = load_template(request.template) if request.template else None
+    system = load_system(request.sources[0], at, template)
     stated = read_requirements(file, system.fleet)
     decided = decide_all(stated, system)
     findings = decided_findings(decided, system)

@@ -49,8 +49,8 @@ _LISTENING_TEXTS = (
         "not-tls", r"zenoh_link\S*: received corrupt message of type InvalidContentType",
         "something without TLS connected to an endpoint with TLS: a process with an endpoint "
         "tcp/..., or another program",
-        f"{_RUN_PEER} Many such lines a second keep everybody out: use a firewall, or "
-        "listen on localhost.",
+        f"{_RUN_PEER} Many such connections a second keep all other processes out: use a firewall, "
+        "or listen on localhost.",
     ),
     _zenoh_text(
         "peer-expired", r"invalid peer certificate: certificate expired",

@@ -385,9 +385,9 @@ def _untranslatable_name_error(name: str, place: Source) -> PolicyError:
 def _too_many_error(name: str, place: Source) -> PolicyError:
     return PolicyError(
         f"{place}: the name {name} cannot be expressed in Zenoh",
-        "A key expression of Zenoh has no '?' and no set of characters, and a list of all names "
-        f"takes more than {MOST_EXPRESSIONS} key expressions.",
-        "List the names, or use '*'.",
+        "Zenoh key expressions have no '?' and no sets of characters, so sros lists the names that "
+        f"{name} may match: here more than {MOST_EXPRESSIONS} key expressions.",
+        "Write only the names that the robot uses, or use '*'.",
     )
 
 

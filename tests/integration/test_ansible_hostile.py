@@ -215,8 +215,8 @@ def test_robots_that_lie_in_many_ways(tmp_path: Path) -> None:
     assert not odd | ({*text} & {*BLANK.strip()}) and " " * 60 not in shown, (odd, text)
     assert text.count("\nPLAY RECAP") == 2, text  # of each playbook
     flat = " ".join(text.split())
-    assert "Revoked: /r4/a, /r4/spare. Still valid, with the name" in flat, text
-    assert "in the path: /dispatcher/r4. If" in flat, text
+    assert "Revoked: /r4/a, /r4/spare. Enclaves whose path" in flat, text
+    assert "revoked robot are still valid: /dispatcher/r4. If" in flat, text
     assert "processes: /dispatcher, /dispatcher/r4." in flat, text
     assert "The revocation list did not get to r2, r3, r5, r6, r7, r8," in flat, text
     assert "This robot has facts that replace variables (sros_robot)" in flat, text

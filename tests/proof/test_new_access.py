@@ -688,7 +688,7 @@ def test_a_git_that_fails_without_a_word_is_no_missing_file(
     sides = ("git:main:policies/robot.xml", "policies/robot.xml")
     ended = sros("diff_policy", "--no-new-access", *sides, cwd=repository)
     assert ended.status == 2
-    assert "git cannot read it: it ended with status 9" in ended.err
+    assert "git failed: exit status 9" in ended.err
 
 
 # ── fleets ─────────────────────────────────────────────────────────────────────────────────

@@ -10,7 +10,7 @@ import pytest
 from sros_tool.report import sampling
 from sros_tool.report.folding import Folding
 from sros_tool.report.picture import Picture
-from sros_tool.report.sources import Drawing, draw
+from sros_tool.report.sources import PictureRequest, draw
 from tests.report.pictures import group
 from tests.support.harness import Ended, made_once, policy_text, sros
 from tests.support.long_form import some
@@ -63,7 +63,7 @@ def large(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def drawing(keystore: Path, *, sampled: bool) -> tuple[Picture, Folding]:
     """Return the picture of all enclaves, or of a sample."""
-    return draw(Drawing([keystore], datetime.now(UTC), UTC, sampled=sampled))
+    return draw(PictureRequest([keystore], datetime.now(UTC), UTC, sampled=sampled))
 
 
 def test_a_sample_draws_what_all_enclaves_draw(large: Path) -> None:

@@ -158,7 +158,9 @@ class _Entry(tarfile.TarInfo):
         """
         entry = super().frombuf(buf, encoding, errors)
         if entry.type in _EXTENSION_HEADERS and entry.size > _MOST_HEADER:
-            raise DocumentError(f"it contains a header of {entry.size} bytes")
+            raise DocumentError(
+                f"it contains a header of {entry.size} bytes; at most {_MOST_HEADER} are allowed"
+            )
         if entry.type not in (
             *_EXTENSION_HEADERS,
             tarfile.REGTYPE,

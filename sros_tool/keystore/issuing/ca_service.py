@@ -166,10 +166,11 @@ class CaService:
 
 
 def _bounded_output(process: subprocess.Popen[bytes]) -> tuple[bytes | None, bytes]:
-    """Return the output of a program, up to just above the limit, and the end of its error output.
+    """Return the output of a program, and the end of its error output.
 
-    The output is None if the program does not end in time.  The program and its child processes are
-    then ended in any case.
+    Reading stops when the output exceeds `_MOST_BYTES`, so that the caller can see this.  The
+    output is None if the program does not end in time.  A program that has not ended by itself is
+    killed, with its child processes.
     """
     end, answer, errors, ended = time.monotonic() + _MOST_SECONDS, b"", b"", False
     assert process.stdout and process.stderr
