@@ -430,7 +430,8 @@ def _how_to_replace_key(keystore: CheckedKeystore, path: str) -> str:
     root, where = quote(os.fspath(keystore.root)), ""
     if not keystore.looks_like_original:
         root, where = "KEYSTORE", f" in the {ORIGINAL_KEYSTORE}"
-    folder, *inside, name = Path(os.path.relpath(path, keystore.root)).parts
+    place = Path(os.path.relpath(path, keystore.root))
+    (folder, *inside), name = place.parent.parts or ("",), place.name
     enclave = "/" + "/".join(part for part in inside if not part.startswith(".."))  # a mount
     if folder == "..":  # sros deletes no key outside of the keystore
         how = f"replace the CA{where}: `sros rotate_ca {root} --finish`; delete the old key"
