@@ -908,7 +908,10 @@ def test_a_clock_behind_the_keystore_is_said_of_what_seems_valid(tmp_path: Path)
     assert sros(*due).status == 2
     assert "keystore.clock-behind" in sros("check", root).out
     # Or the clock was ahead at the last change, which an entry with the right time ends.
-    assert "If it is right, it was ahead at the last change" in sros("crl", root, "--refresh").err
+    said = sros("crl", root, "--refresh").err
+    assert "If it is right, it was ahead at the last change" in said
+    assert f"`sros check {root}` names them; renew them." in said
+    assert f"`sros renew {root} /b`" in sros("check", root).out
     assert behind not in sros(*due).ok().err
     create_enclaves(root, ["/c"], now=later)
     (root / "ledger.jsonl").unlink()

@@ -498,8 +498,10 @@ class KeystoreChange:
         if behind := self.keystore.ledger_file.clock_behind(self.now):
             text = (
                 f"{behind}. If the clock is wrong, set it: files that are made now are valid for "
-                "too short a time. If it is right, it was ahead at the last change, and there is "
-                "nothing to do: the ledger now has an entry with the right time."
+                "too short a time. If it is right, it was ahead at the last change: the ledger "
+                "now has an entry with the right time, but certificates and permissions that were "
+                "made with the wrong time may not be valid yet. "
+                f"`sros check {quote(str(self.keystore.root))}` names them; renew them."
             )
             self.notes.append(Note("keystore.clock", text))
         if faults := self.keystore.ledger_file.reading_for_append().unrecorded:
