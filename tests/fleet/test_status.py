@@ -359,7 +359,8 @@ def test_files_of_a_robot_that_others_can_read_or_change(field: Field) -> None:
     folder, key, permissions = sorted(found["problems"], key=lambda text: text.partition(":")[0])
     assert folder.startswith("enclaves/r1/base: a file or folder that everybody can change: its mo")
     assert permissions.startswith("enclaves/r1/base/permissions.p7s: a file or folder that everyb")
-    assert key == "enclaves/r1/base/key.pem: a private key that others can read: its mode is 0644."
+    shown = "enclaves/r1/base/key.pem: a private key that others can read: its mode is 0644. Run `"
+    assert key.startswith(shown) and "`chmod 600`" in key and "--revoke-old`" in key
     assert found["to_do"] == "look into it"
 
 

@@ -297,6 +297,10 @@ def _enclave(
 
 
 _MOST_NAMED = 2
+_CLOSE_KEY = (
+    " Run `chmod 600` on it; if others may have copied it, also run `sros renew KEYSTORE ENCLAVE "
+    "--new-key --revoke-old`."
+)
 
 
 class InstalledEnclave(NamedTuple):
@@ -339,16 +343,17 @@ def _on_robot(folder: Path, now: datetime) -> CheckedKeystore:
 
 def exposed_sentences(folder: Path, now: datetime) -> Iterator[str]:
     """Yield sentences on files that others can read or change, as `sros verify` finds them."""
-    paths: dict[tuple[str, str], list[str]] = {}
+    paths: dict[tuple[str, str, str], list[str]] = {}
     try:
         for finding in check_files(_on_robot(folder, now)):
             if finding.severity >= ERROR:
                 path = os.path.relpath(finding.file, folder)
-                paths.setdefault((finding.kind.title, finding.text), []).append(path)
+                to_do = _CLOSE_KEY if finding.kind is KEY_READABLE else ""
+                paths.setdefault((finding.kind.title, finding.text, to_do), []).append(path)
     except (SrosError, OSError) as error:
         yield f"The modes of the files in '{folder}' cannot be checked: {error}"
-    for (title, text), files in paths.items():
-        yield f"{first_few(files, _MOST_NAMED)}: {title}: {text}."
+    for (title, text, to_do), files in paths.items():
+        yield f"{first_few(files, _MOST_NAMED)}: {title}: {text}.{to_do}"
 
 
 def exposed_keys(folder: Path, now: datetime) -> frozenset[str]:
