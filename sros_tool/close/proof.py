@@ -197,16 +197,18 @@ def _unsigned_policy_text(robot: LocalRobot) -> str:
     """Return a clause on the enclaves whose signed rights differ from the policy; "" if none do."""
     if not robot.policy.exists():
         return ""
+    has_keystore = robot.keystore.exists()
+    signed = robot.keystore if has_keystore else robot.export
     only = ("--include", STALE.id, "--json")
-    words = ("check", str(robot.export), "--policy", str(robot.policy), *only)
+    words = ("check", str(signed), "--policy", str(robot.policy), *only)
     _, output, _ = robot.shell.run(words, False)
     stale = [finding["subject"] for finding in json.loads(output)["findings"]]
-    unsigned = robot.policy_enclaves() - robot.not_here - {*list_enclaves(robot.export)}
-    changed = sorted({*stale} | unsigned)
+    unsigned = robot.policy_enclaves().difference(list_enclaves(signed))
+    changed = sorted({*stale} | (unsigned if has_keystore else unsigned - robot.not_here))
     if not changed:
         return ""
     remedy = f"`{robot.close_command}` checks and signs it"
-    if not robot.keystore.exists():
+    if not has_keystore:
         remedy = "bring the signed policy here, or sign this policy where the keystore is"
     return (
         f"; '{robot.policy}' differs from the signed permissions of "
@@ -321,17 +323,18 @@ def _proof_of_processes(running: RunningRobot, number: int) -> Proof:
         remedy = remedies.get(finding.subject, finding.remedy)
         robot.shell.say(f"{finding.subject}: {finding.text}. {remedy}")
     wrong = [finding for finding in findings if finding.id != PROCESS_NOT_SEEN.id]
+    text = f"{counted(number, 'enclave')}, and no open process in domain {robot.domain}"
     if findings:
         texts = [
             finding.text if finding.subject == "processes" else f"{finding.subject}: {finding.text}"
             for finding in wrong or findings
         ]
-        return Proof(_CLAIM_STARTED, False if wrong else None, first_few(texts, MOST_NAMES, "; "))
-    guests = "".join(f"; {guest}" for guest in _unexpected_processes(running))
+        text = first_few(texts, MOST_NAMES, "; ")
+    else:
+        text += "".join(f"; {guest}" for guest in _unexpected_processes(running))
     if more := running.not_observed():
-        guests += f"; not observed before: {first_few(more, MOST_NAMES)} (stop what is not yours)"
-    summary = f"{counted(number, 'enclave')}, and no open process in domain {robot.domain}"
-    return Proof(_CLAIM_STARTED, True, f"{summary}{guests}")
+        text += f"; not observed before: {first_few(more, MOST_NAMES)} (stop what is not yours)"
+    return Proof(_CLAIM_STARTED, False if wrong else None if findings else True, text)
 
 
 def _process_findings(running: RunningRobot) -> list[Finding]:

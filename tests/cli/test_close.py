@@ -816,6 +816,11 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     more = "; not observed before: process 6 (thief) in /talker, process 7 (run) in /talker ("
     guest = "in domain 0; process 5 (guest) runs open in domain 7"
     assert f"{guest}{more}stop what is not yours)\n" in robot.close("--proof").out
+    robot.more += (replace(seven, environment={"ROS_DOMAIN_ID": "0"}),)
+    said = robot.close("--proof", status=1).out
+    assert (
+        "no: every process was started in its enclave: process 5 (guest)" in said and more in said
+    )
     robot.more = ()
     robot.remaining = (TALKER,)
     lost = "no: everything that talked can still talk: "
@@ -1652,6 +1657,13 @@ def test_an_enclave_that_belongs_to_another_machine(robot: Robot) -> None:
     for words in (("--brought", "/listener"), ("--proof",)):
         said = robot.close(*words).err
         assert brought in said and needed not in said
+    policy = robot.folder / "robot/policy.xml"
+    stated = policy.read_bytes()
+    policy.write_bytes(stated.replace(b"</topics>", b"<topic>more</topic></topics>"))
+    assert "differs from the signed permissions of /listener, /talker, which" in (
+        robot.close("--proof").out
+    )
+    policy.write_bytes(stated)
     os.utime(shared)
     assert "restart the process: /listener (" in robot.close().err
     robot.remaining = (TALKER,)
