@@ -21,7 +21,7 @@ from collections.abc import (
     Mapping,
     Sequence,
 )
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from itertools import product
 from string import ascii_letters
@@ -87,7 +87,8 @@ class Witness:
 
     For influence, the uses are a chain: after each use that writes comes the use that reads.
     ``others`` are uses of each further enclave that breaks the requirement: the uses of the witness
-    if this enclave has them, else different uses.
+    if this enclave has them, else different uses.  For influence, they are the chain with another
+    enclave in one place.
     """
 
     uses: tuple[Use, ...]
@@ -671,7 +672,41 @@ def _witness_against_apart(requirement: Apart, world: World, limit: SearchLimit)
     chain = _shortest_chain(world, sources, targets, through, limit)
     if not chain:
         return None
-    return Witness(tuple(use for hop in chain for use in _uses_of_hop(hop)))
+    # The findings of a table for each robot are folded, which lists of the others would prevent.
+    others = () if requirement.robot else _similar_chains(chain, world, sources, through)
+    return Witness(_uses_of_chain(chain), tuple(_uses_of_chain(other) for other in others))
+
+
+def _similar_chains(
+    chain: _Chain, world: World, sources: Collection[str], through: Container[str]
+) -> Iterator[_Chain]:
+    """Yield the chain with each other enclave that can stand where the findings name one.
+
+    This is the source of a direct influence, else the first enclave that passes it on.
+    """
+    worlds = (world, *world.elsewhere)
+    used = {ANYBODY, *(enclave for hop in chain for enclave in (hop.source, hop.target))}
+    *before, after = chain[:2]
+    for enclave in sorted({each for of in worlds for each in of.writers_of(after.topic)} - used):
+        if enclave in through or not (before or enclave in sources):
+            continue
+        changed = [replace(hop, target=enclave) for hop in before]
+        changed.append(replace(after, source=enclave))
+        if all(any(_passes(of, hop) for of in worlds) for hop in changed):
+            yield (*changed, *chain[2:])
+
+
+def _passes(world: World, hop: TopicHop) -> bool:
+    crossing = world.topics_between(hop.source, hop.target)
+    return (
+        hop.source in world.writers_of(hop.topic)
+        and hop.target in world.readers_of(hop.topic)
+        and (crossing is None or hop.topic in crossing)
+    )
+
+
+def _uses_of_chain(chain: _Chain) -> tuple[Use, ...]:
+    return tuple(use for hop in chain for use in _uses_of_hop(hop))
 
 
 def _uses_of_hop(hop: TopicHop) -> Iterator[Use]:

@@ -130,15 +130,25 @@ class Violation:
     others: tuple[tuple[Step, ...], ...] = ()
 
     @property
+    def position(self) -> int:
+        """The place, in the uses, of the enclave to change: the first that passes on, if any."""
+        return 2 if isinstance(self.requirement, Apart) and len(self.steps) > 2 else 0
+
+    @property
     def alike(self) -> list[str]:
         """Further enclaves that break the requirement with the same uses."""
-        return [uses[0].enclave for uses in self.witness.others if _are_alike(uses, self.witness)]
+        others, position = self.witness.others, self.position
+        return [uses[position].enclave for uses in others if _are_alike(uses, self.witness)]
 
     @property
     def differing(self) -> list[tuple[Step, ...]]:
         """The steps of ``others`` that break the requirement with different uses."""
         similar_enclaves = {*self.alike}
-        return [steps for steps in self.others if steps[0].use.enclave not in similar_enclaves]
+        return [
+            steps
+            for steps in self.others
+            if steps[self.position].use.enclave not in similar_enclaves
+        ]
 
 
 def _are_alike(uses: Sequence[Use], witness: Witness) -> bool:
@@ -450,11 +460,12 @@ def _edit_text(violation: Violation) -> str:
             key, enclaves = "enclaves", [violation.steps[0].use.enclave, *violation.alike]
             enclaves += [steps[0].use.enclave for steps in violation.differing]
         case Apart(through=listed, sources=sources):
-            # The narrowest exception: the first enclave that passes on what the source sends.
-            key, enclaves = "through", [steps[2 if len(steps) > 2 else 0].use.enclave]
-            if enclaves[0] in sources:  # the source would no longer be kept apart from anything
+            # The narrowest exception: the first enclaves that pass on what the source sends.
+            key, enclaves = "through", [steps[violation.position].use.enclave, *violation.alike]
+            if {*enclaves} & {*sources}:  # a source would no longer be kept apart from anything
                 return ""
-            effect = f"; it then passes on all that reaches {enclaves[0]}" * (len(steps) > 2)
+            if violation.position:
+                effect = f"; it then passes on all that reaches {_listed_names(enclaves)}"
         case _:
             return ""
     if not requirement.as_written or any(name.startswith(EXCEPT) for name in listed):
@@ -485,7 +496,7 @@ def short_text(violation: Violation) -> str:
             text = f"messages of {_subject(violation)} are not {is_wanted}"
         case _:
             text = f"{_subject(violation)} {_clause(violation)}"
-    more = len(violation.witness.others)
+    more = 0 if violation.position else len(violation.witness.others)
     return f"{text}, and {more} more break it" if more else text
 
 
@@ -493,7 +504,10 @@ def _violation_clause(violation: Violation) -> str:
     """Return a clause that states a violation, without the subject of the finding."""
     match violation.requirement:
         case Apart():
-            return f"{_clause(violation)}: {_chain(violation.steps)}"
+            text = f"{_clause(violation)}: {_chain(violation.steps)}"
+            how = "through" if violation.position else "from"
+            names = violation.alike
+            return f"{text} (the same {how} {_listed_names(names)})" if names else text
         case Must() | Protected():
             return _clause(violation)
         case _:

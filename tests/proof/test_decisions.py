@@ -153,14 +153,27 @@ def test_in_short_a_violation_says_who_breaks_it_by_what() -> None:
         ),
         (
             {
+                "/a": may("publish", "/x"),
+                "/b": may("publish", "/*"),
+                "/c": may("subscribe", "/x"),
+                "/d": may("publish", "/x"),
+            },
+            '[[apart]]\nfrom = ["*"]\nto = ["/c"]\nthrough = ["/d"]\n',
+            'add "/a", "/b" to `through` of the requirement at r.toml:1.',
+            '"/d"',
+        ),
+        (
+            {
                 "/web": may("publish", "/x"),
                 "/nav": may("subscribe", "/x") + may("publish", "/y"),
+                "/nav2": may("subscribe", "/x") + may("publish", "/y"),
+                "/no": may("publish", "/y"),
                 "/mux": may("subscribe", "/y") + may("publish", "/z"),
                 "/base": may("subscribe", "/z"),
             },
             '[[apart]]\nfrom = ["/web"]\nto = ["/base"]\nthrough = ["/d"]\n',
-            'add "/nav" to `through` of the requirement at r.toml:1; it then passes on all that '
-            "reaches /nav.",
+            'add "/nav", "/nav2" to `through` of the requirement at r.toml:1; it then passes on '
+            "all that reaches /nav and /nav2.",
             '"/d"',
         ),
     ],
@@ -171,6 +184,8 @@ def test_after_the_edit_that_a_finding_names_the_requirement_holds(
     findings = requirement_findings(parse_requirements(required.encode(), "r.toml"), robot(rights))
     assert findings[0].remedy.endswith(f"; or, if this is wanted, {edit}")
     added = edit.removeprefix("add ").partition(" to ")[0]
+    said = f"{findings[0].subject} {findings[0].text}"
+    assert all(name.strip('"') in said for name in added.split(", "))
     assert not decided(rights, required.replace(kept, f"{kept}, {added}")).violations
 
 
