@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from sros_tool.errors import KeystoreError
+from sros_tool.faults import Fault
 from sros_tool.keystore.describe import history
 from sros_tool.keystore.layout import enclave_path, list_enclaves
 from sros_tool.keystore.lifecycle.create import create_enclaves
@@ -53,7 +54,9 @@ def see(root: Path) -> Seen:
             moves = (folder / "cert.pem").is_symlink()  # and the rest of the folder with it
             assert moves or not (folder / "key.pem").exists(), name
             continue
-        assert not open_enclave(folder, now=LATER).problems, name
+        # The first list may be a link to nothing for a moment: ROS 2 does without it, as before.
+        no_list_yet = {Fault.CRL_LEFT_OUT} if not (folder / "crl.pem").exists() else set[Fault]()
+        assert {e.fault for e in open_enclave(folder, now=LATER).problems} <= no_list_yet, name
         loadable.append((name, (folder / "cert.pem").read_bytes()))
         lists.add((folder / "crl.pem").read_bytes() if (folder / "crl.pem").exists() else b"")
     assert len(lists) == 1, "some refuse the revoked, others do not"
