@@ -208,7 +208,7 @@ class FileChange(NamedTuple):
     """The file; for ``send``, its path in the archive on standard output."""
 
 
-NamedKeystore = Annotated[Path, "The keystore, as it was named."]
+NamedKeystore = Annotated[Path, "Path of the keystore, as the user gave it."]
 DryRun = Annotated[bool, "Whether nothing was changed, because of `--dry-run`."]
 FileChanges = Annotated[
     Sequence[FileChange], "The files that were written or, with `--dry-run`, would be."

@@ -120,9 +120,9 @@ def _paths_option(name: str, help_text: str) -> Callable[[Decorated], Decorated]
     "namespaces",
     metavar="NS",
     multiple=True,
-    help="Put the requirements into this namespace, as `sros check --namespace` does, for policies "
-    "that have their nodes there: the policies do not move.  Can be repeated, or name several on "
-    "separate lines.",
+    help="Put the requirements into this namespace, as `sros check --namespace` does. The policies "
+    "do not change: their nodes have to be in this namespace already. Can be repeated, or name "
+    "several on separate lines.",
 )
 @click.option(
     "--remap",

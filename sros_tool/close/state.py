@@ -130,9 +130,10 @@ class RunningRobot:
 
     @cached_property
     def not_current(self) -> Mapping[str, Sequence[tuple[Process, str]]]:
-        """Map each enclave with processes that are not closed to these processes, with the reasons.
+        """Return, for each enclave, its processes that are not closed, each with the reason.
 
-        A reason is text before "the processes of X".  A process of a user who cannot read the
+        Enclaves without such processes are left out.  A reason is text before "the processes of X",
+        such as "no ROS_SECURITY_STRATEGY=Enforce in".  A process of a user who cannot read the
         files only claims to run in an enclave: such a process counts only if the enclave has no
         other process.
         """
@@ -363,8 +364,9 @@ class CloseState(NamedTuple):
     whose current files were brought are in `brought`.
     """
     brought: Mapping[str, datetime]
-    """The other enclaves of other machines, also with the last change of their files: `--brought`
-    says that the other machine has these files, which sros cannot see.
+    """The enclaves whose present files the user has brought to other machines (`--brought`), and
+    when these files in the keystore changed last, in UTC. sros cannot see whether the other machine
+    has them.
     """
     valid_until: datetime | None
     """When the first enclave of the export expires, in UTC; null without an export."""

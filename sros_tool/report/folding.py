@@ -511,15 +511,15 @@ class _Draft:
                 continue
             name = self._text(edge.name)
 
-            def word(named: int, at: int, edge: Edge = edge, unit: int | None = unit) -> str:
+            def unit_label(named: int, at: int, edge: Edge = edge, unit: int | None = unit) -> str:
                 if unit is None or not self._is_counted(unit, named):
                     return self._label(named, at)
                 return count_text(edge, unit, named, at)
 
-            shown = name.fill(word)
+            shown = name.fill(unit_label)
             if shown != edge.name and (edge.kind, shown) not in self._names:
                 self._names[edge.kind, shown] = tuple(self._real_names(edge.kind, name))
-            by = tuple(dict.fromkeys(self._text(wildcard).fill(word) for wildcard in edge.by))
+            by = tuple(dict.fromkeys(self._text(wildcard).fill(unit_label) for wildcard in edge.by))
             path = self._path(edge.enclave)
             yield replace(edge, enclave=path, name=shown, by=by, differs=edge in differing_parts)
 
@@ -669,17 +669,17 @@ class _Draft:
     ) -> Iterator[str]:
         """Yield enclaves and rights in words, with the name of ``unit`` instead of ``replaced``."""
 
-        def word(named: int, position: int) -> str:
+        def unit_label(named: int, position: int) -> str:
             return self._label(unit if named == replaced else named, position)
 
         enclaves = {part for part in drawn if isinstance(part, str)}
         for part in drawn:
             if isinstance(part, str):
-                yield f"enclave {self._path_split_at_own_unit(part).fill(word)}"
+                yield f"enclave {self._path_split_at_own_unit(part).fill(unit_label)}"
             elif part.enclave not in enclaves:
                 deny = "" if part.qualifier is ALLOW else "DENY "
-                enclave = self._path_split_at_own_unit(part.enclave).fill(word)
-                yield f"{enclave} {deny}{part.right} {self._text(part.name).fill(word)}"
+                enclave = self._path_split_at_own_unit(part.enclave).fill(unit_label)
+                yield f"{enclave} {deny}{part.right} {self._text(part.name).fill(unit_label)}"
 
 
 def _classes(views: Sequence[Counter[_Part]], before: Sequence[int]) -> dict[int, list[int]]:

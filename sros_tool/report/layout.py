@@ -638,7 +638,11 @@ def _linked_cards(cards: Mapping[str, Card], links: Sequence[Link]) -> tuple[Lin
 def _card_tops(
     columns: Sequence[Sequence[ColumnItem]], lines: Sequence[tuple[str, str]]
 ) -> dict[str, float]:
-    """Map cards to their y; the tallest column has no gaps, and other columns follow it."""
+    """Map cards to their y.
+
+    The tallest column is placed first, as tight as possible. In the other columns, each card is
+    placed near the cards to which lines connect it.
+    """
     extent = [_extent(column) for column in columns]
     tallest = max(range(len(columns)), key=lambda number: (extent[number], number % 2 == 1))
     tops: dict[str, float] = {}

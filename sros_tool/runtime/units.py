@@ -305,7 +305,7 @@ def job_units(
                 "PrivateNetwork=yes",
                 "StateDirectory=sros-metrics",
                 "UMask=0022",
-                "# Robots without the current files, as the metrics show.",
+                "# Status 1: some robots lack the current files. The metrics show this.",
                 "SuccessExitStatus=1",
             ],
         ),
@@ -409,7 +409,7 @@ User={_check_user(user)}
 Nice=10
 TimeoutStartSec=30min
 ExecStart={program} agent run {root} --once
-# What is wrong is in the message of the robot, and in `sros agent status`.
+# Status 1: something is wrong. The message of the robot, and `sros agent status`, say what.
 SuccessExitStatus=1
 ReadWritePaths={places}
 UMask=0077

@@ -184,7 +184,7 @@ def test_a_process_without_a_connection_is_refused_only_if_the_router_says_so() 
 
 
 def test_what_was_heard_before_the_rights_were_taken_away_does_not_count() -> None:
-    name = "rights taken away while all run"
+    name = "rights taken away from running nodes"
     talker = sent("T", 99.5, 101)
     for at, observed in ((99.5, RowStatus.NOT_HEARD), (101, RowStatus.HEARD)):
         parties = {"talker": talker, "listener": heard(("T", at))}

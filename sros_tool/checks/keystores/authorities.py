@@ -401,7 +401,7 @@ def _left_enclave_findings(keystore: CheckedKeystore, fleet: Fleet) -> Iterator[
         clause = f"{robot}: {first_few(names, _SHOWN)}"
         yield LEFT_ENCLAVES.found("fleet", clause, keystore.shown(FLEET))
     if (more_robots := len(robots) - _MOST_LEFT) > 0:
-        clause = f"and of {more_robots} more robots"
+        clause = f"{more_robots} more robots also left enclaves"
         yield LEFT_ENCLAVES.found("fleet", clause, keystore.shown(FLEET))
 
 

@@ -427,8 +427,8 @@ def choose_scenarios(names: Sequence[str], *, on_zenoh: bool = False) -> tuple[S
             raise UsageError(
                 f"the scenario {name} cannot run on Zenoh",
                 "Scenario files run only on a DDS; on Zenoh, the demo has scenarios of its own.",
-                f"Leave out --backend zenoh, or name {', '.join(known)}. What a policy of yours "
-                "allows there, `sros explain KEYSTORE ENCLAVE publish NAME --vendor zenoh` says.",
+                f"Leave out --backend zenoh, or name {', '.join(known)}. To see what your policy "
+                "allows on Zenoh, run `sros explain KEYSTORE ENCLAVE publish NAME --vendor zenoh`.",
             )
         elif name.endswith(".toml"):
             chosen[name] = read_scenario(Path(name))

@@ -403,7 +403,7 @@ def joined(scenarios: Sequence[Scenario]) -> Scenario:
     if any(
         (scenario.cast, scenario.policy) != (first.cast, first.policy) for scenario in scenarios
     ):
-        raise ValueError("scenarios with other enclaves cannot run together")
+        raise ValueError("scenarios with different enclaves or policies cannot run together")
     return replace(first, rows=tuple(row for scenario in scenarios for row in scenario.rows))
 
 

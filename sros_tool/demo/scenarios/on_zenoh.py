@@ -1071,7 +1071,7 @@ _OPEN_ROWS = (
     replace(
         _succeeding_attack(
             _attempt_row(
-                "rights taken away while all run",
+                "rights taken away from running nodes",
                 RowStatus.HEARD,
                 "Zenoh reads its configuration at start",
                 hears("listener", "talker"),

@@ -289,7 +289,8 @@ def exported_files(
         if at_robot and not keyless:
             raise KeystoreError(
                 f"the key of enclave {name} is not in keystore '{keystore.root}'",
-                "It was made on its robot and stays there, so an export could not run.",
+                "It was made on its robot and stays there, so no process could run with the "
+                "exported files.",
                 _ADD_KEYLESS,
             )
         evaluation = _evaluate_enclave(keystore, name, now)
