@@ -49,6 +49,7 @@ from sros_tool.runtime.stacks import (
 )
 from sros_tool.runtime.variables import ENABLE, ENCLAVE, KEYSTORE, choose_loadable, domain_of
 from sros_tool.translate import governance_for
+from sros_tool.wording import counted
 
 AUTO, RCLPY, CYCLONE, ZENOH = "auto", "rclpy", "cyclone", "zenoh"
 
@@ -414,6 +415,10 @@ def _types_not_heard(node: HandNode, environment: Mapping[str, str]) -> str:
     return f"secured nodes on {rmw} and this node do not hear each other; {rmw} {but}"
 
 
+_HEARD = "heard  "
+"""Begin of the line of a message that a listener heard."""
+
+
 def run_by_hand(
     node: HandNode, say: Callable[[str], None], duration: timedelta | None = None
 ) -> int:
@@ -443,7 +448,12 @@ def run_by_hand(
     if node.backend == RCLPY:  # this process already prints each message
         command += ["--ros-args", "--log-level", "warn", "--"]
     command += ["--report", f"/proc/self/fd/{writing}"]
-    stopped = threading.Event()
+    stopped, heard = threading.Event(), 0
+
+    def say_and_count(line: str) -> None:
+        nonlocal heard
+        heard += line.startswith(_HEARD)
+        say(line)
 
     def stop(*_: object) -> None:
         again = stopped.is_set()
@@ -477,7 +487,7 @@ def run_by_hand(
 
         with open(events, "rb", buffering=0) as pipe:
             try:
-                last = _report(node, pipe.fileno(), say, on_ready=start_duration)
+                last = _report(node, pipe.fileno(), say_and_count, on_ready=start_duration)
             except BaseException:  # such as nobody who reads the lines any more
                 end_within(_SECONDS_TO_STOP, process)
                 process.wait()
@@ -485,7 +495,8 @@ def run_by_hand(
         status = process.wait()
     if stopped.is_set():
         by_force = ", by force: it did not end by itself" * (status == -signal.SIGKILL)
-        say(f"stopped{by_force}")
+        result = f"; heard {counted(heard, 'message')}" if node.role is Role.LISTENER else ""
+        say(f"stopped{by_force}{result}")
     elif last and last.stage is ProcessStage.ENDPOINT and os.environ.get(ENABLE) == "true":
         verb = "publish" if node.role is Role.TALKER else "subscribe"
         asked = shlex.join((os.environ.get(KEYSTORE, ""), os.environ.get(ENCLAVE) or "/", verb))
@@ -553,7 +564,7 @@ def _line(event: Event, own_type: str) -> str:
         case EventKind.SENT:
             return f"sent   {event.text}"
         case EventKind.HEARD:
-            return f"heard  {event.text}"
+            return f"{_HEARD}{event.text}"
         case EventKind.REFUSED | EventKind.FAILED:
             return f"{event.kind}: {' '.join(event.text.split())}"
         case EventKind.READY:

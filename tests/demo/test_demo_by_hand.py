@@ -164,7 +164,7 @@ def test_a_listener_ends_after_its_time_and_without_a_reader(
             lines.append("goes on")
         return lines[-1:]
 
-    assert apart(played) == ["stopped"]
+    assert apart(played) == ["stopped; heard 0 messages"]
     assert "--for is for a talker" in sros("demo", "--for", "3s").err
 
 
