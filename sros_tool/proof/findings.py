@@ -459,6 +459,8 @@ def _edit_text(violation: Violation) -> str:
         case Only(enclaves=listed):
             key, enclaves = "enclaves", [violation.steps[0].use.enclave, *violation.alike]
             enclaves += [steps[0].use.enclave for steps in violation.differing]
+            if (number := sum(len(names) for _, names in requirement.rights)) > 1:
+                effect = f"; this allows all names of the requirement ({number})"
         case Apart(through=listed, sources=sources):
             # The narrowest exception: the first enclaves that pass on what the source sends.
             key, enclaves = "through", [steps[violation.position].use.enclave, *violation.alike]

@@ -142,6 +142,13 @@ def test_in_short_a_violation_says_who_breaks_it_by_what() -> None:
             '"/a"',
         ),
         (
+            {"/a": may("publish", "/x"), "/b": may("publish", "/x"), "/c": may("publish", "/z")},
+            '[[only]]\npublish = ["/x", "/z"]\nenclaves = ["/a"]\n',
+            'add "/b", "/c" to `enclaves` of the requirement at r.toml:1; this allows all names of '
+            "the requirement (2).",
+            '"/a"',
+        ),
+        (
             {
                 "/a": may("publish", "/x"),
                 "/b": may("subscribe", "/x") + may("publish", "/y"),
