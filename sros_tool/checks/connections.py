@@ -24,7 +24,7 @@ from sros_tool.runtime.processes import MemoryPort, Process, plain
 from sros_tool.wording import counted, enumerated, first_few
 
 CONNECTING_TIME = timedelta(seconds=30)
-"""Time after the start of a process within which it connects to the others, or never does."""
+"""Time after the start of a process in which it should have connected to the others."""
 
 PROCESS_NOT_CONNECTED = FindingKind(
     "runtime.process-not-connected",

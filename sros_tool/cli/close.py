@@ -129,10 +129,11 @@ def close(
     run the verb again.
 
     Nothing is closed before --apply, which restarts the processes that are systemd units, and shows
-    the commands for all others. --proof checks four claims: every process was started in its
-    enclave, the files of the enclaves have no error, everything that talked may still talk, and an
-    open listener finds nothing. --apply also proves this, if nothing is left to do by hand. --undo
-    makes the robot open again.
+    the commands for all others. --proof checks that every process was started in its enclave, that
+    the files have no error, that the requirements hold, that everything that talked may still talk,
+    that the processes of Fast DDS have connected to each other, and that an open listener finds
+    nothing. --apply also proves this, if nothing is left to do by hand. --undo makes the robot open
+    again.
 
     Example:
       $ sros close robot --for 5m

@@ -161,7 +161,7 @@ def _proof_of_files(robot: LocalRobot, expired: Sequence[str]) -> Proof:
     unsigned = _unsigned_policy_text(robot) if status == 0 else ""
     examined = f"{robot.export}"
     if robot.keystore.exists() and not expired:
-        examined += f" and {robot.keystore}"
+        examined += f", and {robot.keystore} without its enclaves"
         # An expired enclave of another machine does not make this robot less closed.
         words = (str(robot.keystore), "--include", "keystore.*")
         if status_there := robot.shell.check(*words):
@@ -271,15 +271,19 @@ def _proof_of_connections(robot: LocalRobot) -> Iterator[Proof]:
         yield Proof(CONNECTED, False, missing_text(connections.missing))
     elif len(connections.compared) > 1:
         number = counted(len(connections.compared), "process", "processes")
-        reason = f"{number} of Fast DDS have all connected to each other"
-        if unknown := [process.label for process in connections.unknown]:
+        reason = f"{number} of Fast DDS, each with all others"
+        unknown = [process.label for process in connections.unknown]
+        if unknown := [*["other machines"] * bool(robot.not_here), *unknown]:
             reason += f"; sros cannot see this of {first_few(unknown, MOST_NAMES)}"
         yield Proof(CONNECTED, True, reason)
 
 
 def _connections(running: RunningRobot) -> Connections:
+    """Return the connections of processes in enclaves, except those that only claim to be there."""
     return connections_between(
-        process for process, enclave in running.secured if enclave.name != OBSERVER
+        process
+        for process, enclave in running.secured
+        if enclave.name != OBSERVER and running.may_use_files(process)
     )
 
 

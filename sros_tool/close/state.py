@@ -52,7 +52,7 @@ _TOOLS = ("ros2", "sros", "sros_tool")
 """Programs, and packages of Python modules, with which a person tries an enclave."""
 
 TALK = "everything that talked can still talk"
-CONNECTED = "the processes on this machine hear each other"
+CONNECTED = "the processes on this machine have connected to each other"
 SILENCE = "an open listener finds nothing"
 _ACCEPTS_REVOKED = f"a certificate was revoked ({CRL_FILE}), and is still accepted by"
 

@@ -451,7 +451,8 @@ def test_a_robot_is_closed_proved_and_opened_again(robot: Robot) -> None:
     assert closed.out.splitlines()[-6:] == [
         "yes: every process was started in its enclave: 2 enclaves, and no open process in "
         "domain 0",
-        "yes: the files are accepted: sros check finds no error: robot/export and robot/keystore",
+        "yes: the files are accepted: sros check finds no error: robot/export, and robot/keystore "
+        "without its enclaves",
         "yes: the requirements hold: all of them: robot/requirements.toml",
         "yes: everything that talked can still talk: 2 nodes with 36 endpoints as before "
         "(types are not compared)",
@@ -872,7 +873,10 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
         assert f"If others may have copied the key, replace {replace_it}" in re.sub(
             "(?<=replace )[^`]*`sros ", "", ended.out
         )
-    assert "`, and restart all processes: robot/export and robot/keystore\n" in ended.out
+    assert (
+        "`, and restart all processes: robot/export, and robot/keystore without its enclaves\n"
+        in ended.out
+    )
     assert (
         "no: the requirements hold: at least one is violated: robot/requirements.toml" in ended.out
     )
@@ -905,9 +909,9 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     policy.write_text(policy.read_text().replace("chatter", "old/chatter", 1))
     ended = robot.close("--proof", "--partial")
     assert (
-        ": robot/export and robot/keystore; 'robot/policy.xml' differs from the signed "
-        "permissions of /listener, which the processes use: `sros close robot` checks and signs "
-        "it\n" in ended.out
+        ": robot/export, and robot/keystore without its enclaves; 'robot/policy.xml' differs from "
+        "the signed permissions of /listener, which the processes use: `sros close robot` checks "
+        "and signs it\n" in ended.out
     )
     assert (
         "not checked (accepted by --partial): every process was started in its enclave: process 9 "

@@ -127,26 +127,41 @@ def test_a_demand_for_an_enclave_that_the_export_lacks_is_judged_by_the_keystore
     assert _proof_of_requirements(robot).holds is False
 
 
+STRANGER = replace(robot(9)[0], user=4711)
+
+
 @pytest.mark.parametrize(
-    ("processes", "holds", "says"),
+    ("processes", "not_here", "holds", "says"),
     [
-        (robot(1, 2, 3), True, "3 processes of Fast DDS have all connected to each other"),
-        (robot(1, 2, 3, deaf=[(1, 2)]), False, "do not hear each other; restart process 1"),
-        ([*robot(1, 2), replace(robot(3)[0], own_ports=frozenset())], True, "of process 3 (node3)"),
-        ([replace(process, own_ports=frozenset()) for process in robot(1, 2)], None, ""),
-        (robot(1), None, ""),
+        (robot(1, 2, 3), (), True, "3 processes of Fast DDS, each with all others"),
+        (robot(1, 2, 3), ("/laptop",), True, "; sros cannot see this of other machines"),
+        (robot(1, 2, 3, deaf=[(1, 2)]), (), False, "do not hear each other; restart process 1"),
+        ([*robot(1, 2), replace(robot(3)[0], own_ports=frozenset())], (), True, "of process 3 ("),
+        ([*robot(1, 2), STRANGER], (), True, "2 processes"),
+        ([replace(process, own_ports=frozenset()) for process in robot(1, 2)], (), None, ""),
+        (robot(1), (), None, ""),
     ],
 )
 def test_processes_that_have_not_connected_fail_the_proof(
-    processes: list[Process], holds: bool | None, says: str, monkeypatch: pytest.MonkeyPatch
+    processes: list[Process],
+    not_here: tuple[str, ...],
+    holds: bool | None,
+    says: str,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Where sros sees no connections, it proves nothing, and `close` says so."""
-    secured = [(process, ProcessEnclave("/export", "/node")) for process in processes]
-    running: Any = SimpleNamespace(secured=secured)
+    """Where sros sees no connections, it proves nothing, and `close` says so.
+
+    A process of a user who cannot read the files only claims to run in an enclave.
+    """
+    running: Any = SimpleNamespace(
+        secured=[(process, ProcessEnclave("/export", "/node")) for process in processes],
+        may_use_files=lambda process: process is not STRANGER,
+    )
     monkeypatch.setattr(proof, "RunningRobot", lambda *_: running)
     monkeypatch.setattr(proof, "wait_until", lambda *_: running)
     shell = SimpleNamespace(now=lambda: datetime.now(UTC))
-    proofs = [*_proof_of_connections(cast(Any, SimpleNamespace(shell=shell)))]
+    closed: Any = SimpleNamespace(shell=shell, not_here=not_here)
+    proofs = [*_proof_of_connections(closed)]
     assert [said.holds for said in proofs] == [holds] * (holds is not None)
     assert says in "".join(said.reason for said in proofs)
 
