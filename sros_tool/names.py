@@ -73,6 +73,13 @@ READING_SERVICES = (
 
 Sources: rcl_interfaces, lifecycle_msgs, composition_interfaces and type_description_interfaces.
 """
+_READING_SUFFIXES = tuple(f"/{name}" for name in READING_SERVICES)
+
+
+def only_reads(service: str) -> bool:
+    """Return whether a service is one of `READING_SERVICES`, of whatever node."""
+    return service.endswith(_READING_SUFFIXES)
+
 
 DISTRIBUTIONS = (
     "ardent", "bouncy", "crystal", "dashing", "eloquent", "foxy", "galactic", "humble", "iron",

@@ -11,7 +11,13 @@ from typing import NamedTuple
 
 from sros_tool.automata import SearchLimit
 from sros_tool.fleet.robots import Fleet, Robot
-from sros_tool.names import READING_SERVICES, expression_problem, is_expression, moves_robot
+from sros_tool.names import (
+    READING_SERVICES,
+    expression_problem,
+    is_expression,
+    moves_robot,
+    only_reads,
+)
 from sros_tool.policy.model import PEER_RIGHT, RIGHTS, Level, Source
 from sros_tool.policy.patterns import matches
 from sros_tool.policy.placeholders import Placeholder
@@ -172,17 +178,20 @@ def _candidates(stated_rights: _Stated, worlds: Sequence[World]) -> Iterator[Req
 def _few_holders(stated_rights: _Stated, right: str) -> Iterator[Only]:
     """Yield a requirement for each group of up to three enclaves that are the only users of names.
 
-    Names that move the robot get a requirement for any number of enclaves, even without a known
-    receiver.
+    Services that only read get their own requirement, so that an exception for them does not allow
+    changes, too.  Names that move the robot get a requirement for any number of enclaves, even
+    without a known receiver.
     """
     other = PEER_RIGHT[right]
-    names: dict[tuple[str, ...], list[str]] = defaultdict(list)
+    names: dict[tuple[tuple[str, ...], bool], list[str]] = defaultdict(list)
     for name in stated_rights.names(right):
         users = tuple(sorted(stated_rights.users[right, name]))
         received = name not in _OF_EVERY_NODE and (other, name) in stated_rights.users
         if moves_robot(name) or (len(users) <= _MAX_HOLDERS and received):
-            names[users].append(name)
-    for enclaves, names_held in sorted(names.items(), key=lambda item: (len(item[0]), item[0])):
+            names[users, only_reads(name)].append(name)
+    for (enclaves, _), names_held in sorted(
+        names.items(), key=lambda item: (len(item[0][0]), item[0])
+    ):
         yield Only(source=_NOWHERE, rights=((right, tuple(names_held)),), enclaves=enclaves)
 
 

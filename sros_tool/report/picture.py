@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Annotated, NamedTuple
 
-from sros_tool.names import READING_SERVICES
+from sros_tool.names import only_reads
 from sros_tool.policy.model import ALLOW, RIGHTS, Qualifier
 from sros_tool.policy.rights import RIGHT_ORDER
 from sros_tool.values import Words, shows
@@ -23,7 +23,6 @@ SENDS = {"publish": True, "request": True, "call": True} | dict.fromkeys(
 )
 """Right → whether its holder sends, so that the arrow points to the name."""
 
-_QUESTION_SUFFIXES = tuple(f"/{name}" for name in READING_SERVICES)
 _KINDS = (*RIGHTS, "dds")
 """Kinds of names in display order; ``dds`` is a topic without a ROS name."""
 
@@ -200,7 +199,7 @@ def lack_text(kind: str, lacks: Lack) -> str:
 
 def is_question(name: Name | Edge) -> bool:
     """Return whether a name is a service whose requests change nothing (`QUESTIONS` of reach)."""
-    return name.kind == "services" and name.name.endswith(_QUESTION_SUFFIXES)
+    return name.kind == "services" and only_reads(name.name)
 
 
 class Statement(NamedTuple):

@@ -452,6 +452,13 @@ def test_who_moves_the_robot_is_proposed_for_any_number() -> None:
     ]
 
 
+def test_an_exception_for_reading_parameters_does_not_allow_to_set_them() -> None:
+    services = ("/arm/get_parameters", "/arm/list_parameters", "/arm/set_parameters")
+    system = robot({"/arm": may("reply", *services), "/tuner": may("request", *services)})
+    only = [e for e in suggest(system.rights, system.worlds)[0] if isinstance(e, Only)]
+    assert [e.rights for e in only] == [(("request", services[2:]),), (("request", services[:2]),)]
+
+
 def test_what_is_proposed_for_a_package_blames_no_other_part_of_the_robot() -> None:
     """The users of a package's services are elsewhere, and so are the robot's operators."""
     gripper = may("publish", "width") + may("reply", "~/release", "~/set_parameters")
