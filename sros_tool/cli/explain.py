@@ -1136,7 +1136,7 @@ _SILENT_ON_ZENOH = "denials on Zenoh, which only logs with RUST_LOG=zenoh=trace 
 def _lines_without_findings(log: str, count: int) -> Iterator[str]:
     """Yield what was not found in a log of ``count`` lines, and what such a log does not show."""
     from sros_tool.checks.environment import is_zenoh
-    from sros_tool.runtime.vendor_log import SECURITY_DIRECTORY
+    from sros_tool.runtime.vendor_log import log_lines, plain_text, security_directory
 
     if not count:
         yield (
@@ -1148,7 +1148,7 @@ def _lines_without_findings(log: str, count: int) -> Iterator[str]:
     if is_zenoh(os.environ):
         yield not_found
         yield f"not shown: {_SILENT_ON_ZENOH}"
-    elif match := SECURITY_DIRECTORY.search(log):
+    elif match := next(filter(None, map(security_directory, log_lines(plain_text(log)))), None):
         yield f"{not_found}; a node found its enclave '{match['folder']}'"
         yield (
             "not shown: whether peers drop its messages (explain their logs, or compare both "

@@ -47,11 +47,11 @@ from sros_tool.policy.rights import Right, Rules, action_right, profile_rights
 from sros_tool.runtime.vendor_log import (
     ENDPOINT_KINDS,
     REMOTE_ENDPOINT,
-    SECURITY_DIRECTORY,
     denied_topic,
     labeled_line,
     log_lines,
     plain_text,
+    security_directory,
 )
 
 _MAX_LINES_TO_DIRECTION = 3
@@ -128,7 +128,7 @@ def _denials_of(process: str, numbered: list[tuple[int, str]]) -> Iterator[Denia
     enclave = folder = ""
     lines = [line for _, line in numbered]
     for index, (number, line) in enumerate(numbered):
-        if named := SECURITY_DIRECTORY.search(line):
+        if named := security_directory(line):
             enclave, folder = named["enclave"] or "/", named["folder"]
         if denied := denied_topic(line):
             vendor, match = denied

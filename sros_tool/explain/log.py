@@ -6,6 +6,7 @@ and may contain colors and tracebacks.
 
 from __future__ import annotations
 
+import os
 import re
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -87,13 +88,13 @@ from sros_tool.runtime.log_texts import (
 from sros_tool.runtime.vendor_log import (
     CONTINUATION,
     LINE_DOMAIN,
-    SECURITY_DIRECTORY,
     denied_topic,
     labeled_line,
     log_lines,
     matching_text,
     plain_refusal,
     plain_text,
+    security_directory,
     vendor_of_line,
 )
 from sros_tool.runtime.zenoh_log import (
@@ -424,7 +425,8 @@ def explain_log_of(
         policy,
     )
     plain = plain_text(text)
-    started = [(m["enclave"] or "/", m["folder"]) for m in SECURITY_DIRECTORY.finditer(plain)]
+    named_folders = filter(None, map(security_directory, log_lines(plain)))
+    started = [(found["enclave"] or "/", found["folder"]) for found in named_folders]
 
     def is_named(enclave: str) -> bool:
         if policy:
@@ -443,10 +445,10 @@ def explain_log_of(
 
 def _is_of_zenoh(log: str, rmw: str, named: LoadedEnclave | None) -> bool:
     """Return whether a log may be of a node on Zenoh, which logs nothing about its security."""
+    if rmw:  # stated by the user; a bridge, or the text of a message, can put such a line in a log
+        return rmw.startswith(RMW_ZENOH)
     if any(ZENOH_LINE.search(labeled_line(line)[1]) for line in log_lines(log)):
         return True
-    if rmw:
-        return rmw.startswith(RMW_ZENOH)
     folder = named.folder if named else None
     return folder is not None and any((folder / file).exists() for file in ZENOH_SIGNED)
 
@@ -457,7 +459,8 @@ def _other_folder_notes(examined: Path, folders: Iterable[str]) -> Iterator[Note
     other = [
         folder
         for folder in dict.fromkeys(folders)
-        if Path(folder).is_absolute() and not Path(folder).resolve().is_relative_to(inside)
+        # Path.resolve() fails for a link to itself, which the log may name.
+        if Path(folder).is_absolute() and not Path(os.path.realpath(folder)).is_relative_to(inside)
     ]
     if other:
         shown = first_few(other, _MAX_PEERS)
@@ -562,7 +565,7 @@ def _log_hits(lines: Iterable[tuple[int, str]]) -> Iterator[_Hit]:
     while following:
         number, line = following.popleft()
         process, rest = labeled_line(line)
-        if named := SECURITY_DIRECTORY.search(line):
+        if named := security_directory(line):
             enclaves[process] = named["enclave"] or "/"
             text = " ".join(rest.split())
             yield _Hit(number, text, process, enclaves[process], RUNS_OPEN, {})
@@ -591,7 +594,7 @@ def _rejoined_message(process: str, line: str, rest: str, following: str) -> str
     other, end = labeled_line(following)
     if other not in ("", process) or matching_text(line) or matching_text(following):
         return ""
-    if denied_topic(line) or denied_topic(following) or SECURITY_DIRECTORY.search(following):
+    if denied_topic(line) or denied_topic(following) or security_directory(following):
         return ""
     return next(
         (candidate for candidate in (rest + end, f"{rest} {end}") if matching_text(candidate)), ""

@@ -35,17 +35,22 @@ def vendor_of_line(line: str) -> Vendor | None:
     return next((vendor for vendor, form in _LINE_FORMATS if form.search(line)), None)
 
 
-SECURITY_DIRECTORY = re.compile(
-    r"\b(?:Found )?security directory: (?P<folder>\S*?/enclaves(?P<enclave>/\S*)?)(?:\s|\Z)"
-)
-"""The line in which rcl, or a node of `sros demo`, names its enclave and folder (groups)."""
-
 _PROCESS_LABEL = re.compile(
     r"\[(?P<launch>[\w.-]+-\d+)\] "  # ros2 launch: [talker-1]
-    r"|(?:\S+ +){2,4}?(?P<journald>[\w.@-]+\[\d+\]): "  # Nov 21 06:00:00 robot talker[12]:
+    # Nov 21 06:00:00 robot talker[12]: (but not the message of a node: [INFO] [1.0] [talker]: ...)
+    r"|(?!\[[A-Z]+\] )(?:\S+ +){2,4}?(?P<journald>[\w.@-]+\[\d+\]): "
     r"|(?P<compose>[\w.-]+) +\| "  # Docker Compose: talker-1  |
 )
 """Matches the label at the start of a line, which distinguishes the processes in a log."""
+
+_SECURITY_DIRECTORY = re.compile(
+    r"(?:(?:[\w.-]+ +\| )?(?:(?:\[[^\[\]]*\] )*\[rcl\]: )?Found|\[\w+\]) security directory: "
+    r"(?P<folder>[^\s\0]*?/enclaves(?P<enclave>/[^\s\0]*)?)(?:\s|\Z)"
+)
+"""Matches a line, without its label, in which rcl or a node of `sros demo` names its enclave.
+
+The beginning of the line counts, because a node can log the text of a message that it received.
+"""
 
 LINE_DOMAIN = re.compile(r"\] \S+\|\S+ (\d{1,9}) \w+::\w+ :")
 """Matches the domain in a line of ROS_SECURITY_LOG_FILE, after the participant's identifier."""
@@ -89,6 +94,11 @@ def labeled_line(line: str) -> tuple[str, str]:
     """
     label = _PROCESS_LABEL.match(line)
     return (label[label.lastgroup or 0], line[label.end() :]) if label else ("", line)
+
+
+def security_directory(line: str) -> re.Match[str] | None:
+    """Return the folder and the enclave (groups) that a process found at its start, or None."""
+    return _SECURITY_DIRECTORY.match(labeled_line(line)[1])
 
 
 def missing_security(text: str) -> str:

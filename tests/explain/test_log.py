@@ -694,17 +694,28 @@ def test_a_log_of_an_enclave_has_to_show_that_its_node_runs_secured(
     own, folder = STARTED.format(keystore, ENCLAVE), f"{keystore}/enclaves{ENCLAVE}"
     moved = STARTED.format("/k", f"/left{ENCLAVE}")
     zenoh = {"RMW_IMPLEMENTATION": "rmw_zenoh_cpp"}
+    dds = {"RMW_IMPLEMENTATION": "rmw_fastrtps_cpp"}
+    quoted = own.replace("[rcl]: ", "[talker]: I heard: [").replace("\n", " ]\n")
+    (tmp_path / "loop").symlink_to("loop")
     for asked, text, variables, secured in (
         ([keystore, ENCLAVE], own + node, {}, True),
         ([keystore, ENCLAVE], node, {}, False),
         ([keystore, ENCLAVE], "", {}, False),
         ([keystore, ENCLAVE], STARTED.format(keystore, "/other") + node, {}, False),
+        ([keystore, ENCLAVE], f"Nov 21 06:00:00 r d[1]: r-1 | [r-1] {own}", {}, True),
+        ([keystore, ENCLAVE], STARTED.format(tmp_path / "loop", ENCLAVE), {}, True),
+        ([keystore, ENCLAVE], quoted, {}, False),
+        ([keystore, ENCLAVE], own.replace("[rcl]", "[talker]"), {}, False),
+        ([keystore, ENCLAVE], own.replace("[rcl]", "[talker]: x[1]"), {}, False),
+        ([keystore, ENCLAVE], f"x\r{own}", {}, False),
+        ([keystore, ENCLAVE], own.replace("\n", "\0\n"), {}, False),
         ([folder], own + node, {}, True),
         ([folder], node, {}, False),
         ([policy, ENCLAVE], moved + node, {}, True),
         ([policy, ENCLAVE], node, {}, False),
         ([keystore, ENCLAVE], node, zenoh, None),
         ([keystore, ENCLAVE], OF_ZENOH + node, {}, None),
+        ([keystore, ENCLAVE], OF_ZENOH + node, dds, False),
         ([keystore], node, {}, None),
     ):
         log.write_text(text)
@@ -715,7 +726,6 @@ def test_a_log_of_an_enclave_has_to_show_that_its_node_runs_secured(
         assert ("perhaps the node runs open" in ended.out) is (secured is False)
     (Path(folder) / "session.json5").write_text("{}")
     assert sros("explain", keystore, ENCLAVE, "--log", log).status == 0
-    dds = {"RMW_IMPLEMENTATION": "rmw_fastrtps_cpp"}
     assert sros("explain", keystore, ENCLAVE, "--log", log, env=dds).status == 1
 
 
