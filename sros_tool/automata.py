@@ -472,8 +472,8 @@ class SearchLimit:
 def _too_many_error() -> DocumentError:
     return DocumentError(
         "there are too many wildcards to decide which names they match",
-        "The sets of names that the wildcards share are too many to compare, for example with many "
-        "'?' after a '*'.",
+        "Too many combinations of names would have to be compared, for example with many '?' after "
+        "a '*'.",
         "Write names instead of wildcards, or fewer wildcards.",
     )
 

@@ -521,8 +521,8 @@ def _zenoh_environment(
         by_graph = version and release_of(version).below_topics
         images = ", and send it no images" if by_graph else ""
         text = (
-            f"start every node with `--ros-args --enclave {name}`: on Zenoh, others drop the "
-            "graph token of a node that names another enclave or none, and do not find its "
+            f"start every node with `--ros-args --enclave {name}`: if a node on Zenoh names "
+            "another enclave or none, other nodes drop its graph token, and do not find its "
             f"topics and services{images}."
         )
         needed = (Note("zenoh.enclave-argument", text),)
@@ -796,7 +796,7 @@ def _unnamed_node_error(policy: Policy, command: Sequence[str]) -> UsageError:
         if len(enclaves) == 1:
             run = f"`sros run KEYSTORE {quote(enclaves[0].path)} -- COMMAND`"
             node = _full_name(ns, name)
-            remedy = f"If the process has the node {node}, as a remapping rule says: {run}."
+            remedy = f"If the process has the node {node}, which a remapping rule names: {run}."
     return UsageError(
         f"the command '{command[0]}' names no node",
         "The policy assigns enclaves to node names, and `--ros-args -r __node:=NAME` sets the "
@@ -821,9 +821,9 @@ def _unknown_node_error(
     enclave = "ENCLAVE" if several else quote(enclave_paths[0][0])
     return UsageError(
         f"sros cannot know which node the command '{command[0]}' starts",
-        f"By its remapping rules it is {', '.join(cases)}, {other}.",
-        f"Name the enclave: `sros run KEYSTORE {enclave} -- COMMAND`. Or, if the process has one "
-        "node, give its name without a node before it: `-r __node:=NAME`.",
+        f"By the remapping rules, the node is {', '.join(cases)}, {other}.",
+        f"Name the enclave: `sros run KEYSTORE {enclave} -- COMMAND`. Or, if the process has only "
+        "one node, write a rule that names no node: `-r __node:=NAME`.",
     )
 
 

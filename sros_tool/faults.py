@@ -151,7 +151,7 @@ class Fault(Enum):
     CERTIFICATE_ISSUER = (
         "certificate-issuer",
         "a certificate that another CA issued",
-        "The node itself refuses it; Fast DDS with an empty reason.",
+        "The node itself refuses it; Fast DDS gives an empty reason.",
         "DDS-Security 1.1, 9.3; Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; tested.",
         REPLACE,
     )
@@ -387,8 +387,8 @@ class Fault(Enum):
     CERTIFICATE_LASTS = (
         "certificate-lasts",
         "a certificate that expires more than 292 years from now",
-        "Fast DDS 2.6 and 3.2 set a timer for its expiry, whose nanoseconds overflow: the node is "
-        "refused as if the certificate had expired, or crashes.",
+        "Fast DDS 2.6 and 3.2 set a timer for the expiry, and its nanoseconds overflow: the node "
+        "is refused as if the certificate had expired, or crashes.",
         "Fast DDS 2.6.12 and 3.2.5 (PKIDH.cpp, arm_identity_expiry); tested.",
         "Issue a certificate for a shorter time: `sros renew {root} {enclave}`.",
     )

@@ -163,8 +163,8 @@ def read_advisories(path: Path) -> tuple[Advisory, ...]:
         raise DocumentError(
             f"'{path}' has no advisory about {', '.join(products)} or {last}",
             "sros recognizes these products by their repositories.",
-            f"Write the package as {next(iter(_REPOSITORIES))}, or write the repository of a "
-            "range.",
+            f"Write a repository such as {next(iter(_REPOSITORIES))} as the name of the package, "
+            "or as `repo` of a range.",
         )
     replaced = {(advisory.id, advisory.product) for advisory in newer}
     kept = (old for old in shipped_advisories() if (old.id, old.product) not in replaced)

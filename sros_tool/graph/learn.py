@@ -869,7 +869,8 @@ def _check(plan: Draft) -> None:
         written = policy_rights(read_policy(plan.path, plan.document))
         if plan.least <= written <= plan.most:
             return
-        why = f"The written policy would differ in {min(written ^ plan.least, key=order)}."
+        difference = min(written ^ plan.least, key=order)
+        why = f"The written policy and the learned rights would differ in {difference}."
     except DocumentError as error:
         why = f"{error}"
     raise PolicyError(

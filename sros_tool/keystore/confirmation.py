@@ -464,8 +464,9 @@ class ReceivedConfirmation:
         if alternated is None or self.time - alternated > timedelta(days=1):
             return ""
         return (
-            f"Two computers that have its keys send messages in turn, last at {iso(alternated)}; "
-            "perhaps a disk was copied. The files of the other computer are not known."
+            "Two computers with the keys of this robot send messages in turn, last at "
+            f"{iso(alternated)}; perhaps a disk was copied. The files of the other computer are "
+            "not known."
         )
 
     def clock_note(self) -> str:

@@ -1524,8 +1524,8 @@ def fleet_metrics(
         ),
         Metric(
             "sros_fleet_mended",
-            "Like sros_fleet_complete, but problems that an agent has mended, and reports for a "
-            "day, do not count.",
+            "Like sros_fleet_complete, but problems that an agent has mended do not count; agents "
+            "report them for a day.",
             (Sample(int(status.mended), place),),
         ),
         Metric(
@@ -1563,8 +1563,8 @@ def fleet_metrics(
         ),
         Metric(
             "sros_fleet_revocation_list_in_force",
-            "Whether the current revocation list is in force on a robot (1), or not, or it is not "
-            "known (0); only if it revokes a certificate.",
+            "1 if the current revocation list is known to be in force on a robot, otherwise 0; "
+            "present only if the list revokes a certificate.",
             per_robot(lambda robot: None if robot.crl_in_force is None else int(robot.crl_in_force))
             if status.is_any_revoked
             else (),
@@ -1662,8 +1662,9 @@ def _dds_metrics(
         unknown.append(Sample(unknown_libraries, labels))
     yield Metric(
         "sros_fleet_dds_known_vulnerabilities",
-        "Number of known vulnerabilities of a DDS of a robot, in a process or only installed, "
-        "without regard to fixes of a package; of several releases, the largest.",
+        "Number of known vulnerabilities of a DDS that processes of a robot have loaded or that is "
+        "only installed; fixes of packages are ignored. If the robot has several releases of the "
+        "DDS, the largest number.",
         tuple(numbers),
     )
     yield Metric(

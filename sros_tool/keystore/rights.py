@@ -752,7 +752,7 @@ def without_enclaves_of_sros(source: RightsSource, other: RightsSource) -> Right
     if named := sorted(left_out & routers):
         number = counted(len(named), "Zenoh router")
         text = (
-            f"left out: {number} that the policy lacks, with no more rights than every node needs"
+            f"left out: {number} that the policy lacks, with only the rights that every node needs"
         )
         notes = (*notes, Note("rights.routers", f"{text}: {first_few(named, 5)}."))
     return replace(

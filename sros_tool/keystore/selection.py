@@ -148,7 +148,7 @@ def _revocation_by_name(keystore: OpenedKeystore, robots: Sequence[str]) -> str:
     command = f"sros revoke {root} {' '.join(arguments) or 'ENCLAVE...'}"
     return (
         f"To revoke now, name the enclaves: `{command}`; `sros list_enclaves {root}` shows "
-        f"whether the {'robot has' if len(robots) == 1 else 'robots have'} others. "
+        f"whether the {'robot has' if len(robots) == 1 else 'robots have'} other enclaves. "
     )
 
 

@@ -415,7 +415,7 @@ def with_values(
             inner = inner.get(part) if isinstance(inner, dict) else None
         if path == ["zenoh"] and inner is None:
             raise UsageError(
-                "the keystore has no files for Zenoh yet, so they have no settings",
+                "the keystore has no files for Zenoh yet, and so no settings of Zenoh",
                 "",
                 "Write them first, for example with `sros zenoh KEYSTORE --mode peer`.",
             )

@@ -308,7 +308,8 @@ def _network_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
             if len(networks) > 1 or not set(networks) <= set(_INHERITED_VALUES):
                 yield f"{subject_text(certificate.subject)} has {title}, which sros does not know"
         if values[0] and values[-1]:
-            yield f"{subject_text(chain[-1].subject)} has {title} of another CA, and is trusted"
+            name = subject_text(chain[-1].subject)
+            yield f"the trusted CA {name} inherits {title} from another CA"
 
 
 class _CaStatus(Flag):

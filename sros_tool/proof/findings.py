@@ -467,7 +467,7 @@ def _edit_text(violation: Violation) -> str:
             if {*enclaves} & {*sources}:  # a source would no longer be kept apart from anything
                 return ""
             if violation.position:
-                effect = f"; it then passes on all that reaches {_listed_names(enclaves)}"
+                effect = f"; this allows all influence through {_listed_names(enclaves)}"
         case _:
             return ""
     if not requirement.as_written or any(name.startswith(EXCEPT) for name in listed):

@@ -1434,8 +1434,8 @@ def _assumptions(base: AccessSource, head: AccessSource) -> Iterator[str]:
             yield "both are signed with the same governance, which controls all access"
         elif base.governance is None:
             yield (
-                "BASE is signed with a governance that controls all access, and with encryption "
-                "unless BASE demands another protection"
+                "BASE is signed with a governance that controls all access, and encrypts all names "
+                "for which BASE demands no other protection"
             )
         elif head.governance is None:
             yield (

@@ -909,7 +909,7 @@ class _Review:
         except SrosError as error:
             yield f"keystores that did not change were not looked for: {error.what}"
         if self._template_changes():
-            yield f"access that the changes of '{asked.template}' give is not compared"
+            yield f"'{asked.template}' changes, and the access that it gives is not compared"
         for path in self._changed_settings():
             yield f"'{path}' changes and is not reviewed"
         for side in (self.head, self.base):

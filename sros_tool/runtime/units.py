@@ -172,7 +172,7 @@ Environment=ROS_LOG_DIR=%L/sros/%i
 
 {_SANDBOX_SETTINGS}
 # DDS lists network interfaces through netlink. /dev stays: it has shared memory, and the devices
-# of drivers. No limit on real time, which controllers use.
+# of drivers. Real-time scheduling, which controllers use, is not restricted.
 RestrictAddressFamilies=AF_UNIX AF_INET AF_INET6 AF_NETLINK
 
 [Install]

@@ -415,7 +415,8 @@ def test_a_node_that_was_observed_in_an_enclave_of_its_own(folder: Path) -> None
     ended = sros("minimize_policy", "own.xml", "--observed", "seen.xml").ok()
     assert "publish topic /*  covered publish topic /pose" in ended.out
     assert (
-        "The rights observed in /arm/driver count for /robot/arm, which has this node." in ended.err
+        "The rights observed in enclave /arm/driver count for /robot/arm, because the policy has "
+        "the node /arm/driver there." in ended.err
     )
     sros("view", "own.xml", "--observed", "seen.xml", "-o", "use.html").ok()
     assert "/arm/driver" not in {

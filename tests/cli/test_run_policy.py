@@ -95,8 +95,8 @@ def test_the_keystore_may_come_from_the_environment(made: Path) -> None:
         (
             ("-r", "listener:/a:=/b"),
             "names no node. The policy assigns enclaves to node names, and `--ros-args -r "
-            "__node:=NAME` sets the name. If the process has the node /listener, as a "
-            "remapping rule says: `sros run KEYSTORE /line/listener -- COMMAND`.",
+            "__node:=NAME` sets the name. If the process has the node /listener, which a "
+            "remapping rule names: `sros run KEYSTORE /line/listener -- COMMAND`.",
         ),
         (("-r", "both:/a:=/b"), "in an enclave of its own"),
         (

@@ -333,7 +333,7 @@ def test_no_existing_ca_that_robots_would_take_for_a_replaced_one(
     assert "the first `sros import` on each robot needs --force" in note.text
     (separate / FLEET_ROOT).parent.mkdir(exist_ok=True)
     (separate / FLEET_ROOT).touch()
-    with pytest.raises(KeystoreError, match="is valid from before the identity CA"):
+    with pytest.raises(KeystoreError, match="is valid from an earlier time than the identity CA"):
         rotate()
 
 

@@ -179,8 +179,8 @@ def test_in_short_a_violation_says_who_breaks_it_by_what() -> None:
                 "/base": may("subscribe", "/z"),
             },
             '[[apart]]\nfrom = ["/web"]\nto = ["/base"]\nthrough = ["/d"]\n',
-            'add "/nav", "/nav2" to `through` of the requirement at r.toml:1; it then passes on '
-            "all that reaches /nav and /nav2.",
+            'add "/nav", "/nav2" to `through` of the requirement at r.toml:1; this allows all '
+            "influence through /nav and /nav2.",
             '"/d"',
         ),
     ],

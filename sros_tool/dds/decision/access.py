@@ -960,7 +960,7 @@ class Access:
                     return self._peers_refuse(rule)
                 text = (
                     f"the governance neither controls {asked} nor protects the topic, so even "
-                    "peers that refuse the participant exchange its messages"
+                    "peers that refuse the participant exchange messages with it"
                 )
             return self._answer(Outcome.ALLOWED, "unrestricted", text, topic_rule=rule)
         verdict = self._own[verb].ask(topic, partitions)

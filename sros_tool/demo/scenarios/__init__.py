@@ -365,20 +365,17 @@ def _check_controls(
         if claim.relation is Relation.IS_ANSWERED:
             who = f"{claim.talker} answers a client"
             remedy = "Add a control, such as a permitted client whom the same server answers."
+        problem = f"no claim or control shows that {who} at the same time"
         talker = parties[claim.talker or claim.subject]
         if claim.talker and not talker.identity.enclave:
             remedy = remedy.replace("a permitted", "an unsecured")
         elif claim.talker and not _may_send(talker, rules):
-            who = f"{who}, and nobody can: {talker.identity.enclave} lacks the right to speak there"
+            problem = f"{talker.identity.enclave} lacks the right to speak, so nobody hears it"
             remedy = (
                 f"A process of this enclave is refused. Claim that: {{ party = "
                 f'"{talker.name}", expected = "refused" }}, with a control that something works.'
             )
-        raise table.error(
-            "claim",
-            f"no claim or control shows that {who} at the same time: a crash would look the same",
-            remedy,
-        )
+        raise table.error("claim", f"{problem}: a crash would look the same", remedy)
 
 
 def _may_send(party: Party, rules: Rules) -> bool:

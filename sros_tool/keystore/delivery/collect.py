@@ -622,7 +622,8 @@ class _Verifier:
         if signer.serial_number in self._revoked:
             raise _RefusedError(
                 f"its certificate, {signer.serial_number:x}, was revoked: perhaps the robot lacks "
-                "its new keys, or another computer with its earlier keys replaces its messages"
+                "its new keys, or another computer, with earlier keys of the robot, sends messages "
+                "in its place"
             )
         issued = self._issued(digest(signer))
         if issued is None:

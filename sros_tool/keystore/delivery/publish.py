@@ -239,9 +239,9 @@ def publish(
         raise KeystoreError(
             behind,
             "Robots would refuse what is published now, or get it with wrong dates.",
-            "Set the clock, and publish again. If it is right, and was ahead before, first run "
-            f"`sros crl {quote(str(root))} --refresh`, so that the last entry of the ledger has "
-            "today's date.",
+            "Set the clock, and publish again. If the clock is right now, but was ahead before, "
+            f"first run `sros crl {quote(str(root))} --refresh`, so that the last entry of the "
+            "ledger has today's date.",
         )
     with ExitStack() as stack:
         if not dry_run:
@@ -842,7 +842,8 @@ class _Publication:
     def _has_later_releases(self, restored: bool) -> bool:
         """Return whether the folder has later releases, which is an error unless ``restored``."""
         if self.list.number >= (unused := self.keystore.ledger_file.next_number()):
-            why = f"It has release {self.list.number}, but the ledger has none after {unused - 1}."
+            number = self.list.number
+            why = f"It has release {number}, but the last number in the ledger is {unused - 1}."
             raise damaged_list_error(self.keystore, why)
         latest = self._highest_number
         if latest <= self.list.number:
@@ -1187,7 +1188,7 @@ class _Publication:
             if published and is_new:
                 lines.append(f"{published.release.sha256}  {robot}\n")
             if not_valid:
-                text = f"{robot}: published although it is not valid now: {not_valid}"
+                text = f"{robot}: published, although the release is not valid now: {not_valid}"
                 self._notes.append(Note("fleet.release-not-valid", text))
         if lines or self._is_restored:
             digest = hashlib.sha256("".join(sorted(lines)).encode()).hexdigest()

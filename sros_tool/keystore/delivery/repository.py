@@ -261,7 +261,7 @@ def read_present(folder: Path, roots: Roots) -> PresentMetadata:
             return PresentMetadata()
         raise KeystoreError(
             f"'{error.filename}', which robots fetch, is missing",
-            "The keystore wrote the metadata that leads there.",
+            "The metadata that the keystore wrote names this file.",
             "Copy the file back. If the keystore was restored from a backup, first follow "
             f"docs/howto/keystore_is_lost.md. If the file is lost, "
             f"{_damaged_metadata_remedy(folder)}.",

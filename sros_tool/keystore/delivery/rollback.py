@@ -140,9 +140,9 @@ def check_rollback(
             f"It trusts {authority_text(authority)}, and the keystore's CA is "
             f"{_first_authority(files, path)}, an earlier CA: the robot would trust this CA again, "
             "and certificates that were revoked since then. Nothing was changed.",
-            "The keystore may come from a backup: docs/howto/keystore_is_lost.md says how to go "
-            "on; or the folder has its files from another keystore. If the keystore's CA is right, "
-            f"first {_removal_of(target, later)}",
+            "The keystore may come from a backup (docs/howto/keystore_is_lost.md says how to go "
+            "on), or the files in the folder are of another keystore. If the keystore's CA is "
+            f"right, first {_removal_of(target, later)}",
         )
     if foreign := _foreign_authorities(keystore, present, files):
         path, authority = next(iter(foreign.items()))

@@ -289,7 +289,7 @@ def _shut_out_error(
     options = " ".join(f"--allow-refusal {word}" for word in words_of(vendors))
     return KeystoreError(
         f"processes that still have certificates of {name} would be refused in '{root}'",
-        f"If there is a revocation list, {demand} a list of each CA, but the keyUsage of {name} "
+        f"Once there is a revocation list, {demand} one from each CA, but the keyUsage of {name} "
         "lacks cRLSign. Nothing was changed.",
         f"{remedy} If no process runs with such a certificate, add {options}.",
     )

@@ -253,7 +253,7 @@ def load_authority(
             f"the {role} CA {authority_text(certificate)} is not valid now",
             f"It is valid from {iso(validity.not_before)} to {iso(validity.not_after)}, and DDS "
             "refuses the certificates and documents of a CA outside its validity.",
-            "Check the clock of this machine; otherwise make a new keystore.",
+            "Check the clock of this machine; if it is right, make a new keystore.",
         )
     return Authority(certificate, key, service)
 

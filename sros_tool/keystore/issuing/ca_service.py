@@ -232,8 +232,8 @@ def _certificate_problem(
     constraints = extension(certificate, x509.BasicConstraints)
     if (constraints and constraints.ca) or not denies_issuing(certificate):
         return (
-            "it is a CA certificate, or could be used as one: it has neither basicConstraints with "
-            "CA:FALSE nor a keyUsage without keyCertSign"
+            "it is a CA certificate, or could be used as one: it lacks basicConstraints with "
+            "CA:FALSE"
         )
     if not (validity.contains(now) or validity.contains(now + _CLOCK_TOLERANCE)):
         return f"it is valid from {iso(validity.not_before)} to {iso(validity.not_after)}, not now"

@@ -405,7 +405,7 @@ class EnclaveWriter:
             if known.public_key == identity.public_key:
                 return known.pem
         raise KeystoreError(
-            f"the key of enclave {name} is not in this keystore, nor a request that it signed",
+            f"this keystore has neither the key of enclave {name}, nor a request signed with it",
             "A CA service requires proof that the requester has the key.",
             "Create a request on the robot with `sros create_request`, and sign it here with "
             "`sros sign_request --renew`.",

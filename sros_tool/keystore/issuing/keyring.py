@@ -99,7 +99,7 @@ class Keyring:
         if not self._is_from_user(role) and owner not in (0, os.geteuid()):
             raise KeystoreError(
                 f"the keystore '{root}' of user {owner} names the CA service '{place}'",
-                "It would issue certificates with your rights.",
+                "The program of this service would run with your rights.",
                 f"If it may, set SROS_IDENTITY_KEY={place}.",
             )
         return CaService(place, root)

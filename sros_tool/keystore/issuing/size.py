@@ -170,7 +170,8 @@ def minimized_policy(
         notes += [
             Note(
                 "minimize.enclave-of-node",
-                f"The rights observed in {path} count for {home}, which has this node.",
+                f"The rights observed in enclave {path} count for {home}, because the policy has "
+                f"the node {path} there.",
             )
             for path, home in sorted(homes.items())
         ]
@@ -210,7 +211,8 @@ def _scope_notes(policy: Policy, result: MinimizedPolicy, observed: Set[Right]) 
     if unknown:
         text = (
             f"these enclaves were observed, but the policy lacks them: {', '.join(unknown)}. If "
-            "the policy has their nodes in another enclave, write its path in the observed file."
+            "the policy has their nodes in another enclave, write that enclave into the observed "
+            "file."
         )
         yield Note("minimize.enclave-not-in-policy", text)
 

@@ -933,7 +933,7 @@ class _EnclaveMaker:
             and permissions.count(subject) == 1
         ):
             return ""
-        return "certificates or permissions that the ledger has from earlier may still work"
+        return "earlier certificates or permissions in the ledger may still work"
 
     @cached_property
     def _recorded_credentials(

@@ -489,8 +489,8 @@ def _drop_routers(change: KeystoreChange, revoked: Collection[str]) -> None:
         change.set_network(replace(network, routers=left))
         names = ", ".join(router.name for router in dropped)
         text = (
-            f"{names} is no longer a router. By their new files, its sessions that are not revoked "
-            "connect to another router."
+            f"{names} is no longer a router. The new files of the enclaves that connected there "
+            "name another router."
         )
         change.notes.append(Note("zenoh.router-revoked", text))
 

@@ -987,7 +987,9 @@ def _make_successor(
     is_plain = given is False or not (given or new_keys.encrypt or is_token_uri(place))
     if is_plain and encrypted is not False:
         path = quote(str(key_path(change.root, place or at)))
-        why = "the current key has one" if encrypted else "sros cannot see whether the current has"
+        why = "the current key has one"
+        if not encrypted:
+            why = "sros cannot see whether the current key has one"
         text = (
             f"the new key of the {_ca_name(roles)} has no passphrase, and {why}. To encrypt it: "
             f"`openssl pkcs8 -topk8 -scrypt -in {path} -out {path}.new && mv {path}.new {path}`."
@@ -1003,8 +1005,8 @@ def _make_successor(
         certificate = _existing_ca(change, roles, existing, key, name)
         if validity_of(certificate).not_before < first:
             older = (
-                f"{authority_text(certificate)} is valid from before the {_ca_name(roles)} that it "
-                "would replace"
+                f"{authority_text(certificate)} is valid from an earlier time than the "
+                f"{_ca_name(roles)} that it would replace"
             )
             if publish_command(change.root):
                 raise KeystoreError(

@@ -668,9 +668,9 @@ class _Updater:
             return []
         which = "these enclaves" if len(self._kept_open) > 1 else "this enclave"
         text = (
-            f"Still open: {', '.join(self._kept_open)} may do everything as before, because the "
-            f"new default is for enclaves without a policy, and the rights of {which} differ from "
-            f"the old default. State them with `sros create_permission {quote(str(self._root))} "
+            f"Still open: {', '.join(self._kept_open)} may do everything, as before. The new "
+            f"default replaces only rights that equal the old default, and the rights of {which} "
+            f"do not. State them with `sros create_permission {quote(str(self._root))} "
             f"{' '.join(map(quote, self._kept_open))} POLICY_FILE`."
         )
         return [Note("keystore.kept-open", text)]
