@@ -126,8 +126,8 @@ _REPAIRS_REPORTED_FOR = timedelta(days=1)
 """How long the agent reports that it replaced files which differed from the release."""
 _BRING_KEY = (
     " A release has no keys: run `sros distribute_key KEYSTORE --robot {} DIR --force` on the "
-    "keystore machine, and bring DIR here. For a key that was made on a robot: switch this "
-    "computer off if it was replaced; otherwise make a new key, as for new hardware "
+    "keystore machine, and bring DIR here. If the key was made on a robot, and another computer "
+    "replaced this one, switch this computer off; otherwise make a new key, as for new hardware "
     "(docs/howto/one_robot.md)."
 )
 _DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
@@ -540,7 +540,7 @@ class _Round:
             self._problems.append(
                 f"Until {iso(max(closed.values()))}{READABLE_KEYS}"
                 f"{counted(len(closed), 'private key')}: {first_few(sorted(closed), 3)}. The mode "
-                "is right now. If anybody may have copied a key, run `sros renew KEYSTORE "
+                "is correct now. If anybody may have copied a key, run `sros renew KEYSTORE "
                 "ENCLAVE --new-key --revoke-old` in the keystore."
             )
 

@@ -122,8 +122,8 @@ KEYSTORE_RELATIVE = FindingKind(
     "runtime.keystore-relative",
     WARNING,
     "ROS_SECURITY_KEYSTORE is a relative path",
-    "Each process resolves the path in its working directory, so a service, for instance, looks "
-    "in another folder.",
+    "Each process resolves the path in its working directory, so a systemd unit, for instance, "
+    "looks in another folder.",
     _RCL_SOURCE,
     f"Write the absolute path. {_ENV_REMEDY}",
 )
@@ -230,7 +230,7 @@ def variable_findings(
     if not root.is_absolute():
         yield KEYSTORE_RELATIVE.found(KEYSTORE, value_text(environment, KEYSTORE))
     if not is_keystore(root):
-        missing = "does not exist" if not root.exists() else "has no enclaves folder with content"
+        missing = "does not exist" if not root.exists() else "has no folder 'enclaves' with content"
         remedy = ""
         try:
             refuse_flat_keystore(root)

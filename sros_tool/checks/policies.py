@@ -541,8 +541,8 @@ _INCLUDE_ELEMENT = (
     'xpointer="xpointer(/profile/*)"/>'
 )
 _INCLUDE_HINT = (
-    f"{_INCLUDE_ELEMENT} allows what every node needs; `sros policies --copy common` writes that "
-    "file, in the folder of the policy."
+    f"{_INCLUDE_ELEMENT} allows what every node needs; `sros policies --copy common`, run in the "
+    "folder of the policy, writes that file."
 )
 
 NO_TYPE_DESCRIPTION = FindingKind(
@@ -832,8 +832,8 @@ def _missing_common_part_cause(lacking: Sequence[_NodeLackingRight]) -> Cause:
 
 
 _NAME_NODE_FIRST_REMEDY = (
-    "First write the name of the node in place of '*': with the line, a process could serve the "
-    "parameters of every node."
+    "First write the name of the node in place of '*': otherwise the added line lets a process "
+    "serve the parameters of every node."
 )
 
 
@@ -905,7 +905,8 @@ DENY_BLOCKS = FindingKind(
     "Cyclone DDS 11 create it.",
     "Cyclone DDS 0.10.2 and 11.0.1 (access_control.c), Fast DDS 2.6 to 3.6; tested.",
     "Remove the deny rule (everything that no rule allows is denied anyway), or deny only names "
-    "whose other direction the node does not use; every node serves its parameters.",
+    "whose other direction the node does not use. Do not deny calls to the parameter services of "
+    "all nodes, because every node serves its own.",
     vendors=(Vendor.CYCLONE,),
 )
 CHARACTER_SET = FindingKind(

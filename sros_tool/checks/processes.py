@@ -578,7 +578,8 @@ ZENOH_CHANGED = FindingKind(
     "Zenoh reads the file that a variable names, and then applies ZENOH_CONFIG_OVERRIDE. So both "
     "can let strangers in, whatever the files of the enclave say.",
     "rmw_zenoh_cpp (zenoh_config.cpp); Zenoh 1.10.2, tested.",
-    f"Find out what sets them, remove it there, and restart the process. {OWN_CONFIGURATION}",
+    "Find out who changed the file or set the variables, undo this, and restart the process. "
+    f"{OWN_CONFIGURATION}",
 )
 PROCESS_ELSEWHERE = FindingKind(
     "runtime.process-elsewhere",

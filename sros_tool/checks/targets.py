@@ -121,7 +121,7 @@ def _policies_at(path: Path) -> list[Path]:
     refuse_flat_keystore(path)
     raise DocumentError(
         f"'{path}' is neither a keystore nor an enclave, and holds no policy",
-        "It has no enclaves folder with content, no cert.pem, and no XML file that begins "
+        "It has no folder 'enclaves' with content, no cert.pem, and no XML file that begins "
         "with <policy>.",
     )
 

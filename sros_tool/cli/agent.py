@@ -88,8 +88,8 @@ def agent() -> None:
     "--new-key",
     is_flag=True,
     help=(
-        "Make a new key for each renewal, which the robot asks for before `sros renew "
-        "--all-expiring soon` renews the present one. [default: the key stays]"
+        "Make a new key for each renewal. The robot then asks for renewal before `sros renew "
+        "--all-expiring soon` would renew the present key. [default: the key stays]"
     ),
 )
 @click.option(
@@ -362,7 +362,7 @@ def _due_lines(folder: Path, due_enclaves: Sequence[str], unseen: Sequence[str])
 def _status(folder: Path, max_age: str, as_json: bool) -> int:
     """Show the result of the agent's last round in FOLDER, what is due, and what is wrong now.
 
-    The files are looked at now, as `sros verify` does; the processes are those of the last round.
+    sros examines the files now, as `sros verify` does; the processes are those of the last round.
 
     Example:
       $ sros agent status /etc/sros/keystore

@@ -230,7 +230,7 @@ def _show(robot: LocalRobot, closed: CloseState) -> None:
         echo(f"  {_process_line(process, closed, policy)}")
     for why in dict.fromkeys(closed.outdated.values()):
         names = [name for name, other in closed.outdated.items() if other == why]
-        echo(f"  restart, because {why} the processes of {enumerated(names)}")
+        echo(f"  {why} the processes of {enumerated(names)}: restart them")
     for process_text in closed.not_observed:
         echo(f"  not observed before: {process_text}; if it does not belong there, stop it")
     for name in closed.new:
@@ -386,7 +386,7 @@ def _show_end(
         steps = f"stop the robot, start each process by the commands in {robot.commands_file}"
         if closed.secured:
             stop = "" if closed.stopped.issuperset(closed.pending) else "stop them, "
-            steps = f"{stop}start them by the first commands in {robot.commands_file}"
+            steps = f"{stop}start them by the commands at the top of {robot.commands_file}"
         if not closed.pending:
             following = ask
         elif any(
@@ -455,9 +455,10 @@ def _other_machines_advice(robot: LocalRobot, closed: CloseState) -> str:
     """Return which files other machines need; sros does not see whether the files are there."""
     needed = ", ".join(f"{name} ({iso(of)})" for name, of in closed.needed_elsewhere.items())
     text = needed and (
-        "; on other machines, replace files that are older than these times, and restart the "
-        f"process: {needed}: sros distribute_key {shlex.quote(str(robot.keystore))} ENCLAVE FOLDER "
-        f"--force; when a machine has them: {robot.close_command} --brought ENCLAVE"
+        "; on other machines, replace files that are older than the time of their enclave by the "
+        f"output of `sros distribute_key {shlex.quote(str(robot.keystore))} ENCLAVE FOLDER "
+        f"--force`, and restart the process: {needed}; when a machine has the files, run "
+        f"`{robot.close_command} --brought ENCLAVE`"
     )
     if brought := ", ".join(f"{name} ({iso(of)})" for name, of in closed.brought.items()):
         text += f"; on other machines, as you said with --brought: the current files of {brought}"

@@ -240,8 +240,8 @@ def fleets_option(function: Decorated) -> Decorated:
         type=PATH,
         multiple=True,
         metavar="FILE",
-        help="Fleet file whose robots replace the placeholders of the policies; give it twice "
-        "if the first and the second policy are for different fleets.",
+        help="Fleet file whose robots replace the placeholders of the policies; give the "
+        "option twice if the first and the second policy are for different fleets.",
     )(function)
 
 

@@ -1130,7 +1130,7 @@ _NOT_SHOWN_SECURED = (
     "at level info): perhaps the node runs open. Start it with `sros run KEYSTORE ENCLAVE -- "
     "COMMAND`, and log all its output from the start"
 )
-_SILENT_ON_ZENOH = "denials on Zenoh, which only logs with RUST_LOG=zenoh=trace have"
+_SILENT_ON_ZENOH = "denials on Zenoh, because a log has them only with RUST_LOG=zenoh=trace"
 
 
 def _lines_without_findings(log: str, count: int) -> Iterator[str]:

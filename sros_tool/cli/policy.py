@@ -254,9 +254,9 @@ def diff_policy(
     or Zenoh configurations such as router.json5. Permissions and Zenoh rules are shown in ROS
     terms; the signature of permissions is verified if the permissions CA is next to them. "!" marks
     a right of B whose counterpart, such as the subscriber, only A has. If A or B covers only some
-    enclaves, as an export does, only these are compared. Zenoh routers that a policy lacks are no
-    difference if they have no more rights than every node needs; a note names them. Lines that
-    differ only in the robot of a fleet are shown as one. Two policies are also compared by the
+    enclaves, as an export does, only these are compared. If a policy lacks Zenoh routers, and these
+    have only the rights that every node needs, a note names them in place of a difference. Lines
+    that differ only in the robot of a fleet are shown as one. Two policies are also compared by the
     protection that they demand, two keystores by their governance.
 
     The exit status is 1 if they differ, or if DDS would refuse A or B.
@@ -266,10 +266,11 @@ def diff_policy(
     no enclave access that A does not give. Also, B must not assign a node to an enclave with more
     rights, or protect anything less. The exit status is 2 if sros cannot decide this. sros assumes
     that a policy is signed with a governance that controls all access. If A is a policy, and B is a
-    keystore that protects less than the template production, this counts as more access. If B is a
-    policy, it never lowers the protection. The last line says what is assumed and what is left out,
-    such as dates. "!" marks a DENY of A that B lacks, for names that B does not allow. If only a
-    DENY is missing, nobody gets access, so the exit status is 0, but `sros review` fails.
+    keystore that protects less than the template production, this counts as more access. If A is a
+    keystore, and B is a policy, B never counts as less protection. The last line says what is
+    assumed and what is left out, such as dates. "!" marks a DENY of A that B lacks, for names that
+    B does not allow. If only a DENY is missing, nobody gets access, so the exit status is 0, but
+    `sros review` fails.
 
     Example:
       $ sros diff_policy robot.xml keystore
@@ -1017,7 +1018,9 @@ def access_summary(
     if elsewhere:
         new = _count(len(elsewhere), "right")
         here = access_summary(growth, dropped)
-        return f"{new} new for users who put the node into another namespace; without that, {here}"
+        return (
+            f"{new} new only for users who put the node into another namespace; otherwise: {here}"
+        )
     from sros_tool.dds.decision.vendors import joined_titles
 
     worlds = ", ".join(joined_titles(growth.worlds))
@@ -1035,7 +1038,9 @@ def access_summary(
     if not growth:
         same = f"nobody gets more access, and nothing is protected less ({worlds})"
         if dropped:
-            same = f"{denials_gone}, so that other policies may allow the names; by itself, {same}"
+            same = (
+                f"{denials_gone}, so that other policies may allow the names; without these, {same}"
+            )
         return f"{same}{rights_gone}{basis}"
     parts = []
     if growth.added:

@@ -103,8 +103,8 @@ def _paths_option(name: str, help_text: str) -> Callable[[Decorated], Decorated]
     required=True,
     metavar="COMMIT|none",
     help="The commit to compare with: a full id, or a full reference such as "
-    "refs/remotes/origin/main. For the target branch of a merge, the full id of the merge "
-    "with ^1. `none`: no comparison.",
+    "refs/remotes/origin/main. To compare a merge with its target branch, add ^1 to the full id "
+    "of the merge. `none`: no comparison.",
 )
 @click.option(
     "--head",

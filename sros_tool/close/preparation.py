@@ -439,7 +439,7 @@ def _unknown_process_problems(running: RunningRobot, state: CloseState) -> Itera
     if routers and not any(process.is_router for process in observed.processes):
         yield (
             f"{routers[0].label} is a Zenoh router that did not run when sros watched, or does not "
-            f"belong to the robot. Watch again while it runs, or stop it: {close} --for 1m. "
+            f"belong to the robot. Stop it, or watch again while it runs: {close} --for 1m. "
             "Otherwise closed nodes do not reach each other through this router (--partial accepts "
             "this)"
         )
@@ -448,7 +448,7 @@ def _unknown_process_problems(running: RunningRobot, state: CloseState) -> Itera
         yield (
             f"nodes of {twice[0]} are in process {pids[twice[0]]} and in another process "
             "that sros does not see. If another robot is in this ROS domain, switch it off, or "
-            "give it a domain of its own. Then remove the rights that it added to "
+            "give it a domain of its own. Then remove the rights of its nodes from "
             f"'{robot.policy}', and watch again: {close} --for 1m"
         )
     if only_there := [name for name in observed.elsewhere if name not in twice]:

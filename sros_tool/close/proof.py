@@ -152,7 +152,7 @@ def _proof_of_files(robot: LocalRobot, expired: Sequence[str]) -> Proof:
         else:
             if changes:
                 number = counted(len(changes), "file")
-                reason = f"{number} of '{robot.keystore}' would change there, such as {changes[0]}"
+                reason = f"exporting '{robot.keystore}' would change {number}, such as {changes[0]}"
                 holds, reason = False, f"{reason}; `{robot.close_command}` exports them"
             elif outside := robot.enclaves_outside_policy():
                 reason = f"the keystore has {first_few(outside, MOST_NAMES)}, and the policy does "
@@ -306,7 +306,7 @@ def _proof_of_silence(robot: LocalRobot, before: Observation, *, hears: bool) ->
         why = "this proves nothing, because the observer in its enclave does not see the robot now"
         return Proof(SILENCE, None, why)
     seen = nodes_text(before.nodes)
-    return Proof(SILENCE, True, f"the observer that saw {seen} before sees none")
+    return Proof(SILENCE, True, f"the observer, which saw {seen} before, now sees none")
 
 
 def _proof_of_processes(running: RunningRobot, number: int) -> Proof:
@@ -466,10 +466,11 @@ def _remedy(robot: LocalRobot, difference: str) -> str:
     """Return the remedy for a kind of difference, as a clause; "" if the kind needs no remedy."""
     policy, restart = f"'{robot.policy}'", f"run `{robot.close_command}`, and restart these nodes"
     remedies = {
-        "denied": f"if a node needs this, add it to its profile in {policy}, and {restart}; if a "
-        "name was changed only in the policy, start the node with this name, too",
-        "gone": f"if the node uses another name now, write that name into its profile in {policy} "
-        f"in place of this one, also into the profiles of the nodes that it talks to, and "
+        "denied": "if a node needs this right, add the right to the node's profile in "
+        f"{policy}, and {restart}; if you changed a name only in the policy, also start the node "
+        "with the new name",
+        "gone": f"if the node uses another name now, replace the old name in {policy}, in the "
+        "profiles of the node and of the nodes that it talks to, and "
         f"{restart}; if not, start the node as before ({robot.commands_file})",
         "left alone": f"give both sides one name, in {policy} and in their programs, and {restart}",
         "refused": f"ask `sros check {shlex.quote(str(robot.export))}`",
@@ -603,7 +604,7 @@ def _renamed_text(nodes: ObservedNodes, current: Observation | None, *, fails: b
         topics = sorted({(ros_use(pair.old)[1], ros_use(pair.new)[1]) for pair in pairs})
         private = tuple(f"{name}/" for name in renamed)
         if moved := [f"{old} as {new}" for old, new in topics if not old.startswith(private)]:
-            text += f", with {enumerated(moved)} (write a name absolute if it must not move)"
+            text += f", with {enumerated(moved)} (to keep a name, write it as an absolute name)"
         if fails:
             text += " (if the new name is another node: remove the unused rights from its profile)"
     _, without_profile = nodes.divide_by_profile(nodes.as_observed)

@@ -133,8 +133,8 @@ class RunningRobot:
         """Return, for each enclave, its processes that are not closed, each with the reason.
 
         Enclaves without such processes are left out.  A reason is text before "the processes of X",
-        such as "no ROS_SECURITY_STRATEGY=Enforce in".  A process of a user who cannot read the
-        files only claims to run in an enclave: such a process counts only if the enclave has no
+        such as "ROS_SECURITY_STRATEGY is not 'Enforce' in".  A process of a user who cannot read
+        the files only claims to run in an enclave: such a process counts only if the enclave has no
         other process.
         """
         by_enclave: dict[str, list[SecuredProcess]] = {}
@@ -162,7 +162,7 @@ class RunningRobot:
         if not self.may_use_files(process):
             return f"users other than the owner of the files ({user_text(process.user)}) run"
         if process.environment.get(STRATEGY) != "Enforce":
-            return f"no {STRATEGY}=Enforce in"
+            return f"{STRATEGY} is not 'Enforce' in"
         if not enclave.is_there:
             return f"no files are there{f' ({enclave.problem})' * bool(enclave.problem)} for"
         names = [*newer_files(process, enclave)]
@@ -172,8 +172,8 @@ class RunningRobot:
             return f"the files are not in force ({finding.text}) in" if finding else ""
         mode = enclave.file(KEY_FILE).mode
         readable = (
-            f"others can read {KEY_FILE} (its mode is {mode:04o}): if anybody did, `sros renew "
-            f"KEYSTORE {enclave.name} --new-key --revoke-old`, otherwise chmod 600; "
+            f"others can read {KEY_FILE} (its mode is {mode:04o}): if anybody read it, run `sros "
+            f"renew KEYSTORE {enclave.name} --new-key --revoke-old`, otherwise `chmod 600`; "
         )
         warning = readable if mode & 0o077 else ""
         if clock := why_order_is_unknown(process):

@@ -246,8 +246,8 @@ def _lacking_text(robot: LocalRobot, nodes: Sequence[ObservedNode]) -> str:
     )
     return (
         f"'{robot.policy}' stays as it is, and lacks {counted(len(rights), 'right')} seen now "
-        f"({first_few(rights, MOST_NAMES)}); {restart}if a process should not have them, stop "
-        f"it, and run `{robot.close_command}`; if they are right, add them: {add}"
+        f"({first_few(rights, MOST_NAMES)}); {restart}if a process should not have these "
+        f"rights, stop the process, and run `{robot.close_command}`; if it needs them: {add}"
     )
 
 

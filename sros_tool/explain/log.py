@@ -1092,7 +1092,7 @@ class _Examiner:
                     f"{beginning}this is the node {node}, for which there is "
                     f"{_enclaves_text(enclaves)}"
                 ], (
-                    "Start it in the enclave that is for it: `sros run "
+                    "Start the node in its enclave: `sros run "
                     f"{quote(self._root or 'KEYSTORE')} {quote(enclaves[0])} -- COMMAND`."
                 )
             if nodes:

@@ -1050,7 +1050,7 @@ class ZenohExplanation(NamedTuple):
             return ""
         text = "Look at the files"
         if self.out_of_date:
-            text = "Write the Zenoh files as the permissions are"
+            text = "Write the Zenoh files again from the permissions"
         command = f"sros zenoh {quote(str(self.keystore.root))}"
         return f"{text}: `{command}`; then restart the processes that it names."
 

@@ -228,7 +228,7 @@ def check_choice(policies: Sequence[FleetPolicy], fleet: Fleet, robots: Collecti
         has_enclave = fleet.robots[name] in owners
         if left_out := below if has_enclave else (*below, *naming):
             raise PolicyError(
-                f"the robot {name} would be chosen without {first_few(left_out, 5)}",
+                f"--robot {name} would leave out {first_few(left_out, 5)}",
                 "A path without a placeholder belongs to no robot.",
                 "Write the path with {robot}, or {robot:GROUP} for the robots of a group in the "
                 "fleet file, or leave out --robot.",

@@ -346,7 +346,7 @@ def _demo_head(result: Json, made: str) -> str:
     removed = sum(bool(row.get("defence_removed")) for row in rows)
     controls = (
         f"in {removed} of the attempts a defense is removed, and the attack has to succeed: this "
-        "shows that the defense stops it elsewhere"
+        "shows that the defense stops it in the other attempts"
         if removed
         else ""
     )

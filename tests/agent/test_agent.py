@@ -356,7 +356,7 @@ def test_what_somebody_damaged_is_installed_again(home: Home, r1: Robot) -> None
     shutil.copytree(r1.folder / "enclaves/r1/a", r1.folder / "enclaves/r1/b")
     (problem,) = (each for each in r1.round().problems if "/r1/b keeps its files" in each)
     assert bring in problem, "it has another key"
-    assert "made on a robot: switch this computer off if it was replaced" in problem
+    assert "another computer replaced this one, switch this computer off" in problem
     assert r1.message().release == 1
     assert has(r1.folder, home.first, ("/r1/a", "/r1/c"))
     assert any(changed in problem for problem in r1.message().problems or ()), "for a day"

@@ -304,9 +304,9 @@ def test_a_policy_that_was_changed_stays_and_is_followed(robot: Robot) -> None:
         "; if the node lacks this, restart the node with it, and watch again: "
         "sros close robot --for 1m;" in again.out
     )
-    assert " otherwise, if a process should not have them, stop it, and run `sros c" in again.out
+    assert " otherwise, if a process should not have these rights, stop the process, " in again.out
     add = "sros merge_policy robot/policy.xml robot/seen.xml --in-place"
-    assert f"; if they are right, add them: {add}\n" in again.out
+    assert f"; if it needs them: {add}\n" in again.out
     sros(*add.split()[1:], cwd=robot.folder).ok()
     assert "would have" not in robot.close("--for", "1s").out
     policy.write_text(changed)
@@ -458,7 +458,8 @@ def test_a_robot_is_closed_proved_and_opened_again(robot: Robot) -> None:
         "(types are not compared)",
         "  sros cannot see whether two nodes hear each other: look at what the nodes receive now, "
         "and restart a node that receives nothing",
-        "yes: an open listener finds nothing: the observer that saw 2 nodes before sees none",
+        "yes: an open listener finds nothing: "
+        "the observer, which saw 2 nodes before, now sees none",
     ]
     renew = "Z; next: have them renewed before then (docs/howto/close.md, Renewal without hands), "
     assert f"{renew}and bring robot/keystore to another machine: it has the CA k" in closed.err
@@ -548,7 +549,7 @@ def test_what_systemd_does_not_start_is_done_by_hand(
         "the processes run in their enclaves, except for /listener (open); the files are valid"
         in ended.err
     )
-    assert "; next: stop them, start them by the first commands in robot/start/c" in ended.err
+    assert "; next: stop them, start them by the commands at the top of robot/" in ended.err
     commands = (robot.folder / "robot/start/commands.txt").read_text()
     assert re.search(r"\A# Stop .*\n\n# /listener\n.*\n\n# These .*\n\n# /talker\n", commands)
     assert ("ros2 launch" in commands) == bool(shutil.which("ros2"))
@@ -558,7 +559,7 @@ def test_what_systemd_does_not_start_is_done_by_hand(
     commands = (robot.folder / "robot/start/commands.txt").read_text()
     assert "\nros2 launch --secured " in commands
     assert "except for /listener (not running); the files" in ended.err
-    assert "; next: start them by the first commands in robot/start/commands.txt" in ended.err
+    assert "; next: start them by the commands at the top of robot/start/commands.txt" in ended.err
     assert ended.err.endswith(
         "--proof; for enclaves without a running process: --without /listener\n"
     )
@@ -779,21 +780,19 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     said = robot.close("--proof", status=1).out
     key.chmod(0o600)
     assert (
-        "others can read key.pem (its mode is 0644): if anybody did, `sros renew KEYSTORE /talker"
-        in said
+        "others can read key.pem (its mode is 0644): if anybody read it, run `sros renew " in said
     )
     assert " and 2 more changed, or got another mode, after the start of" in said
     assert f"the processes of /talker (process {PID['/talker']}); restart them\n" in said
     said = robot.close().out
-    assert "\n  restart, because " in said
-    assert " changed, or got another mode, after the start of the processes of /talker\n" in said
+    assert " another mode, after the start of the processes of /talker: restart them\n" in said
     robot.more = (replace(robot.process("/talker", is_secured=True), pid=13, command=("b",)),)
     named = f"the processes of /talker (processes {PID['/talker']}, 13); restart them\n"
     assert named in robot.close("--proof", status=1).out
     robot.outdated, robot.absent = set(), {"/talker"}
     talker = robot.process("/talker", is_secured=True)
     robot.more = (replace(talker, started=datetime.now(UTC) + timedelta(days=1)),)
-    assert "restart, because" not in robot.close().out
+    assert ": restart them" not in robot.close().out
     long_ago = talker.started - timedelta(days=400)
     robot.more = (replace(talker, started=long_ago, clock_advanced=timedelta(days=2)),)
     said = robot.close("--proof", status=1).out
@@ -801,7 +800,7 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     assert " may have changed after the start of the processes of /talker (process 4711); " in said
     lax = {**talker.environment, "ROS_SECURITY_STRATEGY": "Permissive"}
     for changed, why in (
-        (replace(talker, environment=lax), "no ROS_SECURITY_STRATEGY=Enforce in"),
+        (replace(talker, environment=lax), "ROS_SECURITY_STRATEGY is not 'Enforce' in"),
         (replace(talker, user=12345), "users other than the owner of the files (user 12345) run"),
     ):
         robot.more = (changed,)
@@ -836,14 +835,12 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     robot.remaining = (TALKER, (*ros_node("listener", LISTENER[3])[:4], EVENTS))
     said = robot.close("--proof", status=1).out
     assert f"{lost}gone: /listener publish /rosout, /listener re" in said
-    assert (
-        "; if the node uses another name now, write that name into its profile in 'robot/" in said
-    )
+    assert "; if the node uses another name now, replace the old name in 'robot/policy" in said
     assert "start the node as before (robot/start/commands.txt)" in said
     robot.remaining = (TALKER, ros_node("guest", "05"))
     said = robot.close("--proof", status=1).out
     assert f"{lost}denied: /guest " in said and "; also not seen: /listener (" in said
-    assert "; if a node needs this, add it to its profile in 'robot/policy.xml', and run `s" in said
+    assert "; if a node needs this right, add the right to the node's profile in 'robot/pol" in said
     robot.remaining = (TALKER, LISTENER)
     robot.nodes = (*robot.nodes, ("/", "/", "spy", "03", ["subscribe rt/chatter"]))
     assert (
@@ -885,7 +882,7 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     robot.remaining = ()
     sros("crl", "robot/keystore", "--refresh", cwd=robot.folder).ok()
     ended = robot.close("--proof", "--partial", status=1)
-    crl = "3 files of 'robot/keystore' would change there, such as robot/export/enclaves/"
+    crl = "exporting 'robot/keystore' would change 3 files, such as robot/export/enclaves/"
     assert f"no: the files are accepted: {crl}" in ended.out, "as in an export that is restored"
     again = "distribute_key", "robot/keystore", "--all", "robot/export", "--force"
     sros(*again, cwd=robot.folder).ok()
@@ -1088,7 +1085,7 @@ def test_a_renamed_node_is_compared_and_a_new_one_is_named(
     )
     assert f"{denied}; new, without a profile: /ghost_node in /listener; compared " in said
     renamed = "compared under a new name: /rear_camera as /nav/stern_camera, with /odom as /nav/o"
-    assert f"; {renamed}dom (write a name absolute if it must not move)\n" in said
+    assert f"; {renamed}dom (to keep a name, write it as an absolute name)\n" in said
     renamed_alone = policy.read_text()
     policy.write_text(
         renamed_alone.replace(">odom</topic>", ">odom</topic><topic>/odom</topic>", 1)
@@ -1103,7 +1100,7 @@ def test_a_renamed_node_is_compared_and_a_new_one_is_named(
     with monkeypatch.context() as patched:
         patched.setattr(nodes, "audit", counted_audit)
         said = robot.close("--proof").out
-    assert f"{talk}3 nodes with 56 endpoints as before" in said and f"{renamed}dom (w" in said
+    assert f"{talk}3 nodes with 56 endpoints as before" in said and f"{renamed}dom (to" in said
     assert len(audits) == 2, "one of all possible names, one of the nodes"
     policy.write_text(renamed_alone)
     robot.close()
@@ -1137,7 +1134,7 @@ def test_a_process_that_the_policy_lacks_keeps_its_command(robot: Robot) -> None
     robot.nodes, robot.absent = (TALKER, LISTENER), set()
     said = robot.close("--for", "1s", status=1).out
     add = "sros merge_policy robot/policy.xml robot/seen.xml --in-place"
-    assert "(/talker publish /chatter" in said and f"; if they are right, add them: {add}\n" in said
+    assert "(/talker publish /chatter" in said and f"; if it needs them: {add}\n" in said
     assert "the policy lacks enclaves that sros saw when it watched: /talker\n" in robot.close().out
     sros(*add.split()[1:], cwd=robot.folder).ok()
     said = robot.close().out
@@ -1535,7 +1532,7 @@ def test_what_is_exported_without_the_enclaves_of_other_machines(
         )
         said = capsys.readouterr()
         assert ("fix this first" in said.out) is bool(problems)
-        assert "restart the process: /b (2027-01-15T08:00:00Z): sros distr" in said.err
+        assert "restart the process: /b (2027-01-15T08:00:00Z); when a mac" in said.err
     # Until the files change, their machine has those that --brought said are there.
     when = state_now.needed_elsewhere
     robot.named_brought = ["/b"]
@@ -1646,7 +1643,7 @@ def test_an_enclave_that_belongs_to_another_machine(robot: Robot) -> None:
     robot.by_hand = {"/talker"}
     sros("renew", "robot/keystore", "/talker", "--new-key", "--revoke-old", cwd=robot.folder).ok()
     shared = robot.folder / "robot/keystore/public/identity_ca.crl.pem"
-    needed = f"the process: /listener ({iso(time_of_file(shared.stat().st_mtime))}): sros dist"
+    needed = f"the process: /listener ({iso(time_of_file(shared.stat().st_mtime))}); when a"
     assert needed in robot.close().err
     ended = robot.close("--proof")
     assert needed in ended.err

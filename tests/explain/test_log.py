@@ -667,10 +667,10 @@ def test_nothing_found_is_said_of_what_was_read(tmp_path: Path) -> None:
         ended = sros("explain", "--log", tmp_path / "robot.log").ok()
         assert ended.err.startswith(said)
     assert "\nnot shown: whether a node runs open (`sros check runtime` on its machi" in ended.err
-    assert "denials on Zenoh, which only logs with RUST_LOG=zenoh=trace have" in ended.err
+    assert "denials on Zenoh, because a log has them only with RUST_LOG=zenoh=trace" in ended.err
     variables = {"RMW_IMPLEMENTATION": "rmw_zenoh_cpp"}
     on_zenoh = sros("explain", "--log", tmp_path / "robot.log", env=variables)
-    assert "in 1 line\nnot shown: denials on Zenoh, which only" in on_zenoh.ok().err
+    assert "in 1 line\nnot shown: denials on Zenoh, because" in on_zenoh.ok().err
     for found in ("[INFO] [1.0] [rcl]: Found", "[talker]"):  # rcl, and a node of `sros demo`
         line = f"{found} security directory: /k/enclaves/talker\n"
         (tmp_path / "robot.log").write_text(line)
@@ -1183,7 +1183,7 @@ def test_a_node_in_another_enclave_of_a_policy_without_a_keystore(
     found = sros("explain", policy, "/guard", "--log", log).out
     where = f"{namespace}/blade"
     assert f"this is the node {where}, for which there is the enclave {where}" in found
-    assert f"enclave that is for it: `sros run KEYSTORE {where} -- COMMAND`" in found
+    assert f"Start the node in its enclave: `sros run KEYSTORE {where} -- COMMAND`" in found
 
 
 def test_a_denial_by_a_rule_is_not_said_to_miss_something(tmp_path: Path) -> None:

@@ -275,7 +275,7 @@ def _why_no_enclaves(path: Path) -> str:
         return "It does not exist."
     if not path.is_dir():
         return "It is a file."
-    return "It has no enclaves folder with content, and neither cert.pem nor key.pem."
+    return "It has no folder 'enclaves' with content, and neither cert.pem nor key.pem."
 
 
 def _enclave(

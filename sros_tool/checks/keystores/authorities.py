@@ -268,7 +268,7 @@ FLEET_EDITED = FindingKind(
 LEFT_ENCLAVES = FindingKind(
     "keystore.left-enclaves",
     NOTE,
-    "enclaves of robots that left the fleet, or the group to which these enclaves belong",
+    "enclaves of robots that left the fleet, or left the group of these enclaves",
     "Anyone who has the files of such an enclave has its rights until the files expire, and "
     "`--robot` no longer chooses the enclave.",
     "sros: the paths have the form of a robot's enclaves, and no robot has these enclaves.",
