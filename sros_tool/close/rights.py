@@ -1,4 +1,4 @@
-"""The rights of a closed robot: who may use a name, and requirements that more rights break."""
+"""The rights of a closed robot: who may use a name, and requirements that added rights break."""
 
 from __future__ import annotations
 
