@@ -91,7 +91,7 @@ class Signers(Enum):
     LISTED = auto()
     """Anyone whose certificate is in the permissions CA's file; no chain is needed (2.14)."""
     CHAIN = auto()
-    """Anyone with a certificate for S/MIME in the message and a chain to the permissions CA."""
+    """Anyone whose certificate chains to the permissions CA, is for S/MIME and in the message."""
 
 
 class Hashes(Enum):
