@@ -713,7 +713,7 @@ def explain_access(
     if vendor not in vendors:
         raise UsageError(f"unknown vendor {vendor!r}", "", f"Choose {', '.join(vendors)}.")
     if vendor == ZENOH and distribution:
-        text = "Zenoh decides alike in every distribution."
+        text = "On Zenoh, the decision is the same in every distribution."
         raise UsageError("vendor 'zenoh' takes no distribution", text, "Leave it out.")
     (vendor,) = _selected_vendors(vendor, distribution)
     asking = AskingContext(_time_or_now(now), zone, domain)

@@ -83,7 +83,8 @@ class Fault(Enum):
     FILE_MISSING = (
         "file-missing",
         "a file that an enclave needs is missing",
-        "The node fails, or without Enforce runs unsecured; Fast DDS says \"couldn't find all "
+        "With Enforce the node fails; without Enforce it runs unsecured. Fast DDS says \"couldn't "
+        "find all "
         'security files!" and never names the file.',
         _SOURCE_RCL,
         _CREATE_MISSING_FILE,
@@ -199,8 +200,8 @@ class Fault(Enum):
         "a key.p11 that does not name a key on a token",
         "Either no ROS 2 node finds the key, or whoever can read the file has the PIN.",
         "RFC 7512; rmw_dds_common of ROS 2 Jazzy (security.cpp); libp11 0.4.12 (eng_parse.c).",
-        "Write one line into {path}: pkcs11:token=TOKEN;object=LABEL;type=private, and for a file "
-        "with the PIN, ?pin-source=file:PATH after it.",
+        "Write one line into {path}: pkcs11:token=TOKEN;object=LABEL;type=private. If a file "
+        "has the PIN, add ?pin-source=file:PATH at the end.",
     )
     KEY_TWICE = (
         "key-twice",
@@ -237,9 +238,9 @@ class Fault(Enum):
     CRL_PARTIAL = (
         "crl-partial",
         "a revocation list that is not the whole list of its CA",
-        "No certificate can be verified with it, so every participant is refused. OpenSSL uses no "
-        "delta list, no list for one distribution point or for some certificates, and no list with "
-        "an unknown critical extension.",
+        "No certificate can be verified with it, so every participant is refused. OpenSSL "
+        "ignores delta lists, lists for one distribution point or for some certificates, and lists "
+        "with an unknown critical extension.",
         "RFC 5280, 5.2; OpenSSL 3 (x_crl.c, x509_vfy.c); Fast DDS 2.9.1, Cyclone DDS 0.10.2; "
         "tested.",
         _SIGN_CRL,
@@ -417,8 +418,8 @@ class Fault(Enum):
     KEY_ON_TOKEN = (
         "key-on-token",
         "a key on a token, which only Fast DDS uses",
-        "Only rmw_fastrtps of ROS 2 Jazzy and later reads key.p11; without key.pem, no node "
-        "of another RMW, or of ROS 2 Humble or Iron, starts.",
+        "Only rmw_fastrtps of ROS 2 Jazzy and later reads key.p11. Without key.pem, nodes on other "
+        "RMWs and nodes of ROS 2 Humble and Iron do not start.",
         "rmw_fastrtps_shared_cpp 8.4 (participant.cpp), rmw_cyclonedds 2.2 and rmw_connextdds "
         "0.22 (they ask rmw_dds_common only for files); Fast DDS 2.9.1, tested.",
         "Use rmw_fastrtps_cpp, or a key in a file.",

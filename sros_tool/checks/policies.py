@@ -913,7 +913,7 @@ CHARACTER_SET = FindingKind(
     "portable.character-set",
     NOTE,
     "a [set] of characters in a name",
-    "Vendors read plain sets alike, but only * and ? are part of the portable profile.",
+    "Vendors agree on sets such as [ab], but only * and ? are part of the portable profile.",
     "Fast DDS 2.6 to 3.6 (fnmatch), Cyclone DDS 0.10 and 11.0 (its own matching); tested.",
     "Use * or ?, or write the names out.",
 )

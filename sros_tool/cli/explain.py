@@ -327,7 +327,7 @@ def explain(
     if logs:
         return _show_log(logs[0], opened, rest, asking, policy, as_json)
     if vendor == ZENOH and distro:
-        text = "Zenoh decides alike in every distribution."
+        text = "On Zenoh, the decision is the same in every distribution."
         raise UsageError("--vendor zenoh takes no --distro", text, "Leave it out.")
     why_zenoh = "" if all_vendors or all_distros else _reason_for_zenoh(vendor, opened)
     by_machine = not (why_zenoh or vendor or distro or all_vendors or all_distros)

@@ -61,7 +61,8 @@ class DomainSet:
             last = int(match[2]) if match and match[2] else first
             if not match or first > last or last > MAX_DOMAIN:
                 raise UsageError(
-                    f"{text!r}{source and f' ({source})'} is not a domain id, or a list of them",
+                    f"{text!r}{source and f' ({source})'} is neither a domain id nor a list of "
+                    "domain ids",
                     f"Domain ids are whole numbers from 0 to {MAX_DOMAIN}; "
                     "above it, some DDS vendors refuse the documents.",
                     "Write for example 0 or 0,7 or 10-19.",

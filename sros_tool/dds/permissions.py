@@ -366,8 +366,8 @@ _CONSEQUENCES = {
     f"{_LONGEST_TOPIC} bytes. Use shorter namespaces and names.",
     "portable.deny-blocks-topic": " on Cyclone DDS, which refuses the topic as a whole; Fast "
     "DDS allows it. What no rule allows is denied anyway, so perhaps the deny rule can be removed.",
-    "portable.character-set": ". Vendors read plain sets alike, but only * and ? are part of the "
-    "portable profile.",
+    "portable.character-set": ". Vendors agree on sets such as [ab], but only * and ? are part of "
+    "the portable profile.",
 }
 
 

@@ -535,7 +535,7 @@ def _report(
             elif not is_ready:
                 say(
                     f"not connected for {_SILENCE_SECONDS:.0f} s: no router runs (`sros demo "
-                    "router` starts one), or it refuses this node"
+                    "router` starts one), or the router refuses this node"
                 )
             elif node.role is Role.LISTENER:
                 say(

@@ -835,7 +835,7 @@ def _left_out_clauses(result: DemoResult) -> Iterator[str]:
         used = {member.enclave for member in scenario.cast}
         yield f"{len(used)} of {scenario.keystore.enclaves} enclaves took part"
         if scenario.keystore.elsewhere:
-            yield f"{scenario.keystore.elsewhere} with their key elsewhere"
+            yield f"{scenario.keystore.elsewhere} could not (keys elsewhere)"
         if scenario.not_tried:
             names = "; ".join(scenario.not_tried)
             yield f"not proved, because something was not tried ({names})"

@@ -681,8 +681,8 @@ def _notes(
     if shared:
         yield Note(
             "graph.shared-enclave",
-            "several processes share an enclave, which gets the rights of all of them, because "
-            "their nodes have the same name. Unless it is a single process that was restarted, "
+            "nodes of several processes have the same name, so these processes share an enclave, "
+            "which gets the rights of all of them. Unless it is one process that was restarted, "
             "give the nodes different names (-r __node:=NAME), or start each process with "
             "--ros-args --enclave: "
             f"{first_subjects(shared)}",

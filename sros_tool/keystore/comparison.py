@@ -393,7 +393,7 @@ def _zenoh_changes(old: ZenohNetwork | None, new: ZenohNetwork | None) -> Iterat
         ("listen", "the router listens on these endpoints"),
         ("mode", "how sessions reach each other"),
         ("domains", "the domains of the governance in which the network is used"),
-        ("routers", "further routers, to which the sessions of their enclaves connect"),
+        ("routers", "further routers, each with the enclaves whose sessions connect to it"),
         ("crossing", "names that pass from one router to another"),
     ):
         before, after = getattr(old, key), getattr(new, key)

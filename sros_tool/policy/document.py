@@ -77,9 +77,9 @@ _XPOINTER_STEP = re.compile(
 )
 _SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*:")
 NAME_THE_FLEET = (
-    "Name the fleet's file with --fleet FILE. If the verb has no --fleet, write a robot's name in "
-    "place of the placeholder in a copy. `merge_policy` does not change a policy with "
-    "placeholders: write placeholders in the other policy, too, and name both files."
+    "Name the fleet's file with --fleet FILE. If the verb has no --fleet, copy the policy, and "
+    "write a robot's name in place of the placeholder. `merge_policy` does not change a policy "
+    "with placeholders: write placeholders in the other policy, too, and name both files."
 )
 """The remedy for reading a policy with placeholders without a fleet."""
 _MAX_INCLUDES = 10_000

@@ -112,7 +112,7 @@ def parse_remapping_of_names(text: str) -> Remapping:
             problem, remedy = "It does not say for which node.", f"Write it as NODE:{rule}."
     elif rule.node:
         problem = f"Other nodes than {rule.node} may keep the name."
-        remedy = f"Write {rule._replace(node='')} if it is for all nodes, or edit the requirements."
+        remedy = f"For all nodes, write {rule._replace(node='')}; otherwise edit the requirements."
     if problem:
         raise UsageError(f"requirements cannot be remapped by {rule}", problem, remedy)
     return rule

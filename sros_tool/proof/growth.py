@@ -433,7 +433,7 @@ def _not_compared_clauses(base: AccessSource, head: AccessSource) -> Iterator[st
             ):
                 yield (
                     f"on {vendor.title} the permissions of {name} in '{side.shown}' do not fit its "
-                    "certificate, so it is not certain what it can do"
+                    "certificate, so it is not certain what this enclave can do"
                 )
 
 

@@ -349,7 +349,7 @@ def test_a_distribution_that_is_none_is_no_choice(whole: Path) -> None:
     [
         (("--distro", "lunar"), "It knows ardent, bouncy"),
         (("--distro", "jazzy", "--vendor", "fastdds-2.9"), "does not ship Fast DDS 2.9.1"),
-        (("--distro", "jazzy", "--vendor", "zenoh"), "Zenoh decides alike"),
+        (("--distro", "jazzy", "--vendor", "zenoh"), "On Zenoh, the decision is the same"),
         (("--distro", "jazzy", "--all-distros"), "exclude each other"),
         (("--vendor", "fastdds", "--all-distros"), "exclude each other"),
     ],

@@ -294,7 +294,7 @@ def test_after_a_restore_certificates_are_replaced_once(folder: Path) -> None:
     assert (first.changed, first.kept, second.kept) == (("/b", "/c"), ("/a",), NAMES)
     assert first.revoked == 2 and not second.revoked
     (note,) = (each.text for each in first.notes if each.id == "permissions.others-fit")
-    assert note.startswith("/b, /c: new certificates") and "restored from a backup" in note
+    assert note.startswith("/b, /c: the certificates are new") and "restored from a backup" in note
 
 
 @pytest.mark.parametrize(

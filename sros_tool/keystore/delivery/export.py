@@ -176,8 +176,9 @@ def included_keys_notes(keystore: OpenedKeystore, names: Iterable[str]) -> Itera
         their = "its private key" if len(keys) == 1 else "their private keys"
         yield Note(
             "export.keys-included",
-            f"the export has {first_few(keys, _MOST_SHOWN)} with {their}: --keyless leaves out no "
-            "key that the keystore has. Releases of `sros fleet publish` have no private key.",
+            f"the export has {first_few(keys, _MOST_SHOWN)} with {their}: --keyless does not "
+            "leave out keys that the keystore has. Releases of `sros fleet publish` have no "
+            "private key.",
         )
 
 

@@ -836,7 +836,7 @@ def _other_files_notes(done: Mapping[str, _EnclaveOutcome]) -> Iterator[Note]:
     """Yield a note for each reason to replace certificates of enclaves that keep their rights."""
     for reason in sorted({made.other_files for made in done.values()} - {""}):
         names = [name for name, made in done.items() if made.other_files == reason]
-        text = f"new certificates although the rights are the same: {reason}"
+        text = f"the certificates are new, although the rights are the same: {reason}"
         yield Note("permissions.others-fit", f"{first_few(names, 5)}: {text}.")
 
 
