@@ -872,6 +872,8 @@ def _why_never_fails(requirement: Requirement, world: World) -> str:
                 return "every enclave matches the list"
         case AtMost(most=most) if most >= count:
             return f"there are only {count} enclaves"
+        case Widest() | NothingBut() if not any(restricted_enclaves(requirement, world.enclaves)):
+            return "no enclave is left to restrict"
         case Widest(rights=rights):
             if all(any(covers(name, "/*") for name in names) for _, names in rights):
                 return "wildcards may match every name"

@@ -252,6 +252,8 @@ CANNOT_FAIL = {
     '[[only]]\npublish = ["/x"]\nenclaves = ["/r/?"]': "every enclave matches the list",
     '[[at_most]]\npublish = ["/x"]\nenclaves = 100': "there are only 3 enclaves",
     '[[at_most]]\npublish = ["/x"]\nenclaves = 3': "there are only 3 enclaves",
+    '[[widest]]\nenclaves = ["*", "!/*"]\npublish = []': "no enclave is left to restrict",
+    '[[nothing_but]]\nenclaves = ["/*", "!/r/*"]\npublish = []': "no enclave is left to restrict",
     '[[widest]]\nenclaves = ["*"]\npublish = ["*"]': "wildcards may match every name",
     '[[widest]]\nenclaves = ["*"]\npublish = ["/*"]\nsubscribe = ["/*"]':
         "wildcards may match every name",
