@@ -45,7 +45,7 @@ _PROCESS_LABEL = re.compile(
 
 _SECURITY_DIRECTORY = re.compile(
     r"(?:(?:[\w.-]+ +\| )?(?:(?:\[[^\[\]]*\] )*\[rcl\]: )?Found|\[\w+\]) security directory: "
-    r"(?P<folder>[^\s\0]*?/enclaves(?P<enclave>/[^\s\0]*)?)(?:\s|\Z)"
+    r"(?P<folder>[^\s\0]{0,4096}?/enclaves(?P<enclave>/[^\s\0]{0,4096})?)(?:\s|\Z)"
 )
 """Matches a line, without its label, in which rcl or a node of `sros demo` names its enclave.
 

@@ -708,6 +708,7 @@ def test_a_log_of_an_enclave_has_to_show_that_its_node_runs_secured(
         ([keystore, ENCLAVE], own.replace("[rcl]", "[talker]"), {}, False),
         ([keystore, ENCLAVE], own.replace("[rcl]", "[talker]: x[1]"), {}, False),
         ([keystore, ENCLAVE], f"x\r{own}", {}, False),
+        ([keystore, ENCLAVE], STARTED.format("/a/.." * 10**6, ENCLAVE), {}, False),
         ([keystore, ENCLAVE], own.replace("\n", "\0\n"), {}, False),
         ([folder], own + node, {}, True),
         ([folder], node, {}, False),
