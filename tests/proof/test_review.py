@@ -256,7 +256,7 @@ def test_changed_rights_are_named_and_decided_over_all_policies(change: Change) 
     change.commit({"second.xml": policy_text({"/c": reads.replace(">x<", ">/x<")})})
     ended = change.review("--policy", "robot.xml\nsecond.xml")
     assert ended.status == 1, ended
-    assert "new-access robot.xml second.xml: 1 right is new for users who put the node" in ended.out
+    assert "robot.xml second.xml: 1 right is new only for users who put the node into" in ended.out
     assert "\n  + /c subscribe topic /x in another namespace  (second.xml:3)\n" in ended.out
     denies = '<topics publish="DENY"><topic>{}</topic></topics>'
     change.base = change.commit({"second.xml": policy_text({"/c": denies.format("/stop*")})})

@@ -127,8 +127,8 @@ TIME_FORMAT = FindingKind(
     "time, and years from 2263 on.",
     "DDS-Security 1.1, 9.4.1.3.2.2; Fast DDS 2.6 to 3.6 (mktime), Cyclone DDS 0.10 and 11.0; "
     "tested.",
-    "Sign the permissions again: for all enclaves with `sros renew KEYSTORE --all`, for one with "
-    "`sros create_permission KEYSTORE ENCLAVE POLICY_FILE`. In documents that sros does not sign, "
+    "Sign the permissions again: `renew --all` does this for all enclaves, `sros create_permission "
+    "KEYSTORE ENCLAVE POLICY_FILE` for one. In documents that sros does not sign, "
     "write CCYY-MM-DDThh:mm:ssZ.",
 )
 TIME_WINDOW = FindingKind(
