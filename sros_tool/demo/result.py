@@ -421,7 +421,7 @@ def _judge_loss(case: _ClaimRecords) -> _ClaimFinding:
         return _undecided(f"{claim.subject} counted nothing in the window")
     left = inside[-1].publishers.get(topic, 0)
     detail = f"{case.subject.through} counts {left} publishers on {topic}, {most} before"
-    return case.result(not left, f"{detail}; {claim.talker} tried it")
+    return case.result(not left, f"{detail}; {claim.talker} tried to remove the node")
 
 
 def _judge_wire(case: _ClaimRecords) -> _ClaimFinding:

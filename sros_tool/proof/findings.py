@@ -494,8 +494,7 @@ def short_text(violation: Violation) -> str:
         case AtMost():
             text = _clause(violation)
         case Protected(level=level):
-            is_wanted = "encrypted" if level is Level.ENCRYPT else "signed"
-            text = f"messages of {_subject(violation)} are not {is_wanted}"
+            text = f"messages of {_subject(violation)} are not {_protected(level)}"
         case _:
             text = f"{_subject(violation)} {_clause(violation)}"
     more = 0 if violation.position else len(violation.witness.others)
@@ -509,7 +508,7 @@ def _violation_clause(violation: Violation) -> str:
             text = f"{_clause(violation)}: {_chain(violation.steps)}"
             how = "through" if violation.position else "from"
             names = violation.alike
-            return f"{text} (the same {how} {_listed_names(names)})" if names else text
+            return f"{text} (also {how} {_listed_names(names)})" if names else text
         case Must() | Protected():
             return _clause(violation)
         case _:
@@ -527,14 +526,18 @@ def _clause(violation: Violation) -> str:
             if violation.idle:
                 return "cannot start with its current files; `sros check` shows why"
             return f"may not {steps[0].action_text()}"
-        case Protected():
-            return "its messages are not"
+        case Protected(level=level):
+            return f"its messages are not {_protected(level)}"
         case AtMost():
             return _joined_steps(steps)
         case NotBoth():
             return f"may {steps[0].action_text()} and {steps[1].action_text()}"
         case _:
             return f"may {steps[0].action_text()}"
+
+
+def _protected(level: Level) -> str:
+    return "encrypted" if level is Level.ENCRYPT else "signed"
 
 
 def _chain(steps: Sequence[Step]) -> str:

@@ -389,7 +389,7 @@ def test_an_assumed_template_is_said(folder: Path, keystore: Path, tmp_path: Pat
     weak.write_text((templates_dir() / "production.toml").read_text().replace("ENCRYPT", "SIGN"))
     ended = sros(*asked, "--template", weak, cwd=folder)
     assert ended.status == 1
-    assert "/scan: its messages are not, but topic /scan has to be encrypted" in ended.out
+    assert "/scan: its messages are not encrypted, but topic /scan has to be encrypted" in ended.out
     demanded = tmp_path / "robot.xml"
     demanded.write_text(POLICY.replace("/scan<", '/scan<?sros protect="sign"?><'))
     assert sros("check", demanded, *asked[2:], cwd=folder).status == 1
@@ -408,7 +408,7 @@ def test_a_requirement_of_protection_is_about_the_governance(folder: Path, tmp_p
         sros("update_keystore", tmp_path / "ks", "--set", each, "--allow-looser").ok()
     ended = sros(*asked)
     assert ended.status == 1
-    assert "/scan: its messages are not, but topic /scan has to be encrypted" in ended.out
+    assert "/scan: its messages are not encrypted, but topic /scan has to be encrypted" in ended.out
     required.write_text(required.read_text().replace("encrypt", "sign"))
     sros(*asked).ok()
 

@@ -1018,7 +1018,7 @@ def test_requirements_get_the_protection_of_a_template(change: Change) -> None:
     change.commit({"t.toml": weaker})
     ended = change.review(*words, "t.toml")
     assert ended.status == 1
-    assert "/x: its messages are not, but topic /x has to be encrypted" in ended.out
+    assert "/x: its messages are not encrypted, but topic /x has to be encrypted" in ended.out
     assert (
         "not covered: 't.toml' changes, and the access that it gives is not compared"
         in " ".join(ended.out.split())

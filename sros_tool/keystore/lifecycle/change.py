@@ -773,8 +773,8 @@ def _left_out_notes(left_out: Mapping[str, str]) -> Iterable[Note]:
         get, of_each = ("gets", "it") if len(names) == 1 else ("get", "each of them")
         yield Note(
             "zenoh.left-out",
-            f"{first_few(names, 5)} {get} no configuration for Zenoh, and all others deny "
-            f"{of_each} everything there: {why}.",
+            f"{first_few(names, 5)} {get} no configuration for Zenoh, where all other "
+            f"enclaves deny {of_each} everything: {why}.",
         )
 
 
