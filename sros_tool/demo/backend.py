@@ -415,10 +415,6 @@ def _types_not_heard(node: HandNode, environment: Mapping[str, str]) -> str:
     return f"secured nodes on {rmw} and this node do not hear each other; {rmw} {but}"
 
 
-_HEARD = "heard  "
-"""Begin of the line of a message that a listener heard."""
-
-
 def run_by_hand(
     node: HandNode, say: Callable[[str], None], duration: timedelta | None = None
 ) -> int:
@@ -450,10 +446,9 @@ def run_by_hand(
     command += ["--report", f"/proc/self/fd/{writing}"]
     stopped, heard = threading.Event(), 0
 
-    def say_and_count(line: str) -> None:
+    def count(event: Event) -> None:
         nonlocal heard
-        heard += line.startswith(_HEARD)
-        say(line)
+        heard += event.count if event.kind is EventKind.HEARD else 0
 
     def stop(*_: object) -> None:
         again = stopped.is_set()
@@ -487,7 +482,7 @@ def run_by_hand(
 
         with open(events, "rb", buffering=0) as pipe:
             try:
-                last = _report(node, pipe.fileno(), say_and_count, on_ready=start_duration)
+                last = _report(node, pipe.fileno(), say, on_ready=start_duration, on_event=count)
             except BaseException:  # such as nobody who reads the lines any more
                 end_within(_SECONDS_TO_STOP, process)
                 process.wait()
@@ -496,6 +491,8 @@ def run_by_hand(
     if stopped.is_set():
         by_force = ", by force: it did not end by itself" * (status == -signal.SIGKILL)
         result = f"; heard {counted(heard, 'message')}" if node.role is Role.LISTENER else ""
+        if result and not heard and duration and duration.total_seconds() < _SILENCE_SECONDS:
+            result += ", but that was too short to find all publishers: listen longer (--for 10s)"
         say(f"stopped{by_force}{result}")
     elif last and last.stage is ProcessStage.ENDPOINT and os.environ.get(ENABLE) == "true":
         verb = "publish" if node.role is Role.TALKER else "subscribe"
@@ -518,12 +515,17 @@ def end_within(seconds: float, process: subprocess.Popen[bytes]) -> None:
 
 
 def _report(
-    node: HandNode, pipe: int, say: Callable[[str], None], *, on_ready: Callable[[], None]
+    node: HandNode,
+    pipe: int,
+    say: Callable[[str], None],
+    *,
+    on_ready: Callable[[], None],
+    on_event: Callable[[Event], None],
 ) -> Event | None:
     """Pass the node's reports to ``say`` until the node ends, and return the last report or None.
 
-    ``on_ready`` is called when the node is ready. Before that moment, the node hears nothing in any
-    case.
+    ``on_event`` gets all reports. ``on_ready`` is called when the node is ready. Before that
+    moment, the node hears nothing in any case.
     """
     data, seen, event = b"", "", None
     is_ready = False
@@ -548,6 +550,7 @@ def _report(
         *lines, data = (data + more).split(b"\n")
         for line in lines:
             event = parse_event(line, Path("the node's report"))
+            on_event(event)
             if event.kind is EventKind.READY and not is_ready:
                 is_ready = True
                 on_ready()
@@ -564,7 +567,7 @@ def _line(event: Event, own_type: str) -> str:
         case EventKind.SENT:
             return f"sent   {event.text}"
         case EventKind.HEARD:
-            return f"{_HEARD}{event.text}"
+            return f"heard  {event.text}"
         case EventKind.REFUSED | EventKind.FAILED:
             return f"{event.kind}: {' '.join(event.text.split())}"
         case EventKind.READY:

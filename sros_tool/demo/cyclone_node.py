@@ -15,6 +15,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from types import FrameType
 
 from sros_tool.demo.nodes import ROLES, Call, Hear, enclave_in, parse_options, ros_type
@@ -135,10 +136,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
             role = ROLES[options.role](node, options, events)
             stage = ProcessStage.RUNNING
             events.report(EventKind.READY)
-            while True:
-                role.step()
-                node.poll()
-                time.sleep(_POLL_SECONDS)
+            with suppress(_Stopped):
+                while True:
+                    role.step()
+                    node.poll()
+                    time.sleep(_POLL_SECONDS)
+            role.end()
     except _Stopped:
         pass
     except SecurityRefusedError as refusal:
@@ -159,6 +162,8 @@ def _say(role: str, text: str) -> None:
 
 def _stop_on_signals() -> None:
     def stop(_number: int, _frame: FrameType | None) -> None:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.SIG_IGN)
         raise _Stopped
 
     handler: Callable[[int, FrameType | None], None] = stop

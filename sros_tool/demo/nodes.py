@@ -205,7 +205,7 @@ class NodeRole:
     def __init__(self, node: Node, options: NodeOptions, events: EventWriter) -> None:
         self._node, self._options, self._events = node, options, events
         self._due = time.monotonic() + options.period
-        self._sent = self._heard = 0
+        self._sent = 0
         self.prepare()
 
     def prepare(self) -> None:
@@ -219,6 +219,9 @@ class NodeRole:
         if time.monotonic() >= self._due:
             self._due = max(self._due + self._options.period, time.monotonic())
             self.act()
+
+    def end(self) -> None:
+        """Report what was heard since the last report; the node stops."""
 
     def _other_types(self, *, of_publishers: bool) -> OtherTypes | None:
         """Begin to discover other endpoints on the topic of a node that was started by hand.
@@ -236,12 +239,11 @@ class NodeRole:
     def sent(self, text: str) -> None:
         """Report a message that was sent."""
         self._sent += 1
-        self._events.report(EventKind.SENT, text, count=self._sent)
+        self._events.report(EventKind.SENT, text)
 
     def heard(self, text: str) -> None:
         """Report a message that was received."""
-        self._heard += 1
-        self._events.report(EventKind.HEARD, text, count=self._heard)
+        self._events.report(EventKind.HEARD, text)
 
 
 class OtherTypes:
@@ -273,6 +275,10 @@ class OtherTypes:
         if (seen := Counter(self._types())) != self._seen:
             self._seen = seen
             self._events.report(EventKind.SEEN, "; ".join(map(self._kind_text, sorted(seen))))
+        self.report_heard()
+
+    def report_heard(self) -> None:
+        """Report the number of messages heard since the last report."""
         for kind in [kind for kind, number in self._heard.items() if number]:
             text = f"{counted(number := self._heard[kind], 'message')} of {kind}"
             self._heard[kind] -= number
@@ -333,6 +339,10 @@ class _Listener(NodeRole):
         """Look for publishers of other types."""
         if self._others:
             self._others.step()
+
+    def end(self) -> None:
+        if self._others:
+            self._others.report_heard()
 
 
 class _Relay(_Talker):

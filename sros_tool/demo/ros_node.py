@@ -145,7 +145,7 @@ def _talker(node: Any, options: NodeOptions, events: EventWriter) -> None:
         text = f"{options.text}: {sent}" if is_text else f"{options.type}: {sent}"
         node.get_logger().info(f"Publishing: '{text}'")
         publisher.publish(message(data=text) if is_text else message())
-        events.report(EventKind.SENT, text, count=sent)
+        events.report(EventKind.SENT, text)
 
     node.create_timer(options.period, speak)
     if options.by_hand:
@@ -176,13 +176,9 @@ def _listener(node: Any, options: NodeOptions, events: EventWriter) -> None:
     """Log and report every message."""
     from std_msgs.msg import String
 
-    heard = 0
-
     def hear(message: Any) -> None:
-        nonlocal heard
-        heard += 1
         node.get_logger().info(f"I heard: '{message.data}'")
-        events.report(EventKind.HEARD, message.data, count=heard)
+        events.report(EventKind.HEARD, message.data)
 
     # The subscription needs no variable: its node keeps it alive.
     if not options.by_hand:
@@ -205,7 +201,9 @@ def _listener(node: Any, options: NodeOptions, events: EventWriter) -> None:
         node.create_subscription(*get, raw=True)
         return ""
 
-    node.create_timer(options.period, OtherTypes(options, events, types, count).step)
+    others = OtherTypes(options, events, types, count)
+    node.create_timer(options.period, others.step)
+    node.context.on_shutdown(partial(OtherTypes.report_heard, others))
 
 
 def _observer(node: Any, options: NodeOptions, events: EventWriter) -> None:
@@ -233,15 +231,11 @@ def _server(node: Any, options: NodeOptions, events: EventWriter) -> None:
     """
     from std_srvs.srv import SetBool
 
-    answered = 0
-
     def answer(request: Any, response: Any) -> Any:
-        nonlocal answered
-        answered += 1
         response.success = not request.data
         response.message = f"{options.text}: not {request.data} = {response.success}"
         node.get_logger().info(f"Answering: '{response.message}'")
-        events.report(EventKind.SENT, response.message, count=answered)
+        events.report(EventKind.SENT, response.message)
         return response
 
     node.create_service(SetBool, options.service, answer)
@@ -252,22 +246,20 @@ def _client(node: Any, options: NodeOptions, events: EventWriter) -> None:
     from std_srvs.srv import SetBool
 
     client = node.create_client(SetBool, options.service)
-    asked = right = 0
+    asked = 0
 
     def ask() -> None:
         nonlocal asked
         asked += 1
         value = bool(asked % 2)
-        events.report(EventKind.SENT, f"not {value}", count=asked)
+        events.report(EventKind.SENT, f"not {value}")
         future = client.call_async(SetBool.Request(data=value))
         future.add_done_callback(lambda done: check(value, done.result()))
 
     def check(value: bool, response: Any) -> None:
-        nonlocal right
         if response.success is not value and response.message.endswith(f"= {not value}"):
-            right += 1
             node.get_logger().info(f"Answer: '{response.message}'")
-            events.report(EventKind.HEARD, response.message, count=right)
+            events.report(EventKind.HEARD, response.message)
 
     node.create_timer(options.period, ask)
 
@@ -284,11 +276,8 @@ def _action_server(node: Any, options: NodeOptions, events: EventWriter) -> None
     from rclpy.action import ActionServer
 
     action = _fibonacci_action()
-    done = 0
 
     def execute(goal: Any) -> Any:
-        nonlocal done
-        done += 1
         feedback = action.Feedback()
         field = "sequence" if hasattr(feedback, "sequence") else "partial_sequence"
         for length in range(2, goal.request.order + 1):
@@ -297,7 +286,7 @@ def _action_server(node: Any, options: NodeOptions, events: EventWriter) -> None
         goal.succeed()
         sequence = fibonacci(goal.request.order)
         node.get_logger().info(f"Result: {sequence}")
-        events.report(EventKind.SENT, f"{options.text}: {sequence}", count=done)
+        events.report(EventKind.SENT, f"{options.text}: {sequence}")
         return action.Result(sequence=[*sequence, *options.text.encode()])
 
     node.action = ActionServer(node, action, options.topic, execute)
@@ -309,13 +298,13 @@ def _action_client(node: Any, options: NodeOptions, events: EventWriter) -> None
 
     action = _fibonacci_action()
     client = ActionClient(node, action, options.topic)
-    sent = right = 0
+    sent = 0
     feedback: set[tuple[int, ...]] = set()
 
     def send() -> None:
         nonlocal sent
         sent += 1
-        events.report(EventKind.SENT, f"goal {sent}", count=sent)
+        events.report(EventKind.SENT, f"goal {sent}")
         goal = action.Goal(order=FIBONACCI_ORDER)
         future = client.send_goal_async(goal, feedback_callback=keep)
         future.add_done_callback(fetch)
@@ -329,16 +318,14 @@ def _action_client(node: Any, options: NodeOptions, events: EventWriter) -> None
             goal.get_result_async().add_done_callback(check)
 
     def check(future: Any) -> None:
-        nonlocal right
         numbers = _sequence_of(future.result().result)
         sequence, text = numbers[: FIBONACCI_ORDER + 1], numbers[FIBONACCI_ORDER + 1 :]
         lengths = range(2, FIBONACCI_ORDER + 1)
         complete = {tuple(fibonacci(length)) for length in lengths} <= feedback
         if sequence == fibonacci(FIBONACCI_ORDER) and complete:
-            right += 1
             node.get_logger().info(f"Result: {sequence}")
             server = bytes(number % 256 for number in text).decode(errors="replace")
-            events.report(EventKind.HEARD, f"{server}: {sequence}", count=right)
+            events.report(EventKind.HEARD, f"{server}: {sequence}")
 
     node.create_timer(options.period, send)
 

@@ -397,6 +397,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         events.report(EventKind.READY)
         while not stop.wait(_POLL_SECONDS):
             role.step()
+        role.end()
     except _RefusedError as refusal:
         events.report(EventKind.REFUSED, str(refusal), stage=stage)
         return 1

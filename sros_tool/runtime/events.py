@@ -32,6 +32,9 @@ class EventKind(StrEnum):
     DONE = "done"
 
 
+_MESSAGES = (EventKind.SENT, EventKind.HEARD)
+
+
 class ProcessStage(StrEnum):
     """The stage of a process before it was refused or failed."""
 
@@ -46,8 +49,8 @@ class Event:
     """An event that a process reported.
 
     ``text`` is the message sent or received, or the reason of a refusal or failure; ``count`` is
-    the number of messages so far; ``publishers`` maps topics to the number of publishers that an
-    observer counts.
+    the number of messages sent or received; ``publishers`` maps topics to the number of publishers
+    that an observer counts.
     """
 
     kind: EventKind
@@ -82,8 +85,8 @@ class EventWriter:
         record: dict[str, Any] = {"event": kind.value, "time": round(time.monotonic(), 6)}
         if text:
             record["text"] = text
-        if count:
-            record["count"] = count
+        if count or kind in _MESSAGES:
+            record["count"] = count or 1
         if stage is not None:
             record["stage"] = stage.value
         if publishers:

@@ -147,7 +147,7 @@ def test_a_listener_ends_after_its_time_and_without_a_reader(
         load_cyclone()
     except UnavailableError as error:
         pytest.skip(str(error))
-    monkeypatch.setattr(backend, "_SILENCE_SECONDS", 0.1)
+    monkeypatch.setattr(backend, "_SILENCE_SECONDS", 0.6)
     node = HandNode(Role.LISTENER, "cyclone", "/nobody_talks")
 
     def say(line: str) -> None:
@@ -164,8 +164,41 @@ def test_a_listener_ends_after_its_time_and_without_a_reader(
             lines.append("goes on")
         return lines[-1:]
 
-    assert apart(played) == ["stopped; heard 0 messages"]
+    (last,) = apart(played)
+    assert last.startswith("stopped; heard 0 messages, but that was too short to find all publish")
     assert "--for is for a talker" in sros("demo", "--for", "3s").err
+
+
+_COUNTING_NODE = """#!/bin/sh
+for report; do :; done
+tell() { printf '{"event": "%s", "time": 1, "text": "%s", "count": %s}\\n' "$@" > "$report"; }
+trap 'tell heard "2 messages of nav_msgs/msg/Odometry" 2; exit 0' TERM
+tell ready "" 0
+tell heard "4 messages of nav_msgs/msg/Odometry" 4
+tell heard "3 messages of love" 1
+while :; do sleep 0.01; done
+"""
+
+
+def test_a_listener_sums_the_messages_that_it_heard(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also those that its node reports only when it ends; a text that looks like a sum is one."""
+    node, lines = tmp_path / "node", list[str]()
+    node.write_text(_COUNTING_NODE)
+    node.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(node))
+
+    def say(line: str) -> None:
+        lines.append(line)
+        if line.endswith("love"):
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    def played() -> list[str]:
+        run_by_hand(HandNode(Role.LISTENER, "cyclone", "/odom"), say)
+        return lines
+
+    assert apart(played)[-1] == "stopped; heard 7 messages"
 
 
 def test_a_node_by_hand_says_what_others_have_of_another_type(tmp_path: Path) -> None:
