@@ -496,6 +496,14 @@ class _SeveralObserved(SeveralValues):
     is_flag=True,
     help="Also remove the standard rights of nodes (common/node.xml) that were not seen in use.",
 )
+@click.option(
+    "--fail-on",
+    type=click.Choice(["never", "difference"]),
+    default="never",
+    show_default=True,
+    help="`difference`: exit with 1 if POLICY has rights or wildcards to remove, or lacks an "
+    "observed right, or if an enclave, or a robot of it, is only in POLICY or only in OBSERVED.",
+)
 @force_option
 @dry_run_option
 @json_option
@@ -505,10 +513,11 @@ def minimize_policy(
     fleet_file: Path | None,
     output: Path | None,
     strict: bool,
+    fail_on: str,
     force: bool,
     dry_run: bool,
     as_json: bool,
-) -> None:
+) -> int:
     """Show the rights in POLICY that were never observed in use, and write a policy without them.
 
     "allowed" and "observed" count pairs of a right and an exact name. A wildcard counts once for
@@ -519,8 +528,7 @@ def minimize_policy(
     With --fleet, all robots keep the rights that some robots used in the same enclave, and sizes
     are those of the robot with the longest name.
 
-    The exit status is 0, also if rights are removed; `sros diff_policy POLICY FILE` then exits with
-    1.
+    The exit status is 0, also if rights are removed or missing, unless --fail-on is given.
 
     Example:
       $ sros minimize_policy robot.xml --observed learned.xml -o narrow.xml
@@ -560,6 +568,7 @@ def minimize_policy(
         echo(f"would {'replace' if output.exists() else 'write'} {output}", err=as_json)
     if saved:
         echo(saved, err=True)
+    return int(fail_on == "difference" and not minimized.is_as_observed)
 
 
 def _ratio_text(ratio: float | None) -> str:

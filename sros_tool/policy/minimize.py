@@ -115,6 +115,13 @@ class EnclaveUse:
         """Over-privilege: allowed pairs divided by observed pairs; null without observed pairs."""
         return self.allowed / self.observed if self.observed else None
 
+    @property
+    def is_as_observed(self) -> bool:
+        """Whether the enclave was observed, with neither more nor fewer rights than it has."""
+        return self.observed_at_all and not (
+            self.never_observed or self.wildcards or self.not_allowed
+        )
+
 
 @dataclass(frozen=True, slots=True)
 class MinimizedPolicy:

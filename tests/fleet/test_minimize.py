@@ -84,3 +84,11 @@ def test_what_is_observed_and_denied_is_not_kept(folder: Path) -> None:
     (folder / "seen.xml").write_text(policy_text({"/r1/base": publish("/hall/r1/secret", "/a")}))
     ended = sros(*WORDS, "--strict", cwd=folder).ok()
     assert "publish topic /*  becomes  publish topic /a\n" in ended.out
+
+
+def test_a_robot_that_was_not_observed_is_a_difference(folder: Path) -> None:
+    (folder / "robot.xml").write_text(policy_text({"/{robot}/base": publish("/a")}))
+    for robots, status in ((("r1", "r3"), 1), (("r1", "r2", "r3"), 0)):
+        seen = {f"/{robot}/base": publish("/a") for robot in robots}
+        (folder / "seen.xml").write_text(policy_text(seen))
+        assert sros(*WORDS, "--fail-on", "difference", cwd=folder).status == status

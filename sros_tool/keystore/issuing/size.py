@@ -130,6 +130,8 @@ class Minimization(NamedTuple):
     document: bytes
     enclaves: Sequence[MinimizedEnclave]
     notes: Sequence[Note]
+    is_as_observed: bool
+    """Whether the policy and the observations have the same enclaves, robots and rights."""
 
 
 def minimized_policy(
@@ -159,9 +161,10 @@ def minimized_policy(
     used = observed_rights = frozenset(right for source in sources for right in source.rights)
     notes = [note for source in sources for note in source.notes]
     robots = FleetPolicy(policy, fleet) if fleet else None
+    gaps: list[Note] = []
     if robots:
         observed_rights = with_placeholders(robots, used)
-        notes += _robot_notes(unobserved_robots(robots, used))
+        gaps += _robot_notes(unobserved_robots(robots, used))
     else:
         homes = enclaves_of_nodes({right.enclave for right in used}, policy.nodes())
         observed_rights = frozenset(
@@ -179,10 +182,12 @@ def minimized_policy(
     result = minimize(stated, observed_rights, () if strict else _node_basics())
     if robots:
         check_narrowed(robots, result, used)
-    notes += _scope_notes(policy, result, observed_rights)
+    gaps += _scope_notes(policy, result, observed_rights)
     narrowed = with_names_as_written(result.policy)
     document = checked_text(narrowed, output, "narrowed", placeholders=fleet is not None)
-    return Minimization(document, _measured_enclaves(stated, result, observed_rights, fleet), notes)
+    enclaves = _measured_enclaves(stated, result, observed_rights, fleet)
+    is_as_observed = not gaps and all(use.is_as_observed for use in result.uses)
+    return Minimization(document, enclaves, [*notes, *gaps], is_as_observed)
 
 
 def _node_basics() -> Sequence[Group]:
