@@ -49,8 +49,8 @@ class ClosedProcess(NamedTuple):
     enclave: str
     """The enclave of the process."""
     pid: int
-    """The id of the process; 0 if no process with its command runs any more, and it ended while
-    sros watched or is restarted by hand.
+    """The id of the process; 0 if the process ended while sros watched, or is restarted by hand,
+    and no process with the same command runs now.
     """
     command: Sequence[str]
     """Its command with the arguments."""

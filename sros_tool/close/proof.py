@@ -117,7 +117,8 @@ def proofs_of(robot: LocalRobot, state: CloseState, patience: float) -> list[Pro
     talk = _proof_of_talk(running, nodes, away)
     if talk.fails and (present := sorted(not_here - away)):
         options = " ".join(f"--without {name}" for name in present)
-        talk = talk._replace(reason=f"{talk.reason}; if they may be away, add {options}")
+        away_text = f"if the other machines may be away, add {options}"
+        talk = talk._replace(reason=f"{talk.reason}; {away_text}")
     silence = _proof_of_silence(robot, nodes.nodes_to_compare(away), hears=talk.holds is not None)
     return [
         proof,
@@ -647,7 +648,7 @@ def _unseen_text(running: RunningRobot, node: str, enclave: str) -> str:
         return f"any node in {enclave}"
     label = next((process.label for process, of in running.secured if of.name == enclave), "")
     asking = f"{label} runs: ask again, or restart it; " if label else ""
-    gone = f"if it is gone for good, remove its profile from '{running.robot.policy}'"
+    gone = f"if the node is gone for good, remove its profile from '{running.robot.policy}'"
     return f"{node} ({asking}{gone})"
 
 

@@ -183,10 +183,10 @@ class RunningRobot:
         return f"{warning}{newer} changed, or got another mode, after the start of"
 
     def not_observed(self) -> Sequence[str]:
-        """Return the processes in enclaves, as text, that are none of the observed processes.
+        """Return the processes in enclaves that sros did not observe, as text.
 
-        Another process with an observed command is one, too. An enclave without an observed process
-        may have one process. Programs of `ros2` and sros do not count.
+        A further process with an observed command counts, too. An enclave without an observed
+        process may have one process. Programs of `ros2` and sros do not count.
         """
         programs: dict[tuple[str, int], Process] = {}
         for process, enclave in sorted(self.secured, key=lambda secured: secured.process.started):
@@ -349,8 +349,8 @@ class CloseState(NamedTuple):
     """The ids of the processes that have to be restarted, by these enclaves, in the order in which
     they should be restarted."""
     not_observed: Sequence[str]
-    """Processes that run in enclaves of the robot, and are none of the observed processes, or one
-    more with the same command, as "process 123 (talker) in /talker"."""
+    """Processes in enclaves of the robot that sros did not observe, and further processes with an
+    observed command, as "process 123 (talker) in /talker"."""
     new: Sequence[str]
     """The enclaves of the policy without a process: no process of them was observed or runs now."""
     absent: Sequence[str]

@@ -168,8 +168,8 @@ class ExplainedLog(NamedTuple):
     findings: Sequence[LogFinding]
     """The different security messages."""
     secured: bool | None
-    """Whether a line says that a node of the named enclave ran secured; null if no enclave is named
-    or on Zenoh, where no line says so.
+    """Whether a line says that a node of the named enclave ran secured; null if no enclave is
+    named, and on Zenoh, which logs no such line.
     """
     notes: Sequence[Note]
     """Notes, which text output prints on standard error."""
@@ -1140,14 +1140,14 @@ class _Examiner:
                 return facts, f"{remedy} Or, if the node lacks a remapping that its policy has{add}"
             return facts, (
                 f"If the node lacks a remapping{add} If the policy lacks a remapping that the node "
-                f"has, write {name} in place of {meant}, or merge it with `--remap "
-                f"{quote(meant)}:={quote(name)}`. Otherwise, {remedy}"
+                f"has, write {name} in place of {meant} in the policy, or merge the policy with "
+                f"`--remap {quote(meant)}:={quote(name)}`. Otherwise, {remedy}"
             )
         if is_used is False and self._keystore:
             place = self._keystore.place
             return [f"no enclave of the {place} may {PEER_RIGHT[denied.right]} {name}"], (
                 "If another name is meant, the node perhaps lacks a remapping, or has a wrong one: "
-                "compare its command with the one that the robot starts (after `sros close`: "
+                "compare the command that started it with the robot's own (after `sros close`: "
                 f"start/commands.txt). Otherwise, {remedy}{renamed or new_name}"
             )
         newer = "Perhaps the node is newer than its policy: "

@@ -248,7 +248,9 @@ class RobotStatus:
     enclaves: int
     """Number of the robot's enclaves in the keystore."""
     revoked: tuple[str, ...]
-    """Revoked enclaves of the robot that are no longer in the keystore, confirmed or not."""
+    """Revoked enclaves of the robot that are no longer in the keystore, whether or not the robot
+    confirmed their files.
+    """
     others: Unrecorded
     received: datetime | None
     """When the last confirmation was received, in UTC, by the clock of the keystore's machine; or
@@ -281,13 +283,13 @@ class RobotStatus:
     """The files that the processes of each enclave of the robot have loaded, by its last
     confirmation; null if the confirmation does not tell."""
     crl_in_force: bool | None
-    """Whether the current revocation list is in force on the robot, or an earlier list that revokes
-    the same: the robot has the list, which has not expired, says that no process may run with
-    another list or with earlier CAs, and is not ``offline``. False if this is not known, or if the
-    keystore was restored from a backup and lacks what its robots have; null if the keystore has no
-    list, or the robot has no enclave. `sros agent` and plays know the processes that lack only new
-    permissions, governance or certificates of their own; for other robots, any restart that is due
-    counts.
+    """Whether the current revocation list, or an earlier list that revokes the same certificates,
+    is in force on the robot: the robot has the list, the list has not expired, the robot says that
+    no process may run with another list or with earlier CAs, and it is not ``offline``. False if
+    this is not known, or if the keystore was restored from a backup and lacks what its robots have;
+    null if the keystore has no list, or the robot has no enclave. `sros agent` and plays know the
+    processes that lack only new permissions, governance or certificates of their own; for other
+    robots, any restart that is due counts.
     """
     expiry: Mapping[Annotated[str, Words(_EXPIRING_KINDS)], datetime]
     """The first expiry of the files that the robot confirmed, by kind, in UTC, from the ledger."""

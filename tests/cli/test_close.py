@@ -1670,7 +1670,7 @@ def test_an_enclave_that_belongs_to_another_machine(robot: Robot) -> None:
     robot.remaining = (TALKER,)
     said = robot.close("--proof", status=1).out
     assert (
-        "not seen: /listener" in said and "; if they may be away, add --without /listener\n" in said
+        "not seen: /listener" in said and "machines may be away, add --without /listener\n" in said
     )
     ended = robot.close("--proof", "--without", "/listener")
     assert (

@@ -539,7 +539,7 @@ DISCOVERY_OPEN = FindingKind(
     "governance.discovery-open",
     WARNING,
     "discovery without protection",
-    "Anyone in the network can read every node, topic and type, and announce false ones.",
+    "Anyone in the network can see every node, topic and type, and announce false ones.",
     f"{_GOVERNANCE_SOURCE} (discovery_protection_kind, enable_discovery_protection).",
     _TEMPLATE_REMEDY,
 )

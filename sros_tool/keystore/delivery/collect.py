@@ -158,7 +158,9 @@ class CollectedInbox(NamedTuple):
     robots: Sequence[CollectedMessage]
     """The robots of the fleet, sorted by name."""
     not_signed: str
-    """Why the CAs could not sign requests (a clause), and the exit status is 2; otherwise empty."""
+    """Why the CAs could not sign requests, as a clause; the exit status is then 2. Empty if no CA
+    failed.
+    """
     published: PublishedAnswers | None
     """What ``--publish`` published; null without this option, or if publishing failed."""
     dry_run: DryRun

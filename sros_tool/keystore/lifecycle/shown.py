@@ -284,8 +284,9 @@ class RenewedEnclaves(NamedTuple):
     ]
     """The renewed enclaves."""
     replaced_work_until: datetime | None
-    """When the last of these enclaves' earlier certificates in the ledger stops working, in UTC:
-    when it expires, or the last permissions for it. Null if all have expired or were revoked.
+    """When the last earlier certificate of these enclaves in the ledger stops working, in UTC: when
+    the certificate expires, or the last permissions for it expire. Null if all have expired or were
+    revoked.
     """
     may_work_longer: bool
     """Whether certificates that the ledger lacks may work longer, because the keystore is an old
@@ -532,7 +533,8 @@ class RotationChange(NamedTuple):
     """Places of old CA keys outside of the keystore, which sros never deletes."""
     cut_off: Sequence[str]
     """The robots of the fleet that have not confirmed the previous stage, and therefore cannot
-    communicate with the others until they get its files (``--allow-unconfirmed``).
+    communicate with robots that have the files of this stage, until they get these files, too
+    (``--allow-unconfirmed``).
     """
     remarks: Sequence[str]
     """Next steps, as sentences; empty in a dry run."""
