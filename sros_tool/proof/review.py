@@ -622,7 +622,7 @@ class _Review:
                 or (old.name != robot.name and _delivery_place(old) != _delivery_place(robot))
             ):
                 had = old.name if old else "no robot"
-                lines.append((f"gets the keys of {enclave}, which {had} had", robot.name))
+                lines.append((f"gets the keys of {enclave}, which {had} had before", robot.name))
         if base[1] and self.base:
             file = self.request.fleet
             before, after = (read_connections(e.folder / file) for e in (self.base, self.head))

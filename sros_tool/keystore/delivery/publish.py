@@ -923,7 +923,7 @@ class _Publication:
             else:
                 return release
         raise KeystoreError(
-            f"no robot's last release in '{self._folder}' can be read",
+            f"sros cannot read the last release of any robot in '{self._folder}'",
             f"{problem} Without a release, sros cannot tell which revocations the keystore lacks.",
             "Copy a release there from a copy of the folder, or from the robot, whose agent "
             "keeps it as FOLDER/.agent/release.tar.gz.",

@@ -423,7 +423,7 @@ def refuse_lost_changes(
             what.append(f"the governance was changed{f' ({change.what})' if change.what else ''}")
             again = f"`sros update_keystore {root} --set KEY=VALUE`"
             steps.append(
-                f"Change the governance again to what was published last, with {again}; make other "
+                f"Restore the governance that was published last, with {again}; make other "
                 "changes only after publishing."
             )
     if what:

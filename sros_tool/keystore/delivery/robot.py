@@ -640,10 +640,10 @@ def _lost_revocation_notes(place: Path, answer: RequestAnswer) -> Iterator[Note]
         text = (
             f"the earlier revocation list revokes {counted(len(lost), 'certificate')} that the new "
             f"list lacks, such as {min(lost):x}. This is right if these certificates have expired: "
-            "`sros inspect KEYSTORE --history` shows it. If a certificate has not expired, or is "
-            "not shown, the keystore comes from a backup: then take the list over from another "
-            "robot, with `sros crl KEYSTORE --refresh --crl FILE`, and have the request signed "
-            "again."
+            "`sros inspect KEYSTORE --history` shows when they expire. If a certificate has not "
+            "expired, or is not shown, the keystore comes from a backup: then take the list over "
+            "from another robot, with `sros crl KEYSTORE --refresh --crl FILE`, and have the "
+            "request signed again."
         )
         yield Note("import.list-lacks", text)
 
