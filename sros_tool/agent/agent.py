@@ -991,8 +991,8 @@ class _Round:
                 raise
             raise UnavailableError(
                 f"{place} refuses this robot, which has no certificate to identify itself with",
-                "No enclave here has a certificate with its key (a key on a token cannot be used "
-                "for this).",
+                "No enclave here has a certificate and its key in files (a key on a token cannot "
+                "be used for this).",
                 "On the keystore machine, run `sros distribute_key KEYSTORE --robot "
                 f"{self._settings.robot} FOLDER --force`, and bring the files here.",
             ) from error

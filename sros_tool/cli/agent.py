@@ -243,8 +243,9 @@ def _parse_unit(text: str) -> Unit:
 )  # fmt: skip
 @click.option(
     "--restarted", is_flag=True,
-    help="With --once: all processes were restarted since the last round, even processes that the "
-        "agent cannot see. This does not count for files that this round installs.",
+    help="With --once: confirm that all processes were restarted since the last round, even "
+        "processes that the agent cannot see. This does not count for files that this round "
+        "installs.",
 )  # fmt: skip
 @json_option
 def _run(folder: Path, once: bool, interval: str, restarted: bool, as_json: bool) -> int:

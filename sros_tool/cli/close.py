@@ -98,8 +98,8 @@ def _run(words: Sequence[str], shows_output: bool) -> tuple[int, str, str]:
     "--brought",
     metavar="ENCLAVE",
     multiple=True,
-    help="Remember that the other machine of ENCLAVE runs with the files that the keystore has "
-    "now; sros asks again when these change. Can be repeated.",
+    help="Remember that the machine of ENCLAVE has the keystore's present files, and runs with "
+    "them; sros asks again when these files change. Can be repeated.",
 )
 @dry_run_option
 @json_option

@@ -121,9 +121,8 @@ def _inventory(root: Path, as_yaml: bool, as_list: bool) -> None:
 @click.option("--robot", metavar="NAME", required=True, help="The name of this robot.")
 @click.option(
     "--restarted", is_flag=True,
-    help="All processes were restarted since the files were brought, even processes that sros "
-        "cannot "
-        "see.",
+    help="Confirm that all processes were restarted since the files were brought, even processes "
+        "that sros cannot see.",
 )  # fmt: skip
 def _report(folder: Path, robot: str, restarted: bool) -> None:
     """On a robot, print a report of its enclaves' files and its DDS, for `fleet confirm`.
