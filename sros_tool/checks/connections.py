@@ -78,9 +78,11 @@ def connections_between(processes: Iterable[Process]) -> Connections:
     missing = [
         (first, second)
         for first, second in combinations(processes, 2)
-        for place in ports[first.pid].keys() & ports[second.pid].keys()
-        if not ports[first.pid][place] <= second.mapped_ports
-        or not ports[second.pid][place] <= first.mapped_ports
+        if any(
+            not ports[first.pid][place] <= second.mapped_ports
+            or not ports[second.pid][place] <= first.mapped_ports
+            for place in ports[first.pid].keys() & ports[second.pid].keys()
+        )
     ]
     return Connections(
         missing,

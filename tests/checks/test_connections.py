@@ -50,6 +50,11 @@ def missing_pairs(processes: Iterable[Process]) -> set[tuple[int, int]]:
 def test_a_pair_that_has_not_mapped_each_others_port_is_missing() -> None:
     assert missing_pairs(robot(1, 2, 3)) == set()
     assert missing_pairs(robot(1, 2, 3, deaf=[(1, 3)])) == {(1, 3)}
+    in_two_domains = [
+        replace(process, own_ports=process.own_ports | {port(process.pid, domain=78)})
+        for process in robot(1, 2, deaf=[(1, 2)])
+    ]
+    assert len(connections_between(in_two_domains).missing) == 1
 
 
 def test_one_direction_is_enough_to_be_missing() -> None:
