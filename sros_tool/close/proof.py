@@ -20,6 +20,7 @@ from sros_tool.checks.connections import (
 from sros_tool.checks.keystores.issued import STALE
 from sros_tool.checks.kind import NOTE, Finding
 from sros_tool.checks.processes import PROCESS_NOT_SEEN, process_findings
+from sros_tool.checks.requirements import MISSPELLED_ENCLAVE, VACUOUS
 from sros_tool.close.nodes import MovedEndpoint, ObservedNodes, node_name, nodes_text, ros_use
 from sros_tool.close.processes import ObservedProcesses
 from sros_tool.close.robot import MOST_NAMES, OBSERVER, LocalRobot
@@ -247,7 +248,26 @@ def _proof_of_requirements(robot: LocalRobot) -> Proof:
     status = 1 if 1 in statuses else max(statuses)
     reasons = {0: "all of them", 1: "at least one is violated", 2: "sros could not check them"}
     holds = {0: True, 1: False}.get(status)
-    return Proof(_CLAIM_REQUIRED, holds, f"{reasons[status]}: {robot.requirements}")
+    weak = _weak_requirements_text(robot) if holds else ""
+    return Proof(_CLAIM_REQUIRED, holds, f"{reasons[status]}: {robot.requirements}{weak}")
+
+
+def _weak_requirements_text(robot: LocalRobot) -> str:
+    """Return a clause on requirements that protect less than they state; "" if there are none."""
+    required = ("--requirements", str(robot.requirements), "--json")
+    only = ("--include", VACUOUS.id, "--include", MISSPELLED_ENCLAVE.id)
+    try:
+        _, output, _ = robot.shell.run(("check", str(robot.rights_source), *required, *only), False)
+    except SrosError as error:
+        return f"; sros cannot say whether they protect all that they state: {error.what}"
+    findings = json.loads(output)["findings"]
+    if not findings:
+        return ""
+    number = counted(len(findings), "warning")
+    first = "line {line}: {text}".format_map(findings[0])
+    return (
+        f"; but with {number} that a requirement protects less than it states, the first: {first}"
+    )
 
 
 def _demands_more_enclaves(robot: LocalRobot) -> bool:
