@@ -64,8 +64,8 @@ if TYPE_CHECKING:
     metavar="[NODE:]FROM:=TO",
     multiple=True,
     help="Remap a name of OTHER, as -r does when its nodes start; also __node:=NAME and __ns:=NS. "
-    "Applies after --namespace.  Requirements need the same rules (`sros check --remap`).  Can be "
-    "repeated.",
+    "Applies after --namespace.  Requirements need the same rules (`sros check --remap`), but "
+    "cannot follow __ns.  Can be repeated.",
 )
 @click.option(
     "--enclave",

@@ -971,6 +971,10 @@ def merge_policies(
             no policy.
     """
     additions = list(others)
+    if namespace is not None:
+        namespace = check_plain_namespace(namespace)
+        additions = [policy_in_namespace(addition, namespace) for addition in additions]
+    of_all_nodes = additions
     if nodes:
         additions = [policy_of_nodes(addition, nodes) for addition in additions]
         known = {
@@ -982,13 +986,10 @@ def merge_policies(
                 "",
                 "Write the name as node= has it.",
             )
-    if namespace is not None:
-        namespace = check_plain_namespace(namespace)
-        additions = [policy_in_namespace(addition, namespace) for addition in additions]
     notes: list[Note] = []
     present, stated = read_policy(path, may_be_empty=True), additions
     if remaps:
-        additions, notes = remapped_policies(additions, remaps, present)
+        additions, notes = remapped_policies(additions, remaps, present, of_all_nodes)
     if enclave is not None:
         check_enclave_name(enclave)
         additions = [policy_in_enclave(addition, enclave) for addition in additions]

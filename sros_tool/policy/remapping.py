@@ -106,7 +106,8 @@ def parse_remapping_of_names(text: str) -> Remapping:
     rule = parse_remapping(text)
     problem = remedy = ""
     if rule.old == _NAMESPACE:
-        problem, remedy = "It is for a namespace.", "Name the namespace with --namespace."
+        problem = "It moves names, but not their enclaves."
+        remedy = _namespace_advice(rule)
     elif rule.depends_on_node:
         if not rule.node:
             problem, remedy = "It does not say for which node.", f"Write it as NODE:{rule}."
@@ -116,6 +117,14 @@ def parse_remapping_of_names(text: str) -> Remapping:
     if problem:
         raise UsageError(f"requirements cannot be remapped by {rule}", problem, remedy)
     return rule
+
+
+def _namespace_advice(rule: Remapping) -> str:
+    """Return what to do about requirements after a rule for a namespace."""
+    return (
+        f"Merge the policy with --namespace {quote(rule.new)} in place of this rule, and check "
+        "with the same option; or change the names in a copy of the requirements."
+    )
 
 
 def remapped_name(name: str, ns: str, rules: Iterable[Remapping]) -> list[str]:
@@ -168,16 +177,20 @@ def renamed_action_text(rule: Remapping) -> str:
 
 
 def remapped_policies(
-    policies: Iterable[Policy], texts: Iterable[str], file: Policy = _EMPTY_POLICY
+    policies: Iterable[Policy],
+    texts: Iterable[str],
+    file: Policy = _EMPTY_POLICY,
+    left_out: Iterable[Policy] = (),
 ) -> tuple[list[Policy], list[Note]]:
     """Return remapped policies, and notes on changes of the nodes' rights.
 
     ``texts`` are rules.  There is also a note for each DENY in ``file``, the policy to merge into,
-    that denies an old name but not its new name.
+    that denies an old name but not its new name.  ``left_out`` are policies with nodes that --node
+    leaves out, for the error.
 
     Raises:
-        UsageError: (or another error of `parse_remapping`) a text is not a rule, or no policy has
-            the name for which the rule is.
+        UsageError: (or another error of `parse_remapping`) a text is not a rule, or a rule changes
+            nothing.
     """
     rules = [parse_remapping(text) for text in texts]
     policies = tuple(policies)
@@ -188,11 +201,7 @@ def remapped_policies(
     for rule in rules:
         uses = {use for _, of_policy in remapped for use in of_policy if use.rule == rule}
         if not uses:
-            raise UsageError(
-                f"--remap {rule}: no policy to merge has this name, or such a node",
-                "",
-                "Write the names as the nodes of the policy use them.",
-            )
+            raise _unused_rule_error(rule, rules, policies, left_out)
         nodes = sorted({use.node for use in uses})
         if rule.old == _NODE and len(nodes) > 1:
             text = (
@@ -208,14 +217,55 @@ def remapped_policies(
     return result, [*notes, *_notes_on_old_names(file, result, moved)]
 
 
+def _unused_rule_error(
+    rule: Remapping,
+    rules: Sequence[Remapping],
+    policies: Iterable[Policy],
+    left_out: Iterable[Policy],
+) -> UsageError:
+    """Return the error for a rule that changes nothing, with the reason."""
+
+    def users(of: Iterable[Policy], rules: Sequence[Remapping]) -> list[str]:
+        uses = {use for policy in of for use in remapped_policy(policy, rules)[1]}
+        return sorted({use.node for use in uses if use.rule == rule})
+
+    policies = tuple(policies)
+    for other in rules:
+        if users(policies, [each for each in rules if each != other]):
+            return UsageError(
+                f"--remap {rule} changes nothing",
+                f"The rule {other} applies first.",
+                "Write the node and the name as they are after that rule, or leave out one of the "
+                "two rules.",
+            )
+    if nodes := users(left_out, rules):
+        return UsageError(
+            f"--remap {rule} changes nothing",
+            f"It is for {enumerated(nodes)}, which --node leaves out.",
+            f"Add --node {nodes[0]}, or leave out the rule.",
+        )
+    return UsageError(
+        f"--remap {rule}: no policy to merge has this name, or such a node",
+        "",
+        "Write the names as the nodes of the policy use them.",
+    )
+
+
 def _notes_on_requirements(
     policies: Iterable[Policy], rules: Iterable[Remapping]
 ) -> Iterator[Note]:
-    """Yield a note on names that no node has any more.
+    """Yield notes on names that no node has any more.
 
-    A requirement for such a name would hold, regardless of who may use the new name.  Rules for
-    namespaces are ignored, because `sros check` puts requirements into a namespace, too.
+    A requirement for such a name would hold, regardless of who may use the new name.  With other
+    rules, `sros check` puts requirements into a namespace, too.
     """
+    for rule in rules:
+        if rule.old == _NAMESPACE:
+            text = (
+                f"requirements cannot follow --remap {rule}, which moves names, but not their "
+                f"enclaves. {_namespace_advice(rule)}"
+            )
+            yield Note("merge.requirements-of-old-namespace", text)
     of_names = [rule for rule in rules if rule.old != _NAMESPACE]
     policies = tuple(policies)
     remapped = [remapped_policy(policy, of_names) for policy in policies]

@@ -96,8 +96,20 @@ def test_the_names_of_a_merged_policy_are_remapped(folder: Path) -> None:
     words = ("merge_policy", "cam.xml", "cam.xml", "--remap")
     ended = sros(*words, "image:=/front/image", "--json", cwd=folder).ok()
     assert [right["name"] for right in json.loads(ended.out)["added"]] == ["/front/image"]
-    ended = sros(*words, "imag:=/front/image", cwd=folder)
-    assert (ended.status, "no policy to merge has this name" in ended.err) == (2, True), ended
+    nodes = policy_text({"/cam": publish("/image"), "/b": publish("state")})
+    (folder / "cam.xml").write_text(nodes.replace('node="n"', 'node="cam"', 1))
+    for more, said in (
+        (("imag:=/front/image",), "no policy to merge has this name"),
+        (
+            ("cam:__node:=eye", "--remap", "cam:image:=/i"),
+            "The rule cam:__node:=eye applies first.",
+        ),
+        (("image:=/one", "--remap", "image:=/two"), "The rule image:=/one applies first."),
+        (("/state:=/s", "--remap", "__ns:=/l"), "The rule __ns:=/l applies first."),
+        (("state:=/s", "--node", "cam"), "It is for n, which --node leaves out. Add --node n, or"),
+    ):
+        ended = sros(*words, *more, cwd=folder)
+        assert (ended.status, said in ended.err) == (2, True), ended
 
 
 def test_a_merge_that_takes_a_counterpart_away_says_so(folder: Path) -> None:

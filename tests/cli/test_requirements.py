@@ -545,7 +545,7 @@ def test_requirements_are_remapped_as_the_policy(tmp_path: Path) -> None:
         (("--remap", "~/close:=/g"), "Write it as NODE:~/close:=/g."),
         (("--remap", "close:=~/g"), "Write it as NODE:close:=~/g."),
         (("--remap", "__node:=x"), "Write it as NODE:__node:=x."),
-        (("--remap", "__ns:=/x"), "Name the namespace with --namespace."),
+        (("--remap", "__ns:=/x"), "policy with --namespace /x in place of this rule"),
         (("--remap", "a:close:=/g"), "Other nodes than a may keep the name."),
     ):
         ended = sros(*asked, *words, cwd=tmp_path)

@@ -33,6 +33,7 @@ from sros_tool.policy.rights import Right, policy_rights
 from tests.policy.drawn_policies import PATHS, effective, meant, policies
 
 OF_REQUIREMENTS = "merge.requirements-of-old-names"
+OF_NAMESPACE = "merge.requirements-of-old-namespace"
 
 
 def one(*groups: Group, node: str = "n") -> Policy:
@@ -221,7 +222,8 @@ def test_what_nodes_remap_otherwise_is_noted() -> None:
         (["n:__node:=x"], [], ""),
         # All names below a node's name move, also those of no right.
         (["base:__node:=x"], [OF_REQUIREMENTS], "that name /base/* do not apply"),
-        (["__ns:=/left"], [], ""),
+        (["__ns:=/left"], [OF_NAMESPACE], "Merge the policy with --namespace /left in place"),
+        (["base:__ns:=/l", "~/arm:=/a"], [OF_NAMESPACE, OF_REQUIREMENTS], "follow --remap base:__"),
         (["/plan:=/y"], ["merge.remapped-action", OF_REQUIREMENTS], "that name /plan do not apply"),
     ):
         base = [one(own, node="base")] if "base" in texts[0] else []
