@@ -386,7 +386,7 @@ class _Ledgers:
         user = min(user, _FIRST_OF_RANGES)
         if self._read[user] + size > _MOST_LEDGERS:
             most = _MOST_LEDGERS // 1024**2
-            return (), f"the ledgers that processes of a user name have more than {most} MiB"
+            return (), f"processes of one user need ledgers of more than {most} MiB in all"
         self._read[user] += size
         try:
             entries = OpenedKeystore(enclave.here).ledger_with("enclave", enclave.name).entries
@@ -1070,7 +1070,7 @@ def runtime_metrics(
     return (
         Metric(
             "sros_processes",
-            "Number of processes that speak ROS 2 by their security (secured, open or unknown).",
+            "Number of processes that speak ROS 2, by security (secured, open or unknown).",
             tuple(Sample(security[level], {"security": level.value}) for level in Security),
         ),
         Metric(
@@ -1080,7 +1080,7 @@ def runtime_metrics(
         ),
         Metric(
             "sros_process_findings",
-            "Number of findings of `sros check runtime` about processes by the id of their kind.",
+            "Number of findings of `sros check runtime` about processes, by the id of their kind.",
             tuple(
                 Sample(number, {"severity": severity.word, "id": identity})
                 for (severity, identity), number in sorted(kinds.items())

@@ -105,7 +105,7 @@ SELF_LIMITING = FindingKind(
     ERROR,
     "a session whose rules no other process enforces",
     "No rule names another process: the rules state only what this process itself may do. Any "
-    "other process with a certificate of the CA publishes to it, and reads from it.",
+    "other process with a certificate of the CA can publish to it, and read from it.",
     "zenoh_security_tools writes such files; Zenoh 1.10.2, tested.",
     _WRITE_BY_SROS_REMEDY,
 )

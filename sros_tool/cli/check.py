@@ -252,8 +252,8 @@ def check(
     r"""Find errors and weaknesses in policies, keystores and the runtime.
 
     PATH is a policy, a folder of policies, a keystore or an enclave. sros detects the type, unless
-    the word `policy` or `keystore` before the first PATH states it. A keystore in this folder that
-    is named `keystore` is checked by `sros check keystore`. Without PATH, the keystore of
+    the word `policy` or `keystore` before the first PATH states it. `sros check keystore` checks
+    the keystore in the folder named `keystore` here. Without PATH, the keystore of
     $ROS_SECURITY_KEYSTORE and the runtime are checked: the environment and the processes of this
     machine.
 

@@ -284,7 +284,7 @@ def test_the_ledgers_of_all_processes_of_a_user_are_bounded(
     ):
         entries, unknown = ledgers.entries(enclave, user)
         assert bool(entries) == are_read, user
-        assert ("the ledgers that processes of a user name" in unknown) != are_read
+        assert ("processes of one user need ledgers of" in unknown) != are_read
 
 
 @pytest.mark.parametrize(

@@ -331,7 +331,7 @@ CLOCK_BEHIND = FindingKind(
     "a check for a moment before the last change of the keystore",
     "If the clock of this machine is behind, expired files count as valid.",
     "sros: ledger.jsonl has the time of each change.",
-    "Set the clock. If the clock is right now but was ahead at the last change, run `sros crl "
+    "Set the clock. If the clock is correct now, but was ahead at the last change, run `sros crl "
     "KEYSTORE --refresh`, so that the last entry of the ledger has today's date.",
 )
 CRL_EXPIRES_SOON = FindingKind(
@@ -346,7 +346,7 @@ CRL_LACKS = FindingKind(
     "keystore.revocation-list-lacks",
     ERROR,
     "a revocation list that lacks revoked certificates",
-    "An earlier list was put back, or the list was removed: every process that loads it accepts "
+    "An earlier list was put back, or the list was removed: processes that start now accept "
     "these certificates.",
     "RFC 5280, 5; sros: ledger.jsonl has all revocations.",
     "Find out who changed the list, and run `sros crl KEYSTORE --refresh`, which revokes the "

@@ -239,7 +239,7 @@ def publish(
         raise KeystoreError(
             behind,
             "Robots would refuse what is published now, or get it with wrong dates.",
-            "Set the clock, and publish again. If the clock is right now, but was ahead before, "
+            "Set the clock, and publish again. If the clock is correct now, but was ahead before, "
             f"first run `sros crl {quote(str(root))} --refresh`, so that the last entry of the "
             "ledger has today's date.",
         )
