@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -9,8 +10,11 @@ from pathlib import Path
 
 import pytest
 
+from sros_tool import check_requirements
 from sros_tool.checks.keystores.opened import Circumstances
 from sros_tool.files import policies_dir
+from sros_tool.graph.learn import merge_policies
+from sros_tool.policy.document import read_policy
 from sros_tool.proof.findings import decide_all
 from sros_tool.proof.requirements import Requirement, demand, read_requirements
 from sros_tool.proof.system import load_system
@@ -156,3 +160,23 @@ def test_each_kind_has_a_change_that_breaks_it(requirements: tuple[Requirement, 
     assert {by_demand[each].KIND for each in broken} == {each.KIND for each in requirements} - {
         "protected"
     }
+
+
+def test_operators_break_no_requirement_of_the_page_for_packages(tmp_path: Path) -> None:
+    """Twin: without the exception, operators break each of its requirements."""
+    page = (policies_dir().parent / "docs/howto/package.md").read_text()
+    (text,) = re.findall(r"requirements.toml -->\n```toml\n(.*?)```", page, re.DOTALL)
+    (operators := tmp_path / "operators.xml").write_bytes(
+        merge_policies(
+            policies_dir() / "operator_configure.xml",
+            [read_policy(policies_dir() / "operator_drive.xml")],
+            may_include=False,
+        ).document
+    )
+    for name in ("common", "operator"):
+        shutil.copytree(policies_dir() / name, tmp_path / name)
+    for written, broken in ((text, 0), (text.replace("*/operator/*", "*/arm"), 2)):
+        (required := tmp_path / "r.toml").write_text(written)
+        found = check_requirements(operators, required, namespaces=["/left"])
+        lines = {each.line for each in found if each.id == "requirement.violated"}
+        assert len(lines) == broken, found
