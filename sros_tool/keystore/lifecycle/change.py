@@ -123,14 +123,14 @@ class Changed:
     root: Path
     dry_run: bool = False
     outcomes: Mapping[str, str] = field(default_factory=dict)
-    changes: Sequence[Change] = ()
-    rights: tuple[ReplacedRights, ...] = ()
+    changes: Sequence[Change] = field(default=(), repr=False)
+    rights: tuple[ReplacedRights, ...] = field(default=(), repr=False)
     works_until: datetime | None = None
     may_work_longer: bool = False
     revoked: int = 0
     restart: tuple[str, ...] = ()
-    zenoh: StagedZenoh = field(default_factory=StagedZenoh)
-    remarks: tuple[Note, ...] = ()
+    zenoh: StagedZenoh = field(default_factory=StagedZenoh, repr=False)
+    remarks: tuple[Note, ...] = field(default=(), repr=False)
     notes: tuple[Note, ...] = ()
 
     def names(self, outcome: str) -> tuple[str, ...]:

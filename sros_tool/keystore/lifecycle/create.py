@@ -11,7 +11,7 @@ import os
 from collections import ChainMap
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from shlex import quote
@@ -133,8 +133,8 @@ class Creation(Changed):
     certificates, or still use the old governance or old Zenoh rules.
     """
 
-    template: Template
-    domains: DomainSet
+    template: Template = field(repr=False)
+    domains: DomainSet = field(repr=False)
     new_keystore: bool = False
 
     @property
