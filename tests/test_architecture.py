@@ -28,6 +28,7 @@ LAYERS = {
         "faults",
         "names",
         "owners",
+        "spelling",
         "validity",
         "values",
         "wording",

@@ -76,6 +76,7 @@ from sros_tool.policy.node_basics import are_basic
 from sros_tool.policy.patterns import ComparisonLimit, Names, covers, literal_prefix, matches
 from sros_tool.policy.placeholders import parts_of
 from sros_tool.policy.rights import ACTION_RIGHT, Right, Rules, parts, placed_rights, policy_rights
+from sros_tool.spelling import NearNames, is_typing_error
 from sros_tool.translate import permissions_for
 from sros_tool.validity import Window
 from sros_tool.wording import counted, first_few
@@ -472,10 +473,10 @@ def _check_node_names(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
         for profile in enclave.all_profiles():
             full = expand("~", profile.ns, profile.node)
             if enclave.path == full or (
-                own == profile.node and not _is_typing_error(enclave.path, full)
+                own == profile.node and not is_typing_error(enclave.path, full)
             ):
                 break
-            if _is_typing_error(own, profile.node) or _is_typing_error(enclave.path, full):
+            if is_typing_error(own, profile.node) or is_typing_error(enclave.path, full):
                 near.append((profile, full))
         else:
             for profile, full in near:
@@ -1590,114 +1591,6 @@ class _IncludeGraph:
             return self._includer.target(element, IncludedFile(file))
         except PolicyError:
             return None  # the include is in <metadata>, or in an unused fallback
-
-
-# ── names that are nearly equal ────────────────────────────────────────────────────────────
-
-
-_NAME_SEPARATORS = re.compile(r"([/_])")
-_DIGITS = re.compile(r"\d+")
-_SHORTEST_PART = 4  # letters of a part; shorter parts, as in /arm_l and /arm_r, differ on purpose
-
-
-_MOST_SAME_ENDS = 8
-
-
-class NearNames:
-    """An index of names that finds similar names in constant time."""
-
-    def __init__(self, names: Iterable[str]) -> None:
-        self._by_key: dict[str, list[str]] = defaultdict(list)
-        self._by_end: dict[str, list[str]] = defaultdict(list)
-        self._by_last: dict[str, list[str]] = defaultdict(list)
-        self._names = dict.fromkeys(names)
-        for name in self._names:
-            self._by_last[name.rpartition("/")[2]].append(name)
-            for end in _name_ends(name):
-                self._by_end[end].append(name)
-            for key in set(_index_keys(name)):
-                self._by_key[key].append(name)
-
-    def similar_names(self, name: str) -> list[str]:
-        """Return the sorted names, other than ``name``, that look like a typing error of ``name``.
-
-        Similar names differ in one part (between "/" and "_") by one letter that is added,
-        removed, replaced or swapped with its neighbor; or only in capitals and separators.
-        Parts that differ in digits, or are shorter than four letters, are not similar.
-        """
-        candidates = {
-            candidate for key in set(_index_keys(name)) for candidate in self._by_key.get(key, ())
-        }
-        return sorted(
-            candidate for candidate in candidates if candidate != name and _is_near(name, candidate)
-        )
-
-    def same_name_elsewhere(self, name: str) -> list[str]:
-        """Return the sorted names that are ``name`` with a namespace added in front, or removed."""
-        shorter = (end for end in _name_ends(name) if end in self._names)
-        longer = self._by_end.get(name, ()) if name.count("/") > 1 else ()
-        return sorted({*shorter, *longer} - {name})
-
-    def names_with_same_end(self, name: str) -> list[str]:
-        """Return the sorted names with the same last part as ``name``, without ``name`` itself.
-
-        Empty if there are many: a last part that many names share says nothing.
-        """
-        names = self._by_last.get(name.rpartition("/")[2], ())
-        return sorted({*names} - {name}) if len(names) <= _MOST_SAME_ENDS else []
-
-
-def _name_ends(name: str) -> Iterator[str]:
-    """Yield the proper suffixes of a name that have at least two parts."""
-    parts = name.split("/")[1:]
-    for at in range(1, len(parts) - 1):
-        yield "/" + "/".join(parts[at:])
-
-
-def _index_keys(name: str) -> Iterator[str]:
-    """Yield index keys of a name; similar names have a key in common."""
-    yield _without_separators(name)
-    parts = _NAME_SEPARATORS.split(name)
-    for index, part in enumerate(parts):
-        if len(part) < _SHORTEST_PART - 1:
-            continue
-        before, after = "".join(parts[:index]), "".join(parts[index + 1 :])
-        # The part without each of its letters, and at last the whole part.
-        for at in range(len(part) + 1):
-            yield f"{before}{part[:at]}{part[at + 1 :]}\0{after}"
-
-
-def _without_separators(name: str) -> str:
-    return name.replace("_", "").replace("/", "").lower()
-
-
-def _is_near(first_name: str, second_name: str) -> bool:
-    if _without_separators(first_name) == _without_separators(second_name):
-        return True
-    pairs = zip(
-        _NAME_SEPARATORS.split(first_name), _NAME_SEPARATORS.split(second_name), strict=False
-    )
-    different = [(a, b) for a, b in pairs if a != b]
-    if len(different) != 1:
-        return False
-    a, b = sorted(different[0], key=len)
-    if len(b) < _SHORTEST_PART or _DIGITS.sub("", a) == _DIGITS.sub("", b):
-        return False
-    return _is_one_edit(a, b)
-
-
-def _is_typing_error(a: str, b: str) -> bool:
-    """Return whether two names differ by a typing error, not only in capitals and separators."""
-    return _without_separators(a) != _without_separators(b) and _is_near(a, b)
-
-
-def _is_one_edit(a: str, b: str) -> bool:
-    """Return whether one typing error turns ``a`` into ``b``; ``b`` is at least as long."""
-    at = next((index for index, (x, y) in enumerate(zip(a, b, strict=False)) if x != y), len(a))
-    if len(a) < len(b):
-        return a[at:] == b[at + 1 :]
-    changed_places = a[at : at + 2] == b[at : at + 2][::-1] and a[at + 2 :] == b[at + 2 :]
-    return a[at + 1 :] == b[at + 1 :] or changed_places
 
 
 _MOST_ENCLAVES = 1000  # per policy; checking a whole fleet would delay signing

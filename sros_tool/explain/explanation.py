@@ -51,6 +51,7 @@ from sros_tool.names import (
 )
 from sros_tool.policy.model import ALLOW, DENY, Enclave, Group, Policy, Profile, Profiles, Source
 from sros_tool.policy.rights import Right, action_right, order, profile_rights
+from sros_tool.spelling import is_spelled_alike
 from sros_tool.terminal import log_step
 
 
@@ -383,6 +384,13 @@ def likely_names(answer: Answer) -> tuple[str, ...]:
     return _similar_names(question.name, names - {question.name}, question.type == "service")
 
 
+def likely_actions(answer: Answer) -> tuple[str, ...]:
+    """Return at most three allowed actions that may be meant instead of a denied service."""
+    right = {"request": "call", "reply": "execute"}.get(answer.question.right)
+    names = {held.name for held in named_rights(answer) if held.right == right}
+    return _similar_names(answer.question.name, names, is_service=False)
+
+
 def likely_meaning(right: Right, used: Collection[Right], named: Iterable[Right]) -> str:
     """Return a clause on the name that a policy may mean instead of a denied right, or "".
 
@@ -431,6 +439,8 @@ def _similar_names(name: str, names: AbstractSet[str], is_service: bool) -> tupl
     same_last = sorted(other for other in names if other.rpartition("/")[2] == last)
     if (is_service and last in NODE_SERVICES) or 0 < len(same_last) <= _MAX_PROPOSED_NAMES:
         return tuple(same_last) if len(same_last) <= _MAX_PROPOSED_NAMES else ()
+    if alike := sorted(other for other in names if is_spelled_alike(name, other)):
+        return tuple(alike[:_MAX_PROPOSED_NAMES])
     if not names:
         return ()
     from difflib import get_close_matches  # imported only for this last search

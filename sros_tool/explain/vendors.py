@@ -36,7 +36,12 @@ from sros_tool.explain.asking import (
     question_meant,
     rights_naming,
 )
-from sros_tool.explain.explanation import explain, likely_names, remapping_clause
+from sros_tool.explain.explanation import (
+    explain,
+    likely_actions,
+    likely_names,
+    remapping_clause,
+)
 from sros_tool.faults import REFUSE_STRANGERS, Fault
 from sros_tool.keystore.layout import (
     KEY_FILE,
@@ -358,6 +363,10 @@ def _other_name_notes(answer: Answer, asked_enclave: AskedEnclave) -> Iterator[N
         if len(names) == 1 and is_moved and question.type != "action":
             text += f" ({remapping_clause(question.name, names[0])})"
         yield Note("explain.likely-name", f"{text}.")
+    elif names := likely_actions(answer):
+        does = "call" if question.right == "request" else "execute"
+        text = f"the enclave may {does} action {' and '.join(names)}: perhaps that is meant"
+        yield Note("explain.likely-name", f"{text} (add --type action).")
     elif asked_enclave.has_peers and not is_of_every_node(question.name):
         kind, does = ("not-used", "needs")
         if question.right in OFFERING_RIGHT:

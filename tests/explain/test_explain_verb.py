@@ -689,6 +689,8 @@ def test_a_part_of_an_action_is_told_as_the_action(fibonacci: Path) -> None:
         found = explain(fibonacci, enclave, word, f"/fibonacci/_action/{part}")
         assert found.status == 1 and added in found.out
         assert f"ask about `{asked} /fibonacci --type action`" in found.err
+    meant = "[explain.likely-name]: the enclave may call action /fibonacci: perhaps that is meant"
+    assert f"{meant} (add --type action)." in explain(fibonacci, CLIENT, "call", "/fibonaci").err
     allowed = explain(fibonacci, CLIENT, "subscribe", "/fibonacci/_action/status")
     assert allowed.status == 0 and "part-of-action" not in allowed.err
 
@@ -753,6 +755,7 @@ def test_a_change_is_for_the_node_that_the_permissions_are_for(whole: Path) -> N
     rules = "-r /front/chatter:=/chatter, or the policy may lack --remap /chatter:=/front/chatter)."
     assert rules in explain(whole, ENCLAVE, "publish", "/front/chatter").err
     assert "may publish /chatter: " in explain(whole, "--who", "publish", "/chater").err
+    assert "may publish /chatter: " in explain(whole, ENCLAVE, "publish", "/chattre").err
     assert "likely-name" not in found.err
     unused = (
         "[explain.not-used]: no enclave that was read has a right to subscribe exactly /nothing"
