@@ -444,11 +444,12 @@ def run_by_hand(
     if node.backend == RCLPY:  # this process already prints each message
         command += ["--ros-args", "--log-level", "warn", "--"]
     command += ["--report", f"/proc/self/fd/{writing}"]
-    stopped, heard = threading.Event(), 0
+    stopped, heard, seen = threading.Event(), 0, ""
 
-    def count(event: Event) -> None:
-        nonlocal heard
+    def remember(event: Event) -> None:
+        nonlocal heard, seen
         heard += event.count if event.kind is EventKind.HEARD else 0
+        seen = (event.text if event.kind is EventKind.SEEN else "") or seen
 
     def stop(*_: object) -> None:
         again = stopped.is_set()
@@ -482,7 +483,7 @@ def run_by_hand(
 
         with open(events, "rb", buffering=0) as pipe:
             try:
-                last = _report(node, pipe.fileno(), say, on_ready=start_duration, on_event=count)
+                last = _report(node, pipe.fileno(), say, on_ready=start_duration, on_event=remember)
             except BaseException:  # such as nobody who reads the lines any more
                 end_within(_SECONDS_TO_STOP, process)
                 process.wait()
@@ -490,9 +491,14 @@ def run_by_hand(
         status = process.wait()
     if stopped.is_set():
         by_force = ", by force: it did not end by itself" * (status == -signal.SIGKILL)
-        result = f"; heard {counted(heard, 'message')}" if node.role is Role.LISTENER else ""
-        if result and not heard and duration and duration.total_seconds() < _SILENCE_SECONDS:
-            result += ", but that was too short to find all publishers: listen longer (--for 10s)"
+        results = {
+            Role.LISTENER: f"; heard {counted(heard, 'message')}",
+            Role.TALKER: f"; {seen or f'found no subscription of {node.topic}'}",
+        }
+        result = results.get(node.role, "")
+        was_short = duration is not None and duration.total_seconds() < _SILENCE_SECONDS
+        if result and was_short and not (heard or seen):
+            result += ", but that was too short to find all others: add --for 10s"
         say(f"stopped{by_force}{result}")
     elif last and last.stage is ProcessStage.ENDPOINT and os.environ.get(ENABLE) == "true":
         verb = "publish" if node.role is Role.TALKER else "subscribe"

@@ -165,27 +165,37 @@ def test_a_listener_ends_after_its_time_and_without_a_reader(
         return lines[-1:]
 
     (last,) = apart(played)
-    assert last.startswith("stopped; heard 0 messages, but that was too short to find all publish")
+    assert last.startswith("stopped; heard 0 messages, but that was too short to find all others:")
     assert "--for is for a talker" in sros("demo", "--for", "3s").err
 
 
-_COUNTING_NODE = """#!/bin/sh
+_NODE = """#!/bin/sh
 for report; do :; done
 tell() { printf '{"event": "%s", "time": 1, "text": "%s", "count": %s}\\n' "$@" > "$report"; }
 trap 'tell heard "2 messages of nav_msgs/msg/Odometry" 2; exit 0' TERM
 tell ready "" 0
+SEEN
 tell heard "4 messages of nav_msgs/msg/Odometry" 4
 tell heard "3 messages of love" 1
 while :; do sleep 0.01; done
 """
+_SEEN = "/odom has 1 subscription of nav_msgs/msg/Odometry"
 
 
-def test_a_listener_sums_the_messages_that_it_heard(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("role", "seen", "result"),
+    [
+        (Role.LISTENER, "", "heard 7 messages"),
+        (Role.TALKER, f'tell seen "{_SEEN}" 0; tell seen "" 0', _SEEN),
+        (Role.TALKER, "", "found no subscription of /odom"),
+    ],
+)
+def test_a_node_by_hand_ends_with_what_it_heard_and_saw(
+    role: Role, seen: str, result: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Also those that its node reports only when it ends; a text that looks like a sum is one."""
+    """Also messages that it reports only when it ends; a text that looks like a sum is one."""
     node, lines = tmp_path / "node", list[str]()
-    node.write_text(_COUNTING_NODE)
+    node.write_text(_NODE.replace("SEEN", seen))
     node.chmod(0o755)
     monkeypatch.setattr(sys, "executable", str(node))
 
@@ -195,10 +205,10 @@ def test_a_listener_sums_the_messages_that_it_heard(
             os.kill(os.getpid(), signal.SIGTERM)
 
     def played() -> list[str]:
-        run_by_hand(HandNode(Role.LISTENER, "cyclone", "/odom"), say)
+        run_by_hand(HandNode(role, "cyclone", "/odom"), say)
         return lines
 
-    assert apart(played)[-1] == "stopped; heard 7 messages"
+    assert apart(played)[-1] == f"stopped; {result}"
 
 
 def test_a_node_by_hand_says_what_others_have_of_another_type(tmp_path: Path) -> None:
