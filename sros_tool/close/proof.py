@@ -71,6 +71,12 @@ _CLAIM_REQUIRED = "the requirements hold"
 _START_SECONDS = 3.0
 """How long processes that were restarted by hand may take until they run in their enclaves."""
 
+_OTHERS_SEEN = {
+    "graph.silent": "nodes without endpoints:",
+    "graph.stray": "writers or readers that belong to no ROS node, of topics",
+}
+"""The notes of `generate_policy` on what it sees besides nodes with endpoints, as words."""
+
 _MOST_TRIES = 3
 """Maximum number of looks of the observer, until the nodes do what they did on the open robot."""
 
@@ -319,10 +325,17 @@ def _proof_of_silence(robot: LocalRobot, before: Observation, *, hears: bool) ->
         _, value = robot.shell.read_json((*words, "--dry-run", "--json"))
     except UnavailableError as error:
         return Proof(SILENCE, None, f"{error}")
-    if value["nodes"]:
-        nodes = {f"{node['namespace'].rstrip('/')}/{node['name']}" for node in value["nodes"]}
-        found = f"it sees {first_few(sorted(nodes), MOST_NAMES)}"
-        return Proof(SILENCE, False, f"{found}; stop what runs open, or start it in its enclave")
+    nodes = {f"{node['namespace'].rstrip('/')}/{node['name']}" for node in value["nodes"]}
+    found = [first_few(sorted(nodes), MOST_NAMES)] if nodes else []
+    # Nodes without endpoints, and programs without ROS, are only in notes.
+    found += [
+        f"{_OTHERS_SEEN[note['id']]} {note['text'].partition(': ')[2]}"
+        for note in value["notes"]
+        if note["id"] in _OTHERS_SEEN
+    ]
+    if found:
+        text = f"it sees {enumerated(found)}; stop what runs open, or start it in its enclave"
+        return Proof(SILENCE, False, text)
     if not hears:
         why = "this proves nothing, because the observer in its enclave does not see the robot now"
         return Proof(SILENCE, None, why)

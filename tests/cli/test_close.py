@@ -824,8 +824,8 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     robot.more = ()
     robot.remaining = (TALKER,)
     lost = "no: everything that talked can still talk: "
-    runs = f"process {PID['/listener']} (run) runs: ask again, or restart it; if it is gone for"
-    assert f"{lost}not seen: /listener ({runs} good" in robot.close("--proof", status=1).out
+    runs = f"process {PID['/listener']} (run) runs: ask again, or restart it; if the node is"
+    assert f"{lost}not seen: /listener ({runs} gone" in robot.close("--proof", status=1).out
     with monkeypatch.context() as patched:
         patched.setattr(close, "_run", ended_before_the_audit(robot, "/listener"))
         stopped = "/listener (process 4712 (run); start it again, or, if it does not always run, "
@@ -845,6 +845,11 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     robot.nodes = (*robot.nodes, ("/", "/", "spy", "03", ["subscribe rt/chatter"]))
     assert (
         "no: an open listener finds nothing: it sees /spy; stop what runs open, or start it in"
+        in robot.close("--proof", status=1).out
+    )
+    robot.nodes = (TALKER, LISTENER, ("/", "", observe.NOBODY, "03", ["publish rt/cmd_vel"]))
+    assert (
+        "writers or readers that belong to no ROS node, of topics rt/cmd_vel; stop what runs open"
         in robot.close("--proof", status=1).out
     )
     robot.nodes = (TALKER, LISTENER)
