@@ -7,7 +7,7 @@ from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
 from itertools import chain
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from sros_tool.close.processes import read_document
 from sros_tool.close.robot import OBSERVER, LocalRobot
@@ -57,6 +57,17 @@ class ObservedNodes:
             file = self.robot.observation_file
             nodes = read_document(file, observation_from_json, "an observation", again).nodes
         return [node for node in nodes if node.enclaves]
+
+    @property
+    def topics_without_node(self) -> str:
+        """The topics on the open robot, as text, whose writers or readers belonged to no node."""
+
+        def topics(learned: Any) -> str:
+            notes = learned["notes"]
+            texts = [str(note["text"]) for note in notes if note["id"] == "graph.stray"]
+            return ", ".join(text.partition(": ")[2] for text in texts)
+
+        return read_document(self.robot.observation_file, topics, "an observation", "")
 
     @cached_property
     def policy(self) -> Policy:

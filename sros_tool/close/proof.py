@@ -608,6 +608,9 @@ class _TalkComparison:
         if new:
             text += "; not compared, because sros did not see them on the open robot: "
             text += first_few(new, MOST_NAMES)
+        if topics := self._nodes.topics_without_node:
+            text += "; not compared, because they belonged to no ROS node: writers or readers of "
+            text += f"{topics} (programs without security cannot talk to the closed robot)"
         return text
 
 

@@ -1117,6 +1117,12 @@ def test_a_renamed_node_is_compared_and_a_new_one_is_named(
                     policy.read_text(), flags=re.DOTALL)  # fmt: skip
     policy.write_text(copied)
     robot.close()
+    seen = robot.folder / "robot/observed.json"
+    value = json.loads(seen.read_text())
+    value["notes"].append(
+        {"id": "graph.stray", "text": "left out, because they are alone: rt/odom"}
+    )
+    seen.write_text(json.dumps(value))
     bow_camera = ros_node("nav/bow_camera", of, "publish rt/nav/bow_camera/image")
     robot.remaining = (TALKER, LISTENER, stern_camera, bow_camera)
     said = robot.close("--proof").out
@@ -1127,6 +1133,10 @@ def test_a_renamed_node_is_compared_and_a_new_one_is_named(
     assert (
         "; not compared, because sros did not see them on the open robot: /nav/bow_camera, /n"
         in said
+    )
+    assert (
+        "; not compared, because they belonged to no ROS node: writers or readers of rt/odom ("
+        in (said)
     )
 
 
