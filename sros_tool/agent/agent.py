@@ -71,6 +71,7 @@ from sros_tool.keystore.confirmation import (
     concerns_key,
     enclave_of,
     make_confirmation,
+    problem_rank,
     render_confirmation,
     shortened_dds,
     shortened_problems,
@@ -276,9 +277,10 @@ class _Round:
         )
         asked = self._renewals(names)
         arrived = self._confirm(names, opened, processes, clock, asked)
-        problems = tuple(dict.fromkeys(self._problems))
         self._state = replace(
-            self._state, fetched=now if fetched else self._state.fetched, problems=problems
+            self._state,
+            fetched=now if fetched else self._state.fetched,
+            problems=self._sorted_problems(),
         )
         self._save_state()
         return Round(
@@ -291,10 +293,13 @@ class _Round:
             self._state.unseen,
             len(asked.requests),
             arrived,
-            tuple(dict.fromkeys(self._problems)),
+            self._sorted_problems(),
         )
 
     # ── parts of a round ───────────────────────────────────────────────────────────────────
+
+    def _sorted_problems(self) -> tuple[str, ...]:
+        return tuple(sorted(dict.fromkeys(self._problems), key=problem_rank))
 
     def _try_part(self, work: Callable[[], None]) -> bool:
         """Call ``work``; return whether it succeeded, and add a problem to the round if not."""

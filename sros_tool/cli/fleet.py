@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -597,7 +597,7 @@ class ComparedFleet(NamedTuple):
 
 @fleet.command("status")
 @keystore_argument()
-@robot_option("Show only this robot of the fleet, with each of its files.")
+@robot_option("Show only this robot of the fleet, with all its problems and files.")
 @click.option(
     "--max-age",
     metavar="DURATION",
@@ -994,10 +994,15 @@ class _Group(NamedTuple):
         return min(self.robots, key=lambda robot: robot.received or moment)
 
 
-def _groups(compared_fleet: ComparedFleet, robots: Sequence[str]) -> list[_Group]:
+def _groups(
+    compared_fleet: ComparedFleet,
+    robots: Sequence[str],
+    problems: Callable[[RobotStatus], Iterable[str]],
+) -> list[_Group]:
     """Group robots with the same state, remedy and summary; the last group has the current robots.
 
-    If ``robots`` are named, each robot is a group of its own.
+    If ``robots`` are named, each robot is a group of its own.  ``problems`` returns the clauses of
+    the summary on a robot's problems.
     """
     status, places = compared_fleet.status, _robot_positions(compared_fleet.status.names)
     robots_by_texts: dict[tuple[str, ...], list[RobotStatus]] = {}
@@ -1008,6 +1013,7 @@ def _groups(compared_fleet: ComparedFleet, robots: Sequence[str]) -> list[_Group
             clauses = (
                 *_expiry_clauses(robot, compared_fleet.at),
                 *_summary(robot, status.stage, compared_fleet.at),
+                *problems(robot),
             )
             what = _CLOCK_SENTENCE.sub("", _without_robot_name("; ".join(clauses), robot.robot))
             clauses_by_robot[robot.robot] = what
@@ -1026,7 +1032,8 @@ def _groups(compared_fleet: ComparedFleet, robots: Sequence[str]) -> list[_Group
 
 def _rows(compared_fleet: ComparedFleet, robots: Sequence[str]) -> Iterator[tuple[str, ...]]:
     """Yield the header and the rows of a table, or nothing if no robot needs a row."""
-    groups = _groups(compared_fleet, robots)
+    # Of named robots, `_file_details` shows the problems.
+    groups = _groups(compared_fleet, robots, (lambda _: ()) if robots else _gravest_problem)
     if not robots and all(group.state == "current" for group in groups):
         groups = [group for group in groups if group.what]
     if not groups:
@@ -1046,7 +1053,10 @@ def _page_rows(compared_fleet: ComparedFleet, robots: Sequence[str]) -> Iterator
     """
     from sros_tool.validity import iso
 
-    for group in _groups(compared_fleet, robots):
+    def problems(robot: RobotStatus) -> Iterable[str]:
+        return robot.problem_clauses if robots else _gravest_problem(robot)
+
+    for group in _groups(compared_fleet, robots, problems):
         status, most = compared_fleet.status, len(group.robots)
         names = _robot_names(group.names, status.names, status.groups, most)
         received = group.oldest_confirmation(compared_fleet.at).received
@@ -1249,9 +1259,13 @@ def _summary(robot: RobotStatus, stage: str, moment: datetime) -> Iterator[str]:
     if robot.enclaves and robot.stage not in ("", "unknown", stage):
         yield f"its CA files are of the stage '{robot.stage}'"
     yield from robot.notes
-    for number, problem in enumerate((robot.problems or ())[:_MOST_GROUPS]):
-        # Whoever controls the robot chose the words.
-        yield f"it reports: {problem}" if number < robot.reported else problem
+
+
+def _gravest_problem(robot: RobotStatus) -> Iterator[str]:
+    """Yield the gravest problem of a robot, and the number of the others."""
+    yield from robot.problem_clauses[:1]
+    if (more := len(robot.problem_clauses) - 1) > 0:
+        yield f"{counted(more, 'more problem')}, see --robot"
 
 
 def _kind_in_plural(number: int, kind: str) -> str:
@@ -1261,8 +1275,9 @@ def _kind_in_plural(number: int, kind: str) -> str:
 
 
 def _file_details(robot: RobotStatus) -> Iterator[str]:
-    """Yield the files of a robot: their number by kind and state, and the files that differ."""
+    """Yield the problems of a robot, and its files: their number by state, and what differs."""
     yield f"{robot.robot}:"
+    yield from (f"  {problem}" for problem in robot.problem_clauses)
     where = ("in its folder", "elsewhere, with its name in the path")
     for names, place in zip(robot.others, where, strict=True):
         see = ", see --json" if len(names) > _MOST_GROUPS else ""

@@ -240,9 +240,13 @@ OF_SAME_NUMBER = "of the installed release, but other files"
 COULD_NOT_START = "could not start"
 """A robot's words if no process would start in an enclave."""
 REPLACED_FILES = "changed or missing here, and replaced: "
+"""An agent's words on files that it has mended, and reports for a day."""
 READABLE_KEYS = ", others could read "
 REMOVED_ENCLAVES = "The agent removed enclaves, "
-"""An agent's words on what it has mended, and reports for a day."""
+_OPEN_KEYS = ("private key that others can read", "private key others can read")
+_TWO_COMPUTERS = "Two computers with the keys of this robot"
+_COPIED_KEYS = (READABLE_KEYS, REMOVED_ENCLAVES, *_OPEN_KEYS, _TWO_COMPUTERS)
+"""Words on private keys that somebody may have copied."""
 
 
 def concerns_key(problem: str) -> bool:
@@ -265,6 +269,13 @@ def is_unusable(problem: str) -> bool:
 def is_mended(problem: str) -> bool:
     """Return whether a robot's problem is over: its agent mended it, and reports it for a day."""
     return any(words in problem for words in (REPLACED_FILES, READABLE_KEYS, REMOVED_ENCLAVES))
+
+
+def problem_rank(problem: str) -> int:
+    """Return the rank of a robot's problem, 0 for the gravest: somebody may have copied a key."""
+    if any(words in problem for words in _COPIED_KEYS):
+        return 0
+    return 2 if is_mended(problem) else 1
 
 
 def is_enclave_below_root(name: str) -> bool:
@@ -336,9 +347,9 @@ def shortened_dds(dds: RobotDds) -> RobotDds:
 
 
 def shortened_problems(problems: Iterable[str]) -> tuple[str, ...]:
-    """Return problems with the length and the number that confirmations allow."""
+    """Return problems with the length and the number that confirmations allow, sorted by rank."""
     texts = []
-    for problem in dict.fromkeys(problems):
+    for problem in sorted(dict.fromkeys(problems), key=problem_rank):
         text = "".join(character if character.isprintable() else "?" for character in problem)
         texts.append(text if len(text) <= LONGEST_PROBLEM else f"{text[: LONGEST_PROBLEM - 3]}...")
     surplus = len(texts) - MOST_PROBLEMS
@@ -464,9 +475,8 @@ class ReceivedConfirmation:
         if alternated is None or self.time - alternated > timedelta(days=1):
             return ""
         return (
-            "Two computers with the keys of this robot send messages in turn, last at "
-            f"{iso(alternated)}; perhaps a disk was copied. The files of the other computer are "
-            "not known."
+            f"{_TWO_COMPUTERS} send messages in turn, last at {iso(alternated)}; perhaps a disk "
+            "was copied. The files of the other computer are not known."
         )
 
     def clock_note(self) -> str:

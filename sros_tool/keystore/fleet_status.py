@@ -44,6 +44,7 @@ from sros_tool.keystore.confirmation import (
     is_mended,
     is_unusable,
     last_confirmation,
+    problem_rank,
     refusals,
     shows_old_copy,
 )
@@ -353,6 +354,19 @@ class RobotStatus:
         """Whether the robot is `settled` except for problems that its agent has mended."""
         is_over = self.state is State.CURRENT and all(map(is_mended, self.problems or ()))
         return self.settled or is_over
+
+    @property
+    def problem_clauses(self) -> list[str]:
+        """The problems, the gravest first; the robot's own words begin with "it reports"."""
+        problems = enumerate(self.problems or ())
+        clauses = [
+            # Whoever controls the robot chose the words.
+            (problem_rank(text), True, f"it reports: {text}")
+            if number < self.reported
+            else (problem_rank(text), False, text)
+            for number, text in problems
+        ]
+        return [clause for *_, clause in sorted(clauses, key=lambda clause: clause[:2])]
 
     @property
     def last_heard(self) -> datetime | None:

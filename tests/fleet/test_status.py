@@ -22,6 +22,8 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from sros_tool.agent.running import EnclaveProcesses
 from sros_tool.agent.state import AgentState, write_state
+from sros_tool.checks.keystores.files import KEY_READABLE
+from sros_tool.checks.processes import PROCESS_KEY_READABLE
 from sros_tool.cli import fleet as fleet_verbs
 from sros_tool.cli.fleet import (
     ComparedFleet,
@@ -33,12 +35,15 @@ from sros_tool.cli.fleet import (
 )
 from sros_tool.keystore.confirmation import (
     MESSAGE_FILE,
+    READABLE_KEYS,
+    REPLACED_FILES,
     RobotClock,
     RobotDds,
     RobotLibrary,
     RunningFiles,
     Seen,
     parse_confirmation,
+    problem_rank,
 )
 from sros_tool.keystore.fleet_status import (
     FleetStatus,
@@ -314,6 +319,25 @@ def test_what_a_robot_says_is_neither_an_error_nor_a_word_of_sros(field: Field) 
     assert "it reports: a 5 s b\n" in said and "it reports: a  b\n" in said
     field.send("r1", problems=["Publish with --restored."])
     assert "it reports: Publish with --rest" in field.run("fleet", "status", "ks", status=1).out
+
+
+def test_the_gravest_problem_of_a_robot_is_shown_and_the_number_of_the_others(
+    field: Field,
+) -> None:
+    """Whatever another robot reports, with --robot all are shown."""
+    key = f"Until 2026-11-29T12:00:00Z{READABLE_KEYS}1 private key: x."
+    mended = f"1 file was {REPLACED_FILES}x."
+    field.send("r1", problems=[mended, "a", "b", "c", key])
+    field.send("r2", problems=[f"{KEY_READABLE.title} {number}" for number in range(50)])
+    ended = field.run("fleet", "status", "ks", status=1).out
+    assert f"  it reports: {key}; 4 more problems, see --robot\n" in ended
+    ended = field.run("fleet", "status", "ks", "--robot", "r1", status=1).out
+    lines = "".join(f"  it reports: {problem}\n" for problem in (key, "a", "b", "c", mended))
+    assert f"\nr1:\n{lines}" in ended and ended.count(key) == 1
+    page = field.run("fleet", "status", "ks", "--robot", "r1", "--html", status=1).out
+    assert all(f"it reports: {problem}" in page for problem in (key, "a", "b", "c", mended))
+    copied = (KEY_READABLE.title, PROCESS_KEY_READABLE.title, key)
+    assert {*map(problem_rank, copied)} == {0} and problem_rank(mended) == 2
 
 
 def test_a_web_server_cannot_keep_the_keystore_busy_with_archives(field: Field) -> None:
