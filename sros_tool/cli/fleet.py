@@ -306,9 +306,9 @@ def _collect(
       renewed /r1/base for the key 6f5bbd292e91c5d0...
       $ sros fleet collect keystore inbox --publish pub
 
-    The exit status is 0 if nothing was refused, 1 if a message, request or release was refused or
-    the fleet file does not allow a request, and 2 if the CAs cannot sign, or the releases cannot be
-    published.
+    The exit status is 0 if nothing was refused, 1 if a message, request or release was refused, the
+    fleet file does not allow a request, or published files were altered, and 2 if the CAs cannot
+    sign, or the releases cannot be published.
     """
     from sros_tool.keystore.delivery.collect import PublishedAnswers, collect
 
@@ -334,7 +334,9 @@ def _collect(
                 moment = now()
                 published = publish(root, folder, now=moment, keyring=keys, dry_run=dry_run)
             new, refused = published.names("published"), published.names("refused")
-            collected = collected._replace(published=PublishedAnswers(folder, new, refused))
+            collected = collected._replace(
+                published=PublishedAnswers(folder, new, refused, published.altered)
+            )
         except (SrosError, OSError) as error:
             problem = error  # what was collected is printed first
     if as_json:
@@ -495,8 +497,9 @@ def _publish(
       $ sros fleet publish keystore pub --rotate-key timestamp
             --root-key /media/safe/fleet_root.pem
 
-    The exit status is 1 in two cases: an enclave of a robot cannot run, so that its release was
-    refused; or the root metadata has expired, so that robots refuse everything.
+    The exit status is 1 in three cases: an enclave of a robot cannot run, so that its release was
+    refused; the root metadata has expired, so that robots refuse everything; or files in PUB were
+    missing, changed or older than this verb published them, so that it published them again.
     """
     from sros_tool.keystore.delivery.publish import publish
     from sros_tool.keystore.delivery.published import MetadataExpiry
@@ -620,9 +623,10 @@ class ComparedFleet(NamedTuple):
     default="delivery",
     show_default=True,
     help="`delivery`: the exit status is 1 only for problems with the delivery of files, and for "
-    "problems that agents report. `unmended`: as `delivery`, but problems that an agent has mended "
-    "(such as a changed file; agents report them for a day) do not count. `vulnerabilities`: as "
-    "`delivery`, and also for a DDS with known vulnerabilities that a later release fixes.",
+    "problems that agents report. `unmended`: as `delivery`, but problems that an agent or `sros "
+    "fleet publish` has mended (such as a changed file; they are shown for a day) do not count. "
+    "`vulnerabilities`: as `delivery`, and also for a DDS with known vulnerabilities that a later "
+    "release fixes.",
 )
 @output_option("Replace FILE atomically instead of printing.")
 @dry_run_option
@@ -670,10 +674,10 @@ def _status(
       $ sros fleet status keystore --prometheus -o /var/lib/.../fleet.prom
 
     The exit status is 0 if every robot that is not revoked has confirmed the files that it should
-    have, no restart is due, no agent reports a problem, no published file is missing, and robots
-    still accept the published files. Otherwise it is 1. With --fail-on unmended, problems that an
-    agent has mended do not count. With --fail-on vulnerabilities, it is also 1 if a robot has a DDS
-    to upgrade.
+    have, no restart is due, no agent reports a problem, no published file is missing or was altered
+    in the last day, and robots still accept the published files. Otherwise it is 1. With --fail-on
+    unmended, problems that an agent or `sros fleet publish` has mended do not count. With --fail-on
+    vulnerabilities, it is also 1 if a robot has a DDS to upgrade.
     """
     from sros_tool.checks.vulnerabilities import is_fixed_later, robot_findings
     from sros_tool.keystore.fleet_status import fleet_status
@@ -841,6 +845,13 @@ def _fleet_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
         yield f"the published files expired {ago} ago, so robots get no new files: run `{publish}`"
     elif publication and publication.accepted is None:
         yield f"the expiry of the published files is not known: run `{publish}`"
+    if publication and publication.altered:
+        ago = elapsed(compared_fleet.at - max(publication.altered.values()))
+        yield (
+            "published files were missing, changed or older than published: "
+            f"{first_few(list(publication.altered), _MOST_GROUPS)} (last seen {ago} ago). They are "
+            "published again; find out who else can write to the folder"
+        )
     if status.stage != "complete":
         behind, robots = len(status.unconfirmed), sum(bool(each.enclaves) for each in status.robots)
         every = "all " if robots > 1 else ""

@@ -48,7 +48,7 @@ from sros_tool.keystore.confirmation import (
     refusals,
     shows_old_copy,
 )
-from sros_tool.keystore.delivery.published import read_published
+from sros_tool.keystore.delivery.published import altered_lately, read_published
 from sros_tool.keystore.fleet import enclaves_of_robot, fleet_edits_clause, recorded_fleet
 from sros_tool.keystore.known_keys import restored_at
 from sros_tool.keystore.layout import (
@@ -458,7 +458,7 @@ class RobotStatus:
 
 
 @shows(
-    *("folder", "expires", "root_expires", "accepted", "lacks", "refused"),
+    *("folder", "expires", "root_expires", "accepted", "lacks", "refused", "altered"),
     null_if_empty=("folder", "lacks", "refused"),
 )
 @dataclass(frozen=True, slots=True)
@@ -486,6 +486,10 @@ class PublishedMetadata:
     """Why the metadata in ``folder`` does not verify, so that robots refuse it, as a clause.  Null
     if the metadata verifies, or if the folder is not on this machine.
     """
+    altered: Mapping[str, datetime] = field(default_factory=dict)
+    """Files that ``sros fleet publish`` found missing, changed or older than published in the last
+    day, and published again, with the time, in UTC.
+    """
 
     @property
     def is_in_order(self) -> bool:
@@ -495,7 +499,8 @@ class PublishedMetadata:
     def at(self, now: datetime) -> PublishedMetadata:
         """Return this publication as robots see it at the time ``now``."""
         accepted = now < self.expires if self.expires else None
-        return replace(self, accepted=False if self.refused else accepted)
+        altered = altered_lately(self.altered, now)
+        return replace(self, accepted=False if self.refused else accepted, altered=altered)
 
 
 @shows(
@@ -597,15 +602,19 @@ class FleetStatus:
     def complete(self) -> bool:
         """Whether nothing is left to do for the fleet; if false, the exit status is 1.  True if
         every robot with enclaves confirmed the current files in time, no restart is due, no agent
-        reports a problem, robots can still fetch the published releases, and there is no other
-        doubt about the robots' files.  Robots whose enclaves were all revoked do not count.
+        reports a problem, robots can still fetch the published releases, no published file was
+        altered in the last day, and there is no other doubt about the robots' files.  Robots whose
+        enclaves were all revoked do not count.
         """
-        return self._is_in_order and all(robot.settled for robot in self.robots)
+        is_altered = self.publication is not None and bool(self.publication.altered)
+        in_order = self._is_in_order and not is_altered
+        return in_order and all(robot.settled for robot in self.robots)
 
     @property
     def mended(self) -> bool:
         """Like ``complete``, but problems that an agent has mended, and reports for a day, do not
         count: files that it replaced, keys that others could read, and enclaves that it removed.
+        Altered files that were published again do not count, either.
         """
         return self._is_in_order and all(robot.mended for robot in self.robots)
 
@@ -959,6 +968,7 @@ class _KeystoreRecords:
                 published.root_until,
                 lacks=published.first_missing(),
                 refused=metadata_problem(keystore),
+                altered=published.altered,
             )
             if published.robots
             else None
@@ -1540,8 +1550,8 @@ def fleet_metrics(
         ),
         Metric(
             "sros_fleet_mended",
-            "Like sros_fleet_complete, but problems that an agent has mended do not count; agents "
-            "report them for a day.",
+            "Like sros_fleet_complete, but problems that an agent or `sros fleet publish` has "
+            "mended do not count; they are shown for a day.",
             (Sample(int(status.mended), place),),
         ),
         Metric(
@@ -1604,6 +1614,12 @@ def fleet_metrics(
             "sros_fleet_root_expiry_timestamp_seconds",
             "When the root metadata expires, in seconds since 1970; only the root key renews it.",
             (Sample(int(root.timestamp()), place),) if root else (),
+        ),
+        Metric(
+            "sros_fleet_publication_altered",
+            "Number of published files that `sros fleet publish` found missing, changed or older "
+            "than published in the last day, and published again.",
+            (Sample(len(status.publication.altered), place),) if status.publication else (),
         ),
         Metric(
             "sros_fleet_agent_problems",

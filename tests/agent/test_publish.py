@@ -28,7 +28,7 @@ from sros_tool.keystore.delivery import publish as publishing
 from sros_tool.keystore.delivery import published
 from sros_tool.keystore.delivery.export import ReleasedEnclave
 from sros_tool.keystore.delivery.export import released_enclave as evaluate
-from sros_tool.keystore.delivery.publish import publish
+from sros_tool.keystore.delivery.publish import PublishedFleet, publish
 from sros_tool.keystore.delivery.published import (
     MetadataExpiry,
     PublishedRelease,
@@ -228,7 +228,10 @@ def test_an_earlier_revocation_list_is_not_published(publisher: Home) -> None:
 
 
 @pytest.mark.parametrize("missing", [False, True])
-def test_a_damaged_archive_is_published_again(publisher: Home, missing: bool) -> None:
+@pytest.mark.parametrize("is_renewed", [False, True])
+def test_a_damaged_archive_is_published_again(
+    publisher: Home, missing: bool, is_renewed: bool
+) -> None:
     assert not publisher.publish().notes
     (archive,) = (publisher.pub / "targets/robots").glob("*.r2.tar.gz")
     data = archive.read_bytes()
@@ -236,10 +239,39 @@ def test_a_damaged_archive_is_published_again(publisher: Home, missing: bool) ->
     if missing:
         archive.unlink()
     publisher.robot("r2").refuses(FetchProblem.UNREACHABLE if missing else FetchProblem.NOT_SIGNED)
+    publisher.run("renew", "ks", "/r2/base" if is_renewed else "/r1/base")
     result = publisher.publish()
-    assert result.names("published") == ["r2"]
+    assert "r2" in result.names("published")
     assert [note.id for note in result.notes] == ["fleet.archive-damaged"]
     assert publisher.robot("r2").gets().number > read_release(data).number
+    assert_shown_for_a_day(publisher, result, "robots/r2.tar.gz")
+
+
+@pytest.mark.parametrize("whole", [False, True])
+def test_a_folder_that_went_back_is_published_again_and_shown(publisher: Home, whole: bool) -> None:
+    """With all its files, or only the timestamp; each time, one run shows it, and the next not."""
+    earlier = publisher.kept("earlier")
+    publisher.run("renew", "ks", "/r1/base")
+    publisher.publish()
+    if whole:
+        shutil.rmtree(publisher.pub)
+        earlier.rename(publisher.pub)
+    else:
+        shutil.copy(earlier / "metadata/timestamp.json", publisher.pub / "metadata")
+    result = publisher.publish()
+    assert [note.id for note in result.notes] == ["fleet.metadata-older"]
+    assert_shown_for_a_day(publisher, result, "metadata/timestamp.json")
+    publisher.robot().gets()
+
+
+def assert_shown_for_a_day(publisher: Home, result: PublishedFleet, file: str) -> None:
+    """Assert that a run which published a file again ends with 1, and the status has the file."""
+    assert result.altered == [file] and not result.is_complete(publisher.now)
+    for hours, is_shown in ((1, True), (22, True), (2, False)):
+        done = publisher.publish(after=timedelta(hours=hours))
+        assert not done.altered and done.is_complete(publisher.now)
+        status = fleet_status(OpenedKeystore(publisher.root)).with_overdue(publisher.now)
+        assert status.publication and list(status.publication.altered) == [file] * is_shown
 
 
 def test_a_private_key_in_a_file_that_would_be_published(publisher: Home) -> None:

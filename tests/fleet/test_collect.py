@@ -1035,7 +1035,8 @@ def test_what_was_renewed_is_published_at_once(home: Home) -> None:
     home.run("renew", "ks", "/r1/base")
     ended = sros("fleet", "collect", "ks", "inbox", "--publish", "pub", "--json", cwd=home.folder)
     said = json.loads(ended.out)["published"]
-    assert ended.status == 0 and said == {"folder": "pub", "robots": [*ROBOTS], "refused": []}
+    published = {"folder": "pub", "robots": [*ROBOTS], "refused": [], "altered": []}
+    assert ended.status == 0 and said == published
     number = read_published(OpenedKeystore(home.root)).robots["r1"].release.number
     home.send("r1", datetime.now(UTC), release=number - 1)
     ended = sros("fleet", "collect", "ks", "inbox", "--publish", "pub", cwd=home.folder).ok()
@@ -1075,7 +1076,14 @@ def test_a_publishing_folder_that_lost_its_files_is_not_in_order(home: Home) -> 
     ended = sros(*status, cwd=home.folder)
     assert f"'{pub}' lacks {archive}, which robots fetch: {command}\n" in ended.out
     assert ended.status == 1
-    sros(*publish, cwd=home.folder).ok()
+    ended = sros("fleet", "collect", "ks", "inbox", "--publish", pub, cwd=home.folder)
+    assert ended.status == 1 and f"archives in '{pub}' were missing or changed: r2." in ended.err
+    for fail_on, exit_status in (("delivery", 1), ("unmended", 0)):
+        shown = sros(*status, "--fail-on", fail_on, cwd=home.folder)
+        assert "than published: robots/r2.tar.gz (last seen" in shown.out
+        assert shown.status == exit_status
+    metrics = sros(*status, "--prometheus", cwd=home.folder).out
+    assert re.search(r"^sros_fleet_publication_altered\{.*\} 1$", metrics, re.MULTILINE)
     (pub / "metadata/timestamp.json").unlink()
     found = sros(*status, cwd=home.folder).out
     assert f"metadata/timestamp.json, which robots fetch: {command} says what to check" in found

@@ -1567,7 +1567,7 @@ def test_the_alerts_of_the_page_name_metrics_that_are_written(field: Field) -> N
     alerts = [rule["expr"] for rule in yaml.safe_load(rules)["groups"][0]["rules"]]
     named = {name for alert in alerts for name in re.findall(r"sros_\w+", alert)}
     metrics = fleet_metrics(fleet_status(OpenedKeystore(field.root)), now=datetime.now(UTC))
-    assert len(named) == len(alerts) == 11 and named <= {metric.name for metric in metrics}
+    assert len(named) == len(alerts) == 12 and named <= {metric.name for metric in metrics}
 
 
 def test_metrics_and_the_page(field: Field) -> None:

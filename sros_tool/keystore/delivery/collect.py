@@ -147,6 +147,10 @@ class PublishedAnswers(NamedTuple):
     """Robots with a new release, sorted by name."""
     refused: Sequence[str]
     """Robots whose release was refused, because an enclave cannot run."""
+    altered: Sequence[str]
+    """Published files that were missing, changed or older than published, as with ``sros fleet
+    publish``.
+    """
 
 
 class CollectedInbox(NamedTuple):

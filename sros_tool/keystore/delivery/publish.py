@@ -34,10 +34,12 @@ from sros_tool.keystore.delivery.export import released_enclave, released_files
 from sros_tool.keystore.delivery.published import (
     BEGIN_AGAIN,
     MOST_NUMBER,
+    TIMESTAMP_PATH,
     Evaluated,
     MetadataExpiry,
     PublishedRelease,
     PublishedRobot,
+    altered_lately,
     damaged_list_error,
     may_have_later_releases,
     read_published,
@@ -49,6 +51,7 @@ from sros_tool.keystore.delivery.release import (
     check_tuf,
     pack_release,
     read_release,
+    release_target,
     seal_problem,
     seal_releases,
 )
@@ -183,6 +186,11 @@ class PublishedFleet(NamedTuple):
     """
     later: Sequence[LaterChange]
     """With ``--restored``: changes from after the backup that the keystore lacks."""
+    altered: Sequence[str]
+    """Files that this run found missing, changed or older than the keystore published them: an
+    archive as ``robots/NAME.tar.gz``, and ``metadata/timestamp.json``. This run published them
+    again, and the exit status is 1.
+    """
     changes: FileChanges
     notes: Notes
 
@@ -191,8 +199,11 @@ class PublishedFleet(NamedTuple):
         return [robot.robot for robot in self.robots if robot.outcome == outcome]
 
     def is_complete(self, now: datetime) -> bool:
-        """Return whether no release was refused, and robots accept the metadata at ``now``."""
-        return not self.names("refused") and all(end > now for end in self.expires.values())
+        """Return whether no release was refused, no published file was found altered, and robots
+        accept the metadata at ``now``.
+        """
+        is_accepted = all(end > now for end in self.expires.values())
+        return is_accepted and not (self.names("refused") or self.altered)
 
 
 def publish(
@@ -679,6 +690,7 @@ class _Publication:
         self._made: list[_ReleaseOutcome] = []
         self._removed: list[str] = []
         self._damaged: set[str] = set()
+        self._altered: Sequence[str] = ()
         self._number = 0
         self._least = 0
         self._changes: Sequence[FileChange] = ()
@@ -1103,11 +1115,11 @@ class _Publication:
             wanted.add(robot)
             state = _files_digest(root, names)
             before = self.list.robots.get(robot)
-            if not before or before.files != state:
+            has_files = before is not None and self._has_files_of(robot, before.release)
+            if not before or before.files != state or not has_files:
                 changed_robots.append(_ChangedRobot(robot, names, state))
-            elif not self._has_files_of(robot, before.release):
-                changed_robots.append(_ChangedRobot(robot, names, state))
-                self._damaged |= {robot} if self._there.get(robot) == before.release else set()
+            if before and not has_files and self._there.get(robot) == before.release:
+                self._damaged.add(robot)
         known = self.list.robots.keys() | self._there.keys()
         gone = (known if among is None else looked_at) - wanted
         for name in gone:
@@ -1176,10 +1188,6 @@ class _Publication:
         on_token = authority is not None and authority.on_token
         made = [(changed, work(changed))] if on_token else map_slices(changed, work)
         self._made = [robot for _, part in made for robot in part]
-        if self._damaged:
-            text = f"archives in '{self._folder}' were missing or damaged, so that robots refused "
-            text += f"them: {first_few(sorted(self._damaged), 5)}"
-            self._notes.append(Note("fleet.archive-damaged", text))
         lines = []
         for robot, published, is_new, _, not_valid in self._made:
             self.list.robots.pop(robot, None)
@@ -1250,6 +1258,7 @@ class _Publication:
         """Compose the metadata, and note which files it no longer names."""
         from sros_tool.keystore.delivery.repository import MetadataComposer
 
+        self._note_altered()
         composer = MetadataComposer(
             self._present,
             keys.signers,
@@ -1273,6 +1282,33 @@ class _Publication:
         self.list.superseded = {
             path: self.list.superseded.get(path, self._now)
             for path in islice(superseded, _MOST_SUPERSEDED)
+        }
+
+    def _note_altered(self) -> None:
+        """Note which published files are missing, changed or older, and list them for a day."""
+        altered = [release_target(robot) for robot in sorted(self._damaged)]
+        if altered:
+            text = (
+                f"archives in '{self._folder}' were missing or changed: "
+                f"{first_few(sorted(self._damaged), 5)}. They are published again, with a new "
+                "number. Find out who else can write to this folder."
+            )
+            self._notes.append(Note("fleet.archive-damaged", text))
+        present, last = (
+            of.get("timestamp", 0) for of in (self._present.versions(), self.list.versions)
+        )
+        if 0 < present < last and not self._is_other_folder:
+            altered.append(TIMESTAMP_PATH)
+            text = (
+                f"the metadata in '{self._folder}' was older than the keystore published it last, "
+                "and is published again. Either a run was interrupted, or somebody put earlier "
+                "files there: find out who else can write to this folder."
+            )
+            self._notes.append(Note("fleet.metadata-older", text))
+        self._altered = altered
+        self.list.altered = {
+            **altered_lately(self.list.altered, self._now),
+            **dict.fromkeys(altered, self._now),
         }
 
     def _paths(self) -> Iterator[str]:
@@ -1364,6 +1400,7 @@ class _Publication:
             hashlib.sha256(data).hexdigest(),
             list(_robots_without_ca(self.keystore, sorted(sealed))),
             self._later,
+            self._altered,
             self._changes,
             (*self._notes, *keys.notes),
         )

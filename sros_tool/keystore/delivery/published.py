@@ -40,7 +40,9 @@ MOST_NUMBER = 10**12 - 1
 """Highest number of a release that a seal can have, and highest version of metadata."""
 BEGIN_AGAIN = "Start again as after a theft of all keys: docs/fetching.md says how."
 """The remedy if somebody has used up the version numbers."""
-_TIMESTAMP_PATH = "metadata/timestamp.json"
+TIMESTAMP_PATH = "metadata/timestamp.json"
+_ALTERED_FOR = timedelta(days=1)
+"""How long it is remembered that a published file was altered."""
 _DIGEST = re.compile(r"[0-9a-f]{64}\Z")
 
 
@@ -111,9 +113,12 @@ class Published:
     ``superseded`` maps paths in the publishing folder that nothing names any more to the time when
     sros first noticed this.  ``folder`` is the absolute path of the publishing folder, "" if
     unknown. ``metadata`` has the paths there of the metadata to which the timestamp leads.
+    ``altered`` maps files that a run found missing, changed or older than published to the time of
+    that run; it has only targets and ``metadata/timestamp.json``, so that it stays small.
     ``until`` is the first expiry of the metadata: from then on, robots refuse it; ``root_until`` is
-    the expiry of the root metadata.  These three fields are empty or None if nothing was published,
-    or if an earlier release of sros, which did not record them, published last.
+    the expiry of the root metadata.  These fields, from ``folder`` on, are empty
+    or None if nothing was published, or if an earlier release of sros, which did not record them,
+    published last.
     """
 
     robots: dict[str, PublishedRobot] = field(default_factory=dict)
@@ -123,6 +128,7 @@ class Published:
     metadata: Sequence[str] = ()
     until: datetime | None = None
     root_until: datetime | None = None
+    altered: dict[str, datetime] = field(default_factory=dict)
 
     @property
     def number(self) -> int:
@@ -139,7 +145,7 @@ class Published:
 
         The result is also "" if the folder is not here, for example on a disk that is not mounted.
         """
-        paths = (_TIMESTAMP_PATH, *self.paths())
+        paths = (TIMESTAMP_PATH, *self.paths())
         with suppress(OSError):
             if self.folder and Path(self.folder).is_dir():
                 return next((path for path in paths if not Path(self.folder, path).exists()), "")
@@ -157,8 +163,14 @@ class Published:
             "root_until": iso(self.root_until) if self.root_until else None,
             "versions": dict(sorted(self.versions.items())),
             "metadata": list(self.metadata),
+            "altered": {path: iso(time) for path, time in sorted(self.altered.items())},
         }
         return json.dumps({**value, "superseded": superseded, "robots": robots}).encode()
+
+
+def altered_lately(altered: Mapping[str, datetime], now: datetime) -> dict[str, datetime]:
+    """Return the files of ``Published.altered`` that were found in the last day before ``now``."""
+    return {path: at for path, at in altered.items() if now - at < _ALTERED_FOR}
 
 
 def read_published(keystore: OpenedKeystore) -> Published:
@@ -172,16 +184,18 @@ def read_published(keystore: OpenedKeystore) -> Published:
     try:
         path = keystore.root / PUBLISHED
         value = parse_json(read_bytes(path, "list of what is published", max_bytes=_MOST_BYTES))
+        until, root_until = (
+            parse_iso(end) if (end := value.get(name)) else None for name in ("until", "root_until")
+        )
         return Published(
             {name: _robot_from(robot_value) for name, robot_value in value["robots"].items()},
             {name: check_positive_number(version) for name, version in value["versions"].items()},
             {path: parse_iso(time) for path, time in value["superseded"].items()},
             str(value.get("folder", "")),
             [str(path) for path in value.get("metadata", ())],
-            *(
-                parse_iso(end) if (end := value.get(name)) else None
-                for name in ("until", "root_until")
-            ),
+            until,
+            root_until,
+            {str(path): parse_iso(at) for path, at in value.get("altered", {}).items()},
         )
     except (ValueError, OverflowError, KeyError, TypeError, AttributeError) as error:
         raise damaged_list_error(keystore) from error
@@ -196,7 +210,7 @@ def may_have_later_releases(keystore: OpenedKeystore) -> bool:
     with suppress(SrosError, ValueError, OSError, KeyError, TypeError):
         known = read_published(keystore)
         if known.folder:
-            path = Path(known.folder) / _TIMESTAMP_PATH
+            path = Path(known.folder) / TIMESTAMP_PATH
             version = parse_json(read_bytes(path, "timestamp", max_bytes=_MOST_TIMESTAMP_BYTES))[
                 "signed"
             ]["version"]
