@@ -390,7 +390,7 @@ def _differ_only_by_namespace(statement_a: _Statement, statement_b: _Statement) 
 
 def _candidates_text(candidates: Sequence[_Statement]) -> str:
     texts = dict.fromkeys(f"{candidate.name} ({candidate.right.right})" for candidate in candidates)
-    return f"perhaps you mean {' or '.join([*texts][:_NAMES_SHOWN])}, which nobody uses"
+    return f"perhaps you mean {' or '.join([*texts][:_NAMES_SHOWN])}"
 
 
 def _is_service_of_every_node(name: str) -> bool:

@@ -579,7 +579,7 @@ def _part_finding(
     kind: FindingKind, requirement: Requirement, why: Sequence[str], remedy: str = ""
 ) -> Finding:
     place = requirement.source
-    text = f"{'; '.join(why)}: {demand(requirement)}"
+    text = f"{'; '.join(why)}; required: {demand(requirement)}"
     return kind.found(place.file, text, place.file, place.line, remedy)
 
 

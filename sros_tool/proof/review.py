@@ -885,11 +885,11 @@ class _Review:
             yield "requirements: none are named"
         others = ""
         if self.decided_elsewhere:
-            others = f", where sros decided only {self.decided_elsewhere}"
+            others = f": there, sros decided only {self.decided_elsewhere}"
         if self.is_relative and not asked.namespaces:
             yield (
-                "requirements with relative names in other namespaces than / (--namespace NS "
-                f"decides them in NS){others}"
+                "requirements with relative names in namespaces other than / (add --namespace NS)"
+                f"{others}"
             )
         if not self.base:
             yield "nothing is compared with an earlier commit, as the options say"

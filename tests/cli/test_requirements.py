@@ -117,9 +117,12 @@ def test_what_holds_and_what_cannot_fail(folder: Path, tmp_path: Path) -> None:
     ended = sros(*ONLY, "--requirements", held, cwd=folder)
     assert ended.status == 1
     assert f"{held}:1: warning: a requirement that protects less than it states" in ended.out
-    assert "there is no enclave /mix (perhaps /mux is meant): only /mix may publish" in ended.out
+    assert (
+        "there is no enclave /mix (perhaps /mux is meant); required: only /mix may publish"
+        in ended.out
+    )
     empty = "no enclave may publish topic /cmdvel (perhaps /cmd_vel is meant)"
-    assert f"{empty}: only /mix may publish" in ended.out
+    assert f"{empty}; required: only /mix may publish" in ended.out
     held.write_text(held.read_text().replace("/cmdvel", "/cmd_vel"))
     ended = sros(*ONLY, "--requirements", held, cwd=folder)
     assert "[requirement.violated]" in ended.out and "[requirement.vacuous]" not in ended.out
@@ -132,7 +135,9 @@ def test_what_holds_and_what_cannot_fail(folder: Path, tmp_path: Path) -> None:
     ended = sros(*ONLY, "--requirements", held, cwd=folder)
     ended.ok()
     assert f"{held}:1: note: a requirement with an exception for an enclave that" in ended.out
-    assert "there is no enclave /teleop: only /mux, /web, /teleop may publish" in ended.out
+    assert (
+        "there is no enclave /teleop; required: only /mux, /web, /teleop may publish" in ended.out
+    )
 
 
 def test_an_action_that_is_a_service(tmp_path: Path) -> None:

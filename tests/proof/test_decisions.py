@@ -649,7 +649,7 @@ EXPRESSIBLE = {
     ),
     '[[only]]\npublish = ["/image"]\nenclaves = ["*", "!/base"]\n': "",
     '[[apart]]\nfrom = ["*", "!/camera"]\nto = ["/base"]\n': (
-        "r.toml: no two enclaves are left to keep apart: * (but not /camera) must not "
+        "r.toml: no two enclaves are left to keep apart; required: * (but not /camera) must not "
         "influence /base"
     ),
 }

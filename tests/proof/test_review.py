@@ -965,7 +965,9 @@ def test_a_change_renames_nothing_out_of_a_requirement(change: Change) -> None:
     renamed = {"/a": publish("/drive"), "/b": publish("/*"), "/c": publish("/drive")}
     change.commit({"robot.xml": policy_text(renamed)})
     ended = change.review(*words)
-    assert "no right names topic /x any more: only /a, /b may publish /x" in ended.out, ended
+    assert "no right names topic /x any more; required: only /a, /b may publish /x" in ended.out, (
+        ended
+    )
     assert ended.status == 1
     change.base = change.commit({"README": "x"})
     change.commit({"README": "y"})
@@ -978,7 +980,8 @@ def test_a_name_that_nobody_may_use_may_lose_its_denial_and_its_right(change: Ch
     change.base = change.commit({"robot.xml": denied, "robot.toml": required})
     words = ("--policy", "robot.xml", "--requirements", "robot.toml", "--new-access", "allow")
     change.commit({"README": "x"})
-    note = "  robot.toml:1: note: no right names topic /q: nobody may publish /q [requirement.unn"
+    said = "no right names topic /q; required: nobody may publish /q [requirement.unn"
+    note = f"  robot.toml:1: note: {said}"
     assert note in change.review(*words).ok().out
     change.base = change.commit({"robot.xml": policy_text({"/a": publish("/x", "/q")})})
     change.commit({"robot.xml": policy_text({"/a": publish("/x")})})
@@ -1292,13 +1295,13 @@ def test_requirements_of_a_package_are_decided_in_a_namespace(
     change.commit({"other": "1"})
     asked = ("--policy", "robot.xml", "--requirements", "robot.toml")
     ended = change.review(*asked).ok()
-    assert "other namespaces than / (--namespace NS decides them in NS), where sros" in ended.out
+    assert "namespaces other than / (add --namespace NS): there, sros decided only" in ended.out
     with monkeypatch.context() as patched:
         patched.setattr(review, "_MOST_NAMESPACES", 1)
         some = "the change breaks them in 1 of 2 namespaces (those of changed names first)"
         assert some in change.review(*asked).ok().out
     assert (
-        "(--namespace NS decides them in NS); nothing"
+        "(add --namespace NS); nothing"
         in sros("review", "--base", "none", *asked, cwd=change.folder).out
     )
     ended = change.review(*asked, "--namespace", "/l", "--namespace", "/")
