@@ -1112,6 +1112,9 @@ def test_messages_that_show_later_releases_refuse_a_new_folder(home: Home) -> No
         refused = sros(*publish, cwd=home.folder)
         assert refused.status == 2
         assert "the keystore 'ks' is older than its robots, as messages" in refused.err
+    copy_of(home.root, home.folder / "copy")
+    home.run("revoke", "copy", "--robot", "r1")  # a stolen robot may claim any number
+    home.run("fleet", "publish", "copy", "other", "--new-folder")
     sros(*publish, "--restored", cwd=home.folder).ok()
 
 

@@ -780,7 +780,10 @@ class _Publication:
         last = max((entry.number for entry in entries if entry.what == "release"), default=0)
         if restores_after_last_release(self.keystore):
             return True
-        for robot in recorded_fleet(self.keystore).robots:
+        fleet = recorded_fleet(self.keystore)
+        for robot, member in fleet.robots.items():
+            if not enclaves_of_robot(self.keystore, fleet, member):
+                continue  # it was revoked, and may claim anything so that no robot gets the list
             with suppress(SrosError):
                 if received := last_confirmation(self.keystore, robot):
                     sent = received.confirmation
