@@ -86,6 +86,7 @@ from sros_tool.keystore.layout import (
     IDENTITY_CA_FILE,
     KEY_FILE,
     KEY_URI_FILE,
+    PERMISSIONS_CA_FILE,
     PERMISSIONS_FILE,
     ROUTER_FILE,
     enclave_folder,
@@ -119,6 +120,8 @@ _TRUST_FILES = tuple(
     if file not in (CERTIFICATE_FILE, PERMISSIONS_FILE, GOVERNANCE_FILE)
 )
 """Files of an enclave that decide whom it trusts: CAs and revocation list."""
+_GRAVEST_FILES = (CRL_FILE, IDENTITY_CA_FILE, PERMISSIONS_CA_FILE, GOVERNANCE_FILE)
+"""The files that are named first if they were changed: they decide for all other enclaves, too."""
 _REPLACED_LIST = "replaced.crl.pem"
 _KEEP_REPLACED_LIST = timedelta(days=30)
 """How long the agent sends a revocation list after a release replaced it by a shorter one.
@@ -243,9 +246,7 @@ class _Round:
         if clock is not RobotClock.BEHIND and installation.made:
             clock = self._clock_next_to_release(installation.made) or clock
         self._note_unreleased_enclaves()
-        repaired = self._state.repaired_at
-        if repaired and abs(now - repaired) < _REPAIRS_REPORTED_FOR:
-            self._problems.append(self._state.repaired)
+        self._note_repaired(now)
         self._note_removed(now)
         names = self._enclaves()
         opened = open_installed(self._folder, names, now=now)
@@ -426,7 +427,8 @@ class _Round:
                 )
             )
         )
-        self._note_repaired(state.accepted, tuple(repaired))
+        moments = dict.fromkeys(repaired, self._machine.now)
+        self._state = replace(self._state, repairs={**self._state.repairs, **moments})
         if not is_later:
             removed = dict.fromkeys(installation.removed, self._machine.now)
             self._state = replace(self._state, removed={**self._state.removed, **removed})
@@ -503,16 +505,23 @@ class _Round:
                     "everything that the release lacks."
                 )
 
-    def _note_repaired(self, release: int, paths: Sequence[str]) -> None:
-        """Report for a day that the files ``paths`` were repaired."""
-        if paths:
-            now = self._machine.now
-            text = (
-                f"At {iso(now)}, {counted(len(paths), 'file')} of release {release} "
+    def _note_repaired(self, now: datetime) -> None:
+        """Report for a day the files that differed from the release and were replaced."""
+        recent = {
+            path: at
+            for path, at in self._state.repairs.items()
+            if abs(now - at) < _REPAIRS_REPORTED_FOR
+        }
+        self._state = replace(self._state, repairs=recent)
+        if recent:
+            first, last = iso(min(recent.values())), iso(max(recent.values()))
+            when = f"At {last}" if first == last else f"From {first} to {last}"
+            paths = sorted(recent, key=lambda path: (_repaired_rank(path), path))
+            self._problems.append(
+                f"{when}, {counted(len(paths), 'file')} of the release "
                 f"{'was' if len(paths) == 1 else 'were'} {REPLACED_FILES}"
                 f"{first_few(paths, 3)}. Find out who or what changes files on this robot."
             )
-            self._state = replace(self._state, repaired=text, repaired_at=now)
 
     def _note_removed(self, now: datetime) -> None:
         """Report for a day the enclaves that were removed because the release lacks them."""
@@ -1038,6 +1047,12 @@ def _moments_of(names: Collection[str], moments: Mapping[str, float]) -> dict[st
 def _boot_digest(robot: str, boot: str) -> str | None:
     """Return a SHA-256 that hides the random id of the machine's start; None without an id."""
     return hashlib.sha256(f"{robot} {boot}".encode()).hexdigest() if boot else None
+
+
+def _repaired_rank(path: str) -> int:
+    """Return the rank of a file that was changed, 0 for the gravest: a revocation list."""
+    file = path.rpartition("/")[2]
+    return _GRAVEST_FILES.index(file) if file in _GRAVEST_FILES else len(_GRAVEST_FILES)
 
 
 def _certificate_path(name: str) -> str:

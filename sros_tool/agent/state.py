@@ -11,7 +11,7 @@ import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -59,10 +59,10 @@ class AgentState:
     second digest is the same.  ``fetched`` and ``sent`` are when the source and the inbox were last
     reached. ``replaced`` and ``list_replaced`` map enclaves of `due` and `list_due` to when the
     agent last replaced their files, in seconds since the start of the machine: setting the clock
-    does not change these times. ``repaired`` is a sentence on files that differed from the release
-    and were replaced at ``repaired_at``.  ``exposed`` maps paths of private keys that other users
-    could read to the time of the last round that found them readable, and ``exposed_digests`` to
-    the SHA-256 of their public keys; ``removed`` maps enclaves that the installed release did not
+    does not change these times. ``repairs`` maps paths of files that differed from the release to
+    the time of the last round that replaced them.  ``exposed`` maps paths of private keys that
+    other users could read to the time of the last round that found them readable, and
+    ``exposed_digests`` to the SHA-256 of their public keys; ``removed`` maps enclaves that the installed release did not
     have to the time of the round that removed them.
     """
 
@@ -78,8 +78,7 @@ class AgentState:
     fetched: datetime | None = None
     sent: datetime | None = None
     problems: tuple[str, ...] = ()
-    repaired: str = ""
-    repaired_at: datetime | None = None
+    repairs: Mapping[str, datetime] = field(default_factory=dict)
     list_since: Mapping[str, datetime] = field(default_factory=dict)
     replaced: Mapping[str, float] = field(default_factory=dict)
     list_replaced: Mapping[str, float] = field(default_factory=dict)
@@ -95,6 +94,9 @@ class AgentState:
         disk was restored.
         """
         return max(self.sequence, int(now.timestamp())) + 1
+
+
+_STATE_KEYS = frozenset(key.name for key in fields(AgentState))
 
 
 def read_state(folder: Path) -> AgentState:
@@ -122,11 +124,10 @@ def _state_from(value: Any) -> AgentState:
     for number in ("release", "accepted", "sequence"):
         if type(value[number]) is not int or not 0 <= value[number] <= MOST_NUMBER:
             raise ValueError(number)
-    for moment in ("latest", "fetched", "sent", "repaired_at"):
+    for moment in ("latest", "fetched", "sent"):
         if value.get(moment) is not None:
             value[moment] = parse_iso(_checked_text(value[moment]))
     value["boot"] = _checked_text(value["boot"])
-    value["repaired"] = _checked_text(value.get("repaired", ""))
     value = {"list_due": value["due"], "restarted": [], **value}
     for names in ("due", "unseen", "restarted", "list_due"):
         value[names] = tuple(check_enclave_name(_checked_text(name)) for name in value[names])
@@ -134,7 +135,7 @@ def _state_from(value: Any) -> AgentState:
         check_enclave_name(_checked_text(name)): _checked_text(text)
         for name, text in dict(value.get("files", {})).items()
     }
-    for moments in ("exposed", "removed", "list_since"):
+    for moments in ("repairs", "exposed", "removed", "list_since"):
         value[moments] = {
             _checked_text(path): parse_iso(_checked_text(moment))
             for path, moment in dict(value.get(moments, {})).items()
@@ -149,7 +150,8 @@ def _state_from(value: Any) -> AgentState:
             for name, moment in dict(value.get(seconds, {})).items()
         }
     value["problems"] = tuple(map(_checked_text, value["problems"]))
-    return AgentState(**value)
+    # An agent of another version may remember more.
+    return AgentState(**{key: value[key] for key in value.keys() & _STATE_KEYS})
 
 
 def _checked_uptime(value: Any) -> float:

@@ -49,7 +49,7 @@ from sros_tool.runtime.processes import (
     RunningProcesses,
     UnseenProcess,
 )
-from sros_tool.validity import BACKDATE, Window
+from sros_tool.validity import BACKDATE, Window, iso
 from tests.agent import published
 from tests.agent.releases import NAMES, Home, files_of, moment, release_of
 from tests.agent.test_install import content, has
@@ -351,7 +351,7 @@ def test_what_somebody_damaged_is_installed_again(home: Home, r1: Robot) -> None
     (problem,) = (problem for problem in done.problems if "/r1/b keeps its files" in problem)
     bring = "`sros distribute_key KEYSTORE --robot r1 DIR --force`"
     assert "is not on this robot. A release has no keys" in problem and bring in problem
-    changed = "1 file of release 1 was changed or missing here, and replaced: enclaves/r1/a/p"
+    changed = "1 file of the release was changed or missing here, and replaced: enclaves/r1/a/p"
     assert sum(changed in problem for problem in done.problems) == 1
     shutil.copytree(r1.folder / "enclaves/r1/a", r1.folder / "enclaves/r1/b")
     (problem,) = (each for each in r1.round().problems if "/r1/b keeps its files" in each)
@@ -363,6 +363,24 @@ def test_what_somebody_damaged_is_installed_again(home: Home, r1: Robot) -> None
     late = r1.round(moment() + timedelta(days=1, minutes=1)).problems
     assert not any(changed in problem for problem in late)
     assert sros("agent", "status", r1.folder).status == 1
+
+
+def test_a_later_change_does_not_hide_that_the_revocation_list_was_removed(
+    home: Home, r1: Robot
+) -> None:
+    """Each file is named for a day, the gravest first."""
+    r1.release, start = home.revoked, moment()
+    r1.round()
+    files = ("b/crl.pem", "a/permissions.p7s", "a/governance.p7s", "a/cert.pem")
+    for hours, file in enumerate(files):
+        (r1.folder / "enclaves/r1" / file).unlink()
+        (problem,) = r1.round(start + timedelta(hours=hours)).problems
+        names = "enclaves/r1/b/crl.pem" + (", enclaves/r1/a/governance.p7s, " if hours > 1 else "")
+        assert f"replaced: {names}" in problem and is_mended(problem)
+    assert problem.startswith(f"From {iso(start)} to {iso(start + timedelta(hours=3))}, 4 files")
+    assert "/a/cert.pem and 1 more. Find out" in problem and problem in r1.message().problems
+    (problem,) = r1.round(start + timedelta(hours=24.5)).problems
+    assert "crl.pem" not in problem and ", 3 files" in problem
 
 
 def test_what_somebody_damaged_is_named_also_if_a_later_release_replaces_it(
@@ -377,7 +395,7 @@ def test_what_somebody_damaged_is_named_also_if_a_later_release_replaces_it(
     r1.release = home.revoked
     done = r1.round()
     assert (done.release, done.changed) == (3, ("/r1/b", "/r1/c"))
-    changed = f"1 file of release 1 was changed or missing here, and replaced: {path}. Find"
+    changed = f"1 file of the release was changed or missing here, and replaced: {path}. Find"
     assert sum(changed in problem for problem in done.problems) == 1
     (problem,) = (problem for problem in r1.round().problems if changed in problem)
     assert is_mended(problem), "for a day"
