@@ -1086,6 +1086,33 @@ def test_a_restored_keystore_publishes_to_no_other_folder(
     publisher.robot("r1").gets(stick)
 
 
+def test_damaged_metadata_after_a_completed_restore_shows_no_other_restore(
+    publisher: Home,
+) -> None:
+    """The folder still has releases of before; but what is lost in a second restore counts."""
+    backup = copy_of(publisher.root, publisher.folder / "backup")
+    publisher.run("revoke", "ks", "--robot", "r5")
+    publisher.run("renew", "ks", "--all")
+    publisher.publish()
+    shutil.rmtree(publisher.root)
+    backup.rename(publisher.root)
+    publisher.publish(restored=True)
+    second = copy_of(publisher.root, publisher.folder / "second")
+    publisher.run("renew", "ks", "--all")
+    publisher.publish()
+    for file in publisher.pub.glob("metadata/*.robots-*.json"):
+        file.write_bytes(file.read_bytes().replace(b'"length"', b'"lengtn"'))
+    for root, is_restored in ((publisher.root, False), (second, True)):
+        with pytest.raises(KeystoreError) as refused:
+            publish(root, publisher.pub, now=publisher.now)
+        assert ("The keystore was restored" in refused.value.why) == is_restored
+        assert ("--restored" in refused.value.remedy) == is_restored
+    shutil.rmtree(publisher.pub / "metadata")
+    with pytest.raises(KeystoreError, match="sealed but does not know"):
+        publish(second, publisher.pub, now=publisher.now, new_folder=True)
+    assert publisher.publish(new_folder=True).names("published") == ["r1", "r2"]
+
+
 def test_all_unknown_releases_in_a_folder_without_metadata_revoke(publisher: Home) -> None:
     """Also if the last one is of another copy of the keystore, which revoked nothing."""
     backup = copy_of(publisher.root, publisher.folder / "backup")

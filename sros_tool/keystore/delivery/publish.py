@@ -1007,15 +1007,23 @@ class _Publication:
     def _unknown_releases(self) -> list[Release]:
         """Return the sealed releases, by number, whose number or list the keystore does not know.
 
-        A release is left out if the keystore has or issued all its files, because then publishing
-        was only interrupted before the ledger recorded its number.
+        A number counts as known if the keystore's last publication in this folder has a higher one,
+        for example from before a restore that was completed since.  It also counts as known if the
+        keystore has or issued all files of the release, because then publishing was only
+        interrupted before the ledger recorded its number.
         """
         known = self._known_numbers()
+        is_same_folder = self._earlier_folder == self.list.folder
+        last = self.list.number if is_same_folder else 0
         forgotten = LostRecords(self.keystore, self._now)
         unknown = [
             release
             for release in self._sealed_releases()
-            if (release.number not in known and not self._issued_all_files_of(release))
+            if (
+                release.number > last
+                and release.number not in known
+                and not self._issued_all_files_of(release)
+            )
             or any(
                 forgotten.add(content)
                 for path, content in release.files.items()
