@@ -1146,9 +1146,9 @@ class _Examiner:
         if is_used is False and self._keystore:
             place = self._keystore.place
             return [f"no enclave of the {place} may {PEER_RIGHT[denied.right]} {name}"], (
-                "If another name is meant, the node perhaps lacks a remapping, or has a wrong one: "
-                "compare the command that started it with the robot's own (after `sros close`: "
-                f"start/commands.txt). Otherwise, {remedy}{renamed or new_name}"
+                f"{remedy} Or, if another name is meant, the node lacks a remapping, or has a wrong "
+                "one: compare the command that started it with the robot's own (after `sros close`: "
+                f"start/commands.txt).{renamed or new_name}"
             )
         newer = "Perhaps the node is newer than its policy: "
         return [], f"{newer}{remedy}{renamed}" if renamed else f"{remedy}{new_name}"
