@@ -62,8 +62,8 @@ class AgentState:
     does not change these times. ``repairs`` maps paths of files that differed from the release to
     the time of the last round that replaced them.  ``exposed`` maps paths of private keys that
     other users could read to the time of the last round that found them readable, and
-    ``exposed_digests`` to the SHA-256 of their public keys; ``removed`` maps enclaves that the installed release did not
-    have to the time of the round that removed them.
+    ``exposed_digests`` to the SHA-256 of their public keys; ``removed`` maps enclaves that the
+    installed release did not have to the time of the round that removed them.
     """
 
     release: int = 0

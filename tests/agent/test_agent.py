@@ -378,7 +378,7 @@ def test_a_later_change_does_not_hide_that_the_revocation_list_was_removed(
         names = "enclaves/r1/b/crl.pem" + (", enclaves/r1/a/governance.p7s, " if hours > 1 else "")
         assert f"replaced: {names}" in problem and is_mended(problem)
     assert problem.startswith(f"From {iso(start)} to {iso(start + timedelta(hours=3))}, 4 files")
-    assert "/a/cert.pem and 1 more. Find out" in problem and problem in r1.message().problems
+    assert "/a/cert.pem and 1 more. Find out" in problem and r1.message().problems == (problem,)
     (problem,) = r1.round(start + timedelta(hours=24.5)).problems
     assert "crl.pem" not in problem and ", 3 files" in problem
 
