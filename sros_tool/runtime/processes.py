@@ -733,9 +733,13 @@ def launch_verb(command: Sequence[str]) -> int:
 SERVICE_NAME = r"\w[\w:.@\\-]*\.service"
 """The name of a systemd service, as a regular expression."""
 _SERVICE = re.compile(
-    r"^(?:0:|\d+:name=systemd):/system\.slice/(?:.*/)?(" + SERVICE_NAME + r")$", re.M | re.A
+    r"^(?:0:|\d+:name=systemd):/system\.slice/(?:[^/\n]+\.slice/)*(" + SERVICE_NAME + r")$",
+    re.M | re.A,
 )
-"""A line of /proc/PID/cgroup, version 2 or 1 (cgroups(7)), for a system service (not of a user)."""
+"""A line of /proc/PID/cgroup, version 2 or 1 (cgroups(7)), for a system service (not of a user).
+
+Only slices may be above the service: below a service or a container, others choose the names.
+"""
 _CONTAINER = re.compile(r"/(?:docker|libpod)[-/]([0-9a-f]{64})(?:\.scope)?(?:/|$)", re.M | re.A)
 """A line of /proc/PID/cgroup for a Docker or Podman container, by either cgroup driver."""
 
