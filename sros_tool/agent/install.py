@@ -65,6 +65,7 @@ from sros_tool.pki.certificates import (
     load_certificates,
     load_request,
     make_request,
+    subject_text,
     validity_of,
 )
 from sros_tool.pki.crl import last_update, newest_list, next_update, read_lists
@@ -318,19 +319,21 @@ def release_time(release: Release) -> datetime | None:
 def _newest_validity_start(enclaves: Iterable[Mapping[str, bytes]]) -> datetime | None:
     """Return when the newest document of enclaves began to be valid; None if none can be read.
 
-    The documents are certificates, revocation lists and permissions, which the caller has verified.
+    The documents are certificates, revocation lists, and the grants of the enclaves themselves,
+    which the caller has verified.
     """
     moments = []
     for files in enclaves:
         with suppress(SrosError):
             certificates = load_certificates(files.get(CERTIFICATE_FILE, b""), CERTIFICATE_FILE)
             moments += [validity_of(certificate).not_before for certificate in certificates]
+            document = smime.parse(files.get(PERMISSIONS_FILE, b"")).document
+            subjects = [subject_text(certificate.subject) for certificate in certificates]
+            grants = map(parse_permissions(document).grant_of, subjects)
+            moments += [grant.validity.not_before for grant in grants if grant]
+        with suppress(SrosError):
             lists = read_lists(files[CRL_FILE], CRL_FILE) if CRL_FILE in files else ()
             moments += [last_update(crl) for crl in lists]
-        with suppress(SrosError):
-            document = smime.parse(files.get(PERMISSIONS_FILE, b"")).document
-            grants = parse_permissions(document).grants
-            moments += [grant.validity.not_before for grant in grants]
     return max(moments, default=None)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import time
 from collections.abc import Callable, Sequence
@@ -680,6 +681,20 @@ def test_permissions_prove_time_as_certificates_do(home: Home, r1: Robot) -> Non
     assert early
     problems = r1.round(early + timedelta(minutes=5)).problems
     assert "but verified documents were made at" in problems[0], problems
+
+
+def test_a_grant_of_another_enclave_proves_no_time(home: Home, r1: Robot) -> None:
+    path = "enclaves/r1/a/permissions.p7s"
+    document = smime.parse(home.renewed.files[path]).document
+    begin, end = document.index(b"<grant "), document.index(b"</permissions>")
+    other = document[begin:end].replace(b"/r1/a", b"/x")
+    other = re.sub(rb"<not_before>\d+", b"<not_before>2030", other)
+    document = document[:end] + other + document[end:]
+    signed = smime.sign(document, home.authority.certificate, home.authority.key)
+    r1.release = home.release({**home.renewed.files, path: signed})
+    assert not r1.round().problems
+    latest = read_state(r1.folder).latest
+    assert latest and latest.year < 2030
 
 
 def test_a_clock_at_home_that_was_ahead_locks_no_robot_out(home: Home, r1: Robot) -> None:
