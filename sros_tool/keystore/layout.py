@@ -366,8 +366,9 @@ class UnreadPath(NamedTuple):
         if self.why == _FOLDER_ELSEWHERE:
             return "Replace the link with a real folder."
         return (
-            "Run sros as the owner of the file, or give the keystore to one user: `sudo chown -R "
-            f"USER {quote(str(root))}`."
+            "Run sros as the owner of the file. If you may only look, ask the owner for a copy "
+            "without private keys (docs/keystores.md). If files belong to several users, give all "
+            f"to one: `sudo chown -R USER {quote(str(root))}`."
         )
 
 

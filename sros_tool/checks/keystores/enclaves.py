@@ -81,14 +81,14 @@ def _check_loading(enclave: CheckedEnclave) -> Iterator[Finding]:
         kind = _LOADING_KINDS[f"enclave.{problem.fault.id}"]
         text = problem.text if problem.text != "missing" else f"{problem.file} is missing"
         file = enclave.file(problem.file)
+        remedy = fault_remedy(enclave, problem.fault, problem.file)
         lacks_key = (problem.file, problem.fault) == (KEY_FILE, Fault.FILE_MISSING)
         if lacks_key and not enclave.keystore.opened.has_keys:
-            text += (
-                ", like all keys here: if this is a copy without keys, nothing is wrong "
-                "(`--exclude "
-                f"{kind.id}` hides this finding)"
+            text += ", like all keys here"
+            remedy = (
+                "If this is a copy without keys, nothing is wrong: `--exclude "
+                f"{kind.id}` hides this finding. Otherwise: {remedy}"
             )
-        remedy = fault_remedy(enclave, problem.fault, problem.file)
         accepted = enclave.accepts_expiry if problem.fault in _EXPIRY_FAULTS else ""
         yield kind.found(enclave.name, text, file, remedy=remedy, accepted=accepted)
 
