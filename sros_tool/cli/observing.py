@@ -485,7 +485,9 @@ def generate_policy(
         write(plan)
     if as_json:
         print_json(
-            _learned_json(plan, file, learned, seen.observation, dry_run)._replace(ended=ended)
+            _learned_json(plan, file, learned, seen.observation, dry_run)._replace(
+                ended=ended, intermittent=sorted(snapshot.intermittent)
+            )
         )
     else:
         _show(plan, learned, written=not dry_run)
@@ -543,6 +545,7 @@ def _learned_json(
         dry_run=dry_run,
         observation=observation,
         ended=(),
+        intermittent=(),
         added=plan.added if plan else sorted(policy_rights(learned.policy()), key=order),
         copied=copied,
         accepted=None,

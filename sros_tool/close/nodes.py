@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence, Set
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence, Set
 from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
 from itertools import chain
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 from sros_tool.close.processes import read_document
 from sros_tool.close.robot import OBSERVER, LocalRobot
@@ -19,6 +19,7 @@ from sros_tool.graph.observation import (
     Endpoint,
     Observation,
     ObservedNode,
+    intermittent_from_json,
     make_observation,
     observation_from_json,
 )
@@ -29,6 +30,8 @@ from sros_tool.policy.model import Policy
 from sros_tool.policy.patterns import overlap
 from sros_tool.runtime.rmw import chosen_vendor
 from sros_tool.wording import counted
+
+_Value = TypeVar("_Value")
 
 
 class MovedEndpoint(NamedTuple):
@@ -52,10 +55,9 @@ class ObservedNodes:
 
         Nodes whose enclave the graph did not show are left out.
         """
-        nodes, again = self._nodes, "Watch the robot again: --for 1m."
+        nodes = self._nodes
         if nodes is None:
-            file = self.robot.observation_file
-            nodes = read_document(file, observation_from_json, "an observation", again).nodes
+            nodes = self._read_observation(observation_from_json).nodes
         return [node for node in nodes if node.enclaves]
 
     @property
@@ -67,7 +69,11 @@ class ObservedNodes:
             texts = [str(note["text"]) for note in notes if note["id"] == "graph.stray"]
             return ", ".join(text.partition(": ")[2] for text in texts)
 
-        return read_document(self.robot.observation_file, topics, "an observation", "")
+        return self._read_observation(topics)
+
+    def _read_observation(self, parse: Callable[[Any], _Value]) -> _Value:
+        file, again = self.robot.observation_file, "Watch the robot again: --for 1m."
+        return read_document(file, parse, "an observation", again)
 
     @cached_property
     def policy(self) -> Policy:
@@ -107,12 +113,20 @@ class ObservedNodes:
         """
         names, nodes = self.policy_enclaves, []
         for node in self.in_their_enclaves():
-            if new := self.renamed.get(node_name(node)):
-                endpoints = frozenset(self._current_endpoints(node, current).values())
-                nodes.append(replace(node, ns=new[0], name=new[1], endpoints=endpoints))
-            elif names.issuperset(node.enclaves):
-                nodes.append(node)
+            if node_name(node) in self.renamed or names.issuperset(node.enclaves):
+                nodes.append(self._with_current_name(node, current, node.endpoints))
         return make_observation(nodes)
+
+    def _with_current_name(
+        self, node: ObservedNode, current: Observation | None, endpoints: Iterable[Endpoint]
+    ) -> ObservedNode:
+        """Return an observed node with its current name, and with only these of its endpoints."""
+        new = self.renamed.get(node_name(node))
+        if not new:
+            return replace(node, endpoints=frozenset(endpoints))
+        names = self._current_endpoints(node, current)
+        now = frozenset(names[endpoint] for endpoint in endpoints)
+        return replace(node, ns=new[0], name=new[1], endpoints=now)
 
     def nodes_to_compare(
         self, away: Collection[str], current: Observation | None = None
@@ -194,6 +208,26 @@ class ObservedNodes:
             for endpoint, names in self._allowed_endpoints[node].items()
         }
 
+    def intermittent_endpoints(self, current: Observation) -> set[tuple[str, Endpoint]]:
+        """Return the endpoints that nodes of the open robot had only for a part of the watch.
+
+        The result has the names of `endpoints_of`, as in `expected` for the ``current`` graph.
+        """
+        intermittent = {
+            (seen.node, seen.participant, Endpoint(seen.topic, seen.direction))
+            for seen in self._read_observation(intermittent_from_json)
+        }
+        partly, always = [], []
+        for node in self.as_observed:
+            part = frozenset(
+                endpoint
+                for endpoint in node.endpoints
+                if (node.fqn, node.participant, endpoint) in intermittent
+            )
+            partly.append(self._with_current_name(node, current, part))
+            always.append(self._with_current_name(node, current, node.endpoints - part))
+        return {*endpoints_of(partly)}.difference(endpoints_of(always))
+
     def moved_endpoints(self, current: Observation | None = None) -> Set[MovedEndpoint]:
         """Return the endpoints whose names change because their nodes were renamed."""
         return {
@@ -272,6 +306,14 @@ def ros_use(endpoint: Endpoint) -> tuple[str, str]:
 def node_name(node: ObservedNode) -> str:
     """Return the full name of a node, with ``*`` for the part that changes with every start."""
     return f"{node.ns.rstrip('/')}/{stable_name(node.name)}"
+
+
+def endpoints_of(nodes: Iterable[ObservedNode]) -> Iterator[tuple[str, Endpoint]]:
+    """Yield node name and endpoint, with ``*`` for the parts that change with every start."""
+    for node in nodes:
+        for endpoint in node.endpoints:
+            topic = endpoint.topic.replace(node.name, stable_name(node.name))
+            yield node_name(node), endpoint._replace(topic=topic)
 
 
 def nodes_text(nodes: Iterable[ObservedNode]) -> str:

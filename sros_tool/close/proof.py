@@ -21,7 +21,14 @@ from sros_tool.checks.keystores.issued import STALE
 from sros_tool.checks.kind import NOTE, Finding
 from sros_tool.checks.processes import PROCESS_NOT_SEEN, process_findings
 from sros_tool.checks.requirements import MISSPELLED_ENCLAVE, VACUOUS
-from sros_tool.close.nodes import MovedEndpoint, ObservedNodes, node_name, nodes_text, ros_use
+from sros_tool.close.nodes import (
+    MovedEndpoint,
+    ObservedNodes,
+    endpoints_of,
+    node_name,
+    nodes_text,
+    ros_use,
+)
 from sros_tool.close.processes import ObservedProcesses
 from sros_tool.close.robot import MOST_NAMES, OBSERVER, LocalRobot
 from sros_tool.close.state import (
@@ -37,7 +44,7 @@ from sros_tool.close.state import (
 )
 from sros_tool.errors import SrosError, UnavailableError
 from sros_tool.explain.audit import DeniedRight
-from sros_tool.graph.learn import is_tool, stable_name
+from sros_tool.graph.learn import is_tool
 from sros_tool.graph.observation import (
     PUBLISH,
     SUBSCRIBE,
@@ -505,7 +512,8 @@ def _remedy(robot: LocalRobot, difference: str) -> str:
         "with the new name",
         "gone": f"if the node uses another name now, replace the old name in {policy}, in the "
         "profiles of the node and of the nodes that it talks to, and "
-        f"{restart}; if not, start the node as before ({robot.commands_file})",
+        f"{restart}; if the node does not always use the name, ask again while it does; if not, "
+        f"start the node as before ({robot.commands_file})",
         "left alone": f"give both sides one name, in {policy} and in their programs, and {restart}",
         "refused": f"ask `sros check {shlex.quote(str(robot.export))}`",
     }
@@ -528,6 +536,7 @@ class _TalkComparison:
         self.current = observation_from_json(audited)
         self._running, self._nodes, self._away, self._audited = running, nodes, away, audited
         self._denied = nodes.denied_rights(nodes.expected(self.current))
+        self._intermittent = nodes.intermittent_endpoints(self.current)
 
     @property
     def denied(self) -> Sequence[str]:
@@ -570,7 +579,7 @@ class _TalkComparison:
                 for node in unseen
                 if node["enclave"] not in ended
             ],
-            "gone": _lost_endpoints(make_observation(present), self.current, self._denied),
+            "gone": _endpoint_texts(self._lost_endpoints(present) - self._intermittent),
             "left alone": [
                 *_abandoned_names(before, expected, moved, self._denied),
                 *_endpoints_without_peer(
@@ -582,19 +591,28 @@ class _TalkComparison:
             ],
         }
 
+    def _lost_endpoints(self, before: Iterable[ObservedNode]) -> set[tuple[str, Endpoint]]:
+        """Return the endpoints that nodes had before and lack now, except denied endpoints."""
+        lost = {*endpoints_of(before)} - _denied_endpoints(self._denied)
+        return lost.difference(endpoints_of(self.current.nodes))
+
     def summary(self) -> str:
         """Return text on the comparison, on rights that the policy takes away, and on new nodes."""
         before = self._nodes.nodes_to_compare(self._away)
         as_now = self._nodes.nodes_to_compare(self._away, self.current)
-        endpoints = len({*_endpoints_of(as_now.nodes)} - _denied_endpoints(self._denied))
-        text = f"{nodes_text(before.nodes)} with {endpoints} endpoints as before (types are not "
-        text += "compared)"
+        not_now = self._lost_endpoints(as_now.nodes)
+        endpoints = {*endpoints_of(as_now.nodes)} - _denied_endpoints(self._denied) - not_now
+        text = f"{nodes_text(before.nodes)} with {len(endpoints)} endpoints as before (types are "
+        text += "not compared)"
         text += f", without {', '.join(sorted(self._away))}" if self._away else ""
         if denied := self._denied:
             text += f"; the policy takes away {counted(len(denied), 'right')} that the robot used: "
             text += ", ".join(f"{right.right.enclave} {right.right.describe()}" for right in denied)
             lost = _without_counterpart(self._running.robot, [right.right for right in denied])
             text += f"; left without a partner: {first_few(lost, MOST_NAMES, '; ')}" if lost else ""
+        if not_now:
+            text += "; allowed, but not seen now, as in a part of the watch: "
+            text += first_few(_endpoint_texts(not_now), MOST_NAMES)
         known = {*map(node_name, before.nodes)}
         with_profile, without_profile = self._nodes.divide_by_profile(self.current.nodes)
         new = sorted(
@@ -688,16 +706,12 @@ def _unseen_text(running: RunningRobot, node: str, enclave: str) -> str:
     return f"{node} ({asking}{gone})"
 
 
-def _lost_endpoints(
-    before: Observation, current: Observation, denied: Iterable[DeniedRight]
-) -> list[str]:
-    """Return the endpoints, as text, that nodes had before and lack now, unless ``denied``."""
-    expected = {*_endpoints_of(before.nodes)} - _denied_endpoints(denied)
-    lost: dict[str, list[str]] = {}
-    gone = expected - {*_endpoints_of(current.nodes)}
-    for node, right, name in sorted({(node, *ros_use(endpoint)) for node, endpoint in gone}):
-        lost.setdefault(f"{node} {right}", []).append(name)
-    return [f"{uses} {first_few(names, MOST_NAMES)}" for uses, names in lost.items()]
+def _endpoint_texts(endpoints: Iterable[tuple[str, Endpoint]]) -> list[str]:
+    """Return endpoints as text: each node and right, with the first names."""
+    names: dict[str, list[str]] = {}
+    for node, right, name in sorted({(node, *ros_use(endpoint)) for node, endpoint in endpoints}):
+        names.setdefault(f"{node} {right}", []).append(name)
+    return [f"{uses} {first_few(names[uses], MOST_NAMES)}" for uses in names]
 
 
 def _abandoned_names(
@@ -713,8 +727,8 @@ def _abandoned_names(
     """
     refused = _denied_endpoints(denied)
     robot_nodes = [node for node in expected.nodes if not is_tool(node)]
-    kept = {endpoint for _, endpoint in {*_endpoints_of(robot_nodes)} - refused}
-    uses = {*_endpoints_of(node for node in before.nodes if not is_tool(node))} - refused
+    kept = {endpoint for _, endpoint in {*endpoints_of(robot_nodes)} - refused}
+    uses = {*endpoints_of(node for node in before.nodes if not is_tool(node))} - refused
     new_names = {
         _opposite(pair.old): ros_use(pair.new)[1] for pair in moved if pair.old not in kept
     }
@@ -741,7 +755,7 @@ def _endpoints_without_peer(
     """
     refused = _denied_endpoints(denied)
     talked, talks = (
-        {*_endpoints_of(node for node in seen.nodes if not is_tool(node))} for seen in (before, now)
+        {*endpoints_of(node for node in seen.nodes if not is_tool(node))} for seen in (before, now)
     )
     lonely = {
         (pair.new_node, *ros_use(pair.new))
@@ -769,11 +783,3 @@ def _denied_endpoints(denied: Iterable[DeniedRight]) -> set[tuple[str, Endpoint]
     return {
         (node, endpoint) for right in denied for node in right.nodes for endpoint in right.endpoints
     }
-
-
-def _endpoints_of(nodes: Iterable[ObservedNode]) -> Iterator[tuple[str, Endpoint]]:
-    """Yield node name and endpoint, with ``*`` for the parts that change with every start."""
-    for node in nodes:
-        for endpoint in node.endpoints:
-            topic = endpoint.topic.replace(node.name, stable_name(node.name))
-            yield node_name(node), endpoint._replace(topic=topic)

@@ -31,6 +31,7 @@ from sros_tool.graph.observation import (
     PUBLISH,
     SUBSCRIBE,
     Endpoint,
+    IntermittentEndpoint,
     Observation,
     ObservedNode,
     make_observation,
@@ -747,6 +748,8 @@ class LearnedPolicy(NamedTuple):
     """The nodes that were observed; empty for a log."""
     ended: Sequence[str]
     """The nodes whose participants ended while they were observed (`--watch`)."""
+    intermittent: Sequence[IntermittentEndpoint]
+    """The endpoints that running nodes had only for a part of the watch (`--watch`)."""
     added: Sequence[Right]
     """The rights that are added to the policy."""
     copied: Sequence[str]

@@ -19,7 +19,7 @@ import secrets
 import select
 import sys
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, NamedTuple, Protocol
 
@@ -33,6 +33,19 @@ class Endpoint(NamedTuple):
 
     topic: str
     """Raw DDS name of the topic, such as ``rt/chatter``."""
+    direction: Annotated[str, Words((PUBLISH, SUBSCRIBE))]
+    """Whether the endpoint writes or reads the topic."""
+
+
+class IntermittentEndpoint(NamedTuple):
+    """An endpoint that its node had only for a part of a watch."""
+
+    node: str
+    """Full name of the node."""
+    participant: str
+    """DDS participant of the node's process, as in `nodes`."""
+    topic: str
+    """Raw DDS name of the topic."""
     direction: Annotated[str, Words((PUBLISH, SUBSCRIBE))]
     """Whether the endpoint writes or reads the topic."""
 
@@ -164,6 +177,19 @@ def observation_from_json(value: Mapping[str, Any]) -> Observation:
         )
         for node in value["nodes"]
     )
+
+
+def intermittent_from_json(value: Mapping[str, Any]) -> Sequence[IntermittentEndpoint]:
+    """Return the intermittent endpoints of an observation; earlier releases wrote none.
+
+    Raises:
+        ValueError, TypeError, KeyError: ``value`` is not such a JSON value.
+    """
+    fields = IntermittentEndpoint._fields
+    return [
+        IntermittentEndpoint(*(_text(endpoint[name]) for name in fields))
+        for endpoint in value.get("intermittent", ())
+    ]
 
 
 def _text(value: object) -> str:

@@ -34,6 +34,7 @@ from sros_tool.errors import UnavailableError
 from sros_tool.graph.observation import (
     SUBSCRIBE,
     Endpoint,
+    IntermittentEndpoint,
     Observation,
     ObservedNode,
     make_observation,
@@ -244,13 +245,15 @@ class Snapshot:
     """The graph at the end of an observation that took ``seconds`` seconds.
 
     ``everything`` also has the nodes that left while the graph was observed.  ``settled`` says
-    whether the graph had stopped changing.
+    whether the graph had stopped changing.  ``intermittent`` are endpoints of the nodes in
+    ``observation`` that a watch saw for a part of its time.
     """
 
     observation: Observation
     everything: Observation
     seconds: float
     settled: bool
+    intermittent: frozenset[IntermittentEndpoint] = frozenset()
 
     @property
     def gone(self) -> frozenset[str]:
@@ -307,9 +310,14 @@ def watch(
     so that no node is reported before it is discovered completely.  At the latest, it is called
     after ``patience`` seconds.  If a node that has just started is not announced yet, the watch
     lasts up to ``patience`` seconds longer.
+
+    An endpoint is intermittent if the graph stood still without it after the endpoint was seen,
+    while its node was there: a graph that changes may show a node that is just ending.
     """
     begin = clock()
     seen = union = reported = Observation()
+    missed: set[IntermittentEndpoint] = set()
+    still_seen = seen
     grown = changed = begin
     while not stop() and (
         seconds is None or clock() - begin < seconds + patience * bool(seen.strays)
@@ -322,12 +330,25 @@ def watch(
                 if reported is union:
                     grown = now
                 union, changed = joined, now
+        elif still_seen is not seen:
+            missed.update(_missing_endpoints(union, seen))
+            still_seen = seen
         if union is not reported and (now - changed >= still or now - grown >= patience):
             report(union)
             reported = union
     if union is not reported:
         report(union)
-    return Snapshot(seen, union, clock() - begin, True)
+    stayed = {(node.fqn, node.participant) for node in seen.nodes}
+    intermittent = frozenset(lost for lost in missed if (lost.node, lost.participant) in stayed)
+    return Snapshot(seen, union, clock() - begin, True, intermittent)
+
+
+def _missing_endpoints(before: Observation, now: Observation) -> Iterator[IntermittentEndpoint]:
+    """Yield the endpoints that nodes of the graph ``now`` had ``before``, and lack now."""
+    earlier = {(node.fqn, node.participant): node.endpoints for node in before.nodes}
+    for node in now.nodes:
+        for endpoint in earlier[node.fqn, node.participant] - node.endpoints:
+            yield IntermittentEndpoint(node.fqn, node.participant, *endpoint)
 
 
 # ── the process and the enclave of each node ────────────────────────────────────────────

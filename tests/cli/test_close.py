@@ -757,6 +757,16 @@ def ended_before_the_audit(robot: Robot, enclave: str) -> Any:
     return run
 
 
+def intermittently_used(robot: Robot, node: str, topic: str, direction: str) -> None:
+    """Let the watch have seen an endpoint of a node for a part of its time."""
+    file = robot.folder / "robot/observed.json"
+    seen = json.loads(file.read_text())
+    assert seen["intermittent"] == []
+    (of,) = (each["participant"] for each in seen["nodes"] if f"/{each['name']}" == node)
+    endpoint = {"node": node, "participant": of, "topic": topic, "direction": direction}
+    file.write_text(json.dumps({**seen, "intermittent": [endpoint]}))
+
+
 def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
     robot.units = UNITS
     robot.close()
@@ -836,7 +846,18 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     said = robot.close("--proof", status=1).out
     assert f"{lost}gone: /listener publish /rosout, /listener re" in said
     assert "; if the node uses another name now, replace the old name in 'robot/policy" in said
+    assert "; if the node does not always use the name, ask again while it does; if not, " in said
     assert "start the node as before (robot/start/commands.txt)" in said
+    robot.remaining = (TALKER, ros_node("listener", LISTENER[3]))
+    assert f"{lost}gone: /listener subscribe /chatter" in robot.close("--proof", status=1).out
+    intermittently_used(robot, "/listener", "rt/chatter", "subscribe")
+    said = robot.close("--proof").out
+    assert (
+        "talk: 2 nodes with 35 endpoints as before (types are not compared); allowed, but" in said
+    )
+    assert "allowed, but not seen now, as in a part of the watch: /listener subscribe /c" in said
+    robot.remaining = (TALKER, LISTENER)
+    assert "2 nodes with 36 endpoints as before (types are not c" in robot.close("--proof").out
     robot.remaining = (TALKER, ros_node("guest", "05"))
     said = robot.close("--proof", status=1).out
     assert f"{lost}denied: /guest " in said and "; also not seen: /listener (" in said

@@ -264,7 +264,9 @@ def test_what_a_verb_prints_beside_a_graph(
         ended = beside_graph(verb, there, *words.split(), *SHORT, "--json")
         assert ended.status == status, ended
         seen.check(verb, ended)
-    assert seen.unseen(verb) == []
+    # Only a graph that changes has them: tests/graph/test_generate_policy_observing.py.
+    changing = "generate_policy.json#/properties/intermittent/items/"
+    assert [at for at in seen.unseen(verb) if not at.startswith(changing)] == []
 
 
 def test_what_check_prints(

@@ -9,8 +9,14 @@ from pathlib import Path
 
 import pytest
 
+from sros_tool.cli import observing
+from sros_tool.graph.observation import IntermittentEndpoint, intermittent_from_json
+from sros_tool.graph.observe import Snapshot
+from tests.cli.test_json import Seen
 from tests.graph.fake_graph import Beside, graph
-from tests.support.harness import Ended
+from tests.graph.graphs import graph as known_graph
+from tests.graph.graphs import node
+from tests.support.harness import Ended, sros
 
 pytest_plugins = ["tests.graph.beside"]
 
@@ -59,6 +65,7 @@ def test_json_has_a_stable_shape(program: Program) -> None:
             }
         ],
         "ended": [],
+        "intermittent": [],
         "added": [
             {
                 "enclave": "/talker",
@@ -72,6 +79,18 @@ def test_json_has_a_stable_shape(program: Program) -> None:
         "changes": [{"action": "create", "path": "robot.xml"}],
         "notes": [],
     }
+
+
+def test_json_names_what_a_watch_saw_for_a_part_of_its_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lost = IntermittentEndpoint("/talker", "p1", "rt/chatter", "publish")
+    seen = known_graph(node("/talker", "publish chatter"))
+    snapshot = Snapshot(seen, seen, 9.0, True, frozenset({lost}))
+    monkeypatch.setattr(observing, "observe", lambda *_, **__: (snapshot, "rmw_fake"))
+    ended = sros("generate_policy", "robot.xml", "--watch", "9s", "--json", cwd=tmp_path)
+    Seen().check("generate_policy", ended.ok())
+    assert intermittent_from_json(json.loads(ended.out)) == [lost]
 
 
 def test_twins_are_told_apart_where_the_middleware_keeps_an_order(

@@ -87,6 +87,24 @@ def test_a_watch_keeps_what_was_gone_and_tells_it_once() -> None:
     assert told == [ONE, ONE.union(passing), TWO.union(passing)]
 
 
+def test_an_endpoint_that_goes_while_its_node_stays_is_intermittent() -> None:
+    """Not one that comes late, or that goes for a moment, or with its node."""
+    calls = graph(node("/a", "publish x", "publish now_and_then"))
+    late = graph(node("/a", "publish x", "publish late"))
+    lost = ("/a", "p1", "rt/now_and_then", "publish")
+    for changes, expected in (
+        ([(0.1, ONE), (3.0, calls), (3.4, ONE)], {lost}),
+        ([(0.1, calls), (3.0, ONE), (6.0, calls)], {lost}),
+        ([(0.1, ONE), (3.0, late)], set()),
+        ([(0.1, calls), (3.0, ONE), (3.1, calls)], set()),
+        ([(0.1, TWO), (3.0, ONE)], set()),
+        ([(0.1, calls), (3.0, ONE), (6.0, Observation())], set()),
+    ):
+        script = Script(changes)
+        snapshot = watch(script, 9.0, script.clock, stop=lambda: False, report=lambda _: None)
+        assert snapshot.intermittent == expected, changes
+
+
 def test_what_is_half_discovered_is_not_told_for_a_moment() -> None:
     half = graph(node("/a"))
     script = Script([(0.1, half), (0.3, ONE)])
