@@ -430,7 +430,8 @@ def explain_log_of(
 
     def is_named(enclave: str) -> bool:
         if policy:
-            return policy.place(enclave)[1] == policy.place(name)[1]
+            namespace, path = policy.place(name)
+            return enclave == name if namespace else policy.place(enclave)[1] == path
         loaded = find(enclave)
         return loaded is not None and named is not None and loaded.folder == named.folder
 

@@ -713,6 +713,8 @@ def test_a_log_of_an_enclave_has_to_show_that_its_node_runs_secured(
         ([folder], own + node, {}, True),
         ([folder], node, {}, False),
         ([policy, ENCLAVE], moved + node, {}, True),
+        ([policy, f"/left{ENCLAVE}"], moved + node, {}, True),
+        ([policy, f"/right{ENCLAVE}"], moved + node, {}, False),
         ([policy, ENCLAVE], node, {}, False),
         ([keystore, ENCLAVE], node, zenoh, None),
         ([keystore, ENCLAVE], OF_ZENOH + node, {}, None),
