@@ -1147,9 +1147,9 @@ class _Examiner:
         if is_used is False and self._keystore:
             place = self._keystore.place
             return [f"no enclave of the {place} may {PEER_RIGHT[denied.right]} {name}"], (
-                f"{remedy} Or, if another name is meant, the node lacks a remapping, or has a wrong "
-                "one: compare the command that started it with the robot's own (after `sros close`: "
-                f"start/commands.txt).{renamed or new_name}"
+                f"{remedy} Or, if another name is meant, the node lacks a remapping, or has a "
+                "wrong one: compare the command that started it with the robot's own (after `sros "
+                f"close`: start/commands.txt).{renamed or new_name}"
             )
         newer = "Perhaps the node is newer than its policy: "
         return [], f"{newer}{remedy}{renamed}" if renamed else f"{remedy}{new_name}"
