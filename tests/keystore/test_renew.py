@@ -22,6 +22,7 @@ from sros_tool.keystore.layout import enclave_path
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, generate_artifacts
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revoke import revoke
+from sros_tool.keystore.lifecycle.rotate import rotate_ca
 from sros_tool.keystore.reader import OpenedKeystore, open_enclave
 from sros_tool.keystore.template import load_template
 from sros_tool.pki import smime
@@ -168,9 +169,14 @@ def test_nothing_outlives_its_authority(tmp_path: Path) -> None:
     assert life.certificate.not_after == life.permissions.not_after == end
     assert not problems(root, "/a", end)
     before = snapshot(root)
-    with pytest.raises(KeystoreError, match="identity CA .* is not valid now"):  # noqa: RUF043
-        renew(root, ["/a"], now=end + timedelta(seconds=1))
+    late = end + timedelta(seconds=1)
+    with pytest.raises(KeystoreError, match="identity CA .* is not valid now") as refused:  # noqa: RUF043
+        renew(root, ["/a"], now=late)
     assert snapshot(root) == before
+    assert f"`sros rotate_ca {root} --finish`" in refused.value.remedy
+    rotate_ca(root, finish=True, now=late)
+    renew(root, ["/a"], now=late)
+    assert not problems(root, "/a", late)
 
 
 # ── when it is time ────────────────────────────────────────────────────────────────────────

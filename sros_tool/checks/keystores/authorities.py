@@ -201,7 +201,8 @@ CA_EXPIRED = FindingKind(
     "Nothing can be issued or signed with the CA, and DDS refuses everything that it issued or "
     "signed.",
     "RFC 5280, 6.1.3; Fast DDS 2.14.5 (Error '10' verifying CA certificate).",
-    "Replace the CA with `sros rotate_ca KEYSTORE`, or correct the clock.",
+    "Check the clock of this machine. If it is right, replace the CA: `sros rotate_ca KEYSTORE "
+    "--finish`.",
 )
 CA_MISSING = FindingKind(
     "keystore.ca-missing",

@@ -11,6 +11,7 @@ import secrets
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
+from shlex import quote
 
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes
@@ -253,7 +254,8 @@ def load_authority(
             f"the {role} CA {authority_text(certificate)} is not valid now",
             f"It is valid from {iso(validity.not_before)} to {iso(validity.not_after)}, and DDS "
             "refuses the certificates and documents of a CA outside its validity.",
-            "Check the clock of this machine; if it is right, make a new keystore.",
+            "Check the clock of this machine. If it is right, replace the CA: `sros rotate_ca "
+            f"{quote(str(root))} --finish`.",
         )
     return Authority(certificate, key, service)
 
