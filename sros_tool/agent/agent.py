@@ -43,7 +43,14 @@ from sros_tool.agent.running import (
     restart_units,
 )
 from sros_tool.agent.settings import AgentSettings, agent_folder
-from sros_tool.agent.state import mark_outdated, read_seal, read_state, write_seal, write_state
+from sros_tool.agent.state import (
+    CopiedKey,
+    mark_outdated,
+    read_seal,
+    read_state,
+    write_seal,
+    write_state,
+)
 from sros_tool.checks.keystores.arrival import (
     InstalledEnclave,
     exposed_keys,
@@ -122,6 +129,9 @@ _TRUST_FILES = tuple(
 """Files of an enclave that decide whom it trusts: CAs and revocation list."""
 _GRAVEST_FILES = (CRL_FILE, IDENTITY_CA_FILE, PERMISSIONS_CA_FILE, GOVERNANCE_FILE)
 """The files that are named first if they were changed: they decide for all other enclaves, too."""
+_MOST_COPIED = 100
+"""Maximum number of keys of each kind that the agent remembers because somebody may have copied
+them; it keeps those that it has reported first."""
 _REPLACED_LIST = "replaced.crl.pem"
 _KEEP_REPLACED_LIST = timedelta(days=30)
 """How long the agent sends a revocation list after a release replaced it by a shorter one.
@@ -232,28 +242,23 @@ class _Round:
         clock = self._clock(self._proven_moment())
         # Verified documents prove that ``before.latest`` has passed, whatever the clock shows.
         certain = max(now, before.latest) if before.latest else now
-        readable_keys = exposed_keys(self._folder, now)
-        recent = {
-            key: at for key, at in before.exposed.items() if abs(now - at) < _REPAIRS_REPORTED_FOR
-        }
         # Remembered now, because installing closes the keys of changed enclaves to others.
-        exposed = recent | dict.fromkeys(readable_keys, now)
-        digests = {key: self._key_digest(key) for key in readable_keys}
-        self._state = replace(
-            self._state, exposed=exposed, exposed_digests={**before.exposed_digests, **digests}
-        )
+        exposed = {key.path: key for key in self._still_copied(before.readable_keys)}
+        for path in exposed_keys(self._folder, now):
+            exposed[path] = self._copied_key(path)
+        self._state = replace(self._state, readable_keys=tuple(exposed.values())[:_MOST_COPIED])
         installation, fetched = self._fetch_and_install(certain)
         if clock is not RobotClock.BEHIND and installation.made:
             clock = self._clock_next_to_release(installation.made) or clock
         self._note_unreleased_enclaves()
         self._note_repaired(now)
-        self._note_removed(now)
+        self._note_removed()
         names = self._enclaves()
         opened = open_installed(self._folder, names, now=now)
         if clock is not RobotClock.BEHIND:  # with a wrong clock, valid files look unusable
             self._problems += unusable_sentences(opened)
         self._problems += exposed_sentences(self._folder, now)
-        self._note_closed_keys(exposed, now)
+        self._note_closed_keys(now)
         self._note_due_restarts(installation.changed, names)
         restarted: Sequence[str] = ()
         # With a wrong clock, nodes would not accept their certificates.
@@ -409,6 +414,11 @@ class _Round:
         if release is None:
             self._is_in_step = True
             return Installation(), True
+        unreleased = {
+            name: self._copied_key(f"{enclave_folder(name)}/{KEY_FILE}")
+            for name in here
+            if name not in release.enclaves()
+        }
         installation = self._install(release, certain_time)
         is_later = release.number != state.accepted
         published = {path: hashlib.sha256(data).hexdigest() for path, data in release.files.items()}
@@ -430,8 +440,9 @@ class _Round:
         moments = dict.fromkeys(repaired, self._machine.now)
         self._state = replace(self._state, repairs={**self._state.repairs, **moments})
         if not is_later:
-            removed = dict.fromkeys(installation.removed, self._machine.now)
-            self._state = replace(self._state, removed={**self._state.removed, **removed})
+            removed = [unreleased[name] for name in installation.removed if name in unreleased]
+            known = {(key.path, key.serial): key for key in (*self._state.removed_keys, *removed)}
+            self._state = replace(self._state, removed_keys=tuple(known.values())[:_MOST_COPIED])
         return installation, True
 
     def _changed_files(self) -> dict[str, str] | None:
@@ -523,40 +534,83 @@ class _Round:
                 f"{first_few(paths, 3)}. Find out who or what changes files on this robot."
             )
 
-    def _note_removed(self, now: datetime) -> None:
-        """Report for a day the enclaves that were removed because the release lacks them."""
-        recent = {
-            name: at
-            for name, at in self._state.removed.items()
-            if abs(now - at) < _REPAIRS_REPORTED_FOR
-        }
-        self._state = replace(self._state, removed=recent)
-        if recent:
+    def _note_removed(self) -> None:
+        """Report the removed enclaves whose keys somebody may have copied.
+
+        This ends when their certificates are revoked or have expired, or a release has them.
+        """
+        released: Collection[str] = ()
+        with suppress(SrosError):  # the next installation writes the seal again
+            released = self._released_files()
+        removed = [
+            key
+            for key in self._not_revoked(self._state.removed_keys)
+            if _certificate_path(enclave_of(key.path)) not in released
+        ]
+        self._state = replace(self._state, removed_keys=tuple(removed))
+        if removed:
+            names = sorted({enclave_of(key.path) for key in removed})
             self._problems.append(
-                f"{REMOVED_ENCLAVES}the last at {iso(max(recent.values()))}, that the "
-                f"installed release lacks: {first_few(sorted(recent), 3)}. If they belong to "
+                f"{REMOVED_ENCLAVES}the last at {iso(max(key.at for key in removed))}, that the "
+                f"installed release lacks: {first_few(names, 3)}. If they belong to "
                 "another robot, somebody may have copied their keys: run `sros renew KEYSTORE "
                 "ENCLAVE --new-key --revoke-old`."
             )
 
-    def _note_closed_keys(self, exposed: Mapping[str, datetime], now: datetime) -> None:
-        """Report for a day the keys that other users could read, until they are replaced."""
-        digests = self._state.exposed_digests
-        closed = {
-            key: exposed[key]
-            for key in exposed.keys() - exposed_keys(self._folder, now)
-            if (self._folder / key).exists()  # a removed enclave has no key
-            and (not digests.get(key) or digests[key] == self._key_digest(key))
-        }
-        digests = {key: digest for key, digest in digests.items() if key in exposed}
-        self._state = replace(self._state, exposed=closed, exposed_digests=digests)
-        if closed:
+    def _note_closed_keys(self, now: datetime) -> None:
+        """Report the keys that other users could read, until they are replaced."""
+        exposed = self._still_copied(self._state.readable_keys)
+        self._state = replace(self._state, readable_keys=tuple(exposed))
+        readable = exposed_keys(self._folder, now)
+        if closed := {key.path: key.at for key in exposed if key.path not in readable}:
             self._problems.append(
                 f"Until {iso(max(closed.values()))}{READABLE_KEYS}"
                 f"{counted(len(closed), 'private key')}: {first_few(sorted(closed), 3)}. The mode "
-                "is correct now. If anybody may have copied a key, run `sros renew KEYSTORE "
-                "ENCLAVE --new-key --revoke-old` in the keystore."
+                "is correct now, but somebody may have copied a key: run `sros renew KEYSTORE "
+                "ENCLAVE --new-key --revoke-old`, and bring the new key."
             )
+
+    def _copied_key(self, path: str) -> CopiedKey:
+        """Return the key at ``path`` with the present certificate of its enclave."""
+        serial, expires = "", None
+        with suppress(SrosError, OSError):
+            certificate = read_certificate(self._folder / _certificate_path(enclave_of(path)))
+            serial, expires = f"{certificate.serial_number:x}", validity_of(certificate).not_after
+        return CopiedKey(path, self._machine.now, self._key_digest(path), serial, expires)
+
+    def _still_copied(self, keys: Sequence[CopiedKey]) -> list[CopiedKey]:
+        """Return the keys that were not replaced here, with their present certificates.
+
+        A key that is not here, or cannot be read, counts until its certificate is revoked.
+        """
+        still, unknown = [], []
+        for key in keys:
+            present = self._copied_key(key.path)
+            if not (key.key and present.key):
+                unknown.append(key)
+            elif key.key == present.key:
+                still.append(present._replace(at=key.at) if present.serial else key)
+        return [*still, *self._not_revoked(unknown)]
+
+    def _not_revoked(self, keys: Sequence[CopiedKey]) -> list[CopiedKey]:
+        """Return the keys whose certificates are neither revoked nor certainly expired.
+
+        A key whose certificate is not known is left out after a day.
+        """
+        if not keys:
+            return []
+        now, latest = self._machine.now, self._state.latest
+        revoked = _revoked_serials(self._revocation_lists(self._enclaves()) or "")
+        return [
+            key
+            for key in keys
+            if (
+                int(key.serial, 16) not in revoked
+                and not (latest and key.expires and key.expires <= latest)
+                if key.serial
+                else abs(now - key.at) < _REPAIRS_REPORTED_FOR
+            )
+        ]
 
     def _key_digest(self, path: str) -> str:
         """Return the SHA-256 of the public key of a private key; "" if it cannot be read."""

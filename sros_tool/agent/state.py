@@ -41,6 +41,21 @@ _FORMAT = 1
 _LONGEST_UPTIME = 1e10  # seconds
 
 
+class CopiedKey(NamedTuple):
+    """A private key that somebody may have copied, and the certificate of its enclave."""
+
+    path: str
+    """Path of the key in the security folder."""
+    at: datetime
+    """When the agent last saw that others could read the key, or when it removed the key."""
+    key: str
+    """SHA-256 of the public key; "" if it is not known."""
+    serial: str
+    """Serial number of the certificate (hexadecimal); "" if it is not known."""
+    expires: datetime | None
+    """Expiry of the certificate; None if it is not known."""
+
+
 @dataclass(frozen=True, slots=True)
 class AgentState:
     """The state that an agent keeps between its rounds.
@@ -60,10 +75,9 @@ class AgentState:
     reached. ``replaced`` and ``list_replaced`` map enclaves of `due` and `list_due` to when the
     agent last replaced their files, in seconds since the start of the machine: setting the clock
     does not change these times. ``repairs`` maps paths of files that differed from the release to
-    the time of the last round that replaced them.  ``exposed`` maps paths of private keys that
-    other users could read to the time of the last round that found them readable, and
-    ``exposed_digests`` to the SHA-256 of their public keys; ``removed`` maps enclaves that the
-    installed release did not have to the time of the round that removed them.
+    the time of the last round that replaced them.  ``readable_keys`` are private keys that other
+    users could read, and ``removed_keys`` the keys of enclaves that the agent removed because the
+    installed release did not have them.
     """
 
     release: int = 0
@@ -82,9 +96,8 @@ class AgentState:
     list_since: Mapping[str, datetime] = field(default_factory=dict)
     replaced: Mapping[str, float] = field(default_factory=dict)
     list_replaced: Mapping[str, float] = field(default_factory=dict)
-    exposed: Mapping[str, datetime] = field(default_factory=dict)
-    exposed_digests: Mapping[str, str] = field(default_factory=dict)
-    removed: Mapping[str, datetime] = field(default_factory=dict)
+    readable_keys: tuple[CopiedKey, ...] = ()
+    removed_keys: tuple[CopiedKey, ...] = ()
     files: Mapping[str, str] = field(default_factory=dict)
 
     def next_sequence(self, now: datetime) -> int:
@@ -135,15 +148,13 @@ def _state_from(value: Any) -> AgentState:
         check_enclave_name(_checked_text(name)): _checked_text(text)
         for name, text in dict(value.get("files", {})).items()
     }
-    for moments in ("repairs", "exposed", "removed", "list_since"):
+    for moments in ("repairs", "list_since"):
         value[moments] = {
             _checked_text(path): parse_iso(_checked_text(moment))
             for path, moment in dict(value.get(moments, {})).items()
         }
-    value["exposed_digests"] = {
-        _checked_text(path): _checked_text(digest)
-        for path, digest in dict(value.get("exposed_digests", {})).items()
-    }
+    for keys in ("readable_keys", "removed_keys"):
+        value[keys] = tuple(map(_copied_key_from, value.get(keys, ())))
     for seconds in ("replaced", "list_replaced"):
         value[seconds] = {
             check_enclave_name(_checked_text(name)): _checked_uptime(moment)
@@ -152,6 +163,14 @@ def _state_from(value: Any) -> AgentState:
     value["problems"] = tuple(map(_checked_text, value["problems"]))
     # An agent of another version may remember more.
     return AgentState(**{key: value[key] for key in value.keys() & _STATE_KEYS})
+
+
+def _copied_key_from(value: Mapping[str, Any]) -> CopiedKey:
+    path, at, key, serial = (_checked_text(value[name]) for name in CopiedKey._fields[:4])
+    int(serial or "0", 16)
+    expires = value["expires"]
+    until = None if expires is None else parse_iso(_checked_text(expires))
+    return CopiedKey(path, parse_iso(at), key, serial, until)
 
 
 def _checked_uptime(value: Any) -> float:

@@ -623,8 +623,8 @@ class ComparedFleet(NamedTuple):
     default="delivery",
     show_default=True,
     help="`delivery`: the exit status is 1 only for problems with the delivery of files, and for "
-    "problems that agents report. `unmended`: as `delivery`, but problems that an agent or `sros "
-    "fleet publish` has mended (such as a changed file; they are shown for a day) do not count. "
+    "problems that agents report. `unmended`: as `delivery`, but changed files that an agent or "
+    "`sros fleet publish` has replaced (they are shown for a day) do not count. "
     "`vulnerabilities`: as `delivery`, and also for a DDS with known vulnerabilities that a later "
     "release fixes.",
 )
@@ -676,8 +676,8 @@ def _status(
     The exit status is 0 if every robot that is not revoked has confirmed the files that it should
     have, no restart is due, no agent reports a problem, no published file is missing or was altered
     in the last day, and robots still accept the published files. Otherwise it is 1. With --fail-on
-    unmended, problems that an agent or `sros fleet publish` has mended do not count. With --fail-on
-    vulnerabilities, it is also 1 if a robot has a DDS to upgrade.
+    unmended, changed files that an agent or `sros fleet publish` has replaced do not count. With
+    --fail-on vulnerabilities, it is also 1 if a robot has a DDS to upgrade.
     """
     from sros_tool.checks.vulnerabilities import is_fixed_later, robot_findings
     from sros_tool.keystore.fleet_status import fleet_status

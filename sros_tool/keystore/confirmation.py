@@ -268,14 +268,17 @@ def is_unusable(problem: str) -> bool:
 
 def is_mended(problem: str) -> bool:
     """Return whether a robot's problem is over: its agent mended it, and reports it for a day."""
-    return any(words in problem for words in (REPLACED_FILES, READABLE_KEYS, REMOVED_ENCLAVES))
+    return problem_rank(problem) == 2
 
 
 def problem_rank(problem: str) -> int:
-    """Return the rank of a robot's problem, 0 for the gravest: somebody may have copied a key."""
+    """Return the rank of a robot's problem, 0 for the gravest: somebody may have copied a key.
+
+    The rank is 2 for a problem that the agent has mended, such as a changed file.
+    """
     if any(words in problem for words in _COPIED_KEYS):
         return 0
-    return 2 if is_mended(problem) else 1
+    return 2 if REPLACED_FILES in problem else 1
 
 
 def is_enclave_below_root(name: str) -> bool:

@@ -612,9 +612,9 @@ class FleetStatus:
 
     @property
     def mended(self) -> bool:
-        """Like ``complete``, but problems that an agent has mended, and reports for a day, do not
-        count: files that it replaced, keys that others could read, and enclaves that it removed.
-        Altered files that were published again do not count, either.
+        """Like ``complete``, but changed files that an agent replaced, and altered files that were
+        published again, do not count; both are shown for a day.  A key that somebody may have
+        copied counts.
         """
         return self._is_in_order and all(robot.mended for robot in self.robots)
 
