@@ -127,11 +127,11 @@ def loadable_environment(
         raise missing_enclave_error(keystore, name, keystore.names)
     folder = keystore.folder(name)
     state = keystore.enclave(name, now=now)
-    domains = state.domains() if wanted is not None else state.joined_domains()
+    domains, joined = state.domains(), state.joined_domains()
     zenoh = _opened_zenoh(keystore, name, state, now) if with_zenoh and not state.token else None
-    if zenoh and domains:
-        wanted = _zenoh_domain(keystore, zenoh, wanted, domains)
-    domain = _choose_domain(domains, wanted, keystore) if domains else 0
+    if zenoh and joined:
+        wanted = _zenoh_domain(keystore, zenoh, wanted, joined)
+    domain = _choose_domain(domains, joined, wanted, keystore) if domains and joined else 0
     state = keystore.enclave(name, now=now, domain=domain)
     if not with_zenoh:
         vendor = vendor_of(used) if target else shipped_vendor(used, environment)
@@ -179,9 +179,9 @@ def loadable_environment(
             f"of the other enclave. See `sros check {quote(str(keystore.root))}`."
         )
         notes += (Note("env.other-enclave", text),)
-    if wanted is None and any(other_domain != domain for other_domain in domains or ()):
+    if wanted is None and any(other_domain != domain for other_domain in joined or ()):
         text = (
-            f"a process in enclave {name} may run in any of the domains {domains}, and runs in "
+            f"a process in enclave {name} may run in any of the domains {joined}, and runs in "
             f"{domain}: for another domain, add --domain ID."
         )
         notes += (Note("env.several-domains", text),)
@@ -431,12 +431,14 @@ def _refuse_outdated(keystore: OpenedKeystore, name: str, now: datetime) -> None
         )
 
 
-def _choose_domain(domains: DomainSet, wanted_domain: int | None, keystore: OpenedKeystore) -> int:
+def _choose_domain(
+    domains: DomainSet, joined: DomainSet, wanted_domain: int | None, keystore: OpenedKeystore
+) -> int:
     """Return the ROS domain for a process: ``wanted_domain``, or a default.
 
-    ``wanted_domain`` comes from an option or ROS_DOMAIN_ID, and ``domains`` are the domains of the
-    keystore. The default is 0, as in ROS, if the keystore has that domain, or else the first domain
-    of the keystore.
+    ``wanted_domain`` comes from an option or ROS_DOMAIN_ID, ``domains`` are the domains of the
+    keystore, and ``joined`` those of them that the enclave may join. The default is 0, as in ROS,
+    if the enclave may join it, or else the first domain of the enclave.
 
     Raises:
         KeystoreError: the keystore is not for ``wanted_domain``.
@@ -444,13 +446,13 @@ def _choose_domain(domains: DomainSet, wanted_domain: int | None, keystore: Open
     from sros_tool.keystore.layout import how_to_add_domains
 
     if wanted_domain is None:
-        return domains.preferred()
+        return joined.preferred()
     if wanted_domain in domains:
         return wanted_domain
     raise KeystoreError(
         f"keystore '{keystore.root}' is for domain {domains}, not for {wanted_domain}",
         "DDS would refuse the node.",
-        f"Set ROS_DOMAIN_ID to {next(iter(domains))}, or "
+        f"Set ROS_DOMAIN_ID to {joined.preferred()}, or "
         f"{how_to_add_domains(keystore.root, f'{domains},{wanted_domain}')}.",
     )
 

@@ -1089,7 +1089,9 @@ class _EnclaveFiles:
             self._add(name, error.what, Fault.PERMISSIONS_MALFORMED)
         rules = [rule for rule in grant.rules if rule.allow]
         if domain is not None and not any(domain in rule.domains.closed() for rule in rules):
-            text = f"none of its rules allows anything in domain {domain}"
+            allowed = grant.domains()
+            only = f", only in domain {allowed}" if allowed.ranges else ""
+            text = f"none of its rules allows anything in domain {domain}{only}"
             self._add(name, text, Fault.PERMISSIONS_DOMAIN)
 
 

@@ -199,6 +199,12 @@ def test_a_process_of_several_domains_is_told_of_them(halls: Path) -> None:
     assert "several" not in sros("env", "ks", "/f02/guard", cwd=halls).ok().err
 
 
+def test_a_process_in_a_wrong_domain_gets_the_domain_of_its_enclave(halls: Path) -> None:
+    for domain, said in ((30, "Set ROS_DOMAIN_ID to 20, or add"), (10, "10, only in domain 20. ")):
+        ended = sros("env", "ks", "/f02/guard", "--domain", domain, cwd=halls)
+        assert ended.status == 2 and said in ended.err
+
+
 def test_a_name_that_nobody_has_leads_to_that_of_the_robot(halls: Path) -> None:
     asked = ("explain", "ks", "--who", "publish")
     ended = sros(*asked, "/north/estop", cwd=halls)
