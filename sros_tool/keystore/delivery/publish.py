@@ -1311,9 +1311,9 @@ class _Publication:
         if 0 < present < last and not self._is_other_folder:
             altered.append(TIMESTAMP_PATH)
             text = (
-                f"the metadata in '{self._folder}' was older than the keystore published it last, "
-                "and is published again. Either a run was interrupted, or somebody put earlier "
-                "files there: find out who else can write to this folder."
+                f"the metadata in '{self._folder}' was older than the last publication, and is "
+                "published again. Either a run was interrupted, or somebody put earlier files "
+                "there: find out who else can write to this folder."
             )
             self._notes.append(Note("fleet.metadata-older", text))
         self._altered = altered
