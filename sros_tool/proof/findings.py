@@ -31,7 +31,7 @@ from sros_tool.names import (
     is_expression,
     service_of,
 )
-from sros_tool.policy.model import ALLOW, Level, Source
+from sros_tool.policy.model import ALLOW, DENY, Level, Source
 from sros_tool.policy.patterns import covers
 from sros_tool.policy.remapping import Remapping, has_new_name
 from sros_tool.policy.rights import KIND_OF, Right
@@ -66,6 +66,8 @@ from sros_tool.wording import first_few
 class Step:
     """A use in a witness, with the place of the right that states it, or None.
 
+    If an enclave lacks a right that it must have, the place is preferably that of a denial.
+
     ``permissions_of`` is another enclave whose permissions allow the use; "" for the enclave's own
     permissions.
     """
@@ -84,7 +86,8 @@ class Step:
         right, kind, name, by = self.drawn()
         shown = f"action {name}" if kind == "actions" else name
         text = f"{right or ('write' if self.use.writes else 'read')} {shown}"
-        text += f" by {by}" if by else ""
+        is_denied = self.place and self.place.right.qualifier is DENY
+        text += f"{', denied' if is_denied else ''} by {by}" if by else ""
         return (
             f"{text} with the permissions of {self.permissions_of}" if self.permissions_of else text
         )
@@ -203,7 +206,7 @@ def decide_all(requirements: Sequence[Requirement], system: System) -> Decided:
         broken = [(world, verdict.witness) for world, verdict in verdicts if verdict.witness]
         if broken:
             world, witness = min(broken, key=lambda pair: len(pair[1].uses))
-            steps = tuple(_step(use, world, system) for use in witness.uses)
+            steps = tuple(_step(requirement, use, world, system) for use in witness.uses)
             titles = tuple(world.title for world, _ in broken)
             titles = () if len(broken) == len(system.worlds) else titles
             missing = next(
@@ -213,7 +216,7 @@ def decide_all(requirements: Sequence[Requirement], system: System) -> Decided:
             similar_uses = [uses for uses in witness.others if _are_alike(uses, witness)]
             differing = [uses for uses in witness.others if not _are_alike(uses, witness)]
             other_steps = tuple(
-                tuple(_step(use, world, system) for use in uses)
+                tuple(_step(requirement, use, world, system) for use in uses)
                 for uses in (*similar_uses[:_MOST_SHOWN], *differing[:_MOST_SHOWN])
             )
             violations.append(
@@ -271,8 +274,10 @@ def _no_enclave_clause(names: Sequence[str]) -> str:
     return f"there is no enclave {_listed_names(names, 'or')}"
 
 
-def _step(use: Use, world: World, system: System) -> Step:
-    """Return a use with the right that allows the use, which may be of another enclave."""
+def _step(requirement: Requirement, use: Use, world: World, system: System) -> Step:
+    """Return a use with the right that allows it, perhaps of another enclave, or that denies it."""
+    if isinstance(requirement, Must) and (denial := system.places.find(use, DENY)):
+        return Step(use, denial)
     holder = world.other_sufficient_enclave(use.enclave, use.writes, use.topic)
     stating = replace(use, enclave=holder) if holder else use
     return Step(use, system.places.find(stating), holder)

@@ -50,6 +50,7 @@ from sros_tool.policy.model import (
     Enclave,
     Level,
     Policy,
+    Qualifier,
     Source,
     StatedProtection,
     stated_protections,
@@ -463,7 +464,7 @@ def _keystore_system(keystore: OpenedKeystore, at: Circumstances) -> System:
         worlds += on_zenoh
     files = {name: str(enclave_path(root, name) / PERMISSIONS_FILE) for name in names}
     places = {
-        name: [Place(right, Source(files[name], 0)) for right in rights if right.enclave == name]
+        name: [Place(r, Source(files[name], 0)) for r in source.rights if r.enclave == name]
         for name in names
     }
     return System(
@@ -588,7 +589,7 @@ class Place:
 
 
 class Places:
-    """An index of stated rights, which finds the right that lets an enclave use a topic."""
+    """An index of stated rights, which finds the right that allows or denies a use of a topic."""
 
     def __init__(self, stated: Mapping[str, Iterable[Place]]) -> None:
         """Create an index of rights by enclave."""
@@ -598,10 +599,10 @@ class Places:
     @classmethod
     def index_of_policy(cls, policy: Policy) -> Places:
         """Return the index of the rights in a policy, with their lines."""
-        return cls({enclave.path: _AllowedRights(enclave) for enclave in policy.enclaves})
+        return cls({enclave.path: _StatedRights(enclave) for enclave in policy.enclaves})
 
-    def find(self, use: Use) -> Place | None:
-        """Return a right that permits a use, preferably a right without wildcards, or None."""
+    def find(self, use: Use, qualifier: Qualifier = ALLOW) -> Place | None:
+        """Return a right that allows (or denies) a use, preferably without wildcards, or None."""
         topics = self._by_enclave.get(use.enclave)
         if topics is None:
             places = self._stated_topics.get(use.enclave, ())
@@ -610,7 +611,7 @@ class Places:
             ]
         best = None
         for writes, topic, place in topics:
-            if writes is not use.writes:
+            if writes is not use.writes or place.right.qualifier is not qualifier:
                 continue
             if topic == use.topic:
                 return place
@@ -619,13 +620,12 @@ class Places:
         return best
 
 
-class _AllowedRights:
-    """The allowed rights of an enclave in a policy, which every iteration computes again."""
+class _StatedRights:
+    """The rights and denials of an enclave in a policy, which every iteration computes again."""
 
     def __init__(self, enclave: Enclave) -> None:
         self._enclave = enclave
 
     def __iter__(self) -> Iterator[Place]:
         for placed in placed_rights(self._enclave):
-            if placed.right.qualifier is ALLOW:
-                yield Place(placed.right, placed.source)
+            yield Place(placed.right, placed.source)

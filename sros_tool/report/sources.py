@@ -419,7 +419,8 @@ def _with_requirements(
             tuple(
                 PicturedUse(step.use.enclave, *step.drawn())
                 for step in violation.steps
-                if step.place and step.use.right
+                # What an enclave may not do, but must, is no right that could be drawn.
+                if step.place and step.use.right and not isinstance(violation.requirement, Must)
             ),
         )
         for violation, finding in zip(decided.violations, findings, strict=False)

@@ -621,7 +621,8 @@ def test_unique_subjects_fit_no_other_permissions_for_each_vendor(tmp_path: Path
 CAMERA = {
     "/camera": may("publish", "/image", "/rosout", "/parameter_events")
     + may("subscribe", "/parameter_events", "/trigger")
-    + may("reply", "/camera/set_*"),
+    + may("reply", "/camera/set_*")
+    + may("reply", "/camera/set_no*").replace("ALLOW", "DENY"),
     "/base": may("subscribe", "/image") + may("publish", "/trigger"),
 }
 NOTHING_BUT = '[[nothing_but]]\nenclaves = ["/camera"]\npublish = ["/image"]\n'
@@ -644,6 +645,10 @@ EXPRESSIBLE = {
         "both publish /image and reply */set_x"
     ),
     BOTH % 'publish = ["/trigger"]': "",
+    '[[must]]\nenclave = "/camera"\nreply = ["/camera/set_now"]\n': (
+        "/camera: may not reply /camera/set_now, denied by /camera/set_no*, but /camera has to be "
+        "able to reply /camera/set_now"
+    ),
     '[[only]]\npublish = ["/image"]\nenclaves = ["*", "!/camera"]\n': (
         "/camera: may publish /image, but /camera may not publish /image"
     ),

@@ -266,11 +266,21 @@ def test_a_column_with_many_enclaves_has_groups(tmp_path: Path) -> None:
 
 
 def test_what_breaks_a_requirement_is_red_and_said(tmp_path: Path) -> None:
-    enclaves = CHAIN | {"/web": group("topics", "publish", "/goal", "/cmd*")}
+    denied = group("topics", "publish", "/cmd_arm").replace("ALLOW", "DENY")
+    enclaves = CHAIN | {"/web": group("topics", "publish", "/goal", "/cmd*") + denied}
     policy, wanted = tmp_path / "robot.xml", tmp_path / "robot.toml"
     policy.write_text(policy_text(enclaves))
     only = '[[only]]\npublish = ["/cmd_vel"]\nenclaves = ["/mux"]\n'
-    wanted.write_text(only + '[[must]]\nenclave = "/mux"\npublish = ["/cmd_vel"]\n')
+    only += '[[must]]\nenclave = "/mux"\npublish = ["/cmd_vel"]\n'
+    # What an enclave must and may not is said, and never drawn as a right that it has.
+    wanted.write_text(only + '[[must]]\nenclave = "/web"\npublish = ["/cmd_arm"]\n')
+    shown_picture = value(policy, "--requirements", wanted)
+    said = [violation["short"] for violation in shown_picture["requirements"]["violations"]]
+    assert said[1:] == ["/web may not publish /cmd_arm"]
+    of_web = [edge for edge in shown_picture["edges"] if edge["enclave"] == "/web"]
+    drawn = [e["qualifier"] for e in of_web if (e["name"], e["right"]) == ("/cmd_arm", "publish")]
+    assert drawn == ["DENY"]
+    wanted.write_text(only)
     shown_picture = value(policy, "--requirements", wanted)
     assert shown_picture["requirements"]["hold"] == 1
     (violation,) = shown_picture["requirements"]["violations"]
