@@ -434,14 +434,7 @@ def _state_text(closed: CloseState, *, apply: bool) -> str:
     if not closed.secured:
         not_closed = "nothing was closed" if apply else "nothing is closed yet"
         return "no process of the robot runs" if closed.stopped >= {*closed.pending} else not_closed
-    words = {
-        name: _NOT_CURRENT
-        if name in closed.secured
-        else "not running"
-        if name in closed.stopped
-        else "open"
-        for name in closed.pending
-    }
+    words = {name: _how_it_runs(closed, name) for name in closed.pending}
     exceptions = ", ".join(
         f"{enumerated([name for name in words if words[name] == word])} ({word})"
         for word in dict.fromkeys(words.values())
@@ -449,6 +442,17 @@ def _state_text(closed: CloseState, *, apply: bool) -> str:
     if len(words) > 1 and not any(closed.secured.values()):
         return f"restart all {len(words)} processes: {exceptions}"
     return f"the processes run in their enclaves{', except for ' * bool(words)}{exceptions}"
+
+
+def _how_it_runs(closed: CloseState, enclave: str) -> str:
+    """Return how the process of an enclave runs that is not as it should be."""
+    if enclave in closed.secured:
+        return _NOT_CURRENT
+    if enclave in closed.other_files:
+        return "secured with other files"
+    if enclave in closed.stopped:  # an unknown process may be the process of the enclave
+        return "no known process" if closed.observed.unknown else "not running"
+    return "open"
 
 
 def _other_machines_advice(robot: LocalRobot, closed: CloseState) -> str:

@@ -201,6 +201,22 @@ class RunningRobot:
                 texts.append(f"{process.label} in {name}")
         return texts
 
+    def with_other_files(self, observed: ObservedProcesses) -> Sequence[str]:
+        """Return the enclaves whose process runs secured, but with no files of the export."""
+        own = {process.pid for process, _ in self.secured}
+        others = [
+            process
+            for process in self.in_domain
+            if process.asks_for_security and process.pid not in own
+        ]
+        pids = {process.program[0] for process in others}
+        names = {process.enclave.name for process in others if process.enclave}
+        return [
+            process.enclave
+            for process in observed.processes
+            if process.pid in pids or (process.enclave in names and not process.pid)
+        ]
+
     def with_later_processes(self, observed: ObservedProcesses) -> ObservedProcesses:
         """Return the observed processes with their present commands, and processes of new enclaves.
 
@@ -342,6 +358,8 @@ class CloseState(NamedTuple):
     """The enclaves in which a process of the robot runs now, and whether this process has the
     current files; otherwise it has to be restarted.
     """
+    other_files: Sequence[str]
+    """The enclaves whose process runs secured, but not with the files of the export."""
     outdated: Mapping[str, str]
     """Why the processes of these enclaves have to be restarted, as text before "the processes of"
     and the enclave."""
@@ -475,6 +493,7 @@ def current_state(robot: LocalRobot, policy: Policy | None) -> CloseState:
         observed=observed,
         steps=(),
         secured=secured,
+        other_files=running.with_other_files(observed),
         outdated={name: processes[-1][1] for name, processes in outdated.items()},
         outdated_pids={
             name: [*dict.fromkeys(process.program[0] for process, _ in processes)]

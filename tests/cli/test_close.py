@@ -676,6 +676,7 @@ def test_processes_that_started_after_the_watch(robot: Robot) -> None:
     assert "  /late: new, start it with: sros run " in ended.out
     robot.more = (late,)
     said = robot.close(status=1).out
+    assert "enclaves, except for /late (no known process); fix this first:\n" in said
     assert "such as your own `sros demo listener`; stop what belongs in /late, and start " in said
     assert "it there: sros run /" in said and "/robot/export ENCLAVE -- COMMAND; to give an" in said
     learn = "`sros generate_policy robot/policy.xml --enclave-per-node`; read the added rights"
@@ -1641,7 +1642,10 @@ def test_a_process_with_older_files_of_an_enclave_is_no_closed_process(robot: Ro
         copied.write_bytes(copied.read_bytes() + b"\n")
         robot.more = (replace(robot.process("/talker", is_secured=True), pid=13),)
         robot.spelled = "robot/export"
+        robot.absent = {"/talker"} if status else set()
         ended = robot.close(status=status)
+        runs = "enclaves, except for /talker (secured with other files); fix this first:\n"
+        assert (runs in ended.out) == bool(status), ended
         said = f"  process 13 (run): /talker from '{copy}', not from '{robot.folder}/robot/export'"
         assert (f"{said}: stop it; if it belongs to the robot" in ended.out) == bool(status), ended
 
@@ -1904,5 +1908,5 @@ def test_the_state_says_first_what_to_do_if_no_process_is_as_it_should_be(
     secured: dict[str, bool], says: str
 ) -> None:
     pending = [name for name in ("/a", "/b", "/c") if not secured.get(name)]
-    closed: Any = SimpleNamespace(secured=secured, pending=pending, stopped=set())
+    closed: Any = SimpleNamespace(secured=secured, pending=pending, stopped=set(), other_files=())
     assert close._state_text(closed, apply=False) == says
