@@ -19,10 +19,21 @@ from typing import NamedTuple
 from sros_tool.checks.processes import has_other_files, other_folder_findings
 from sros_tool.checks.requirements import VACUOUS, VIOLATED
 from sros_tool.close.nodes import ObservedNodes
-from sros_tool.close.processes import ClosedProcess, ObservedProcesses, run_words
+from sros_tool.close.processes import (
+    ClosedProcess,
+    ObservedProcesses,
+    process_text,
+    run_words,
+)
 from sros_tool.close.robot import MOST_NAMES, TEMPLATE, LocalRobot
 from sros_tool.close.start_files import write_start_files
-from sros_tool.close.state import CloseState, CloseStep, RunningRobot, current_state
+from sros_tool.close.state import (
+    CloseState,
+    CloseStep,
+    RunningRobot,
+    current_state,
+    secured_process,
+)
 from sros_tool.close.watch import check_watchable, watch
 from sros_tool.errors import SrosError, UsageError
 from sros_tool.files import replace_file
@@ -424,15 +435,14 @@ def _unknown_process_problems(running: RunningRobot, state: CloseState) -> Itera
         advice = advice if observed.elsewhere else ""
         advice = f"watch again while they run{advice}: {close} --for 1m"
         if state.secured:
-            advice = "stop what is not of the robot, such as your own `sros demo listener`; "
-            if idle := sorted(state.stopped):
-                start = observed.command_of_new(robot.export.absolute(), "ENCLAVE")
-                advice += f"stop what belongs in {first_few(idle, MOST_NAMES)}, and start it "
-                advice += f"there: {start}; "
-            learn = how_to_learn_one_process(robot.folder, robot.domain)
-            advice += f"to give another process its own enclave, {learn}"
+            advice = _start_of_unknown_process(running, state)
+            advice += "stop what is not of the robot, such as your own `sros demo listener`"
+            # An enclave that was added while the robot is closed may already be of this process.
+            if len(observed.unknown) > len({*state.new}.difference(observed.ended)):
+                learn = how_to_learn_one_process(robot.folder, robot.domain)
+                advice += f"; to give another process its own enclave, {learn}"
         yield (
-            f"sros saw no node of {counted(len(observed.unknown), 'process', 'processes')}: "
+            f"sros knows no node of {counted(len(observed.unknown), 'process', 'processes')}: "
             f"{processes}; {advice}; otherwise {silent}"
         )
     routers = [process for process in running.open_processes if process.is_router]
@@ -460,6 +470,25 @@ def _unknown_process_problems(running: RunningRobot, state: CloseState) -> Itera
             f"a stranger's: remove its enclave from '{robot.policy}', and remove "
             f"'{robot.requirements}', which sros then proposes again. Otherwise, {silent}"
         )
+
+
+def _start_of_unknown_process(running: RunningRobot, state: CloseState) -> str:
+    """Return a clause on how to start an unknown process in an enclave that has no process.
+
+    Returns "" without such an enclave. The clause has the command of the process if there is only
+    one process and one enclave, and the process is of a user who can read the enclaves.
+    """
+    observed, export = state.observed, running.robot.export.absolute()
+    if not (idle := sorted(state.stopped)):
+        return ""
+    start = observed.command_of_new(export, "ENCLAVE")
+    if len(observed.unknown) == len(idle) == 1:
+        for process in running.open_processes:
+            known = secured_process(process, idle[0])
+            is_unknown = process_text(process) in observed.unknown
+            if is_unknown and running.may_use_files(process) and not known.unit:
+                start = known.secured_command(export.parent)
+    return f"stop what belongs in {first_few(idle, MOST_NAMES)}, and start it there: {start}; "
 
 
 def _shared_program_problems(robot: LocalRobot) -> Iterator[str]:

@@ -596,6 +596,14 @@ class _TalkComparison:
         lost = {*endpoints_of(before)} - _denied_endpoints(self._denied)
         return lost.difference(endpoints_of(self.current.nodes))
 
+    def _later_names(self, nodes: Iterable[ObservedNode]) -> list[str]:
+        """Return the nodes, and the uses of other nodes, that the open robot did not have."""
+        expected = self._nodes.expected(self.current).nodes
+        known = {*map(node_name, expected)}
+        uses = {*endpoints_of(nodes)}.difference(endpoints_of(expected))
+        later = sorted({*map(node_name, nodes)} - known)
+        return [*later, *_endpoint_texts((node, use) for node, use in uses if node in known)]
+
     def summary(self) -> str:
         """Return text on the comparison, on rights that the policy takes away, and on new nodes."""
         before = self._nodes.nodes_to_compare(self._away)
@@ -621,11 +629,9 @@ class _TalkComparison:
             if node_name(node) not in known and not is_tool(node)
         )
         text += f"; new, without a profile: {first_few(new, MOST_NAMES)}" if new else ""
-        expected = {*map(node_name, self._nodes.expected(self.current).nodes)}
-        new = sorted({*map(node_name, with_profile)} - expected)
-        if new:
-            text += "; not compared, because sros did not see them on the open robot: "
-            text += first_few(new, MOST_NAMES)
+        if later := self._later_names(with_profile):
+            text += "; not compared, because `sros close` did not see this on the open robot: "
+            text += first_few(later, MOST_NAMES)
         if topics := self._nodes.topics_without_node:
             text += "; not compared, because they belonged to no ROS node: writers or readers of "
             text += f"{topics} (programs without security cannot talk to the closed robot)"

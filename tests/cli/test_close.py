@@ -649,7 +649,7 @@ def test_processes_that_started_after_the_watch(robot: Robot) -> None:
     late = Process(7, ("/opt/late", "--ros-args"), {}, datetime.now(UTC))
     robot.more = (late,)
     said = robot.close(status=1).out
-    assert "saw no node of 1 process: process 7 (late): /opt/late --ros-args; watch again" in said
+    assert "knows no node of 1 process: process 7 (late): /opt/late --ros-args; watch again" in said
     robot.close("--partial")
     robot.more = ()
     robot.close()
@@ -677,8 +677,14 @@ def test_processes_that_started_after_the_watch(robot: Robot) -> None:
     robot.more = (late,)
     said = robot.close(status=1).out
     assert "enclaves, except for /late (no known process); fix this first:\n" in said
-    assert "such as your own `sros demo listener`; stop what belongs in /late, and start " in said
-    assert "it there: sros run /" in said and "/robot/export ENCLAVE -- COMMAND; to give an" in said
+    export = robot.folder / "robot/export"
+    start = f"cd /opt && sros run {export} /late -- /opt/late --ros-args"
+    assert f"; stop what belongs in /late, and start it there: {start}; stop what is not" in said
+    assert "such as your own `sros demo listener`; otherwise nobody would hear" in said
+    robot.more = (late, replace(late, pid=8, command=("/opt/more", "--ros-args")))
+    said = robot.close(status=1).out
+    assert f"it there: sros run {export} ENCLAVE -- COMMAND; stop what is not of the " in said
+    assert "`sros demo listener`; to give another process its own enclave, let it run" in said
     learn = "`sros generate_policy robot/policy.xml --enclave-per-node`; read the added rights"
     assert f"next to the closed robot, and run {learn}" in said
     assert "--undo" not in said, "no advice opens the robot"
@@ -686,7 +692,6 @@ def test_processes_that_started_after_the_watch(robot: Robot) -> None:
     commands = (robot.folder / "robot/start/commands.txt").read_text()
     assert commands.startswith("# /late is new: COMMAND is what starts it\nsros run ")
     assert "enclaves, except for /late (not running); the files" in ended.err
-    export = robot.folder / "robot/export"
     environment = secured_environment(export, "/late", 0)
     late = robot.with_its_files(replace(late, environment=environment))
     robot.more = (replace(late, user=os.geteuid() + 1),)
@@ -1073,7 +1078,9 @@ def test_processes_that_show_no_id_are_to_be_named(robot: Robot) -> None:
 def test_nothing_is_closed_of_what_is_not_understood(robot: Robot) -> None:
     robot.units = UNITS
     robot.more = (Process(5, ("other", "--ros-args"), {}, datetime.now(UTC)),)
-    assert "first:\n  sros saw no node of 1 process: process 5 (other)" in robot.close(status=1).out
+    assert (
+        "first:\n  sros knows no node of 1 process: process 5 (other)" in robot.close(status=1).out
+    )
     assert (
         "nobody would hear them any more (--partial accepts this)"
         in robot.close("--apply", status=1).out
@@ -1144,6 +1151,8 @@ def test_a_renamed_node_is_compared_and_a_new_one_is_named(
     value["notes"].append(
         {"id": "graph.stray", "text": "left out, because they are alone: rt/odom"}
     )
+    (talker,) = (node for node in value["nodes"] if node["name"] == "talker")
+    talker["publish"].remove("rt/chatter")  # as a use that it learned later
     seen.write_text(json.dumps(value))
     bow_camera = ros_node("nav/bow_camera", of, "publish rt/nav/bow_camera/image")
     robot.remaining = (TALKER, LISTENER, stern_camera, bow_camera)
@@ -1153,9 +1162,9 @@ def test_a_renamed_node_is_compared_and_a_new_one_is_named(
         in said
     )
     assert (
-        "; not compared, because sros did not see them on the open robot: /nav/bow_camera, /n"
-        in said
-    )
+        "; not compared, because `sros close` did not see this on the open robot: "
+        "/nav/bow_camera, /nav/stern_camera, /talker publish /chatter; not"
+    ) in said
     assert (
         "; not compared, because they belonged to no ROS node: writers or readers of rt/odom ("
         in (said)
