@@ -165,14 +165,14 @@ def _proof_of_files(robot: LocalRobot, expired: Sequence[str]) -> Proof:
         except SrosError as error:  # for example, an older revocation list
             holds, reason = False, f"the keystore does not export them: {error}"
         else:
-            if changes:
+            if outside := robot.enclaves_outside_policy():
+                reason = f"the keystore has {first_few(outside, MOST_NAMES)}, and the policy does "
+                reason += f"not; {_revoking_advice(robot)}"
+                holds = False
+            elif changes:
                 number = counted(len(changes), "file")
                 reason = f"exporting '{robot.keystore}' would change {number}, such as {changes[0]}"
                 holds, reason = False, f"{reason}; `{robot.close_command}` exports them"
-            elif outside := robot.enclaves_outside_policy():
-                reason = f"the keystore has {first_few(outside, MOST_NAMES)}, and the policy does "
-                reason += f"not; `{robot.close_command}` says how to revoke or keep this"
-                holds = False
     unsigned = _unsigned_policy_text(robot) if status == 0 else ""
     examined = f"{robot.export}"
     if robot.keystore.exists() and not expired:
@@ -185,6 +185,10 @@ def _proof_of_files(robot: LocalRobot, expired: Sequence[str]) -> Proof:
             reason = told if holds else f"{reason}; {told}"
             holds = False if fails or holds is False else None
     return Proof("the files are accepted", holds, f"{reason}: {examined}{unsigned}")
+
+
+def _revoking_advice(robot: LocalRobot) -> str:
+    return f"`{robot.close_command}` says how to revoke or keep this"
 
 
 def _expired_enclaves(robot: LocalRobot, root: Path) -> list[str]:
@@ -704,6 +708,8 @@ def _unseen_text(running: RunningRobot, node: str, enclave: str) -> str:
                 f"end of the command of {process.label}, because others on Zenoh do not see a node "
                 "without these arguments)"
             )
+    if enclave in running.robot.enclaves_outside_policy():
+        return f"{node or f'any node in {enclave}'} ({_revoking_advice(running.robot)})"
     if not node or is_expression(node):
         return f"any node in {enclave}"
     label = next((process.label for process, of in running.secured if of.name == enclave), "")

@@ -947,6 +947,16 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
         "(?) may be a node, but cannot be examined (/proc hides it)\n"
     ) in ended.out
     assert "closed, except for the claims that were not checked" in ended.err
+    robot.unseen, rogue = (), robot.folder / "rogue.xml"
+    rogue.write_text(policy_text({"/rogue": publish("x")}))
+    sros("generate_artifacts", "-k", "robot/keystore", "-p", rogue, cwd=robot.folder).ok()
+    said = robot.close("--proof", status=1).out
+    advice = "`sros close robot` says how to revoke or keep this"
+    assert (
+        f"no: the files are accepted: the keystore has /rogue, and the policy does not; {advice}"
+        in said
+    )
+    assert f"not seen: any node in /rogue ({advice})" in said and "exports them" not in said
 
 
 @pytest.mark.parametrize("after", some([False, True], 1))
