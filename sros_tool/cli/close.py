@@ -71,8 +71,7 @@ def _run(words: Sequence[str], shows_output: bool) -> tuple[int, str, str]:
     "--partial",
     is_flag=True,
     help="Accept processes whose nodes sros does not know, nodes that belong to no process here, "
-    "and "
-    "processes that sros could not examine.",
+    "processes that sros could not examine, and processes in enclaves that sros did not observe.",
 )
 @click.option(
     "--without",

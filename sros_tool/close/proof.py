@@ -73,6 +73,7 @@ from sros_tool.runtime.variables import ENCLAVE
 from sros_tool.wording import counted, enumerated, first_few
 
 _CLAIM_STARTED = "every process was started in its enclave"
+_CLAIM_KNOWN = "every process in an enclave belongs there"
 _CLAIM_REQUIRED = "the requirements hold"
 
 _START_SECONDS = 3.0
@@ -136,6 +137,7 @@ def proofs_of(robot: LocalRobot, state: CloseState, patience: float) -> list[Pro
     silence = _proof_of_silence(robot, nodes.nodes_to_compare(away), hears=talk.holds is not None)
     return [
         proof,
+        *_proof_of_observed_processes(running),
         _proof_of_files(robot, expired),
         _proof_of_requirements(robot),
         talk,
@@ -381,9 +383,19 @@ def _proof_of_processes(running: RunningRobot, number: int) -> Proof:
         text = first_few(texts, MOST_NAMES, "; ")
     else:
         text += "".join(f"; {guest}" for guest in _unexpected_processes(running))
-    if more := running.not_observed():
-        text += f"; not observed before: {first_few(more, MOST_NAMES)} (stop what is not yours)"
     return Proof(_CLAIM_STARTED, False if wrong else None if findings else True, text)
+
+
+def _proof_of_observed_processes(running: RunningRobot) -> Iterator[Proof]:
+    """Yield the proof that the processes in enclaves belong there, if sros does not know some."""
+    if more := running.not_observed():
+        yield Proof(
+            _CLAIM_KNOWN,
+            None,
+            f"sros did not see {first_few(more, MOST_NAMES)} when it watched, and each process has "
+            "all rights of its enclave: stop what is not yours; if only the command of a process "
+            f"is new, `{running.robot.close_command}` remembers it",
+        )
 
 
 def _process_findings(running: RunningRobot) -> list[Finding]:

@@ -829,14 +829,19 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
         replace(talker, pid=pid, command=command, started=talker.started + timedelta(pid))
         for pid, command in ((6, ("/tmp/thief",)), (7, talker.command), (8, ("ros2", "topic")))
     )
-    more = "; not observed before: process 6 (thief) in /talker, process 7 (run) in /talker ("
-    guest = "in domain 0; process 5 (guest) runs open in domain 7"
-    assert f"{guest}{more}stop what is not yours)\n" in robot.close("--proof").out
-    robot.more += (replace(seven, environment={"ROS_DOMAIN_ID": "0"}),)
+    more = "sros did not see process 6 (thief) in /talker, process 7 (run) in /talker when it wat"
+    more = f"every process in an enclave belongs there: {more}"
+    guest = "in domain 0; process 5 (guest) runs open in domain 7\n"
     said = robot.close("--proof", status=1).out
+    assert f"{guest}not checked (--partial accepts this): {more}" in said
     assert (
-        "no: every process was started in its enclave: process 5 (guest)" in said and more in said
+        f"{guest}not checked (accepted by --partial): {more}"
+        in robot.close("--proof", "--partial").out
     )
+    robot.more = (*robot.more[:2], *robot.more[4:], replace(seven, environment={}))
+    said = robot.close("--proof", status=1).out
+    assert "no: every process was started in its enclave: process 5 (guest)" in said
+    assert "belongs there" not in said, "only programs of ros2 are left"
     robot.more = ()
     robot.remaining = (TALKER,)
     lost = "no: everything that talked can still talk: "
