@@ -1037,11 +1037,9 @@ def _unseen_process_findings(running: RunningProcesses) -> Iterator[Finding]:
     doubtful = [process for process in running.unseen if not process.speaks]
     reasons = [running.hidden] if running.hidden else []
     if doubtful:
-        why = ", ".join(sorted({process.why for process in doubtful})[:3])
-        may_be = f"{doubtful[0].label} may be a node"
-        if len(doubtful) > 1:
-            may_be = f"{len(doubtful)} processes may be nodes"
-        reasons.append(f"{may_be}, but cannot be examined ({why})")
+        processes = first_few([f"{process.label} ({process.why})" for process in doubtful], 3)
+        may_be = "may be a node" if len(doubtful) == 1 else "may be nodes"
+        reasons.append(f"{processes} {may_be}, but cannot be examined")
     if running.container:
         text = f"{len(running.processes)} of them speak ROS 2"
         yield CONTAINER_ALONE.found("processes", text)

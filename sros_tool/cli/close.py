@@ -284,7 +284,7 @@ def _process_line(process: ClosedProcess, closed: CloseState, policy: Policy) ->
         state += "it, watch the open robot again)"
     else:
         ended = process.enclave in closed.observed.ended
-        state = "has ended" if ended else "not running as observed"
+        state = "has ended" if ended else "no process runs its command"
     return f"{process.enclave}: {state}{_nodes_clause(policy, process.enclave)}: {restart}"
 
 
@@ -416,16 +416,12 @@ def _show_undone(robot: LocalRobot, closed: CloseState) -> None:
         ask = f"ask again with sros close {shlex.quote(str(robot.folder))} --undo"
         echo(f"the robot is not open yet; next: restart these processes, and {ask}", err=True)
     else:
-        pids = [
-            process.pid for process in closed.observed.processes if process.pid or process.alike
-        ]
-        # Without the list of observed processes, "no process runs" would be a guess.
-        stopped = robot.observed is not None and not (pids or closed.observed.unknown)
-        state = "no process of the robot runs" if stopped else "the robot is open"
         more = ""
         if other_machines := closed.observed.not_here:
             more = f"; on other machines, also start {enumerated(other_machines)} without sros run"
-        echo(f"{state}: sros sees no process in an enclave of this folder{more}", err=True)
+        echo(
+            f"the robot is open: sros sees no process in an enclave of this folder{more}", err=True
+        )
 
 
 def _state_text(closed: CloseState, *, apply: bool) -> str:

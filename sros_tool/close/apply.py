@@ -126,6 +126,10 @@ def undo(robot: LocalRobot, *, dry_run: bool) -> CloseState:
         *remaining.secured_in_unobserved_enclaves(),
         *remaining.unknown_processes(),
     ]
+    runs = any(process.pid or process.alike for process in state.observed.processes)
+    # Without the list of observed processes, "no process runs" would be a guess.
+    if robot.observed and not (dry_run or problems or runs or state.observed.unknown):
+        problems = ["no process of the robot runs, open or secured: start its processes open"]
     return state._replace(problems=problems)
 
 

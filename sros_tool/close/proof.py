@@ -380,7 +380,8 @@ def _proof_of_processes(running: RunningRobot, number: int) -> Proof:
             finding.text if finding.subject == "processes" else f"{finding.subject}: {finding.text}"
             for finding in wrong or findings
         ]
-        text = first_few(texts, MOST_NAMES, "; ")
+        done = "" if wrong else f"true for {counted(number, 'enclave')}; "
+        text = f"{done}{first_few(texts, MOST_NAMES, '; ')}"
     else:
         text += "".join(f"; {guest}" for guest in _unexpected_processes(running))
     return Proof(_CLAIM_STARTED, False if wrong else None if findings else True, text)
@@ -448,7 +449,8 @@ def _why_missing(running: RunningRobot, missing: Sequence[str], observed: Observ
         if (enclave := process.enclave)
     }
     enclaves = ", ".join(f"{name} ({causes[name]})" if name in causes else name for name in absent)
-    reasons, advice = [f"no secured process of {enclaves} runs"] * bool(absent), ""
+    reasons = [f"no secured process of this robot runs in {enclaves}"] * bool(absent)
+    advice = ""
     if absent:
         log = f"`sros explain {shlex.quote(str(robot.export))} --log ITS_LOG`"
         advice = (

@@ -104,12 +104,14 @@ def _commands_text(robot: LocalRobot, state: CloseState) -> str:
     commands = state.observed.commands_by_hand(folder)
     rest = {command: commands[command] for command in commands if command not in due}
     place = "by its command, in the place that starts it today."
+    together = "# Start them one second apart: processes that start together may miss each other."
     lines = [
         "# Stop all of these processes: secured and open ones do not hear each other. Then",
         f"# start each of them {place}",
+        together,
     ]
     if state.secured:
-        lines = [f"# Stop each of these processes, and start it {place}"]
+        lines = [f"# Stop each of these processes, and start it {place}", together]
     if not state.secured:
         lines = [*map(_warning_of_rmw, robot.rmws_without_security()), *lines]
     lines = [*lines, *_commands(due, folder)] if due else []

@@ -894,7 +894,9 @@ def _read(folder: int, name: str, max_bytes: int) -> bytes:
             parts.append(part)
             length += len(part)
             if length > max_bytes:
-                raise _TooLongError(0, f"its {name} is longer than {max_bytes // 1024**2} MiB")
+                raise _TooLongError(
+                    0, f"/proc/PID/{name} is longer than {max_bytes // 1024**2} MiB"
+                )
         return b"".join(parts)
     finally:
         os.close(handle)

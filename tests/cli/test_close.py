@@ -527,8 +527,8 @@ def test_what_systemd_does_not_start_is_done_by_hand(
     assert "stop process 4711, and start it with:\n  cd /opt && sros run " in ended.out
     assert ended.err.endswith("next: run these commands, and then sros close robot --proof\n")
     assert (
-        "no: every process was started in its enclave: no secured process of /listener (stop "
-        "process 4712, which is open), /talker (stop process 4711, which is open) runs. "
+        "no: every process was started in its enclave: no secured process of this robot runs in "
+        "/listener (stop process 4712, which is open), /talker (stop process 4711, which is open). "
     ) in robot.close("--proof", status=1).out
     for root in ("robot/keystore", "robot/export"):
         denied = sros("explain", root, "/talker", "publish", "/x", cwd=robot.folder).out
@@ -551,7 +551,9 @@ def test_what_systemd_does_not_start_is_done_by_hand(
     )
     assert "; next: stop them, start them by the commands at the top of robot/" in ended.err
     commands = (robot.folder / "robot/start/commands.txt").read_text()
-    assert re.search(r"\A# Stop .*\n\n# /listener\n.*\n\n# These .*\n\n# /talker\n", commands)
+    assert re.search(
+        r"\A# Stop .*\n# Start .*\n\n# /listener\n.*\n\n# These .*\n\n# /talker\n", commands
+    )
     assert ("ros2 launch" in commands) == bool(shutil.which("ros2"))
     (robot.folder / "bin/ros2").symlink_to("systemctl")
     robot.absent = {"/listener"}
@@ -628,7 +630,7 @@ def test_what_systemd_does_not_start_is_done_by_hand(
     robot.absent = {"/listener", "/talker"}
     policy = robot.folder / "robot/policy.xml"
     policy.write_text(policy.read_text().replace('node="listener"', 'node="hearer"'))
-    undone = robot.close("--undo")
+    undone = robot.close("--undo")  # with the open process 12
     assert undone.err.startswith(
         "/listener may run open by another command (process 12 (run)); if that is not so, "
         "start /listener open, under its old name /listener: cd /opt && /opt/run listener\n"
@@ -637,6 +639,9 @@ def test_what_systemd_does_not_start_is_done_by_hand(
     assert "\nsome processes cannot be examined: run this command as root\n" in undone.err
     assert "the robot is open: " in undone.err
     looked = replace(robot.look(None, datetime.now(UTC)), by_root=True)
+    robot.more, robot.unseen = (), ()
+    undone = robot.close("--undo", status=1)
+    assert undone.out.startswith("no process of the robot runs, open or secured: start its proc")
     monkeypatch.setattr(ProcessTable, "look", lambda _table, _now: looked)
     undone = robot.close("--undo")
     assert "\nsome processes cannot be examined. Being root is not enough here: " in undone.err
@@ -721,8 +726,8 @@ def test_a_node_that_does_not_run_always(robot: Robot) -> None:
     robot.by_hand, robot.absent, robot.remaining = {"/talker"}, {"/listener"}, (TALKER,)
     ended = robot.close("--proof", status=1)
     assert (
-        "no: every process was started in its enclave: no secured process of /listener runs. St"
-        in ended.out
+        "no: every process was started in its enclave: no secured process of this robot runs in "
+        "/listener. St" in ended.out
     )
     assert "If it does not always run, add --without /listener\n" in ended.out
     assert ended.out == robot.close("--proof", "--partial", status=1).out
@@ -782,7 +787,7 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     robot.more += tuple(replace(robot.more[0], pid=pid) for pid in (6, 7))
     robot.absent = {"/listener"}
     said = robot.close("--proof", status=1).out
-    assert "no secured process of /listener (" in said
+    assert "no secured process of this robot runs in /listener (" in said
     assert "; also open: process 5 (spy), process 4711 (run), process 6 (spy) and 1 more; " in said
     robot.absent = set()
     ended = robot.close("--proof", status=1)
@@ -938,7 +943,10 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     assert "not checked: an open listener finds nothing: this proves nothing, because" in ended.out
     assert "accept with --partial" not in ended.err
     robot.remaining = (TALKER, LISTENER)
-    robot.unseen = (UnseenProcess(9, (), "/proc hides it", speaks=False),)
+    robot.unseen = (
+        UnseenProcess(9, (), "/proc hides it", speaks=False),
+        UnseenProcess(10, ("init",), "Permission denied", speaks=False),
+    )
     policy = robot.folder / "robot/policy.xml"
     policy.write_text(policy.read_text().replace("chatter", "old/chatter", 1))
     ended = robot.close("--proof", "--partial")
@@ -948,8 +956,9 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
         "and signs it\n" in ended.out
     )
     assert (
-        "not checked (accepted by --partial): every process was started in its enclave: process 9 "
-        "(?) may be a node, but cannot be examined (/proc hides it)\n"
+        "not checked (accepted by --partial): every process was started in its enclave: true for 2 "
+        "enclaves; process 9 (?) (/proc hides it), process 10 (init) (Permission denied) may be "
+        "nodes, but cannot be examined\n"
     ) in ended.out
     assert "closed, except for the claims that were not checked" in ended.err
     robot.unseen, rogue = (), robot.folder / "rogue.xml"
@@ -1041,7 +1050,7 @@ def test_a_unit_that_does_not_run_is_not_called_open(
     robot.absent = {"/listener"}
     unit = robot.units["/listener"]
     said = robot.close("--proof", status=1).out
-    assert f"of /listener ({unit} does not run it: systemctl status {unit}) runs. Start " in said
+    assert f"in /listener ({unit} does not run it: systemctl status {unit}). Start " in said
     assert "--without" not in said
     ended = robot.close()
     assert "  /listener: not running: --apply restarts" in ended.out

@@ -109,7 +109,9 @@ def test_a_robot_is_closed(tmp_path: Path) -> None:
 
     assert said["not yet"].status == 1
     (first,) = proofs(said["not yet"]).values()
-    assert first["reason"].startswith("no secured process of /listener (stop process ")
+    assert first["reason"].startswith(
+        "no secured process of this robot runs in /listener (stop process "
+    )
 
     assert said["closed"].status == 1, said["closed"]
     processes, files, required, talk, silence = proofs(said["closed"]).values()

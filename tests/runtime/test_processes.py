@@ -199,7 +199,7 @@ def test_endless_texts_are_not_looked_at_and_named(proc: Proc) -> None:
         file.truncate(5 * 1024**2)
     (unseen,) = proc.look().unseen
     assert unseen.speaks
-    assert unseen.why == "its environ is longer than 4 MiB"
+    assert unseen.why == "/proc/PID/environ is longer than 4 MiB"
 
 
 def test_a_process_that_always_starts_another_program_is_named(
