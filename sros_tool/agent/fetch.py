@@ -302,6 +302,8 @@ def _read_archive(path: Path, robot: str, number: int) -> Release:
         raise FetchError(
             FetchProblem.NOT_SIGNED,
             f"the release of {robot} has number {release.number}, but the metadata says {number}",
+            "Somebody with the keys of the metadata put it there.",
+            "Nothing was changed. Find out who published it.",
         )
     return release
 

@@ -241,7 +241,7 @@ def test_a_number_that_the_seal_does_not_have(publisher: Home) -> None:
     thief = Thief(publisher, publisher.pub, *ROLES)
     archive, number = thief.archive("r1")
     thief.put("r1", archive, number + 1)
-    publisher.robot().refuses(FetchProblem.NOT_SIGNED)
+    assert publisher.robot().refuses(FetchProblem.NOT_SIGNED).remedy
     thief.put("r1", archive, number)
     publisher.robot().gets()
 

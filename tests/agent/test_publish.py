@@ -568,7 +568,17 @@ def test_check_knows_the_files_and_who_may_read_the_keys(publisher: Home) -> Non
 
 
 def test_a_key_that_was_lost(publisher: Home) -> None:
-    (publisher.root / "private/fleet_snapshot.pem").unlink()
+    targets, snapshot = (publisher.root / f"private/fleet_{e}.pem" for e in ("targets", "snapshot"))
+    before = targets.read_bytes(), snapshot.read_bytes()
+    targets.write_bytes(before[1])
+    snapshot.write_bytes(before[0])
+    with pytest.raises(
+        KeystoreError, match="--rotate-key targets --rotate-key snapshot of"
+    ) as both:
+        publisher.publish()
+    assert f"'{targets}' is not the targets key and '{snapshot}' is not the" in str(both.value)
+    targets.write_bytes(before[0])
+    snapshot.unlink()
     with pytest.raises(KeystoreError, match="--rotate-key snapshot"):
         publisher.publish()
     publisher.publish(rotate=("snapshot",))

@@ -855,7 +855,7 @@ def test_a_revoked_robot_of_which_only_a_copied_list_knows(field: Field) -> None
     shutil.rmtree(field.root)
     backup.rename(field.root)
     shutil.copy(field.folder / "later" / crl, field.root / crl)
-    assert "/r2/base --new-key`" in field.run("renew", "ks", "/r2/base", status=2).err
+    assert "/r2/base --new-key --revoke-old`" in field.run("renew", "ks", "/r2/base", status=2).err
     field.run("revoke", "ks", "--robot", "r3")
     robot = field.status()["robots"]["r3"]
     assert (robot["state"], robot["revoked"]) == ("revoked", ["/r3/base"])

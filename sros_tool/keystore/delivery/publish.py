@@ -440,6 +440,13 @@ class _RoleKeys:
         self.rotated = () if first else tuple(role for role in _ROLES if role in rotate)
         for role in _ONLINE:
             self.signers[role] = self._online_signers(role, new=first or role in rotate)
+        self.roots.check_signers(
+            {
+                role: (self.signers[role][0], self._path(role))
+                for role in _ONLINE
+                if fleet_key(role) not in self.new
+            }
+        )
         left = expiry.root if first else self.roots.last.expires - now
         if first or rotate or left < expiry.root / 3:
             self._sign_root(
@@ -475,7 +482,6 @@ class _RoleKeys:
         if not path.exists():
             raise KeystoreError(f"'{path}' is missing", "", lost_key_remedy(role))
         signers = [load_signer(read_bytes(path, "key"), f"'{path}'")]
-        self.roots.check_signer(role, signers[0], path)
         if before.exists():
             signers.append(load_signer(read_bytes(before, "key"), f"'{before}'"))
         return signers
@@ -489,7 +495,7 @@ class _RoleKeys:
         if path.exists():
             keys.append(load_signer(read_bytes(path, "root key"), f"'{path}'"))
             if self.roots.versions:
-                self.roots.check_signer("root", keys[0], path)
+                self.roots.check_signers({"root": (keys[0], path)})
         elif self.roots.versions:
             if is_required or self._elsewhere:
                 raise KeystoreError(

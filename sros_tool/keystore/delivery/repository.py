@@ -43,6 +43,7 @@ from sros_tool.keystore.delivery.published import (
     check_positive_number,
 )
 from sros_tool.keystore.delivery.release import release_target
+from sros_tool.wording import enumerated
 from sros_tool.xml import read_bytes
 
 _ROOT, _TARGETS, _SNAPSHOT, _TIMESTAMP = Root.type, Targets.type, Snapshot.type, Timestamp.type
@@ -80,12 +81,11 @@ def load_signer(data: bytes, label: str) -> CryptoSigner:
     return CryptoSigner(key)
 
 
-def lost_key_remedy(role: str) -> str:
-    """Return the remedy for a lost key of a role, as a sentence."""
-    return (
-        "Restore it from a backup, or make another with --rotate-key "
-        f"{role} of `sros fleet publish`."
-    )
+def lost_key_remedy(*roles: str) -> str:
+    """Return the remedy for lost keys of roles, as a sentence."""
+    options = " ".join(f"--rotate-key {role}" for role in roles)
+    what, other = ("it", "another") if len(roles) == 1 else ("them", "others")
+    return f"Restore {what} from a backup, or make {other} with {options} of `sros fleet publish`."
 
 
 _REMEDY_ROOT_KEY = (
@@ -165,13 +165,15 @@ class Roots:
         """Return whether the current root metadata names the key of ``signer`` for a role."""
         return signer.public_key.keyid in self.last.roles[role].keyids
 
-    def check_signer(self, role: str, signer: CryptoSigner, path: Path) -> None:
-        """Raise `KeystoreError` unless ``signer``, read from ``path``, has the key of a role."""
-        if not self.has_key(role, signer):
+    def check_signers(self, signers: Mapping[str, tuple[CryptoSigner, Path]]) -> None:
+        """Raise `KeystoreError` unless each signer, read from its path, has the key of its role."""
+        wrong = [role for role, (signer, _) in signers.items() if not self.has_key(role, signer)]
+        if wrong:
+            which = enumerated([f"'{signers[role][1]}' is not the {role} key" for role in wrong])
             raise KeystoreError(
-                f"'{path}' is not the {role} key with which this keystore publishes",
-                "Robots would refuse its signatures.",
-                _REMEDY_ROOT_KEY if role == _ROOT else lost_key_remedy(role),
+                f"{which} with which this keystore publishes",
+                "Robots would refuse the signatures.",
+                _REMEDY_ROOT_KEY if _ROOT in wrong else lost_key_remedy(*wrong),
             )
 
     def verify(

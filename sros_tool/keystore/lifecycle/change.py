@@ -347,7 +347,8 @@ class KeystoreChange:
             KeystoreError: the key was revoked.
         """
         public: PublicKey = certificate.public_key()  # type: ignore[assignment]
-        remedy = f"Give it another key with `sros renew {quote(str(self.root))} {name} --new-key`."
+        where = f"{quote(str(self.root))} {name}"
+        remedy = f"Give it another key with `sros renew {where} --new-key --revoke-old`."
         self.known.refuse_revoked(public, f"enclave {name}", remedy, certificate)
         return public
 
