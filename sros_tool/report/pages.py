@@ -61,8 +61,6 @@ def render_page(
     made = f"{origins}. Findings are as of {iso(now)[:10]}."
     if unread := sum(units.enclaves for units in picture.unread):
         made += f" {unread} enclaves were only compared: they have no findings and expiry here."
-    if revoked := picture.revoked_sentence:
-        made += f" {revoked[:1].upper()}{revoked[1:]}."
     return _document(
         f"{picture.title}: who may do what",
         Template(_asset("view.html")).substitute(title=escape(picture.title), made=escape(made)),

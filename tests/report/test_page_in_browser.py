@@ -601,8 +601,8 @@ def test_what_all_names_have_in_common_is_said_once(
 def test_of_equal_robots_it_says_who_drives_and_shows_the_names_of_all(
     browser: Browser, tmp_path: Path
 ) -> None:
-    enclaves = {}
-    for robot in (f"/r{number}" for number in range(1, 10)):
+    enclaves, last = {}, "r9_of_the_long_hall_at_the_end_of_the_road"
+    for robot in (*(f"/r{number}" for number in range(1, 9)), f"/{last}"):
         enclaves[f"{robot}/mux"] = publish(f"{robot}/cmd_vel", f"{robot}/state")
         enclaves[f"{robot}/base"] = subscribe(f"{robot}/cmd_vel")
         enclaves[f"{robot}/recorder"] = subscribe("/*")
@@ -613,8 +613,11 @@ def test_of_equal_robots_it_says_who_drives_and_shows_the_names_of_all(
     assert path.read_text().count('"right":"publish"') < 4
     with opened(browser, path) as page:
         said = page.inner_text("#headlines")
-        assert "May publish /{r1…r9}/cmd_vel: /{r1…r9}/mux\n" in said
+        assert f"May publish /{{r1…{last}}}/cmd_vel: /{{r1…{last}}}/mux\n" in said
         assert ": nobody" not in said
+        assert page.evaluate(
+            "(side => side.scrollWidth <= side.clientWidth)(document.querySelector('#side'))"
+        )
         page.click("#tab-names")
         moving = page.locator("#names .group", has_text="Moves the robot").locator("tbody th")
         shown = moving.all_inner_texts() or page.locator("#names tbody th").all_inner_texts()
@@ -622,12 +625,14 @@ def test_of_equal_robots_it_says_who_drives_and_shows_the_names_of_all(
         # Each robot is found by its own name, also in rows on names of the others.
         for name, number in (("/r7/CMD", "2 names in 2 rows"), ("r7/base", "1 name in")):
             page.fill("#search-names", name)
-            assert page.inner_text("#names [role=status]").startswith(number)
-            assert "/{r1…r9}/cmd_vel" in page.inner_text("#names tbody")
+            said = page.inner_text("#names [role=status]")
+            assert said.startswith(number) and "; those of equal namespaces count once." in said
+            assert f"/{{r1…{last}}}/cmd_vel" in page.inner_text("#names tbody")
         page.fill("#search-names", "r10")
         assert page.inner_text("#names [role=status]") == "No name matches."
         page.click("#headlines .link-button >> nth=0")
-        assert "9 TOPICS ALIKE" in details(page) and "/r7/cmd_vel" in details(page)
+        assert f"9 TOPICS ALIKE\n\n/{{r1…{last}}}/cmd_vel\n" in details(page)
+        assert "/r7/cmd_vel" in details(page)
 
 
 def test_overlays_can_be_filtered_and_listed(browser: Browser, tmp_path: Path) -> None:
@@ -652,6 +657,9 @@ def test_overlays_can_be_filtered_and_listed(browser: Browser, tmp_path: Path) -
         assert "allowed, never observed" in text and "observed, not allowed" in text
     with opened(browser, path, "phone") as page:
         assert page.locator("#panel-differences").is_visible()
+        page.set_viewport_size({"width": 280, "height": 600})
+        right = "tabs => Math.max(...tabs.map(tab => tab.getBoundingClientRect().right))"
+        assert page.eval_on_selector_all("[role=tab]", right) <= 280
 
 
 @pytest.mark.parametrize("size", SIZES)
@@ -909,5 +917,6 @@ def test_it_prints_every_part(browser: Browser, robot_page: Path) -> None:
         page.emulate_media(media="print")
         for part in ("#map", "#timeline", "#findings"):
             assert page.locator(part).is_visible(), part
-        assert page.locator("#search").is_hidden()
+        for control in ("#search", "#search-names", ".choices"):
+            assert page.locator(control).is_hidden(), control
         assert len(page.pdf()) > 20_000

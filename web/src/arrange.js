@@ -28,6 +28,9 @@ function wrapped(text, letters) {
   return [...lines, text];
 }
 
+// The names that lines of a card show, each as one text again.
+export const unwrapped = (lines) => lines.join("\n").replace(/\n {2,}/g, "").split("\n");
+
 function height(card) {
   const { line: row, small, pad } = SIZES;
   return 2 * pad + row * card.lines.length + small * card.notes.length;
@@ -322,12 +325,7 @@ function rewrapped(card, width, slim) {
   const names = card.role === "names";
   const letter = slim ? 6.8 : SIZES.letter;
   const around = (names ? (slim ? 30 : 62) : slim ? 14 : 24) + (names && slim ? 14 : 0) * card.tags.length;
-  const whole = [];
-  for (const text of card.lines) {
-    if (text.startsWith("  ") && whole.length) whole.push(whole.pop() + text.trim());
-    else whole.push(text);
-  }
-  const lines = whole.flatMap((text) => wrapped(text, Math.floor((width - around) / letter)));
+  const lines = unwrapped(card.lines).flatMap((text) => wrapped(text, Math.floor((width - around) / letter)));
   const notes = card.notes.flatMap((text) => inWords(text, Math.floor((width - (names && slim ? 34 : 18)) / SIZES.smallLetter)));
   const fit = { ...card, width, slim, lines, notes };
   return { ...fit, height: Math.max(height(fit), names && slim && card.lock ? 46 : 0) };

@@ -1,5 +1,6 @@
 // What is known of the enclave or the name that was chosen.
 
+import { unwrapped } from "./arrange.js";
 import { breakable, counted, el } from "./dom.js";
 import { byRight, sends } from "./model.js";
 import { KINDS, LEVELS, RECEIVES, SENDS, markText, noneText } from "./words.js";
@@ -225,7 +226,7 @@ export function cardDetails(card, act) {
   const items = card.members.map((name) => el("li", {}, link(name, () => act.name(card.kind, name))));
   return [
     el("p", { class: "kind", text: `${counted(card.members.length, KINDS[card.kind])} alike` }),
-    el("h2", { text: card.lines[0].trim(), tabindex: "-1" }),
+    el("h2", { text: unwrapped(card.lines)[0], tabindex: "-1" }),
     section("Names", longList(items)),
   ];
 }

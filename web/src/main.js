@@ -1,6 +1,6 @@
 // Puts the page together: tabs, search, filters, the map, and what was chosen.
 
-import { MOST_BUNDLES, columns, fitted, flowScene } from "./arrange.js";
+import { MOST_BUNDLES, columns, fitted, flowScene, unwrapped } from "./arrange.js";
 import { cardDetails, enclaveDetails, equalDetails, findingItem, nameDetails } from "./details.js";
 import { breakable, byId, counted, el, isSmall, svg } from "./dom.js";
 import { drawScene, legend, onlookerText, withLocks } from "./draw.js";
@@ -337,7 +337,7 @@ function fillLists() {
   // A name that stands for several is a card of the first scene.
   const opens = (kind, name) => {
     if (model.bundle(kind, name)) return () => act.name(kind, name);
-    const card = model.scenes[0].cards.find((each) => each.kind === kind && each.lines.join("") === name);
+    const card = model.scenes[0].cards.find((each) => each.kind === kind && unwrapped(each.lines).includes(name));
     return card && (() => choose(card));
   };
   byId("headlines").replaceChildren(...headlines(model, opens, act, showTab));

@@ -89,9 +89,10 @@ export function namesTable(rows, equal, opens) {
     groups.replaceChildren(...(parts.length > 1 ? parts.map(part) : [table([...shown])]));
     const names = namesIn(fit);
     const shared = names > fit.length ? " (names with the same rights share a row)" : "";
+    const once = equal.length ? `; those of equal ${equal[0].what}s count once` : "";
     const first = fit.length > MOST ? `; shown are the first ${MOST}` : "";
     const none = found.length ? "A name matches, but not these choices." : "No name matches.";
-    status.textContent = text && !fit.length ? none : `${counted(names, "name")} in ${counted(fit.length, "row")}${shared}${first}.${same}`;
+    status.textContent = text && !fit.length ? none : `${counted(names, "name")} in ${counted(fit.length, "row")}${shared}${once}${first}.${same}`;
   }
   search.addEventListener("input", show);
   only.addEventListener("change", show);
