@@ -129,9 +129,9 @@ _TRUST_FILES = tuple(
 """Files of an enclave that decide whom it trusts: CAs and revocation list."""
 _GRAVEST_FILES = (CRL_FILE, IDENTITY_CA_FILE, PERMISSIONS_CA_FILE, GOVERNANCE_FILE)
 """The files that are named first if they were changed: they decide for all other enclaves, too."""
-_MOST_COPIED = 100
+_MOST_COPIED = 4000
 """Maximum number of keys of each kind that the agent remembers because somebody may have copied
-them; it keeps those that it has reported first."""
+them: one for each enclave of a large robot.  It keeps those that it has reported first."""
 _REPLACED_LIST = "replaced.crl.pem"
 _KEEP_REPLACED_LIST = timedelta(days=30)
 """How long the agent sends a revocation list after a release replaced it by a shorter one.
@@ -565,7 +565,7 @@ class _Round:
         if closed := {key.path: key.at for key in exposed if key.path not in readable}:
             self._problems.append(
                 f"Until {iso(max(closed.values()))}{READABLE_KEYS}"
-                f"{counted(len(closed), 'private key')}: {first_few(sorted(closed), 3)}. The mode "
+                f"{counted(len(closed), 'private key')}: {first_few(sorted(closed), 2)}. The mode "
                 "is correct now, but somebody may have copied a key: run `sros renew KEYSTORE "
                 "ENCLAVE --new-key --revoke-old`, and bring the new key."
             )

@@ -502,6 +502,8 @@ def test_an_older_release_is_refused_also_without_a_state(home: Home, r1: Robot)
     for value in damaged:
         path.write_text(json.dumps(value))
         assert read_state(r1.folder).accepted == 2, value
+    path.write_text(json.dumps({**whole, "more": 1}))
+    assert read_state(r1.folder).release == 2, "another version of sros wrote it"
     path.write_text("damaged")
     assert read_state(r1.folder).accepted == 2
     path.write_text(json.dumps({**whole, "latest": "0001-01-01T00:00:00Z"}))
