@@ -171,12 +171,18 @@ def learn(observation: Observation, common: CommonParts | None = None) -> Learne
     """
     notes = _Notes()
     seen: dict[_Place, set[NodeRight]] = {}
+    processes: dict[tuple[str, str], set[str]] = {}
     for node in observation.nodes:
         if is_tool(node):
             notes.add("tool", node.fqn)
             continue
+        if len(node.enclaves) == 1:
+            processes.setdefault((node.fqn, *node.enclaves), set()).add(node.process)
         for place, rights in _rights_of(node, notes):
             seen.setdefault(place, set()).update(rights)
+    for (fqn, enclave), using in processes.items():
+        if len(using) > 1:
+            notes.add("same-node", f"{fqn} in {enclave} ({len(using)} processes)")
     for enclave, ns, name in observation.silent:
         if is_tool_name(name):
             notes.add("tool", f"{ns.rstrip('/')}/{name}")
@@ -535,6 +541,9 @@ _NOTE_TEXTS = {
     "without an enclave, or ROS_SECURITY_ENCLAVE_OVERRIDE (as `sros run` and `sros env` set it) "
     "names an enclave that the graph does not show. --enclave-per-node gives each process an "
     "enclave of its own, with the name of its node",
+    "same-node": "several processes have the same node in the same enclave, so this enclave gets "
+    "the rights of all of them. Unless it is one process that was restarted, find out whether each "
+    "of these processes is yours, and give the nodes different names (-r __node:=NAME): {}",
     "service-event": "service introspection is on: every subscriber of these topics can read the "
     "requests; remove the topics from the policy if introspection is for debugging only: {}",
     "sets-clock": "these nodes may set the clock of every node that uses simulated time; only a "
@@ -670,20 +679,21 @@ def _notes(
             "DDS secures processes, so all nodes of a process share its enclave, which is named "
             f"after one of these nodes: {first_subjects(sorted(several), '; ')}",
         )
-    users: dict[str, set[str]] = {}
+    users: dict[str, dict[str, set[str]]] = {}
     for node in nodes:
         for enclave in node.enclaves:
-            users.setdefault(enclave, set()).add(node.process)
+            users.setdefault(enclave, {}).setdefault(node.process, set()).add(node.fqn)
     shared = [
         f"{name} ({len(users[name])} processes)"
         for name in sorted(set(names.values()))
-        if len(users[name]) > 1
+        # `learn` has a note on processes that have a node in common.
+        if len(users[name]) > 1 and not set.intersection(*users[name].values())
     ]
     if shared:
         yield Note(
             "graph.shared-enclave",
-            "nodes of several processes have the same name, so these processes share an enclave, "
-            "which gets the rights of all of them. Unless it is one process that was restarted, "
+            "several processes share an enclave, because of the names of their nodes; it gets the "
+            "rights of all of them. Unless it is one process that was restarted, "
             "give the nodes different names (-r __node:=NAME), or start each process with "
             "--ros-args --enclave: "
             f"{first_subjects(shared)}",

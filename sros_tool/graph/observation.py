@@ -19,6 +19,7 @@ import secrets
 import select
 import sys
 import time
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, NamedTuple, Protocol
@@ -259,11 +260,23 @@ def main() -> int:
     return 0
 
 
+class Reading(NamedTuple):
+    """Nodes (enclave, namespace, name) and endpoints of the graph, in the RMW's order.
+
+    With ``nodes_changed``, nodes came or went during the reading: ``listed`` has the nodes before
+    and after it, so that nobody hides others by nodes that come and go all the time.
+    """
+
+    listed: list[Any]
+    endpoints: list[Any]
+    nodes_changed: bool = False
+
+
 class GraphObserver(Protocol):
     """Interface of an observer of the ROS graph."""
 
-    def snapshot(self) -> tuple[list[Any], list[Any]] | None:
-        """Return nodes and endpoints of the same moment, or None."""
+    def snapshot(self) -> Reading:
+        """Return a reading, of a single moment if possible."""
 
 
 def report_graph(observer: GraphObserver, report: Any, period: float, *, ordered: bool) -> None:
@@ -271,15 +284,15 @@ def report_graph(observer: GraphObserver, report: Any, period: float, *, ordered
 
     After a change, the graph is read again immediately, not after ``period`` seconds: a node may
     not show all its endpoints yet, and may exit before the next regular reading.  ``ordered`` says
-    that the nodes are listed by ascending participant.
+    that the nodes are listed by ascending participant, unless they changed during a reading.
     """
-    before: object = None
+    before: Reading | None = None
     while True:
         now = observer.snapshot()
-        changes = now is None or now != before
-        if now is not None and changes:
-            listed, endpoints = before = now
-            send(report, {"ordered": ordered, "listed": listed, "endpoints": endpoints})
+        if changes := now.nodes_changed or now != before:
+            in_order = ordered and not now.nodes_changed
+            send(report, {"ordered": in_order, "listed": now.listed, "endpoints": now.endpoints})
+            before = now
         if select.select([sys.stdin], [], [], _REREAD_SECONDS if changes else period)[0]:
             return
 
@@ -295,14 +308,15 @@ class _Observer:
         self._itself: tuple[str, str, str] | None = None
         self._participant = ""
 
-    def snapshot(self) -> tuple[list[Any], list[Any]] | None:
-        """Return nodes and endpoints of the same moment; None if nodes changed in every attempt."""
+    def snapshot(self) -> Reading:
+        """Return a reading; only if nodes changed in every attempt, it is not of one moment."""
+        after = self._listed()
         for _ in range(_ATTEMPTS):
-            listed = self._listed()
-            endpoints = self._endpoints()
-            if self._listed() == listed:
-                return listed, endpoints
-        return None
+            before, endpoints, after = after, self._endpoints(), self._listed()
+            if before == after:
+                return Reading(after, endpoints)
+        listed = (Counter(before) | Counter(after)).elements()
+        return Reading(sorted(listed), endpoints, nodes_changed=True)
 
     def _listed(self) -> list[tuple[str, str, str]]:
         """Return (enclave, namespace, name) of all nodes but the observer, in the RMW's order."""

@@ -20,7 +20,7 @@ from typing import Any
 
 import zenoh
 
-from sros_tool.graph.observation import PUBLISH, SUBSCRIBE, report_graph, send
+from sros_tool.graph.observation import PUBLISH, SUBSCRIBE, Reading, report_graph, send
 from sros_tool.names import dds_names
 
 NODE = "NN"
@@ -69,7 +69,7 @@ class _TokenObserver:
         alive = sample.kind == zenoh.SampleKind.PUT
         (self._tokens.add if alive else self._tokens.discard)(str(sample.key_expr))
 
-    def snapshot(self) -> tuple[list[Any], list[Any]]:
+    def snapshot(self) -> Reading:
         """Return nodes and endpoints in the form of the observer on DDS."""
         nodes, endpoints = set(), set()
         for token in tuple(self._tokens):
@@ -84,7 +84,7 @@ class _TokenObserver:
                 topics = dds_names(_RIGHTS[kind], chunks[9].replace("%", "/"))
                 for way, names in ((PUBLISH, topics.publish), (SUBSCRIBE, topics.subscribe)):
                     endpoints |= {(session, ns, chunks[8], name, way) for name in names}
-        return [node[1:] for node in sorted(nodes)], sorted(endpoints)
+        return Reading([node[1:] for node in sorted(nodes)], sorted(endpoints))
 
 
 def main() -> int:

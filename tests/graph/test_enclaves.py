@@ -59,7 +59,12 @@ def test_names(nodes: list[ObservedNode], enclaves: set[str]) -> None:
         ),
         (
             [unshown("/a"), unshown("/a", participant="p2")],
-            ["graph.shared-enclave: --ros-args --enclave: /a (2 processes)"],
+            ["graph.same-node: /a in /a (2 processes)"],
+        ),
+        # A stranger that takes the name and the enclave of a node gets no right without a word.
+        (
+            [unshown("/a", enclave="/e"), unshown("/a", enclave="/e", participant="p2")],
+            ["graph.same-node: /a in /e (2 processes)"],
         ),
         (
             [unshown("/a"), unshown("/z", participant="p2", enclave="/a")],
@@ -78,7 +83,11 @@ def test_names(nodes: list[ObservedNode], enclaves: set[str]) -> None:
     ],
 )
 def test_what_a_name_cannot_tell_apart_is_said(nodes: list[ObservedNode], said: list[str]) -> None:
-    notes = enclave_per_node(graph(*nodes)).notes
+    named = enclave_per_node(graph(*nodes))
+    notes = [
+        *named.notes,
+        *(n for n in learn(named.observation).notes if n.id == "graph.same-node"),
+    ]
     assert [note.id for note in notes] == [each.partition(": ")[0] for each in said]
     for note, each in zip(notes, said, strict=True):
         assert each.partition(": ")[2] in note.text

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import io
+import itertools
+import json
+import select
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -10,6 +14,8 @@ import pytest
 from sros_tool.graph.observation import (
     Endpoint,
     Observation,
+    Reading,
+    _Observer,
     make_observation,
     observation_from_json,
     report_graph,
@@ -76,20 +82,46 @@ def test_json_gives_the_same_back() -> None:
 
 def test_a_graph_that_changed_is_read_again_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """A tool that lives shorter than a period would otherwise be seen only while it starts."""
-    full = (["tool"], ["rosout", "chatter"])
-    looks: list[Any] = [([], ["rosout"]), None, full, full]
+    full = Reading(["tool"], ["rosout", "chatter"])
+    looks = [Reading([], ["rosout"]), full, full]
     waits: list[float] = []
 
     class Script:
-        def snapshot(self) -> Any:
+        def snapshot(self) -> Reading:
             return looks.pop(0)
 
-    def select(*words: Any) -> tuple[bool]:
+    def selected(*words: Any) -> tuple[bool]:
         waits.append(words[-1])
         return (not looks,)
 
-    monkeypatch.setattr("select.select", select)
+    monkeypatch.setattr(select, "select", selected)
     report = io.StringIO()
     report_graph(Script(), report, 60.0, ordered=True)
     assert report.getvalue().count("rosout") == 2
-    assert [wait < 0.05 for wait in waits] == [True, True, True, False]
+    assert [wait < 0.05 for wait in waits] == [True, True, False]
+
+
+def test_nobody_hides_behind_nodes_that_come_and_go(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A stranger that announces other nodes during every reading hides no node from the report."""
+    monkeypatch.setattr(select, "select", lambda *_: ([True],))
+    names = itertools.count()
+
+    class Graph:
+        def get_node_names_and_namespaces_with_enclaves(self) -> list[tuple[str, str, str]]:
+            return [("evil", "/", "/"), (f"n{next(names)}", "/", "/")]
+
+        def get_topic_names_and_types(self, *, no_demangle: bool) -> list[tuple[str, list[str]]]:
+            return [("rt/cmd_vel", [])]
+
+        def get_publishers_info_by_topic(self, topic: str, *, no_mangle: bool) -> list[Any]:
+            return [SimpleNamespace(endpoint_gid=[1] * 16, node_namespace="/", node_name="evil")]
+
+        def get_subscriptions_info_by_topic(self, topic: str, *, no_mangle: bool) -> list[Any]:
+            return []
+
+    report = io.StringIO()
+    report_graph(_Observer(Graph()), report, 60.0, ordered=True)
+    told = json.loads(report.getvalue())
+    assert told["endpoints"] == [["01" * 12, "/", "evil", "rt/cmd_vel", "publish"]]
+    assert told["listed"].count(["/", "/", "evil"]) == 1
+    assert not told["ordered"]

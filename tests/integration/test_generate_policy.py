@@ -607,7 +607,7 @@ def test_a_robot_without_enclaves_is_learned_into_one_for_each_process(tmp_path:
     own, shared = live(DOMAIN + 5, tmp_path, UNSECURED, list(commands))
     assert own.status == shared.status == 0, (own, shared)
     assert "note [graph.several-nodes]" in own.err and "/left has /cellar/right, /left" in own.err
-    assert "note [graph.shared-enclave]" in own.err and "/twin (2 processes)" in own.err
+    assert "note [graph.same-node]" in own.err and "/twin in /twin (2 processes)" in own.err
     assert "note [graph.root-enclave]" in shared.err and "[graph.root-enclave]" not in own.err
     rights = rights_of(tmp_path / "own.xml")
     assert {each[0] for each in rights} == {"/talker", "/hall/listener", "/left", "/twin"}
