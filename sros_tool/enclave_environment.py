@@ -460,7 +460,7 @@ def _choose_domain(
 def _zenoh_domain(
     keystore: OpenedKeystore, zenoh: OpenedZenoh, wanted_domain: int | None, domains: DomainSet
 ) -> int | None:
-    """Return the ROS domain for a process, which its Zenoh configuration has to name.
+    """Return the ROS domain that the Zenoh configuration of a process has to name.
 
     Without ``wanted_domain``, it is preferably one of ``domains``.
 

@@ -259,7 +259,7 @@ class Network:
     def links(self, enclave: str, known: Container[str]) -> Iterator[tuple[str, Callable[[], Hop]]]:
         """Yield each enclave that ``enclave`` can influence directly, with a function for the hop.
 
-        The function searches for the name of the hop, which takes long.  Enclaves that are
+        The search of this function for the name of the hop takes long.  Enclaves that are
         ``known`` by then are left out.
         """
         for writer, reader in self._access_pairs(enclave, True, set(), known):

@@ -962,10 +962,10 @@ class _Round:
         return None
 
     def _keep_replaced_list(self, text: str | None) -> None:
-        """Keep the current revocation list: a release may replace it by a shorter one.
+        """Store a copy of the revocation list ``text``, because a release may replace the list.
 
-        A release leaves out entries that have expired; but a keystore that was restored from a
-        backup may have lost entries.
+        A shorter list is normal: expired entries are left out.  But it can also come from a
+        restored keystore that lost entries.
         """
         if text and not self._replaced_list():
             path = agent_folder(self._folder) / _REPLACED_LIST

@@ -85,13 +85,13 @@ def _key_without_enclave(group: tuple[Finding, ...]) -> Hashable:
 def _merge_robots(
     groups: Iterable[tuple[Finding, ...]], fleet: Fleet | None
 ) -> Iterator[tuple[tuple[Finding, ...], str]]:
-    """Merge single findings that differ only in one robot.
+    """Merge findings that differ only in one robot.
 
-    Yields the first finding of each group, with a text that names the robots of the other findings
-    ("" if there are none).  A finding that names several robots is merged by the robot that gives
-    the largest group. If more than `_MOST_SIMILAR` merged findings differ only in the other robots
-    that they name, they are merged again. Findings that share a cause are not merged. Without
-    ``fleet``, nothing is merged.
+    Each group in ``groups`` has the findings with one cause; only groups of one finding are merged.
+    Yields the first group of each merge, with a text that names the robots of the other groups (""
+    if there are none).  A finding that names several robots is merged by the robot with which most
+    findings become one.  If more than `_MOST_SIMILAR` merges differ only in the other robots that
+    they name, these become one merge, too.  Without ``fleet``, nothing is merged.
     """
     read = []
     for group in groups:

@@ -557,7 +557,7 @@ class ReadConfiguration(NamedTuple):
     """The rights that an existing configuration gives to each subject."""
 
     file: str
-    """The configuration, as it was named."""
+    """Path of the configuration, as given on the command line."""
     mode: Mode
     """How the process takes part in the network."""
     enforced: bool
@@ -570,7 +570,7 @@ class ReadConfiguration(NamedTuple):
     """The policy that was written, or null."""
     dry_run: DryRun
     changes: Sequence[FileChange]
-    """The files that were written or, with ``--dry-run`` or ``--check``, would be."""
+    """The files that were written or, with ``--dry-run``, would be."""
     notes: Notes
 
 

@@ -317,7 +317,7 @@ def create_request(
 
     Example:
       $ sros create_request /arm/camera robot
-      made the key of enclave /arm/camera, which stays in 'robot'
+      made the key of enclave /arm/camera; the key stays in 'robot'
         its SHA-256 is 6f5bbd292e91c5d0fbf579aa0d036ac044cdd9788c6efdbc730a...
         bring 'robot/enclaves/arm/camera/request.pem' to the keystore: ...
       $ ssh robot cat robot/enclaves/arm/camera/request.pem |   # or in one step
@@ -341,7 +341,7 @@ def create_request(
             f"{request.token.token}, and stays there"
         )
     else:
-        echo(f"made the key of enclave {name}, which stays in '{folder}'")
+        echo(f"made the key of enclave {name}; the key stays in '{folder}'")
     echo(f"  its SHA-256 is {request.key}")
     echo(f"  bring '{request.file}' to the keystore: sros sign_request KEYSTORE request.pem")
     print_notes(request.notes)

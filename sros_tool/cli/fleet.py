@@ -921,8 +921,8 @@ def _remedies(status: FleetStatus, to_dos: Collection[str]) -> Mapping[str, str]
         "renew": f"`{renewal_command(root)}`, then {_delivery_advice(root, to_renew)}",
         "take it out of the fleet file": "remove the robot from the fleet file, and run "
         f"`sros generate_artifacts -k {where} -p POLICY --fleet FILE`",
-        "upgrade the DDS": "upgrade the package of the library, which is named below, on the "
-        "robot, and restart the robot's processes",
+        "upgrade the DDS": "upgrade the library's package (named below) on the robot, "
+        "and restart the robot's processes",
     }
     shown = {
         name: known[name] for name in known if known[name] and any(name in text for text in to_dos)
@@ -1255,7 +1255,7 @@ def _summary(robot: RobotStatus, stage: str, moment: datetime) -> Iterator[str]:
         yield other if robot.is_published else "not published yet"
     if robot.fetches and robot.lacks_key:
         names = first_few(robot.lacks_key, _MOST_GROUPS)
-        yield f"lacks the key of {names}, which no release brings"
+        yield f"lacks the key of {names}: releases bring no keys"
     elif robot.lacks_ca:
         yield "does not trust the CA that seals releases: fetching does not change this"
     elif robot.is_locked_out(moment):

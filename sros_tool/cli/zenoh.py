@@ -211,7 +211,8 @@ def zenoh(
         notes = tuple(note for note in result.notes if note.id != "zenoh.left-out")
         result = replace(result, notes=notes)
     if not result.changes:
-        without = f", and {counted(len(left_out), 'enclave')} without a file" if left_out else ""
+        have = "has" if len(left_out) == 1 else "have"
+        without = f"; {counted(len(left_out), 'enclave')} {have} no file" if left_out else ""
         echo(f"the Zenoh files are up to date{without}", err=True)
     print_follow_up(result, restart=not (dry_run or only_check))
     if only_check and (result.changes or {*left_out.values()} - {OTHER_DOMAINS}):

@@ -431,9 +431,10 @@ def _unknown_process_problems(running: RunningRobot, state: CloseState) -> Itera
     if observed.unknown:
         processes = first_few(observed.unknown, MOST_NAMES)
         remap = "--ros-args -r __node:=NODE -r __ns:=NAMESPACE"
-        advice = f", or name its node in the command of each process ({remap})"
-        advice = advice if observed.elsewhere else ""
-        advice = f"watch again while they run{advice}: {close} --for 1m"
+        advice = f"watch again while they run: {close} --for 1m"
+        if observed.elsewhere:
+            advice += "; if sros still sees none, first add the name of the node to the command "
+            advice += f"of each process ({remap})"
         if state.secured:
             advice = _start_of_unknown_process(running, state)
             advice += "stop what is not of the robot, such as your own `sros demo listener`"

@@ -69,13 +69,13 @@ def check_watchable(robot: LocalRobot) -> None:
         raise UsageError(
             f"{on_zenoh[0].label} speaks Zenoh, but this shell is set up for DDS",
             "",
-            f"Run `export {RMW}={RMW_ZENOH}`, and this command again.",
+            f"Run `export {RMW}={RMW_ZENOH}`. Then run this command again.",
         )
     if nodes and not on_zenoh and rmw == RMW_ZENOH:
         raise UsageError(
             f"{nodes[0].label} speaks DDS, but this shell is set up for Zenoh",
             "",
-            f"Run `unset {RMW}`, or set it to the RMW of the robot, and this command again.",
+            f"Run `unset {RMW}`, or set it to the RMW of the robot. Then run this command again.",
         )
 
 
@@ -98,7 +98,8 @@ def watch(robot: LocalRobot, words: Sequence[str]) -> list[str]:
         raise UnavailableError(
             f"there is no robot to close: no node was observed in domain {robot.domain}",
             f"{others}." if others else "",
-            f"{'Otherwise start' if others else 'Start'} the robot open, and run this again.",
+            f"{'Otherwise start' if others else 'Start'} the robot open. Then run "
+            "this command again.",
         )
     replace_file(robot.observer, (policies_dir() / "observer.xml").read_bytes())
     learned = json.loads(document)

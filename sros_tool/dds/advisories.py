@@ -264,7 +264,9 @@ def _ranges(affected: Mapping[str, Any], identity: str) -> Iterator[_Range]:
         if kind == "GIT":
             continue  # a range of git commits: the releases are listed in ``versions``
         if kind not in ("SEMVER", "ECOSYSTEM") or not part.get("events"):
-            raise ValueError(f"a range of {identity} has another type, or no events")
+            raise ValueError(
+                f"a range of {identity} is not of type GIT, SEMVER or ECOSYSTEM, or has no events"
+            )
         introduced: Version | None = None
         for event in map(_object, _list(part.get("events", []), "events")):
             for name, version in event.items():

@@ -283,8 +283,9 @@ def _duplicate_path_error(path: str, enclave: Enclave, other: Enclave) -> Policy
         )
     return PolicyError(
         f"{enclave.source}: the enclave {path} is defined twice",
-        f"It is also the enclave of {other.source}"
-        f"{', for another robot' if other is enclave else ''}.",
+        "The same element gives this path for another robot, too."
+        if other is enclave
+        else f"The other definition is at {other.source}.",
         remedy,
     )
 

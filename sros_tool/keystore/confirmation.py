@@ -142,7 +142,7 @@ class RobotDds(NamedTuple):
     libraries: tuple[RobotLibrary, ...]
     """The DDS libraries; an empty list if the robot saw none."""
     unseen: int
-    """Number of processes that could not be examined, which may use other libraries."""
+    """Number of processes that could not be examined; they may use other libraries."""
 
 
 class EnclaveExpiry(NamedTuple):
@@ -670,7 +670,7 @@ def last_confirmation(keystore: OpenedKeystore, robot: str) -> ReceivedConfirmat
             raise _FormError('its keys are not "received" and "confirmation"')
         confirmation = _confirmation_from(value["confirmation"])
         if confirmation.robot != robot:
-            raise _FormError(f"it is the confirmation of {confirmation.robot}")
+            raise _FormError(f"it is the confirmation of another robot, {confirmation.robot}")
         message = _message_from(value["message"]) if "message" in value else None
         return ReceivedConfirmation(confirmation, _moment_from(value["received"]), message)
 

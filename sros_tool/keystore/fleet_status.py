@@ -1707,6 +1707,6 @@ def _dds_metrics(
     )
     yield Metric(
         "sros_fleet_processes_not_seen",
-        "Number of processes that a robot could not look at, which may use other libraries.",
+        "Number of processes that a robot could not look at; they may use other libraries.",
         tuple(Sample(robot.dds.unseen, labels) for labels, robot in robots if robot.dds),
     )

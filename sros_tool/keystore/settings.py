@@ -255,14 +255,14 @@ def _governance_edit(keystore: OpenedKeystore) -> str:
     return f"{GOVERNANCE_XML} differs from the signed governance"
 
 
-def with_places(template: Template, places: Template) -> Template:
-    """Return ``template`` with the places of the CA keys from the template ``places``.
+def with_places(template: Template, source: Template) -> Template:
+    """Return ``template`` with the places of the CA keys from the template ``source``.
 
-    If ``template`` has no Zenoh network, the result has the network of ``places``.
+    If ``template`` has no Zenoh network, the result has the network of ``source``.
     """
     return replace(
         template,
-        identity_key=places.identity_key,
-        permissions_key=places.permissions_key,
-        zenoh=template.zenoh or places.zenoh,
+        identity_key=source.identity_key,
+        permissions_key=source.permissions_key,
+        zenoh=template.zenoh or source.zenoh,
     )

@@ -204,7 +204,10 @@ class Staged:
 
 
 def staged_name(path: str) -> str:
-    """Return a path's file name in the stage, which is so short that a link fits in an inode."""
+    """Return the file name that stands for ``path`` in the stage.
+
+    The name is short, so that a file system can store the target of a link to it in the inode.
+    """
     return hashlib.blake2b(os.fsencode(path), digest_size=8).hexdigest()
 
 

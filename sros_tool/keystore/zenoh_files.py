@@ -299,7 +299,7 @@ _MOST_BYTES = 512 << 20
 _BATCH_SIZE = 50
 """Number of enclaves that are read together, step by step.
 
-The code of a step then stays in the caches of the processor, which takes a third less time than
+The code of a step then stays in the caches of the processor.  This takes a third less time than
 reading one enclave after the other, and little memory.
 """
 _MOST_DOMAINS = 16

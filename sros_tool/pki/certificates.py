@@ -590,7 +590,7 @@ def other_issuer_text(certificate: x509.Certificate, authority: x509.Certificate
 
 
 def subject_text(name: x509.Name) -> str:
-    """Return a distinguished name as OpenSSL prints it (RFC 2253), which vendors compare.
+    """Return a distinguished name as OpenSSL prints it (RFC 2253); vendors compare this text.
 
     RDNs, and the attributes in an RDN, are in reverse order; non-ASCII characters are kept.
     """

@@ -138,7 +138,10 @@ def check_name_der_readable(name: bytes) -> None:
             if (attribute.tag, oid.tag) != (der.SEQUENCE, der.OID):
                 raise ValueError("not the structure of a name")
             if value.tag not in _TYPES_IN_NAMES:
-                raise ValueError(f"a value of a name has the ASN.1 type {value.tag}")
+                raise ValueError(
+                    f"a value of a name has the ASN.1 type {value.tag}, which OpenSSL does not "
+                    "read in names"
+                )
             characters = value.content.decode("utf-16-be") if value.tag == _BMP_STRING else ""
             if max(characters, default="") > "\uffff":
-                raise ValueError("a BMPString has a character of more than 16 bits")
+                raise ValueError("a BMPString may not have a character of more than 16 bits")

@@ -373,7 +373,7 @@ class _Narrowing:
         }
 
     def _with_actions(self, found_pairs: set[_Pair], rules: Rules) -> set[_Pair]:
-        """Return the pairs, with a pair for each action that ``rules`` allow completely."""
+        """Return the pairs, with one pair in place of all parts of a completely allowed action."""
         pairs = set(found_pairs)
         for action in ("call", "execute"):
             for name in self._names.of(KIND_OF[action]):

@@ -672,7 +672,7 @@ def _witness_against_apart(requirement: Apart, world: World, limit: SearchLimit)
     chain = _shortest_chain(world, sources, targets, through, limit)
     if not chain:
         return None
-    # The findings of a table for each robot are folded, which lists of the others would prevent.
+    # Findings of a table for each robot are folded; different lists of others would prevent this.
     others = () if requirement.robot else _similar_chains(chain, world, sources, through)
     return Witness(_uses_of_chain(chain), tuple(_uses_of_chain(other) for other in others))
 
@@ -758,7 +758,10 @@ def _missing_enclaves(requirement: Requirement, world: World) -> tuple[list[str]
 
 
 def similar_enclave_clause(pattern: str, enclaves: Iterable[str]) -> str:
-    """Return a clause with an enclave that is perhaps meant by a missing enclave, or ""."""
+    """Return a clause with the enclave that ``pattern`` perhaps means.
+
+    ``pattern`` matches no enclave, perhaps because of a typing error; "" if none is similar.
+    """
     return _meant_clause(pattern.removeprefix(EXCEPT), [frozenset(enclaves)])
 
 

@@ -926,11 +926,11 @@ class DroppedRequirement:
         """Return a clause on the part of the requirement that the new file still demands."""
         if self.only_elsewhere:
             names = {*_moving_names([self.requirement])} ^ {*_moving_names(self.kept)}
-            which = first_few(sorted(names), 3) if names else "a name"
-            return (
-                "the new file demands less in another namespace (`sros check --namespace`): "
-                f"{which} moves with the namespace in only one of the files"
-            )
+            text = "the new file demands less in another namespace (`sros check --namespace`)"
+            if names:
+                text += f": only one of the files states {first_few(sorted(names), 3)} without the "
+                text += "first '/', as a relative name"
+            return text
         text = f"the new file demands less: {'; '.join(self.now)}"
         if not self.kept:
             text = "the new file has no such requirement"

@@ -311,7 +311,8 @@ class Overlay(NamedTuple):
     """
 
     kind: Annotated[str, Words(("use", "change", "drift", "worlds"))]
-    """Kind of the comparison: use, change, drift or worlds."""
+    """What is compared: ``use``: rights with observed rights; ``change``: an earlier with a later
+    policy; ``drift``: a policy with a keystore; ``worlds``: rights with Zenoh rules."""
     first: str
     """Label of rights that only the first source has."""
     second: str

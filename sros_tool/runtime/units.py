@@ -365,7 +365,7 @@ def _guard_service(keystore: str, sros: str, domain: int) -> str:
     return f"""\
 {_ORIGIN_COMMENT}
 [Unit]
-Description=Watch the ROS processes of this machine, which the keystore {root} secures
+Description=Watch the ROS processes that the keystore {root} secures on this machine
 
 [Service]
 Type=exec

@@ -243,7 +243,7 @@ def test_an_enclave_without_a_file_is_told_and_not_up_to_date(folder: Path) -> N
     assert "note [zenoh.left-out]: /b gets no configuration" in written.err
     checked = sros("zenoh", "ks", "--check", cwd=folder)
     assert (checked.status, checked.out) == (1, "no file: enclave /b: it has no permissions\n")
-    assert checked.err == "the Zenoh files are up to date, and 1 enclave without a file\n"
+    assert checked.err == "the Zenoh files are up to date; 1 enclave has no file\n"
     told = sros("zenoh", "ks", "--check", "--json", cwd=folder)
     assert (told.status, json.loads(told.out)["left_out"]) == (
         1, [{"enclave": "/b", "why": "it has no permissions"}],

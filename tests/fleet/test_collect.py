@@ -277,7 +277,7 @@ def test_a_robot_cannot_answer_for_another_one(home: Home) -> None:
     home.put("r1", home.message("r2", NOW))
     assert home.of("r1").why == "it is signed by /r2/base, an enclave of r2"
     home.put("r2", of_r2)
-    assert home.of("r2").why == "it is the confirmation of r1"
+    assert home.of("r2").why == "it is the confirmation of another robot, r1"
     # The certificate of r1 is no secret: with it, and the key of r2.
     stolen = read_certificate(home.folder / "r1/enclaves/r1/base/cert.pem")
     home.put("r1", smime.sign(named_r1, stolen, home.key("r2", "/r2/base")))

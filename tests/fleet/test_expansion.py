@@ -148,7 +148,7 @@ def test_a_policy_without_placeholders_is_the_same() -> None:
         (enclave("/{robot:none}", "/x"), "no group 'none'"),
         (enclave("/d", "{robots:none}"), "no group 'none'"),
         (enclave("/{robot}", "{namespace}"), "It is a namespace"),
-        (enclave("/{robot}", "/x") + enclave("/r1", "/x"), "defined twice"),
+        (enclave("/{robot}", "/x") + enclave("/r1", "/x"), "The other definition is at p.xml:2"),
         (
             enclave("/{robot}", "/x") + enclave("/{robot:carriers}", "/x"),
             "one enclave for each group",

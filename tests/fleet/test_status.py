@@ -1239,7 +1239,7 @@ def test_what_is_to_be_done_for_robots_that_do_not_fetch_what_is_published(field
     assert "give the list to a web server of robots" in err and bring not in err
     field.run("fleet", "publish", "ks", "pub")
     rows = said()
-    assert rows["r1"][0] == "deliver" and "lacks the key of /r1/base, which no" in rows["r1"][1]
+    assert rows["r1"][0] == "deliver" and "lacks the key of /r1/base: releases" in rows["r1"][1]
     assert "is published" not in rows["r1"][1], "no other enclave waits for it"
     refused = "a web server with the current CA and list refuses it"
     assert rows["r3"][0] == "wait, else deliver" and refused in rows["r3"][1]

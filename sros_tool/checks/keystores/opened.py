@@ -84,7 +84,7 @@ class Circumstances:
     """The keystores that are already open, by path."""
 
     def keystore(self, root: Path) -> OpenedKeystore:
-        """Return the keystore at a path, which is opened once for all checks."""
+        """Return the keystore at a path; it is opened once for all checks."""
         return self.opened.setdefault(root, OpenedKeystore(root))
 
 

@@ -268,7 +268,7 @@ class _Node:
         self.text = "".join(child for child in element.children if isinstance(child, str))
         _check_attributes(element, self.tag)
         if self.text and self.tag in grammar:
-            raise UnreadableError(f"<{self.tag}> holds text")
+            raise UnreadableError(f"<{self.tag}> holds text, but may hold only elements")
         self._children = []
         for child in element.elements:
             tag = child.name.lower()
@@ -277,7 +277,7 @@ class _Node:
             elif tag in grammar.get(self.tag, ()):
                 self._children.append(_Node(child, grammar, skipped))
             else:
-                raise UnreadableError(f"<{self.tag}> holds <{child.name}>")
+                raise UnreadableError(f"<{self.tag}> holds an unexpected <{child.name}>")
 
     @classmethod
     def root(
@@ -301,7 +301,7 @@ class _Node:
 def _check_attributes(element: XmlElement, tag: str) -> None:
     for name in element.attributes:
         if name.lower() not in _SCHEMA_ATTRIBUTES and (name, tag) != ("name", "grant"):
-            raise UnreadableError(f"<{tag}> has the attribute {name!r}")
+            raise UnreadableError(f"<{tag}> has the unexpected attribute {name!r}")
 
 
 def _check_skipped(element: XmlElement) -> None:
@@ -320,7 +320,7 @@ def _read_number(node: _Node) -> int:
         raise UnreadableError(f"<{node.tag}> holds {node.text!r}, which is not a number")
     sign, digits = ("-", node.text[1:]) if node.text[0] == "-" else ("", node.text.lstrip("+"))
     if len(digits) > _LONGEST_NUMBER:
-        raise UnreadableError(f"<{node.tag}> holds a number of {len(digits)} digits")
+        raise UnreadableError(f"<{node.tag}> holds a number of {len(digits)} digits: far too large")
     octal = len(digits) > 1 and digits[0] == "0" and digits[1] not in "xX"
     if digits in ("0x", "0X"):
         return 0

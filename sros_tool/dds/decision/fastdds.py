@@ -353,7 +353,7 @@ def _read_domains(element: XmlElement) -> DomainSet:
             case "id_range":
                 ranges.append(_read_range(child))
             case other:
-                raise UnreadableError(f"<domains> holds <{other}>")
+                raise UnreadableError(f"<domains> holds an unexpected <{other}>")
     if not ranges:
         raise UnreadableError("<domains> is empty")
     return DomainSet(tuple(ranges))
@@ -419,7 +419,7 @@ def _read_grant(element: XmlElement) -> Grant:
     )
     default = _read_required_text(take.next("default"))
     if default not in ("ALLOW", "DENY"):
-        raise UnreadableError(f"<default> holds {default!r}")
+        raise UnreadableError(f"<default> holds {default!r} instead of ALLOW or DENY")
     return Grant(name, subject, not_before, not_after, rules, default == "ALLOW")
 
 
@@ -466,7 +466,7 @@ def _read_criteria(element: XmlElement) -> Criteria:
             case "data_tags":
                 pass
             case other:
-                raise UnreadableError(f"<{element.name}> holds <{other}>")
+                raise UnreadableError(f"<{element.name}> holds an unexpected <{other}>")
     return Criteria(tuple(topics), tuple(partitions))
 
 

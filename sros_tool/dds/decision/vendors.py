@@ -187,7 +187,7 @@ class VendorTraits:
     longest_topic_name: int | None = None
     """Longest topic name that rules match, in bytes; longer topics can still be created."""
     creates_topics: bool = False
-    """Creating an endpoint first creates its topic, which needs a right to publish or subscribe.
+    """Creating an endpoint first creates its topic; this needs a right to publish or subscribe.
 
     The first rule that names the topic decides, for publishing or for subscribing.
     """

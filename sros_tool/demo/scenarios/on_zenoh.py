@@ -399,7 +399,7 @@ _CONNECTION_ROWS = (
         _accepted_connection_row(
             "no certificate, and none is asked for",
             zenoh_forger.certificates_not_asked_for,
-            "mutual TLS and named subjects",
+            "mutual TLS and rules that trust only known names",
         ),
     ),
     *tries(
@@ -425,9 +425,9 @@ _CONNECTION_ROWS = (
             "InvalidContentType",
         ),
         _accepted_connection_row(
-            "TCP instead of TLS, which the router also accepts",
+            "TCP instead of TLS, with a router that also accepts TCP",
             zenoh_forger.tcp_next_to_tls,
-            "the list of protocols and named subjects",
+            "the list of protocols and rules that trust only known names",
         ),
     ),
     *tries(
@@ -661,10 +661,10 @@ _ROUTER_ROWS = tuple(
     for suffix, keystore, world, defence_removed in (
         ("", zenoh_forger.another_router, "rogue router", ""),
         (
-            ", a subject for everybody",
+            ", trusted under any name",
             zenoh_forger.subject_for_everybody,
             "believed router",
-            "a named subject for the router",
+            "rules that trust only the router's name",
         ),
     )
     for reads, attack in (
@@ -759,9 +759,9 @@ _FAR_ROUTER_ROWS = tries(
     _PLAYS_FAR_ROUTER,
     _rogue_far_router_row(_PLAYS_FAR_ROUTER, zenoh_forger.another_far_router),
     _rogue_far_router_row(
-        f"{_PLAYS_FAR_ROUTER}, a subject for everybody",
+        f"{_PLAYS_FAR_ROUTER}, trusted under any name",
         zenoh_forger.guest_as_far_router,
-        "a named subject for the router",
+        "rules that trust only the router's name",
     ),
 )
 

@@ -582,7 +582,7 @@ class _Verifier:
         except SrosError as error:
             raise _RefusedError(error.what) from error
         if confirmation.robot != robot.name:
-            raise _RefusedError(f"it is the confirmation of {confirmation.robot}")
+            raise _RefusedError(f"it is the confirmation of another robot, {confirmation.robot}")
         if confirmation.sequence is None:
             raise _RefusedError("it has no sequence number, although `sros agent` writes one")
         return _Verified(confirmation, enclave, signer)

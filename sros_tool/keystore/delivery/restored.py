@@ -66,7 +66,7 @@ _WAITING = frozenset({LATER_RELEASE, PUBLISHING})
 
 
 class LaterChange(NamedTuple):
-    """A change from after the backup of a restored keystore, which the keystore lacks."""
+    """A change that a restored keystore lacks, because it was made after the backup."""
 
     change: Annotated[
         str,
@@ -476,8 +476,8 @@ def check_authorities(keystore: OpenedKeystore, folder: Path, last: Release) -> 
         "Restore a backup from after the rotation. If there is none, repeat later "
         f"revocations, repeat the rotation (`sros rotate_ca {where}{flag} --finish "
         "--allow-unconfirmed`), and repeat this command. If you have the key of each later "
-        f"CA, add {options} to the rotation, which goes back to the later CA "
-        f"(docs/howto/keystore_is_lost.md).{by_hand}",
+        f"CA, add {options} to the command of the rotation, so that the keystore uses the later "
+        f"CA again (docs/howto/keystore_is_lost.md).{by_hand}",
     )
 
 

@@ -230,11 +230,12 @@ def _foreign_authorities(
 def _later_authorities(
     keystore: OpenedKeystore, present: Mapping[str, bytes], files: Mapping[str, bytes]
 ) -> Mapping[str, x509.Certificate]:
-    """Map the paths of CA files in ``present`` to a CA in them that replaced the keystore's CA.
+    """Map the paths of CA files in the target to a CA in them that replaced the keystore's CA.
 
-    Such a keystore is from before a stage of a rotation.  If the ledger has both CAs, their order
-    there says which one is later.  A CA that is not in the ledger counts as later if it is not
-    older than any CA in ``files``.
+    If there is such a CA, the keystore is from before a stage of a rotation.  ``present`` are the
+    files in the target, ``files`` those of the export.  If the ledger has both CAs, their order
+    there says which one is later.  A CA that is not in the ledger counts as later if it is at least
+    as new as the newest CA in the file of the export.
     """
     entries = [e for e in keystore.ledger_with("what", "ca").entries if e.what == "ca"]
     place_in_ledger = {entry.sha256: place for place, entry in enumerate(entries)}

@@ -110,7 +110,7 @@ class RotationStep(Changed):
 
     ``stage`` is the stage of the keystore afterwards.  ``files`` are the names, without suffixes,
     of the replaced CA files ("identity_ca", "permissions_ca" or "ca").  ``kept_elsewhere`` are the
-    places of old keys outside of the keystore, which sros never deletes.  ``cut_off`` are robots
+    places outside of the keystore with old keys; sros never deletes these.  ``cut_off`` are robots
     that have not confirmed the previous stage, and can no longer communicate with the others.
     """
 

@@ -530,7 +530,7 @@ class RotationChange(NamedTuple):
     ]
     """All enclaves of the keystore, with their outcomes."""
     old_keys_elsewhere: Sequence[str]
-    """Places of old CA keys outside of the keystore, which sros never deletes."""
+    """Places outside of the keystore with old CA keys; sros never deletes these keys."""
     cut_off: Sequence[str]
     """The robots of the fleet that have not confirmed the previous stage, and therefore cannot
     communicate with robots that have the files of this stage, until they get these files, too

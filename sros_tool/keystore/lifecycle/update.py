@@ -628,7 +628,8 @@ class _Updater:
         if any(rule.domains.closed() != before for rule in grant.rules):
             raise KeystoreError(
                 f"the permissions of enclave {name} are not for domain {before}",
-                "So its rights in other domains are not known.",
+                "The change would give the enclave the same rights in the new domain as in domain "
+                f"{before}, but its permissions are for other domains.",
                 f"State them with `sros create_permission {quote(str(self._root))} {name} "
                 "POLICY_FILE`.",
             )
@@ -669,8 +670,8 @@ class _Updater:
         which = "these enclaves" if len(self._kept_open) > 1 else "this enclave"
         text = (
             f"Still open: {', '.join(self._kept_open)} may do everything, as before. The new "
-            f"default replaces only rights that equal the old default, and the rights of {which} "
-            f"do not. State them with `sros create_permission {quote(str(self._root))} "
+            f"default replaces only rights that equal the old default; the rights of {which} "
+            f"differ from it. State them with `sros create_permission {quote(str(self._root))} "
             f"{' '.join(map(quote, self._kept_open))} POLICY_FILE`."
         )
         return [Note("keystore.kept-open", text)]
