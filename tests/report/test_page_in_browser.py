@@ -633,6 +633,11 @@ def test_of_equal_robots_it_says_who_drives_and_shows_the_names_of_all(
         page.click("#headlines .link-button >> nth=0")
         assert f"9 TOPICS ALIKE\n\n/{{r1…{last}}}/cmd_vel\n" in details(page)
         assert "/r7/cmd_vel" in details(page)
+    with opened(browser, path, "phone") as page:
+        # No robot is drawn as one that uses the names of the others.
+        page.click("#headlines .link-button >> nth=0")
+        assert "/r1/" not in " ".join(texts(page, "#map .card.enclave"))
+        assert "/r7/cmd_vel" in details(page)
 
 
 def test_overlays_can_be_filtered_and_listed(browser: Browser, tmp_path: Path) -> None:

@@ -53,13 +53,16 @@ function currentScene() {
 }
 
 // On a small screen, what was chosen is drawn with its neighbors alone: side by side, they fit.
+// Names of equal units have no neighbors in common: they stay in the map.
 function alone() {
   const { type, path, kind, name, card } = (isSmall() && state.chosen) || {};
   if (!type || card?.role === "group" || (card && card.role !== "names")) return null;
   const names = card?.members ?? [name];
+  const bundle = model.bundle(kind ?? card?.kind, names[0]);
+  if (names.some((each) => model.bundle(kind ?? card?.kind, each) !== bundle)) return null;
   const bundles = path
     ? model.filtered({ enclave: path, common: state.scene > 0 }).map((bundle) => ({ ...bundle, ties: bundle.ties.filter((tie) => tie.enclave === path) }))
-    : [{ ...model.bundle(kind ?? card.kind, names[0]), names }];
+    : [{ ...bundle, names }];
   return { ...columns(bundles), title: path ? `What ${path} may use` : `Who may use ${names[0]}` };
 }
 
