@@ -501,8 +501,9 @@ class _SeveralObserved(SeveralValues):
     type=click.Choice(["never", "difference"]),
     default="never",
     show_default=True,
-    help="`difference`: exit with 1 if POLICY has rights or wildcards to remove, or lacks an "
-    "observed right, or if an enclave, or a robot of it, is only in POLICY or only in OBSERVED.",
+    help="`difference`: exit with 1 if POLICY has rights or wildcards to remove or used only in "
+    "part, or lacks an observed right, or if an enclave, or a robot of it, is only in POLICY or "
+    "only in OBSERVED.",
 )
 @force_option
 @dry_run_option
@@ -599,6 +600,9 @@ def _use_lines(enclave: MinimizedEnclave) -> Iterator[str]:
     if use.kept_for_every_node:
         number = len(use.kept_for_every_node)
         yield f"  never observed, but kept because every node needs it: {number}"
+    if use.in_part:
+        yield "  used or allowed only in part, and kept"
+        yield from (f"    {right.describe()}" for right in use.in_part)
     if use.not_allowed:
         yield "  observed, and not allowed"
         yield from (f"    {right.describe()}" for right in use.not_allowed)

@@ -85,7 +85,7 @@ class WideRule(NamedTuple):
 
 @shows(
     *("enclave", "observed_at_all", "allowed", "observed", "remaining", "ratio"),
-    *("never_observed", "kept_for_every_node", "wildcards", "not_allowed"),
+    *("never_observed", "kept_for_every_node", "wildcards", "in_part", "not_allowed"),
 )
 @dataclass(frozen=True, slots=True)
 class EnclaveUse:
@@ -101,6 +101,9 @@ class EnclaveUse:
     """Rights that were not observed, but stay because every node needs them."""
     wildcards: tuple[WideRule, ...]
     """Wildcards that match more names than were used."""
+    in_part: tuple[Right, ...]
+    """Rights that stay although only a part of them was observed, such as the feedback of an
+    action, and observed wildcards that the policy allows only in part."""
     not_allowed: tuple[Right, ...]
     """Rights that were observed, but that the policy does not allow."""
     allowed: int
@@ -119,7 +122,7 @@ class EnclaveUse:
     def is_as_observed(self) -> bool:
         """Whether the enclave was observed, with neither more nor fewer rights than it has."""
         return self.observed_at_all and not (
-            self.never_observed or self.wildcards or self.not_allowed
+            self.never_observed or self.wildcards or self.in_part or self.not_allowed
         )
 
 
@@ -139,7 +142,9 @@ def minimize(
     Every DENY stays.  ``common`` are the rights that every node needs.  If the policy allows these
     rights to a node with a profile, they stay even if they were not observed.
     """
+    observed = frozenset(observed)
     used = join_actions(right for right in observed if right.qualifier is ALLOW)
+    unused = Rules(right for right in observed if right.qualifier is DENY)
     by_enclave: dict[str, set[Right]] = defaultdict(set)
     for right in used:
         by_enclave[right.enclave].add(right)
@@ -150,7 +155,7 @@ def minimize(
     enclaves, uses = [], []
     for enclave in policy.enclaves:
         enclave, use = _Narrowing(
-            enclave, frozenset(by_enclave.get(enclave.path, ())), common, names
+            enclave, frozenset(by_enclave.get(enclave.path, ())), unused, common, names
         ).result()
         enclaves.append(enclave)
         uses.append(use)
@@ -223,11 +228,13 @@ class _Narrowing:
         self,
         enclave: Enclave,
         observed: frozenset[Right],
+        unused: Rules,
         common: Sequence[Group],
         names: _KnownNames,
     ) -> None:
         self._enclave = enclave
         self._names = names
+        self._unused = unused
         stated = policy_rights(Policy((enclave,)))
         self._stated = sorted((r for r in stated if r.qualifier is ALLOW), key=order)
         self._denied = [right for right in stated if right.qualifier is DENY]
@@ -277,11 +284,25 @@ class _Narrowing:
             ),
             kept_for_every_node=tuple(r for r in unused if is_observed and r in kept_rights),
             wildcards=tuple(wide),
+            in_part=tuple(sorted(self._in_part(kept_rights), key=order)) if is_observed else (),
             not_allowed=tuple(sorted(self._refused, key=order)),
             allowed=len(self._pairs(self._stated) | in_use),
             observed=len(in_use),
             remaining=len(self._pairs(remaining) | in_use),
         )
+
+    def _in_part(self, kept_rights: set[Right]) -> Iterator[Right]:
+        """Yield rights that were used only in part, and used wildcards allowed only in part."""
+        for right in kept_rights - self._common:
+            if self._use.overlaps(right) and not all(
+                self._use.cover(part) or self._rules.cover(part._replace(qualifier=DENY))
+                for part in parts(right)
+            ):
+                yield right
+        for part in self._in_use:
+            denials = self._rules.overlapping(part._replace(qualifier=DENY))
+            if not (self._rules.cover(part) and all(map(self._unused.cover, denials))):
+                yield part
 
     # ── rules that stay, and replacements of wildcards ─────────────────────────────────────
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from sros_tool.keystore.issuing.size import SizeEstimator, minimized_policy, right_bytes
 from sros_tool.names import is_expression
-from sros_tool.policy.document import read_policy
+from sros_tool.policy.document import policy_xml, read_policy
 from sros_tool.policy.minimize import EnclaveUse, minimize, propose_wildcards
 from sros_tool.policy.model import ALLOW, Group, Policy
 from sros_tool.policy.rights import Right, Rules, policy_rights
@@ -151,6 +151,50 @@ def test_what_is_told() -> None:
         "publish topic /cam/secret",
         "call action /f",
     }
+
+
+@pytest.mark.parametrize(
+    ("given_groups", "observed_rights", "in_part"),
+    [
+        (group("topics", "/x", "publish"), ["publish /x"], []),
+        (group("actions", "/f", "call"), ["call /f"], []),
+        (group("actions", "/f", "call"), ["subscribe /f/_action/feedback"], ["call action /f"]),
+        (group("topics", "/x", "publish"), ["publish /x*"], ["publish topic /x*"]),
+        (
+            group("topics", "/x*", "publish"),
+            ["publish /*y"],
+            ["publish topic /*y", "publish topic /x*"],
+        ),
+        (
+            group("topics", "/*", "publish") + group("topics", "/y", "-publish"),
+            ["publish /*"],
+            ["publish topic /*"],
+        ),
+    ],
+)
+def test_what_is_used_only_in_part_is_a_difference(
+    given_groups: str, observed_rights: list[str], in_part: list[str]
+) -> None:
+    found = use(policy(given_groups), *observed_rights)
+    assert sorted(right.describe() for right in found.in_part) == in_part
+    assert found.is_as_observed == (not in_part)
+
+
+def test_a_policy_is_as_it_is() -> None:
+    given_policy = policy(group("topics", "/*", "publish") + group("topics", "/y", "-publish"))
+    assert minimize(given_policy, policy_rights(given_policy)).uses[0].is_as_observed
+
+
+def test_what_an_observed_file_denies_is_told(tmp_path: Path) -> None:
+    paths = tmp_path / "robot.xml", tmp_path / "used.xml"
+    denied = group("topics", "/y", "-publish")
+    for path, groups in zip(paths, ("", denied), strict=True):
+        given_policy = policy(group("topics", "/*", "publish") + groups)
+        path.write_bytes(policy_xml(given_policy))
+    for given_path, told in ((paths[0], ["minimize.observed-denial"]), (paths[1], [])):
+        minimized = minimized_policy(given_path, [paths[1]])
+        assert [note.id for note in minimized.notes] == told
+        assert minimized.is_as_observed == (not told)
 
 
 def test_the_ratio_counts_known_names() -> None:

@@ -33,9 +33,9 @@ from sros_tool.policy.minimize import (
     minimize,
     propose_wildcards,
 )
-from sros_tool.policy.model import Enclave, Group, Policy
+from sros_tool.policy.model import ALLOW, DENY, Enclave, Group, Policy
 from sros_tool.policy.node_basics import node_basics
-from sros_tool.policy.rights import Right, policy_rights
+from sros_tool.policy.rights import Right, Rules, policy_rights
 from sros_tool.translate import permissions_for
 from sros_tool.validity import window
 from sros_tool.values import DryRun, FileChanges, Notes, shows
@@ -220,6 +220,20 @@ def _scope_notes(policy: Policy, result: MinimizedPolicy, observed: Set[Right]) 
             "file."
         )
         yield Note("minimize.enclave-not-in-policy", text)
+    rules, stated = Rules(observed), Rules(policy_rights(policy))
+    denied = [
+        f"{right}"
+        for right in sorted(observed)
+        if right.qualifier is DENY
+        and rules.overlaps(right._replace(qualifier=ALLOW))
+        and not stated.cover(right)
+    ]
+    if denied:
+        text = (
+            "what an observed file allows counts as used, even if the file also denies it: "
+            f"{first_few(denied, _MOST_SHOWN)}."
+        )
+        yield Note("minimize.observed-denial", text)
 
 
 def _measured_enclaves(
