@@ -273,7 +273,7 @@ def _release_number(target: TargetFile | None, source: str, robot: str) -> int:
     if target.length > OF_ONE_ROBOT.packed:
         raise FetchError(
             FetchProblem.TOO_LARGE,
-            f"the release of {robot} has {target.length} bytes",
+            f"the release of {robot} is too large: {target.length} bytes",
             f"The limit is {OF_ONE_ROBOT.packed} bytes.",
         )
     number = target.custom.get("number") if isinstance(target.custom, dict) else None

@@ -427,7 +427,7 @@ def select_kinds(selection: FindingFilter) -> Sequence[FindingKind]:
 
 
 _DIFFERENCES_ID = "portable.vendors-differ"
-"""Id of the kind of finding about differences between vendors, which has no single vendor."""
+"""Id of the kind of finding about differences between vendors; it has no single vendor."""
 
 
 def _matches(kind: FindingKind, pattern: str) -> bool:

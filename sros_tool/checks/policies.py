@@ -628,7 +628,7 @@ _START_ACTIONS = {
 }
 """Kind of finding → action of a starting node that the policy denies."""
 _TF_LISTENER_PREFIX = "transform_listener_impl_"
-"""Name prefix of the nodes of tf2_ros listeners, which have no parameter services."""
+"""Name prefix of the nodes of tf2_ros listeners; these nodes have no parameter services."""
 _KINDS_OF_LISTENERS = (NO_TYPE_DESCRIPTION, NO_ROSOUT)
 
 

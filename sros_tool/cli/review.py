@@ -342,7 +342,7 @@ def review(
 
 
 class _Outputs:
-    """The output files of a review, which must be outside of the repository."""
+    """The output files of a review; they must be outside of the repository."""
 
     def __init__(
         self,

@@ -1008,7 +1008,7 @@ class HistoryStatus(StrEnum):
     SUPERSEDED = "superseded"
     """The keystore has a later one, but DDS still accepts this one (not revoked, not expired)."""
     REPLACED = "replaced"
-    """Earlier settings of the keystore, which DDS does not read."""
+    """Earlier settings of the keystore; DDS does not read them."""
     REVOKED = "revoked"
     RETIRED = "retired"
     """A replaced CA, which is no longer trusted."""

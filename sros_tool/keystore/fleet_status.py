@@ -473,7 +473,7 @@ class PublishedMetadata:
     expiry.
     """
     root_expires: datetime | None = None
-    """Expiry of the root metadata, in UTC, which only the root key can renew.  Null if the last
+    """Expiry of the root metadata, in UTC; only the root key can renew them.  Null if the last
     publication was by a release of sros that recorded no expiry.
     """
     accepted: bool | None = None

@@ -48,13 +48,13 @@ SEALED_LEDGER = re.compile(r"ledger\.[0-9]{4,9}\.jsonl")
 LEDGER_HEAD = "ledger.p7s"
 """The file with the ledger's number of lines and the digest of the last one, signed by a CA."""
 LEDGER_INDEX = ".sros-index"
-"""The index of a long ledger, which sros makes again if it is missing or does not fit."""
+"""The index of a long ledger; sros makes the index again if it is missing or does not fit."""
 
 IDENTITY, PERMISSIONS = "identity", "permissions"
 ROLES = (IDENTITY, PERMISSIONS)
 
 CRL = f"{PUBLIC}/identity_ca.crl.pem"
-"""The revocation list of the identity CA, which exists after the first revocation."""
+"""The revocation list of the identity CA; it exists after the first revocation."""
 REVOKED = "revoked"
 """The folder for the files of revoked enclaves."""
 
@@ -681,7 +681,7 @@ def keystore_around(folder: Path) -> Path | None:
 
 
 def similar_keystores(root: Path) -> list[Path]:
-    """Return keystores next to ``root`` with similar names, which differ not only in digits."""
+    """Return keystores next to ``root`` with similar names that differ not only in digits."""
     from difflib import get_close_matches  # only needed for this error
 
     def without_digits(name: str) -> str:

@@ -672,7 +672,7 @@ class OpenedEnclave:
 
     @cached_property
     def grant(self) -> Grant | None:
-        """The first grant for the certificate's subject, which DDS reads; None without any."""
+        """The first grant for the certificate's subject (DDS reads this one); None without any."""
         return self.permissions.grant_of(self.subject) if self.permissions else None
 
     @property

@@ -390,7 +390,7 @@ _MOST_KEPT = 32 << 20
 
 
 class Transaction:
-    """An atomic change of many files of a keystore, which is locked during the change.
+    """An atomic change of many files of a keystore; the keystore is locked during the change.
 
     A transaction is a context manager, and changes nothing without `commit`.  Unless
     ``new_keystore`` is set, the keystore must exist.  With ``dry_run``, nothing is written, and
@@ -992,10 +992,11 @@ _LOCK_RETRY_SECONDS = 0.02
 
 
 class KeystoreLock:
-    """The lock on a keystore: a locked file in the keystore, which exists only while it is locked.
+    """The lock on a keystore: a locked file in the keystore.
 
-    Only the owner of the keystore (and root) can open the file, so no other user can hold the lock.
-    The folder itself is not locked, because anybody who may read it could lock it.
+    The file exists only while the keystore is locked. Only the owner of the keystore (and root) can
+    open the file, so no other user can hold the lock. The folder itself is not locked, because
+    anybody who may read it could lock it.
     """
 
     def __init__(self, folder: Folder, label: str = "keystore") -> None:

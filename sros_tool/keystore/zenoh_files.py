@@ -261,7 +261,8 @@ def _out_of_date_clause(
     """Return how a configuration differs from its enclave's permissions, as a clause, or ""."""
     is_session = file == SESSION_FILE
     if is_session is (configuration.mode is Mode.ROUTER):
-        return f"it is the configuration of a {'router' if is_session else 'session'}"
+        of, wanted = ("router", "session") if is_session else ("session", "router")
+        return f"it is the configuration of a {of}, not of a {wanted}"
     if not is_session or state.grant is None:
         return ""
     control = configuration.access_control

@@ -135,7 +135,7 @@ def sign_crl(
 
 
 def load_crl(data: bytes, name: str) -> RevocationList:
-    """Return the first revocation list of a PEM file, which must state when it expires.
+    """Return the first revocation list of a PEM file; the list must state when it expires.
 
     Raises:
         PkiError: the list cannot be read, or states no expiry; ``name`` names the file.

@@ -869,7 +869,7 @@ class _Denials:
 
 
 class _Stated:
-    """An index of both sides' stated rights, which finds the right that gives an added access."""
+    """An index of both sides' stated rights: it finds the right that gives an added access."""
 
     def __init__(self, old: AccessSource, new: AccessSource) -> None:
         self._old, self._new = old, new

@@ -140,7 +140,7 @@ class Repository:
             if len(candidates) > 1:
                 raise DocumentError(
                     f"the name '{base}' is ambiguous",
-                    f"It is {_candidates_text(candidates)}.",
+                    f"It stands for {_candidates_text(candidates)}.",
                     "Write the full name, such as refs/remotes/origin/main.",
                 )
             base, object_id = next(iter(candidates.items()), (base, ""))

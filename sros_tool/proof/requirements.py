@@ -513,7 +513,7 @@ class _Table:
             raise self.error(
                 key,
                 f"{key} has {shortened(value)}, which is not a text",
-                f"It has 1 to {_LONGEST_TEXT} characters.",
+                f"A text has 1 to {_LONGEST_TEXT} characters.",
             )
         return value
 

@@ -589,7 +589,7 @@ class Place:
 
 
 class Places:
-    """An index of stated rights, which finds the right that allows or denies a use of a topic."""
+    """An index of stated rights: it finds the right that allows or denies a use of a topic."""
 
     def __init__(self, stated: Mapping[str, Iterable[Place]]) -> None:
         """Create an index of rights by enclave."""
@@ -621,7 +621,7 @@ class Places:
 
 
 class _StatedRights:
-    """The rights and denials of an enclave in a policy, which every iteration computes again."""
+    """The rights and denials of an enclave in a policy; every iteration computes them again."""
 
     def __init__(self, enclave: Enclave) -> None:
         self._enclave = enclave

@@ -48,7 +48,7 @@ from sros_tool.report.picture import (
 from sros_tool.wording import counted
 
 _LABEL_CHARACTERS = "{}…"
-"""Characters of labels, which ROS names cannot have; pictures with these are not folded."""
+"""Characters of labels that ROS names cannot have; pictures with these are not folded."""
 _WORD = re.compile(r"[A-Za-z0-9_]+")
 _MAX_PIECES = 16
 """Maximum number of pieces of a word (split at underscores) that are compared with unit names."""

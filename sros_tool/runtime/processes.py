@@ -73,7 +73,7 @@ _ROUTERS = ("rmw_zenohd", _ZENOHD)
 _BRIDGES = ("zenoh-bridge-ros2dds", "zenoh-bridge-dds")
 _DEMO_MODULE = re.compile(r"sros_tool\.demo\.(?:cyclone|ros|zenoh)_node")
 _DEMO_TYPE = "std_msgs/msg/String"
-"""The type of messages without the option --type, which only some nodes of the demo take."""
+"""The type of messages without --type (an option that only some nodes of the demo take)."""
 _INTERPRETER = re.compile(r"(?:python[\d.]*|sh|bash|dash|perl|ruby|node)\Z")
 _PYTHON_FLAGS = re.compile(r"-[BEIOPbdiqsuvx]+\Z")
 """Python options without a value (such as -u); some of them are also options of shells."""

@@ -41,7 +41,7 @@ TEMPLATE = "sros@.service"
 """The unit of all nodes; its instance name is an enclave, in the form of `unit_instance`."""
 
 _NODES_FOLDER = "/etc/sros/nodes"
-"""Folder with a program for each enclave, which runs if no command is named."""
+"""Folder with a program for each enclave; the program runs if no command is named."""
 
 METRICS_FILE = "/var/lib/sros-metrics/sros.prom"
 FLEET_FILE = "/var/lib/sros-metrics/fleet.prom"

@@ -41,7 +41,7 @@ _PROCESS_LABEL = re.compile(
     r"|(?!\[[A-Z]+\] )(?:\S+ +){2,4}?(?P<journald>[\w.@-]+\[\d+\]): "
     r"|(?P<compose>[\w.-]+) +\| "  # Docker Compose: talker-1  |
 )
-"""Matches the label at the start of a line, which distinguishes the processes in a log."""
+"""Matches the label that distinguishes the processes in a log, at the start of a line."""
 
 _SECURITY_DIRECTORY = re.compile(
     r"(?:(?:[\w.-]+ +\| )?(?:(?:\[[^\[\]]*\] )*\[rcl\]: )?Found|\[\w+\]) security directory: "
@@ -79,7 +79,7 @@ ENDPOINT_KINDS: Mapping[str, re.Pattern[str]] = {
 
 
 def log_lines(text: str) -> list[str]:
-    r"""Return the lines of a log, which end only with ``\n``.
+    r"""Return the lines of a log; only ``\n`` ends a line.
 
     A process can print another line separator, such as ``\r``, in the middle of a line, and then a
     label of another process, to make the text look like the text of that process.

@@ -392,7 +392,7 @@ def _too_many_error(name: str, place: Source) -> PolicyError:
 
 
 def _number_of_chunks(name: str) -> int:
-    """Return a lower bound for the number of results of `chunks_of`, which ``*`` can double."""
+    """Return a lower bound for the number of results of `chunks_of`; each ``*`` can double it."""
     stars_within = len(re.findall(r"(?<=[^/*])\*+(?=[^/*])", name))
     return 1 << stars_within
 

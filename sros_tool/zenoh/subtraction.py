@@ -41,7 +41,7 @@ In a process with Zenoh 1.10.2, a right to publish with 16,384 key expressions t
 _LETTERS = "_" + digits + ascii_letters
 _CACHE_SIZE, _SMALL_CACHE_SIZE = 65536, 1024
 _MOST_CHARACTERS = 1_000_000
-"""Maximum number of characters that are compared for a chunk, which takes about one second."""
+"""Maximum number of characters compared for a chunk; comparing them takes about one second."""
 
 
 class CannotSubtract(Exception):  # noqa: N818 - the caller makes an error of it

@@ -180,7 +180,7 @@ DAMAGE = {
             shutil.copy(ks / f"enclaves/router/router.{end}", session(ks).with_suffix(f".{end}"))
             for end in ("json5", "p7s")
         ],
-        "session.json5: it is the configuration of a router",
+        "session.json5: it is the configuration of a router, not of a session",
     ),
     "a folder": (
         make_folder,

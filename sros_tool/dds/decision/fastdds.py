@@ -294,7 +294,7 @@ def _read_required_text(element: XmlElement) -> str:
 
 
 def _read_first_text(element: XmlElement) -> str:
-    """Return the text of a number or flag, which must be the first node of the element.
+    """Return the text of a number or flag; the text must be the first node of the element.
 
     Raises:
         UnreadableError: the first node is not text, but for instance a comment.

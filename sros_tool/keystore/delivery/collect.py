@@ -329,9 +329,9 @@ class _ReceivedMessage:
     verified: _Verified | None = None
     received: ReceivedConfirmation | None = None
     crl: str | None = None
-    """The revocation list in the message, which counts only if a CA of the keystore signed it."""
+    """The revocation list in the message; it counts only if a CA of the keystore signed it."""
     seal: str | None = None
-    """The seal of a release in the message, which counts only if a CA of the keystore signed it."""
+    """The seal of a release in the message; it counts only if a CA of the keystore signed it."""
     signer_certificate: x509.Certificate | None = None
     """The signer's certificate, if the message itself is not accepted."""
     remarks: list[str] = field(default_factory=list)

@@ -924,7 +924,7 @@ class _Publication:
         return max((release.number for release in self._there.values()), default=0)
 
     def _latest_release(self) -> Release:
-        """Return a release with the highest number, which has the last CAs and revocation list.
+        """Return a release with the highest number; it has the last CAs and revocation list.
 
         Robots without such a release may have been refused since, and still have earlier files.
         """

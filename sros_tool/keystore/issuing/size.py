@@ -47,7 +47,7 @@ _BYTES_PER_LINE = len("<topic></topic>\r\n")
 
 
 class SizeEstimator:
-    """An estimator for the size of signed permissions, which signs with a temporary key.
+    """An estimator for the size of signed permissions; it signs with a temporary key.
 
     The estimate can be wrong by less than 100 bytes, because the lengths of CA names and signatures
     vary.

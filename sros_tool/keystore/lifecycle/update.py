@@ -824,7 +824,7 @@ def _with_routers_of_robots(change: KeystoreChange, network: ZenohNetwork) -> Ze
         if of_fleet and (robot := robot_of_router(change.fleet, router.name)):
             raise UsageError(
                 f"the fleet of keystore '{change.root}' names the router of {robot.name}",
-                f"It is {router}.",
+                f"The fleet file says {router}.",
                 f"Change `router` of {robot.name} in the fleet file, and run `sros "
                 "generate_artifacts --fleet`.",
             )
