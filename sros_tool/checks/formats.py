@@ -135,8 +135,10 @@ def _merge_keys(group: tuple[Finding, ...], fleet: Fleet) -> _MergeKeys:
     return kinds
 
 
-def findings_markdown(chosen_findings: ChosenFindings, fleet: Fleet | None = None) -> str:
-    """Return the findings as Markdown, under a heading with their numbers.
+def findings_markdown(
+    chosen_findings: ChosenFindings, fleet: Fleet | None = None, title: str = "Findings"
+) -> str:
+    """Return the findings as Markdown, under a heading with a title and their numbers.
 
     Findings that differ only in one robot of ``fleet``, or in one enclave, are one item.
     """
@@ -144,8 +146,8 @@ def findings_markdown(chosen_findings: ChosenFindings, fleet: Fleet | None = Non
     groups = folded_findings(group_by_cause(chosen_findings.shown), fleet)
     items = (_markdown_item(group, others) for group, others in groups)
     listed = bounded_list(items, _MOST_CHARACTERS, shown_by)
-    title = f"### Findings: {plain(chosen_findings.summary())}"
-    return "\n\n".join(part for part in (title, listed) if part) + "\n"
+    heading = f"### {title}: {plain(chosen_findings.summary())}"
+    return "\n\n".join(part for part in (heading, listed) if part) + "\n"
 
 
 def _markdown_item(findings: Sequence[Finding], others: str) -> str:

@@ -712,16 +712,19 @@ def _detail(result: Review, step: ReviewStep, request: ReviewRequest) -> str:
         StepFindings,
     )
 
-    def findings(chosen_findings: ChosenFindings) -> str:
+    def findings(chosen_findings: ChosenFindings, title: str = "Findings") -> str:
         shown = tuple(map(result.shown_finding, chosen_findings.shown))
         chosen_findings = ChosenFindings(shown, chosen_findings.accepted, chosen_findings.hidden)
-        return findings_markdown(chosen_findings, step.fleet)
+        return findings_markdown(chosen_findings, step.fleet, title)
 
     shown_by = "which `sros review` prints"
     match step.content:
         case ChosenFindings() as chosen:
-            title = f"### {_TITLES[step.kind]}: allowed\n\n" if step.allowed else ""
-            return title + findings(chosen) if chosen.shown else ""
+            if not chosen.shown:
+                return ""
+            if step.allowed:
+                return f"### {_TITLES[step.kind]}: allowed\n\n{findings(chosen)}"
+            return findings(chosen, _TITLES[step.kind])
         case AccessChange(before, after, growth, dropped, elsewhere):
             return access_markdown(before, after, growth, dropped, elsewhere)
         case RightsChange(before=before, after=after, compared=compared) as change:

@@ -869,7 +869,7 @@ def summary_page(result: DemoResult, now: datetime) -> str:
     if attacks:
         lines += _attack_lines(attacks, [row for row in result.rows if row.defence_removed])
     if plain_rows:
-        lines += ["## Other rows", "", *_rows_table(plain_rows)]
+        lines += ["## Other rows" if attacks else "## Rows", "", *_rows_table(plain_rows)]
     return "\n".join(lines).rstrip() + "\n"
 
 

@@ -422,6 +422,7 @@ def test_an_error_is_said_once(change: Change, tmp_path: Path) -> None:
     assert ended.status == 2 and ended.out.count("not well-formed") == 1
     assert ended.out.count(": could not be decided, for the reason above\n") == 2
     assert summary.read_text().count("not well-formed") == 2  # in short, and as a finding
+    assert "\n### Policy: 1 error" in summary.read_text()
     (link := tmp_path.with_name("link.md")).symlink_to(summary)
     ended = change.review("--policy", "robot.xml", "--summary", str(link))
     assert (ended.status, link.is_symlink()) == (2, True)
