@@ -558,7 +558,7 @@ class _Round:
             )
 
     def _note_closed_keys(self, now: datetime) -> None:
-        """Report the keys that other users could read, until they are replaced."""
+        """Report the keys that other users could read, until they are revoked or have expired."""
         exposed = self._still_copied(self._state.readable_keys)
         self._state = replace(self._state, readable_keys=tuple(exposed))
         readable = exposed_keys(self._folder, now)
@@ -579,18 +579,19 @@ class _Round:
         return CopiedKey(path, self._machine.now, self._key_digest(path), serial, expires)
 
     def _still_copied(self, keys: Sequence[CopiedKey]) -> list[CopiedKey]:
-        """Return the keys that were not replaced here, with their present certificates.
+        """Return the keys that can still be used, with their present certificates.
 
-        A key that is not here, or cannot be read, counts until its certificate is revoked.
+        A key that was replaced here, or cannot be read, counts until its certificate is revoked or
+        has expired.
         """
-        still, unknown = [], []
+        still, replaced = [], []
         for key in keys:
             present = self._copied_key(key.path)
-            if not (key.key and present.key):
-                unknown.append(key)
-            elif key.key == present.key:
+            if key.key and key.key == present.key:
                 still.append(present._replace(at=key.at) if present.serial else key)
-        return [*still, *self._not_revoked(unknown)]
+            else:
+                replaced.append(key)
+        return [*still, *self._not_revoked(replaced)]
 
     def _not_revoked(self, keys: Sequence[CopiedKey]) -> list[CopiedKey]:
         """Return the keys whose certificates are neither revoked nor certainly expired.
