@@ -589,8 +589,8 @@ class ComparedFleet(NamedTuple):
     """When the robots were compared with the keystore, in UTC."""
     status: FleetStatus
     outdated_dds: Sequence[str]
-    """Robots with a DDS that has known vulnerabilities which a later release of the same major
-    version fixes, sorted by name; with ``--fail-on vulnerabilities``, the exit status is 1 if there
+    """Robots whose DDS has known vulnerabilities that a later release of the same major version
+    fixes, sorted by name; with ``--fail-on vulnerabilities``, the exit status is 1 if there
     are such robots.
     """
     findings: Sequence[Finding]

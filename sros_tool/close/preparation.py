@@ -419,7 +419,7 @@ def _launch_problems(robot: LocalRobot, observed: ObservedProcesses) -> Iterator
             prefix = f"prefix='{' '.join(words)}'"
             yield (
                 f"the process of {process.enclave} has no name= in its launch file, and would "
-                f"not start: give it one, or {prefix}"
+                f"not start: give it a name=, or {prefix}"
             )
 
 

@@ -252,8 +252,8 @@ SETTINGS_EDITED = FindingKind(
     "keystore.settings-edited",
     WARNING,
     "settings that were edited by hand and not applied",
-    "Files issued later may follow the edit, earlier files do not. sros has not shown which "
-    "protection the edit weakens.",
+    "Files that are issued after the edit may follow it; earlier files do not. sros has not shown "
+    "which protection the edit weakens.",
     "sros: the ledger has the settings as sros wrote them.",
     edit_remedy("KEYSTORE"),
 )

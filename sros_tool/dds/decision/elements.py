@@ -36,7 +36,7 @@ def decoded(text: str) -> str:
 class UnreadableError(Exception):
     """Raised with the reason that a vendor does not accept a document.
 
-    ``missing`` says that content is missing from the document, which makes some releases crash
+    ``missing`` says that content is missing from the document; this makes some releases crash
     (`VendorTraits.crashes_on_missing_content`).
     """
 
