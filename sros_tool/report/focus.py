@@ -597,8 +597,9 @@ class _Draft:
         for before, paths in zip((True, False), self._further, strict=True):
             if paths:
                 side = self._side(before)
-                hops, direct = max(side[path] for path in paths), 2 if before else 1
-                notes = ["directly" if hops <= direct else f"over up to {hops} hops"]
+                most = max(side[path] for path in paths)
+                hops = f"over up to {self._hops_to_focus(before, most)} hops"
+                notes = ["directly" if most <= (2 if before else 1) else hops]
                 column = 1 if before else self.columns - 2  # one column before the outermost one
                 card = "s:" if before else "l:"
                 yield side_card(card, column, f"{len(paths)} more", notes, paths)
@@ -636,6 +637,10 @@ class _Draft:
                     ends = ("s:", card.id) if before else (card.id, "l:")
                     yield Link(*ends, 0, 0, ("influence",), ALLOW, WireLevel.UNKNOWN, False, _BOTH)
 
+    def _hops_to_focus(self, is_before_focus: bool, hop: int) -> int:
+        """Return the hops to show: an enclave in the focus is itself the first hop before it."""
+        return hop - 1 if is_before_focus and self._flow.own else hop
+
     def _side(self, is_before_focus: bool) -> Mapping[str, int]:
         return self._flow.before if is_before_focus else self._flow.after
 
@@ -647,18 +652,19 @@ class _Draft:
     def heads(self, cards: Mapping[str, Card]) -> Iterator[Head]:
         """Yield the heading of each column."""
         kinds = {focus.kind for focus in self._picture.focus}
-        sends, receives = "in focus" if _ENCLAVE in kinds else "1 hop before", "1 hop behind"
+        sends, receives = "in focus" if _ENCLAVE in kinds else "1 hop before", "1 hop after"
         if len(kinds) == 1 and _ENCLAVE not in kinds:
             publish, _, subscribe = _WORDS_OF_KIND[kinds.pop()]
             sends, receives = f"may {publish}", f"may {subscribe.removesuffix(' to')}"
         texts = {
             self._column_of(before, hop): text
             for before, near, far, most in (
-                (True, sends, "hops before", self._left),
-                (False, receives, "hops behind", self._right),
+                (True, sends, "before", self._left),
+                (False, receives, "after", self._right),
             )
             for hop in range(1, most + 1)
-            for text in (near if hop == 1 else f"{hop} {far}",)
+            for number in (counted(self._hops_to_focus(before, hop), "hop"),)
+            for text in (near if hop == 1 else f"{number} {far}",)
         }
         for column, text in texts.items():
             card = next((card for card in cards.values() if card.column == column), None)

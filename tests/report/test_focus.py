@@ -77,6 +77,11 @@ def test_an_enclave_is_a_focus_with_both_directions(tmp_path: Path) -> None:
     assert picture.headlines == (
         "/planner can influence 3 enclaves (2 directly), and 1 enclave can influence it",
     )
+    # Headings count hops from the enclave, as its answer does: /web influences it directly.
+    heads = sorted(flow_scene(picture).heads, key=lambda head: head.x)
+    assert [head.text for head in heads] == [
+        *("1 hop before", "in focus", "1 hop after", "2 hops after"),
+    ]
     (answer,) = picture.focus
     assert {influence.enclave for influence in answer.influenced} == {"/mux", "/base", "/recorder"}
     assert [influence.path for influence in answer.influencing] == [
