@@ -505,8 +505,9 @@ def _proof_of_talk(running: RunningRobot, nodes: ObservedNodes, away: Collection
             return Proof(TALK, None, f"{error}{_renamed_text(nodes, None, fails=False)}")
         comparison = _TalkComparison(running, nodes, away, audited)
         differences = {**comparison.differences(), "not judged": audited["unjudged"]}
-        if status and not any(differences.values()):
-            differences = {"not done": ["the ROS graph kept changing"]}
+        # If everything is seen that the open robot did, the graph may keep changing.
+        if status and audited["settled"] and not any(differences.values()):
+            differences = {"not done": ["`sros audit` fails, and does not say why"]}
         reasons = {
             why: f"{why}: {first_few(names, MOST_NAMES)}"
             for why, names in differences.items()
@@ -639,6 +640,7 @@ class _TalkComparison:
         if not_now:
             text += "; allowed, but not seen now, as in a part of the watch: "
             text += first_few(_endpoint_texts(not_now), MOST_NAMES)
+        text += "" if self._audited["settled"] else "; the ROS graph kept changing meanwhile"
         known = {*map(node_name, before.nodes)}
         with_profile, without_profile = self._nodes.divide_by_profile(self.current.nodes)
         new = sorted(
