@@ -540,6 +540,16 @@ PROCESS_PERMISSIVE = FindingKind(
     "rcl 9 (rcl/src/rcl/security.c); tested with ROS 2 Jazzy.",
     "Start it with `sros run KEYSTORE ENCLAVE -- COMMAND...`.",
 )
+PROCESS_WITHOUT_RCL = FindingKind(
+    "runtime.process-without-rcl",
+    WARNING,
+    "a program that uses DDS without rcl, in the environment of a secured node",
+    "Only rcl reads ROS_SECURITY_ENABLE and the other variables: unless the program itself secures "
+    "its participants, everybody on the network hears it and can send to it.",
+    "rcl 9 (rcl/src/rcl/security.c); Cyclone DDS 0.10.2, tested.",
+    "Find out whether the program secures its participants; "
+    "if not, stop it, or keep it out of the network of the robot.",
+)
 PROCESS_OTHER_KEYSTORE = FindingKind(
     "runtime.process-other-keystore",
     WARNING,
@@ -646,7 +656,7 @@ def _security_of(process: Process) -> Security:
             return Security.UNKNOWN
     if not process.asks_for_security:
         return Security.OPEN
-    if process.enclave and process.enclave.problem:
+    if process.is_without_rcl or (process.enclave and process.enclave.problem):
         return Security.UNKNOWN
     return Security.OPEN if _why_unsecured(process) else Security.SECURED
 
@@ -683,6 +693,9 @@ def process_findings(
         if process.asks_for_security:
             yield from _file_findings(process, ledgers, now=now, zone=zone)
             yield from _unsecured_findings(process)
+            if process.is_without_rcl and not process.is_zenoh:
+                text = f"it runs {_domain_text(process)} with {ENABLE}=true"
+                yield PROCESS_WITHOUT_RCL.found(process.label, text)
         elif security[process.pid] is Security.OPEN:
             if _network_and_domain(process) in closed:
                 value = process.environment.get(ENABLE)

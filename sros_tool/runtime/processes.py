@@ -218,6 +218,15 @@ class Process:
         )
 
     @property
+    def is_without_rcl(self) -> bool:
+        """Whether the process uses DDS without rcl, which reads the variables of security.
+
+        The nodes of the demo read these variables themselves.
+        """
+        is_demo = any(map(_DEMO_MODULE.fullmatch, self.command))
+        return bool(self.libraries & _DDS_NAMES) and "librcl" not in self.libraries and not is_demo
+
+    @property
     def demo_command(self) -> tuple[str, ...]:
         """The `sros demo` command that started this node or router; () for other processes.
 
@@ -251,6 +260,7 @@ _RMW_OF = {
     "zenoh": "rmw_zenoh",
     "libzenohpico": "rmw_zenoh",
 }
+_DDS_NAMES = frozenset(library for library, rmw in _RMW_OF.items() if rmw != "rmw_zenoh")
 
 
 class UnseenProcess(NamedTuple):

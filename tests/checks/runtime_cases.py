@@ -189,7 +189,7 @@ def _among_strangers(state: RuntimeState, bench: Bench) -> RuntimeState:
 
 def _not_connected(state: RuntimeState, _: Bench) -> RuntimeState:
     """Two processes of one keystore, with ports in shared memory that the other has not mapped."""
-    node = replace(state.running.processes[0], libraries=frozenset({"libfastrtps"}))
+    node = replace(state.running.processes[0], libraries=frozenset({"libfastrtps", "librcl"}))
     ports = [frozenset({MemoryPort(7411 + 2 * number, "00:1b", number)}) for number in (1, 2)]
     nodes = [
         replace(node, pid=number, own_ports=own, mapped_ports=own)
@@ -277,6 +277,7 @@ CASES: dict[str, Change] = {
     "runtime.process-without-files": running(0, **{ENCLAVE: "/gone"}),
     "runtime.process-expired": lambda state, _: replace(state, now=state.now + 9000 * DAY),
     "runtime.process-permissive": running(0, **{STRATEGY: "Permissive"}),
+    "runtime.process-without-rcl": changed(0, libraries=frozenset({"libddsc"})),
     "runtime.process-other-keystore": _among_strangers,
     "runtime.process-not-connected": _not_connected,
     "runtime.process-other-folder": _from_an_older_copy,

@@ -120,7 +120,7 @@ class Robot:
             command += ("--ros-args", "-r", f"__node:={enclave.strip('/')}")
         if self.launch_file:
             command += ("--params-file", self.launch_file)
-        libraries, now = frozenset({"libfastrtps"}), datetime.now(UTC)
+        libraries, now = frozenset({"libfastrtps", "librcl"}), datetime.now(UTC)
         process = Process(PID[enclave], command, {}, now, libraries=libraries, user=os.geteuid())
         if not is_secured:
             return process
@@ -1088,7 +1088,7 @@ def test_a_node_of_another_robot_is_not_proposed_for_another_machine(robot: Robo
 @sometimes("processes_that_show_no_id_are_to_be_named", 1 / 2)
 def test_processes_that_show_no_id_are_to_be_named(robot: Robot) -> None:
     """As in containers, in each of which the only process has the id 1."""
-    now, mapped = datetime.now(UTC), frozenset({"libfastrtps"})
+    now, mapped = datetime.now(UTC), frozenset({"libfastrtps", "librcl"})
     robot.more = tuple(Process(pid, ("main",), {}, now, mapped, own_pid=1) for pid in (5, 6))
     robot.nodes += tuple(
         ros_node(name, f"010f7f0101000{index}00000000", "publish rt/chatter")
@@ -1245,7 +1245,7 @@ def test_a_process_with_the_name_of_another_is_not_signed(robot: Robot) -> None:
     """Or whoever calls itself /talker while sros watches gets its rights into /talker."""
     twin = ("/", "/", "talker", "010f0000070000000000", ["publish rt/cmd_vel"])
     robot.nodes = (*robot.nodes, twin)
-    command, library = ("/tmp/evil", "a b"), frozenset({"libfastrtps"})
+    command, library = ("/tmp/evil", "a b"), frozenset({"libfastrtps", "librcl"})
     robot.more = (Process(7, command, {}, datetime.now(UTC), libraries=library),)
     said = robot.close(status=1).out
     both = "process 7 (/tmp/evil 'a b') and process 4711 (/opt/run talker) call themselves /talker,"
@@ -1325,7 +1325,7 @@ def test_a_program_that_gives_its_processes_their_enclaves(
         return replace(made, command=spawned, environment=environment)
 
     monkeypatch.setattr(robot, "process", process_of)
-    library = frozenset({"libfastrtps"})
+    library = frozenset({"libfastrtps", "librcl"})
     robot.more = (Process(4700, ("python3", "pumps.py"), {}, datetime.now(UTC), libraries=library),)
     robot.close()
     said = robot.close("--apply", status=1).out
@@ -1340,7 +1340,7 @@ def test_tools_that_ended_while_sros_watched(robot: Robot, monkeypatch: pytest.M
         ros_node(name, f"010f00000{number}0000000000", f"publish rt/{name}")
         for number, name in enumerate(("tool", "look", "job"), 7)
     )
-    library = frozenset({"libfastrtps"})
+    library = frozenset({"libfastrtps", "librcl"})
     seen = {7: ("/opt/tool", "a b"), 9: ("/opt/job",), 10: ("ros2", "topic", "list")}
     origins = {9: ProcessOrigin("job.service", "/opt")}
     find_origins(monkeypatch, lambda pid: origins.get(pid, ProcessOrigin("", "/opt")))
@@ -1562,7 +1562,7 @@ def test_no_command_of_another_user_is_proposed(robot: Robot) -> None:
     export = robot.folder / "robot/export"
     variables = secured_environment(export, "/talker", 0)
     later = datetime.now(UTC) + timedelta(days=1)
-    mapped = frozenset({"libfastrtps"})
+    mapped = frozenset({"libfastrtps", "librcl"})
     command = ("/tmp/evil", "--as-root")
     robot.more = (robot.with_its_files(Process(66, command, variables, later, mapped, user=12345)),)
     words = {**graph(), "secured": graph(*secured(*robot.remaining))}

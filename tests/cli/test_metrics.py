@@ -76,11 +76,13 @@ def test_short_lived_enclaves_do_not_expire_first(tmp_path: Path) -> None:
 
 def test_the_running_processes_are_counted(keystore: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     process = Process(7, ("talker",), {}, datetime.now(UTC), network="net:[1]")
+    asks = {"ROS_SECURITY_ENABLE": "true", "ROS_SECURITY_STRATEGY": "Enforce"}
+    other = Process(9, ("gateway",), asks, datetime.now(UTC), frozenset({"libddsc"}))
     unseen = UnseenProcess(8, ("init",), "Permission denied", speaks=False)
-    running = RunningProcesses((process,), (unseen,))
+    running = RunningProcesses((process, other), (unseen,))
     monkeypatch.setattr(ProcessTable, "look", lambda *_: running)
     found = read(sros("metrics", keystore, "--runtime").ok().out)
-    assert found["sros_processes"] == {("secured",): 0, ("open",): 1, ("unknown",): 0}
+    assert found["sros_processes"] == {("secured",): 0, ("open",): 1, ("unknown",): 1}
     assert found["sros_processes_not_seen"][()] == 1
     assert found["sros_process_findings"]["note", "runtime.process-elsewhere"] == 1
     assert "sros_processes" not in read(sros("metrics", keystore).ok().out)
