@@ -333,7 +333,12 @@ def run(
       $ ros2 launch --launch-prefix 'sros run keystore --policy policy.xml --' \
             demo_nodes_cpp talker_listener_launch.py
     """
-    from sros_tool.runtime.environment import enclave_argument, named_enclave, with_enclave
+    from sros_tool.runtime.environment import (
+        enclave_argument,
+        named_enclave,
+        with_enclave,
+        without_own_libraries,
+    )
 
     root, rest = split_root(arguments)
     if policy and rest and ctx.meta[_COMMAND_KEY]:
@@ -371,7 +376,7 @@ def run(
             f"added {added}, so that the ROS graph shows the enclave (--no-ros-args adds nothing)",
             err=True,
         )
-    environment = {**os.environ, **secured.variables}
+    environment = {**without_own_libraries(os.environ), **secured.variables}
     pin = environment.pop(_FAST_DDS_PIN, None)
     if secured.needs_pin and pin is None:
         print_notes([Note("token.no-pin", _NO_PIN)])

@@ -23,9 +23,11 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
+import os
 import re
 import shlex
 import shutil
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -81,6 +83,22 @@ def secured_environment(root: Path, name: str, domain: int) -> dict[str, str]:
         ENCLAVE: name,
         DOMAIN: str(domain),
     }
+
+
+def without_own_libraries(environment: Mapping[str, str]) -> dict[str, str]:
+    """Return an environment for a command that may use another ROS than the Python of sros.
+
+    The PyPI wheels of ROS start a Python again with their libraries in LD_LIBRARY_PATH, and mark
+    this in the environment; a node of another ROS would load them, without DDS Security.  A Python
+    of the same wheels adds the libraries again.
+    """
+    kept = dict(environment)
+    if kept.pop("_ROS_WHEELS_BOOTSTRAP_COMPLETE", None):
+        own = Path(sys.prefix).resolve()
+        folders = kept.pop("LD_LIBRARY_PATH", "").split(os.pathsep)
+        if others := [f for f in folders if f and not Path(f).resolve().is_relative_to(own)]:
+            kept["LD_LIBRARY_PATH"] = os.pathsep.join(others)
+    return kept
 
 
 REFUSING_DDS: Mapping[str, str] = {KEYSTORE: "", ENABLE: "true", STRATEGY: "Enforce"}

@@ -21,10 +21,20 @@ from sros_tool.runtime.environment import (
     render_environment,
     render_refusal,
     with_enclave,
+    without_own_libraries,
 )
 from tests.support.children import run
 
 ADDED = ("--ros-args", "--enclave", "/arm")
+
+
+def test_a_command_gets_no_libraries_of_the_wheels_that_sros_runs_with() -> None:
+    own, libraries = f"{sys.prefix}/lib/python3/site-packages/ros_fastrtps.libs", "LD_LIBRARY_PATH"
+    for folders, kept in ((f"{own}:/opt/ros/lib", {libraries: "/opt/ros/lib"}), (own, {})):
+        environment = {"HOME": "/root", libraries: folders}
+        assert without_own_libraries(environment) == environment, "set by the user"
+        marked = environment | {"_ROS_WHEELS_BOOTSTRAP_COMPLETE": "1"}
+        assert without_own_libraries(marked) == {"HOME": "/root", **kept}
 
 
 @pytest.fixture
