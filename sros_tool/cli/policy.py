@@ -259,7 +259,8 @@ def diff_policy(
     that differ only in the robot of a fleet are shown as one. Two policies are also compared by the
     protection that they demand, two keystores by their governance.
 
-    The exit status is 1 if they differ, or if DDS would refuse A or B.
+    The exit status is 1 if they differ, also in something that rights do not tell (a note says so),
+    or if DDS would refuse A or B.
 
     With --no-new-access, A and B can also be folders of policies, and policies at a git revision,
     as git:REVISION:PATH. The exit status is 0 only if, for every vendor, domain and name, B gives
@@ -316,7 +317,7 @@ def diff_policy(
         count = len(difference.only_first) + len(difference.only_second)
         of = f" of {first_few(sorted(compared.scope), _MOST_NEW_LINES)}" if compared.scope else ""
         differ = f"1 right{of} differs" if count == 1 else f"{count} rights{of} differ"
-        if count or not (compared.domains or compared.enclaves):
+        if count or not (compared.domains or compared.enclaves or compared.unclear):
             echo(differ if count else f"the rights{of} are the same", err=True)
         if compared.domains:
             number = counted(len(compared.domains), "enclave")
@@ -324,6 +325,9 @@ def diff_policy(
         if compared.enclaves:
             number = counted(len(compared.enclaves), "enclave")
             echo(f"only one side has {number} without rights", err=True)
+        if compared.unclear:
+            number = counted(len(compared.unclear), "enclave")
+            echo(f"the permissions of {number} differ in what the notes below name", err=True)
         if protections:
             echo("the policies demand different protection", err=True)
         if compared.governance_differs:
@@ -356,7 +360,7 @@ def rights_markdown(
     lines += _protection_lines(difference.protections)
     parts = []
     shown_by = "which `sros diff_policy` shows"
-    for sign, title in (("~", "renamed"), ("+", "added"), ("-", "removed")):
+    for sign, title in (("~", "renamed"), ("+", "added"), ("-", "removed"), ("?", "unclear")):
         signed = [line.removeprefix(f"{sign} ") for line in lines if line.startswith(sign)]
         if signed:
             parts.append(f"**{len(signed)} {title}**")
@@ -383,9 +387,10 @@ def rights_markdown(
 
 
 def enclave_lines(difference: SourcesDifference, fleet: Fleet | None) -> list[str]:
-    """Return lines for enclaves without rights on one side only, and for differing ROS domains.
+    """Return lines for enclaves that differ in something else than rights.
 
-    Equal lines of robots are merged.
+    They have no rights on one side only, other ROS domains, or unclear permissions.  Equal lines of
+    robots are merged.
     """
     from sros_tool.fleet.robots import folded
 
@@ -401,6 +406,8 @@ def enclave_lines(difference: SourcesDifference, fleet: Fleet | None) -> list[st
         ]
         for side in "-+"
     ]
+    unclear = "may be allowed or denied something else, as the notes say"
+    sides.append([(name, f"? {name} {unclear}") for name in difference.unclear])
     return [text for lines in sides for text in folded(fleet, lines)]
 
 

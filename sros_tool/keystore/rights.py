@@ -637,6 +637,10 @@ class PolicyDifference(NamedTuple):
     """Enclaves without rights that only one side has."""
     governance_differs: bool
     """Whether the governance of the enclaves differs between A and B, or cannot be read."""
+    unclear: Sequence[str]
+    """Enclaves whose permissions differ in something that rights do not tell, such as partitions,
+    the order of rules, or a default that allows everything; `notes` of A and B name it.
+    """
 
 
 class SourcesDifference(NamedTuple):
@@ -657,9 +661,11 @@ class SourcesDifference(NamedTuple):
     """
     governance_differs: bool = False
     """As in `PolicyDifference`."""
+    unclear: Sequence[str] = ()
+    """As in `PolicyDifference`."""
 
     def __bool__(self) -> bool:
-        parts = self.rights, self.protections, self.domains, self.enclaves
+        parts = self.rights, self.protections, self.domains, self.enclaves, self.unclear
         return self.governance_differs or any(map(bool, parts))
 
 
@@ -706,9 +712,27 @@ def compare_sources(
         for enclave in sorted(side.without_rights() - other.stated_enclaves())
         if other.kind != "zenoh" and (scope is None or enclave in scope)
     ]
+    unclear = [*_unclear_enclaves(first_source, second_source, scope)]
     return SourcesDifference(
-        scope, difference, protections, unanswered, domains, enclaves, governed
+        scope, difference, protections, unanswered, domains, enclaves, governed, unclear
     )
+
+
+def _unclear_enclaves(
+    first_source: RightsSource, second_source: RightsSource, scope: frozenset[str] | None
+) -> Iterator[str]:
+    """Yield the enclaves whose permissions differ in something that rights do not tell."""
+    for name in sorted({*first_source.documents, *second_source.documents}):
+        if scope is not None and name not in scope:
+            continue
+        documents = (side.documents.get(name) for side in (first_source, second_source))
+        sides = [
+            [grant for grant in document.grants if _enclave_of(grant) == name] if document else []
+            for document in documents
+        ]
+        first, second = ([(grant.rules, grant.default_allow) for grant in side] for side in sides)
+        if first != second and any(any(_left_out_notes(side)) for side in sides):
+            yield name
 
 
 def _governance_differs(first_source: RightsSource, second_source: RightsSource) -> bool:
@@ -850,6 +874,7 @@ def policy_difference(
         difference.domains,
         [DifferentEnclave(_SIDE_OF_SIGN[sign], enclave) for sign, enclave in difference.enclaves],
         difference.governance_differs,
+        difference.unclear,
     )
 
 

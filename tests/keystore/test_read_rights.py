@@ -137,6 +137,38 @@ def test_what_rights_do_not_tell(
     assert ids(source) == ["rights.unsigned", *notes]
 
 
+@pytest.mark.parametrize(
+    ("document", "other", "is_unclear"),
+    [
+        (grant(rule()), grant(rule(), default="ALLOW"), True),
+        (
+            grant(rule()),
+            grant(rule(rest="<partitions><partition>p</partition></partitions>")),
+            True,
+        ),
+        (
+            grant(rule(), rule("rt/y", "deny_rule")),
+            grant(rule("rt/y", "deny_rule"), rule()),
+            True,
+        ),
+        (grant(rule(), rule("rt/y", domain=7)), grant(rule("rt/y"), rule(domain=7)), True),
+        (grant(rule()), grant(rule()) + grant(rule("rt/y")), True),
+        (grant(rule(), rule("rt/y", domain=7)), grant(rule(), rule("rt/y", domain=7)), False),
+        (grant(rule(), rule("rt/y")), grant(rule("rt/y"), rule()), False),
+    ],
+)
+def test_permissions_with_another_effect_are_not_the_same(
+    tmp_path: Path, document: str, other: str, is_unclear: bool
+) -> None:
+    files = tmp_path / "a.xml", tmp_path / "b.xml"
+    for file, text in zip(files, (document, other), strict=True):
+        file.write_text(DOCUMENT.format(text))
+    ended = sros("diff_policy", *files)
+    assert ended.status == is_unclear
+    assert ("? /a may be allowed" in ended.out) == is_unclear
+    assert ("the rights are the same" in ended.err) != is_unclear
+
+
 def test_rights_of_a_grant_leave_out_what_every_participant_has() -> None:
     (found,) = parse_permissions(DOCUMENT.format(grant(rule("ros_discovery_info"))).encode()).grants
     assert grant_rights("/a", found) == frozenset()
