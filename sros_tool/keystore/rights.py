@@ -436,6 +436,8 @@ def _document_rights(path: Path, kind: str, file: Path) -> RightsSource:
 
 FOREIGN_GRANT = "rights.foreign-grant"
 """The id of the note on permissions that have a grant for another enclave."""
+RELAY = "rights.relay"
+"""The id of the note on permissions that allow or deny topics in ``<relay>``."""
 
 
 def _keystore_rights(
@@ -557,6 +559,12 @@ def _left_out_notes(grants: Iterable[Grant]) -> Iterator[Note]:
             yield Note("rights.default-allow", text)
         if any(c.partitions for r in grant.rules for c in (*r.publish, *r.subscribe)):
             yield Note("rights.partitions", "this answer ignores its partitions.")
+        if any(rule.relay for rule in grant.rules):
+            text = (
+                "this answer ignores its <relay>, by which peers on Fast DDS let a process "
+                "subscribe that does not apply its own permissions."
+            )
+            yield Note(RELAY, text)
         if len({rule.domains for rule in grant.rules}) > 1:
             text = "its rules are for different domains; this answer ignores the domains."
             yield Note("rights.domains", text)

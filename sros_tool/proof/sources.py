@@ -41,7 +41,7 @@ from sros_tool.keystore.layout import (
     permissions_ca_for,
 )
 from sros_tool.keystore.reader import OpenedKeystore
-from sros_tool.keystore.rights import RightsSource, load_rights, load_zenoh_rights
+from sros_tool.keystore.rights import RELAY, RightsSource, load_rights, load_zenoh_rights
 from sros_tool.keystore.template import Template
 from sros_tool.keystore.zenoh_files import is_signed
 from sros_tool.pki import smime
@@ -74,6 +74,7 @@ from sros_tool.zenoh.document import ConfigurationDocument
 
 UNCERTAIN = {
     "rights.partitions",
+    RELAY,
     "rights.zenoh-open",
     "rights.zenoh-conditions",
     "rights.zenoh-nameless",

@@ -40,7 +40,7 @@ from sros_tool.keystore.layout import (
 from sros_tool.keystore.participant import JoinContext, LoadedEnclave, deciding_enclave
 from sros_tool.keystore.protection import governance_with_stated
 from sros_tool.keystore.reader import OpenedKeystore
-from sros_tool.keystore.rights import FOREIGN_GRANT, load_rights, load_zenoh_rights
+from sros_tool.keystore.rights import FOREIGN_GRANT, RELAY, load_rights, load_zenoh_rights
 from sros_tool.keystore.template import DEFAULT_TEMPLATE, Template, load_template
 from sros_tool.names import ROS_DISCOVERY_TOPIC, is_expression
 from sros_tool.policy.document import files_of_policies, join_policies, refuse_fallbacks
@@ -348,6 +348,14 @@ _MOST_DOMAINS = 20
 _MOST_GOVERNANCES = 4
 
 
+_WHY_UNKNOWN = {
+    FOREIGN_GRANT: "Permissions are not secret: whoever has the key of an enclave can use all "
+    "permissions that have a grant for this enclave.",
+    RELAY: "A changed process can use what its peers allow.",
+}
+"""Ids of notes → why the rights in a keystore are not known."""
+
+
 def _keystore_system(keystore: OpenedKeystore, at: Circumstances) -> System:
     """Return the worlds of a keystore.
 
@@ -363,11 +371,10 @@ def _keystore_system(keystore: OpenedKeystore, at: Circumstances) -> System:
     names = enclave_names(root, hidden=True)
     source = load_rights(keystore, hidden=True)
     for note in source.notes:
-        if note.id == FOREIGN_GRANT:
+        if note.id in _WHY_UNKNOWN:
             raise KeystoreError(
                 f"the rights in keystore '{root}' are not known: {note.text.rstrip('.')}",
-                "Permissions are not secret: whoever has the key of an enclave can use all "
-                "permissions that have a grant for this enclave.",
+                _WHY_UNKNOWN[note.id],
                 "Sign permissions with one grant for each enclave, with create_permission or "
                 "generate_artifacts.",
             )

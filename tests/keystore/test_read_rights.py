@@ -22,6 +22,8 @@ GRANT = """<grant name="/g"><subject_name>{subject}</subject_name><validity>
 RULE = """<{kind}><domains><id>{domain}</id></domains><publish><topics><topic>{topic}</topic>
 </topics>{rest}</publish></{kind}>"""
 
+RAW = "<topics><topic>raw</topic></topics>"
+
 
 def rule(topic: str = "rt/x", kind: str = "allow_rule", domain: int = 0, rest: str = "") -> str:
     return RULE.format(topic=topic, kind=kind, domain=domain, rest=rest)
@@ -153,6 +155,7 @@ def test_what_rights_do_not_tell(
         ),
         (grant(rule(), rule("rt/y", domain=7)), grant(rule("rt/y"), rule(domain=7)), True),
         (grant(rule()), grant(rule()) + grant(rule("rt/y")), True),
+        (grant(rule()), grant(rule(rest=f"</publish><relay>{RAW}</relay><publish>{RAW}")), True),
         (grant(rule(), rule("rt/y", domain=7)), grant(rule(), rule("rt/y", domain=7)), False),
         (grant(rule(), rule("rt/y")), grant(rule("rt/y"), rule()), False),
     ],

@@ -92,6 +92,12 @@ def in_another_domain(keystore: Path) -> None:
         signed(keystore, file, lambda old: old.replace(b"<id>0<", b"<id>0</id><id>7<"))
 
 
+def in_a_relay(keystore: Path) -> None:
+    """Peers on Fast DDS let a reader of /web subscribe, if /web does not ask its own rules."""
+    relay = b"<relay><topics><topic>rt/cmd_vel</topic></topics></relay></allow_rule>"
+    signed(keystore, WEB, lambda document: document.replace(b"</allow_rule>", relay))
+
+
 def from_later_on(keystore: Path) -> None:
     begin = re.compile(rb"(<not_before>)\d{4}")
     signed(keystore, WEB, lambda old: begin.sub(rb"\g<1>2035", drives(old)))
@@ -241,6 +247,7 @@ def another_router(keystore: Path) -> None:
         (a_name_without_an_enclave, "/ghost: may publish /cmd_vel, but"),
         (a_router_that_the_settings_do_not_name, "/web: may publish /cmd_vel, but"),
         (a_weaker_governance_of_one_enclave, "/router: may publish /cmd_vel, and so may /web"),
+        (in_a_relay, "/web: this answer ignores its <relay>"),
         (at_many_times, "become valid at more than 10 different times"),
         (a_link_without_tls, "is not known"),
         (no_certificate_asked_for, "is not known"),
@@ -512,6 +519,7 @@ def test_settings_of_zenoh_are_compared(sound: Path, path: str, value: object, s
         (the_history_of_a_topic, 2, "gets only the history of '0/cmd_vel/*/*'"),
         (a_denial, 2, "it has deny rules"),
         (a_namespace, 2, "puts a namespace before the keys"),
+        (in_a_relay, 2, "/web: this answer ignores its <relay>"),
         (a_second_router, 2, "has the files of several routers"),
     ],
 )
