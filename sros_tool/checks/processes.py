@@ -68,7 +68,13 @@ from sros_tool.runtime.environment import (
     override_pairs,
     zenoh_environment,
 )
-from sros_tool.runtime.processes import Process, ProcessEnclave, RunningProcesses, plain
+from sros_tool.runtime.processes import (
+    Process,
+    ProcessEnclave,
+    RunningProcesses,
+    domain_number,
+    plain,
+)
 from sros_tool.runtime.rmw import DEFAULT_RMW, RMW, vendor_of
 from sros_tool.runtime.variables import DOMAIN, ENABLE, ENCLAVE, KEYSTORE, STRATEGY
 from sros_tool.validity import Window, elapsed, iso, parse_iso
@@ -675,7 +681,7 @@ def process_findings(
     is not enabled here, all open nodes share one finding, unless ``finding_per_node`` is set.
     """
     is_secured_here = environment.get(ENABLE) == "true"
-    own_domain = ("", environment.get(DOMAIN) or "0")
+    own_domain = ("", domain_number(environment.get(DOMAIN, "")))
     nodes = [process for process in running.processes if not process.is_daemon]
     security = {node.pid: _security_of(node) for node in nodes}
     secured = [node for node in nodes if security[node.pid] is Security.SECURED]
@@ -721,7 +727,7 @@ def process_findings(
 
 def _network_and_domain(process: Process) -> tuple[str, str]:
     """Return the network and the ROS domain of a process, which neighbors share."""
-    return process.network, process.environment.get(DOMAIN) or "0"
+    return process.network, process.domain
 
 
 def _domain_text(process: Process) -> str:
@@ -919,7 +925,9 @@ def _mixed_vendor_findings(
     ``environment`` is the environment of this shell if it enables security, otherwise None.
     """
     places = dict(_group_by_network_and_domain(secured))
-    own_domain = ("", environment.get(DOMAIN) or "0") if environment is not None else None
+    own_domain = (
+        ("", domain_number(environment.get(DOMAIN, ""))) if environment is not None else None
+    )
     if own_domain:
         places.setdefault(own_domain, [])
     for place, processes in places.items():
@@ -942,7 +950,9 @@ def _other_keystore_findings(
     The expected CA is the CA of most neighbors; in the network and domain of ``environment``, the
     expected CA is the one of the enclave in ``environment``.
     """
-    own_domain = ("", environment.get(DOMAIN) or "0") if environment is not None else None
+    own_domain = (
+        ("", domain_number(environment.get(DOMAIN, ""))) if environment is not None else None
+    )
     own_keys = _authorities_here(environment) if environment is not None else frozenset()
     for place, processes in _group_by_network_and_domain(secured).items():
         groups = _group_by_authorities(process for process in processes if not process.is_zenoh)

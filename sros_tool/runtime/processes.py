@@ -89,9 +89,8 @@ _MOST_BYTES = 4 * 1024 * 1024
 _MOST_MAPS = 32 * 1024 * 1024
 _MOST_TRIES = 3
 _KERNEL_THREAD = 0x00200000
-_DOMAIN_NUMBER = re.compile(
-    r"\s*\+?(0[xX][0-9a-fA-F]{1,16}|0[0-7]{0,22}|[1-9][0-9]{0,19})", re.ASCII
-)
+_DOMAIN_NUMBER = re.compile(r"\s*([+-]?)(0[xX][0-9a-fA-F]+|0[0-7]*|[1-9][0-9]*)", re.ASCII)
+_LONGEST_NUMBER = 100
 _LONGEST_TEXT = 40
 
 
@@ -176,18 +175,8 @@ class Process:
 
     @property
     def domain(self) -> str:
-        """The ROS domain that the process names, as a number.
-
-        rcl reads the variable with strtoul(3), which also accepts 0x0. Text that is no 64-bit
-        number is returned in quotes, safe to print.
-        """
-        named = self.environment.get(DOMAIN) or "0"
-        number = _DOMAIN_NUMBER.fullmatch(named)
-        if number is None:
-            return f"'{plain(named)}'"
-        digits = number[1].lower()
-        base = 16 if digits.startswith("0x") else 8 if digits.startswith("0") else 10
-        return str(int(digits, base))
+        """The ROS domain that the process names, as a number; see `domain_number`."""
+        return domain_number(self.environment.get(DOMAIN, ""))
 
     @property
     def rmw(self) -> str:
@@ -251,6 +240,26 @@ class Process:
         return any(mark in word for word in self.command for mark in _DAEMON)
 
 
+def domain_number(named: str) -> str:
+    """Return the ROS domain of a value of ROS_DOMAIN_ID, as a number.
+
+    rcl reads the value with strtoul(3), which accepts 0x39, and ignores what follows a number other
+    than 0. DDS keeps 32 bits of it. A value that rcl refuses is returned in quotes, safe to print.
+    """
+    number = _DOMAIN_NUMBER.match(named or "0", 0, _LONGEST_NUMBER)
+    if number is not None:
+        digits = number[2].lower()
+        base = 16 if digits.startswith("0x") else 8 if digits.startswith("0") else 10
+        value = int(digits, base)
+        if value < _NUMBERS and (value or not named[number.end() :]):
+            value = -value % _NUMBERS if number[1] == "-" else value
+            # The highest number stands for the default domain.
+            return str(value % 2**32 if value != _NUMBERS - 1 else 0)
+    return f"'{plain(named)}'"
+
+
+_NUMBERS = 2**64
+"""Number of the values of strtoul(3)."""
 _RMW_OF = {
     "libddsc": "rmw_cyclonedds",
     "libfastrtps": "rmw_fastrtps",

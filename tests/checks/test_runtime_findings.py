@@ -105,12 +105,23 @@ def test_without_security_each_open_node_is_named(sound_one: RuntimeState, bench
         assert not chosen.fails(WARNING)
 
 
+@pytest.mark.parametrize("written", ["7", "07", "0x7", "7abc", "4294967303"])
+def test_an_open_node_is_next_to_secured_ones_however_its_domain_is_written(
+    sound_one: RuntimeState, written: str
+) -> None:
+    secured = sound_one.running.processes[0]
+    secured = replace(secured, environment={**secured.environment, DOMAIN: "7"})
+    opened = replace(secured, pid=99, environment={DOMAIN: written})
+    state = with_processes(replace(sound_one, environment={}), secured, opened)
+    assert "runtime.process-unsecured" in ids(state)
+
+
 def test_the_name_of_a_process_cannot_be_taken_for_another_one(sound_one: RuntimeState) -> None:
     name = f"x) in domain 0, process 1 (y\x1b[2J{'z' * 500}"
-    node = Process(7, (name,), {DOMAIN: "4, all"}, sound_one.now, libraries=frozenset({"librcl"}))
+    node = Process(7, (name,), {DOMAIN: "all, 4"}, sound_one.now, libraries=frozenset({"librcl"}))
     (found,) = runtime_findings(with_processes(replace(sound_one, environment={}), node))
     text = found.text.partition("without it: ")[2]
-    assert text == f"process 7 (x? in domain 0? process 1 ?y??2J{'z' * 8}) in domain '4? all'"
+    assert text == f"process 7 (x? in domain 0? process 1 ?y??2J{'z' * 8}) in domain 'all? 4'"
 
 
 def test_a_session_file_of_zenoh_is_security_without_ros_variables(

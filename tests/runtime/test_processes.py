@@ -145,7 +145,8 @@ def test_the_first_of_two_variables_counts_as_for_getenv(proc: Proc) -> None:
     assert (process.user, process.own_pid, process.network) == (8, 7, "net:[1]")
     for text, domain in (
         *(("0x0", "0"), ("010", "8"), (" +5", "5"), ("", "0"), ("0XfF", "255")),
-        *(("x\n", "'x?'"), ("-1", "'-1'"), ("\u0665", "'\u0665'")),
+        *(("7abc", "7"), ("4294967303", "7"), ("-1", "0"), ("0abc", "'0abc'"), ("08", "'08'")),
+        *(("x\n", "'x?'"), ("\u0665", "'\u0665'")),
         *((f"{number}{'1' * 5000}", f"'{number:1<40}'") for number in ("1", "0", "0x")),
     ):
         assert replace(process, environment={"ROS_DOMAIN_ID": text}).domain == domain
