@@ -408,6 +408,8 @@ class _Review:
     base: CommitFiles | None
     robots: dict[str, Fleet | None] = field(default_factory=dict)
     """The fleet of the policy or keystore that a step examines, by subject of the step."""
+    has_all_policies: bool = True
+    """Whether HEAD has every policy of the request."""
     is_relative: bool = False
     """Whether a requirement has a name that moves with the namespace."""
     decided_elsewhere: str = "whether the change breaks them"
@@ -445,10 +447,13 @@ class _Review:
                     for file in self.base.write_policies(path, placeholders=base_fleet is not None)
                 ]
         named = " ".join(asked.policies)
+        complete = self.has_all_policies
         findings = partial(self._findings, of_head, head_fleet)
         if head_fleet:
             self.robots[named] = fleet_with_enclaves(head_fleet, of_head)
-        yield from self._step_result("policy", named, findings, only_with_result=bool(of_head))
+        yield from self._step_result(
+            "policy", named, findings, only_with_result=bool(of_head), complete=complete
+        )
         keystores = yield from self._keystores(self.head)
         for path, keystore in keystores.items():
             with suppress(SrosError):  # faults of the fleet file are findings
@@ -472,6 +477,7 @@ class _Review:
                 named,
                 lambda: self._access(of_base, base_fleet, before, after, moving),
                 only_with_result=bool(asked.policies),
+                complete=complete,
             )
             yield from self._step_result(
                 "rights",
@@ -503,9 +509,13 @@ class _Review:
         decide: Callable[[], tuple[int, Content] | None],
         *,
         only_with_result: bool = True,
+        complete: bool = True,
         can_be_allowed: bool = True,
     ) -> Iterator[ReviewStep]:
-        """Run ``decide`` and yield a step with its result or its error."""
+        """Run ``decide`` and yield a step with its result or its error.
+
+        Without ``complete`` (a file could not be read), no step says that nothing was found.
+        """
         if not only_with_result:
             return
         try:
@@ -514,7 +524,7 @@ class _Review:
             decided = _UNDECIDED, error
         except OSError as error:  # such as a file name that is too long for this system
             decided = _UNDECIDED, DocumentError(f"'{error.filename}': {error.strerror}")
-        if decided:
+        if decided and (complete or decided[0] != _OK):
             status, content = decided
             only_named = isinstance(content, StepFindings) and not content.failing
             is_allowed = can_be_allowed and (self._allows(kind) or only_named)
@@ -563,6 +573,7 @@ class _Review:
             return files
 
         read = yield from _read_each("policy", self.request.policies, files_at)
+        self.has_all_policies = len(read) == len(self.request.policies)
         return list(dict.fromkeys(file for files in read.values() for file in files))
 
     def _keystores(self, side: CommitFiles) -> Generator[ReviewStep, None, dict[str, Path]]:
@@ -1055,7 +1066,8 @@ class _Review:
             except (SrosError, OSError) as error:
                 yield _undecided("requirements", subject, error)
                 continue
-            wanted = yield from self._read(files, system.fleet)
+            read = yield from self._read(files, system.fleet)
+            wanted = [*chain.from_iterable(read.values())]
             self.is_relative |= any(requirement.is_relative for requirement in wanted)
             earlier = yield from self._read(
                 base_files, partial(_without_left_robots, before, system.fleet)
@@ -1070,23 +1082,26 @@ class _Review:
                 "requirements",
                 subject,
                 partial(self._decided, files.values(), wanted, system, rights, elsewhere),
-                only_with_result=bool(files),
+                only_with_result=bool(read),
+                complete=len(read) == len(paths)
+                and (subject in keystores or self.has_all_policies),
             )
-            decide = partial(self._dropped_step, earlier, wanted, system, sources)
-            yield from self._step_result("requirements-before", subject, decide)
+            required_before = [*chain.from_iterable(earlier.values())]
+            decide = partial(self._dropped_step, required_before, wanted, system, sources)
+            yield from self._step_result(
+                "requirements-before", subject, decide, only_with_result=len(read) == len(files)
+            )
 
     def _read(
         self, files: Mapping[str, Path], fleet: FleetSource
-    ) -> Generator[ReviewStep, None, list[Requirement]]:
-        """Return the requirements of files, by path; yield steps for unreadable files."""
-        read = yield from _read_each(
-            "requirements",
-            files,
-            lambda path: read_requirements(
-                files[path], fleet, self.request.namespaces, self.request.remaps
-            ),
-        )
-        return [requirement for requirements in read.values() for requirement in requirements]
+    ) -> Generator[ReviewStep, None, dict[str, Sequence[Requirement]]]:
+        """Map paths to the requirements of files; yield a step for each unreadable file."""
+
+        def requirements_at(path: str) -> Sequence[Requirement]:
+            asked = self.request
+            return read_requirements(files[path], fleet, asked.namespaces, asked.remaps)
+
+        return (yield from _read_each("requirements", files, requirements_at))
 
     def _decided(
         self,

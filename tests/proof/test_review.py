@@ -6,6 +6,7 @@ import gzip
 import io
 import json
 import os
+import re
 import shutil
 import subprocess
 import tarfile
@@ -127,7 +128,7 @@ DENIES = '<topics publish="DENY"><topic>/q</topic></topics>'
             ("robot.xml", 3),
         ),
         ({"second.xml": policy_text(WIDER)}, "review.file", ("second.xml", 1)),
-        ({"robot.toml": ONLY.replace("only", "nobody")}, "requirement.dropped", ("robot.toml", 1)),
+        ({"robot.toml": ONLY.replace('/a"', '/b"')}, "requirement.dropped", ("robot.toml", 1)),
         ({"robot.toml": None}, "review.undecided", ("robot.toml", 1)),
         (
             {"old.key": "-----BEGIN EC PRIVATE KEY-----\nMHcCAQEE\n"},
@@ -232,6 +233,24 @@ def test_dropping_a_requirement_is_a_consent_of_its_own(change: Change) -> None:
     gone = change.review(*words)
     assert "requirements robot.toml: 'robot.toml' is not in the commit" in gone.out
     assert "nothing found" not in gone.out.replace("policy robot.xml: nothing found", ""), gone
+
+
+def test_no_step_is_ok_without_one_of_its_files(change: Change) -> None:
+    required = ONLY.replace("[[only]]", "[[only]]\nname = 'b'")
+    policy = policy_text({"/c": publish("/z")})
+    change.base = change.commit({"second.toml": required, "second.xml": policy})
+    words = ("--policy", "robot.xml\nsecond.xml", "--requirements", "robot.toml\nsecond.toml")
+    cases: tuple[tuple[dict[str, str | bytes | None], int, list[str]], ...] = (
+        ({"README": "x"}, 0, ["policy", "requirements", "new-access"]),
+        ({"second.toml": "[[only]"}, 2, ["policy", "new-access"]),
+        ({"second.toml": required, "second.xml": None}, 2, []),
+    )
+    for files, status, steps in cases:
+        change.commit(files)
+        ended = change.review(*words)
+        ok = re.findall(r"^\[ok\] (policy|requirements|new-access) ", ended.out, re.M)
+        assert (ended.status, ok) == (status, steps), ended
+        assert "requirements-before" not in ended.out, ended
 
 
 def test_changed_rights_are_named_and_decided_over_all_policies(change: Change) -> None:
