@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import re
+import shutil
 import subprocess
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -71,6 +73,26 @@ def test_every_verb_is_described() -> None:
     rows = re.findall(r"^\| (`.+?) \| ", read("docs/verbs.md"), re.MULTILINE)
     assert {word for row in rows for word in re.findall(r"`([a-z_]+)", row)} >= verbs
     assert "(docs/verbs.md)" in read("README.md")
+
+
+def test_setup_py_installs_every_policy_of_a_package(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A formatter of the page could turn rows of a list into statements that cannot be pasted."""
+    shutil.copytree(PROJECT / "policies/common", tmp_path / "policies/common")
+    (tmp_path / "policies/gripper.xml").touch()
+    (tmp_path / "policies/gripper.requirements.toml").touch()
+    (lines,) = re.findall(
+        r"^```python\n(from glob.*?)^```", read("docs/howto/package.md"), re.M | re.S
+    )
+    monkeypatch.chdir(tmp_path)
+    exec(lines, made := dict[str, Any]())
+    files = [Path(file) for _, found in made["POLICIES"] for file in found]
+    assert sorted(files) == sorted(
+        path.relative_to(tmp_path) for path in tmp_path.rglob("*") if path.is_file()
+    )
+    share = Path("share/gripper_driver")
+    assert all(share / Path(found[0]).parent == Path(at) for at, found in made["POLICIES"])
 
 
 def test_every_attack_is_in_the_table_of_attacks() -> None:
