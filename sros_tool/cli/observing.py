@@ -475,7 +475,8 @@ def generate_policy(
     learned = learn(seen.observation, None if flat else common).noting(seen.notes)
     if not learned.profiles:
         if as_json:
-            print_json(_learned_json(None, file, learned, seen.observation, dry_run))
+            value = _learned_json(None, file, learned, seen.observation, dry_run)
+            print_json(value._replace(settled=snapshot.settled))
         echo(_NO_NODES, err=True)
         print_notes(learned.notes)
         echo(why_no_node_was_observed(environment, snapshot.seconds, rmw, enclave), err=True)
@@ -486,7 +487,9 @@ def generate_policy(
     if as_json:
         print_json(
             _learned_json(plan, file, learned, seen.observation, dry_run)._replace(
-                ended=ended, intermittent=sorted(snapshot.intermittent)
+                ended=ended,
+                intermittent=sorted(snapshot.intermittent),
+                settled=snapshot.settled,
             )
         )
     else:
@@ -546,6 +549,7 @@ def _learned_json(
         observation=observation,
         ended=(),
         intermittent=(),
+        settled=True,
         added=plan.added if plan else sorted(policy_rights(learned.policy()), key=order),
         copied=copied,
         accepted=None,

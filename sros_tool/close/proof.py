@@ -349,6 +349,9 @@ def _proof_of_silence(robot: LocalRobot, before: Observation, *, hears: bool) ->
     if found:
         text = f"it sees {enumerated(found)}; stop what runs open, or start it in its enclave"
         return Proof(SILENCE, False, text)
+    if not value["settled"]:
+        why = "the ROS graph kept changing, so the observer may have missed nodes; ask again"
+        return Proof(SILENCE, None, why)
     if not hears:
         why = "this proves nothing, because the observer in its enclave does not see the robot now"
         return Proof(SILENCE, None, why)

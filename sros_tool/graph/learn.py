@@ -760,6 +760,8 @@ class LearnedPolicy(NamedTuple):
     """The nodes whose participants ended while they were observed (`--watch`)."""
     intermittent: Sequence[IntermittentEndpoint]
     """The endpoints that running nodes had only for a part of the watch (`--watch`)."""
+    settled: bool
+    """Whether the ROS graph stopped changing before the result; true for a log."""
     added: Sequence[Right]
     """The rights that are added to the policy."""
     copied: Sequence[str]

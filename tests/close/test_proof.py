@@ -17,11 +17,12 @@ from sros_tool.close.proof import (
     _endpoints_without_peer,
     _proof_of_connections,
     _proof_of_requirements,
+    _proof_of_silence,
     _unseen_text,
     _without_counterpart,
 )
 from sros_tool.explain.audit import DeniedRight
-from sros_tool.graph.observation import Endpoint, make_observation
+from sros_tool.graph.observation import Endpoint, Observation, make_observation
 from sros_tool.keystore.expiry import Lifetime
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.policy.model import ALLOW
@@ -241,3 +242,14 @@ def test_listeners_of_what_nobody_may_send_any_more_are_named(tmp_path: Path) ->
         robot.rights_source.write_text(policy_text(enclaves))
         named = "/autopilot may subscribe /depth, but no enclave may publish it any more"
         assert _without_counterpart(robot, [gone]) == [named] * alone, own
+
+
+@pytest.mark.parametrize("is_settled", [True, False])
+def test_an_observer_that_did_not_see_everything_proves_no_silence(is_settled: bool) -> None:
+    """A stranger that keeps changing the graph hides no open node behind a green proof."""
+    value = {"nodes": [], "notes": [], "settled": is_settled}
+    closed = SimpleNamespace(
+        folder=Path("robot"), domain=0, shell=SimpleNamespace(read_json=lambda _: (1, value))
+    )
+    proof = _proof_of_silence(cast("Any", closed), Observation(), hears=True)
+    assert proof.holds is (True if is_settled else None)

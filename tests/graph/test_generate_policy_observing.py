@@ -66,6 +66,7 @@ def test_json_has_a_stable_shape(program: Program) -> None:
         ],
         "ended": [],
         "intermittent": [],
+        "settled": True,
         "added": [
             {
                 "enclave": "/talker",
