@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import json
 from collections import defaultdict
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import cached_property
 from itertools import islice
 from typing import NamedTuple
 
 from sros_tool.automata import SearchLimit
 from sros_tool.fleet.robots import Fleet, Robot
 from sros_tool.names import (
-    READING_SERVICES,
     expression_problem,
     is_expression,
     moves_robot,
@@ -134,11 +134,15 @@ class _Stated:
     def __init__(self, rights: Iterable[Right]) -> None:
         self.users: dict[tuple[str, str], set[str]] = defaultdict(set)
         self.wild: dict[str, set[str]] = defaultdict(set)
+        self.people: set[str] = set()  # the enclaves of people that may change nodes
         for right in rights:
+            is_of_people = matches(_ENCLAVES_OF_PEOPLE, right.enclave)
+            if is_of_people and right.right == "request" and not only_reads(right.name):
+                self.people.add(right.enclave)
             if right.kind == "dds" or expression_problem(right.name):
                 continue  # permissions that others wrote may have any text
             if is_expression(right.name):
-                if not matches(_ENCLAVES_OF_PEOPLE, right.enclave):
+                if not is_of_people:
                     self.wild[right.right].add(right.name)
             else:
                 self.users[right.right, right.name].add(right.enclave)
@@ -146,6 +150,29 @@ class _Stated:
     def names(self, right: str) -> list[str]:
         """Return the names without wildcards that a right is stated for, sorted."""
         return sorted(name for of, name in self.users if of == right)
+
+    @cached_property
+    def changing_services(self) -> Mapping[str, tuple[str, ...]]:
+        """The enclaves that may call services which change nodes, by the last part of the name.
+
+        Only services that some node offers for nobody.  An enclave without a counterpart, such as
+        the enclave of a package, has its users elsewhere, and does not count.
+        """
+        partners = self.enclaves_with_counterpart()
+        unused = {
+            name.rpartition("/")[2]
+            for name in self.names("reply")
+            if name.count("/") > 1
+            and not only_reads(name)
+            and ("request", name) not in self.users
+            and self.users["reply", name] & partners
+        }
+        people = {_ENCLAVES_OF_PEOPLE} if self.people else set()
+        users = {service: set(people) for service in unused}
+        for (right, name), enclaves in self.users.items():
+            if right == "request" and (service := name.rpartition("/")[2]) in unused:
+                users[service] |= enclaves - self.people
+        return {service: tuple(sorted(enclaves)) for service, enclaves in users.items()}
 
     def enclaves_with_counterpart(self) -> set[str]:
         """Return the enclaves with a right whose counterpart another enclave has."""
@@ -161,7 +188,7 @@ class _Stated:
 def _candidates(stated_rights: _Stated, worlds: Sequence[World]) -> Iterator[Requirement]:
     for right in _SENDING_RIGHTS:
         yield from _few_holders(stated_rights, right)
-    yield from _unused_services(stated_rights)
+    yield from _changing_services(stated_rights)
     yield from _gate_requirements(worlds[0])
     for kind, pair in RIGHTS.items():
         if any(stated_rights.wild[right] or stated_rights.names(right) for right in pair):
@@ -180,14 +207,17 @@ def _few_holders(stated_rights: _Stated, right: str) -> Iterator[Only]:
 
     Services that only read get their own requirement, so that an exception for them does not allow
     changes, too.  Names that move the robot get a requirement for any number of enclaves, even
-    without a known receiver.
+    without a known receiver.  Services for which `_changing_services` states the same users are
+    left out.
     """
     other = PEER_RIGHT[right]
     names: dict[tuple[tuple[str, ...], bool], list[str]] = defaultdict(list)
+    users_elsewhere = stated_rights.changing_services if right == "request" else {}
     for name in stated_rights.names(right):
         users = tuple(sorted(stated_rights.users[right, name]))
         received = name not in _OF_EVERY_NODE and (other, name) in stated_rights.users
-        if moves_robot(name) or (len(users) <= _MAX_HOLDERS and received):
+        is_covered = users_elsewhere.get(name.rpartition("/")[2]) == users
+        if not is_covered and (moves_robot(name) or (len(users) <= _MAX_HOLDERS and received)):
             names[users, only_reads(name)].append(name)
     for (enclaves, _), names_held in sorted(
         names.items(), key=lambda item: (len(item[0][0]), item[0])
@@ -195,19 +225,20 @@ def _few_holders(stated_rights: _Stated, right: str) -> Iterator[Only]:
         yield Only(source=_NOWHERE, rights=((right, tuple(names_held)),), enclaves=enclaves)
 
 
-def _unused_services(stated_rights: _Stated) -> Iterator[Nobody]:
-    """Yield requirements that nobody may call unused services that change nodes.
+def _changing_services(stated_rights: _Stated) -> Iterator[Only | Nobody]:
+    """Yield requirements on services that change nodes, and that some nodes offer for nobody.
 
-    An enclave without a counterpart, such as the enclave of a package, has its users elsewhere.
+    The enclaves that may call such a service of another node are exceptions.
     """
-    partners = stated_rights.enclaves_with_counterpart()
-    last = {
-        name.rpartition("/")[2]
-        for name in stated_rights.names("reply")
-        if name.count("/") > 1 and stated_rights.users["reply", name] & partners
-    }
-    for service in sorted(last.difference(READING_SERVICES)):
-        yield Nobody(source=_NOWHERE, rights=(("request", (f"*/{service}",)),))
+    services: dict[tuple[str, ...], list[str]] = defaultdict(list)
+    for service, users in sorted(stated_rights.changing_services.items()):
+        services[users].append(f"*/{service}")
+    for users, names in sorted(services.items()):
+        rights = (("request", tuple(names)),)
+        if users:
+            yield Only(source=_NOWHERE, rights=rights, enclaves=users)
+        else:
+            yield from (Nobody(source=_NOWHERE, rights=(("request", (name,)),)) for name in names)
 
 
 def _gate_requirements(world: World) -> Iterator[Apart]:

@@ -461,6 +461,30 @@ def test_an_exception_for_reading_parameters_does_not_allow_to_set_them() -> Non
     assert [e.rights for e in only] == [(("request", services[2:]),), (("request", services[:2]),)]
 
 
+def test_a_user_of_one_nodes_parameters_leaves_those_of_other_nodes_protected() -> None:
+    nodes = {
+        f"/{name}": may("reply", f"/{name}/set_parameters") + may("publish", f"/of_{name}")
+        for name in ("arm", "base")
+    }
+    user = may("request", "/arm/set_parameters") + may("subscribe", "/of_arm", "/of_base")
+    looks = {"/operator/ben": may("request", "/*/get_parameters")}
+    only_looked = robot(nodes | {"/tuner": user} | looks)
+    proposed = suggest(only_looked.rights, only_looked.worlds)[0]
+    assert ("/tuner",) in [each.enclaves for each in proposed if isinstance(each, Only)]
+    people = {"/operator/anna": may("request", "/*/set_parameters")}
+    system = robot(nodes | {"/tuner": user} | people)
+    proposed = suggest(system.rights, system.worlds)[0]
+    of_services = [
+        (each.rights, each.enclaves)
+        for each in proposed
+        if isinstance(each, Only) and each.rights[0][0] == "request"
+    ]
+    enclaves = ("/operator/*", "/tuner")
+    assert of_services == [((("request", ("*/set_parameters",)),), enclaves)]
+    changed = robot(nodes | {"/tuner": user, "/new": may("request", "/base/set_parameters")})
+    assert decide_all(proposed, changed).violations
+
+
 def test_what_is_proposed_for_a_package_blames_no_other_part_of_the_robot() -> None:
     """The users of a package's services are elsewhere, and so are the robot's operators."""
     gripper = may("publish", "width") + may("reply", "~/release", "~/set_parameters")
