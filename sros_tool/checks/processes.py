@@ -89,7 +89,8 @@ PROCESS_OUTDATED = FindingKind(
     "a process that started before its enclave's files changed",
     "A running participant does not notice changed certificates, permissions or revocation lists.",
     "Fast DDS 2.14.5, Cyclone DDS 0.10.2 (they read the files when they start).",
-    "Restart the process.",
+    "Restart the process. If its enclave lost rights that the program uses, first install a "
+    "version of the program that does not use them, or sign the earlier policy again.",
 )
 PROCESS_REVOKED = FindingKind(
     "runtime.process-revoked",

@@ -314,8 +314,9 @@ def _show(
     as_json: bool,
     policies: Sequence[Policy | FleetPolicy] = (),
 ) -> None:
-    from sros_tool.keystore.lifecycle.replaced import lasting_text
+    from sros_tool.keystore.lifecycle.replaced import lasting_text, old_program_text
 
+    root = result.root
     findings: list[tuple[Finding, ...]] = []
     if policies:
         from sros_tool.checks.policies import signed_findings
@@ -333,7 +334,7 @@ def _show(
         shown,
         _created_lines(result),
         first=_next_step_hints(result, as_json),
-        after=filter(None, (lasting_text(result.root, result.rights),)),
+        after=filter(None, (old_program_text(result.rights), lasting_text(root, result.rights))),
     )
     if findings and not as_json:
         print_signed(findings, [policy.file for policy in policies])

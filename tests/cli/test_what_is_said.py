@@ -43,6 +43,7 @@ TAKES_AWAY = {
     "create_permission": "create_permission ks /robot narrow.xml",
     "generate_artifacts": "generate_artifacts -k ks -p narrow.xml",
 }
+OLD_PROGRAM = "a program that still uses a lost right may not start with the new files"
 
 
 @pytest.mark.parametrize("verb", TAKES_AWAY)
@@ -54,6 +55,7 @@ def test_what_still_works_after_taking_a_right_away(verb: str, root: Path) -> No
     (line,) = [each for each in ended.err.splitlines() if "it lost still work until" in each]
     assert f"{validity_of(before).not_after:%Y-%m-%d}" in line
     assert "until they are restarted" in line
+    assert OLD_PROGRAM in ended.err
     # What it names as the remedy runs, and ends it.
     (command,) = commands(line)
     sros(*command, cwd=root.parent).ok()
@@ -117,7 +119,7 @@ def test_gaining_a_right_leaves_nothing_behind(root: Path) -> None:
     sros("create_permission", "ks", "/robot", "narrow.xml", cwd=root.parent).ok()
     ended = sros("create_permission", "ks", "/robot", "wide.xml", cwd=root.parent).ok()
     assert "/robot gains: publish topic /secret" in ended.err
-    assert "work until" not in ended.err
+    assert "work until" not in ended.err and OLD_PROGRAM not in ended.err
 
 
 def test_a_denial_takes_a_right_away(root: Path) -> None:

@@ -297,6 +297,16 @@ def _described_rights(rights: Sequence[Right]) -> list[str]:
     ]
 
 
+def old_program_text(replaced_rights: Iterable[ReplacedRights]) -> str:
+    """Return a sentence on restarts of programs that still use lost rights; "" without any."""
+    if not any(rights.lost_text() for rights in replaced_rights):
+        return ""
+    return (
+        "a program that still uses a lost right may not start with the new files: start a version "
+        "without this use, or sign the earlier policy again"
+    )
+
+
 def lasting_text(root: Path, replaced_rights: Sequence[ReplacedRights]) -> str:
     """Return sentences on lost rights that still work, and on how to end them; "" without any."""
     lasting = [
