@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shlex
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -55,7 +56,7 @@ from sros_tool.graph.observation import (
     observation_from_json,
 )
 from sros_tool.keystore.expiry import renewal_command, survey
-from sros_tool.keystore.layout import list_enclaves
+from sros_tool.keystore.layout import KEY_FILES, enclave_path, list_enclaves
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.rights import load_rights
 from sros_tool.names import expand, is_expression
@@ -186,7 +187,28 @@ def _proof_of_files(robot: LocalRobot, expired: Sequence[str]) -> Proof:
             told = _errors_text(robot, *words) if fails else "sros could not check the keystore"
             reason = told if holds else f"{reason}; {told}"
             holds = False if fails or holds is False else None
+    if misplaced := _misplaced_keys_text(robot):
+        reason = misplaced if holds else f"{reason}; {misplaced}"
+        holds = False
     return Proof("the files are accepted", holds, f"{reason}: {examined}{unsigned}")
+
+
+def _misplaced_keys_text(robot: LocalRobot) -> str:
+    """Return which private keys of other machines' enclaves are in the export, or ""."""
+    folders = {name: enclave_path(robot.export, name) for name in sorted(robot.not_here)}
+    names = [
+        name
+        for name, folder in folders.items()
+        if any(os.path.lexists(folder / file) for file in KEY_FILES)
+    ]
+    if not names:
+        return ""
+    text = f"{robot.export} has the private keys of {first_few(names, MOST_NAMES)}, which belong "
+    text += "to other machines; "
+    if robot.keystore.exists():
+        return f"{text}`{robot.close_command}` removes them"
+    remove = shlex.join(("rm", "-r", *(str(folders[name]) for name in names)))
+    return f"{text}run `{remove}`, and export by the names of this robot's enclaves, not --all"
 
 
 def _revoking_advice(robot: LocalRobot) -> str:

@@ -200,6 +200,7 @@ def test_expired_files_are_named_with_the_keystore_that_renews_them(
     robot: Any = SimpleNamespace(
         export=tmp_path / "export",
         keystore=tmp_path / "keystore",
+        not_here=(),
         close_command="sros close robot",
         shell=SimpleNamespace(check=lambda *_: 1, now=lambda: now),
     )
@@ -253,3 +254,28 @@ def test_an_observer_that_did_not_see_everything_proves_no_silence(is_settled: b
     )
     proof = _proof_of_silence(cast("Any", closed), Observation(), hears=True)
     assert proof.holds is (True if is_settled else None)
+
+
+@pytest.mark.parametrize(
+    ("has_keystore", "remedy"), [(True, "`sros close r` removes"), (False, "rm -r")]
+)
+def test_a_key_of_another_machine_in_the_export_fails_the_proof(
+    has_keystore: bool, remedy: str, tmp_path: Path
+) -> None:
+    key = tmp_path / "export/enclaves/laptop/key.pem"
+    key.parent.mkdir(parents=True)
+    robot: Any = SimpleNamespace(
+        export=tmp_path / "export",
+        keystore=tmp_path if has_keystore else tmp_path / "gone",
+        policy=tmp_path / "policy.xml",
+        not_here={"/laptop"},
+        close_command="sros close r",
+        export_words=list,
+        enclaves_outside_policy=list,
+        shell=SimpleNamespace(check=lambda *_: 0, read_json=lambda _: (0, {"changes": []})),
+    )
+    assert proof._proof_of_files(robot, ()).holds
+    key.touch()
+    said = proof._proof_of_files(robot, ())
+    assert said.fails and "export has the private keys of /laptop, which" in said.reason
+    assert remedy in said.reason
