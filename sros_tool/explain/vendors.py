@@ -778,9 +778,9 @@ class VendorOfKeystore(NamedTuple):
         """Yield notes on enclaves that an export lacks, and on other holders of the right."""
         # As in `outcomes`.
         from sros_tool.explain.earlier import note_on_earlier_permissions, note_on_revoked_enclaves
-        from sros_tool.explain.who import note_on_export
+        from sros_tool.explain.who import notes_on_enclaves_left_out
 
-        yield from note_on_export(self.keystore)
+        yield from notes_on_enclaves_left_out(self.keystore)
         refuse = remedy_in_keystore(self.keystore.root, f"Run {REFUSE_STRANGERS}.")
         yield from _note_on_anybody((outcome.opened for outcome in outcomes), refuse)
         denied = {outcome.enclave for outcome in outcomes if not outcome.allowed}

@@ -25,7 +25,11 @@ from sros_tool.keystore.layout import (
     remedy_in_keystore,
 )
 from sros_tool.keystore.reader import OpenedKeystore
-from sros_tool.keystore.rights import RightsSource, rights_by_domains
+from sros_tool.keystore.rights import (
+    RightsSource,
+    notes_on_hidden_enclaves,
+    rights_by_domains,
+)
 from sros_tool.keystore.selection import likely_names, missing_enclave_error
 from sros_tool.names import is_expression
 from sros_tool.pki.certificates import load_certificate, subject_text
@@ -121,8 +125,9 @@ class AnswerForAll(NamedTuple):
         )
 
 
-def note_on_export(keystore: OpenedKeystore) -> Iterator[Note]:
-    """Yield a note if a keystore is an export, which may lack enclaves of its keystore."""
+def notes_on_enclaves_left_out(keystore: OpenedKeystore) -> Iterator[Note]:
+    """Yield notes on enclaves in hidden folders, and on those that an export may lack."""
+    yield from notes_on_hidden_enclaves(keystore.root)
     if not is_original_keystore(keystore.root):
         text = (
             f"'{keystore.root}' is an export, which may lack enclaves: enclaves that are elsewhere "

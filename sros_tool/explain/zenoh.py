@@ -960,9 +960,9 @@ class ZenohOfKeystore:
     def notes(self, question: Question, outcomes: Sequence[ZenohAnswer]) -> Iterator[Note]:
         """Yield notes on an export, files, the router's key, and other holders of the right."""
         from sros_tool.explain.earlier import note_on_revoked_enclaves  # as in `outcomes`
-        from sros_tool.explain.who import note_on_export
+        from sros_tool.explain.who import notes_on_enclaves_left_out
 
-        yield from note_on_export(self._keystore)
+        yield from notes_on_enclaves_left_out(self._keystore)
         yield from note_on_lacking_keys(self._keystore)
         yield from _note_on_unsigned(next(iter(self._evaluators.values())).unsigned_files())
         if any(outcome.of_router and outcome.allowed for outcome in outcomes):

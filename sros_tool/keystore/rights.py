@@ -37,6 +37,7 @@ from sros_tool.keystore.layout import (
     enclave_names,
     enclave_path,
     folder_of_closed_robot,
+    hidden_enclaves,
     is_keystore,
     permissions_ca_for,
     refuse_flat_keystore,
@@ -86,11 +87,12 @@ class RightsSource:
     ``kind`` is "policy", "permissions", "enclave", "keystore" or "zenoh".  ``scope`` are the
     enclaves to which the source can give rights, such as those of an export; None for all.
     ``sound`` is False if DDS would refuse a part of the source, because a signature does not
-    verify, or because permissions are missing or malformed.  ``fleet`` is the fleet for which the
-    source is, or None.  ``protections`` are a policy's statements about the protection of names;
-    None for anything else.  ``documents`` are the permissions of enclaves.  ``enforcers`` are the
-    access control of each Zenoh process that checks other processes.  ``routers`` are the enclaves
-    of a keystore's routers, and ``links`` describes the names that pass between several routers.
+    verify, or because permissions are missing or malformed, or if enclaves are left out.  ``fleet``
+    is the fleet for which the source is, or None.  ``protections`` are a policy's statements about
+    the protection of names; None for anything else.  ``documents`` are the permissions of enclaves.
+    ``enforcers`` are the access control of each Zenoh process that checks other processes.
+    ``routers`` are the enclaves of a keystore's routers, and ``links`` describes the names that
+    pass between several routers.
     ``configurations`` are the Zenoh configurations that were read, including those of clients.
     ``key_domains`` maps the rights in these configurations to the ROS domains in their keys, where
     None stands for a wildcard.  ``policy`` is the policy in a policy file.
@@ -103,7 +105,7 @@ class RightsSource:
     rights: frozenset[Right]
     scope: frozenset[str] | None
     sound: bool
-    """Whether DDS would accept all files of the source."""
+    """Whether DDS would accept all files of the source, and sros left no enclave out."""
     notes: tuple[Note, ...]
     """Notes on the file or folder."""
     fleet: Fleet | None = None
@@ -462,6 +464,9 @@ def _keystore_rights(
             text = f"{name}: its permissions are for {', '.join(foreign)}, {verdict}."
             reader.sound = False
             reader.notes.append(Note(FOREIGN_GRANT, text))
+    if not hidden and only_enclaves is None and (left_out := notes_on_hidden_enclaves(root)):
+        reader.sound = False
+        reader.notes += left_out
     return RightsSource(
         root,
         "keystore",
@@ -472,6 +477,14 @@ def _keystore_rights(
         load_fleet(keystore),
         documents=reader.documents,
     )
+
+
+def notes_on_hidden_enclaves(root: Path) -> tuple[Note, ...]:
+    """Return a note on the enclaves in hidden folders, which answers leave out."""
+    if not (names := hidden_enclaves(root)):
+        return ()
+    text = f"left out, although DDS loads enclaves in hidden folders: {first_few(names, 5)}."
+    return (Note("rights.hidden-enclave", text),)
 
 
 @dataclass(slots=True)

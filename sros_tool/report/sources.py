@@ -35,7 +35,13 @@ from sros_tool.keystore.reader import (
     OpenedKeystore,
     open_enclave,
 )
-from sros_tool.keystore.rights import RightsSource, is_zenoh, load_rights, rights_by_domains
+from sros_tool.keystore.rights import (
+    RightsSource,
+    is_zenoh,
+    load_rights,
+    notes_on_hidden_enclaves,
+    rights_by_domains,
+)
 from sros_tool.keystore.template import load_template
 from sros_tool.pki.certificates import (
     authority_text,
@@ -487,7 +493,8 @@ def read_source(
         sample = SampledKeystore(keystore, keystore.names)
     if sample:
         read = load_rights(sample.keystore, only_enclaves=sample.enclaves)
-        read = replace(read, rights=sample.rights(read.rights))
+        notes = (*read.notes, *notes_on_hidden_enclaves(path))
+        read = replace(read, rights=sample.rights(read.rights), notes=notes)
     else:
         read = load_rights(path, fleet)
     findings = tuple(PicturedFinding(note.id, "warning", note.text) for note in read.notes)

@@ -172,6 +172,21 @@ def test_permissions_with_another_effect_are_not_the_same(
     assert ("the rights are the same" in ended.err) != is_unclear
 
 
+def test_an_enclave_in_a_hidden_folder_is_not_left_out_in_silence(keystore: Path) -> None:
+    """DDS loads it: no answer about all enclaves goes without it."""
+    shutil.copytree(keystore, keystore.parent / "twin", symlinks=True)
+    (keystore / "enclaves/.h").mkdir()
+    shutil.copytree(keystore / "enclaves/a", keystore / "enclaves/.h/a", symlinks=True)
+    for words, status in (
+        (("diff_policy", keystore.parent / "twin", keystore), 1),
+        (("explain", keystore, "--who", "publish", "/x", "--vendor", "fastdds"), 1),
+        (("view", keystore, "--focus", "/old_a", "-o", keystore.parent / "x.svg"), 0),
+    ):
+        ended = sros(*words)
+        assert ended.status == status, ended
+        assert "[rights.hidden-enclave]: left out, although DDS loads" in ended.err, ended
+
+
 def test_rights_of_a_grant_leave_out_what_every_participant_has() -> None:
     (found,) = parse_permissions(DOCUMENT.format(grant(rule("ros_discovery_info"))).encode()).grants
     assert grant_rights("/a", found) == frozenset()
