@@ -1051,9 +1051,9 @@ class _Examiner:
             return remedy
         return (
             f"Perhaps {space} is the namespace of the node: then write "
-            f"{name.removeprefix(f'{space}/')} in the policy, without a / at its beginning. Ask "
-            "for the whole log: rcl's line `Found security directory` shows the namespace. "
-            f"Otherwise: {remedy}"
+            f"{name.removeprefix(f'{space}/')} in the policy, without a / at its beginning (if the "
+            "policy is for this version of the node). Ask for the whole log: rcl's line `Found "
+            f"security directory` shows the namespace. Otherwise: {remedy}"
         )
 
     def _namespace_clause(self, enclave: LoadedEnclave) -> str:
@@ -1151,8 +1151,7 @@ class _Examiner:
                 "wrong one: compare the command that started it with the robot's own (after `sros "
                 f"close`: start/commands.txt).{renamed or new_name}"
             )
-        newer = "Perhaps the node is newer than its policy: "
-        return [], f"{newer}{remedy}{renamed}" if renamed else f"{remedy}{new_name}"
+        return [], f"{remedy}{renamed or new_name}"
 
     def _how_to_ask(self, denial: Denial, name: str) -> str:
         """Return the commands that show which rights a policy lacks for a denied topic."""
@@ -1164,8 +1163,8 @@ class _Examiner:
             if ns and name.startswith(f"{ns}/"):
                 name = name.removeprefix(ns)
                 advice = (
-                    f" Write {name[1:]} in the policy, without a / at its beginning: the robot of "
-                    f"the log has the policy in namespace {ns}."
+                    f" as {name[1:]}, without a / at its beginning: the robot of the log has the "
+                    f"policy in namespace {ns}"
                 )
         enclave = "PEER" if denial.remote else enclave
         commands = [
@@ -1180,7 +1179,11 @@ class _Examiner:
                     f"{' and '.join(commands)} {shows} the DENY, and where the policy has it: no "
                     "ALLOW helps against it."
                 )
-            return f"{' and '.join(commands)} {shows} what is missing in the policy.{advice}"
+            return (
+                f"{' and '.join(commands)} {shows} what is missing in the policy. If the policy is "
+                "for another version of the node, use the policy of the node's version; otherwise, "
+                f"add what is missing{advice}."
+            )
         folder = f"{root}/enclaves/{enclave.lstrip('/')}".rstrip("/")
         return (
             f"`sros inspect {quote(folder)}` shows what the permissions allow: no policy in ROS "

@@ -1081,7 +1081,7 @@ def test_a_log_of_a_robot_that_has_the_policy_in_a_namespace(
     )
     said = sros("explain", policy, *named, "--log", log).out
     assert f"`sros explain {policy} /a publish /x` shows what is missing in the policy" in said
-    assert "Write x in the policy, without a / at its beginning: the robot of the log has" in said
+    assert "add what is missing as x, without a / at its beginning: the robot of the log" in said
     assert "no rule allows publish rt/left/x" in said
     assert "the policy allows it to /a, which is /left/a in namespace /left\n" in said
     assert "merged with --remap, and the process lacks the remapping. Ask for the robot's" in said
@@ -1114,7 +1114,7 @@ def test_a_topic_of_cyclone_dds_that_one_direction_would_create(
     assert is_older == ("failed" in line), ended
 
 
-def test_a_node_that_is_newer_than_its_policy(tmp_path: Path) -> None:
+def test_a_node_of_another_version_than_its_policy(tmp_path: Path) -> None:
     """A name unlike all others is seldom a renamed one, so that this is said last."""
     policy, log = tmp_path / "p.xml", tmp_path / "robot.log"
     policy.write_text(
@@ -1123,8 +1123,8 @@ def test_a_node_that_is_newer_than_its_policy(tmp_path: Path) -> None:
     denied = "[SECURITY Error] rq/calibrate/_action/send_goalRequest topic not found in allow rule"
     log.write_text(f"{denied}. -> check_create_datareader\n")
     said = sros("explain", policy, "/a", "--log", log).out
-    assert "remedy    Perhaps the node is newer than its policy: `sros explain" in said
-    assert "is missing in the policy. If the node's command renames the action: nodes" in said
+    assert "missing in the policy. If the policy is for another version of the node, use" in said
+    assert "add what is missing. If the node's command renames the action: nodes" in said
 
 
 def test_a_log_without_the_namespace_that_its_names_show(tmp_path: Path) -> None:
