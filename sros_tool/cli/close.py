@@ -6,7 +6,7 @@ import io
 import os
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import nullcontext, redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -29,6 +29,8 @@ from sros_tool.validity import iso
 from sros_tool.wording import counted, enumerated
 
 if TYPE_CHECKING:
+    from datetime import datetime
+
     from sros_tool.close.processes import ClosedProcess
     from sros_tool.close.robot import LocalRobot
     from sros_tool.close.state import CloseState
@@ -333,12 +335,7 @@ def _show_end(
     from sros_tool.close.state import CONNECTED, TALK
 
     folder, observed = shlex.quote(str(robot.folder)), closed.observed
-    ask = f"sros close {folder} --proof"
-    idle = closed.stopped if closed.secured else {*observed.ended}
-    if stopped := sorted(idle.intersection(closed.pending)):
-        ask += "; for enclaves without a running process: " + " ".join(
-            f"--without {name}" for name in stopped
-        )
+    ask, details = f"sros close {folder} --proof", list[str]()
     for proof in closed.proofs:
         accept = " (--partial accepts this)" if proof.is_accepted_by_partial else ""
         accept = " (accepted by --partial)" if accept and partial else accept
@@ -359,11 +356,9 @@ def _show_end(
         exceptions = "" if is_asked else ", except for the claims that were not checked"
         if missing := [name for name in closed.without if name not in closed.secured]:
             exceptions += f", without a process of {', '.join(missing)}"
-        following = "; next: have them renewed before then (docs/howto/close.md, Renewal without "
-        following += "hands)"
+        answer, details = f"the robot is closed{exceptions}", _validity_lines(closed)
         if robot.keystore.exists():
-            following += f", and bring {folder}/keystore to another machine: it has the CA keys"
-        answer = f"the robot is closed{exceptions}{_validity_text(closed)}{following}"
+            details.append(f"bring {folder}/keystore to another machine: it has the CA keys")
     elif closed.proofs:
         accept = _ACCEPT_ADVICE if closed.is_proved(partial=True) else ""
         next_command = (
@@ -379,13 +374,17 @@ def _show_end(
             if advice := processes[0].launch_advice(robot.folder.absolute()):
                 echo(f"  {advice}")
         answer = f"next: run these commands, and then {ask}"
+        details = _idle_lines(closed, ask)
         if not_starting := _advice_without_security(robot, closed):
             answer = f"no node would start by these commands yet; next: {not_starting}"
+            details = []
     else:
         steps = f"stop the robot, start each process by the commands in {robot.commands_file}"
         if closed.secured:
-            stop = "" if closed.stopped.issuperset(closed.pending) else "stop them, "
-            steps = f"{stop}start them by the commands at the top of {robot.commands_file}"
+            these = "these processes" if len(closed.pending) > 1 else "this process"
+            steps = f"start {these} by the commands at the top of {robot.commands_file}"
+            if not closed.stopped.issuperset(closed.pending):
+                steps = f"stop and {steps}"
         if not closed.pending:
             following = ask
         elif any(
@@ -393,10 +392,24 @@ def _show_end(
         ):
             following = f"sros close {folder} --apply"
         else:
-            following = f"{steps}, and ask {ask}"
-        following = _advice_without_security(robot, closed) or following
-        answer = f"{_state_text(closed, apply=apply)}{_validity_text(closed)}; next: {following}"
-    echo(f"{answer}{_other_machines_advice(robot, closed)}", err=True)
+            following = f"{steps}, and then {ask}"
+            details = _idle_lines(closed, ask)
+        if not_starting := _advice_without_security(robot, closed):
+            following, details = not_starting, []
+        answer = f"{_state_text(closed, apply=apply)}; next: {following}"
+        details += _validity_lines(closed)
+    echo(answer, err=True)
+    for detail in (*details, *_other_machines_lines(robot, closed)):
+        echo(f"  {detail}", err=True)
+
+
+def _idle_lines(closed: CloseState, ask: str) -> list[str]:
+    """Return how to prove the robot closed without the processes that do not run now."""
+    idle = closed.stopped if closed.secured else {*closed.observed.ended}
+    if not (stopped := sorted(idle.intersection(closed.pending))):
+        return []
+    options = "".join(f" --without {name}" for name in stopped)
+    return [f"to prove it without a process of {enumerated(stopped)}: {ask}{options}"]
 
 
 def _advice_without_security(robot: LocalRobot, closed: CloseState) -> str:
@@ -450,30 +463,44 @@ def _how_it_runs(closed: CloseState, enclave: str) -> str:
     return "open"
 
 
-def _other_machines_advice(robot: LocalRobot, closed: CloseState) -> str:
+def _other_machines_lines(robot: LocalRobot, closed: CloseState) -> list[str]:
     """Return which files other machines need; sros does not see whether the files are there."""
-    needed = ", ".join(f"{name} ({iso(of)})" for name, of in closed.needed_elsewhere.items())
-    text = needed and (
-        "; on other machines, replace files that are older than the time of their enclave by the "
-        f"output of `sros distribute_key {shlex.quote(str(robot.keystore))} ENCLAVE FOLDER "
-        f"--force`, and restart the process: {needed}; when a machine has the files, run "
-        f"`{robot.close_command} --brought ENCLAVE`"
-    )
-    if brought := ", ".join(f"{name} ({iso(of)})" for name, of in closed.brought.items()):
-        text += f"; on other machines, as you said with --brought: the current files of {brought}"
-    return text
+    lines, keystore = [], shlex.quote(str(robot.keystore))
+    if needed := closed.needed_elsewhere:
+        lines.append(
+            f"on other machines, files from before these times are outdated: {_times_text(needed)}"
+            f"; bring the output of `sros distribute_key {keystore} ENCLAVE FOLDER --force` to the "
+            "machine, restart the process there, and then run "
+            f"`{robot.close_command} --brought ENCLAVE`"
+        )
+    if brought := closed.brought:
+        lines.append(
+            "on other machines, as you said with --brought: the current files of "
+            f"{_times_text(brought)}"
+        )
+    if expired := closed.expired_elsewhere:
+        lines.append(
+            f"on other machines, files that have expired: {_times_text(expired)}; to renew them, "
+            f"run `sros renew {keystore} {' '.join(expired)}`, and bring the new files to the "
+            "machine"
+        )
+    return lines
 
 
-def _validity_text(closed: CloseState) -> str:
-    """Return a clause with the expiry of the closed processes' files, or "" if none runs closed."""
+def _times_text(enclaves: Mapping[str, datetime]) -> str:
+    return ", ".join(f"{name} ({iso(moment)})" for name, moment in enclaves.items())
+
+
+def _validity_lines(closed: CloseState) -> list[str]:
+    """Return when the files of the closed processes expire; no line if none runs closed."""
     if not (closed.secured and closed.valid_until):
-        return ""
+        return []
     from sros_tool.keystore.expiry import renewal_command
 
-    soon = f", so renew them now: {renewal_command(closed.folder / 'keystore')}"
-    return (
-        f"; the files are valid until {iso(closed.valid_until)}{soon * bool(closed.expires_soon)}"
-    )
+    advice = "have them renewed before then (docs/howto/close.md, Renewal without hands)"
+    if closed.expires_soon:
+        advice = f"renew them now: {renewal_command(closed.folder / 'keystore')}"
+    return [f"the files are valid until {iso(closed.valid_until)}; {advice}"]
 
 
 def _started_together(processes: Sequence[ClosedProcess]) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence, Set
+from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from datetime import datetime
 from functools import cached_property
 from pathlib import Path
@@ -386,6 +386,8 @@ class CloseState(NamedTuple):
     when these files in the keystore changed last, in UTC. sros cannot see whether the other machine
     has them.
     """
+    expired_elsewhere: Mapping[str, datetime]
+    """The enclaves of other machines whose files in the keystore have expired, and when, in UTC."""
     valid_until: datetime | None
     """When the first enclave of the export expires, in UTC; null without an export."""
     expires_soon: Sequence[str]
@@ -507,6 +509,7 @@ def current_state(robot: LocalRobot, policy: Policy | None) -> CloseState:
             name: changed for name, changed in changed_at.items() if name not in brought
         },
         brought=brought,
+        expired_elsewhere=_expired(robot, changed_at),
         valid_until=(until := _valid_until(robot)),
         expires_soon=_expiring(robot) if until else (),
         denied=(),
@@ -522,12 +525,23 @@ def _valid_until(robot: LocalRobot) -> datetime | None:
     """Return when the first enclave of the export expires; None if one cannot be read."""
     if not robot.export.exists():
         return None
-    now, files = robot.shell.now(), FilesReadOnce()
-    moments = [
-        open_enclave(enclave_path(robot.export, name), now=now, files=files).valid_until()
-        for name in list_enclaves(robot.export)
-    ]
+    moments = _expiries(robot, robot.export, list_enclaves(robot.export)).values()
     return min(filter(None, moments), default=None) if all(moments) else None
+
+
+def _expiries(robot: LocalRobot, root: Path, names: Iterable[str]) -> Mapping[str, datetime | None]:
+    """Map enclaves below ``root`` to their expiry; None for an enclave that cannot be read."""
+    now, files = robot.shell.now(), FilesReadOnce()
+    return {
+        name: open_enclave(enclave_path(root, name), now=now, files=files).valid_until()
+        for name in names
+    }
+
+
+def _expired(robot: LocalRobot, names: Iterable[str]) -> Mapping[str, datetime]:
+    """Map the named enclaves of the keystore that have expired to their expiry."""
+    now, expiries = robot.shell.now(), _expiries(robot, robot.keystore, names)
+    return {name: expiry for name, expiry in expiries.items() if expiry and expiry < now}
 
 
 def _expiring(robot: LocalRobot) -> Sequence[str]:

@@ -433,7 +433,7 @@ def renew_without_hands(robot: Robot) -> None:
     said = robot.close("--apply")
     assert keystore.read_bytes() == export.read_bytes()
     assert robot.restarts[2:] == ["daemon-reload", "restart listener.service talker.service"]
-    assert "the robot is closed; the files are valid until" in said.err
+    assert "\nthe robot is closed\n  the files are valid until" in said.err
     robot.outdated = set()
     log = robot.folder / "systemctl.log"
     log.write_text("".join(log.read_text().splitlines(keepends=True)[:2]))
@@ -461,9 +461,12 @@ def test_a_robot_is_closed_proved_and_opened_again(robot: Robot) -> None:
         "yes: an open listener finds nothing: "
         "the observer, which saw 2 nodes before, now sees none",
     ]
-    renew = "Z; next: have them renewed before then (docs/howto/close.md, Renewal without hands), "
-    assert f"{renew}and bring robot/keystore to another machine: it has the CA k" in closed.err
-    assert "the robot is closed; the files are valid until 20" in closed.err
+    assert re.search(
+        r"\nthe robot is closed\n  the files are valid until 20.*Z; have them renewed before then "
+        r"\(docs/howto/close.md, Renewal without hands\)\n"
+        "  bring robot/keystore to another machine: it has the CA keys\n$",
+        closed.err,
+    )
     robot.close("--apply")
     assert len(robot.restarts) == 2  # they run in their enclaves already
     renew_without_hands(robot)
@@ -546,10 +549,10 @@ def test_what_systemd_does_not_start_is_done_by_hand(
     ended = robot.close()
     assert "/talker: process 4711: closed\n" in ended.out
     assert (
-        "the processes run in their enclaves, except for /listener (open); the files are valid"
-        in ended.err
+        "the processes run in their enclaves, except for /listener (open); next: stop and start "
+        "this process by the commands at the top of robot/start/commands.txt, and then sros close "
+        "robot --proof\n  the files are valid until" in ended.err
     )
-    assert "; next: stop them, start them by the commands at the top of robot/" in ended.err
     commands = (robot.folder / "robot/start/commands.txt").read_text()
     assert re.search(
         r"\A# Stop .*\n# Start .*\n\n# /listener\n.*\n\n# These .*\n\n# /talker\n", commands
@@ -560,11 +563,9 @@ def test_what_systemd_does_not_start_is_done_by_hand(
     ended = robot.close()
     commands = (robot.folder / "robot/start/commands.txt").read_text()
     assert "\nros2 launch --secured " in commands
-    assert "except for /listener (not running); the files" in ended.err
-    assert "; next: start them by the commands at the top of robot/start/commands.txt" in ended.err
-    assert ended.err.endswith(
-        "--proof; for enclaves without a running process: --without /listener\n"
-    )
+    assert "except for /listener (not running); next: start this process by the com" in ended.err
+    idle = "  to prove it without a process of /listener: sros close robot --proof --without /lis"
+    assert f"and then sros close robot --proof\n{idle}tener\n" in ended.err
     robot.absent = set()
     assert "start it with" in (said := robot.close("--apply", status=1).out)
     assert "process 4712" in said and "process 4711" not in said
@@ -576,11 +577,8 @@ def test_what_systemd_does_not_start_is_done_by_hand(
     assert f"{remembered}cd /opt && {now}; before: cd /opt && /opt/run talker\n" in ended.err
     commands = (robot.folder / "robot/start/commands.txt").read_text()
     assert f" /talker -- {now}\n" in commands and " /opt/run talker\n" not in commands
-    assert re.fullmatch(
-        "the processes run in their enclaves; the files are valid until 20.*Z; "
-        "next: sros close robot --proof",
-        ended.err.splitlines()[-1],
-    )
+    in_enclaves = "\nthe processes run in their enclaves; next: sros close robot --proof\n  the fi"
+    assert f"{in_enclaves}les are valid until 20" in ended.err
     robot.named = False
     robot.more = (replace(robot.process("/talker", is_secured=True), pid=13, command=("/opt/b",)),)
     robot.absent = {"/talker"}
@@ -593,7 +591,7 @@ def test_what_systemd_does_not_start_is_done_by_hand(
     )
     robot.more, robot.absent = (), set()
     for words in ("--apply", "--proof"):
-        assert "and bring robot/keystore to another machine" in robot.close(words).err
+        assert "\n  bring robot/keystore to another machine" in robot.close(words).err
     robot.by_hand, robot.absent = {"/talker"}, {"/listener"}
     (robot.folder / "link").symlink_to("robot")
     robot.spelled = "link/export"
@@ -696,7 +694,7 @@ def test_processes_that_started_after_the_watch(robot: Robot) -> None:
     robot.more = ()
     commands = (robot.folder / "robot/start/commands.txt").read_text()
     assert commands.startswith("# /late is new: COMMAND is what starts it\nsros run ")
-    assert "enclaves, except for /late (not running); the files" in ended.err
+    assert "enclaves, except for /late (not running); next: start" in ended.err
     environment = secured_environment(export, "/late", 0)
     late = robot.with_its_files(replace(late, environment=environment))
     robot.more = (replace(late, user=os.geteuid() + 1),)
@@ -706,9 +704,9 @@ def test_processes_that_started_after_the_watch(robot: Robot) -> None:
     robot.more = (replace(late, started=datetime.now(UTC) - timedelta(days=1)),)
     ended = robot.close()
     assert ": runs with earlier files or other settings: by hand\n" in ended.out
-    assert "except for /late (with earlier files or other settings); the files" in ended.err
+    assert "except for /late (with earlier files or other settings); next: stop" in ended.err
     robot.more = (replace(late, started=datetime.now(UTC) + timedelta(days=1)),)
-    assert "the processes run in their enclaves; the files are valid until" in robot.close().err
+    assert "\nthe processes run in their enclaves; next: sros close robot --pr" in robot.close().err
     watching = robot.close("--for", "1s", status=2).err
     assert "the robot runs closed: process 4711 (run), process 4712 (run), process 7" in watching
     commands = (robot.folder / "robot/start/commands.txt").read_text()
@@ -744,7 +742,7 @@ def test_a_node_that_does_not_run_always(robot: Robot) -> None:
         "talk: 1 node with 18 endpoints as before (types are not compared), without /listener\n"
         in ended.out
     )
-    assert "the robot is closed, without a process of /listener; the files are" in ended.err
+    assert "the robot is closed, without a process of /listener\n  the files are" in ended.err
     robot.unseen = (UnseenProcess(9, (), "/proc hides it", speaks=False),)
     ended = robot.close(*without, "--partial")
     assert "; not counted: /listener (not seen)\n" in ended.out
@@ -1056,7 +1054,7 @@ def test_a_unit_that_does_not_run_is_not_called_open(
     assert "--without" not in said
     ended = robot.close()
     assert "  /listener: not running: --apply restarts" in ended.out
-    assert "in their enclaves, except for /listener (not running); the files" in ended.err
+    assert "in their enclaves, except for /listener (not running); next:" in ended.err
 
     def proofs_of(*arguments: Any) -> Any:
         robot.absent = set()
@@ -1368,7 +1366,7 @@ def test_tools_that_ended_while_sros_watched(robot: Robot, monkeypatch: pytest.M
     assert f"# /look has ended: COMMAND is what starts it\n{run_it} /look -- COMMAND" in commands
     assert f"# /tool\ncd /opt && {run_it} /tool -- /opt/tool 'a b'\n" in commands
     applied = robot.close("--apply", status=1).err
-    assert applied.endswith("process: --without /job --without /look --without /tool\n")
+    assert applied.endswith("--proof --without /job --without /look --without /tool\n")
     assert robot.restarts == ["daemon-reload", "try-restart job.service"]
 
 
@@ -1605,7 +1603,7 @@ def test_what_is_exported_without_the_enclaves_of_other_machines(
         )
         said = capsys.readouterr()
         assert ("fix this first" in said.out) is bool(problems)
-        assert "restart the process: /b (2027-01-15T08:00:00Z); when a mac" in said.err
+        assert "are outdated: /b (2027-01-15T08:00:00Z); bring the output of" in said.err
     # Until the files change, their machine has those that --brought said are there.
     when = state_now.needed_elsewhere
     robot.named_brought = ["/b"]
@@ -1653,16 +1651,23 @@ def test_a_process_with_a_new_key_is_restarted_before_others(tmp_path: Path) -> 
 
 def test_a_robot_whose_files_expire_soon(keystore: Path, tmp_path: Path) -> None:
     sros("distribute_key", keystore, "/a", "/b", tmp_path / "export").ok()
+    (tmp_path / "keystore").symlink_to(keystore)
+
+    def robot_at(moment: datetime) -> LocalRobot:
+        shell = Shell(close._run, print, {}, lambda: moment, UTC)
+        return LocalRobot(tmp_path, 0, shell, elsewhere=["/b"])
 
     def state_at(moment: datetime) -> state.CloseState:
-        shell = Shell(close._run, print, {}, lambda: moment, UTC)
-        found = state.current_state(LocalRobot(tmp_path, 0, shell), None)
+        found = state.current_state(robot_at(moment), None)
         return found._replace(folder=Path("robot"), secured={"/a": True})
 
     now = state_at(datetime.now(UTC))
-    assert now.valid_until and close._validity_text(now).endswith("Z")
-    soon = close._validity_text(state_at(now.valid_until - timedelta(days=1)))
-    assert soon.endswith("Z, so renew them now: sros renew robot/keystore --all-expiring soon")
+    assert now.valid_until and not now.expired_elsewhere
+    (soon,) = close._validity_lines(state_at(now.valid_until - timedelta(days=1)))
+    assert soon.endswith("Z; renew them now: sros renew robot/keystore --all-expiring soon")
+    later = now.valid_until + timedelta(seconds=1)
+    said = close._other_machines_lines(robot_at(later), state_at(later))[-1]
+    assert f"have expired: /b ({iso(now.valid_until)}); to renew them, run `sros renew" in said
     (tmp_path / "export/enclaves/b/permissions.p7s").write_bytes(b"damaged")
     assert state_at(datetime.now(UTC)).valid_until is None, "nobody knows until when /b works"
 
@@ -1719,7 +1724,7 @@ def test_an_enclave_that_belongs_to_another_machine(robot: Robot) -> None:
     robot.by_hand = {"/talker"}
     sros("renew", "robot/keystore", "/talker", "--new-key", "--revoke-old", cwd=robot.folder).ok()
     shared = robot.folder / "robot/keystore/public/identity_ca.crl.pem"
-    needed = f"the process: /listener ({iso(time_of_file(shared.stat().st_mtime))}); when a"
+    needed = f"are outdated: /listener ({iso(time_of_file(shared.stat().st_mtime))}); bring"
     assert needed in robot.close().err
     ended = robot.close("--proof")
     assert needed in ended.err
@@ -1730,7 +1735,7 @@ def test_an_enclave_that_belongs_to_another_machine(robot: Robot) -> None:
     assert "differs from the signed permissions" not in ended.out
     assert "talk: 2 nodes with 36 endpoints as before (types are not compared)\n" in ended.out
     assert "--brought cannot name /talker" in robot.close("--brought", "/talker", status=2).err
-    brought = "; on other machines, as you said with --brought: the current files of /listener ("
+    brought = "\n  on other machines, as you said with --brought: the current files of /listener ("
     for words in (("--brought", "/listener"), ("--proof",)):
         said = robot.close(*words).err
         assert brought in said and needed not in said
@@ -1742,7 +1747,7 @@ def test_an_enclave_that_belongs_to_another_machine(robot: Robot) -> None:
     )
     policy.write_bytes(stated)
     os.utime(shared)
-    assert "restart the process: /listener (" in robot.close().err
+    assert "are outdated: /listener (" in robot.close().err
     robot.remaining = (TALKER,)
     said = robot.close("--proof", status=1).out
     assert (
