@@ -475,9 +475,16 @@ def _edit_text(violation: Violation) -> str:
                 effect = f"; this allows all influence through {_listed_names(enclaves)}"
         case _:
             return ""
-    if not requirement.as_written or any(name.startswith(EXCEPT) for name in listed):
+    if requirement.robot or any(name.startswith(EXCEPT) for name in listed):
         return ""
-    place, quoted = requirement.source, [f'"{name}"' for name in sorted({*enclaves})]
+    space = requirement.namespace.rstrip("/")
+    if not all(name.startswith(f"{space}/") for name in enclaves):
+        effect += "; an enclave with * at its beginning does not move with the namespace"
+    written = {
+        name.removeprefix(space) if name.startswith(f"{space}/") else f"*{name}"
+        for name in enclaves
+    }
+    place, quoted = requirement.source, [f'"{name}"' for name in sorted(written)]
     return (
         "Change the policy at the named lines; or, if this is wanted, add "
         f"{first_few(quoted, _MOST_SHOWN)} to `{key}` of the requirement at "

@@ -85,10 +85,10 @@ class RobotNames(NamedTuple):
 class Requirement:
     """Base class of requirements, with the place of the table in the file, name and reason (or "").
 
-    ``robot`` is the robot whose values replaced the placeholders, or "". ``as_written`` says
-    whether the names are as in the file, and not changed for a robot or namespace; ``is_relative``
-    says whether a name moves with the namespace.  ``elsewhere`` is the requirement in any other
-    namespace; None if the file was read for a namespace.
+    ``robot`` is the robot whose values replaced the placeholders, or "". ``namespace`` is the
+    namespace for which the file was read; ``is_relative`` says whether a name moves with it.
+    ``elsewhere`` is the requirement in any other namespace; None if the file was read for a
+    namespace.
     """
 
     KIND: ClassVar[str]
@@ -98,7 +98,7 @@ class Requirement:
     why: str = ""
     robot: str = ""
     of_robots: tuple[RobotNames, ...] = field(default=(), compare=False, repr=False)
-    as_written: bool = field(default=True, compare=False, repr=False)
+    namespace: str = field(default="/", compare=False, repr=False)
     is_relative: bool = field(default=False, compare=False, repr=False)
     elsewhere: Requirement | None = field(default=None, compare=False, repr=False)
 
@@ -501,10 +501,9 @@ class _Table:
                 )
         texts = {key: self.text(key) if key in self.values else "" for key in _WORD_KEYS}
         robots = {"robot": self.robot, "of_robots": self.of_robots}
-        as_written = not self.robot and self.namespace == "/" and not self.remaps
         values = [value for key, value in self.values.items() if key not in _KEYS_WITHOUT_NAMES]
         names = (name for name in _names_in(values) if not name.startswith(("/", "*")))
-        written = {"as_written": as_written, "is_relative": any(names)}
+        written = {"namespace": self.namespace, "is_relative": any(names)}
         return {"source": self.source, **written, **robots, **texts}
 
     def text(self, key: str) -> str:

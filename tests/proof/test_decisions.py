@@ -196,20 +196,30 @@ def test_after_the_edit_that_a_finding_names_the_requirement_holds(
     assert not decided(rights, required.replace(kept, f"{kept}, {added}")).violations
 
 
+WEB_AND_MOTOR = {"/n/web": may("publish", "/cmd"), "/n/motor": may("subscribe", "/cmd")}
+
+
+@pytest.mark.parametrize(("namespace", "edit"), [("/n", '"/web"'), ("/m", '"*/n/web"')])
+def test_an_edit_in_a_namespace(namespace: str, edit: str) -> None:
+    required = '[[only]]\npublish = ["/cmd"]\nenclaves = ["/motor"ADDED]\n'
+    for added, edits in (("", [edit]), (f", {edit}", [])):
+        text = required.replace("ADDED", added).encode()
+        requirements = parse_requirements(text, "r.toml", namespaces=[namespace])
+        found = requirement_findings(requirements, robot(WEB_AND_MOTOR))
+        remedies = [each.remedy for each in found if each.id == "requirement.violated"]
+        assert [remedy.partition("add ")[2].partition(" ")[0] for remedy in remedies] == edits
+
+
 @pytest.mark.parametrize(
-    ("required", "namespace"),
+    "required",
     [
-        ('[[apart]]\nfrom = ["/n/web"]\nto = ["/n/motor"]\n', "/"),
-        ('[[only]]\npublish = ["/cmd"]\nenclaves = ["*", "!/n/web"]\n', "/"),
-        ('[[only]]\npublish = ["/cmd"]\nenclaves = ["/motor"]\n', "/n"),
+        '[[apart]]\nfrom = ["/n/web"]\nto = ["/n/motor"]\n',
+        '[[only]]\npublish = ["/cmd"]\nenclaves = ["*", "!/n/web"]\n',
     ],
 )
-def test_no_edit_is_named_that_would_empty_a_requirement_or_not_help(
-    required: str, namespace: str
-) -> None:
-    rights = {"/n/web": may("publish", "/cmd"), "/n/motor": may("subscribe", "/cmd")}
-    requirements = parse_requirements(required.encode(), "r.toml", namespaces=[namespace])
-    (finding,) = requirement_findings(requirements, robot(rights))
+def test_no_edit_is_named_that_would_empty_a_requirement_or_not_help(required: str) -> None:
+    requirements = parse_requirements(required.encode(), "r.toml")
+    (finding,) = requirement_findings(requirements, robot(WEB_AND_MOTOR))
     assert "if this is wanted" not in finding.remedy
 
 
