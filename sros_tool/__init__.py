@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from sros_tool.checks.kind import Finding
     from sros_tool.errors import (
         DocumentError,
+        InvalidNameError,
         KeystoreError,
         PolicyError,
         SrosError,
@@ -69,6 +70,7 @@ __all__ = [
     "Finding",
     "FleetStatus",
     "Growth",
+    "InvalidNameError",
     "Keystore",
     "KeystoreError",
     "Merged",

@@ -687,9 +687,10 @@ def explain_access(
             as "fastdds-3.2" or "zenoh".
         distribution: A ROS 2 distribution, such as "lyrical", whose release of ``vendor`` decides.
         policy: The policy of the enclave, or the path of its file, in which to find the
-        ``policy_lines``. domain: The ROS domain id; by default 0, or the first domain of the
-        governance. now: The time of the access; the current time by default. zone: The time zone of
-        the robot, in which some vendors read dates.
+            ``policy_lines``.
+        domain: The ROS domain id; by default 0, or the first domain of the governance.
+        now: The time of the access; the current time by default.
+        zone: The time zone of the robot, in which some vendors read dates.
 
     Raises:
         KeystoreError: The keystore or the enclave does not exist.
@@ -810,12 +811,15 @@ def check(
     """Return findings on errors and weaknesses in keystores, enclaves and policies, worst first.
 
     Args:
-        paths: Keystores, enclave folders, policy files, or folders of policy files. policies:
-        Policies, or paths of policy files; the permissions of keystores are compared with these
-        policies. fleet: The file with the robots that the placeholders of policy files stand for.
-        severity: The lowest severity that is returned. strict: Include the weaknesses that a
-        keystore's template accepts. distribution: The ROS 2 distribution, such as "lyrical", whose
-        nodes and DDS the findings
+        paths: Keystores, enclave folders, policy files, or folders of policy files.
+        policies: Policies, or paths of policy files; the permissions of keystores are compared with
+            these policies.
+        fleet: The file with the robots that the placeholders of policy files stand for.
+        severity: The lowest severity that is returned. With "warning", notes that `sros check`
+            shows without options are returned, too: a script that fails for findings has to
+            compare ``finding.severity``.
+        strict: Include the weaknesses that a keystore's template accepts.
+        distribution: The ROS 2 distribution, such as "lyrical", whose nodes and DDS the findings
             are for; by default the latest for nodes in policies, and the distributions in the
             keystore's settings.
         domain: The ROS domain id that the enclaves have to join.
@@ -910,7 +914,9 @@ def check_requirements(
 
     Returns:
         Findings with ``subject``, ``text``, ``file`` and ``line``, and in ``related`` the other
-        lines of the policy and the line of the requirement; () if all requirements hold.
+        lines of the policy and the line of the requirement. The ``id`` of a requirement that does
+        not hold is "requirement.violated"; other ids are about requirements that protect less than
+        they state, and some are notes (``severity``).
 
     Raises:
         DocumentError: A file cannot be read, or there are too many wildcards to decide a

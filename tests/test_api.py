@@ -95,7 +95,12 @@ def test_every_name_is_there_and_documented(name: str) -> None:
     assert name in dir(sros_tool)
     assert inspect.getdoc(value)
     if inspect.isfunction(value):
-        assert all(part in (value.__doc__ or "") for part in ("Raises:", "Example:"))
+        text = inspect.getdoc(value) or ""
+        assert all(part in text for part in ("Raises:", "Example:"))
+        _, found, arguments = text.partition("\nArgs:\n")
+        stated = re.findall(r"^    (\w+): ", arguments.partition("\n\n")[0], re.MULTILINE)
+        assert not found or stated == [*inspect.signature(value).parameters]
+        assert {*re.findall(r"\b\w+Error(?=: )", text)} <= {*sros_tool.__all__}
 
 
 def test_no_name_is_also_that_of_a_room() -> None:

@@ -122,8 +122,9 @@ class Keyring:
                 raise KeystoreError(
                     f"the key of the {role} CA is missing: '{path}'",
                     "It may be stored elsewhere on purpose.",
-                    f"Put it back for this command, or set SROS_{role.upper()}_KEY to its place. "
-                    "No new CA is created, because it would lock out every existing enclave.",
+                    f"Put it back for this command, or set SROS_{role.upper()}_KEY to its place "
+                    "(only the command line reads the variable). No new CA is created, because it "
+                    "would lock out every existing enclave.",
                 )
             pem = self._read(keystore, path, role)
             key = load_key(pem, f"'{path}'", self._passphrase(role))
