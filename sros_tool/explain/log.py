@@ -55,11 +55,13 @@ from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.rights import RightsSource, load_rights
 from sros_tool.keystore.selection import likely_names as likely_enclaves
 from sros_tool.names import (
+    PARAMETER_SERVICES,
     action_part,
     check_enclave_name,
     is_expression,
     nodes_served,
     right_to_use,
+    service_of,
 )
 from sros_tool.pki.certificates import IDENTITY_DIGITS
 from sros_tool.policy.model import (
@@ -104,10 +106,11 @@ from sros_tool.runtime.zenoh_log import (
     dropped_messages,
     matching_zenoh_text,
 )
+from sros_tool.spelling import is_spelled_alike, is_typing_error
 from sros_tool.translate import grant_rights
 from sros_tool.translate_zenoh.rights import name_of_key
 from sros_tool.values import shows
-from sros_tool.wording import first_few
+from sros_tool.wording import enumerated, first_few
 
 _WORD_PATTERNS = (re.compile(r"[\w/]+"), re.compile(r"[^\s(]+"), re.compile(r"\S+"))
 """Patterns that split a log line into words: without punctuation, or with that of topics."""
@@ -1122,6 +1125,13 @@ class _Examiner:
         is_used = self._keystore.has_other_side(denied) if self._keystore else None
         names = likely_names(asked)
         if is_used:  # a name that peers have a right to is probably no mistake
+            if misspelled := self._misspelled_in_policy(denied, named_rights(asked)):
+                nobody = f"which no enclave may {PEER_RIGHT[denied.right]}"
+                use = f"{question.word} {misspelled}, {nobody}"
+                return [f"the enclave may {use}: perhaps {name} is meant"], (
+                    f"If the policy misspells the name, write {name} in place of {misspelled} "
+                    f"there. Otherwise, {remedy}"
+                )
             names = tuple(other for other in names if _last_part(other) == _last_part(name))
         own = [right.name for right in named_rights(asked) if right.right == denied.right]
         meant = names[0] if names else own[0] if len(own) == 1 else "NEW"
@@ -1139,10 +1149,13 @@ class _Examiner:
             facts = [f"the enclave may {question.word} {is_meant}"]
             if is_used:
                 return facts, f"{remedy} Or, if the node lacks a remapping that its policy has{add}"
+            misspelled = ""
+            if is_typing_error(name, meant):
+                misspelled = f"If the program misspells the name, write {meant} there. "
             return facts, (
-                f"If the node lacks a remapping{add} If the policy lacks a remapping that the node "
-                f"has, write {name} in place of {meant} in the policy, or merge the policy with "
-                f"`--remap {quote(meant)}:={quote(name)}`. Otherwise, {remedy}"
+                f"{misspelled}If the node lacks a remapping{add} If the policy lacks a remapping "
+                f"that the node has, write {name} in place of {meant} in the policy, or merge the "
+                f"policy with `--remap {quote(meant)}:={quote(name)}`. Otherwise, {remedy}"
             )
         if is_used is False and self._keystore:
             place = self._keystore.place
@@ -1152,6 +1165,14 @@ class _Examiner:
                 f"close`: start/commands.txt).{renamed or new_name}"
             )
         return [], f"{remedy}{renamed or new_name}"
+
+    def _misspelled_in_policy(self, denied: Right, named: Iterable[Right]) -> str:
+        """Return a name like the denied one that only the enclave may use, not its peers, or ""."""
+        for right in named:
+            is_alike = right.right == denied.right and is_spelled_alike(denied.name, right.name)
+            if is_alike and self._keystore and self._keystore.has_other_side(right) is False:
+                return right.name
+        return ""
 
     def _how_to_ask(self, denial: Denial, name: str) -> str:
         """Return the commands that show which rights a policy lacks for a denied topic."""
@@ -1182,7 +1203,7 @@ class _Examiner:
             return (
                 f"{' and '.join(commands)} {shows} what is missing in the policy. If the policy is "
                 "for another version of the node, use the policy of the node's version; otherwise, "
-                f"add what is missing{advice}."
+                f"add what is missing{advice}.{_parameter_client_hint(denial, name)}"
             )
         folder = f"{root}/enclaves/{enclave.lstrip('/')}".rstrip("/")
         return (
@@ -1298,6 +1319,19 @@ def _nodes_clause(answer: Answer) -> tuple[str, ...]:
     if nodes:
         return (f"its permissions are for {_listed_nodes(nodes)}",)
     return (f"its permissions lack {_EVERY_NODE}",)
+
+
+def _parameter_client_hint(denial: Denial, name: str) -> str:
+    """Return which other services a parameter client needs, if it may not call one; or ""."""
+    node, _, service = name.rpartition("/")
+    is_client = service_of(denial.topic)[0] and not node_denied_own_service(denial)
+    if service not in PARAMETER_SERVICES or not is_client:
+        return ""
+    return (
+        " A parameter client of rclpy needs all six parameter services of the other node, and a "
+        "log may have only the first that is denied: for such a client, add "
+        f"{enumerated(PARAMETER_SERVICES)} of {node}, all together."
+    )
 
 
 def _last_part(name: str) -> str:

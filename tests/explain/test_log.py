@@ -1322,7 +1322,7 @@ def test_a_folder_that_is_there_has_the_right_name(keystore: Path, tmp_path: Pat
 
 def test_a_forgotten_remapping_is_shown(keystore: Path, tmp_path: Path) -> None:
     log = tmp_path / "robot.log"
-    meant = ": perhaps that is meant"
+    meant, typo = ": perhaps that is meant", "If the program misspells the name, write /chatter th"
     for topic, why in (
         ("front/chatter", meant),
         ("chater", meant),
@@ -1335,6 +1335,7 @@ def test_a_forgotten_remapping_is_shown(keystore: Path, tmp_path: Path) -> None:
         found = sros("explain", keystore, ENCLAVE, "--log", log).out
         assert (f"the enclave may publish /chatter{why}\n" in found) is bool(why)
         assert (f"`--ros-args -r /{topic}:=/chatter`" in found) is bool(why)
+        assert (typo in found) is (topic == "chater")
         assert (f"the policy lacks a remapping that the node has, write /{topic}" in found) is bool(
             why
         )
@@ -1346,8 +1347,10 @@ def test_the_other_side_of_a_name_tells_whether_a_remapping_may_be_forgotten(
     tmp_path: Path,
 ) -> None:
     """A name that a peer has is no mistake; without any, the right alone gives a silent node."""
-    camera = publish("/front/image", "/rear/image", "/map_*")
-    enclaves = {"/camera": camera, "/weed": subscribe("/front/image")}
+    drawer = '<services reply="ALLOW"><service>/drawer/open</service></services>'
+    calls = '<services request="ALLOW"><service>/drawer/opn</service></services>'
+    camera = publish("/front/image", "/rear/image", "/map_*") + drawer
+    enclaves = {"/camera": camera, "/weed": subscribe("/front/image") + calls}
     (policy := tmp_path / "policy.xml").write_text(policy_text(enclaves))
     keystore, log = tmp_path / "keystore", tmp_path / "robot.log"
     sros("create_keystore", keystore).ok()
@@ -1376,7 +1379,15 @@ def test_the_other_side_of_a_name_tells_whether_a_remapping_may_be_forgotten(
             "not-offered]: no enclave that was read has a right to publish exactly /odom" in notes
         ) is (len(facts) == 2)
         assert ("[explain.likely-name]" in notes) is (topic == "/frnt/image")
-    export = tmp_path / "export"
+    client, export = tmp_path / "client.log", tmp_path / "export"
+    for service, fact in (
+        ("drawer/open", "call /drawer/opn, which no enclave may reply: perhaps /drawer/open is me"),
+        ("camera/get_parameters", "set_parameters and set_parameters_atomically of /camera, all"),
+    ):
+        client.write_text(
+            f"rq/{service}Request topic not found in allow rule. check_create_datawriter\n"
+        )
+        assert fact in sros("explain", keystore, "/weed", "--log", client).out, service
     sros("distribute_key", keystore, "/weed", export).ok()
     found = sros("explain", export, "--log", log, "/weed").out
     assert "no enclave of the export may publish /odometry\n" in found
