@@ -619,12 +619,13 @@ class ComparedFleet(NamedTuple):
 )
 @click.option(
     "--fail-on",
-    type=click.Choice(["delivery", "unmended", "vulnerabilities"]),
+    type=click.Choice(["delivery", "unmended", "seen", "vulnerabilities"]),
     default="delivery",
     show_default=True,
     help="`delivery`: the exit status is 1 only for problems with the delivery of files, and for "
     "problems that agents report. `unmended`: as `delivery`, but changed files that an agent or "
-    "`sros fleet publish` has replaced (they are shown for a day) do not count. "
+    "`sros fleet publish` has replaced (they are shown for a day) do not count. `seen`: "
+    "as `delivery`, but a publishing folder that is not on this machine does not count. "
     "`vulnerabilities`: as `delivery`, and also for a DDS with known vulnerabilities that a later "
     "release fixes.",
 )
@@ -675,9 +676,11 @@ def _status(
 
     The exit status is 0 if every robot that is not revoked has confirmed the files that it should
     have, no restart is due, no agent reports a problem, no published file is missing or was altered
-    in the last day, and robots still accept the published files. Otherwise it is 1. With --fail-on
-    unmended, changed files that an agent or `sros fleet publish` has replaced do not count. With
-    --fail-on vulnerabilities, it is also 1 if a robot has a DDS to upgrade.
+    in the last day, and robots still accept the published files. Otherwise it is 1, also if the
+    publishing folder is not on this machine. With --fail-on unmended, changed files that an agent
+    or `sros fleet publish` has replaced do not count. With --fail-on seen, a publishing folder that
+    is not on this machine does not count, as for a copy of the keystore. With --fail-on
+    vulnerabilities, it is also 1 if a robot has a DDS to upgrade.
     """
     from sros_tool.checks.vulnerabilities import is_fixed_later, robot_findings
     from sros_tool.keystore.fleet_status import fleet_status
@@ -719,7 +722,7 @@ def _status(
 
     findings = robot_findings(reported, known, names) if html else robot_findings(reported, known)
     compared = ComparedFleet(moment, status, outdated, list(findings))
-    complete = status.mended if fail_on == "unmended" else status.complete
+    complete = {"unmended": status.mended, "seen": status.seen}.get(fail_on, status.complete)
     exit_status = 0 if complete and not (outdated and on_vulnerabilities) else 1
     if as_json:
         print_json(compared)
@@ -845,6 +848,13 @@ def _fleet_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
         yield f"the published files expired {ago} ago, so robots get no new files: run `{publish}`"
     elif publication and publication.accepted is None:
         yield f"the expiry of the published files is not known: run `{publish}`"
+    if publication and folder and not (publication.seen or status.older):
+        yield (
+            f"the folder of the last publication, '{folder}', is not on this machine: it is not "
+            "known whether robots can fetch, or whether the keystore is older than its robots. If "
+            f"the folder was lost, `{publish}` says what to check first. If it belongs on another "
+            "machine, add `--fail-on seen`"
+        )
     if publication and publication.altered:
         ago = elapsed(compared_fleet.at - max(publication.altered.values()))
         yield (

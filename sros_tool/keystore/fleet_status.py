@@ -458,7 +458,7 @@ class RobotStatus:
 
 
 @shows(
-    *("folder", "expires", "root_expires", "accepted", "lacks", "refused", "altered"),
+    *("folder", "seen", "expires", "root_expires", "accepted", "lacks", "refused", "altered"),
     null_if_empty=("folder", "lacks", "refused"),
 )
 @dataclass(frozen=True, slots=True)
@@ -478,13 +478,17 @@ class PublishedMetadata:
     """
     accepted: bool | None = None
     """Whether robots still accept the metadata; null if ``expires`` is null."""
+    seen: bool = True
+    """Whether ``folder`` is on this machine and can be read.  If not, it is not known whether
+    robots can fetch, or whether the folder has later releases than the keystore knows.
+    """
     lacks: str = ""
     """Path of a published file that is missing in ``folder``, such as metadata or a robot's
-    archive.  Null if nothing is missing, or if the folder is not on this machine.
+    archive.  Null if nothing is missing, or if the folder was not ``seen``.
     """
     refused: str = ""
     """Why the metadata in ``folder`` does not verify, so that robots refuse it, as a clause.  Null
-    if the metadata verifies, or if the folder is not on this machine.
+    if the metadata verifies, or if the folder was not ``seen``.
     """
     altered: Mapping[str, datetime] = field(default_factory=dict)
     """Files that ``sros fleet publish`` found missing, changed or older than published in the last
@@ -493,7 +497,7 @@ class PublishedMetadata:
 
     @property
     def is_in_order(self) -> bool:
-        """Whether robots still accept the metadata, and no file is known to be missing."""
+        """Whether the metadata has not expired, and no file is known to be missing or refused."""
         return bool(self.accepted and not self.lacks)
 
     def at(self, now: datetime) -> PublishedMetadata:
@@ -508,6 +512,7 @@ class PublishedMetadata:
         "keystore",
         "complete",
         "mended",
+        "seen",
         "stage",
         "counts",
         "unassigned",
@@ -606,9 +611,7 @@ class FleetStatus:
         altered in the last day, and there is no other doubt about the robots' files.  Robots whose
         enclaves were all revoked do not count.
         """
-        is_altered = self.publication is not None and bool(self.publication.altered)
-        in_order = self._is_in_order and not is_altered
-        return in_order and all(robot.settled for robot in self.robots)
+        return self.seen and self._is_folder_seen
 
     @property
     def mended(self) -> bool:
@@ -616,7 +619,19 @@ class FleetStatus:
         published again, do not count; both are shown for a day.  A key that somebody may have
         copied counts.
         """
-        return self._is_in_order and all(robot.mended for robot in self.robots)
+        in_order = self._is_in_order and self._is_folder_seen
+        return in_order and all(robot.mended for robot in self.robots)
+
+    @property
+    def seen(self) -> bool:
+        """Like ``complete``, but a publishing folder that is not on this machine does not count."""
+        is_altered = self.publication is not None and bool(self.publication.altered)
+        in_order = self._is_in_order and not is_altered
+        return in_order and all(robot.settled for robot in self.robots)
+
+    @property
+    def _is_folder_seen(self) -> bool:
+        return self.publication is None or self.publication.seen
 
     @property
     def _is_in_order(self) -> bool:
@@ -958,6 +973,7 @@ class _KeystoreRecords:
         from sros_tool.keystore.delivery.publish import metadata_problem
 
         published = read_published(keystore)
+        missing = published.first_missing()
         self._published = published.robots
         self.published = {name: robot.release.number for name, robot in published.robots.items()}
         """Maps robots to the number of the release that was published last for them."""
@@ -966,7 +982,8 @@ class _KeystoreRecords:
                 published.folder,
                 published.until,
                 published.root_until,
-                lacks=published.first_missing(),
+                seen=missing is not None,
+                lacks=missing or "",
                 refused=metadata_problem(keystore),
                 altered=published.altered,
             )
@@ -1553,6 +1570,12 @@ def fleet_metrics(
             "Like sros_fleet_complete, but problems that an agent or `sros fleet publish` has "
             "mended do not count; they are shown for a day.",
             (Sample(int(status.mended), place),),
+        ),
+        Metric(
+            "sros_fleet_seen",
+            "Like sros_fleet_complete, but a publishing folder that is not on the machine of the "
+            "keystore does not count.",
+            (Sample(int(status.seen), place),),
         ),
         Metric(
             "sros_fleet_robots",

@@ -1365,7 +1365,7 @@ def test_home_is_older_than_its_robots(field: Field) -> None:
         if away:
             (field.folder / "pub").rename(kept)
             assert (
-                "the keystore is older" not in sros("fleet", "status", "ks", cwd=field.folder).out
+                "\nthe keystore is older" not in sros("fleet", "status", "ks", cwd=field.folder).out
             )
             assert field.send("r1").status == 1
         rows = field.run("fleet", "status", "ks", status=1).out

@@ -140,16 +140,17 @@ class Published:
         yield from self.metadata
         yield from (robot.release.path(name) for name, robot in sorted(self.robots.items()))
 
-    def first_missing(self) -> str:
+    def first_missing(self) -> str | None:
         """Return the first file that is missing in the publishing folder, or "".
 
-        The result is also "" if the folder is not here, for example on a disk that is not mounted.
+        The result is None if the folder cannot be seen, for example because its disk is not
+        mounted.
         """
         paths = (TIMESTAMP_PATH, *self.paths())
         with suppress(OSError):
             if self.folder and Path(self.folder).is_dir():
                 return next((path for path in paths if not Path(self.folder, path).exists()), "")
-        return ""
+        return None
 
     def document(self, now: datetime) -> bytes:
         """Return the content of ``published.json``."""
