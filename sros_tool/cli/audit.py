@@ -299,7 +299,10 @@ def _show(
     if audited.unjudged:
         verdict += f"; not judged: {', '.join(audited.unjudged)}"
     if changing_seconds:
-        verdict += f"; the ROS graph kept changing for {changing_seconds:.0f} s"
+        verdict += (
+            f"; the ROS graph kept changing for {changing_seconds:.0f} s, or could not be read in "
+            "time"
+        )
     echo(verdict, err=True)
     if any(denied_right.by_rule for denied_right in audited.denied):
         echo("a DENY denies some rights; no additional right overrides a DENY", err=True)

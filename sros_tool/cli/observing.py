@@ -501,8 +501,8 @@ def generate_policy(
         echo(f"{text}; --watch keeps them.", err=True)
     if not snapshot.settled:
         echo(
-            f"the ROS graph kept changing for {snapshot.seconds:.0f} s; use --watch to collect "
-            "nodes that come and go.",
+            f"the ROS graph kept changing for {snapshot.seconds:.0f} s, or could not be read in "
+            "time, so nodes may be missing; --watch collects nodes that come and go.",
             err=True,
         )
     return 0

@@ -372,7 +372,8 @@ def _proof_of_silence(robot: LocalRobot, before: Observation, *, hears: bool) ->
         text = f"it sees {enumerated(found)}; stop what runs open, or start it in its enclave"
         return Proof(SILENCE, False, text)
     if not value["settled"]:
-        why = "the ROS graph kept changing, so the observer may have missed nodes; ask again"
+        why = "the ROS graph kept changing, or could not be read in time, so the observer may have "
+        why += "missed nodes; ask again"
         return Proof(SILENCE, None, why)
     if not hears:
         why = "this proves nothing, because the observer in its enclave does not see the robot now"
@@ -665,7 +666,11 @@ class _TalkComparison:
         if not_now:
             text += "; allowed, but not seen now, as in a part of the watch: "
             text += first_few(_endpoint_texts(not_now), MOST_NAMES)
-        text += "" if self._audited["settled"] else "; the ROS graph kept changing meanwhile"
+        text += (
+            ""
+            if self._audited["settled"]
+            else "; the ROS graph kept changing meanwhile, or could not be read in time"
+        )
         known = {*map(node_name, before.nodes)}
         with_profile, without_profile = self._nodes.divide_by_profile(self.current.nodes)
         new = sorted(

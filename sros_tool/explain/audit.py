@@ -301,7 +301,7 @@ class AuditResult(NamedTuple):
     """
     observation: Observation
     settled: bool
-    """Whether the ROS graph stopped changing before the result."""
+    """Whether the whole ROS graph was seen: it stopped changing, or was watched without a gap."""
     partial: bool
     """Whether ``--partial`` accepted nodes that were not seen."""
     unjudged_accepted: bool

@@ -761,7 +761,9 @@ class LearnedPolicy(NamedTuple):
     intermittent: Sequence[IntermittentEndpoint]
     """The endpoints that running nodes had only for a part of the watch (`--watch`)."""
     settled: bool
-    """Whether the ROS graph stopped changing before the result; true for a log."""
+    """Whether the whole ROS graph was seen: it stopped changing, or was watched without a gap. True
+    for a log.
+    """
     added: Sequence[Right]
     """The rights that are added to the policy."""
     copied: Sequence[str]

@@ -6,9 +6,9 @@ unambiguous; `sros_tool.graph.learn` translates them to ROS names.
 ``python -P -m sros_tool.graph.observation FD PERIOD`` is the observer process: it reads the ROS
 graph through rclpy, so that a DDS that logs to standard output, refuses or crashes does no harm to
 its parent.  The observer process writes JSON, one object per line, to the file descriptor FD: first
-``{"ready": RMW}`` or ``{"failed": STAGE, "reason": TEXT}``, then the graph after each change. The
-process reads the graph every PERIOD seconds, after a change immediately, and exits when its
-standard input is closed.
+``{"ready": RMW}`` or ``{"failed": STAGE, "reason": TEXT}``, then an object after each reading: when
+the reading began, and the graph if it has changed. The process reads the graph every PERIOD
+seconds, after a change immediately, and exits when its standard input is closed.
 """
 
 from __future__ import annotations
@@ -280,7 +280,10 @@ class GraphObserver(Protocol):
 
 
 def report_graph(observer: GraphObserver, report: Any, period: float, *, ordered: bool) -> None:
-    """Report the graph after each change until standard input is closed.
+    """Report each reading, with the graph after a change, until standard input is closed.
+
+    ``began`` is the begin of the reading by the monotonic clock, which all processes share: others
+    can make a graph so large that a reading takes minutes, and what came since is not in it.
 
     After a change, the graph is read again immediately, not after ``period`` seconds: a node may
     not show all its endpoints yet, and may exit before the next regular reading.  ``ordered`` says
@@ -288,11 +291,13 @@ def report_graph(observer: GraphObserver, report: Any, period: float, *, ordered
     """
     before: Reading | None = None
     while True:
+        message: dict[str, Any] = {"began": time.monotonic()}
         now = observer.snapshot()
         if changes := now.nodes_changed or now != before:
             in_order = ordered and not now.nodes_changed
-            send(report, {"ordered": in_order, "listed": now.listed, "endpoints": now.endpoints})
+            message |= {"ordered": in_order, "listed": now.listed, "endpoints": now.endpoints}
             before = now
+        send(report, message)
         if select.select([sys.stdin], [], [], _REREAD_SECONDS if changes else period)[0]:
             return
 

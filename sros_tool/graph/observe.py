@@ -49,10 +49,35 @@ _READING_SECONDS = 0.1
 """Seconds between two readings of the graph; short, to see a node that runs for a second."""
 _START_SECONDS = 30.0
 _END_SECONDS = 3.0
+_MOST_UNREAD_SECONDS = 5.0
+
+
+class Readings(NamedTuple):
+    """The moments at which complete readings of the graph began.
+
+    ``last`` is the begin of the last reading, ``gap`` the longest time between the begins of two
+    readings.
+    """
+
+    last: float = float("-inf")
+    gap: float = 0.0
+
+    def and_one(self, began: float) -> Readings:
+        """Return these readings and one that ``began`` later."""
+        gap = began - self.last if self.last > float("-inf") else 0.0
+        return Readings(began, max(self.gap, gap))
+
+    def show_everything(self, now: float) -> bool:
+        """Return whether the graph was read so often until ``now`` that no node was missed."""
+        return max(self.gap, now - self.last) <= _MOST_UNREAD_SECONDS
 
 
 class GraphSource(Protocol):
     """A source of observations: `RosGraph`, or a script in a test."""
+
+    @property
+    def readings(self) -> Readings:
+        """The complete readings until the last call of `next`."""
 
     def next(self, seconds: float) -> Observation | None:
         """Return the graph after its next change, or None if it has not changed for ``seconds``."""
@@ -87,6 +112,7 @@ class RosGraph:
         self._module = f"sros_tool.graph.{'zenoh_tokens' if on_zenoh else 'observation'}"
         _require("zenoh" if on_zenoh else "rclpy")
         self.rmw = ""
+        self.readings = Readings()
 
     def __enter__(self) -> Self:
         read_end, write_end = os.pipe()
@@ -129,9 +155,14 @@ class RosGraph:
 
     def next(self, seconds: float) -> Observation | None:
         """Return the graph after its next change, or None if it has not changed for ``seconds``."""
-        line = self._line(seconds)
-        if line is None:
-            return None
+        deadline = time.monotonic() + seconds
+        while True:
+            line = self._line(max(deadline - time.monotonic(), 0))
+            if line is None:
+                return None
+            self.readings = self.readings.and_one(line["began"])
+            if "listed" in line:
+                break
         endpoints = tuple(
             (participant, ns, name, Endpoint(topic, direction))
             for participant, ns, name, topic, direction in line["endpoints"]
@@ -245,8 +276,8 @@ class Snapshot:
     """The graph at the end of an observation that took ``seconds`` seconds.
 
     ``everything`` also has the nodes that left while the graph was observed.  ``settled`` says
-    whether the graph had stopped changing.  ``intermittent`` are endpoints of the nodes in
-    ``observation`` that a watch saw for a part of its time.
+    whether the graph had stopped changing, or was watched without a gap.  ``intermittent`` are
+    endpoints of the nodes in ``observation`` that a watch saw for a part of its time.
     """
 
     observation: Observation
@@ -267,7 +298,8 @@ class Snapshot:
 def settle(source: GraphSource, settling: Settling, clock: Clock) -> Snapshot:
     """Return the graph once it stops changing, at the latest after ``settling.most`` seconds.
 
-    Time counts from the observer's first report, which comes late on a slow machine.
+    Time counts from the observer's first report, which comes late on a slow machine.  A graph is
+    known to be still only until its last complete reading began.
     """
     begin = clock()
     changed: float | None = None
@@ -276,7 +308,7 @@ def settle(source: GraphSource, settling: Settling, clock: Clock) -> Snapshot:
         now = clock()
         if now - begin >= settling.most:
             return Snapshot(seen, all_seen, now - begin, False)
-        is_still = changed is not None and now - changed >= settling.still
+        is_still = changed is not None and source.readings.last - changed >= settling.still
         if now - begin >= settling.least and is_still:
             return Snapshot(seen, all_seen, now - begin, True)
         news = source.next(_TICK)
@@ -291,7 +323,7 @@ def look_for(source: GraphSource, seconds: float, clock: Clock) -> Snapshot:
     while (left := begin + seconds - clock()) > 0:
         if news := source.next(min(left, _TICK)):
             seen, all_seen = news, all_seen.union(news)
-    return Snapshot(seen, all_seen, seconds, True)
+    return Snapshot(seen, all_seen, seconds, source.readings.show_everything(clock()))
 
 
 def watch(
@@ -340,7 +372,8 @@ def watch(
         report(union)
     stayed = {(node.fqn, node.participant) for node in seen.nodes}
     intermittent = frozenset(lost for lost in missed if (lost.node, lost.participant) in stayed)
-    return Snapshot(seen, union, clock() - begin, True, intermittent)
+    end = clock()
+    return Snapshot(seen, union, end - begin, source.readings.show_everything(end), intermittent)
 
 
 def _missing_endpoints(before: Observation, now: Observation) -> Iterator[IntermittentEndpoint]:

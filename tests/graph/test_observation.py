@@ -97,7 +97,10 @@ def test_a_graph_that_changed_is_read_again_at_once(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(select, "select", selected)
     report = io.StringIO()
     report_graph(Script(), report, 60.0, ordered=True)
-    assert report.getvalue().count("rosout") == 2
+    told = [json.loads(line) for line in report.getvalue().splitlines()]
+    assert ["listed" in each for each in told] == [True, True, False]
+    began = [each["began"] for each in told]
+    assert began == sorted(began)
     assert [wait < 0.05 for wait in waits] == [True, True, False]
 
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from sros_tool.graph.observation import Endpoint, Observation, make_observation
-from sros_tool.graph.observe import Settling, look_for, settle, watch
+from sros_tool.graph.observe import Readings, Settling, look_for, settle, watch
 from tests.graph.graphs import graph, node
 
 ONE = graph(node("/a", "publish x"))
@@ -16,11 +16,16 @@ SETTLING = Settling(least=2.0, still=1.0, most=10.0)
 
 @dataclass
 class Script:
-    """A graph that changes at the given moments, and the clock by which it does."""
+    """A graph that changes at the given moments, and the clock by which it does.
+
+    A reading ends every tenth of a second, but none of those in ``reading`` (begin and end).
+    """
 
     changes: Sequence[tuple[float, Observation]]
     now: float = 100.0
     begin: float = 100.0
+    reading: tuple[float, float] = (0.0, 0.0)
+    readings: Readings = field(default=Readings())
     _told: int = field(default=0)
 
     def clock(self) -> float:
@@ -32,9 +37,17 @@ class Script:
             if self.begin + at <= self.now + seconds:
                 self.now = max(self.now, self.begin + at)
                 self._told += 1
+                self._read()
                 return seen
         self.now += seconds
+        self._read()
         return None
+
+    def _read(self) -> None:
+        began, ended = (self.begin + each for each in self.reading)
+        during = began < self.now < ended
+        if not during or self.readings.last < began:
+            self.readings = self.readings.and_one(began if during else self.now)
 
 
 def test_a_still_graph_takes_the_least_time() -> None:
@@ -69,6 +82,26 @@ def test_a_graph_that_never_rests_ends_at_last() -> None:
     snapshot = settle(script, SETTLING, script.clock)
     assert not snapshot.settled
     assert 10.0 <= snapshot.seconds < 10.6
+
+
+def test_a_graph_that_nobody_read_in_time_has_not_settled() -> None:
+    """Others can make a graph so large that a reading lasts longer than the observation."""
+    for reading, is_settled in (((0.5, 4.5), True), ((0.5, 99.0), False), ((3.0, 9.0), False)):
+        observed = [
+            look_for((script := Script([(0.1, ONE)], reading=reading)), 12.0, script.clock),
+            watch(
+                (script := Script([(0.1, ONE)], reading=reading)),
+                12.0,
+                script.clock,
+                stop=lambda: False,
+                report=lambda _: None,
+            ),
+        ]
+        assert [each.settled for each in observed] == [is_settled] * 2, reading
+    hidden = Script([(0.1, ONE), (6.0, TWO)], reading=(0.5, 6.0))
+    assert settle(hidden, SETTLING, hidden.clock).observation == TWO
+    endless = Script([(0.1, ONE)], reading=(0.5, 99.0))
+    assert not settle(endless, SETTLING, endless.clock).settled
 
 
 def test_a_given_time_is_kept() -> None:

@@ -27,6 +27,7 @@ from sros_tool.files import policies_dir
 from sros_tool.graph import observe
 from sros_tool.graph.learn import is_tool_name
 from sros_tool.graph.observation import Observation, observation_from_json
+from sros_tool.graph.observe import Readings
 from sros_tool.keystore.layout import enclave_path
 from sros_tool.keystore.lifecycle.create import generate_artifacts
 from sros_tool.keystore.template import load_template
@@ -295,6 +296,10 @@ class Replayed:
 
     def __init__(self, seen: Observation) -> None:
         self._seen: Observation | None = seen
+
+    @property
+    def readings(self) -> Readings:
+        return Readings(time.monotonic())
 
     def __enter__(self) -> Replayed:
         return self
