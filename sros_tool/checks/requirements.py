@@ -20,10 +20,10 @@ VACUOUS = FindingKind(
     "The named part protects nothing: perhaps a name is misspelled or was changed, or the "
     "exceptions cover every enclave.",
     "The requirements file.",
-    "Correct the name or its kind (service or action), here or in the policy (was a topic or an "
-    "enclave renamed?), or name fewer exceptions. For a name that is to stay unused, write "
-    "[[nobody]]. For enclaves that come and go, such as laptops, write who may ([[only]]), not who "
-    "may not.",
+    "Correct the name or its kind (service or action), here or in the policy, or name fewer "
+    "exceptions. (Was a topic, node or enclave renamed? If by `merge_policy --remap`, check with "
+    "the same --remap.) For a name that is to stay unused, write [[nobody]]. For enclaves that "
+    "come and go, such as laptops, write who may ([[only]]), not who may not.",
 )
 UNKNOWN_ENCLAVE = FindingKind(
     "requirement.unknown-enclave",

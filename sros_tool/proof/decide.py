@@ -788,16 +788,17 @@ def _unused_names(
             other = _RIGHT_OF_OTHER_KIND.get(right, "")
             if other and _is_used_by_anybody(world, _sufficient_parts(other), name, limit):
                 meant = f", but some enclaves may {other} {_named_right(other, name)}"
+            peer = PEER_RIGHT[right]
             if isinstance(requirement, Nobody) and not meant:
                 unnamed.append(named)
-            elif (
-                known
-                and not meant
-                and _is_used_by_anybody(world, _sufficient_parts(PEER_RIGHT[right]), name, limit)
-            ):
+            elif meant or verb != right:
+                clauses.append(f"no enclave may {verb} {named}{meant}")
+            elif not _is_used_by_anybody(world, _sufficient_parts(peer), name, limit):
+                clauses.append(f"no enclave may {verb} or {peer} {named}")
+            elif known:
                 waiting.append(f"no enclave may {verb} {named}")
             else:
-                clauses.append(f"no enclave may {verb} {named}{meant}")
+                clauses.append(f"no enclave may {verb} {named}")
         elif meant:
             clauses.append(f"only wildcards match {named}{meant}")
         elif not known:

@@ -293,8 +293,17 @@ def _why_never_fails(verdicts: Sequence[Verdict]) -> tuple[list[str], list[str]]
     empty = _texts_in_all(verdict.empty for verdict in verdicts)
     reasons = [verdicts[0].always] if all(verdict.always for verdict in verdicts) else []
     if waiting := _texts_in_all(verdict.waiting for verdict in verdicts):
-        reasons = [_listed_names(waiting)]
-    return [_listed_names(empty)] if empty else [], reasons
+        reasons = [_listed_clauses(waiting)]
+    return [_listed_clauses(empty)] if empty else [], reasons
+
+
+def _listed_clauses(clauses: Iterable[str]) -> str:
+    """Return clauses in words; those that differ only in the name at their end are one clause."""
+    names: dict[str, list[str]] = {}
+    for clause in clauses:
+        start, _, name = clause.rpartition(" ")
+        names.setdefault(start, []).append(name)
+    return _listed_names([f"{start} {_listed_names(ends)}" for start, ends in names.items()])
 
 
 def _texts_in_all(lists: Iterable[Sequence[str]]) -> tuple[str, ...]:

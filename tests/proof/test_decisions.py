@@ -427,6 +427,21 @@ def test_a_package_may_promise_what_its_nodes_never_do(required: str, reason: st
     assert len(broken.violations) == 1
 
 
+@pytest.mark.parametrize(
+    ("names", "text"),
+    [
+        ('"/n/x/*", "/n/y/*"', "no enclave may request service /n/x/* and /n/y/*"),
+        ('"/n/x/*", "/old/*"', "no enclave may request or reply service /old/*"),
+    ],
+)
+def test_a_renamed_node_has_no_side_of_its_names(names: str, text: str) -> None:
+    """Twin: a service that only users request."""
+    required = f'[[only]]\nrequest = [{names}]\nenclaves = ["*/operator/*"]\n'
+    serves = {"/n": may("reply", "/n/x/set", "/n/y/set")}
+    findings = requirement_findings(parse_requirements(required.encode(), "r.toml"), robot(serves))
+    assert any(each.text.startswith(f"{text}; ") for each in findings), findings
+
+
 def test_whom_nobody_reaches_needs_no_search(monkeypatch: pytest.MonkeyPatch) -> None:
     """Proposals for 300 robots ask for each enclave whether one gate alone reaches it."""
     rights = {"/a": may("publish", "/x"), "/gate": may("publish", "/y")}
