@@ -312,7 +312,7 @@ def diff_policy(
         lines = _difference_lines(difference, first.fleet, second.fleet)
         lines += enclave_lines(compared, first.fleet or second.fleet)
         unanswered = unanswered_lines(compared, second.fleet)
-        for line in (*lines, *_protection_lines(protections), *unanswered):
+        for line in (*lines, *protection_lines(protections), *unanswered):
             echo(line)
         count = len(difference.only_first) + len(difference.only_second)
         of = f" of {first_few(sorted(compared.scope), _MOST_NEW_LINES)}" if compared.scope else ""
@@ -357,7 +357,7 @@ def rights_markdown(
     )
     lines = folded_differences(first_source, second_source, difference.rights)
     lines += enclave_lines(difference, first_source.fleet or second_source.fleet)
-    lines += _protection_lines(difference.protections)
+    lines += protection_lines(difference.protections)
     parts = []
     shown_by = "which `sros diff_policy` shows"
     for sign, title in (("~", "renamed"), ("+", "added"), ("-", "removed"), ("?", "unclear")):
@@ -425,7 +425,8 @@ def unanswered_lines(difference: SourcesDifference, fleet: Fleet | None) -> Iter
     yield from folded(fleet, lines)
 
 
-def _protection_lines(protections: Iterable[tuple[str, StatedProtection]]) -> list[str]:
+def protection_lines(protections: Iterable[tuple[str, StatedProtection]]) -> list[str]:
+    """Return a line for each protection that only one of two policies demands."""
     return [
         f"{sign} {stated.enclave} protect {stated} with {stated.word}"
         for sign, stated in protections

@@ -593,6 +593,7 @@ def _lines_to_read(step: ReviewStep) -> list[str]:
         elsewhere_lines,
         enclave_lines,
         folded_differences,
+        protection_lines,
         unanswered_lines,
     )
     from sros_tool.proof.review import AccessChange, DroppedRequirements, RightsChange, StepFindings
@@ -607,6 +608,7 @@ def _lines_to_read(step: ReviewStep) -> list[str]:
             unanswered = unanswered_lines(compared, after.fleet)
             differing = folded_differences(before, after, compared.rights, ("BASE", "HEAD"))
             differing += enclave_lines(compared, after.fleet or before.fleet)
+            differing += protection_lines(compared.protections)
             return [*unanswered, *_absolute_lines(step.content), *differing]
         case (ChosenFindings() as chosen) | DroppedRequirements(chosen=chosen):
             one_per_group = ((finding,) for finding in chosen.shown)

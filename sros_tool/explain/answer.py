@@ -243,9 +243,7 @@ def _checked_name(name: str, word: str, kind: str) -> str:
     elif not problem and name == "/":
         problem = "It is a namespace."
     if problem:
-        raise UsageError(
-            f"{name!r} cannot be the name of {with_article(kind)} here", problem, remedy
-        )
+        raise UsageError(f"the name {name!r} is not valid in a question", problem, remedy)
     return name
 
 

@@ -530,6 +530,7 @@ def test_access_control_that_is_off_is_told(tmp_path: Path) -> None:
     [
         (["/a", "publish"], "publish needs the name of a topic"),
         (["/a", "fly", "/x"], "fly"),
+        (["/a", "call", "x"], "the name 'x' is not valid in a question"),
         (["/a", "publish", "x"], "Write /x"),
         (["/a", "publish", "/*"], "wildcard"),
         (["/a", "publish", "/x y"], "white space"),

@@ -266,6 +266,11 @@ def test_changed_rights_are_named_and_decided_over_all_policies(change: Change) 
     said = ended.out.partition("\n[ok] rights ")[2].splitlines()
     assert "written rights gone, 1 name made absolute" in said[0], ended
     assert "  ! /c may subscribe /x, but no enclave may publish it any more" in said
+    protected = policy_text({"/b": publish("/y").replace("/y<", '/y<?sros protect="sign"?><')})
+    change.commit({"robot.xml": protected})
+    ended = change.review("--policy", "robot.xml\nsecond.xml", "--new-access", "allow")
+    assert "1 stated protection changed" in ended.out
+    assert "\n  + /b protect topic /y with sign\n" in ended.out, ended
     assert "  - /a ALLOW publish topic /x" in said
     (absolute,) = (line for line in said if line.startswith("  ~"))
     assert "/c subscribe topic /x has a / at its beginning, so that it does" in absolute
