@@ -14,7 +14,7 @@ from sros_tool.files import policies_dir
 from sros_tool.graph.learn import common_parts
 from sros_tool.keystore.layout import CLOSED_POLICY
 from sros_tool.keystore.template import load_template
-from sros_tool.names import is_expression, moves_robot
+from sros_tool.names import PARAMETER_SERVICES, is_expression, moves_robot
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.merge import merge_into
 from sros_tool.policy.model import ALLOW, DENY, RIGHTS, Policy
@@ -28,32 +28,67 @@ from sros_tool.wording import counted, first_few
 
 _NODE_PARTS = ("common/node.xml", "common/rclcpp_node.xml", "common/rclpy_node.xml")
 _MOST_LINES = 20
-"""Number of names that are shown; the others are counted."""
+"""Number of lines that are shown; the others are counted."""
+_KINDS_IN_ORDER = ("actions", "topics", "services")
+"""The kinds of names, with those first that do most."""
 
 
 def access_lines(policy: Policy, folder: Path, others: frozenset[Right] = frozenset()) -> list[str]:
     """Return a line for each name that somebody may use: its senders and its receivers.
 
+    The parameter services of a node are one line if the same enclaves may use them.
     ``others`` are the signed rights of enclaves that the policy does not have.  Names are left out
     if they are only used as every node uses them (the common parts).  Names that move the robot
-    come first, with all of their senders.
+    come first, with all of their senders, and then names that nobody may send or serve.
     """
     sides = _users_by_name(policy, folder, others)
-    kinds = [*RIGHTS]
     names_in_order = sorted(
         sides,
-        key=lambda use: (not moves_robot(use[1]), not all(sides[use]), kinds.index(use[0]), use[1]),
+        key=lambda use: (
+            not moves_robot(use[1]),
+            not _waits_in_vain(use[0], use[1], sides[use]),
+            not all(sides[use]),
+            _KINDS_IN_ORDER.index(use[0]),
+            use[1],
+        ),
     )
+    names_by_line: dict[tuple[str, str], list[str]] = {}
+    for kind, name in names_in_order:
+        node, _, last = name.rpartition("/")
+        is_parameter_service = kind == "services" and node and last in PARAMETER_SERVICES
+        subject = node if is_parameter_service else f"{kind.removesuffix('s')} {name}"
+        users = " -> ".join(side.text(whole=moves_robot(name)) for side in sides[kind, name])
+        names_by_line.setdefault((subject, users), []).append(name)
     lines = [
-        f"{kind.removesuffix('s')} {name}: "
-        + " -> ".join(side.text(whole=moves_robot(name)) for side in sides[kind, name])
-        for kind, name in names_in_order
+        f"{_subject_text(subject, names)}: {users}"
+        for (subject, users), names in names_by_line.items()
     ]
     surplus = len(lines) - _MOST_LINES
     return [
         *lines[:_MOST_LINES],
-        *([f"and {counted(surplus, 'more name')}"] if surplus > 0 else []),
+        *([f"and {counted(surplus, 'more line')}"] if surplus > 0 else []),
     ]
+
+
+def _subject_text(subject: str, names: Sequence[str]) -> str:
+    """Return the subject of a line; the parameter services of a node are one subject."""
+    if not subject.startswith("/"):
+        return subject
+    return (
+        f"service {names[0]}"
+        if len(names) == 1
+        else f"{len(names)} parameter services of {subject}"
+    )
+
+
+def _waits_in_vain(kind: str, name: str, sides: Sequence[_Users]) -> bool:
+    """Return whether enclaves may receive or call a name that nobody may send or serve.
+
+    Such a name is often misspelled.
+    """
+    sends, receives = sides
+    waiting, offering = (receives, sends) if kind == "topics" else (sends, receives)
+    return bool(waiting) and not offering and not is_expression(name)
 
 
 class _Users(NamedTuple):
