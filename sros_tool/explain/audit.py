@@ -50,10 +50,12 @@ from sros_tool.graph.observation import (
     ObservedNode,
     make_observation,
 )
-from sros_tool.keystore.layout import ROUTER_FILE, enclave_names, enclave_path
+from sros_tool.keystore.layout import enclave_names, enclave_path
 from sros_tool.keystore.participant import JoinContext, LoadedEnclave, load_enclave, plan_enclave
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.rights import RightsSource, load_rights
 from sros_tool.keystore.template import DEFAULT_TEMPLATE, load_template
+from sros_tool.keystore.zenoh_files import router_enclaves
 from sros_tool.names import dds_names, expand, is_expression, nodes_served
 from sros_tool.policy.document import join_policies
 from sros_tool.policy.model import ALLOW, Policy
@@ -172,10 +174,8 @@ def audited_enclaves(
                 "",
                 f"Leave '{other_paths[0]}' out.",
             )
-        names = enclave_names(path)
-        with_nodes = [
-            name for name in names if not (enclave_path(path, name) / ROUTER_FILE).exists()
-        ]
+        routers = router_enclaves(OpenedKeystore(path), context.at)
+        with_nodes = [name for name in enclave_names(path) if name not in routers]
         return keystore_enclaves(rights, with_nodes, vendor, context)
     if rights.kind != "policy":
         raise UsageError(

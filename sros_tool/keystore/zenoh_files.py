@@ -362,6 +362,8 @@ class Drift(StrEnum):
     """The permissions CA has not signed the document next to the configuration."""
     STALE = "stale"
     """The enclave should not have the configuration."""
+    FOREIGN = "foreign"
+    """As `STALE`, but without a signed document: perhaps the user's own file, which stays."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -1046,14 +1048,32 @@ def _present_file(keystore: OpenedKeystore, path: str) -> bytes | None:
 def stale_files(
     root: Path, wanted_paths: Collection[str], names: Iterable[str]
 ) -> Iterable[DriftedConfiguration]:
-    """Yield the configurations of the enclaves ``names`` that should not exist.
-
-    A file without a signed document is left out, because it may be the user's own file.
-    """
+    """Yield the configurations of the enclaves ``names`` that should not exist."""
     for name in names:
         for path in (_router_path(name), _session_path(name)):
-            if path not in wanted_paths and (root / signed_path(path)).is_file():
+            if path in wanted_paths:
+                continue
+            if (root / signed_path(path)).is_file():
                 yield DriftedConfiguration(name, path, Drift.STALE)
+            elif os.path.lexists(root / path):
+                yield DriftedConfiguration(name, path, Drift.FOREIGN)
+
+
+def router_enclaves(keystore: OpenedKeystore, now: datetime) -> frozenset[str]:
+    """Return the enclaves of Zenoh routers, by the settings; in an export, by its signed files."""
+    if settings := keystore.settings:
+        return frozenset(settings.zenoh.router_names() if settings.zenoh else ())
+    return frozenset(
+        name
+        for name in keystore.names
+        if os.path.lexists(keystore.folder(name) / ROUTER_FILE)
+        and _has_router_file(keystore, name, now)
+    )
+
+
+def _has_router_file(keystore: OpenedKeystore, name: str, now: datetime) -> bool:
+    zenoh = open_zenoh(keystore.folder(name), name, keystore.enclave(name, now=now))
+    return ROUTER_FILE in zenoh.configurations and not zenoh.problems
 
 
 def _router_path(name: str) -> str:

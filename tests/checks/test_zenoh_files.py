@@ -4,10 +4,16 @@ from __future__ import annotations
 
 import json
 import shutil
+from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
 
+from sros_tool.dds.decision.vendors import Vendor
+from sros_tool.explain.audit import audited_enclaves
+from sros_tool.keystore.participant import JoinContext
+from sros_tool.keystore.reader import OpenedKeystore
+from sros_tool.keystore.zenoh_files import router_enclaves
 from tests.support.harness import copy_of, policy_text, publish, sros
 
 
@@ -69,6 +75,22 @@ def test_a_change_that_is_also_signed_is_found_by_comparison_with_the_keystore(
     assert found(folder, "ks/enclaves/a") == []
     sros("zenoh", "ks", cwd=folder).ok()
     assert found(folder, "ks") == []
+
+
+def test_a_file_of_the_router_makes_no_router(folder: Path) -> None:
+    """Nobody takes the nodes of an enclave out of an audit by a file that he puts there."""
+    file = "enclaves/a/router.json5"
+    shutil.copy(folder / "ks/enclaves/router/router.json5", folder / "ks" / file)
+    assert found(folder, "ks") == [("zenoh.unsigned", f"ks/{file}")]
+    sros("zenoh", "ks", cwd=folder).ok()
+    assert (folder / "ks" / file).exists()  # it may be the user's
+    shutil.copy(folder / "ks" / file, folder / "robot" / file)
+    for place in ("ks", "robot"):
+        keystore = OpenedKeystore(folder / place)
+        assert router_enclaves(keystore, datetime.now(UTC)) == {"/router"}, place
+        context = JoinContext(0, datetime.now(UTC))
+        expected = audited_enclaves([folder / place], Vendor.FAST, context).nodes.expected
+        assert "/a" in {node.enclave for node in expected}, place
 
 
 DAMAGE = {

@@ -371,7 +371,7 @@ def _rights_findings(enclave: CheckedEnclave, grant: Grant) -> Iterator[Finding]
             # No template accepts this finding, because the question is whether the robot is closed.
             accepted = keystore.accepts(EVERYTHING, lambda _: False)
             yield EVERYTHING.found(enclave.name, text, file, accepted=accepted)
-    elif not (enclave.folder / ROUTER_FILE).exists() and any(
+    elif not _is_router(enclave) and any(
         _ANY_NODES_SERVICE in _published_expressions(rule) for rule in grant.rules if rule.allow
     ):
         text = f"the permissions allow publishing {_ANY_NODES_SERVICE}"
@@ -385,6 +385,18 @@ def _rights_findings(enclave: CheckedEnclave, grant: Grant) -> Iterator[Finding]
         )
         text = f"they are valid from {iso(window.not_before)} to {iso(window.not_after)}"
         yield LONG_PERMISSIONS.found(enclave.name, text, file, accepted=accepted)
+
+
+def _is_router(enclave: CheckedEnclave) -> bool:
+    """Return whether a Zenoh router runs in the enclave, whose permissions no node uses."""
+    if not os.path.lexists(enclave.folder / ROUTER_FILE):
+        return False
+    from sros_tool.keystore.zenoh_files import router_enclaves  # most enclaves are no routers
+
+    keystore = enclave.keystore
+    with suppress(SrosError):  # another check reports settings that cannot be read
+        return enclave.name in router_enclaves(keystore.opened, keystore.at.now)
+    return False
 
 
 def _published_expressions(rule: Rule) -> set[str]:

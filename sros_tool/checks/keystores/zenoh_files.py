@@ -205,6 +205,10 @@ def _drift_findings(keystore: CheckedKeystore, drifted: DriftedConfiguration) ->
             drifted.enclave, "the keystore has no such file for the enclave", file
         )
         return
+    if drifted.kind is Drift.FOREIGN:
+        text = "the keystore has no such file for the enclave"
+        yield UNSIGNED.found(drifted.enclave, text, file, remedy="Remove the file.")
+        return
     if drifted.kind is Drift.MISSING:
         yield MISSING.found(drifted.enclave, "it is missing, or cannot be read", file)
         return

@@ -453,7 +453,8 @@ class KeystoreChange:
             *(self.keystore, self.template.zenoh, self.domains, authority, self.now, change),
             existing=existing,
         )
-        drifts = drifted_configurations(self.keystore, wanted, authority, gone_enclaves)
+        drifts = [*drifted_configurations(self.keystore, wanted, authority, gone_enclaves)]
+        drifts = [drift for drift in drifts if drift.kind is not Drift.FOREIGN]
         for drift in drifts:
             if drift.kind is Drift.STALE:
                 _remove_configuration(self.transaction, drift.path)
@@ -750,7 +751,8 @@ def _stage_configurations(
 
 def remove_zenoh(transaction: Transaction) -> tuple[str, ...]:
     """Stage the removal of all Zenoh configurations of a keystore; return their enclaves."""
-    stale = list(stale_files(transaction.root, (), transaction.enclaves))
+    present = stale_files(transaction.root, (), transaction.enclaves)
+    stale = [drift for drift in present if drift.kind is Drift.STALE]
     for drift in stale:
         _remove_configuration(transaction, drift.path)
     return tuple(dict.fromkeys(drift.enclave for drift in stale))
