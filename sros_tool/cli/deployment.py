@@ -99,6 +99,7 @@ def distribute_key(
         pack_enclaves,
         select_enclaves_to_export,
     )
+    from sros_tool.keystore.delivery.publish import older_keystore_notes
     from sros_tool.keystore.layout import enclave_folder, key_on_robot
     from sros_tool.keystore.outcomes import changes_below
     from sros_tool.keystore.reader import OpenedKeystore
@@ -157,6 +158,7 @@ def distribute_key(
                 echo(f"{word} {change.path}", err=True)
         if done:
             print_closed(below, export.changes, keystore=root)
+    notes = (*older_keystore_notes(keystore), *notes)
     if keyless:
         notes += tuple(included_keys_notes(keystore, selection.names))
     exported = [name for name in selection.names if name not in kept]

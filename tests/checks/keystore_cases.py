@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 import re
 import shutil
@@ -16,6 +17,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID
 
+from sros_tool.keystore.ledger import LATER_RELEASE, RESTORED
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import pem
 from sros_tool.pki.keys import key_pem, load_key
@@ -558,6 +560,15 @@ def _(bench: Bench) -> None:
     key = new_key()
     bench.issue("base", key=key, serial=1)
     bench.issue("arm", key=key, serial=2)
+
+
+@case("keystore.older-than-robots")
+def _(bench: Bench) -> None:
+    ledger = bench.path("ledger.jsonl")
+    lines = ledger.read_text().splitlines()
+    time = json.loads(lines[-1])["time"]
+    restored = {"time": time, "what": RESTORED, "number": 2, "reason": LATER_RELEASE}
+    ledger.write_text("\n".join([*lines, json.dumps(restored)]) + "\n")
 
 
 @case("enclave.old-permissions")

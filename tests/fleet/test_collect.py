@@ -1165,6 +1165,10 @@ def test_only_the_seal_of_a_later_release_keeps_a_keystore_from_publishing(
     monkeypatch.setattr("sros_tool.cli.common._clock", lambda: DUE)
     status = sros("fleet", "status", "ks", cwd=home.folder)
     assert "the keystore is older than its robots" in status.out and status.status == 1
+    exported = sros("distribute_key", "ks", "--robot", "r2", "old", cwd=home.folder)
+    assert "note [export.older-keystore]: the keystore is older than its robots" in exported.err
+    checked = sros("check", "ks", cwd=home.folder)
+    assert checked.status == 1 and "keystore.older-than-robots" in checked.out
     for command in (publish, ("renew", "ks", "--all-expiring", "30d")):
         refused = sros(*command, cwd=home.folder)
         assert refused.status == 2

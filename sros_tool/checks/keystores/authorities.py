@@ -20,6 +20,7 @@ from sros_tool.dds.decision.vendors import FAST_DDS, Vendor
 from sros_tool.errors import SrosError
 from sros_tool.faults import ORIGINAL_KEYSTORE
 from sros_tool.fleet.robots import Fleet
+from sros_tool.keystore.delivery.publish import unpublished_restore_clause
 from sros_tool.keystore.fleet import FLEET_REMEDY, is_of_damaged_ledger
 from sros_tool.keystore.known_keys import unlisted_revocations
 from sros_tool.keystore.layout import (
@@ -335,6 +336,16 @@ CLOCK_BEHIND = FindingKind(
     "Set the clock. If the clock is correct now, but was ahead at the last change, run `sros crl "
     "KEYSTORE --refresh`, so that the last entry of the ledger has today's date.",
 )
+OLDER_THAN_ROBOTS = FindingKind(
+    "keystore.older-than-robots",
+    ERROR,
+    "a keystore that is older than its robots",
+    "The keystore was restored from a backup, or is a copy. It may lack revocations, and its "
+    "enclaves may have rights that were taken away after the backup.",
+    "sros: the ledger has all releases; a message or the publishing folder has a later one.",
+    "Run `sros fleet status KEYSTORE`, which names the command that publishes with --restored; "
+    "docs/howto/keystore_is_lost.md has the other steps.",
+)
 CRL_EXPIRES_SOON = FindingKind(
     "keystore.revocation-list-ends",
     ERROR,
@@ -440,6 +451,8 @@ def _settings_and_ledger_findings(keystore: CheckedKeystore) -> Iterator[Finding
     with suppress(SrosError):  # a ledger that cannot be read is unread
         if behind := keystore.opened.ledger_file.clock_behind(keystore.at.now):
             yield CLOCK_BEHIND.found("clock", behind, file)
+        if why := unpublished_restore_clause(keystore.opened):
+            yield OLDER_THAN_ROBOTS.found("keystore", why, file)
     for gap in keystore.ledger.gaps:
         yield LEDGER_DAMAGED.found("ledger", gap, file)
     if count := keystore.ledger.unchained:

@@ -365,6 +365,30 @@ def age_clause(keystore: OpenedKeystore) -> str:
     return _later_in_folder(keystore)
 
 
+def unpublished_restore_clause(keystore: OpenedKeystore) -> str:
+    """Return what shows that later releases exist than the keystore knows, as a clause, or "".
+
+    Unlike `age_clause`, the result is "" for a restore that only a revocation list showed: the
+    keystore has repeated these revocations, and nothing waits for ``--restored``.
+    """
+    if has_unpublished_restore(keystore):
+        return "robots have releases that it sealed but does not know"
+    return _later_in_folder(keystore)
+
+
+def older_keystore_notes(keystore: OpenedKeystore) -> Iterator[Note]:
+    """Yield a note for an export from a keystore that is known to be older than its robots."""
+    with suppress(SrosError):  # `sros check` reports a ledger that cannot be read
+        if why := unpublished_restore_clause(keystore):
+            yield Note(
+                "export.older-keystore",
+                f"the keystore is older than its robots: {why}. The export may have rights that "
+                "were taken away after the backup, and lack revocations: before you bring it to a "
+                f"robot, run `sros fleet status {quote(str(keystore.root))}`, which names the next "
+                "step.",
+            )
+
+
 def is_all_published(root: Path, published: PublishedRobot, enclaves: Sequence[str]) -> bool:
     """Return whether the files of a robot are unchanged since they were last published."""
     return published.files == _files_digest(root, enclaves)
