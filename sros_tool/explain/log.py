@@ -1364,16 +1364,14 @@ def _renaming_advice(nodes: Sequence[str], wrong: str, enclave: str) -> str:
     renamed = ""
     if len(meant) == 1:
         renamed = (
-            f". Or, if this is {meant[0]} by another name, write {wrong} in the profile of "
-            f"{meant[0]}. If the profile comes from the policy of a package, merge that policy "
-            "again, into a policy without the node: `sros merge_policy POLICY OTHER "
-            f"{_merge_options(meant[0], wrong)}`, with the name that OTHER has for the node before "
-            "`:__node`"
+            f". If the new name is wanted, write {wrong} in the profile of {meant[0]}, or, for the "
+            "policy of a package, merge it again, into a policy without the node: `sros "
+            f"merge_policy POLICY OTHER {_merge_options(meant[0], wrong)}`, with the name that "
+            "OTHER has for the node before `:__node`"
         )
     return (
-        f"{start}{renamed}. Or, if {wrong} is a further node, give it a profile with "
-        f"common/node.xml: in the policy of {enclave}, or in an enclave of its own if it is "
-        "another program."
+        f"{start}{renamed}. A further node needs a profile with common/node.xml: in the policy of "
+        f"{enclave}, or in an enclave of its own if it is another program."
     )
 
 
