@@ -469,8 +469,8 @@ class Fault(Enum):
         if text in _INTACT_IN_KEYSTORE:
             return (
                 f"Export the enclave again from the {ORIGINAL_KEYSTORE}: `sros distribute_key "
-                "{root} {enclave} TARGET --force`. Only if `sros check {root}` finds the same "
-                f"there, do this first: {text[0].lower()}{text[1:]}"
+                "{root} {enclave} TARGET --force`. If `sros check {root}` finds an error there, "
+                "first do what it says."
             )
         return remedy_in_original_keystore(text)
 

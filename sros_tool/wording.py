@@ -17,11 +17,15 @@ def counted(number: int, noun: str, plural: str = "") -> str:
 
 
 def first_few(
-    texts: Sequence[str], maximum: int, separator: str = ", ", joint: str = " and "
+    texts: Sequence[str], maximum: int, separator: str = ", ", joint: str = " and ", noun: str = ""
 ) -> str:
-    """Return at most ``maximum`` texts and the number of the others: "a, b and 3 more"."""
+    """Return at most ``maximum`` texts and the number of the others: "a, b and 3 more".
+
+    With the ``noun`` "name", the number is "3 more names".
+    """
     left_out = len(texts) - maximum
-    return separator.join(texts[:maximum]) + (f"{joint}{left_out} more" if left_out > 0 else "")
+    number = counted(left_out, f"more {noun}") if noun else f"{left_out} more"
+    return separator.join(texts[:maximum]) + (f"{joint}{number}" if left_out > 0 else "")
 
 
 def natural_sort_key(name: str) -> list[tuple[int, str]]:

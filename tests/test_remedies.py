@@ -141,7 +141,7 @@ def test_a_remedy_in_a_folder_of_close_names_close(tmp_path: Path) -> None:
     in_export = Fault.FILE_MISSING.remedy_in_export("permissions.p7s")
     renew = remedy_in_original_keystore("Renew it: `sros renew KEYSTORE ENCLAVE`.")
     for remedy, said in (
-        (in_export.format(root="KEYSTORE", enclave="/a"), f"Run `sros close {tmp_path}`. Only if"),
+        (in_export.format(root="KEYSTORE", enclave="/a"), f"Run `sros close {tmp_path}`. If `s"),
         (renew, f"Renew it: `sros renew {keystore} ENCLAVE`. Then {close}."),
         ("export them again (`sros distribute_key K E TARGET --force`), or", f"{close}, or"),
         ("Run `sros zenoh KEYSTORE`, export again, and", f"zenoh {keystore}`, {close}, and"),

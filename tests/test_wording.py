@@ -28,6 +28,7 @@ def test_what_is_left_out_is_counted(most: int, words: str) -> None:
 
 def test_clauses_have_their_own_separators() -> None:
     assert first_few(["a", "b", "c"], 2, "; ", "; and ") == "a; b; and 1 more"
+    assert first_few(["a", "b", "c"], 1, noun="name") == "a and 2 more names"
 
 
 @pytest.mark.parametrize(

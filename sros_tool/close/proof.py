@@ -535,7 +535,7 @@ def _proof_of_talk(running: RunningRobot, nodes: ObservedNodes, away: Collection
         if status and audited["settled"] and not any(differences.values()):
             differences = {"not done": ["`sros audit` fails, and does not say why"]}
         reasons = {
-            why: f"{why}: {first_few(names, MOST_NAMES)}"
+            why: f"{why}: {first_few(names, MOST_NAMES, '; ', '; and ')}"
             for why, names in differences.items()
             if names
         }
@@ -769,7 +769,7 @@ def _endpoint_texts(endpoints: Iterable[tuple[str, Endpoint]]) -> list[str]:
     names: dict[str, list[str]] = {}
     for node, right, name in sorted({(node, *ros_use(endpoint)) for node, endpoint in endpoints}):
         names.setdefault(f"{node} {right}", []).append(name)
-    return [f"{uses} {first_few(names[uses], MOST_NAMES)}" for uses in names]
+    return [f"{uses} {first_few(names[uses], MOST_NAMES, noun='name')}" for uses in names]
 
 
 def _abandoned_names(

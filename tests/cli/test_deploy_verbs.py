@@ -346,9 +346,10 @@ def test_verify_reports_faults_and_sets_its_exit_status(keystore: Path, tmp_path
     assert (
         "Export the enclave again from the keystore that has the CA keys: `sros distribute_key "
     ) in ended.out
-    first = "Only if `sros check KEYSTORE` finds the same there, do this first: "
-    assert f"{first}create the missing file: `sros create_enclave KEYSTORE /b`." in ended.out
-    assert f"{first}sign the permissions again: `sros create_permission KEYSTORE /b " in ended.out
+    at_home = "TARGET --force`. If `sros check KEYSTORE` finds an error there, first do what it"
+    assert ended.out.count(at_home) == 2, "both faults have one remedy"
+    started = sros("run", out, "/b", "--domain", "0", "--", "true")
+    assert started.status == 2 and started.err.count(at_home) == 1, started
     assert f"{out}/enclaves/a/key.pem: error: a private key that others can read" in ended.out
     assert f"chmod 600 {out}/enclaves/a/key.pem`" in ended.out
     said = json.loads(sros("verify", out, "--json", "--at", "2026-12-24", "--domain", "7").out)

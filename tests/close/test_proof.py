@@ -14,6 +14,7 @@ from sros_tool.close import proof
 from sros_tool.close.nodes import MovedEndpoint
 from sros_tool.close.proof import (
     _abandoned_names,
+    _endpoint_texts,
     _endpoints_without_peer,
     _proof_of_connections,
     _proof_of_requirements,
@@ -51,6 +52,12 @@ def test_a_name_that_moved_leaves_nobody_alone() -> None:
     right = Right("/base", ALLOW, "subscribe", "/cmd_vel")
     denied = DeniedRight(right, ("/base",), "no rule", False, False, (heard,))
     assert not _abandoned_names(seen, seen, moved, [denied])
+
+
+def test_names_that_are_left_out_are_not_counted_as_nodes() -> None:
+    """The list of nodes may end in "and 1 more" itself."""
+    used = [("/a", Endpoint(f"rt/t{number}", "publish")) for number in range(5)]
+    assert _endpoint_texts(used) == ["/a publish /t0, /t1, /t2 and 2 more names"]
 
 
 def test_a_moved_node_is_left_alone_if_nobody_is_at_its_new_name() -> None:
