@@ -358,11 +358,13 @@ def _fetch_error(error: Exception, source: str, now: datetime) -> FetchError:
         )
     return FetchError(
         FetchProblem.NOT_SIGNED,
-        f"the files in {source} are not signed with the trusted keys",
-        f"{why} Somebody changed them, or all keys of `sros fleet publish` were made again. "
-        "Nothing was changed.",
-        "If the keys were made again, run `sros agent init` with --force and the new root.json "
-        "(docs/howto/keystore_is_lost.md).",
+        f"the files in {source} are damaged, or not signed with the trusted keys",
+        f"{why} A file was damaged or changed; or the keystore publishes with other keys than "
+        "before, after it was restored from a backup or made again. Nothing was changed.",
+        "If the keystore is as before, copy the published files again. If it was restored, and a "
+        "key of publishing was replaced after the backup, add the later root.json and --rotate-key "
+        "to `sros fleet publish`; if all keys were made again, run `sros agent init` with --force "
+        "and the new root.json (docs/howto/keystore_is_lost.md, --rotate-key).",
     )
 
 

@@ -788,6 +788,23 @@ def test_a_keystore_that_was_restored_from_before_its_keys_were_replaced(publish
     assert robot.gets() == publisher.robot().gets()
 
 
+def test_replaced_keys_of_publishing_that_only_robots_know(publisher: Home) -> None:
+    """The publishing folder is lost, too, so robots refuse what the keys of the backup sign."""
+    backup, robot = copy_of(publisher.root, publisher.folder / "backup"), publisher.robot()
+    publisher.publish(rotate=("timestamp",))
+    robot.gets()
+    shutil.rmtree(publisher.root)
+    shutil.rmtree(publisher.pub)
+    backup.rename(publisher.root)
+    notes = {n.id: n.text for n in publisher.publish(restored=True, new_folder=True).notes}
+    assert "the root metadata up to version 1, and nothing in" in notes["fleet.root-not-seen"]
+    assert "--rotate-key" in robot.refuses(FetchProblem.NOT_SIGNED).remedy
+    (known,) = robot.state.rglob("root_history/2.root.json")
+    shutil.copy(known, publisher.pub / "metadata")
+    publisher.publish(rotate=("timestamp",))
+    assert robot.gets() == publisher.robot().gets()
+
+
 def test_a_keystore_that_was_restored_from_before_all_robots_were_revoked(
     publisher: Home,
 ) -> None:
@@ -1052,8 +1069,8 @@ def test_a_restore_in_which_nothing_shows_what_was_revoked_says_since_when(
     shutil.rmtree(publisher.pub)
     last = OpenedKeystore(publisher.root).ledger_file.last_time()
     assert last
-    (note,) = publisher.publish(restored=True, new_folder=True).notes
-    assert note.id == "fleet.revocations-not-shown"
+    note, of_root = publisher.publish(restored=True, new_folder=True).notes
+    assert (note.id, of_root.id) == ("fleet.revocations-not-shown", "fleet.root-not-seen")
     assert (
         f"which rights were taken away, after {iso(last)}, the last entry of the ledger"
         in note.text

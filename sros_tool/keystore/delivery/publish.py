@@ -790,6 +790,8 @@ class _Publication:
                         forgotten.add(content)
             else:
                 self._notes.append(self._hidden_revocations_note())
+            if is_lost and not self._has_later_root:
+                self._notes.append(self._unseen_root_note())
             self._restore(forgotten, keyring)
             self._is_restored = True
         self._check_removed()
@@ -862,6 +864,18 @@ class _Publication:
             "what messages of robots show. Revoke again what else was stolen (`sros revoke "
             f"{where} --robot NAME`), and sign the present policy (`sros generate_artifacts`). "
             "Then publish again.",
+        )
+
+    def _unseen_root_note(self) -> Note:
+        """Return a note on replaced keys of publishing, which an empty folder does not show."""
+        version = self.roots.last.version
+        return Note(
+            "fleet.root-not-seen",
+            f"the keystore knows the root metadata up to version {version}, and nothing in "
+            f"'{self._folder}' shows a later one. If a robot has a later N.root.json in "
+            ".agent/metadata/root_history, keys of publishing were replaced after the backup, and "
+            f"robots refuse this publication: copy the later files to '{self._folder}/metadata', "
+            f"and run {self._command} with --rotate-key ROLE for each replaced key.",
         )
 
     def _not_restored_error(self) -> KeystoreError:
