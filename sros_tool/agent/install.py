@@ -69,7 +69,7 @@ from sros_tool.pki.certificates import (
     validity_of,
 )
 from sros_tool.pki.crl import last_update, newest_list, next_update, read_lists
-from sros_tool.pki.keys import PrivateKey, PublicKey, key_pem, load_key
+from sros_tool.pki.keys import PrivateKey, PublicKey, key_pem, load_enclave_key
 from sros_tool.validity import iso
 from sros_tool.wording import enumerated
 
@@ -445,7 +445,7 @@ def _present_key(folder: Folder, name: str, files: Mapping[str, bytes]) -> Publi
     """
     place = enclave_folder(name)
     if (data := _read_file(folder, f"{place}/{KEY_FILE}")) is not None:
-        return load_key(data, f"of enclave {name}").public_key()
+        return load_enclave_key(data, f"of enclave {name}").public_key()
     if KEY_URI_FILE in files or folder.state(f"{place}/{KEY_URI_FILE}"):
         if (data := _read_file(folder, f"{place}/{REQUEST}")) is not None:
             return load_request(data, f"of enclave {name}").public_key

@@ -41,6 +41,7 @@ from sros_tool.pki.keys import (
     PublicKey,
     algorithm,
     check_key,
+    holds_private_key,
     is_weak,
     key_problem,
 )
@@ -846,6 +847,18 @@ def load_request(data: bytes, label: str) -> SigningRequest:
             request.signature_hash_algorithm,
         )
         stated_name = subject_text(subject)
+    if holds_private_key(data):
+        raise PkiError(
+            f"the request {label} has a private key next to it",
+            "A private key stays on the robot: whoever saw this one can act as the enclave.",
+            "Make another key with `sros create_request`, and send only its request.pem.",
+        )
+    if isinstance(public, rsa.RSAPublicKey) and not _states_key(request, public):
+        raise PkiError(
+            f"the request {label} is for an RSA key for RSA-PSS alone",
+            "No DDS vendor loads such a key next to a certificate of the keystore.",
+            "Create the key with `sros create_request`.",
+        )
     if not (
         isinstance(public, ec.EllipticCurvePublicKey) and public.curve.name == "secp256r1"
     ) and (not (isinstance(public, rsa.RSAPublicKey) and public.key_size == 2048)):
@@ -877,6 +890,17 @@ def load_request(data: bytes, label: str) -> SigningRequest:
     return SigningRequest(
         common_name_of(subject), public, request.public_bytes(serialization.Encoding.PEM)
     )
+
+
+def _states_key(request: x509.CertificateSigningRequest, key: rsa.RSAPublicKey) -> bool:
+    """Return whether a request states its key as a certificate would, which RSA-PSS alone is not.
+
+    `cryptography` reads a key for RSA-PSS alone as one of any use.
+    """
+    stated = key.public_bytes(
+        serialization.Encoding.DER, serialization.PublicFormat.SubjectPublicKeyInfo
+    )
+    return stated in request.tbs_certrequest_bytes
 
 
 def _has_valid_signature(request: x509.CertificateSigningRequest) -> bool:

@@ -108,6 +108,22 @@ def load_key(pem: bytes, name: str, passphrase: Callable[[], str] | None = None)
     return key
 
 
+def load_enclave_key(pem: bytes, name: str) -> PrivateKey:
+    """Return the key of an enclave, as `load_key`, for which the keystore can issue a certificate.
+
+    Raises:
+        PkiError: as `load_key`, or the key is for RSA-PSS alone.
+    """
+    key = load_key(pem, name)
+    if is_key_for_pss(pem):
+        raise PkiError(
+            f"the private key {name} is an RSA key for RSA-PSS alone",
+            "No DDS vendor loads it next to a certificate of the keystore.",
+            "Make another key with `sros create_request`, in another folder.",
+        )
+    return key
+
+
 def load_any_key(
     pem: bytes, name: str, passphrase: Callable[[], str] | None = None
 ) -> PrivateKeyTypes:

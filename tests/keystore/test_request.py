@@ -49,7 +49,7 @@ from sros_tool.pki.certificates import (
     make_request,
     validity_of,
 )
-from sros_tool.pki.keys import generate_key
+from sros_tool.pki.keys import generate_key, key_pem, load_key
 from sros_tool.policy.document import read_policy
 from tests.support.children import run
 from tests.support.harness import (
@@ -419,6 +419,14 @@ BAD_REQUESTS: dict[str, tuple[Callable[[], bytes], str]] = {
     "a relative name": (lambda: request_with(generate_key(), "camera"), "not a valid enclave"),
     "dots": (lambda: request_with(generate_key(), "/../x"), "not a valid enclave"),
     "a wildcard": (lambda: request_with(generate_key(), "/*"), "not a valid enclave"),
+    "two requests": (
+        lambda: request_with(generate_key()) + request_with(generate_key(), "/base"),
+        "several requests",
+    ),
+    "its private key": (
+        lambda: request_with(key := generate_key()) + key_pem(key),
+        "has a private key next to it",
+    ),
     "no name": (lambda: other_subject(generate_key()), "an empty subject"),
     "more than a name": (
         lambda: other_subject(generate_key(), (_OU, "0123"), (_CN, NAME)),
@@ -450,6 +458,24 @@ def test_a_request_of_openssl_with_rsa_works(home: Path, tmp_path: Path) -> None
     run(command)
     import_answer(tmp_path / "robot", sign(home, tmp_path / "robot").archive, now=NOW)
     assert verify_arrival(tmp_path / "robot", now=NOW).enclaves[0].loadable
+
+
+def test_a_key_for_pss_alone_gets_no_certificate(home: Path, tmp_path: Path) -> None:
+    """No DDS loads such a key next to a certificate, which states an RSA key of any use."""
+    folder = tmp_path / "robot" / FOLDER
+    folder.mkdir(parents=True)
+    key, request = folder / "key.pem", folder / "request.pem"
+    run(["openssl", "genpkey", "-algorithm", "RSA-PSS", "-out", str(key)])
+    subject = ["-subj", r"/CN=\/arm\/camera"]
+    run(["openssl", "req", "-new", "-key", str(key), *subject, "-out", str(request)])
+    with pytest.raises(PkiError, match="for RSA-PSS alone"):
+        sign_request(home, request.read_bytes(), now=NOW)
+    with pytest.raises(PkiError, match="for RSA-PSS alone"):
+        create_request(tmp_path / "robot", NAME, again=True)
+    request.write_bytes(make_request(load_key(key.read_bytes(), "drawn"), NAME))
+    archive = sign(home, tmp_path / "robot").archive
+    with pytest.raises(PkiError, match="for RSA-PSS alone"):
+        import_answer(tmp_path / "robot", archive, now=NOW)
 
 
 def test_a_policy_without_the_enclave_is_refused(home: Path, robot: Path, tmp_path: Path) -> None:

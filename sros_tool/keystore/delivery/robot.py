@@ -83,7 +83,7 @@ from sros_tool.pki.certificates import (
     validity_of,
 )
 from sros_tool.pki.crl import SUPERSEDED, load_crl
-from sros_tool.pki.keys import PrivateKey, PublicKey, generate_key, key_pem, load_key
+from sros_tool.pki.keys import PrivateKey, PublicKey, generate_key, key_pem, load_enclave_key
 from sros_tool.pki.token import (
     Secrets,
     TokenKey,
@@ -164,7 +164,7 @@ def create_request(
         if again and on_token.exists() and not path.exists():
             made = open_enclave_key(place_in(on_token), secrets)
         elif again:
-            made = load_key(read_bytes(path, "private key"), f"'{path}'")
+            made = load_enclave_key(read_bytes(path, "private key"), f"'{path}'")
         elif (folder / place / CERTIFICATE_FILE).exists():
             raise KeystoreError(
                 f"enclave {name} has a certificate in '{folder}', but no key",

@@ -48,7 +48,7 @@ from sros_tool.pki.certificates import (
     validity_of,
 )
 from sros_tool.pki.crl import Revocations, newest_revocations
-from sros_tool.pki.keys import PublicKey, load_key
+from sros_tool.pki.keys import PublicKey, load_enclave_key
 from sros_tool.validity import iso
 from sros_tool.wording import counted
 from sros_tool.xml import read_bytes
@@ -352,7 +352,7 @@ def public_key_of(place: Path, name: str) -> PublicKey:
     """
     path = place / KEY_FILE
     if path.exists():
-        return load_key(read_bytes(path, "private key"), f"'{path}'").public_key()
+        return load_enclave_key(read_bytes(path, "private key"), f"'{path}'").public_key()
     request = load_request(read_bytes(place / REQUEST, "signing request"), f"of enclave {name}")
     return request.public_key
 

@@ -145,6 +145,12 @@ def sign_request(
             enclave; ``answer`` exists; the keystore cannot issue; no vendor would accept the
             enclave, or a vendor that accepts it today would no longer do so.
     """
+    if data.count(_REQUEST_END) > 1:
+        raise DocumentError(
+            "there are several requests, and an answer is for one",
+            "",
+            "Give the request of one enclave, or add --no-answer.",
+        )
     request = load_request(data, "that was given")
     if only_enclaves:
         _check_requested_enclaves([request], only_enclaves)
