@@ -444,7 +444,9 @@ class LastMessage(NamedTuple):
     boots: tuple[str, ...] = ()
     """Ids of the computer's starts that sent messages, the latest first."""
     alternated: datetime | None = None
-    """When a message last came from an earlier start of the computer than the message before."""
+    """When a message last came from an earlier start of the computer than the message before, or
+    with an earlier release.
+    """
 
     def successor(self, boot: str | None, now: datetime) -> tuple[tuple[str, ...], datetime | None]:
         """Return ``boots`` and ``alternated`` for the next record, after a message from ``boot``.
@@ -478,8 +480,9 @@ class ReceivedConfirmation:
         if alternated is None or self.time - alternated > timedelta(days=1):
             return ""
         return (
-            f"{_TWO_COMPUTERS} send messages in turn, last at {iso(alternated)}; perhaps a disk "
-            "was copied. The files of the other computer are not known."
+            f"{_TWO_COMPUTERS} seem to send messages in turn: an earlier start or release came "
+            f"back, last at {iso(alternated)}. Perhaps a disk was copied or restored. The files of "
+            "the other computer are not known."
         )
 
     def clock_note(self) -> str:

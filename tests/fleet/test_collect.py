@@ -340,10 +340,22 @@ def test_an_older_message_in_a_second_inbox(home: Home) -> None:
 
 
 def test_two_computers_with_the_keys_of_a_robot_are_noted(home: Home) -> None:
-    for release, is_noted in ((3, False), (2, True), (3, False)):
+    """Also in the status, until a day after the last message with an earlier release."""
+    home.run("fleet", "publish", "ks", "pub")
+    last = read_published(OpenedKeystore(home.root)).number
+    for release, is_noted, is_shown in (
+        *((last + 1, False, False), (last, True, False)),  # nobody published the first one
+        *((last - 1, True, True), (last, False, True)),
+    ):
         home.send("r1", release=release)
         remarks = "".join(home.of("r1").remarks)
         assert ("two computers have its keys" in remarks) == is_noted
+        (r1,) = fleet_status(OpenedKeystore(home.root), ["r1"]).robots
+        assert any("Two computers" in text for text in r1.problems or ()) == is_shown
+    home.send("r1", NOW + timedelta(days=2), release=last - 1)
+    assert not home.collect(NOW + timedelta(days=2), restored=["r1"]).robots[0].remarks
+    (r1,) = fleet_status(OpenedKeystore(home.root), ["r1"]).robots
+    assert not r1.problems, "--restored explains it"
 
 
 def test_two_computers_that_are_alike_are_seen_by_their_starts(home: Home) -> None:

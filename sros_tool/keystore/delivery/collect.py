@@ -539,7 +539,12 @@ class _Verifier:
             )
         arrived = self._arrival(file, last)
         message = LastMessage(sequence, sha256, verified.enclave)
+        installed, before_it = verified.confirmation.release, last and last.confirmation.release
+        went_back = installed is not None and installed < (before_it or 0) and not is_restored
         boots, alternated = (before or message).successor(verified.confirmation.boot, arrived)
+        # A new agent begins without a release, and a robot can only claim unpublished releases.
+        if went_back and installed and self._is_published(before_it):
+            alternated = arrived
         received = ReceivedConfirmation(
             replace(verified.confirmation, requests=None, crl=None, seal=None),
             arrived,
@@ -547,8 +552,7 @@ class _Verifier:
         )
         if note := received.clock_note():
             remarks.append(note)
-        installed, before_it = verified.confirmation.release, last and last.confirmation.release
-        if installed is not None and installed < (before_it or 0) and not is_restored:
+        if went_back:
             remarks.append(
                 f"it has release {installed or 'none'}, and had {before_it} before: its disk was "
                 "restored, or two computers have its keys"
@@ -556,6 +560,11 @@ class _Verifier:
         return _ReceivedMessage(
             robot, "kept", verified=verified, received=received, remarks=remarks
         )
+
+    def _is_published(self, release: int | None) -> bool:
+        """Return whether the ledger has a release with this number."""
+        entries = self._keystore.ledger_with("what", "release").entries
+        return any(entry.what == "release" and entry.number == release for entry in entries)
 
     def _arrival(self, file: _File, last: ReceivedConfirmation | None) -> datetime:
         """Return when the file of a message was written, but no earlier than the last message.
