@@ -539,8 +539,9 @@ class _Verifier:
             )
         arrived = self._arrival(file, last)
         message = LastMessage(sequence, sha256, verified.enclave)
-        installed, before_it = verified.confirmation.release, last and last.confirmation.release
-        went_back = installed is not None and installed < (before_it or 0) and not is_restored
+        installed = verified.confirmation.release
+        before_it = (last.confirmation.release if last else None) or 0
+        went_back = installed is not None and installed < before_it and not is_restored
         boots, alternated = (before or message).successor(verified.confirmation.boot, arrived)
         # A new agent begins without a release, and a robot can only claim unpublished releases.
         if went_back and installed and self._is_published(before_it):
@@ -561,7 +562,7 @@ class _Verifier:
             robot, "kept", verified=verified, received=received, remarks=remarks
         )
 
-    def _is_published(self, release: int | None) -> bool:
+    def _is_published(self, release: int) -> bool:
         """Return whether the ledger has a release with this number."""
         entries = self._keystore.ledger_with("what", "release").entries
         return any(entry.what == "release" and entry.number == release for entry in entries)
