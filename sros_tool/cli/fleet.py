@@ -889,7 +889,10 @@ def _revocation_list_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
             have = "have" if waiting > 1 else "has"
             text += f"; {waiting} more {have} the list, but perhaps not all processes there "
             text += "have loaded it and the current CAs"
-        if (until := status.revoked_until) and until > compared_fleet.at:
+        if (until := status.revoked_until) is None:
+            text += "; until when robots need it is not known, because the ledger lacks a revoked "
+            text += "certificate"
+        elif until > compared_fleet.at:
             text += f"; robots need it until {until:%Y-%m-%d}, when "
             text += "the revoked certificates have expired"
         yield text

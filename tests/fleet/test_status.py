@@ -462,6 +462,10 @@ def test_until_when_a_revocation_is_needed(field: Field, monkeypatch: pytest.Mon
     assert field.status()["revoked_until"] == iso(until), "a process may trust the earlier CA"
     (field.root / "ledger.jsonl").unlink()
     assert field.status()["revoked_until"] is None, "nobody knows"
+    assert (
+        "until when robots need it is not known, because"
+        in field.run("fleet", "status", "ks", status=1).out
+    )
 
 
 def test_a_revoked_robot_comes_back_by_the_commands_that_errors_name(field: Field) -> None:
