@@ -354,10 +354,13 @@ def _read_given_list(path: Path | None) -> bytes:
 def _enclaves_by_serial(
     keystore: OpenedKeystore, lists: Sequence[RevocationList]
 ) -> dict[str, str]:
-    """Map the serial numbers in ``lists`` to enclaves, by the records of the ledger."""
+    """Map the serial numbers in ``lists`` to enclaves, by the records of the ledger.
+
+    The record of a revocation that a restore repeated names no enclave.
+    """
     serials = {f"{entry.serial:x}" for crl in lists for entry in crl.revoked}
     ledger = keystore.ledger_file.with_values("serial", serials)
-    return {entry.serial: entry.enclave for entry in ledger.entries if entry.serial}
+    return {entry.serial: entry.enclave for entry in ledger.entries if entry.enclave}
 
 
 def _list_lines(lists: Sequence[RevocationList], names: Mapping[str, str]) -> Iterator[str]:

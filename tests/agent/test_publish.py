@@ -1425,6 +1425,8 @@ def test_a_revoked_key_that_a_robot_made_is_replaced_on_the_robot(publisher: Hom
     (note,) = (each.text for each in done.notes if each.id == "fleet.replaced-after-backup")
     assert f"for {name}, new keys that their robots make" in note
     assert f"`sros renew {root} /r1/base --new-key --revoke-old`" in note
+    _, *revoked = sros("crl", root, cwd=publisher.folder).out.splitlines()
+    assert {line.split()[-1] for line in revoked} == {name, "/r1/base"}
     with pytest.raises(KeystoreError, match="was revoked"):
         sign_request(root, files[0].read_bytes(), renew=True, now=publisher.now)
     sign_request(root, files[1].read_bytes(), renew=True, now=publisher.now)
