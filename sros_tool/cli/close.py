@@ -73,7 +73,8 @@ def _run(words: Sequence[str], shows_output: bool) -> tuple[int, str, str]:
     "--partial",
     is_flag=True,
     help="Accept processes whose nodes sros does not know, nodes that belong to no process here, "
-    "processes that sros could not examine, and processes in enclaves that sros did not observe.",
+    "processes that sros could not examine, processes in enclaves that sros did not observe, and "
+    "requirements on names that the policy no longer has.",
 )
 @click.option(
     "--without",

@@ -47,8 +47,11 @@ from sros_tool.keystore.layout import (
     list_enclaves,
 )
 from sros_tool.keystore.reader import OpenedKeystore
+from sros_tool.keystore.rights import load_rights
 from sros_tool.keystore.selection import revocation_of
 from sros_tool.policy.document import read_policy
+from sros_tool.policy.rights import policy_rights
+from sros_tool.proof.requirements import RightsRequirement, read_requirements
 from sros_tool.runtime.environment import RMW_ZENOH, node_argument
 from sros_tool.runtime.processes import SEVERAL_USERS, without_launch_files
 from sros_tool.runtime.rmw import (
@@ -226,7 +229,7 @@ def _run_steps(
                 _, output, messages = robot.shell.run((*step.words, "--dry-run"), False)
                 robot.shell.say_lines(messages if output else "")
         elif state == "open" and not is_stopped:
-            state, step_problems = _run_step(robot, step)
+            state, step_problems = _run_step(robot, step, partial=partial)
             problems += step_problems
             is_stopped = step.guards and state == "findings"
         done.append(CloseStep(step.command, state))
@@ -267,7 +270,7 @@ def steps(robot: LocalRobot, duration: str | None) -> Iterator[CommandStep]:
     yield CommandStep(("view", policy, *created, "-o", str(robot.page), "--force"))
 
 
-def _run_step(robot: LocalRobot, step: CommandStep) -> tuple[str, list[str]]:
+def _run_step(robot: LocalRobot, step: CommandStep, *, partial: bool) -> tuple[str, list[str]]:
     """Run a step; return its state, and the reasons why the robot is not closed yet.
 
     Raises:
@@ -287,6 +290,8 @@ def _run_step(robot: LocalRobot, step: CommandStep) -> tuple[str, list[str]]:
             if not line.startswith(EARLIER_FILES):  # this run exports, and says what to restart
                 robot.shell.say(line)
     needed = shlex.quote(str(robot.requirements))
+    if step.guards and not (status or partial) and (lost := [*_lost_protection(robot)]):
+        return "findings", lost
     if step.guards and VACUOUS.id in output:
         robot.shell.say(
             f"`sros review` refuses a requirement that nothing can break: edit {needed}"
@@ -300,6 +305,28 @@ def _run_step(robot: LocalRobot, step: CommandStep) -> tuple[str, list[str]]:
     if step.into:
         replace_file(step.into, output.encode())
     return "done", []
+
+
+def _lost_protection(robot: LocalRobot) -> Iterator[str]:
+    """Yield a text for each requirement with a name that only the signed permissions have.
+
+    If the policy gave the name up for another one, the requirement does not protect the new name.
+    """
+    if not robot.keystore.exists():
+        return
+    signed = {right.name for right in load_rights(OpenedKeystore(robot.keystore)).rights}
+    gone = signed - {right.name for right in policy_rights(read_policy(robot.policy))}
+    for requirement in read_requirements(robot.requirements):
+        if not isinstance(requirement, RightsRequirement):
+            continue
+        required = {name for _, names in requirement.rights for name in names}
+        if lost := sorted(gone & required):
+            yield (
+                f"{robot.requirements}:{requirement.source.line} protects {enumerated(lost)}, "
+                "which the policy does not name any more; nothing was signed. If the policy "
+                "renamed it, also rename it in the requirement. If nobody needs it any more, "
+                "remove it there (or accept this with --partial)"
+            )
 
 
 def _enclaves_without_origin(robot: LocalRobot) -> list[str]:

@@ -1619,14 +1619,30 @@ def test_what_is_exported_without_the_enclaves_of_other_machines(
 def test_a_requirement_that_lost_its_right_is_told_before_a_review_fails(tmp_path: Path) -> None:
     (tmp_path / "policy.xml").write_text(policy_text({"/a": publish("x")}))
     said: list[str] = []
-    shell = Shell(close._run, said.append, {}, lambda: datetime.now(UTC), UTC)
+
+    def run(words: Any, live: bool) -> tuple[int, str, str]:
+        _, output, messages = close._run(words, live)
+        return 0, output, messages  # the policy has other errors
+
+    shell = Shell(run, said.append, {}, lambda: datetime.now(UTC), UTC)
     robot = LocalRobot(tmp_path, 0, shell)
     (guard,) = (step for step in steps(robot, None) if step.guards)
     for name, told in (("x", False), ("gone", True)):
         needed = f'[[only]]\npublish = ["/{name}"]\nenclaves = ["/a"]\n'
         (tmp_path / "requirements.toml").write_text(needed)
-        preparation._run_step(robot, guard)
+        preparation._run_step(robot, guard, partial=False)
         assert ("`sros review` refuses a requirement" in said[-1]) is told, said
+    # A name that is changed only in the policy loses its protection.
+    sros("create_keystore", robot.keystore).ok()
+    sros("generate_artifacts", "-k", robot.keystore, "-p", robot.policy).ok()
+    assert preparation._run_step(robot, guard, partial=False) == ("done", []), "as before"
+    robot.requirements.write_text(needed.replace("gone", "x"))
+    robot.policy.write_text(policy_text({"/a": publish("y")}))
+    state_of_step, (problem,) = preparation._run_step(robot, guard, partial=False)
+    assert (
+        state_of_step == "findings" and "toml:1 protects /x, which the policy does not" in problem
+    )
+    assert preparation._run_step(robot, guard, partial=True) == ("done", [])
 
 
 def test_a_process_with_a_new_key_is_restarted_before_others(tmp_path: Path) -> None:
