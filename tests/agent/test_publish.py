@@ -781,7 +781,7 @@ def test_a_keystore_that_was_restored_from_before_its_keys_were_replaced(publish
     roots = Roots(json.loads((publisher.root / "fleet_root.json").read_text())["roots"])
     roots.add_later_versions(publisher.pub)
     assert roots.last.version == 2, "the key of 2 did not sign 3"
-    with pytest.raises(KeystoreError, match="is not the timestamp key with which"):
+    with pytest.raises(KeystoreError, match=r"timestamp key .* was published last. A later copy"):
         publisher.publish()
     foreign.unlink()
     assert publisher.publish(rotate=("timestamp",)).root.name == "3.root.json"

@@ -51,6 +51,7 @@ from sros_tool.pki.certificates import (
 )
 from sros_tool.pki.keys import generate_key, key_pem, load_key
 from sros_tool.policy.document import read_policy
+from sros_tool.validity import iso
 from tests.support.children import run
 from tests.support.harness import (
     certificate,
@@ -261,6 +262,9 @@ def test_a_request_for_an_existing_enclave_is_refused(
     assert f"`sros renew {home} {NAME} --revoke-old`" in note.text
     with pytest.raises(KeystoreError, match=f"{NAME} --revoke-old`"):
         renew(home, [NAME], now=LATER, new_key=True, revoke_old=True)
+    ended = validity_of(certificate(home / FOLDER / "cert.pem")).not_after
+    (note,) = sign_request(home, request_of(robot), now=ended, renew=True).notes
+    assert note.text.endswith(f"The certificate of the old key expired at {iso(ended)}.")
 
 
 def test_other_commands_handle_an_enclave_whose_key_is_on_its_robot(

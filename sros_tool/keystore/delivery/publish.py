@@ -790,9 +790,9 @@ class _Publication:
                         forgotten.add(content)
             else:
                 self._notes.append(self._hidden_revocations_note())
+            self._restore(forgotten, keyring)
             if is_lost and not self._has_later_root:
                 self._notes.append(self._unseen_root_note())
-            self._restore(forgotten, keyring)
             self._is_restored = True
         self._check_removed()
         if is_lost or restored:

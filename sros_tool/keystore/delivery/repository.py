@@ -110,6 +110,7 @@ class Roots:
             DocumentError: the values are not a chain of root metadata.
         """
         self.versions: list[Metadata[Root]] = []
+        self._later_in: Path | None = None
         try:
             for number, document in enumerate(documents, 1):
                 version = Metadata[Root].from_dict(dict(document))
@@ -131,6 +132,7 @@ class Roots:
             try:
                 document = Metadata[Root].from_bytes(read_bytes(path, "root metadata")).to_dict()
                 self.versions = Roots([*self.as_json(), document]).versions
+                self._later_in = folder
             except (SrosError, RepositoryError, ValueError, KeyError, TypeError, AttributeError):
                 return
 
@@ -170,6 +172,15 @@ class Roots:
         wrong = [role for role, (signer, _) in signers.items() if not self.has_key(role, signer)]
         if wrong:
             which = enumerated([f"'{signers[role][1]}' is not the {role} key" for role in wrong])
+            if self._later_in and _ROOT not in wrong:
+                raise KeystoreError(
+                    f"{which} with which '{self._later_in}' was published last",
+                    "A later copy of this keystore replaced keys there, and robots would refuse "
+                    "the signatures of this copy.",
+                    "If the keystore was moved to another machine, publish only there, and remove "
+                    "this copy. If this keystore was restored from a backup, see "
+                    f"docs/howto/keystore_is_lost.md. {lost_key_remedy(*wrong)}",
+                )
             raise KeystoreError(
                 f"{which} with which this keystore publishes",
                 "Robots would refuse the signatures.",

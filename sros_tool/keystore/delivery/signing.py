@@ -419,7 +419,7 @@ class _RequestCertifier:
                 f"If you have the robot back and it may have the enclave, add --enclave {name}.",
             )
         if present:
-            note = _new_key_note(root, present, request)
+            note = _new_key_note(root, present, request, change.now)
             change.notes += note or [*known.shared_notes([name])]
         else:
             self._new.append(name)
@@ -620,19 +620,22 @@ def _check_answer_usable(answer: RequestAnswer, request: SigningRequest, now: da
         ) from error
 
 
-def _new_key_note(root: Path, old: x509.Certificate, request: SigningRequest) -> list[Note]:
+def _new_key_note(
+    root: Path, old: x509.Certificate, request: SigningRequest, now: datetime
+) -> list[Note]:
     """Return a note if the request's key is not the key of the current certificate ``old``."""
     if old.public_key() == request.public_key:
         return []
-    until = iso(validity_of(old).not_after)
-    return [
-        Note(
-            "request.new-key",
-            f"{request.name}: the request has a new key. The certificate of the old key "
-            f"stays valid until {until} for anyone who has that key. To revoke it: "
-            f"`sros renew {quote(str(root))} {quote(request.name)} --revoke-old`.",
+    until = validity_of(old).not_after
+    if until <= now:
+        rest = f"The certificate of the old key expired at {iso(until)}."
+    else:
+        rest = (
+            f"The certificate of the old key stays valid until {iso(until)} for anyone who has "
+            f"that key. To revoke it: `sros renew {quote(str(root))} {quote(request.name)} "
+            "--revoke-old`."
         )
-    ]
+    return [Note("request.new-key", f"{request.name}: the request has a new key. {rest}")]
 
 
 def _lost_rights_notes(
