@@ -12,7 +12,7 @@ a person decides.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Set
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -33,6 +33,7 @@ from sros_tool.graph.observation import PUBLISH, SUBSCRIBE
 from sros_tool.names import (
     ACTION_SEPARATOR,
     ACTION_TOPICS,
+    PARAMETER_SERVICES,
     check_enclave_name,
     expression_problem,
     is_expression,
@@ -53,6 +54,7 @@ from sros_tool.runtime.vendor_log import (
     plain_text,
     security_directory,
 )
+from sros_tool.wording import enumerated
 
 _MAX_LINES_TO_DIRECTION = 3
 """Number of log lines after a denial that are searched for its direction."""
@@ -244,6 +246,10 @@ _ALL_BASIC_RIGHTS_TEXT = (
     "together, instead of one after each restart: {}"
 )
 _OTHER_ENCLAVE_TEXT = "not proposed, because the log names another enclave than --enclave: {}"
+PARAMETER_CLIENT_TEXT = (
+    "a parameter client of rclpy needs all six parameter services of the other node, and a log may "
+    "have only the first that is denied: for such a client, also add {}"
+)
 _SEVERAL_ENCLAVES_NOTE = Note(
     "log.several-enclaves",
     "the log names several enclaves, and each denial is assigned to the enclave that its process "
@@ -336,6 +342,7 @@ def as_learned(
     """
     profiles, assumed = [], dict[str, str]()
     other_nodes, parts_by_profile = dict[str, str](), dict[str, str]()
+    parameter_clients = dict[str, str]()
     for path, rights in sorted(_rights_by_enclave(missing_rights, enclave).items()):
         present = _profiles(policy, path)
         for profile, denied in sorted(_rights_by_profile(rights, node, present).items()):
@@ -356,6 +363,8 @@ def as_learned(
             )
             if parts:
                 parts_by_profile[_full_name(profile)] = ", ".join(parts)
+            if lacking := _lacking_parameter_services(denied, denied | has):
+                parameter_clients[f"to {_full_name(profile)}"] = lacking
             groups = groups_of(denied - node_rights, *profile)
             profiles.append(LearnedProfile(path, *profile, denied | node_rights, parts, groups))
     elsewhere = {
@@ -370,10 +379,26 @@ def as_learned(
             ("log.other-node", _NO_PROFILE_TEXT, other_nodes),
             ("log.common-part", _ALL_BASIC_RIGHTS_TEXT, parts_by_profile),
             ("log.other-enclave", _OTHER_ENCLAVE_TEXT, elsewhere),
+            ("log.parameter-client", PARAMETER_CLIENT_TEXT, parameter_clients),
         )
         if reasons
     ]
     return Learned(tuple(profiles), (*_notes(missing_rights), *notes), source=RightsFound.LOG)
+
+
+def _lacking_parameter_services(denied: Set[NodeRight], rights: Set[NodeRight]) -> str:
+    """Return which parameter services of other nodes ``rights`` lack, if one was ``denied``."""
+    asked = [right.name.rpartition("/") for right in denied if right.right == "request"]
+    nodes = sorted({node for node, _, service in asked if service in PARAMETER_SERVICES})
+    lacking = {
+        node: [
+            service
+            for service in PARAMETER_SERVICES
+            if NodeRight("request", f"{node}/{service}") not in rights
+        ]
+        for node in nodes
+    }
+    return ", ".join(f"{enumerated(names)} of {node}" for node, names in lacking.items() if names)
 
 
 def _rights_by_enclave(

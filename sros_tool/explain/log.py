@@ -31,7 +31,12 @@ from sros_tool.explain.asking import (
     policy_to_ask,
     signed_enclave,
 )
-from sros_tool.explain.denials import Denial, node_denied_own_service, read_denials
+from sros_tool.explain.denials import (
+    PARAMETER_CLIENT_TEXT,
+    Denial,
+    node_denied_own_service,
+    read_denials,
+)
 from sros_tool.explain.explanation import (
     likely_names,
     meaning_of_other_kind,
@@ -1327,11 +1332,9 @@ def _parameter_client_hint(denial: Denial, name: str) -> str:
     is_client = service_of(denial.topic)[0] and not node_denied_own_service(denial)
     if service not in PARAMETER_SERVICES or not is_client:
         return ""
-    return (
-        " A parameter client of rclpy needs all six parameter services of the other node, and a "
-        "log may have only the first that is denied: for such a client, add "
-        f"{enumerated(PARAMETER_SERVICES)} of {node}, all together."
-    )
+    others = enumerated([other for other in PARAMETER_SERVICES if other != service])
+    text = PARAMETER_CLIENT_TEXT.format(f"{others} of {node}")
+    return f" {text[0].upper()}{text[1:]}."
 
 
 def _last_part(name: str) -> str:

@@ -1382,7 +1382,7 @@ def test_the_other_side_of_a_name_tells_whether_a_remapping_may_be_forgotten(
     client, export = tmp_path / "client.log", tmp_path / "export"
     for service, fact in (
         ("drawer/open", "call /drawer/opn, which no enclave may reply: perhaps /drawer/open is me"),
-        ("camera/get_parameters", "set_parameters and set_parameters_atomically of /camera, all"),
+        ("camera/get_parameters", "set_parameters and set_parameters_atomically of /camera."),
     ):
         client.write_text(
             f"rq/{service}Request topic not found in allow rule. check_create_datawriter\n"
