@@ -890,7 +890,14 @@ def _first_line(path: Path) -> str:
     """Return the first line of a passphrase file, or of a pipe such as ``<(pass show ca)``."""
     from sros_tool.pki.keys import LONGEST_PASSPHRASE
 
-    line = re.split(rb"[\r\n]", _read_at_most(path, LONGEST_PASSPHRASE + 1))[0]
+    try:
+        line = re.split(rb"[\r\n]", _read_at_most(path, LONGEST_PASSPHRASE + 1))[0]
+    except OSError as error:
+        raise PkiError(
+            f"the passphrase file '{path}' cannot be read",
+            f"{error.strerror or error}.",
+            f"Name another file in {_PASSPHRASE_FILE}, or set {_PASSPHRASE}.",
+        ) from error
     if len(line) > LONGEST_PASSPHRASE:
         raise PkiError(
             f"the passphrase file '{path}' cannot be used",

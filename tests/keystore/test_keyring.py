@@ -189,6 +189,11 @@ def test_a_timer_finds_that_it_cannot_sign_before_something_is_to_sign(tmp_path:
     for timer in timers:
         ended = sros(*timer, env=env, cwd=tmp_path)
         assert (ended.status, "The passphrase is wrong." in ended.err) == (2, True), ended
+    file.unlink()
+    for timer in timers:
+        ended = sros(*timer, env=env, cwd=tmp_path)
+        why = f"the passphrase file '{file}' cannot be read"
+        assert (ended.status, why in ended.err) == (2, True), ended
     del env["SROS_CA_PASSPHRASE_FILE"]
     for timer in timers:
         ended = sros(*timer, env=env, cwd=tmp_path)
