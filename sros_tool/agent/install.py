@@ -76,6 +76,8 @@ from sros_tool.wording import enumerated
 _OPTIONAL_RELEASE_FILES = (*OPTIONAL_FILES, *ZENOH_FILES)
 _ENCLAVE_FILES = (*sorted(RELEASE_FILES), *KEY_FILES, REQUEST, SEAL)
 """The files that are removed together with their enclave."""
+_DATED_FILES = (CERTIFICATE_FILE, PERMISSIONS_FILE, PERMISSIONS_CA_FILE, *LIST_FILES)
+"""The files that must not become older: with `sros import` or a play, newer ones may arrive."""
 _DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
@@ -99,10 +101,14 @@ class Installation(NamedTuple):
 
 @dataclass(slots=True)
 class _Change:
-    """The changes of an enclave's files: new contents by path, and paths to remove."""
+    """The changes of an enclave's files: new contents by path, and paths to remove.
+
+    ``seen`` has the files (None: there is none) with which the new ones were compared.
+    """
 
     write: dict[str, bytes] = field(default_factory=dict)
     remove: list[str] = field(default_factory=list)
+    seen: dict[str, bytes | None] = field(default_factory=dict)
 
     def __bool__(self) -> bool:
         return bool(self.write or self.remove)
@@ -146,6 +152,7 @@ def install_release(
     _check_release(folder, present, release, robot, installed, pinned)
     enclaves = release.enclaves()
     with Folder(folder) as opened:
+        seen = {name: _files_seen(opened, name) for name in {*enclaves, *present}}
         for name, files in enclaves.items():
             _check_lists(name, files, present_lists(opened, name))
         changes: dict[str, _Change] = {}
@@ -168,6 +175,8 @@ def install_release(
             except (SrosError, OSError) as error:
                 kept[name] = _error_clause(error)
         changes = {name: change for name, change in changes.items() if change}
+        for name, change in changes.items():
+            change.seen = seen[name]
         ran = [name for name in changes if name in enclaves and _has_certificate(opened, name)]
     if changes:
         before(ran)
@@ -459,6 +468,17 @@ def _present_key(folder: Folder, name: str, files: Mapping[str, bytes]) -> Publi
     )
 
 
+def _files_seen(folder: Folder, name: str) -> dict[str, bytes | None]:
+    """Return the files of an enclave that show how new it is; those that cannot be read as None."""
+    seen: dict[str, bytes | None] = {}
+    for file in _DATED_FILES:
+        path = f"{enclave_folder(name)}/{file}"
+        seen[path] = None
+        with suppress(SrosError, OSError):
+            seen[path] = _read_file(folder, path)
+    return seen
+
+
 def _check_place(folder: Folder, place: str) -> None:
     """Raise `KeystoreError` if the folder of an enclave exists and cannot be changed."""
     parts = place.split("/")
@@ -574,13 +594,27 @@ def _apply_changes(folder: Path, changes: Mapping[str, _Change]) -> dict[str, st
 
 
 def _commit(folder: Path, changes: Iterable[_Change]) -> None:
-    with Transaction(folder, partial=True) as transaction:
+    with Transaction(folder, partial=True) as transaction, Folder(folder) as opened:
         for change in changes:
+            _check_seen(opened, change)
             for path, data in change.write.items():
                 transaction.write(path, data, private=path.endswith(f"/{KEY_FILE}"))
             for path in change.remove:
                 transaction.remove(path)
         transaction.commit()
+
+
+def _check_seen(folder: Folder, change: _Change) -> None:
+    """Raise `KeystoreError` if files came meanwhile, which the new ones were not compared with."""
+    for path, before in change.seen.items():
+        present = None
+        with suppress(SrosError, OSError):
+            present = _read_file(folder, path)
+        if present != before:
+            raise KeystoreError(
+                "its files changed meanwhile",
+                f"'{folder.path / path}' came from elsewhere; the next round compares again",
+            )
 
 
 def _commit_lists(folder: Path, changes: Iterable[_Change]) -> None:
@@ -589,7 +623,7 @@ def _commit_lists(folder: Path, changes: Iterable[_Change]) -> None:
     for change in changes:
         crls = {path: data for path, data in change.write.items() if path.endswith(f"/{CRL_FILE}")}
         if crls and not any(path.endswith(f"/{IDENTITY_CA_FILE}") for path in change.write):
-            lists.append(_Change(write=crls))
+            lists.append(_Change(write=crls, seen=change.seen))
     with suppress(SrosError, OSError):
         if lists:
             _commit(folder, lists)

@@ -346,6 +346,19 @@ def test_what_a_play_brought_meanwhile_is_not_taken_back(home: Home, robot: Path
     assert done.changed == ("/r1/a",), "files that no process can load are not newer"
 
 
+def test_a_list_that_a_play_brings_during_the_installation_stays(home: Home, robot: Path) -> None:
+    """The lists were compared before it came, and the older one would be written over it."""
+    newer = list_of_nobody(home, later=1)
+
+    def bring(_: object) -> None:
+        (robot / A / "crl.pem").write_bytes(newer)
+
+    done = install(robot, home.revoked, before=bring)
+    assert set(done.kept) == {"/r1/a"} and "changed meanwhile" in done.kept["/r1/a"]
+    assert (robot / A / "crl.pem").read_bytes() == newer
+    assert has(robot, home.revoked, NAMES[1:])
+
+
 def test_permissions_that_a_play_brought_are_not_taken_back(
     home: Home, robot: Path, tmp_path: Path
 ) -> None:
