@@ -20,7 +20,6 @@ from sros_tool.dds.decision.vendors import FAST_DDS, Vendor
 from sros_tool.errors import SrosError
 from sros_tool.faults import ORIGINAL_KEYSTORE
 from sros_tool.fleet.robots import Fleet
-from sros_tool.keystore.delivery.publish import unpublished_restore_clause
 from sros_tool.keystore.fleet import FLEET_REMEDY, is_of_damaged_ledger
 from sros_tool.keystore.known_keys import unlisted_revocations
 from sros_tool.keystore.layout import (
@@ -29,12 +28,13 @@ from sros_tool.keystore.layout import (
     IDENTITY,
     LEDGER,
     PERMISSIONS,
+    PUBLISHED,
     SETTINGS,
     ca_certificate,
     ca_key,
     key_path,
 )
-from sros_tool.keystore.ledger import LEDGER_REMEDY
+from sros_tool.keystore.ledger import LEDGER_REMEDY, RESTORED
 from sros_tool.keystore.loading import authority_refusals, refusals_text
 from sros_tool.keystore.settings import edit_remedy
 from sros_tool.keystore.template import is_ca_service
@@ -429,6 +429,18 @@ def _has_ca_service(keystore: CheckedKeystore) -> bool:
     return bool(keystore.settings and is_ca_service(keystore.settings.identity_key))
 
 
+def _restore_findings(keystore: CheckedKeystore, file: str) -> Iterator[Finding]:
+    opened = keystore.opened
+    was_restored = any(e.what == RESTORED for e in opened.ledger_with("what", RESTORED).entries)
+    if not (opened.has(PUBLISHED) or was_restored):
+        return
+    # Most keystores publish nothing, and do not need it.
+    from sros_tool.keystore.delivery.publish import unpublished_restore_clause
+
+    if why := unpublished_restore_clause(opened):
+        yield OLDER_THAN_ROBOTS.found("keystore", why, file)
+
+
 def _settings_and_ledger_findings(keystore: CheckedKeystore) -> Iterator[Finding]:
     """Yield findings about the settings and the ledger, which only sros writes."""
     settings, ledger = ((keystore.root / name).exists() for name in (SETTINGS, LEDGER))
@@ -451,8 +463,7 @@ def _settings_and_ledger_findings(keystore: CheckedKeystore) -> Iterator[Finding
     with suppress(SrosError):  # a ledger that cannot be read is unread
         if behind := keystore.opened.ledger_file.clock_behind(keystore.at.now):
             yield CLOCK_BEHIND.found("clock", behind, file)
-        if why := unpublished_restore_clause(keystore.opened):
-            yield OLDER_THAN_ROBOTS.found("keystore", why, file)
+        yield from _restore_findings(keystore, file)
     for gap in keystore.ledger.gaps:
         yield LEDGER_DAMAGED.found("ledger", gap, file)
     if count := keystore.ledger.unchained:
