@@ -39,6 +39,7 @@ _EDITED = "the case signs a governance that no settings state, which has to be s
 _UNKNOWN = "the case signs permissions that no ledger has, which `sros renew` never signs again"
 ELSEWHERE = {
     "keystore.home-or-robot": "its command is for the keystore from which the export came",
+    "keystore.older-than-robots": "the keystore of the case has no fleet, as one with robots has",
     "keystore.weak-cryptography": "the case puts in the certificate of a CA without its key",
     "enclave.certificate-not-yet-valid": "the clock is wrong, and so the CA is not valid either",
     "enclave.crl-left-out": "the folder has to be moved away first, as the remedy says",
