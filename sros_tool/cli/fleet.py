@@ -848,12 +848,12 @@ def _fleet_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
         yield f"the published files expired {ago} ago, so robots get no new files: run `{publish}`"
     elif publication and publication.accepted is None:
         yield f"the expiry of the published files is not known: run `{publish}`"
-    if publication and folder and not (publication.seen or status.older):
+    if publication and folder and publication.unseen and not status.older:
         yield (
-            f"the folder of the last publication, '{folder}', is not on this machine: it is not "
-            "known whether robots can fetch, or whether the keystore is older than its robots. If "
-            f"the folder was lost, `{publish}` says what to check first. If it belongs on another "
-            "machine, add `--fail-on seen`"
+            f"the folder of the last publication, '{folder}', {publication.unseen}: it is not "
+            "known whether robots can fetch, or whether the keystore is older than its robots. "
+            f"`{publish}` names the remedy. If the folder belongs on another machine, add "
+            "`--fail-on seen`"
         )
     if publication and publication.altered:
         ago = elapsed(compared_fleet.at - max(publication.altered.values()))

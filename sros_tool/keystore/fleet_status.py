@@ -15,6 +15,7 @@ from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from enum import StrEnum
 from functools import cached_property
+from importlib.util import find_spec
 from itertools import chain
 from typing import Annotated, NamedTuple
 
@@ -458,8 +459,8 @@ class RobotStatus:
 
 
 @shows(
-    *("folder", "seen", "expires", "root_expires", "accepted", "lacks", "refused", "altered"),
-    null_if_empty=("folder", "lacks", "refused"),
+    *("folder", "unseen", "expires", "root_expires", "accepted", "lacks", "refused", "altered"),
+    null_if_empty=("folder", "unseen", "lacks", "refused"),
 )
 @dataclass(frozen=True, slots=True)
 class PublishedMetadata:
@@ -478,17 +479,18 @@ class PublishedMetadata:
     """
     accepted: bool | None = None
     """Whether robots still accept the metadata; null if ``expires`` is null."""
-    seen: bool = True
-    """Whether ``folder`` is on this machine and can be read.  If not, it is not known whether
-    robots can fetch, or whether the folder has later releases than the keystore knows.
+    unseen: str = ""
+    """Why ``folder`` cannot be examined here, as a clause: it is not on this machine, or the
+    package ``tuf`` is missing.  Then it is not known whether robots can fetch, or whether the
+    folder has later releases than the keystore knows.  Null if the folder was examined.
     """
     lacks: str = ""
     """Path of a published file that is missing in ``folder``, such as metadata or a robot's
-    archive.  Null if nothing is missing, or if the folder was not ``seen``.
+    archive.  Null if nothing is missing, or if the folder is ``unseen``.
     """
     refused: str = ""
     """Why the metadata in ``folder`` does not verify, so that robots refuse it, as a clause.  Null
-    if the metadata verifies, or if the folder was not ``seen``.
+    if the metadata verifies, or if the folder is ``unseen``.
     """
     altered: Mapping[str, datetime] = field(default_factory=dict)
     """Files that ``sros fleet publish`` found missing, changed or older than published in the last
@@ -624,14 +626,14 @@ class FleetStatus:
 
     @property
     def seen(self) -> bool:
-        """Like ``complete``, but a publishing folder that is not on this machine does not count."""
+        """Like ``complete``, but a publishing folder that cannot be examined does not count."""
         is_altered = self.publication is not None and bool(self.publication.altered)
         in_order = self._is_in_order and not is_altered
         return in_order and all(robot.settled for robot in self.robots)
 
     @property
     def _is_folder_seen(self) -> bool:
-        return self.publication is None or self.publication.seen
+        return self.publication is None or not self.publication.unseen
 
     @property
     def _is_in_order(self) -> bool:
@@ -716,6 +718,18 @@ def fleet_status(keystore: OpenedKeystore, names: Sequence[str] = ()) -> FleetSt
         awaited=stages.awaited,
         recorded=keystore.ledger_file.last_time(),
     )
+
+
+def _unseen_clause(missing: str | None) -> str:
+    """Return why the publishing folder cannot be examined, or "".
+
+    ``missing`` is the result of `Published.first_missing`.
+    """
+    if missing is None:
+        return "is not on this machine, or cannot be read"
+    if find_spec("tuf") is None:
+        return "cannot be verified, because the Python package tuf is not installed"
+    return ""
 
 
 # ── comparing a confirmation with the keystore's files ────────────────────────────────────────
@@ -982,7 +996,7 @@ class _KeystoreRecords:
                 published.folder,
                 published.until,
                 published.root_until,
-                seen=missing is not None,
+                unseen=_unseen_clause(missing),
                 lacks=missing or "",
                 refused=metadata_problem(keystore),
                 altered=published.altered,
@@ -1573,8 +1587,8 @@ def fleet_metrics(
         ),
         Metric(
             "sros_fleet_seen",
-            "Like sros_fleet_complete, but a publishing folder that is not on the machine of the "
-            "keystore does not count.",
+            "Like sros_fleet_complete, but a publishing folder that cannot be examined on the "
+            "machine of the keystore does not count.",
             (Sample(int(status.seen), place),),
         ),
         Metric(

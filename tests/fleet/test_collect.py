@@ -8,6 +8,7 @@ import os
 import re
 import shutil
 import socket
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
@@ -1069,7 +1070,9 @@ def test_what_was_renewed_is_published_at_once(home: Home) -> None:
     assert "not published yet" in sros("fleet", "status", "ks", cwd=home.folder).out
 
 
-def test_a_publishing_folder_that_lost_its_files_is_not_in_order(home: Home) -> None:
+def test_a_publishing_folder_that_lost_its_files_is_not_in_order(
+    home: Home, monkeypatch: pytest.MonkeyPatch
+) -> None:
     home.run("fleet", "publish", "ks", "pub")
     published = read_published(OpenedKeystore(home.root))
     for robot in ROBOTS:
@@ -1081,13 +1084,17 @@ def test_a_publishing_folder_that_lost_its_files_is_not_in_order(home: Home) -> 
     pub.rename(home.folder / "elsewhere")
     for fail_on, exit_status in (("delivery", 1), ("unmended", 1), ("seen", 0)):
         ended = sros(*status, "--fail-on", fail_on, cwd=home.folder)
-        assert f"'{pub}', is not on this machine: it is not known whether" in ended.out
+        assert f"'{pub}', is not on this machine, or cannot be read: it is" in ended.out
         assert ended.status == exit_status
     metrics = sros(*status, "--prometheus", cwd=home.folder).out
     assert all(
         re.search(rf"(?m)^sros_fleet_{end}$", metrics) for end in ("complete{.*} 0", "seen{.*} 1")
     )
     (home.folder / "elsewhere").rename(pub)
+    with monkeypatch.context() as patched:
+        patched.setitem(sys.modules, "tuf", None)
+        ended = sros(*status, cwd=home.folder)
+        assert "package tuf is not installed: it is not known" in ended.out and ended.status == 1
     targets = next((pub / "metadata").glob("*.targets.json"))
     targets.rename(home.folder / "kept")
     assert f"lacks metadata/{targets.name}, which" in sros(*status, cwd=home.folder).out
