@@ -494,6 +494,11 @@ NEEDS_CA_KEYS = re.compile(
 """The beginning of a command that works only in the keystore that has the CA keys."""
 
 
+WAIT_FOR_CA = (
+    "Set the clock of this machine. If it is right, it was ahead when the CA was made: wait until "
+    "the CA is valid, or create a new keystore."
+)
+"""The remedy for a CA that is not valid yet: a CA that replaces it would begin no earlier."""
 NOT_IN_THE_FILE = (Fault.CA_NOT_YET_VALID, Fault.FILE_UNREADABLE, Fault.FILE_NO_FILE)
 """Faults that remain if a link to the keystore's file replaces the faulty file."""
 FAULTS = {fault.id: fault for fault in Fault}

@@ -215,6 +215,18 @@ def test_all_at_once_from_every_stage(root: Path, tmp_path: Path) -> None:
         assert not list(copy.glob("private/next_*"))
 
 
+def test_a_ca_that_is_not_valid_yet_is_not_replaced(separate: Path) -> None:
+    """Its successor would begin no earlier, and no node could start with it."""
+    before, early = snapshot(separate), NOW - timedelta(days=30)
+    for change in (
+        lambda: rotate_ca(separate, finish=True, now=early),
+        lambda: create_enclaves(separate, ["/c"], now=early),
+    ):
+        with pytest.raises(KeystoreError, match="wait until the CA is valid"):
+            change()
+    assert snapshot(separate) == before
+
+
 def test_an_expired_ca_is_replaced(separate: Path) -> None:
     later = NOW + timedelta(days=6 * 365)
     with pytest.raises(KeystoreError, match="not valid now"):

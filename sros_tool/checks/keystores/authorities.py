@@ -18,7 +18,7 @@ from sros_tool.checks.keystores.opened import CheckedKeystore
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind, names_text
 from sros_tool.dds.decision.vendors import FAST_DDS, Vendor
 from sros_tool.errors import SrosError
-from sros_tool.faults import ORIGINAL_KEYSTORE
+from sros_tool.faults import ORIGINAL_KEYSTORE, WAIT_FOR_CA
 from sros_tool.fleet.robots import Fleet
 from sros_tool.keystore.fleet import FLEET_REMEDY, is_of_damaged_ledger
 from sros_tool.keystore.known_keys import unlisted_revocations
@@ -485,6 +485,8 @@ def _authority(
     remedy = _NEXT_CA if role == IDENTITY and _has_ca_service(keystore) else ""
     if not validity.contains(keystore.at.now):
         text = f"{name} is valid from {begin} to {end}"
+        if keystore.at.now < validity.not_before:
+            remedy = WAIT_FOR_CA
         yield CA_EXPIRED.found(subject, text, file, remedy=remedy)
     elif validity.expires_soon_from(AUTHORITY_SOON) < keystore.at.now:
         yield CA_EXPIRES_SOON.found(subject, f"{name} expires at {end}", file, remedy=remedy)

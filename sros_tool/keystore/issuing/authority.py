@@ -19,6 +19,7 @@ from cryptography.hazmat.primitives.asymmetric import ec, rsa
 
 from sros_tool.dds.decision.vendors import TESTED, Vendor
 from sros_tool.errors import KeystoreError, Note, PkiError, UsageError, check_meaning
+from sros_tool.faults import WAIT_FOR_CA
 from sros_tool.keystore.issuing.ca_service import CaService
 from sros_tool.keystore.issuing.keyring import Keyring, check_imported_keys, check_places
 from sros_tool.keystore.layout import (
@@ -254,7 +255,9 @@ def load_authority(
             f"the {role} CA {authority_text(certificate)} is not valid now",
             f"It is valid from {iso(validity.not_before)} to {iso(validity.not_after)}, and DDS "
             "refuses the certificates and documents of a CA outside its validity.",
-            "Check the clock of this machine. If it is right, replace the CA: `sros rotate_ca "
+            WAIT_FOR_CA
+            if now < validity.not_before
+            else "Check the clock of this machine. If it is right, replace the CA: `sros rotate_ca "
             f"{quote(str(root))} --finish`.",
         )
     return Authority(certificate, key, service)

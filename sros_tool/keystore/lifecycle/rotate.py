@@ -21,6 +21,7 @@ from cryptography import x509
 
 from sros_tool.dds.governance import parse_governance
 from sros_tool.errors import KeystoreError, Note, SrosError, UsageError
+from sros_tool.faults import WAIT_FOR_CA
 from sros_tool.fleet.robots import robot_of
 from sros_tool.keystore.fleet import checked_fleet, load_fleet, publish_command
 from sros_tool.keystore.fleet_status import fleet_status
@@ -96,7 +97,7 @@ from sros_tool.pki.certificates import (
 )
 from sros_tool.pki.keys import PrivateKey, PublicKey, algorithm, is_weak
 from sros_tool.pki.token import is_token_uri
-from sros_tool.validity import Span, Window, span_text, window
+from sros_tool.validity import Span, Window, iso, span_text, window
 from sros_tool.wording import first_few
 
 _MOST_SHOWN = 10
@@ -969,6 +970,14 @@ def _make_successor(
 ) -> _Successor:
     transaction, template, new_keys = change.transaction, change.template, wanted.new_keys
     old = change.keystore.certificates_of(file)
+    # The dates tell robots which CA replaced which (`retired_authorities`).
+    first = validity_of(old[0]).not_before
+    if change.now < first:
+        raise KeystoreError(
+            f"the {_ca_name(roles)} is not valid before {iso(first)}",
+            "A CA that replaces it would not be valid earlier either.",
+            WAIT_FOR_CA,
+        )
     encrypted = change.keyring.is_encrypted(change.keystore, roles[0], template)
     place = new_keys.places.get(roles[0], "")
     elsewhere = replace(template, identity_key="", permissions_key="")
@@ -999,8 +1008,6 @@ def _make_successor(
     name = old[0].subject
     if PERMISSIONS not in roles:
         name = common_name(f"{template.authority_name} identity CA {secrets.token_hex(4)}")
-    # The dates tell robots which CA replaced which (`retired_authorities`).
-    first = validity_of(old[0]).not_before
     if existing := next((wanted.existing[r] for r in roles if r in wanted.existing), b""):
         certificate = _existing_ca(change, roles, existing, key, name)
         if validity_of(certificate).not_before < first:
