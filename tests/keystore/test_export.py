@@ -10,6 +10,7 @@ import subprocess
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -21,6 +22,7 @@ from sros_tool.cli.common import chosen_enclaves
 from sros_tool.dds.domains import DomainSet
 from sros_tool.errors import DocumentError, KeystoreError, SrosError
 from sros_tool.files import policies_dir
+from sros_tool.keystore.delivery import export
 from sros_tool.keystore.delivery.archive import unpack
 from sros_tool.keystore.delivery.export import (
     ExportSelection,
@@ -126,6 +128,25 @@ def test_what_another_export_wrote_meanwhile_is_compared(
     monkeypatch.setattr(KeystoreLock, "acquire", acquire_late)
     with pytest.raises(KeystoreError, match="revokes 1 certificate that the keystore's"):
         distribute(OpenedKeystore(backup), ["/base"], robot, now=NOW, force=True)
+
+
+def test_a_revocation_during_an_export_comes_to_all_enclaves_of_it(
+    fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    revoke(fleet, ["/armada"], now=NOW)
+    read = export._files_of
+
+    def read_and_revoke(*arguments: Any) -> Any:
+        files = read(*arguments)
+        if (fleet / "enclaves/base").exists():
+            revoke(fleet, ["/base"], now=NOW)
+        return files
+
+    monkeypatch.setattr(export, "_files_of", read_and_revoke)
+    names = ("/arm/camera", "/arm/gripper")
+    distribute(OpenedKeystore(fleet), names, tmp_path / "robot", now=NOW)
+    lists = {(tmp_path / f"robot/enclaves{name}/crl.pem").read_bytes() for name in names}
+    assert lists == {(fleet / "public/identity_ca.crl.pem").read_bytes()}
 
 
 def test_a_new_enclave_gets_no_older_list_than_its_neighbor(fleet: Path, tmp_path: Path) -> None:

@@ -67,7 +67,7 @@ from sros_tool.keystore.outcomes import (
     enclave_result,
 )
 from sros_tool.keystore.participant import EvaluatedEnclave, evaluated
-from sros_tool.keystore.reader import OpenedEnclave, OpenedKeystore
+from sros_tool.keystore.reader import OpenedEnclave, OpenedKeystore, read_consistently
 from sros_tool.keystore.selection import missing_enclave_error
 from sros_tool.keystore.transaction import Change, Transaction
 from sros_tool.keystore.zenoh_files import open_zenoh
@@ -270,10 +270,14 @@ def pack_enclaves(
     return PackedEnclaves(pack(files), tuple(files), tuple(_token_notes(files)))
 
 
+@read_consistently
 def exported_files(
     keystore: OpenedKeystore, names: Sequence[str], now: datetime, *, keyless: bool = False
 ) -> dict[str, bytes]:
     """Map the paths of the files to export to their content; ``keyless`` is as in `distribute`.
+
+    All files are of the same state of the keystore: not some enclaves with the revocation list of
+    before a revocation, and others with the new one.
 
     Raises:
         KeystoreError: an enclave does not exist, or cannot run.
