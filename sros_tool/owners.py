@@ -53,6 +53,18 @@ def replaceable_on_the_way(path: Path, trusted_users: frozenset[int]) -> Iterato
             yield step, why
 
 
+def link_of_stranger(path: Path) -> Path | None:
+    """Return a link on the way to ``path`` that another user made where everybody can write."""
+    for step, state in _path_states(path):
+        if (
+            stat.S_ISLNK(state.st_mode)
+            and state.st_uid not in (0, os.geteuid())
+            and step.parent.stat().st_mode & stat.S_IWOTH
+        ):
+            return step
+    return None
+
+
 def file_of_root(path: Path) -> Path | None:
     """Return the real path of a regular file that only root can change or replace, else None."""
     try:

@@ -763,6 +763,22 @@ def test_no_key_is_left_to_the_owner_of_a_folder_that_waited_there(
     distribute(OpenedKeystore(keystore), ["/a"], waiting, now=NOW)
 
 
+@as_root
+@pytest.mark.parametrize("below", ["", "/robot"])
+def test_no_key_goes_where_the_link_of_another_user_leads(
+    below: str, keystore: Path, sticky: Path, tmp_path: Path
+) -> None:
+    link, elsewhere = sticky / "link", tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    link.symlink_to(elsewhere)
+    os.chown(link, STRANGER, STRANGER, follow_symlinks=False)
+    with pytest.raises(KeystoreError, match="is a link of another user"):
+        distribute(OpenedKeystore(keystore), ["/a"], Path(f"{link}{below}"), now=NOW)
+    assert not list(elsewhere.iterdir())
+    os.chown(link, 0, 0, follow_symlinks=False)
+    distribute(OpenedKeystore(keystore), ["/a"], Path(f"{link}{below}"), now=NOW)
+
+
 # ── files that grow, wait, or have no end ──────────────────────────────────────────────────
 
 
