@@ -97,7 +97,7 @@ def refuse_git_revision(paths: Iterable[Path], remedy: str) -> None:
     """Raise `UsageError` if a path is ``git:REVISION:PATH``, which most verbs cannot read."""
     if any(str(path).startswith("git:") and not path.exists() for path in paths):
         raise UsageError(
-            "a git revision can only be compared with --no-new-access of diff_policy", "", remedy
+            "git:REVISION:PATH works only with `sros diff_policy --no-new-access`", "", remedy
         )
 
 

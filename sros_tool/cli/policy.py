@@ -277,7 +277,7 @@ def diff_policy(
       $ sros diff_policy robot.xml keystore
       - /talker ALLOW publish topic /status
       - /talker ALLOW request service /*
-      + /talker ALLOW request service /add_two_ints  (A has it by request ...
+      + /talker ALLOW request service /add_two_ints  (A has it as part of ...
       3 rights differ
       $ sros diff_policy robot.xml keystore/enclaves/talker/permissions.p7s
       $ sros diff_policy keystore keystore/enclaves/router/router.json5
@@ -448,7 +448,7 @@ def _difference_lines(
     lines: list[tuple[str, str, str]] = []
     for sign, right in difference.lines():
         by = ", ".join(cover.describe() for cover in difference.covered.get(right, ()))
-        remark = f"  ({sides[sign == '-']} has it by {by})" if by else ""
+        remark = f"  ({sides[sign == '-']} has it as part of {by})" if by else ""
         lines.append((sign, right.enclave, f"{sign} {right}{remark}"))
     if first is None and second is None:
         return [text for _, _, text in lines]

@@ -715,7 +715,8 @@ def _renamed_text(nodes: ObservedNodes, current: Observation | None, *, fails: b
         topics = sorted({(ros_use(pair.old)[1], ros_use(pair.new)[1]) for pair in pairs})
         private = tuple(f"{name}/" for name in renamed)
         if moved := [f"{old} as {new}" for old, new in topics if not old.startswith(private)]:
-            text += f", with {enumerated(moved)} (to keep a name, write it as an absolute name)"
+            text += f", and so {enumerated(moved)}"
+            text += " (to keep a name, write it in policy.xml with a leading /)"
         if fails:
             text += " (if the new name is another node: remove the unused rights from its profile)"
     _, without_profile = nodes.divide_by_profile(nodes.as_observed)

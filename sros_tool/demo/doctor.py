@@ -307,7 +307,8 @@ def _environment(environment: Mapping[str, str]) -> list[str]:
         value = environment.get(name)
         if value is not None:
             fits = known.match(value) if isinstance(known, re.Pattern) else value in known
-            lines.append(f"{name}={value}" if fits else f"{name} has another value")
+            unknown = f"{name} has a value that sros does not know (not shown)"
+            lines.append(f"{name}={value}" if fits else unknown)
     return lines + [f"{name} is set" for name in _PRESENCE_ONLY_VARIABLES if name in environment]
 
 

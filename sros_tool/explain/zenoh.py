@@ -958,7 +958,12 @@ class ZenohOfKeystore:
         return WhoOnZenoh(str(question), "zenoh", self._reason_text, self._domain, shown, is_export)
 
     def notes(self, question: Question, outcomes: Sequence[ZenohAnswer]) -> Iterator[Note]:
-        """Yield notes on an export, files, the router's key, and other holders of the right."""
+        """Yield notes on what the answer assumes or leaves out.
+
+        They are about enclaves that may be left out, missing keys, unsigned files, the router's
+        key, the files of peers, and enclaves that may still have the right although they were
+        revoked or removed.
+        """
         from sros_tool.explain.earlier import note_on_revoked_enclaves  # as in `outcomes`
         from sros_tool.explain.who import notes_on_enclaves_left_out
 

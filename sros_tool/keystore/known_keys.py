@@ -106,7 +106,10 @@ def certificates_of_revoked(
 
 
 def restored_at(keystore: OpenedKeystore) -> str:
-    """Return when a keystore was restored with an identity CA that it trusts; "" if never."""
+    """Return when a keystore was last restored, if it still trusts an identity CA of that time.
+
+    Returns "" otherwise.
+    """
     entries = _entries_since_trusted_ca(keystore, keystore.ledger_with("what", RESTORED).entries)
     return next((entry.time for entry in reversed(entries) if entry.what == RESTORED), "")
 

@@ -275,7 +275,10 @@ def _no_enclave_clause(names: Sequence[str]) -> str:
 
 
 def _step(requirement: Requirement, use: Use, world: World, system: System) -> Step:
-    """Return a use with the right that allows it, perhaps of another enclave, or that denies it."""
+    """Return a use with the place of the right that allows it or, for `Must`, of the denial.
+
+    The right that allows it may be a right of another enclave.
+    """
     if isinstance(requirement, Must) and (denial := system.places.find(use, DENY)):
         return Step(use, denial)
     holder = world.other_sufficient_enclave(use.enclave, use.writes, use.topic)

@@ -442,7 +442,7 @@ def _overlay_differences(
             OverlaySide.FIRST if sign == "-" else OverlaySide.SECOND,
             str(right),
             tuple(
-                f"the other side has it by {cover.describe()}"
+                f"the other side has it as part of {cover.describe()}"
                 for cover in difference.covered.get(right, ())
             ),
         )

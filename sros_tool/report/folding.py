@@ -140,7 +140,8 @@ class DrawnUnit(NamedTuple):
 class UnitText:
     """A text that is split at names of units.
 
-    A unit is stored as two numbers: of the unit, and of the word in the unit's ``values``.
+    Each name of a unit is stored as two numbers: the index of the unit, and the index of the word
+    in the unit's ``values``.
     """
 
     parts: tuple[str, ...]

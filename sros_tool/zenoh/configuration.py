@@ -132,8 +132,8 @@ class ZenohNetwork:
             else:
                 raise UsageError(
                     f"the routers {first.name} and {second.name} cannot connect to each other",
-                    "No other host can reach either of them: each router listens only on its own "
-                    "host, or has only endpoints there, such as localhost.",
+                    "Other hosts can reach neither of them: each router listens only at localhost, "
+                    "or its endpoints, to which others connect, are all at localhost.",
                     "For one of the two routers, name an endpoint that other hosts can reach.",
                 )
         return connections

@@ -1143,8 +1143,8 @@ def test_a_renamed_node_is_compared_and_a_new_one_is_named(
         "the policy takes away 1 right that the robot " in said
     )
     assert f"{denied}; new, without a profile: /ghost_node in /listener; compared " in said
-    renamed = "compared under a new name: /rear_camera as /nav/stern_camera, with /odom as /nav/o"
-    assert f"; {renamed}dom (to keep a name, write it as an absolute name)\n" in said
+    renamed = "compared under a new name: /rear_camera as /nav/stern_camera, and so /odom as /nav/o"
+    assert f"; {renamed}dom (to keep a name, write it in policy.xml with a leading /)\n" in said
     renamed_alone = policy.read_text()
     policy.write_text(
         renamed_alone.replace(">odom</topic>", ">odom</topic><topic>/odom</topic>", 1)

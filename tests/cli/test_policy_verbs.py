@@ -305,7 +305,7 @@ def test_diff_tells_in_ros_terms(folder: Path) -> None:
     assert ended.status == 1
     assert ended.out.splitlines() == [
         "- /a ALLOW publish topic /cam/*",
-        "+ /a ALLOW publish topic /cam/a  (A has it by publish topic /cam/*)",
+        "+ /a ALLOW publish topic /cam/a  (A has it as part of publish topic /cam/*)",
         "+ /a ALLOW publish topic /cmd_vel",
         "- /a DENY publish topic /cmd_vel",
         "+ /a ALLOW publish topic /y",
@@ -414,7 +414,7 @@ def test_minimize_tells_and_writes(folder: Path) -> None:
     assert "minimize.enclave-not-in-policy" in ended.err
     assert sros("diff_policy", "a.xml", "n.xml").out.splitlines() == [
         "- /a ALLOW publish topic /cam/*",
-        "+ /a ALLOW publish topic /cam/a  (A has it by publish topic /cam/*)",
+        "+ /a ALLOW publish topic /cam/a  (A has it as part of publish topic /cam/*)",
     ]
 
 

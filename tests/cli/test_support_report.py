@@ -74,7 +74,7 @@ def test_nothing_secret_is_in_the_report(tmp_path: Path, monkeypatch: pytest.Mon
         "- Python 3.",
         "- cryptography ",
         "- ROS_SECURITY_STRATEGY=Enforce",
-        "- ROS_SECURITY_ENABLE has another value",
+        "- ROS_SECURITY_ENABLE has a value that sros does not know (not shown)",
         "- ROS_SECURITY_KEYSTORE is set",
         "does not enforce",
         "/usr/lib/libfastrtps.so 2.14.5 has no security",

@@ -214,7 +214,7 @@ def test_what_is_asked_in_vain_names_what_to_ask(tmp_path: Path) -> None:
     policy.write_text(policy_text({"/a": publish("/x")}))
     for verb in ("diff_policy", "view"):
         revision = sros(verb, "git:HEAD:p.xml", policy)
-        assert revision.status == 2 and "only be compared with --no-new-access" in revision.err
+        assert revision.status == 2 and "works only with `sros diff_policy --no-new" in revision.err
     for words, able in (("fleet status", "show the fleet"), ("agent run", "run the agent")):
         assert sros(*words.split(), tmp_path).err.startswith(f"Unable to {able}: ")
     policy.write_text("<policy><enclaves/></policy>")

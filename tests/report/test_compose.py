@@ -43,7 +43,7 @@ def test_a_wildcard_that_became_names_is_a_difference_though_nothing_moved(tmp_p
     assert edge(picture, "/a", "publish", "/*").mark is OverlaySide.FIRST
     assert {d.text: d.notes for d in picture.differences} == {
         "/a ALLOW publish topic /*": (),
-        "/a ALLOW publish topic /x": ("the other side has it by publish topic /*",),
+        "/a ALLOW publish topic /x": ("the other side has it as part of publish topic /*",),
     }
 
 

@@ -645,7 +645,8 @@ class _Verifier:
         if issued is None:
             raise _RefusedError(
                 "its certificate is not in the ledger of the keystore, though the keystore's "
-                "identity CA issued it: the keystore may be older than its robots"
+                "identity CA issued it: the keystore may have been restored from a backup that is "
+                "older than this certificate"
             )
         owner = robot_of(self._fleet, issued.enclave)
         if owner != robot:

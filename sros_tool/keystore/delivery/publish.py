@@ -1004,7 +1004,7 @@ class _Publication:
             self.keystore.root,
             forgotten_lists,
             shown_by=PUBLISHING,
-            rights_named=() if lost else rights,
+            enclaves_with_named_rights=() if lost else rights,
             now=self._now,
             keyring=keyring,
             dry_run=self._dry_run,

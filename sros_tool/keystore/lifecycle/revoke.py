@@ -168,7 +168,7 @@ def restore_revocations(
     forgotten_lists: LostRecords,
     *,
     shown_by: str = "",
-    rights_named: Collection[str] = (),
+    enclaves_with_named_rights: Collection[str] = (),
     **options: Unpack[ChangeOptions],
 ) -> Restored:
     """Revoke again all certificates on revocation lists that the keystore signed and lost.
@@ -185,9 +185,10 @@ def restore_revocations(
 
     The ledger also records that the keystore was restored.  This entry has a number that the
     keystore never used: the seconds since 1970, or the number of a later release that a robot has.
-    Its ``reason`` is ``shown_by``.  Further entries name the enclaves ``rights_named``, so that a
-    later renewal of these enclaves counts as consent to their rights.  These further entries are
-    left out while there are certificates to replace first.
+    Its ``reason`` is ``shown_by``.  Further entries have ``enclaves_with_named_rights``: the caller
+    names the rights that these enclaves lost after the backup, so that a later renewal counts as
+    consent to these rights.  These further entries are left out while there are certificates to
+    replace first.
 
     Raises:
         KeystoreError: as `revoke`.
@@ -257,7 +258,7 @@ def restore_revocations(
         revoked = known | {int(serial, 16) for serial in reasons}
         replaced = _key_revoked_by_enclave(change, revoked, {key for _, key in replaced_keys}, gone)
         mark = Entry(iso(change.now), RESTORED, number=number, reason=shown_by)
-        named = sorted({*rights_named} - gone) if not replaced else ()
+        named = sorted({*enclaves_with_named_rights} - gone) if not replaced else ()
         shows_restore = (
             shown_by
             or forgotten_lists.lists
@@ -356,14 +357,15 @@ def _replaced_notes(change: KeystoreChange, replaced: Mapping[str, bool]) -> Ite
         for name, is_key in replaced.items()
         if is_key and key_on_robot(change.keystore.folder(name))
     }
-    steps = [
+    commands = [
         f"`sros renew {root} {' '.join(map(quote, names))}{options}`"
         for is_key_revoked, options in ((False, ""), (True, " --new-key --revoke-old"))
         if (names := [n for n in replaced if replaced[n] is is_key_revoked and n not in on_robots])
     ]
+    steps = [f"run {' and '.join(commands)}"] if commands else []
     if on_robots:
         steps.append(
-            f"for {first_few(sorted(on_robots), _MOST_SHOWN)}, new keys that their robots make "
+            f"for {first_few(sorted(on_robots), _MOST_SHOWN)}, make new keys on the robots "
             "(docs/howto/rotate.md, A key in wrong hands), because the revoked keys were made there"
         )
     if steps:
@@ -371,8 +373,8 @@ def _replaced_notes(change: KeystoreChange, replaced: Mapping[str, bool]) -> Ite
             REPLACED_AFTER_BACKUP,
             f"after the backup, the certificates of {first_few(tuple(replaced), _MOST_SHOWN)} were "
             "replaced and revoked, and the keystore has only the revoked certificates. Revoke "
-            f"robots that were stolen (`sros revoke {root} --robot NAME`); give the other enclaves "
-            f"new certificates with {' and '.join(steps)}.",
+            f"robots that were stolen (`sros revoke {root} --robot NAME`). Give the other enclaves "
+            f"new certificates: {'; '.join(steps)}.",
         )
 
 
