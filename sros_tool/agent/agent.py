@@ -419,6 +419,9 @@ class _Round:
             for name in here
             if name not in release.enclaves()
         }
+        released_before: Collection[str] = ()
+        with suppress(SrosError):  # there is none before the first installation
+            released_before = self._released_files()
         installation = self._install(release, certain_time)
         is_later = release.number != state.accepted
         published = {path: hashlib.sha256(data).hexdigest() for path, data in release.files.items()}
@@ -439,10 +442,17 @@ class _Round:
         )
         moments = dict.fromkeys(repaired, self._machine.now)
         self._state = replace(self._state, repairs={**self._state.repairs, **moments})
-        if not is_later:
-            removed = [unreleased[name] for name in installation.removed if name in unreleased]
-            known = {(key.path, key.serial): key for key in (*self._state.removed_keys, *removed)}
-            self._state = replace(self._state, removed_keys=tuple(known.values())[:_MOST_COPIED])
+        # What only the release before had, was taken from this robot; no key was copied.
+        removed = [
+            unreleased[name]
+            for name in installation.removed
+            if name in unreleased
+            and (
+                not is_later or (released_before and _certificate_path(name) not in released_before)
+            )
+        ]
+        known = {(key.path, key.serial): key for key in (*self._state.removed_keys, *removed)}
+        self._state = replace(self._state, removed_keys=tuple(known.values())[:_MOST_COPIED])
         return installation, True
 
     def _changed_files(self) -> dict[str, str] | None:

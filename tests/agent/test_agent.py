@@ -334,9 +334,9 @@ def test_enclaves_that_the_release_does_not_have(home: Home, r1: Robot) -> None:
     done = r1.round()
     assert done.removed == ("/r1/since",) and not any("newer" in each for each in done.problems)
     (problem,) = (each for each in r1.round().problems if "another robot, somebody" in each)
-    assert "lacks: /r1/damaged, /r2/x. If they" in problem
+    assert "lacks: /r1/damaged, /r1/since, /r2/x. If they" in problem
     late = "\n".join(r1.round(moment() + timedelta(days=1, minutes=1)).problems)
-    assert "lacks: /r2/x. If they" in late, "for a day, if it had no certificate"
+    assert "lacks: /r1/since, /r2/x. If they" in late, "for a day, if it had no certificate"
 
 
 def test_a_removed_enclave_is_named_until_its_certificate_is_revoked_or_a_release_has_it(
@@ -357,6 +357,18 @@ def test_a_removed_enclave_is_named_until_its_certificate_is_revoked_or_a_releas
         assert copied in problem and not is_mended(problem)
         r1.release = release
         assert not any(copied in problem for problem in r1.round().problems)
+
+
+def test_a_copied_enclave_is_named_also_if_a_later_release_removes_it(
+    home: Home, r1: Robot
+) -> None:
+    r1.round()
+    shutil.copytree(next((home.root / "revoked").iterdir()), r1.folder / "enclaves/r2/x")
+    left = {path: data for path, data in home.renewed.files.items() if "/r1/c/" not in path}
+    r1.release = home.release(left)
+    assert set(r1.round().removed) == {"/r1/c", "/r2/x"}
+    (problem,) = r1.round().problems
+    assert "lacks: /r2/x. If they belong to another robot, somebody may have copied" in problem
 
 
 def test_what_somebody_damaged_is_installed_again(home: Home, r1: Robot) -> None:
