@@ -599,6 +599,7 @@ def units(
         notes = [*notes, *passphrase_file_notes(Path(passphrase))]
     if signing := SIGNING_JOBS.intersection(jobs):
         _ = keystore.authority_files  # raises an error for an export
+        notes = [*notes, *_passphrase_notes(keystore, passphrase, is_here=target is None)]
         if Job.RENEW in signing:
             notes = [*notes, *_late_renewal_notes(keystore)]
     for job in jobs:
@@ -627,6 +628,34 @@ def units(
     if not changes:
         echo(f"the units in '{folder}' are already up to date", err=True)
     print_notes(list(dict.fromkeys(notes)))
+
+
+def _passphrase_notes(
+    keystore: OpenedKeystore, passphrase: str | None, *, is_here: bool
+) -> Iterator[Note]:
+    """Yield a note if the jobs lack the passphrase of the CA keys.
+
+    ``is_here`` says whether the units are for this machine.
+    """
+    from sros_tool.keystore.issuing.keyring import IN_KEYSTORE
+    from sros_tool.keystore.layout import ROLES
+
+    if passphrase and is_here:
+        try:
+            Path(passphrase).stat()
+        except FileNotFoundError:
+            text = f"'{passphrase}' does not exist: systemd does not start the jobs without it"
+            yield Note("units.no-passphrase", text)
+        except OSError:  # only root may look there, and starts the jobs
+            pass
+    elif not passphrase and any(
+        IN_KEYSTORE.is_encrypted(keystore, role, keystore.template) for role in ROLES
+    ):
+        text = (
+            "the CA keys are encrypted, so the jobs fail when they have to sign: write the units "
+            "with --passphrase-file FILE"
+        )
+        yield Note("units.no-passphrase", text)
 
 
 def _late_renewal_notes(keystore: OpenedKeystore) -> Iterator[Note]:

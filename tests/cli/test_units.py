@@ -120,6 +120,23 @@ def test_files_with_a_shorter_validity_than_the_settings_choose(tmp_path: Path) 
     assert re.search(period, said), said
 
 
+def test_jobs_without_the_passphrase_are_said(made: Path, tmp_path: Path) -> None:
+    secret, root = tmp_path / "secret", tmp_path / "ks"
+    secret.write_text("a long secret")
+    secret.chmod(0o600)
+    environment = {"SROS_CA_PASSPHRASE_FILE": str(secret)}
+    sros("create_keystore", root, "--encrypt-ca-keys", env=environment).ok()
+    job, option = ("--job", "renew", "--dry-run"), "--passphrase-file"
+    for keystore, words, why in (
+        (root, (), "the CA keys are encrypted"),
+        (root, (option, tmp_path / "lost"), "lost' does not exist"),
+        (root, (option, secret), ""),
+        (made, (), ""),
+    ):
+        said = sros("units", keystore, *job, *words, tmp_path / "units").ok().err
+        assert ("[units.no-passphrase]" in said) is bool(why) and why in said, said
+
+
 @pytest.mark.parametrize(
     "verb", ["units {0} --job renew {0}/units", "renew {0} --all-expiring soon"]
 )
