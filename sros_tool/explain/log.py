@@ -47,6 +47,7 @@ from sros_tool.faults import NEEDS_CA_KEYS, ORIGINAL_KEYSTORE, Fault, remedy_in_
 from sros_tool.graph.observation import PUBLISH, SUBSCRIBE
 from sros_tool.keystore.known_keys import enclaves_by_identity
 from sros_tool.keystore.layout import (
+    KEY_FILE,
     ROUTER_FILE,
     ZENOH_SIGNED,
     is_keystore,
@@ -503,8 +504,8 @@ def explain_log(
     policy.
     """
     plain = plain_text(text)
-    examiner = _Examiner(find, context, root, keystore, policy)
     lines = log_lines(plain)
+    examiner = _Examiner(find, context, root, keystore, policy, lines)
     denied = read_denials(plain)
     naming = _lines_naming(lines, denied)
     reported = {denial.process for denial in denied}
@@ -778,13 +779,32 @@ class _Examiner:
         root: str,
         keystore: SearchedKeystore | None,
         policy: AskedPolicy | None,
+        lines: Sequence[str],
     ) -> None:
         self._find = find
+        self._lines = lines
         self._policy = policy
         self._context = context
         self._root = root
         self._keystore = keystore
-        self._evaluators: dict[tuple[Vendor, str], Evaluator] = {}
+        self._evaluators: dict[tuple[Vendor, str, bool], Evaluator] = {}
+
+    @cached_property
+    def _started_folders(self) -> frozenset[str]:
+        """The real paths of the folders from which processes of the log started."""
+        named = filter(None, map(security_directory, self._lines))
+        return frozenset(os.path.realpath(found["folder"]) for found in named)
+
+    def _as_started(self, enclave: LoadedEnclave | None) -> LoadedEnclave | None:
+        """Return an enclave as the process started in it.
+
+        A folder without any keys may be a copy of the robot's folder.  If the log names this very
+        folder, it is no copy, and the missing key counts.
+        """
+        if enclave is None or enclave.folder is None or not enclave.key_elsewhere:
+            return enclave
+        is_started = os.path.realpath(enclave.folder) in self._started_folders
+        return enclave._replace(key_elsewhere=not is_started)
 
     def _meaning(self, hit: _Hit, enclave: LoadedEnclave | None) -> LogText | None:
         """Return the meaning of a hit in its enclave; None if the hit is no security message."""
@@ -800,7 +820,7 @@ class _Examiner:
 
     def message(self, hits: list[_Hit]) -> LogFinding | None:
         """Return the finding for a group of equal messages; None if they show no problem."""
-        named = self._find(hits[0].enclave)
+        named = self._as_started(self._find(hits[0].enclave))
         meaning = self._meaning(hits[0], named)
         if meaning is None:
             return None
@@ -839,6 +859,7 @@ class _Examiner:
         if meaning.id == "service" and not causes:
             return replace(plain, enclave=enclave.name, found=_nodes_clause(answer), checked=True)
         causes = causes or list(self._wrong_domain_cause(enclave, answer, first))
+        causes = causes or list(self._missing_key_cause(enclave, first))
         remedies = list(dict.fromkeys(remedy for _, remedy in causes if remedy))
         remedies += [remedy_of] * (meaning in STARTS)
         remedy = self._with_names(meaning.remedy_without_fault, enclave, first)
@@ -1217,7 +1238,7 @@ class _Examiner:
         )
 
     def _answer(self, enclave: LoadedEnclave, vendor: Vendor, question: Question) -> Answer:
-        of = vendor, enclave.name
+        of = vendor, enclave.name, enclave.key_elsewhere
         if of not in self._evaluators:
             self._evaluators[of] = Evaluator(vendor, enclave, self._context(enclave))
         return self._evaluators[of].answer(question)
@@ -1234,6 +1255,20 @@ class _Examiner:
         if not answer.problems and not answer.allowed:
             decision = answer.decision
             yield decision.text, remedy(decision.reason, self._root, enclave.name)
+
+    def _missing_key_cause(self, enclave: LoadedEnclave, hit: _Hit) -> Iterator[tuple[str, str]]:
+        """Yield cause and remedy for a missing file if only the key is missing in a folder without
+        any keys, which may be a copy of the robot's folder.
+        """
+        names_other_file = KEY_FILE not in hit.fields.get("path", KEY_FILE)
+        if names_other_file or Fault.FILE_MISSING not in hit.meaning.faults:
+            return
+        if enclave.key_elsewhere and not enclave.as_here.key_elsewhere:
+            yield (
+                f"{KEY_FILE}: missing, as in a copy without keys; if this is the robot, it is the "
+                "fault",
+                remedy(Fault.FILE_MISSING, self._root, enclave.name, KEY_FILE),
+            )
 
     def _wrong_domain_cause(
         self, enclave: LoadedEnclave, answer: Answer, hit: _Hit

@@ -963,6 +963,28 @@ def test_a_node_that_started_without_a_file_ran_open(
     assert "starts with the strategy Enforce; with Permissive, every node starts open\n" in asked
 
 
+@pytest.mark.parametrize("refused", [True, False])
+def test_the_only_key_of_a_robot_is_missing(refused: bool, keystore: Path, tmp_path: Path) -> None:
+    """An export of one enclave without its key looks like a copy without keys. Twin: a copy."""
+    robot = tmp_path / "robot"
+    sros("distribute_key", keystore, ENCLAVE, robot).ok()
+    (folder := robot / "enclaves" / ENCLAVE[1:]).joinpath("key.pem").unlink()
+    copy, log = copy_of(robot, tmp_path / "copy"), tmp_path / "robot.log"
+    refusal = "RCLError: error creating node: couldn't find all security files!\n" * refused
+    log.write_text(STARTED.format(robot, ENCLAVE) + refusal)
+    here = sros("explain", robot, ENCLAVE, "--log", log)
+    assert here.status == 1
+    assert "  found     key.pem: missing\n" in here.out
+    assert ("on DDS the node RAN UNSECURED" in here.out) is not refused
+    elsewhere = sros("explain", copy, ENCLAVE, "--log", log)
+    row = "  found     key.pem: missing, as in a copy without keys; if this is the robot, it is"
+    assert (row in elsewhere.out) is refused
+    for ended in (here, elsewhere)[: 1 + refused]:
+        assert "  remedy    Export the enclave again from the keystore" in ended.out
+    (folder / "request.pem").touch()  # the key was made on the robot
+    assert "  found     key.pem: missing\n" in sros("explain", robot, ENCLAVE, "--log", log).out
+
+
 def test_a_fault_of_which_a_log_says_nothing_is_no_proof_of_an_open_node(
     keystore: Path, tmp_path: Path
 ) -> None:
