@@ -123,7 +123,7 @@ def undo(robot: LocalRobot, *, dry_run: bool) -> CloseState:
         *remaining.commands_to_open(),
         *(() if dry_run else remaining.secured_units()),
         *(() if dry_run else _processes_not_open(running, started)),
-        *remaining.secured_in_unobserved_enclaves(),
+        *remaining.further_secured(),
         *remaining.unknown_processes(),
     ]
     runs = any(process.pid or process.alike for process in state.observed.processes)
@@ -165,8 +165,21 @@ class _RemainingProcesses:
         by_user = sorted(
             running.secured_everywhere, key=lambda secured: running.may_use_files(secured.process)
         )
+        programs = {(enclave.name, process.program[0]) for process, enclave in by_user}
+        count = Counter(name for name, _ in programs)
+        # The only program in an enclave counts as the observed process, even by another command.
+        self._further = [
+            (process, enclave.name)
+            for process, enclave in running.further_processes(by_user, observed)
+            if count[enclave.name] > 1
+        ]
+        further = {(name, process.program[0]) for process, name in self._further}
         # Sorted so that, of several processes in an enclave, the last one may use its files.
-        self._secured = {enclave.name: process for process, enclave in by_user}
+        self._secured = {
+            enclave.name: process
+            for process, enclave in by_user
+            if (enclave.name, process.program[0]) not in further
+        }
         by_hand = observed.commands_by_hand(self._robot.folder)
         self._started_by_hand = [*chain.from_iterable(by_hand.values())]
 
@@ -218,16 +231,28 @@ class _RemainingProcesses:
             command = process.open_command(self._robot.domain)
             self._robot.shell.say(f"{process.enclave} {state}{start} open{under}: {command}")
 
-    def secured_in_unobserved_enclaves(self) -> Iterator[str]:
-        """Yield a text for each enclave that runs a process, but in which none was observed."""
+    def further_secured(self) -> Iterator[str]:
+        """Yield a text for each process in an enclave that is not an observed process of it."""
         known = {process.enclave for process in self._observed.processes}
         for enclave in sorted(self._secured.keys() - known):
-            guest = self._secured[enclave]
-            remedy = f"restart process {guest.pid} open: {process_text(guest)}"
-            if not self._running.may_use_files(guest):
-                owner = f"not the owner of the enclave's files ({user_text(guest.user)})"
-                remedy = f"end {guest.label}, which runs as {owner}"
+            process = self._secured[enclave]
+            remedy = f"restart process {process.pid} open: {process_text(process)}"
+            remedy = self._end_of_guest(process) or remedy
             yield f"a process runs in the enclave {enclave}, too; {remedy}"
+        for process, enclave in self._further:
+            command = secured_process(process, enclave).open_command(self._robot.domain)
+            remedy = f"stop it, if it is not yours; otherwise restart it open: {command}"
+            remedy = self._end_of_guest(process) or remedy
+            yield f"{process.label} in {enclave} was not observed; {remedy}"
+
+    def _end_of_guest(self, process: Process) -> str:
+        """Return a clause that says to end a process of a user who cannot read the enclaves; ""
+        for other processes.
+        """
+        if self._running.may_use_files(process):
+            return ""
+        owner = f"not the owner of the enclave's files ({user_text(process.user)})"
+        return f"end {process.label}, which runs as {owner}"
 
     def unknown_processes(self) -> Iterator[str]:
         """Yield processes that may run secured, although this folder did not start them."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence, Set
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from datetime import datetime
 from functools import cached_property
 from pathlib import Path
@@ -188,18 +188,34 @@ class RunningRobot:
         A further process with an observed command counts, too. An enclave without an observed
         process may have one process. Programs of `ros2` and sros do not count.
         """
-        programs: dict[tuple[str, int], Process] = {}
-        for process, enclave in sorted(self.secured, key=lambda secured: secured.process.started):
-            if enclave.name != OBSERVER and not _is_tool(process):
-                programs.setdefault((enclave.name, process.program[0]), process)
-        count, texts = Counter[tuple[str, Sequence[int]]](), []
-        for (name, _), process in programs.items():
-            known = [known for known in self.robot.processes.processes if known.enclave == name]
-            fitting = tuple(place for place, like in enumerate(known) if like.fits(process))
+        secured = [
+            secured
+            for secured in self.secured
+            if secured.enclave.name != OBSERVER and not _is_tool(secured.process)
+        ]
+        further = self.further_processes(secured, self.robot.processes)
+        return [f"{process.label} in {enclave.name}" for process, enclave in further]
+
+    def further_processes(
+        self, secured: Sequence[SecuredProcess], observed: ObservedProcesses
+    ) -> Iterator[SecuredProcess]:
+        """Yield the processes in enclaves that are not the observed processes of these enclaves.
+
+        Of several processes that fit an observed process, the first one counts as this process,
+        unless its user cannot read the files of the enclave.
+        """
+        programs: dict[tuple[str, int], SecuredProcess] = {}
+        for each in sorted(
+            secured, key=lambda each: (not self.may_use_files(each.process), each.process.started)
+        ):
+            programs.setdefault((each.enclave.name, each.process.program[0]), each)
+        count = Counter[tuple[str, Sequence[int]]]()
+        for (name, _), each in programs.items():
+            known = [known for known in observed.processes if known.enclave == name]
+            fitting = tuple(place for place, like in enumerate(known) if like.fits(each.process))
             count[name, fitting] += 1
             if count[name, fitting] > (len(fitting) if known else 1):
-                texts.append(f"{process.label} in {name}")
-        return texts
+                yield each
 
     def with_other_files(self, observed: ObservedProcesses) -> Sequence[str]:
         """Return the enclaves whose process runs secured, but with no files of the export."""

@@ -43,6 +43,7 @@ from sros_tool.runtime.processes import (
     UnseenProcess,
     launch_verb,
     process_origin,
+    user_text,
     with_files,
 )
 from sros_tool.validity import iso, time_of_file
@@ -598,6 +599,28 @@ def test_what_systemd_does_not_start_is_done_by_hand(
     undone = robot.close("--undo", status=1)
     assert undone.out == "restart process 4711 open: cd /opt && /opt/run talker\n"
     assert "/listener does not run; start it open: cd /opt && /opt/run listener\n" in undone.err
+    foreign = replace(robot.process("/talker", is_secured=True), pid=13, command=("/opt/idle",))
+    second = replace(
+        foreign, pid=14, command=("/opt/run", "talker"), started=foreign.started + timedelta(1)
+    )
+    robot.more = (foreign, second, replace(foreign, pid=15, user=os.geteuid() + 1))
+    advice = "was not observed; stop it, if it is not yours; otherwise restart it open: cd /opt && "
+    assert robot.close("--undo", status=1).out == (
+        f"{undone.out}process 13 (idle) in /talker {advice}/opt/idle\n"
+        f"process 14 (run) in /talker {advice}/opt/run talker\n"
+        "process 15 (idle) in /talker was not observed; end process 15 (idle), which runs as not "
+        f"the owner of the enclave's files ({user_text(os.geteuid() + 1)})\n"
+    )
+    robot.absent = {"/listener", "/talker"}
+    robot.more = (foreign, replace(foreign, pid=16, command=("/opt/other",)))
+    further = robot.close("--undo", status=1)
+    others = [
+        f"process {pid} ({name}) in /talker {advice}/opt/{name}\n"
+        for pid, name in ((13, "idle"), (16, "other"))
+    ]
+    assert further.out == "".join(others)
+    assert "/talker does not run; start it open: cd /opt && /opt/run talker\n" in further.err
+    robot.more, robot.absent = (), {"/listener"}
     policy = robot.folder / "robot/policy.xml"
     kept = policy.read_text()
     policy.write_text("<policy")
