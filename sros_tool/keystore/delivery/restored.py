@@ -394,7 +394,8 @@ def refuse_lost_changes(
         what.append(f"the certificates of {shown(certificates)} were replaced and revoked")
         steps.append(f"Give new certificates: {renew(certificates)}.")
     if keys := names["key"]:
-        what.append(f"the keys of {shown(keys)} were replaced or revoked")
+        # Only a later certificate shows whether the key was replaced, too; a message may lack it.
+        what.append(f"the keys of {shown(keys)} were replaced or revoked, or may have been")
         on_robots = [name for name in keys if key_on_robot(keystore.folder(name))]
         if here := [name for name in keys if name not in on_robots]:
             steps.append(f"Give new keys: {renew(here, ' --new-key --revoke-old')}.")
