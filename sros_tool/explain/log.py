@@ -64,6 +64,7 @@ from sros_tool.names import (
     PARAMETER_SERVICES,
     action_part,
     check_enclave_name,
+    expand,
     is_expression,
     nodes_served,
     right_to_use,
@@ -99,6 +100,7 @@ from sros_tool.runtime.vendor_log import (
     denied_topic,
     labeled_line,
     log_lines,
+    logging_node,
     matching_text,
     plain_refusal,
     plain_text,
@@ -336,6 +338,18 @@ class AskedPolicy:
             space = space.removesuffix(f"/{profile.node}")
         names = {right.name for right in policy_rights(self.policy)}
         return "" if any(name.startswith(f"{space}/") for name in names) else space
+
+    def private_name(self, name: str, space: str, enclave: str) -> str:
+        """Return a name on the robot as ``~/NAME`` if a node of the enclave has it, or "".
+
+        ``space`` is the namespace of the policy on the robot.
+        """
+        stated = self.policy.enclave(self.place(enclave)[1])
+        for profile in stated.all_profiles() if stated else ():
+            own = below_namespace(expand("~", profile.ns, profile.node), space)
+            if name.startswith(f"{own}/"):
+                return f"~{name.removeprefix(own)}"
+        return ""
 
     def enclaves_for(self, node: str, enclave: str) -> tuple[str, ...]:
         """Return the enclaves, under their paths on the robot, that the policy has for a node.
@@ -1076,11 +1090,12 @@ class _Examiner:
         if not self._policy or denial.folder or denial.by_rule:
             return remedy
         space = self._policy.possible_namespace(name, denial.enclave)
-        if not space:
+        if not space or self._private_name(denial, name, ""):
             return remedy
+        written = self._private_name(denial, name, space) or name.removeprefix(f"{space}/")
         return (
             f"Perhaps {space} is the namespace of the node: then write "
-            f"{name.removeprefix(f'{space}/')} in the policy, without a / at its beginning (if the "
+            f"{written} in the policy, without a / at its beginning (if the "
             "policy is for this version of the node). Ask for the whole log: rcl's line `Found "
             f"security directory` shows the namespace. Otherwise: {remedy}"
         )
@@ -1207,12 +1222,15 @@ class _Examiner:
         if self._policy:
             ns, path = self._policy.place(denial.enclave or self._policy.name)
             enclave = path or self._policy.name or enclave
+            private = self._private_name(denial, name, ns)
             if ns and name.startswith(f"{ns}/"):
                 name = name.removeprefix(ns)
                 advice = (
                     f" as {name[1:]}, without a / at its beginning: the robot of the log has the "
                     f"policy in namespace {ns}"
                 )
+            if private:
+                advice = f" as {private}: it is a private name of the node"
         enclave = "PEER" if denial.remote else enclave
         commands = [
             f"`sros explain {quote(asked)} {quote(enclave)} {question.word} {quote(name)}"
@@ -1236,6 +1254,27 @@ class _Examiner:
             f"`sros inspect {quote(folder)}` shows what the permissions allow: no policy in ROS "
             "terms can name this topic."
         )
+
+    @cached_property
+    def _logging_nodes(self) -> Mapping[str, Sequence[str]]:
+        """Map each process to the full names of the nodes that logged, shortest first."""
+        nodes = defaultdict[str, set[str]](set)
+        for process, message in map(labeled_line, self._lines):
+            if node := logging_node(message):
+                nodes[process].add(node)
+        return {process: sorted(names, key=len) for process, names in nodes.items()}
+
+    def _private_name(self, denial: Denial, name: str, space: str) -> str:
+        """Return a denied name as ``~/NAME`` if it is private to a node of the process, or "".
+
+        The log shows a renamed node, the policy any other one, in the namespace ``space``.
+        """
+        if self._policy is None or denial.remote or _in_ros_terms(denial)[0] == "call":
+            return ""  # a node calls the services of other nodes
+        for node in self._logging_nodes.get(denial.process, ()):
+            if node.startswith(f"{space}/") and name.startswith(f"{node}/"):
+                return f"~{name.removeprefix(node)}"
+        return self._policy.private_name(name, space, denial.enclave or self._policy.name)
 
     def _answer(self, enclave: LoadedEnclave, vendor: Vendor, question: Question) -> Answer:
         of = vendor, enclave.name, enclave.key_elsewhere

@@ -43,6 +43,7 @@ _PROCESS_LABEL = re.compile(
 )
 """Matches the label that distinguishes the processes in a log, at the start of a line."""
 
+_RCUTILS_LOGGER = re.compile(r"\[[A-Z]+\] \[[\d.]+\] \[([\w.]+)\]: ")
 _SECURITY_DIRECTORY = re.compile(
     r"(?:(?:[\w.-]+ +\| )?(?:(?:\[[^\[\]]*\] )*\[rcl\]: )?Found|\[\w+\]) security directory: "
     r"(?P<folder>[^\s\0]{0,4096}?/enclaves(?P<enclave>/[^\s\0]{0,4096})?)(?:\s|\Z)"
@@ -99,6 +100,12 @@ def labeled_line(line: str) -> tuple[str, str]:
 def security_directory(line: str) -> re.Match[str] | None:
     """Return the folder and the enclave (groups) that a process found at its start, or None."""
     return _SECURITY_DIRECTORY.match(labeled_line(line)[1])
+
+
+def logging_node(message: str) -> str:
+    """Return the full name of the node whose logger wrote a line without label, or ""."""
+    logger = _RCUTILS_LOGGER.match(message)
+    return "/" + logger[1].replace(".", "/") if logger else ""
 
 
 def missing_security(text: str) -> str:

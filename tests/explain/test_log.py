@@ -1110,6 +1110,31 @@ def test_a_log_of_a_robot_that_has_the_policy_in_a_namespace(
 
 
 @pytest.mark.parametrize(
+    ("topic", "advice"),
+    [
+        ("rq/left/new/purgeRequest", "~/purge: it"),
+        ("rt/left/n/x", "~/x: it"),
+        ("rr/left/new/purgeReply", "new/purge, without a / at"),  # the node calls it
+        ("rq/left/newer/purgeRequest", "newer/purge, without a / at"),
+    ],
+)
+def test_a_private_name_is_not_written_with_the_name_of_the_node(
+    topic: str, advice: str, tmp_path: Path
+) -> None:
+    """The node is renamed where it runs, which only the log shows: its logger has the new name."""
+    policy, log = tmp_path / "p.xml", tmp_path / "robot.log"
+    policy.write_text(policy_text({"/a": publish("y")}))
+    denied = f"{FAST_LINE}{topic} topic not found in allow rule. -> check_create_datareader\n"
+    started = STARTED.format("/k", "/left/a")
+    logged = "[INFO] [1.0] [left.new]: up\n"
+    log.write_text(started + logged + denied)
+    assert f"add what is missing as {advice}" in sros("explain", policy, "--log", log).out
+    log.write_text(logged + denied)  # without the namespace
+    said = sros("explain", policy, "/a", "--log", log).out
+    assert ("add what is missing as ~/purge: it" in said) is (topic == "rq/left/new/purgeRequest")
+
+
+@pytest.mark.parametrize(
     ("line", "said"),
     [
         (
@@ -1169,7 +1194,7 @@ def test_a_log_without_the_namespace_that_its_names_show(tmp_path: Path) -> None
     ("name", "said"),
     [
         ("left/speed", "Perhaps /left is the namespace of the node: then write speed in"),
-        ("left/n/speed", "Perhaps /left is the namespace of the node: then write n/speed in"),
+        ("left/n/speed", "Perhaps /left is the namespace of the node: then write ~/speed in"),
         *((name, "") for name in ("n/speed", "speed", "fixed/speed")),
     ],
 )
