@@ -198,9 +198,13 @@ def decide(requirement: Requirement, world: World, limit: SearchLimit | None = N
         _confirm(requirement, witness, world)
     unused, waiting, unnamed = _unused_names(requirement, world, limit)
     missing, exceptions = _missing_enclaves(requirement, world)
-    meant = ((name, similar_enclave_clause(name, world.enclaves)) for name in missing)
+    meant = (
+        (name, similar_enclave_clause(name, world.enclaves))
+        for name in missing
+        if name not in world.away
+    )
     empty = (*(f"there is no enclave {name}{clause}" for name, clause in meant), *unused)
-    always = "" if witness or empty else _why_never_fails(requirement, world)
+    always = "" if witness or empty or missing else _why_never_fails(requirement, world)
     assumed = "" if witness else _assumed_protection(requirement, world, limit)
     blocked = None
     if isinstance(requirement, Must) and not witness and world.crossing:
@@ -214,7 +218,7 @@ def decide(requirement: Requirement, world: World, limit: SearchLimit | None = N
         assumed,
         blocked,
         tuple(unnamed),
-        absent=tuple(exceptions),
+        absent=tuple(name for name in exceptions if name.removeprefix(EXCEPT) not in world.away),
     )
 
 

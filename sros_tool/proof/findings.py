@@ -408,6 +408,8 @@ def decided_findings(
             text += (
                 f", such as {first_few(decided.unjudged, _MOST_SHOWN)}, which should have rights"
             )
+        if away := sorted({name for world in system.worlds for name in world.away}):
+            text += f"; left out on purpose, for other machines: {first_few(away, _MOST_SHOWN)}"
         findings.append(OF_EXPORT.found(system.file, text, system.file))
     if system.left_out:
         error = system.left_out

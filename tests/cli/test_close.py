@@ -1748,6 +1748,14 @@ def test_an_enclave_that_belongs_to_another_machine(robot: Robot) -> None:
         in ended.out
     )
     assert not (robot.folder / left).exists() and "/listener: process" not in ended.out
+    required = robot.folder / "required.toml"
+    widest = '[[widest]]\nenclaves = ["%s"]\npublish = ["/x"]\n'
+    only = '[[only]]\npublish = ["/chatter"]\nenclaves = ["/talker", "/listener"]\n'
+    required.write_text(widest % "/listener" + widest % "/nobody" + only)
+    asked = ("--requirements", required, "--include", "requirement.*")
+    said = sros("check", "robot/export", *asked, cwd=robot.folder).out
+    assert "there is no enclave /nobody" in said and "no enclave /listener" not in said, said
+    assert "may be missing; left out on purpose, for other machines: /listener" in said
     said = sros("run", "robot/export", "/listener", "--", "true", cwd=robot.folder).err
     assert "or run `sros close" in said and "robot --here /listener`" in said, said
     assert "--elsewhere and --here both name /listener" in (
