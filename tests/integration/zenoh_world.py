@@ -247,6 +247,7 @@ def communicate(keystore: Path, *, rules: bool) -> dict[str, Any]:
         erase()
         if not rules:  # as for the attacks below
             until(lambda: talkers not in graph.found, erase)
+        erased = talkers not in graph.found  # the router may announce the talker again
         kept.append(token(other, "/other", "other", "MP /elsewhere"))
         until(lambda: "other MP %elsewhere" in graph.announced())
         kept += [
@@ -309,7 +310,7 @@ def communicate(keystore: Path, *, rules: bool) -> dict[str, Any]:
             "nodes": sorted(seen),
             "graph": sorted(graph.nodes()),
             "announced": sorted(graph.announced()),
-            "erased": talkers not in graph.found,
+            "erased": erased or talkers not in graph.found,
             "history": sorted(late),
             "same_enclave": sorted(twin),
         }
