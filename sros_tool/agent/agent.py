@@ -420,7 +420,7 @@ class _Round:
             if name not in release.enclaves()
         }
         released_before: Collection[str] = ()
-        with suppress(SrosError):  # there is none before the first installation
+        with suppress(SrosError):  # without a readable seal, nothing counts as released
             released_before = self._released_files()
         installation = self._install(release, certain_time)
         is_later = release.number != state.accepted
@@ -442,13 +442,13 @@ class _Round:
         )
         moments = dict.fromkeys(repaired, self._machine.now)
         self._state = replace(self._state, repairs={**self._state.repairs, **moments})
-        # What only the release before had, was taken from this robot; no key was copied.
+        # A later release removes what the release before had; nobody copied that key.
         removed = [
             unreleased[name]
             for name in installation.removed
             if name in unreleased
             and (
-                not is_later or (released_before and _certificate_path(name) not in released_before)
+                not is_later or (state.accepted and _certificate_path(name) not in released_before)
             )
         ]
         known = {(key.path, key.serial): key for key in (*self._state.removed_keys, *removed)}

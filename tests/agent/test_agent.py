@@ -359,16 +359,20 @@ def test_a_removed_enclave_is_named_until_its_certificate_is_revoked_or_a_releas
         assert not any(copied in problem for problem in r1.round().problems)
 
 
+@pytest.mark.parametrize("seal", ["there", "gone"])
 def test_a_copied_enclave_is_named_also_if_a_later_release_removes_it(
-    home: Home, r1: Robot
+    seal: str, home: Home, r1: Robot
 ) -> None:
     r1.round()
+    if seal == "gone":  # whoever copied the enclave can remove it, too
+        (r1.folder / ".agent/release.p7s").unlink()
     shutil.copytree(next((home.root / "revoked").iterdir()), r1.folder / "enclaves/r2/x")
     left = {path: data for path, data in home.renewed.files.items() if "/r1/c/" not in path}
     r1.release = home.release(left)
     assert set(r1.round().removed) == {"/r1/c", "/r2/x"}
     (problem,) = r1.round().problems
-    assert "lacks: /r2/x. If they belong to another robot, somebody may have copied" in problem
+    names = "/r1/c, /r2/x" if seal == "gone" else "/r2/x"
+    assert f"lacks: {names}. If they belong to another robot, somebody may have copied" in problem
 
 
 def test_what_somebody_damaged_is_installed_again(home: Home, r1: Robot) -> None:
