@@ -28,7 +28,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from functools import cache, partial
-from itertools import pairwise
+from itertools import pairwise, takewhile
 from pathlib import Path
 from typing import NamedTuple
 
@@ -210,9 +210,12 @@ class Process:
     def is_without_rcl(self) -> bool:
         """Whether the process uses DDS without rcl, which reads the variables of security.
 
-        The nodes of the demo read these variables themselves.
+        The nodes of the demo read these variables themselves.  Only what Python itself runs counts
+        as one, not an argument of another program.
         """
-        is_demo = any(map(_DEMO_MODULE.fullmatch, self.command))
+        flags = list(takewhile(lambda word: word.startswith("-"), self.command[1:]))
+        module = "".join(self.command[len(flags) + 1 : len(flags) + 2])
+        is_demo = flags[-1:] == ["-m"] and _DEMO_MODULE.fullmatch(module) is not None
         return bool(self.libraries & _DDS_NAMES) and "librcl" not in self.libraries and not is_demo
 
     @property

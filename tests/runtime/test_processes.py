@@ -194,6 +194,23 @@ def test_the_configuration_of_zenoh_is_that_of_the_environment_whatever_the_prog
         assert bool(configuration.problem) is not bool(loaded)
 
 
+@pytest.mark.parametrize(
+    ("command", "without"),
+    [
+        ("python3 -P -m sros_tool.demo.cyclone_node talker", False),
+        ("python3 raw.py", True),
+        ("python3 raw.py -m sros_tool.demo.cyclone_node", True),
+        ("python3 raw.py sros_tool.demo.cyclone_node", True),
+    ],
+)
+def test_only_the_nodes_of_the_demo_secure_themselves_without_rcl(
+    command: str, without: bool
+) -> None:
+    process = Process(7, tuple(command.split()), {}, NOW, frozenset({"libddsc"}))
+    assert process.is_without_rcl is without
+    assert not replace(process, libraries=process.libraries | {"librcl"}).is_without_rcl
+
+
 def test_endless_texts_are_not_looked_at_and_named(proc: Proc) -> None:
     folder = proc.add(7, *ROS)
     with (folder / "environ").open("wb") as file:
