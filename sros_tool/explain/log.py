@@ -449,7 +449,7 @@ def explain_log_of(
     )
     plain = plain_text(text)
     named_folders = filter(None, map(security_directory, log_lines(plain)))
-    started = [(found["enclave"] or "/", found["folder"]) for found in named_folders]
+    started = [(line["enclave"] or "/", line["folder"]) for line in named_folders]
 
     def is_named(enclave: str) -> bool:
         if policy:
@@ -807,7 +807,7 @@ class _Examiner:
     def _started_folders(self) -> frozenset[str]:
         """The real paths of the folders from which processes of the log started."""
         named = filter(None, map(security_directory, self._lines))
-        return frozenset(os.path.realpath(found["folder"]) for found in named)
+        return frozenset(os.path.realpath(line["folder"]) for line in named)
 
     def _as_started(self, enclave: LoadedEnclave | None) -> LoadedEnclave | None:
         """Return an enclave as the process started in it.
