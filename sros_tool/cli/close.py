@@ -300,7 +300,7 @@ def _nodes_clause(policy: Policy, enclave: str) -> str:
 def _node_names(policy: Policy, enclave: str) -> Sequence[str]:
     stated = policy.enclave(enclave)
     profiles = stated.all_profiles() if stated else ()
-    return sorted(f"{profile.ns.rstrip('/')}/{profile.node}" for profile in profiles)
+    return sorted(profile.full_name for profile in profiles)
 
 
 def _renaming_advice(closed: CloseState, policy: Policy) -> str:

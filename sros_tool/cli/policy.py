@@ -511,7 +511,8 @@ class _SeveralObserved(SeveralValues):
     show_default=True,
     help="`difference`: exit with 1 if POLICY has rights or wildcards to remove or used only in "
     "part, or lacks an observed right, or if an enclave, or a robot of it, is only in POLICY or "
-    "only in OBSERVED.",
+    "only in OBSERVED. Nodes of an enclave count one by one if OBSERVED has their profiles, but "
+    "not with --fleet.",
 )
 @force_option
 @dry_run_option

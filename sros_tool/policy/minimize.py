@@ -27,7 +27,9 @@ from sros_tool.policy.model import (
     Level,
     Policy,
     Profile,
+    Profiles,
     Qualifier,
+    only_denials,
     stated_protections,
     with_groups,
 )
@@ -121,9 +123,12 @@ class EnclaveUse:
     @property
     def is_as_observed(self) -> bool:
         """Whether the enclave was observed, with neither more nor fewer rights than it has."""
-        return self.observed_at_all and not (
-            self.never_observed or self.wildcards or self.in_part or self.not_allowed
-        )
+        return self.observed_at_all and not self.differing()
+
+    def differing(self) -> tuple[Right, ...]:
+        """Return the rights that were not observed as the enclave has them, or that it lacks."""
+        wide = (wildcard.rule for wildcard in self.wildcards)
+        return (*self.never_observed, *wide, *self.in_part, *self.not_allowed)
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,6 +199,45 @@ def _protected_as_before(before: Policy, after: Policy) -> Policy:
             yield replace(group, names=tuple(names), protect=level, lines=())
 
     return with_groups(after, groups)
+
+
+def nodes_not_as_observed(
+    policy: Policy, observed: Iterable[Policy], common: Sequence[Group] = ()
+) -> dict[str, list[EnclaveUse]]:
+    """Return the nodes of each enclave whose rights differ from what these nodes were seen to use.
+
+    All nodes of an enclave have its rights, so in the comparison of whole enclaves, the rights of
+    one node hide those of another.  A node's denials and those of the other nodes apply to it.
+    Left out are enclaves without an observed node, and enclaves with a wildcard for a node.
+    """
+    nodes = policy.nodes()
+    seen: dict[str, dict[str, list[Profile]]] = defaultdict(lambda: defaultdict(list))
+    for enclave in (enclave for source in observed for enclave in source.enclaves):
+        home = enclaves_of_nodes([enclave.path], nodes).get(enclave.path, enclave.path)
+        for profile in enclave.all_profiles():
+            seen[home][profile.full_name].append(profile)
+    differing = {}
+    for enclave in policy.enclaves:
+        names = {*nodes[enclave.path], *seen[enclave.path]}
+        if len(names) == 1 or not seen[enclave.path] or any(map(is_expression, names)):
+            continue
+        stated = Policy(tuple(_enclave_of_node(enclave, name) for name in sorted(names)))
+        used = (
+            Enclave(name, (Profiles(tuple(profiles)),))
+            for name, profiles in seen[enclave.path].items()
+        )
+        uses = minimize(stated, policy_rights(Policy(tuple(used))), common).uses
+        differing[enclave.path] = [use for use in uses if not use.is_as_observed]
+    return differing
+
+
+def _enclave_of_node(enclave: Enclave, node: str) -> Enclave:
+    """Return an enclave named like a node, with its rights, and with the denials of all nodes."""
+    profiles = (
+        profile if profile.full_name == node else only_denials(profile)
+        for profile in enclave.all_profiles()
+    )
+    return Enclave(node, (Profiles(tuple(profiles)),))
 
 
 class _KnownNames:

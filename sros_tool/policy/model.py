@@ -87,6 +87,11 @@ class Profile:
     groups: tuple[Group, ...]
     source: Source = field(default=_NOWHERE, compare=False)
 
+    @property
+    def full_name(self) -> str:
+        """The name of the node with its namespace, such as ``/left/gripper``."""
+        return f"{self.ns.rstrip('/')}/{self.node}"
+
 
 class Profiles(NamedTuple):
     """A set of profiles with its ``type`` attribute and its ``metadata`` (XML text or "")."""
@@ -150,21 +155,23 @@ def policy_in_enclave(policy: Policy, path: str) -> Policy:
     return replace(policy, enclaves=tuple(enclaves))
 
 
+def only_denials(profile: Profile) -> Profile:
+    """Return a profile without its ALLOW."""
+    groups = (
+        replace(group, rights=tuple(pair for pair in group.rights if pair[1] is DENY))
+        for group in profile.groups
+    )
+    return replace(profile, groups=tuple(group for group in groups if group.rights))
+
+
 def policy_of_nodes(policy: Policy, nodes: Collection[str]) -> Policy:
     """Return a policy with only the rights of the named nodes, and the enclaves of these nodes.
 
     Denials for other nodes stay, because a denial applies to all nodes of an enclave.
     """
 
-    def denials(profile: Profile) -> Profile:
-        groups = (
-            replace(group, rights=tuple(pair for pair in group.rights if pair[1] is DENY))
-            for group in profile.groups
-        )
-        return replace(profile, groups=tuple(group for group in groups if group.rights))
-
     def reduced(profile: Profile) -> Profile:
-        return profile if profile.node in nodes else denials(profile)
+        return profile if profile.node in nodes else only_denials(profile)
 
     enclaves = []
     for enclave in policy.enclaves:
@@ -211,9 +218,7 @@ class Policy:
     def nodes(self) -> dict[str, tuple[str, ...]]:
         """Map each enclave to the full names of its nodes, sorted."""
         return {
-            enclave.path: tuple(
-                sorted({f"{p.ns.rstrip('/')}/{p.node}" for p in enclave.all_profiles()})
-            )
+            enclave.path: tuple(sorted({p.full_name for p in enclave.all_profiles()}))
             for enclave in self.enclaves
         }
 

@@ -466,6 +466,37 @@ def test_a_job_fails_where_the_policy_and_what_was_observed_differ(folder: Path)
         sros(*words[:-2]).ok()
 
 
+@pytest.mark.parametrize(
+    ("seen", "status", "said"),
+    [
+        ({"one": "x", "two": "y x"}, 0, ""),
+        ({"one": "x y"}, 1, "the node /two of enclave /n was never observed."),
+        ({"one": "x", "two": "y"}, 1, "two has rights that the node never used, or only in part:"),
+        ({"one": "x y", "two": "x y"}, 1, "/one lacks rights that the node used: publish topic /y"),
+        (
+            {"one": "x", "two": "x y", "six": "x"},
+            1,
+            "/six lacks rights that the node used: publish",
+        ),
+    ],
+)
+def test_no_node_hides_the_difference_of_another(
+    folder: Path, seen: dict[str, str], status: int, said: str
+) -> None:
+    def profiles(names: dict[str, str]) -> str:
+        return '</profile><profile ns="/" node='.join(
+            f'"{node}">' + publish(*topics.split()) for node, topics in names.items()
+        )
+
+    for file, names in (("user.xml", {"one": "x", "two": "x y"}), ("seen.xml", seen)):
+        text = policy_text({"/n": profiles(names)})
+        (folder / file).write_text(text.replace('node="n">', "node=", 1))
+    words = ("minimize_policy", "user.xml", "--observed", "seen.xml", "--fail-on")
+    ended = sros(*words, "difference")
+    assert (ended.status, said in ended.err) == (status, True)
+    sros(*words, "never").ok()
+
+
 def test_minimize_with_permissions_and_several_observations(keystore: Path) -> None:
     policy = keystore.parent / "p.xml"
     policy.write_text(policy_text({"/a": publish("*"), "/b": publish("old_b", "more"), "/c": DENY}))

@@ -31,6 +31,7 @@ from sros_tool.policy.minimize import (
     WildcardProposal,
     enclaves_of_nodes,
     minimize,
+    nodes_not_as_observed,
     propose_wildcards,
 )
 from sros_tool.policy.model import ALLOW, DENY, Enclave, Group, Policy
@@ -183,6 +184,9 @@ def minimized_policy(
     if robots:
         check_narrowed(robots, result, used)
     gaps += _scope_notes(policy, result, observed_rights)
+    if not robots:
+        policies = [source.policy for source in sources if source.policy]
+        gaps += _node_notes(stated, policies, result, strict=strict)
     narrowed = with_names_as_written(result.policy)
     document = checked_text(narrowed, output, "narrowed", placeholders=fleet is not None)
     enclaves = _measured_enclaves(stated, result, observed_rights, fleet)
@@ -194,6 +198,36 @@ def _node_basics() -> Sequence[Group]:
     """Return the rights that every node needs, as groups of a profile."""
     profiles = (profile for enclave in node_basics().enclaves for profile in enclave.all_profiles())
     return [group for profile in profiles for group in profile.groups]
+
+
+def _node_notes(
+    policy: Policy, observed: Iterable[Policy], result: MinimizedPolicy, *, strict: bool
+) -> Iterator[Note]:
+    """Yield a note for each node that differs where its enclave as a whole does not."""
+    of_enclaves = {use.enclave: set(use.differing()) for use in result.uses}
+    differing = nodes_not_as_observed(policy, observed, () if strict else _node_basics())
+    for path, nodes in differing.items():
+        shown = of_enclaves.get(path, set())
+        for use in nodes:
+            if not use.observed_at_all:
+                yield Note(
+                    "minimize.node-never-observed",
+                    f"the node {use.enclave} of enclave {path} was never observed.",
+                )
+                continue
+            lacking = {right._replace(enclave=path) for right in use.not_allowed} - shown
+            unused = {right._replace(enclave=path) for right in use.differing()} - shown - lacking
+            for text, rights in (
+                ("has rights that the node never used, or only in part", unused),
+                ("lacks rights that the node used", lacking),
+            ):
+                if rights:
+                    names = first_few(sorted(right.describe() for right in rights), _MOST_SHOWN)
+                    yield Note(
+                        "minimize.node-differs",
+                        f"the profile of the node {use.enclave} {text}: {names}. The comparison of "
+                        f"enclave {path} does not show it, because of its other nodes.",
+                    )
 
 
 def _robot_notes(unobserved: Mapping[str, Sequence[str]]) -> Iterator[Note]:
