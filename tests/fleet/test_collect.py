@@ -456,6 +456,21 @@ def test_a_certificate_that_proves_nothing(home: Home) -> None:
     assert home.of("r1").outcome == "kept"
 
 
+def test_a_message_that_was_accepted_before_its_certificate_was_revoked(home: Home) -> None:
+    """It fails no run, and is noted; a message that was first seen afterwards is refused."""
+    home.send("r1")
+    home.send("r2")
+    assert home.collect().complete
+    home.run("renew", "ks", "--robot", "r1", "--revoke-old")
+    ended = sros("fleet", "collect", "ks", "inbox", cwd=home.folder).ok()
+    assert ended.out.splitlines() == [
+        "3 robots: 2 unchanged, 1 by hand or without a message",
+        "r1: its certificate was revoked after this message was accepted",
+    ]
+    home.send("r1")
+    assert home.of("r1").outcome == "refused" and home.kept("r1") == 1
+
+
 def refuse_state_of_r2(folder: Folder, path: str) -> os.stat_result | None:
     if path.startswith("r2"):
         raise PermissionError(errno.EACCES, "Permission denied", path)
@@ -511,7 +526,9 @@ def test_a_certificate_of_the_ca_that_a_rotation_replaces(home: Home) -> None:
     assert "it missed" not in home.of("r1").why
     home.put("r2", home.message("r1", NOW))
     assert home.of("r2").why.startswith("no identity CA of the keystore"), "of another robot"
-    assert home.of("r3").why.startswith("no identity CA of the keystore"), "it was revoked"
+    assert home.of("r3").remarks == ["its certificate was revoked after this message was accepted"]
+    home.send("r3")
+    assert "or another computer, with earlier keys" in home.of("r3").why
 
 
 @pytest.mark.parametrize(
@@ -586,7 +603,7 @@ def test_what_only_robots_know_to_be_revoked_is_revoked_again(home: Home) -> Non
     assert found_kinds == {"keystore.clock-behind"}  # the messages are from later than now
     again = home.collect(DUE)
     assert not again.changes and not again.notes
-    assert "was revoked" in again.robots[1].why
+    assert "was revoked" in again.robots[1].remarks[0] and not again.robots[1].requests
     home.run("inspect", "ks", "--history")
     assert sros("fleet", "status", "ks", "--json", cwd=home.folder).status == 1
 

@@ -121,10 +121,10 @@ class CollectedMessage(NamedTuple):
     """Name of the robot."""
     outcome: Annotated[str, Words(MESSAGE_OUTCOMES)]
     """``kept``: a new message, now the robot's last confirmation; ``unchanged``: the same message
-    as last time; ``older``: an earlier message, written before the last one came, for example in an
-    inbox that the robot used before; ``missing``: the inbox has no message; ``revoked``: all
-    enclaves of the robot were revoked, so its message is not read; ``refused``: the message proves
-    nothing.
+    as last time, even if its certificate was revoked since; ``older``: an earlier message, written
+    before the last one came, for example in an inbox that the robot used before; ``missing``: the
+    inbox has no message; ``revoked``: all enclaves of the robot were revoked, so its message is not
+    read; ``refused``: the message proves nothing.
     """
     why: str
     """Why the message was refused or not read, as a clause; empty for other outcomes."""
@@ -368,8 +368,11 @@ class _RefusedError(SrosError):
     """The message proves nothing, or the request must not be signed."""
 
 
-class _ReplacedCaError(_RefusedError):
-    """The robot itself sent the message, but a replaced identity CA issued its certificate."""
+class _OutdatedCertificateError(_RefusedError):
+    """The certificate of the message was valid once: it was revoked, or its CA was replaced.
+
+    ``why`` is the remark on a message that was accepted before, as a clause.
+    """
 
 
 def _shortened(reason: str) -> str:
@@ -508,18 +511,19 @@ class _Verifier:
         sha256 = hashlib.sha256(file.data).hexdigest()
         try:
             verified = self._verify(robot, file.data)
-        except _ReplacedCaError as error:
+        except _OutdatedCertificateError as error:
             if not (before and before.sha256 == sha256):
                 raise
-            # The message was verified before, when the CA was not yet replaced.
-            remarks.append(error.what)
-            return _ReceivedMessage(
+            # The message was verified before, when its certificate was valid.
+            taken = _ReceivedMessage(
                 robot,
                 "unchanged",
                 enclave=before.enclave,
                 sequence=before.sequence,
-                remarks=remarks,
+                remarks=[*remarks, error.why],
             )
+            _keep_parts_signed_by_cas(taken, file.data)
+            return taken
         remarks += self._expiry_clauses(verified.certificate)
         sequence = verified.confirmation.sequence
         assert sequence
@@ -624,11 +628,9 @@ class _Verifier:
         """
         validity = validity_of(signer)
         moment = min(max(self._now, validity.not_before), validity.not_after)
-        if fault := chain_fault(signer, self._authorities, moment=moment):
-            if self._was_of_replaced_ca(robot, signer):
-                raise _ReplacedCaError(
-                    "its certificate is of an identity CA that was replaced: it missed the rotation"
-                )
+        fault = chain_fault(signer, self._authorities, moment=moment)
+        is_of_replaced_ca = bool(fault) and self._was_of_replaced_ca(robot, signer)
+        if fault and not is_of_replaced_ca:
             why = "no identity CA of the keystore issued its certificate"
             # This comes first, because the sender chose the words of the fault.
             if restored_at(self._keystore):
@@ -636,11 +638,15 @@ class _Verifier:
                 why += "docs/howto/keystore_is_lost.md)"
             raise _RefusedError(f"{why}: {fault}")
         if signer.serial_number in self._revoked:
-            raise _RefusedError(
+            raise _OutdatedCertificateError(
                 f"its certificate, {signer.serial_number:x}, was revoked: perhaps the robot lacks "
                 "its new keys, or another computer, with earlier keys of the robot, sends messages "
-                "in its place"
+                "in its place",
+                "its certificate was revoked after this message was accepted",
             )
+        if is_of_replaced_ca:
+            why = "its certificate is of an identity CA that was replaced: it missed the rotation"
+            raise _OutdatedCertificateError(why, why)
         issued = self._issued(digest(signer))
         if issued is None:
             raise _RefusedError(
@@ -662,17 +668,13 @@ class _Verifier:
     def _was_of_replaced_ca(self, robot: Robot, signer: x509.Certificate) -> bool:
         """Return whether a replaced CA issued the certificate to an enclave of the robot.
 
-        The certificate must not be revoked, and its digest must be in the ledger.  So a copy of the
-        replaced CA's key is not enough to make such a certificate.
+        Its digest must be in the ledger.  So a copy of the replaced CA's key is not enough to make
+        such a certificate.
         """
         if any(issued_by(signer, authority) for authority in self._authorities):
             return False
         issued = self._issued(digest(signer))
-        return bool(
-            issued
-            and robot_of(self._fleet, issued.enclave) == robot
-            and signer.serial_number not in self._revoked
-        )
+        return bool(issued and robot_of(self._fleet, issued.enclave) == robot)
 
     def _has_key_of(self, enclave: str, signer: x509.Certificate) -> bool:
         """Return whether a certificate is for the current key of an enclave.
