@@ -25,7 +25,12 @@ from urllib.parse import quote, urlsplit
 from cryptography import x509
 from cryptography.hazmat.primitives.serialization import Encoding
 
-from sros_tool.agent.connection import REFUSALS, GuardedConnection, is_tls_ended_by_server
+from sros_tool.agent.connection import (
+    REFUSALS,
+    GuardedConnection,
+    error_clause,
+    is_tls_ended_by_server,
+)
 from sros_tool.agent.fetch import ClientCertificate, FetchError, FetchProblem, fetch_release
 from sros_tool.agent.install import (
     Installation,
@@ -1215,7 +1220,12 @@ def send(
                 raise TimeoutError(errno.ETIMEDOUT, "it takes too long")
     except (OSError, http.client.HTTPException, ValueError) as error:
         kind = RefusedError if is_tls_ended_by_server(error) else UnavailableError
-        raise kind(failure, f"{error}.", ("The agent tries again at its next run.")) from error
+        why = error_clause(error)
+        raise kind(
+            failure,
+            f"{why[:1].upper()}{why[1:].removesuffix('.')}.",
+            "The agent tries again at its next run.",
+        ) from error
     if not 200 <= reply.status < 300:
         kind = RefusedError if reply.status in REFUSALS else UnavailableError
         raise kind(

@@ -27,6 +27,19 @@ def is_tls_ended_by_server(error: BaseException | None) -> bool:
     return isinstance(error, ssl.SSLError) and not isinstance(error, certificate_error)
 
 
+def error_clause(error: Exception) -> str:
+    """Return why a server could not be asked, as a clause without any text from the server."""
+    if isinstance(error, ssl.SSLCertVerificationError):
+        return f"its certificate is not valid: {error.verify_message}"
+    if isinstance(error, ssl.SSLError):
+        return f"TLS fails: {(error.reason or str(error)).lower().replace('_', ' ')}"
+    if isinstance(error, TimeoutError):
+        return error.strerror or "it does not answer"
+    if isinstance(error, http.client.HTTPException) and not isinstance(error, OSError):
+        return f"it does not speak HTTP: {type(error).__name__}"
+    return (error.strerror if isinstance(error, OSError) else "") or str(error)
+
+
 class GuardedConnection(http.client.HTTPConnection):
     """A connection that is cut off when `_MOST_SECONDS` are over, also in its handshake.
 

