@@ -21,7 +21,7 @@ from cryptography import x509
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import Governance, parse_governance
-from sros_tool.dds.permissions import Grant, Permissions, parse_permissions
+from sros_tool.dds.permissions import Grant, Permissions, Rule, parse_permissions
 from sros_tool.errors import DocumentError, KeystoreError, Note, SrosError
 from sros_tool.fleet.expansion import FleetPolicy, read_policy_for
 from sros_tool.fleet.robots import Fleet, robot_of
@@ -45,6 +45,7 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.ledger import Entry, Ledger
 from sros_tool.keystore.reader import FilesReadOnce, OpenedKeystore
+from sros_tool.names import ROS_DISCOVERY_TOPIC
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import load_certificate
 from sros_tool.policy.document import files_of_policies, read_policy
@@ -54,6 +55,7 @@ from sros_tool.policy.model import (
     stated_protections,
 )
 from sros_tool.policy.node_basics import are_basic
+from sros_tool.policy.patterns import matches
 from sros_tool.policy.rights import (
     Right,
     RightsDifference,
@@ -515,7 +517,8 @@ class _Reader:
             self.unverified.append(Note("rights.unsigned", text))
         permissions = parse_permissions(data, f"'{file}'")
         self.notes += [
-            Note(note.id, f"{label}: {note.text}") for note in _left_out_notes(permissions.grants)
+            Note(note.id, f"{label}: {note.text}")
+            for note in (*_left_out_notes(permissions.grants), *_discovery_notes(permissions))
         ]
         grants = _first_grants(permissions)
         self.documents.update(dict.fromkeys(grants, permissions))
@@ -585,6 +588,33 @@ def _left_out_notes(grants: Iterable[Grant]) -> Iterator[Note]:
         if False in kinds[kinds.index(True) if True in kinds else len(kinds) :]:
             text = "a deny_rule after an allow_rule may have no effect: the first match decides."
             yield Note("rights.rule-order", text)
+
+
+def _discovery_notes(permissions: Permissions) -> Iterator[Note]:
+    """Yield a note for each enclave whose grant lacks the topic that every node needs."""
+    for name, grant in _first_grants(permissions).items():
+        if lacking := _missing_discovery(grant):
+            text = (
+                f"{name} may not {' and '.join(lacking)} {ROS_DISCOVERY_TOPIC}: its nodes do not "
+                "start, or do not see the other nodes, or are not seen. Sign its permissions from "
+                "its policy."
+            )
+            yield Note("rights.discovery", text)
+
+
+def _missing_discovery(grant: Grant) -> list[str]:
+    """Return "publish" and "subscribe" if the rules do not allow this for every node's topic."""
+
+    def match(rules: Iterable[Rule], verb: str) -> bool:
+        criteria = (criterion for rule in rules for _, criterion in rule.criteria_of((verb,)))
+        return any(matches(e, ROS_DISCOVERY_TOPIC) for c in criteria for e in c.topics)
+
+    allowed, denied = ([r for r in grant.rules if r.allow is allow] for allow in (True, False))
+    return [
+        verb
+        for verb in ("publish", "subscribe")
+        if match(denied, verb) or not (grant.default_allow or match(allowed, verb))
+    ]
 
 
 # ── the JSON of a comparison ────────────────────────────────────────────────────────────────
@@ -660,7 +690,8 @@ class PolicyDifference(NamedTuple):
     """Whether the governance of the enclaves differs between A and B, or cannot be read."""
     unclear: Sequence[str]
     """Enclaves whose permissions differ in something that rights do not tell, such as partitions,
-    the order of rules, or a default that allows everything; `notes` of A and B name it.
+    the order of rules, missing rules for `ros_discovery_info`, or a default that allows
+    everything; `notes` of A and B name it.
     """
 
 
@@ -752,7 +783,9 @@ def _unclear_enclaves(
             for document in documents
         ]
         first, second = ([(grant.rules, grant.default_allow) for grant in side] for side in sides)
-        if first != second and any(any(_left_out_notes(side)) for side in sides):
+        lacking = [_missing_discovery(side[0]) if side else [] for side in sides]
+        left_out = any(any(_left_out_notes(side)) for side in sides)
+        if lacking[0] != lacking[1] or (first != second and left_out):
             yield name
 
 

@@ -33,6 +33,12 @@ def grant(*rules: str, subject: str = "CN=/a", default: str = "DENY") -> str:
     return GRANT.format(rules="".join(rules), subject=subject, default=default)
 
 
+BOTH = rule(
+    "ros_discovery_info",
+    rest="</publish><subscribe><topics><topic>ros_*</topic></topics></subscribe><publish>" + RAW,
+)
+
+
 def told(source: RightsSource) -> list[str]:
     return sorted(str(right) for right in source.rights)
 
@@ -136,7 +142,10 @@ def test_what_rights_do_not_tell(
     file.write_text(DOCUMENT.format(document))
     source = load_rights(file)
     assert told(source) == rights
-    assert ids(source) == ["rights.unsigned", *notes]
+    assert [name for name in ids(source) if name != "rights.discovery"] == [
+        "rights.unsigned",
+        *notes,
+    ]
 
 
 @pytest.mark.parametrize(
@@ -158,6 +167,9 @@ def test_what_rights_do_not_tell(
         (grant(rule()), grant(rule(rest=f"</publish><relay>{RAW}</relay><publish>{RAW}")), True),
         (grant(rule(), rule("rt/y", domain=7)), grant(rule(), rule("rt/y", domain=7)), False),
         (grant(rule(), rule("rt/y")), grant(rule("rt/y"), rule()), False),
+        (grant(rule(), rule("ros_discovery_info")), grant(rule(), BOTH), True),
+        (grant(rule(), BOTH), grant(rule("ros_discovery_info", "deny_rule"), rule(), BOTH), True),
+        (grant(rule(), BOTH), grant(BOTH, rule()), False),
     ],
 )
 def test_permissions_with_another_effect_are_not_the_same(
