@@ -245,7 +245,9 @@ def revoke(
 
     root, given = split_root(arguments)
     check_chosen(given, patterns, robots)
-    names, selection_notes = select_to_revoke(OpenedKeystore(root), given, patterns, robots)
+    names, selection_notes = select_to_revoke(
+        OpenedKeystore(root), given, patterns, robots, now=now()
+    )
     words_of_rfc = reason.replace("-", "_").split("_")
     reason_text = words_of_rfc[0] + "".join(word.capitalize() for word in words_of_rfc[1:])
     with progress("revoking"):

@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
+from datetime import datetime
 from fnmatch import fnmatchcase
 from functools import partial
 from itertools import islice
@@ -19,11 +20,13 @@ from sros_tool.errors import InvalidNameError, KeystoreError, Note, SrosError
 from sros_tool.fleet.robots import (
     Fleet,
     Unrecorded,
+    enclaves_of,
     folders_of_robots,
     robot_of,
     unrecorded_enclaves,
 )
 from sros_tool.keystore.fleet import arguments_for, checked_fleet, enclaves_of_robot, load_fleet
+from sros_tool.keystore.known_keys import revoked_serials
 from sros_tool.keystore.layout import (
     CLOSED_KEYSTORE,
     CLOSED_POLICY,
@@ -40,6 +43,7 @@ from sros_tool.keystore.layout import (
 from sros_tool.keystore.ledger import Entry
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.names import check_enclave_name
+from sros_tool.validity import iso
 from sros_tool.values import NamedKeystore, shows
 from sros_tool.wording import counted, first_few
 
@@ -103,29 +107,67 @@ def select_to_revoke(
     names: Sequence[str],
     patterns: Sequence[str],
     robots: Sequence[str],
+    *,
+    now: datetime,
 ) -> tuple[tuple[str, ...], tuple[Note, ...]]:
     """Return the enclaves to revoke, and notes on other enclaves that ``robots`` may have.
 
     This works like `select_enclaves`, except that a robot also has all enclaves in its folder, such
-    as ``/r3/spare``.
+    as ``/r3/spare``.  Enclaves that are revoked already are only noted.
 
     Raises:
         KeystoreError: as `select_enclaves`.
         DocumentError: as `select_enclaves`.
     """
+    revoked = [name for name in names if _is_revoked(keystore, name, now)]
+    names = [name for name in names if name not in revoked]
     if not (patterns or robots):
-        return tuple(names), ()  # the verb reports what is wrong with a name
+        # The verb reports what is wrong with a name.
+        return tuple(names), tuple(_revoked_notes(revoked))
     chosen = dict.fromkeys(select_enclaves(keystore, names, patterns))
     unrecorded: dict[str, Unrecorded] = {}
     by_name = partial(_revocation_by_name, keystore, robots)
     if fleet := checked_fleet(keystore, by_name) if robots else None:
         possible = _possible_enclaves(keystore, fleet, robots)
         unrecorded = unrecorded_enclaves(fleet, possible, set(robots))
-    chosen |= dict.fromkeys(_enclaves_of_robots(keystore, robots, True, unrecorded))
+    left_robots = list(robots)
+    for name in (name for name in robots if fleet and name in fleet.robots):
+        assert fleet
+        own = enclaves_of(fleet, fleet.robots[name])
+        gone = [enclave for enclave in own if _is_revoked(keystore, enclave, now)]
+        if gone and not unrecorded[name].below and not any(map(keystore.has_enclave, own)):
+            left_robots.remove(name)
+            revoked += gone
+    chosen |= dict.fromkeys(_enclaves_of_robots(keystore, left_robots, True, unrecorded))
     below = [name for enclaves in unrecorded.values() for name in enclaves.below]
     left = {name for enclaves in unrecorded.values() for name in enclaves.naming} - chosen.keys()
-    notes = [*_unrecorded_notes(keystore, sorted(below), sorted(left))]
+    notes = [*_revoked_notes(revoked), *_unrecorded_notes(keystore, sorted(below), sorted(left))]
     return tuple(chosen), (*notes, *(_other_computers_notes(keystore, fleet, robots, chosen)))
+
+
+def _is_revoked(keystore: OpenedKeystore, name: str, now: datetime) -> bool:
+    """Return whether an enclave is gone, and each of its valid certificates is revoked."""
+    if keystore.has_enclave(name) or not revocation_of(keystore, name):
+        return False
+    if not keystore.revocation_lists:  # the revocation is not in force
+        return False
+    valid = {
+        int(entry.serial or "0", 16)
+        for entry in keystore.ledger_with("enclave", name).entries
+        if entry.enclave == name
+        and entry.what == "certificate"
+        and not "" < entry.not_after <= iso(now)
+    }
+    return valid <= revoked_serials(keystore)
+
+
+def _revoked_notes(names: Sequence[str]) -> Iterator[Note]:
+    if names:
+        verb = "was" if len(names) == 1 else "were"
+        yield Note(
+            "revoke.already-revoked",
+            f"{first_few(sorted(names), _MOST_SHOWN)} {verb} revoked before: nothing to do.",
+        )
 
 
 def _revocation_by_name(keystore: OpenedKeystore, robots: Sequence[str]) -> str:

@@ -118,6 +118,9 @@ def revoke(
     change = KeystoreChange(root, **options)
     change.crl = crl
     with change:
+        if not names and (current := change.keystore.revocation_lists):  # no list to sign
+            expiry = min(crl.next_update for crl in current)
+            return change.result(Revocation, next_update=expiry, reason=reason)
         _check_names(change, names)
         lists = change.revocation_lists()
         gone = frozenset(names)
