@@ -4,9 +4,9 @@ A rule has the form of ``--ros-args -r`` (ROS 2 design, "Static Remapping"): ``[
 where ``__node`` and ``__ns`` stand for the name and the namespace of a node.  FROM and TO are
 relative to the node unless they are absolute, and the first rule that fits a name applies.  NODE is
 the name of a node after rules for ``__node`` were applied, except in these rules themselves (rcl,
-node.c).  The name of an action is remapped since rcl_action 10.0.2, and on Jazzy since 9.2.8; in
-earlier versions, only the names of the action's topics and services are remapped (rcl, pull request
-1170).
+node.c).  The name of an action is remapped since rcl_action 10.0.2, and on Jazzy since 9.2.8 (but
+not in each build that states this version); otherwise, only the names of the action's topics and
+services are remapped (rcl, pull request 1170), which every version does.
 """
 
 from __future__ import annotations
@@ -165,14 +165,14 @@ def has_new_name(rule: Remapping, names: Iterable[str], namespaces: Iterable[str
 
 
 def renamed_action_text(rule: Remapping) -> str:
-    """Return a sentence on ROS releases that cannot remap an action, and on what to do there."""
+    """Return how to start a node with a renamed action: as all releases of ROS take it."""
     parts = (
         f"-r {quote(str(rule._replace(old=rule.old + part, new=rule.new + part)))}"
         for _, part in ACTION_PARTS["call"]
     )
     return (
-        f"nodes rename an action with `-r {quote(str(rule))}` only since Kilted, and on Jazzy "
-        f"since rcl_action 9.2.8. Start earlier versions with `--ros-args {' '.join(parts)}`."
+        f"start its nodes with `--ros-args {' '.join(parts)}`, which works with every release of "
+        f"ROS. `-r {quote(str(rule))}` works only since Kilted, and with late updates of Jazzy."
     )
 
 

@@ -1171,7 +1171,7 @@ def test_a_node_of_another_version_than_its_policy(tmp_path: Path) -> None:
     log.write_text(f"{denied}. -> check_create_datareader\n")
     said = sros("explain", policy, "/a", "--log", log).out
     assert "missing in the policy. If the policy is for another version of the node, use" in said
-    assert "add what is missing. If the node's command renames the action: nodes" in said
+    assert "add what is missing. If the node's command renames the action: start" in said
 
 
 def test_a_log_without_the_namespace_that_its_names_show(tmp_path: Path) -> None:
@@ -1477,8 +1477,8 @@ def test_an_action_is_no_service(keystore: Path, tmp_path: Path) -> None:
     )
     for group, name, told in (
         ("services request", "arm", "the policy has it as a service (request), but /arm is an"),
-        ("services request", "inspect", f"`--ros-args {rules.replace('/base/arm', 'NEW')}`."),
-        ("actions call", "base/arm", f"Start earlier versions with `--ros-args {rules}`."),
+        ("services request", "inspect", f"`--ros-args {rules.replace('/base/arm', 'NEW')}`, which"),
+        ("actions call", "base/arm", f": start its nodes with `--ros-args {rules}`, which"),
     ):
         kind = group.partition("s ")[0]
         rights = f'<{group}="ALLOW"><{kind}>/{name}</{kind}></{kind}s>'
@@ -1486,7 +1486,7 @@ def test_an_action_is_no_service(keystore: Path, tmp_path: Path) -> None:
         found = sros("explain", policy, ENCLAVE, "--log", log).out
         assert f"`sros explain {policy} {ENCLAVE} call /arm --type action` shows" in found
         assert told in found and "may call /inspect" not in found
-        assert ("Kilted, and on Jazzy since rcl_action 9.2.8. Start" in found) is (name != "arm")
+        assert ("with late updates of Jazzy." in found) is (name != "arm")
 
 
 def test_an_expired_enclave_is_renewed(keystore: Path, tmp_path: Path) -> None:

@@ -207,7 +207,7 @@ def test_names_that_are_exchanged_are_denied_as_before() -> None:
 
 
 def test_what_nodes_remap_otherwise_is_noted() -> None:
-    """Only rcl_action 9.2.8 (Jazzy), or of Kilted and later, remaps the name of an action."""
+    """Not every rcl_action remaps the name of an action, but each one those of its parts."""
     nodes = [one(group("actions", "plan", execute="ALLOW"), node=node) for node in ("n", "hand")]
     own = group("services", "~/arm ~/set_parameters", reply="ALLOW")
     parts = ("cancel_goal", "get_result", "send_goal", "feedback", "status")
@@ -216,7 +216,7 @@ def test_what_nodes_remap_otherwise_is_noted() -> None:
         (
             ["plan:=/arm/plan"],
             ["merge.remapped-action", OF_REQUIREMENTS],
-            f"earlier versions with `--ros-args {rules}`.",
+            f"start its nodes with `--ros-args {rules}`, which works with every release",
         ),
         (["__node:=x"], ["merge.remapped-nodes"], "name to the nodes hand and n. Choose the node"),
         (["n:__node:=x"], [], ""),
