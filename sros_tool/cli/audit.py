@@ -36,7 +36,7 @@ from sros_tool.cli.observing import (
     why_no_node_was_observed,
 )
 from sros_tool.dds.decision.vendors import Vendor
-from sros_tool.errors import UnavailableError, UsageError
+from sros_tool.errors import KeystoreError, Note, UnavailableError, UsageError
 from sros_tool.terminal import echo
 from sros_tool.values import file_change
 from sros_tool.wording import counted
@@ -107,7 +107,8 @@ def audit(
     every endpoint as the DDS vendor would. sros looks a node up in the enclave that the graph
     shows, or else in the enclave whose profiles name the node. By default, sros observes until the
     graph stops changing; --watch also sees endpoints that nodes create later. Several policies
-    count as one. The default is the keystore of $ROS_SECURITY_KEYSTORE.
+    count as one. The default is the keystore of $ROS_SECURITY_KEYSTORE. For nodes on Zenoh, the
+    files that `sros zenoh` wrote into KEYSTORE decide, unless --vendor is given.
 
     Example:
       $ sros audit robot.xml
@@ -168,7 +169,16 @@ def audit(
 
     at_end = "the result is shown"
     snapshot, rmw = observe(environment, watch, spin_time, report, at_end=at_end)
+    on_zenoh, unknown = rmw == RMW_ZENOH, ""
+    if on_zenoh and enclaves.keystore and not vendor:
+        try:
+            enclaves = enclaves.on_zenoh()
+        except KeystoreError as error:
+            unknown = str(error)
     audited = judge(snapshot.everything)
+    if unknown:
+        notes = (*audited.notes, Note("audit.zenoh-unknown", unknown))
+        audited = replace(audited, unjudged=(*audited.unjudged, _NO_ZENOH_FILES), notes=notes)
     kept_changing = snapshot.seconds if not snapshot.settled else 0
     left_out = [
         text
@@ -185,8 +195,8 @@ def audit(
             why_no_node_was_observed(environment, snapshot.seconds, rmw, enclave),
         )
     ended = audits.notes_on_ended(snapshot.gone)
-    on_zenoh = (audits.ON_ZENOH,) if rmw == RMW_ZENOH else ()
-    audited = replace(audited, notes=(*audited.notes, *ended, *on_zenoh))
+    by_vendor = (audits.BY_VENDOR_ON_ZENOH,) if on_zenoh and not enclaves.zenoh else ()
+    audited = replace(audited, notes=(*audited.notes, *ended, *by_vendor))
     existed = patch is not None and patch.exists()
     written = _write_patch(audited, patch, dry_run=dry_run)
     if as_json:
@@ -198,7 +208,7 @@ def audit(
                 sources[0],
                 sources[1:],
                 enclaves.what,
-                enclaves.vendor,
+                "zenoh" if enclaves.zenoh else enclaves.vendor,
                 enclaves.context.domain,
                 fine,
                 denied=audited.denied,
@@ -216,7 +226,7 @@ def audit(
             )
         )
     else:
-        _show(audited, enclaves, kept_changing, on_zenoh=rmw == RMW_ZENOH)
+        _show(audited, enclaves, kept_changing, on_zenoh=on_zenoh)
     print_notes((*audited.notes, *audited.missing.notes))
     if audited.allowed and left_out:
         echo(f"the exit status is 1: {'; '.join(left_out)}", err=True)
@@ -241,9 +251,14 @@ _UNSEEN = "nodes were not seen (--watch finds nodes that start later, --partial 
 _UNJUDGED = (
     "a part of the graph was not judged, or the graph kept changing (--unjudged accepts this)"
 )
+_NO_ZENOH_FILES = "what the keystore's files for Zenoh allow"
 _ALLOW_ADVICE = (
     "to allow the denied access, add --patch missing.xml: sros then writes the missing rights as a "
     "policy, and names the command that adds them"
+)
+_WRITE_ZENOH_FILES = (
+    "the permissions allow some of these rights, but the keystore's files for Zenoh do not: write "
+    "the files again with `sros zenoh KEYSTORE`, and restart the processes that it names"
 )
 _NO_PATCH = "no patch was written: no additional right would allow the denied access"
 
@@ -288,10 +303,10 @@ def _show(
     problems += [counted(len(audited.refused), "whole enclave")] if audited.refused else []
     verdict = f"{' and '.join(problems) or 'nothing'} would be denied to "
     verdict += f"{counted(len(audited.observation.nodes), 'node')} with "
-    verdict += (
-        f"{counted(audited.observation.endpoint_count, 'endpoint')}, "
-        f"{'by the rules of' if on_zenoh else 'on'} {enclaves.vendor.title}"
-    )
+    decided_by = f"{'by the rules of' if on_zenoh else 'on'} {enclaves.vendor.title}"
+    if enclaves.zenoh:
+        decided_by = "by the keystore's files for Zenoh"
+    verdict += f"{counted(audited.observation.endpoint_count, 'endpoint')}, {decided_by}"
     if audited.unseen:
         number, of = len(audited.expected), len(audited.expected) - len(audited.unseen)
         seen = f"{of} of {counted(number, 'node')} of the {enclaves.what}"
@@ -306,3 +321,5 @@ def _show(
     echo(verdict, err=True)
     if any(denied_right.by_rule for denied_right in audited.denied):
         echo("a DENY denies some rights; no additional right overrides a DENY", err=True)
+    if any(denied_right.by_files for denied_right in audited.denied):
+        echo(_WRITE_ZENOH_FILES, err=True)

@@ -20,7 +20,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
 from sros_tool.dds.decision.access import AccessVerb
 from sros_tool.dds.decision.vendors import Vendor
@@ -65,13 +65,15 @@ from sros_tool.translate import governance_for
 from sros_tool.values import DryRun, FileChanges, Notes, Words, shows
 from sros_tool.wording import counted, first_few
 
+if TYPE_CHECKING:
+    from sros_tool.explain.zenoh import ZenohEvaluator
+
 _DENY_RULE = "deny-rule"
 _USE_WORD = "use"
-ON_ZENOH = Note(
+BY_VENDOR_ON_ZENOH = Note(
     "audit.on-zenoh",
     "these nodes run on Zenoh, and sros decided by the rules of a DDS vendor. On Zenoh, the files "
-    "of `sros zenoh` decide; they state the same rights if `sros zenoh KEYSTORE --check` finds "
-    "them up to date",
+    "of `sros zenoh` decide: to ask them, audit the keystore without --vendor",
 )
 
 # ── the enclaves to audit ──────────────────────────────────────────────────────────────────
@@ -129,14 +131,32 @@ def _matches_node_name(node: str, name: str) -> bool:
 
 @dataclass(frozen=True)
 class AuditedEnclaves:
-    """The enclaves of a policy or keystore (``what``); ``load`` loads an enclave by its name."""
+    """The enclaves of a policy or keystore (``what``); ``load`` loads an enclave by its name.
+
+    With ``zenoh``, the Zenoh files of ``keystore`` decide, and not the permissions.
+    """
 
     what: str
     nodes: EnclaveNodes
     load: Callable[[str], LoadedEnclave]
     vendor: Vendor
     context: JoinContext
+    keystore: OpenedKeystore | None = None
+    zenoh: ZenohEvaluator | None = None
     _evaluators: dict[str, Evaluator] = field(default_factory=dict)
+
+    def on_zenoh(self) -> AuditedEnclaves:
+        """Return the same enclaves of a keystore, for the decisions of Zenoh.
+
+        Raises:
+            KeystoreError: sros cannot know what the router enforces (`ZenohEvaluator`).
+        """
+        from sros_tool.explain.zenoh import ZenohEvaluator  # DDS does not need it
+
+        assert self.keystore
+        at, domain = self.context.at, self.context.domain
+        zenoh = ZenohEvaluator(self.keystore, moment=at, domain=domain)
+        return replace(self, vendor=Vendor.STANDARD, zenoh=zenoh, _evaluators={})
 
     def evaluator(self, enclave: str) -> Evaluator:
         """Return the evaluator for an enclave; an enclave is loaded only once."""
@@ -174,9 +194,10 @@ def audited_enclaves(
                 "",
                 f"Leave '{other_paths[0]}' out.",
             )
-        routers = router_enclaves(OpenedKeystore(path), context.at)
+        keystore = OpenedKeystore(path)
+        routers = router_enclaves(keystore, context.at)
         with_nodes = [name for name in enclave_names(path) if name not in routers]
-        return keystore_enclaves(rights, with_nodes, vendor, context)
+        return replace(keystore_enclaves(rights, with_nodes, vendor, context), keystore=keystore)
     if rights.kind != "policy":
         raise UsageError(
             f"'{path}' is neither a policy nor a keystore",
@@ -253,6 +274,13 @@ class DeniedRight:
     """Whether the policy does not have the enclave yet."""
     endpoints: tuple[Endpoint, ...]
     """The denied DDS endpoints."""
+    by_files: bool = False
+    """Whether the permissions allow the right, but the Zenoh files of the keystore do not."""
+
+    @property
+    def can_be_added(self) -> bool:
+        """Whether an additional right in the policy allows it."""
+        return not (self.by_rule or self.by_files)
 
     def __str__(self) -> str:
         """Return text like ``/robot publish topic /chatter (/talker): no rule allows it``."""
@@ -279,8 +307,10 @@ class AuditResult(NamedTuple):
     """Paths of other policies that were audited together with ``source``."""
     kind: Annotated[str, Words(("policy", "keystore"))]
     """Whether the source is a policy or a keystore."""
-    vendor: Vendor
-    """The DDS vendor, as ``--vendor`` takes it."""
+    vendor: Vendor | Literal["zenoh"]
+    """The DDS vendor, as ``--vendor`` takes it; ``zenoh`` if the Zenoh files of the keystore
+    decided.
+    """
     domain: int
     """The ROS domain."""
     allowed: bool
@@ -363,7 +393,7 @@ class Audit:
 
     @cached_property
     def missing(self) -> Learned:
-        """The rights to add to the policy; rights that a deny rule denies are not included."""
+        """The rights to add to the policy."""
         learned = learn(_nodes_using_denied(self.denied, self.observation))
         return replace(learned, source=RightsFound.AUDIT)
 
@@ -562,15 +592,24 @@ class _Judgement:
 
 
 def _judge(process: Sequence[ObservedNode], enclave: str, enclaves: AuditedEnclaves) -> _Judgement:
-    evaluator = enclaves.evaluator(enclave)
+    evaluator, zenoh = enclaves.evaluator(enclave), enclaves.zenoh
     join = evaluator.answer(Question("join"))
-    if not join.allowed:
-        return _Judgement((), join.decision.clause)
-    return _Judgement(
-        tuple(
-            right for node in process for right in _denied_rights(node, process, enclave, evaluator)
-        )
-    )
+    refused = "" if join.allowed else join.decision.clause
+    if zenoh:
+        refused = zenoh.answer(enclave, Question("join"), reach=False, brief=True).stopped
+    if refused:
+        return _Judgement((), refused)
+    denied = [
+        right
+        for node in process
+        if join.allowed
+        for right in _denied_rights(node, process, enclave, evaluator)
+    ]
+    if zenoh:
+        by_permissions = {denied_right.right for denied_right in denied}
+        dropped = (right for node in process for right in _dropped_rights(node, enclave, zenoh))
+        denied += (right for right in dropped if right.right not in by_permissions)
+    return _Judgement(tuple(denied))
 
 
 def _denied_rights(
@@ -599,6 +638,22 @@ def _denied_rights(
             if not by_rule and (meant := likely_meaning(right, used, named)):
                 reason = f"{reason}; {meant}"
             yield DeniedRight(right, (node.fqn,), reason, bool(by_rule), False, endpoints)
+
+
+def _dropped_rights(
+    node: ObservedNode, enclave: str, zenoh: ZenohEvaluator
+) -> Iterator[DeniedRight]:
+    """Yield the rights of a node whose messages a process on Zenoh drops.
+
+    Topics without a ROS name are left out: the files of `sros zenoh` state rights to ROS names.
+    """
+    for right, needed in _rights_of(node, enclave):
+        if right.kind == "dds":
+            continue
+        question = Question(_USE_WORD, right=right.right, name=right.name)
+        answer = zenoh.answer(enclave, question, reach=False)
+        if not answer.allowed:
+            yield DeniedRight(right, (node.fqn,), answer.text, False, False, needed, by_files=True)
 
 
 def _rights_of(node: ObservedNode, enclave: str) -> Iterator[tuple[Right, tuple[Endpoint, ...]]]:
@@ -638,11 +693,11 @@ def _group_by_right(denied: Iterable[DeniedRight]) -> tuple[DeniedRight, ...]:
 def _nodes_using_denied(denied: Iterable[DeniedRight], observation: Observation) -> Observation:
     """Return the nodes that lack a right, with only the endpoints that need the right.
 
-    Rights that a deny rule denies are left out: an allow rule would not help.
+    Rights that an allow rule would not allow are left out.
     """
     wanted: dict[tuple[str, str], set[Endpoint]] = {}
     for right in denied:
-        if right.by_rule:
+        if not right.can_be_added:
             continue
         needed = set(right.endpoints)
         if right.right.kind != "dds":

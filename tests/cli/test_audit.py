@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -60,6 +61,47 @@ def test_an_audit_says_by_whose_rules_it_decides_and_which_nodes_ended(
     ended = program(graph(FINE), "robot.xml", *SHORT)
     assert "with 1 endpoint, by the rules of Fast DDS 2.14\nnote [audit.ended]: " in ended.err
     assert "such nodes: /talker\nnote [audit.on-zenoh]: " in ended.err
+
+
+@pytest.mark.parametrize(
+    ("files", "words", "status", "out", "err"),
+    [
+        ("new", (), 0, "", "with 2 endpoints, by the keystore's files for Zenoh\n"),
+        ("old", (), 1, "/t publish topic /x (/talker): put 0/x/", "write the files again with"),
+        ("none", (), 1, "", "not judged: what the keystore's files for Zenoh allow"),
+        ("none", ("--unjudged",), 0, "", "[audit.zenoh-unknown]: keystore 'ks' has no Zenoh"),
+        ("old", ("--vendor", "fastdds"), 0, "", "by the rules of Fast DDS 2.14\nnote [audit.on-z"),
+    ],
+)
+def test_on_zenoh_the_files_of_the_keystore_decide(
+    files: str,
+    words: tuple[str, ...],
+    status: int,
+    out: str,
+    err: str,
+    program: Program,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def on_zenoh(*asked: Any, **more: Any) -> tuple[Snapshot, str]:
+        return observe(*asked, **more)[0], RMW_ZENOH
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(audit, "observe", on_zenoh)
+    allowing_x = POLICY.replace("</topic>", "</topic><topic>x</topic>")
+    for policy in (POLICY, allowing_x):
+        (tmp_path / "robot.xml").write_text(policy)
+        sros("generate_artifacts", "-k", "ks", "-p", "robot.xml").ok()
+        if files != "none":
+            sros("zenoh", "ks").ok()
+        if policy == POLICY:
+            shutil.copytree("ks", "before")
+    if files == "old":
+        for file in Path("before").rglob("*.json5*"):
+            shutil.copy(file, "ks" / file.relative_to("before"))
+    ended = program(graph(("/t", *LOUD[1:])), "ks", *SHORT, *words)
+    assert (ended.status, ended.out[: len(out)]) == (status, out)
+    assert err in ended.err
 
 
 TO_ALLOW = (
@@ -172,6 +214,7 @@ def test_json_has_a_stable_shape(program: Program) -> None:
                 "by_rule": False,
                 "new_enclave": False,
                 "endpoints": [{"topic": "rt/x", "direction": "publish"}],
+                "by_files": False,
             }
         ],
         "others": [],
