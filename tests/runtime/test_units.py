@@ -24,6 +24,7 @@ from sros_tool.runtime.units import (
     unit_instance,
 )
 from tests.support.children import run
+from tests.support.pages import PROJECT, blocks
 
 pytestmark = pytest.mark.skipif(not shutil.which("systemd-analyze"), reason="there is no systemd")
 
@@ -119,6 +120,22 @@ def test_systemd_finds_nothing_wrong_in_the_jobs(passphrase: str, tmp_path: Path
     env = {**os.environ, "SYSTEMD_UNIT_PATH": f"{tmp_path}:"}
     command = ["systemd-analyze", "security", "--offline=true", "--no-pager", "--threshold=30"]
     run([*command, "sros-agent.service"], env=env)
+
+
+def test_systemd_finds_nothing_wrong_in_the_mail_of_the_page(tmp_path: Path) -> None:
+    page = (PROJECT / "docs/howto/fleet.md").read_text("utf-8")
+    files = {
+        block.file.removeprefix("units/"): "\n".join(block.lines).replace(
+            "/opt/sros/bin/sros", "/bin/true"
+        )
+        for block in blocks(page)
+        if block.file.startswith("units/")
+    }
+    mail = "mail@sros-status.service.service"
+    said = verified(tmp_path, files, "sros-status.service", "sros-status.timer", mail)
+    assert f"OnFailure: {mail}" in said
+    (sent,) = re.findall(r"Command Line: (/bin/sh -c .*)", said)
+    assert sent.endswith(" sh sros-status.service")
 
 
 # ── hostile names and words ────────────────────────────────────────────────────────────────
