@@ -199,7 +199,7 @@ LIE_TABLE = (
     Lie("pointer of LFS", "cannot be", _text("version https://git-lfs.github.com/spec/v1\n"
                                       "oid sha256:" + "0" * 64 + "\nsize 9\n")),
     Lie("submodule", "is a submodule", _module_of_git),
-    Lie("gone", "If it is renamed, name the folder of both names",
+    Lie("gone", "If it is renamed, give --policy the folder",
         lambda _, folder: (folder / "robot.policy.xml").unlink()),
     Lie("another name", "The change renames it to 'robot/lies/another name/other.xml'",
         lambda _, folder: (folder / "robot.policy.xml").rename(folder / "other.xml")),

@@ -365,7 +365,8 @@ _CONSEQUENCES = {
     "portable.long-name": f"; on Fast DDS no peer matches a topic of more than "
     f"{_LONGEST_TOPIC} bytes. Use shorter namespaces and names.",
     "portable.deny-blocks-topic": " on Cyclone DDS, which refuses the topic as a whole; Fast "
-    "DDS allows it. What no rule allows is denied anyway, so perhaps the deny rule can be removed.",
+    "DDS denies only the named direction. What no rule allows is denied anyway, so perhaps the "
+    "deny rule can be removed.",
     "portable.character-set": ". Vendors agree on sets such as [ab], but only * and ? are part of "
     "the portable profile.",
 }

@@ -411,8 +411,8 @@ def _types_not_heard(node: HandNode, environment: Mapping[str, str]) -> str:
     if not differs_in_vendor or environment.get(ENABLE) != "true":
         return ""
     lacks = built_without_security(rmw, environment)
-    but = "was built without security here" if lacks else "needs --backend rclpy"
-    return f"secured nodes on {rmw} and this node do not hear each other; {rmw} {but}"
+    but = f"{rmw} was built without security here" if lacks else "add --backend rclpy"
+    return f"secured nodes on {rmw} and this node do not hear each other: {but}"
 
 
 def run_by_hand(
@@ -498,7 +498,7 @@ def run_by_hand(
         result = results.get(node.role, "")
         was_short = duration is not None and duration.total_seconds() < _SILENCE_SECONDS
         if result and was_short and not (heard or seen):
-            result += ", but that was too short to find all others: add --for 10s"
+            result += ", but the time may be too short to find other nodes: add --for 10s"
         say(f"stopped{by_force}{result}")
     elif last and last.stage is ProcessStage.ENDPOINT and os.environ.get(ENABLE) == "true":
         verb = "publish" if node.role is Role.TALKER else "subscribe"

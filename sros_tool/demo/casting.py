@@ -265,13 +265,13 @@ class _Enclaves(NamedTuple):
         """Yield the tests that a proof of the keystore needs and this cast cannot run."""
         more = len(self.revoked) + len(self.faulty) - _MOST_FAULTY
         if more > 0:
-            yield f"{more} more enclaves with faulty or revoked files"
+            yield f"{more} more enclaves with faulty files or revoked certificates"
         if self.unreadable:
             yield f"{first_few(sorted(self.unreadable), 1)} with files that cannot be read"
         if self.without_list and cast["listener"] not in self.without_list:
             yield f"{first_few(sorted(self.without_list), 1)} without the newest revocation list"
         if self.other_governance:
-            yield f"{first_few(sorted(self.other_governance), 1)} with a governance of its own"
+            yield f"{first_few(sorted(self.other_governance), 1)} with another governance"
         if self.other_domain:
             yield f"{first_few(sorted(self.other_domain), 1)} outside domain {self.domain}"
 

@@ -283,7 +283,7 @@ def _versions() -> list[str]:
         with suppress(importlib.metadata.PackageNotFoundError):
             version = importlib.metadata.version(name)
             versions.append(
-                f"{name} {version if _VERSION.match(version) else 'of a local version'}"
+                f"{name} {version if _VERSION.match(version) else '(local version, not shown)'}"
             )
     return [f"sros {__version__}", f"Python {platform.python_version()}", *versions]
 

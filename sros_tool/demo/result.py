@@ -420,8 +420,8 @@ def _judge_loss(case: _ClaimRecords) -> _ClaimFinding:
     if not inside:
         return _undecided(f"{claim.subject} counted nothing in the window")
     left = inside[-1].publishers.get(topic, 0)
-    detail = f"{case.subject.through} counts {left} publishers on {topic}, {most} before"
-    return case.result(not left, f"{detail}; {claim.talker} tried to remove the node")
+    detail = f"{case.subject.through} counts {most} publishers on {topic}, and {left} after "
+    return case.result(not left, f"{detail}{claim.talker} tried to remove the node")
 
 
 def _judge_wire(case: _ClaimRecords) -> _ClaimFinding:
@@ -678,7 +678,8 @@ class UsedLibrary(NamedTuple):
         name = f"{self.product} {version}, which the processes loaded,"
         if self.vulnerabilities is None:
             return f"{name} may have vulnerabilities: {_UNKNOWN}."
-        unclear = f"; {len(self.unclear)} more are unclear" if self.unclear else ""
+        others = counted(len(self.unclear), "other vulnerability", "other vulnerabilities")
+        unclear = f"; {others} may affect it" if self.unclear else ""
         if not self.vulnerabilities:
             return f"{name} has no known vulnerability{unclear}."
         number = counted(len(self.vulnerabilities), "known vulnerability", "known vulnerabilities")
@@ -826,7 +827,7 @@ def _left_out_clauses(result: DemoResult) -> Iterator[str]:
     if applicable := sum(1 for row in skipped if row.applies):
         yield f"{applicable} skipped"
     if others := len(skipped) - applicable:
-        yield f"{others} that {'does' if others == 1 else 'do'} not apply to this keystore"
+        yield f"{others} not applicable to this keystore"
     if result.left_out:
         yield f"{result.left_out} left out with --only"
     for scenario in result.scenarios:
@@ -835,7 +836,7 @@ def _left_out_clauses(result: DemoResult) -> Iterator[str]:
         used = {member.enclave for member in scenario.cast}
         yield f"{len(used)} of {scenario.keystore.enclaves} enclaves took part"
         if scenario.keystore.elsewhere:
-            yield f"{scenario.keystore.elsewhere} could not (keys elsewhere)"
+            yield f"{scenario.keystore.elsewhere} could not (no key in the keystore)"
         if scenario.not_tried:
             names = "; ".join(scenario.not_tried)
             yield f"not proved, because something was not tried ({names})"

@@ -536,11 +536,11 @@ _NOTE_TEXTS = {
     "odd-node": "left out, because a policy cannot name these nodes or their enclaves: {}",
     "partial-action": "only parts of an action are used, so they are listed as "
     "topics and services: {}",
-    "root-enclave": "the ROS graph shows the enclave / for {}, so the policy gives all these "
-    "rights to /, and every process without an enclave has them. Either the processes were started "
-    "without an enclave, or ROS_SECURITY_ENCLAVE_OVERRIDE (as `sros run` and `sros env` set it) "
-    "names an enclave that the graph does not show. --enclave-per-node gives each process an "
-    "enclave of its own, with the name of its node",
+    "root-enclave": "the ROS graph shows the enclave / for {}, so the policy gives the "
+    "rights of these nodes to /, and every process without an enclave has them. Either the "
+    "processes were started without an enclave, or ROS_SECURITY_ENCLAVE_OVERRIDE (as `sros run` "
+    "and `sros env` set it) names an enclave that the graph does not show. --enclave-per-node "
+    "gives each process an enclave of its own, with the name of its node",
     "same-node": "several processes have the same node in the same enclave, so this enclave gets "
     "the rights of all of them. Unless it is one process that was restarted, find out whether each "
     "of these processes is yours, and give the nodes different names (-r __node:=NAME): {}",
@@ -1001,7 +1001,7 @@ def merge_policies(
             raise UsageError(
                 f"--node {missing[0]}: no policy to merge has a node of this name",
                 "",
-                "Write the name as node= has it.",
+                "Write the name as in node= of its <profile>.",
             )
     notes: list[Note] = []
     present, stated = read_policy(path, may_be_empty=True), additions

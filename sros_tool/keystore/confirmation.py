@@ -842,7 +842,7 @@ def _requests_from(value: Any) -> tuple[str, ...]:
 
 def _list_from(value: Any, most: int, what: str) -> list[Any]:
     if not isinstance(value, list) or len(value) > most:
-        raise _FormError(f"its {what} are not a list of at most {most}")
+        raise _FormError(f"its {what} are not a list of at most {most} items")
     return value
 
 

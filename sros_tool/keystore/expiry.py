@@ -209,7 +209,7 @@ class ExpiryCheck(NamedTuple):
         """Return a clause that names short-lived enclaves and their expiry; "" without any."""
         shown = [describe_lifetime(lifetime, self.moment) for lifetime in self.short_lived]
         enclaves = counted(len(shown), "short-lived enclave")
-        return f"{enclaves}, renewed only if named: {first_few(shown, 3)}" if shown else ""
+        return f"{enclaves} (renewed only by name): {first_few(shown, 3)}" if shown else ""
 
 
 def due_enclaves(

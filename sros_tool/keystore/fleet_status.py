@@ -1379,7 +1379,7 @@ def _robot_status(
     is_refused = bool(refusal and (received is None or received.time <= refusal.time))
     if refusal and is_refused:
         state = max(state, State.REFUSED, key=_RANK_OF_STATE.__getitem__)
-        refusal_note = f"its last message was refused since {iso(refusal.time)}: {refusal.why}"
+        refusal_note = f"its last message has been refused since {iso(refusal.time)}: {refusal.why}"
         compared_robot = compared_robot._replace(notes=(*compared_robot.notes, refusal_note))
     is_ahead = bool(
         state is State.UNKNOWN
@@ -1458,10 +1458,10 @@ def _robot_status(
         return status
     if status.problems:
         return replace(status, got_earlier_release=True)
+    has = f"release {status.release}" if status.release else "no release"
     copy_problem = (
-        f"It sent a message long after release {status.published} was published, and has release "
-        f"{status.release or 'none'}: the place that `from` names in the settings of its agent has "
-        "an old copy."
+        f"It sent a message long after release {status.published} was published, and has {has}: "
+        "the place that `from` names in the settings of its agent has an old copy."
     )
     return replace(
         status, got_earlier_release=True, problems=(*(status.problems or ()), copy_problem)

@@ -577,8 +577,8 @@ def _left_out_notes(grants: Iterable[Grant]) -> Iterator[Note]:
             yield Note("rights.partitions", "this answer ignores its partitions.")
         if any(rule.relay for rule in grant.rules):
             text = (
-                "this answer ignores its <relay>, by which peers on Fast DDS let a process "
-                "subscribe that does not apply its own permissions."
+                "this answer ignores its <relay>: if a process does not apply its own permissions, "
+                "peers on Fast DDS let it subscribe by this rule."
             )
             yield Note(RELAY, text)
         if len({rule.domains for rule in grant.rules}) > 1:

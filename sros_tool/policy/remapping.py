@@ -245,9 +245,9 @@ def _unused_rule_error(
             f"Add --node {nodes[0]}, or leave out the rule.",
         )
     return UsageError(
-        f"--remap {rule}: no policy to merge has this name, or such a node",
+        f"--remap {rule} matches no name or node in the policies to merge",
         "",
-        "Write the names as the nodes of the policy use them.",
+        "Write the name, and the node if you state one, as in the policy.",
     )
 
 

@@ -59,7 +59,7 @@ from sros_tool.proof.requirements import (
 )
 from sros_tool.proof.system import Place, System
 from sros_tool.proof.worlds import ANYBODY, World
-from sros_tool.wording import first_few
+from sros_tool.wording import counted, first_few
 
 
 @dataclass(frozen=True, slots=True)
@@ -524,7 +524,8 @@ def short_text(violation: Violation) -> str:
         case _:
             text = f"{_subject(violation)} {_clause(violation)}"
     more = 0 if violation.position else len(violation.witness.others)
-    return f"{text}, and {more} more break it" if more else text
+    others = counted(more, "other enclave breaks", "other enclaves break")
+    return f"{text}, and {others} the requirement" if more else text
 
 
 def _violation_clause(violation: Violation) -> str:
@@ -591,7 +592,8 @@ def _other_violators(violation: Violation) -> str:
     for steps in differing:
         text += f"; {steps[0].use.enclave} may {' and '.join(step.action_text() for step in steps)}"
     more = len(violation.witness.others) - len(similar) - len(differing)
-    return text + (f"; {more} more break it in other ways" if more else "")
+    others = counted(more, "other enclave breaks", "other enclaves break")
+    return f"{text}; {others} the requirement in other ways" if more else text
 
 
 def _listed_names(names: Sequence[str], word: str = "and") -> str:

@@ -1448,7 +1448,7 @@ def _assumptions(base: AccessSource, head: AccessSource) -> Iterator[str]:
             continue
         if _domains_of_robots(side, against).keys() < side.permissions.keys():
             whose = "its enclaves without a robot" if side.fleet else "it"
-            yield f"{name} names no domains: the domains of {other} count for {whose}"
+            yield f"{name} names no domains, so the domains of {other} count for {whose}"
         if against.zenoh is not None:
             yield f"{name} has the Zenoh settings that sros writes"
 

@@ -380,7 +380,7 @@ def parse_requirements(
         if len(requirements) > _MOST_FILLED:
             raise DocumentError(
                 f"{table.source}: with the robots of the fleet, or all namespaces, the tables up "
-                f"to this line are more than {_MOST_FILLED} requirements",
+                f"to this line stand for more than {_MOST_FILLED} requirements",
                 "",
                 "Name a group of robots, as in {robot:carriers}, or divide the file.",
             )

@@ -145,7 +145,7 @@ _NOT_USED_TEXT = (
     "changes and is not reviewed: no reviewed policy uses it. Name it with --policy, leave it out "
     "with"
 )
-_BOTH_NAMES_REMEDY = "name the folder of both names with --policy, which compares them"
+_BOTH_NAMES_REMEDY = "give --policy the folder that has both files"
 _PRIVATE_KEY = re.compile(rb"-----BEGIN (?:[A-Z0-9]+ )*PRIVATE KEY-----(?:\s|\\[nr])+[\w+/]")
 """A private key in PEM; a text that only mentions the first line does not match."""
 _UNSIGNED_POLICY_IDS = tuple(

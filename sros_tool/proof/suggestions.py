@@ -111,7 +111,7 @@ def _comment_on_unmet(requirement: Requirement) -> str:
     (right, (name,)), users = requirement.rights[0], counted(len(requirement.enclaves), "enclave")
     return (
         f"# not proposed: only some may {right} {name} (stated for {users}, but others may do so "
-        "by a wildcard, or a DENY is there)"
+        "by a wildcard, or a DENY applies)"
     )
 
 

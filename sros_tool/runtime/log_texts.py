@@ -509,7 +509,7 @@ _FAST_PARTICIPANT_TEXTS = (
     ),
     _log_text(
         "peer-governance", _FAST, r"Security manager returns an error for (?:reader|writer)",
-        "a publisher or subscription of a PEER was refused. Without another line with the reason, "
+        "a publisher or subscription of a PEER was refused. If no other line gives the reason, "
         "the governance of the peer protects the topic differently: the processes have enclaves "
         "of different keystores, or one process was started before the governance changed",
         "`sros check KEYSTORE OTHER`, with the keystore or export of the peer, names the topic. "
@@ -633,16 +633,17 @@ _CONSEQUENCE_TEXTS = (
         "participant", _FAST, r"Error while configuring security plugin"
         r"|Participant is not allowed with its own permissions file"
         r"|SecurityManager::init :\s*\Z|Cryptography plugin not configured",
-        "the process may not join; Fast DDS 2.14 gives the reason in another line, or in the file "
-        "of ROS_SECURITY_LOG_FILE, and neither is in this log", _EXPLAIN_OR_LOG_FILE, _ALL_FAULTS,
+        "the process is not allowed to join; Fast DDS 2.14 gives the reason in another line, or "
+        "in the file of ROS_SECURITY_LOG_FILE, and neither is in this log",
+        _EXPLAIN_OR_LOG_FILE, _ALL_FAULTS,
         remedy_without_fault=_LOG_FILE_REMEDY, vagueness=1,
     ),
     _log_text(
         "participant", _FAST, r"Cannot create participant due to initialization error"
         r"|Problem creating RTPSParticipant|failed to create participant",
-        "the process may not join, and this log gives no reason: Fast DDS 2.6 and 2.9 log "
-        "nothing about signatures, expired permissions and subjects; later releases log why, on "
-        "standard output or in the file of ROS_SECURITY_LOG_FILE",
+        "the process is not allowed to join, and this log gives no reason: Fast DDS 2.6 and 2.9 "
+        "log nothing about signatures, expired permissions and subjects; later releases log why, "
+        "on standard output or in the file of ROS_SECURITY_LOG_FILE",
         _EXPLAIN_OR_LOG_FILE, _ALL_FAULTS,
         remedy_without_fault=_LOG_FILE_REMEDY, vagueness=2,
     ),

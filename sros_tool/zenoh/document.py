@@ -339,7 +339,7 @@ class _Section:
         except ValueError:
             known = ", ".join(choice.value for choice in kind)
             raise self.invalid_value_error(
-                member, f"is {text[:40]!r}, and none of: {known}"
+                member, f"is {text[:40]!r}, which is none of: {known}"
             ) from None
 
     def texts(self, member: str) -> tuple[str, ...] | None:

@@ -307,7 +307,7 @@ def test_what_demo_prints(
         seen.check("demo", both_ways("demo", case, made_folder, tmp_path))
     shown = result(CLOSED, TWIN, OPEN)
     cast = (CastMember("listener", "/a", ("/n",)),)
-    keystore = KeystoreSummary(3, not_tried=("/b with a governance of its own",))
+    keystore = KeystoreSummary(3, not_tried=("/b with another governance",))
     scenario = replace(shown.scenarios[0], cast=cast, attacked=keystore)
     unproved = replace(shown, scenarios=(scenario,))
     run = replace(OPEN, unaccepted=True, libraries=frozenset({OLD}))

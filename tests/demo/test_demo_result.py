@@ -88,7 +88,10 @@ OLD = MappedLibrary("Fast DDS", "2.14.5", "/opt/ros/jazzy/lib/libfastrtps.so.2.1
             MappedLibrary("Cyclone DDS", "0.10.2", "/usr/lib/libddsc.so.0.10.2"),
             "1 known vulnerability, unless its package fixes it: CVE-2023-24011.",
         ),
-        (OLD._replace(version="3.2.5"), "has no known vulnerability; 2 more are unclear."),
+        (
+            OLD._replace(version="3.2.5"),
+            "has no known vulnerability; 2 other vulnerabilities may affect it.",
+        ),
         (OLD._replace(version=""), "of unknown version, which the processes loaded, may have"),
         (None, "Cyclone DDS 0.10.2 may have vulnerabilities: its version is not known"),
     ],

@@ -1315,7 +1315,10 @@ def test_a_robot_whose_last_message_was_refused_is_not_current(field: Field) -> 
     file.write_bytes(good[:-1000])
     field.run("fleet", "collect", "ks", "inbox", status=1)
     found = field.status()["robots"]["r1"]
-    assert found["state"] == "refused" and "its last message was refused since" in found["notes"][0]
+    assert (
+        found["state"] == "refused"
+        and "its last message has been refused since" in found["notes"][0]
+    )
     file.unlink()
     field.run("fleet", "collect", "ks", "inbox")
     rows = field.run("fleet", "status", "ks", status=1).out

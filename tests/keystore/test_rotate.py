@@ -420,7 +420,7 @@ def test_the_note_on_a_lost_old_key_names_where_it_belongs(separate: Path) -> No
     step = rotate_ca(separate, now=NOW)
     assert not step.kept_elsewhere
     (note,) = (note.text for note in step.notes if "the old key of the identity CA" in note.text)
-    assert "is missing; until the stage retire, `sros revoke` needs it as" in note
+    assert "is missing; until the stage retire, `sros revoke` needs it at" in note
     place = Path(note.split("'")[1])
     assert not place.exists()
     refused(lambda: revoke(separate, [NAMES[0]], now=NOW), separate, place.name)

@@ -125,16 +125,13 @@ def test_a_short_lived_enclave_is_renewed_by_its_name_alone(tmp_path: Path) -> N
     none, left_out = said.splitlines()
     assert none == "the only enclave does not need to be renewed (30d)"
     assert left_out.startswith(
-        f"not counted: 1 short-lived enclave, renewed only if named: {SHORT}"
+        f"not counted: 1 short-lived enclave (renewed only by name): {SHORT}"
     )
     due = sros("check", "keystore", root, "--needs-renewal", "99y")
     assert (due.status, SHORT in due.out, LONG in due.out) == (1, False, True)
     renewed = sros("renew", root, "--all-expiring", "99y").ok()
     assert renewed.out == f"renewed enclave {LONG}\n"
-    assert (
-        f"[renew.short-lived]: short-lived enclaves are renewed only if named: {SHORT}"
-        in renewed.err
-    )
+    assert f"[renew.short-lived]: not renewed: {SHORT} (short-lived enclaves are" in renewed.err
     renewed = sros("renew", root, SHORT, "--all-expiring", "30d").ok()
     assert renewed.out == f"renewed enclave {SHORT}\n"
 

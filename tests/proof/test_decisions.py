@@ -123,7 +123,7 @@ def test_in_short_a_violation_says_who_breaks_it_by_what() -> None:
     system = robot(rights | {"/a": rights["/a"].replace("/x<", '/x<?sros protect="sign"?><')})
     violations = decide_all(parse_requirements(required.encode(), "r.toml"), system).violations
     assert [short_text(violation) for violation in violations] == [
-        "/a may publish /x, and 1 more break it",
+        "/a may publish /x, and 1 other enclave breaks the requirement",
         "/a influences /c",
         "/a may not publish /y",
         "/a and /b may publish /x",
@@ -243,7 +243,8 @@ def test_of_each_enclave_the_finding_says_what_it_may() -> None:
     ]
     many = {f"/e{number}": may("publish", f"/topic{number}") for number in range(8)}
     (text,) = texts(many, required)
-    assert "; /e5 may publish /topic5; 2 more break it in other ways, but /* may" in text
+    others = "2 other enclaves break the requirement in other ways"
+    assert f"; /e5 may publish /topic5; {others}, but /* may" in text
     both = {f"/e{number}": may("publish", f"/x{number}", "/y") for number in range(2)}
     required = '[[not_both]]\nfirst.publish = ["/x*"]\nsecond.publish = ["/y"]'
     assert texts(both, required) == [
@@ -475,7 +476,7 @@ def test_who_moves_the_robot_is_proposed_for_any_number() -> None:
     wide = robot({**drivers, **base, "/look": may("publish", "/*")})
     assert suggest(wide.rights, wide.worlds).comments == [
         "# not proposed: only some may publish /cmd_vel (stated for 5 enclaves, but others may do "
-        "so by a wildcard, or a DENY is there)"
+        "so by a wildcard, or a DENY applies)"
     ]
 
 

@@ -183,7 +183,7 @@ def test_what_is_not_proposed_for_a_fleet_is_said_once(folder: Path) -> None:
     suggested = sros("check", "robot.xml", "--fleet", "fleet.toml", "--suggest", cwd=folder).ok()
     assert [line for line in suggested.out.splitlines() if line.startswith("# not")] == [
         "# not proposed: only some may publish {namespace:carriers}/cmd_vel (stated for 1 enclave, "
-        "but others may do so by a wildcard, or a DENY is there)"
+        "but others may do so by a wildcard, or a DENY applies)"
     ]
 
 

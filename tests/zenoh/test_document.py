@@ -113,7 +113,7 @@ def test_lines() -> None:
 
 REFUSED: dict[str, Any] = {
     "is not JSON5. Line 2": "{\n!}",
-    "mode is 'Peer', and none of: router, peer, client": {"mode": "Peer"},
+    "mode is 'Peer', which is none of: router, peer, client": {"mode": "Peer"},
     "listen is not an object": {"listen": None},
     "listen/endpoints is not a list": {"listen": {"endpoints": "tls/a:1"}},
     "listen/endpoints is null": {"listen": {"endpoints": None}},

@@ -346,7 +346,7 @@ def _read_value(node: _Node, attribute: Attribute) -> Value:
         return _read_flag(node)
     if node.text and node.text not in attribute.values:
         raise UnreadableError(
-            f"<{node.tag}> holds {node.text!r}, which is not a protection kind for it"
+            f"<{node.tag}> holds {node.text!r}, which is not one of its protection kinds"
         )
     # For a kind without text, Cyclone DDS uses 0, which stands for the strongest kind.
     return ProtectionKind(node.text or str(attribute.values[-1]))

@@ -250,8 +250,11 @@ class _Sequence:
     def next(self, name: str) -> XmlElement:
         """Return the next child and advance; raise `UnreadableError` if it has another name."""
         if not self.is_next(name):
-            actual = f", where it has <{self.rest()[0].name}>" if self.rest() else ""
-            raise UnreadableError(f"<{self._name}> lacks <{name}> at its position{actual}")
+            if rest := self.rest():
+                raise UnreadableError(
+                    f"<{self._name}> has <{rest[0].name}> where <{name}> is expected"
+                )
+            raise UnreadableError(f"<{self._name}> lacks <{name}> at its end")
         self._index += 1
         return self._children[self._index - 1]
 

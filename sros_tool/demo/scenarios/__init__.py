@@ -236,7 +236,7 @@ def _read_scenario(table: _Table) -> Scenario:
 def _read_party(table: _Table, policy: Policy) -> Party:
     name = table.text("name")
     if not _NAME.fullmatch(name):
-        problem = f"{name!r} is not the name of a party"
+        problem = f"{name!r} cannot be the name of a party"
         remedy = "Use at most 64 letters, digits, blanks, '.', '_' and '-'."
         raise table.error("name", problem, remedy)
     roles = {role.value: role for role in Role if role not in _ZENOH_ROLES}
@@ -333,7 +333,7 @@ def _read_claim(table: _Table, key: str, claim: Any, parties: Mapping[str, Party
             raise table.error(key, problem)
         role = parties[name].role
         if role not in (SPEAKING if relation is Relation.READABLE else _ROLES_OF_KEY[side]):
-            problem = f"{name} is a {role}, and cannot be the {side} of status {expected!r}"
+            problem = f"{name} is a {role}, and cannot be the {side} of a claim {expected!r}"
             raise table.error(key, problem)
     if relation is Relation.IS_ANSWERED:
         client, server = (parties[name].role for name in names)

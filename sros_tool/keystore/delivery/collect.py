@@ -558,9 +558,10 @@ class _Verifier:
         if note := received.clock_note():
             remarks.append(note)
         if went_back:
+            release = f"release {installed}" if installed else "no release"
             remarks.append(
-                f"it has release {installed or 'none'}, and had {before_it} before: its disk was "
-                "restored, or two computers have its keys"
+                f"it has {release}, and had release {before_it} before: its disk was restored, or "
+                "two computers have its keys"
             )
         return _ReceivedMessage(
             robot, "kept", verified=verified, received=received, remarks=remarks

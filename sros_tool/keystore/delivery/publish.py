@@ -1232,7 +1232,7 @@ class _Publication:
         if number > MOST_NUMBER:
             raise KeystoreError(
                 f"no release can have the number {number}",
-                f"The version before it is {number - 1}, written by somebody with the targets key.",
+                f"Somebody with the targets key has written the version {number - 1}.",
                 BEGIN_AGAIN,
             )
         authority = None if self._dry_run or not changed else change.permissions

@@ -93,9 +93,8 @@ def renew(
                 _due_enclave_names(change, {*others}.difference(short_lived), expiring)
             )
             if short_lived:
-                text = (
-                    f"short-lived enclaves are renewed only if named: {first_few(short_lived, 3)}"
-                )
+                names_text = first_few(short_lived, 3)
+                text = f"not renewed: {names_text} (short-lived enclaves are renewed only by name)"
                 change.notes.append(Note("renew.short-lived", text))
         if not wanted:  # then no CA key is opened
             # Raises an error for an export, which is never renewed.

@@ -537,7 +537,7 @@ class _Rotator:
         if not (is_here or elsewhere or revokes):
             return
         if not (is_here or elsewhere):
-            text = f"{key} is missing; until the stage retire, `sros revoke` needs it as "
+            text = f"{key} is missing; until the stage retire, `sros revoke` needs it at "
             text += f"'{place}', or the option --until-retired"
         elif self._delete:
             text = f"--delete-old-key deletes {key}"
