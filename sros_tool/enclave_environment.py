@@ -333,7 +333,7 @@ def _uses_zenoh(named: str | None, rmw: str) -> bool:
         UsageError: the process would use an RMW that sros does not know to enforce security.
     """
     from sros_tool.runtime.environment import RMW_ZENOH
-    from sros_tool.runtime.rmw import RMW, middleware_of
+    from sros_tool.runtime.rmw import RMW, vendor_of
 
     if named is not None and named not in RMWS:
         raise UsageError(
@@ -343,11 +343,11 @@ def _uses_zenoh(named: str | None, rmw: str) -> bool:
         )
     if rmw == RMW_ZENOH:
         return True
-    if (middleware := middleware_of(rmw)) and middleware.name == "Zenoh":
+    if rmw and not vendor_of(rmw):
         raise UsageError(
-            f"{RMW} is {rmw!r}, which is not an RMW that is known to enforce security",
-            f"The only RMW on Zenoh that sros knows is {RMW_ZENOH}.",
-            f"Set {RMW} to another RMW, or name an RMW with --rmw.",
+            f"the process would use {rmw!r}, which is not an RMW that is known to enforce security",
+            "",
+            f"Set {RMW} to another RMW, or name one of {', '.join(RMWS)} with --rmw.",
         )
     return False
 

@@ -557,6 +557,15 @@ PROCESS_WITHOUT_RCL = FindingKind(
     "Find out whether the program secures its participants; "
     "if not, stop it, or keep it out of the network of the robot.",
 )
+PROCESS_RMW_UNKNOWN = FindingKind(
+    "runtime.process-rmw-unknown",
+    ERROR,
+    "a process on an RMW that sros does not know to enforce security",
+    "With other RMWs, ROS_SECURITY_ENABLE=true may change nothing: then everybody on the network "
+    "hears the process and can send to it.",
+    "rmw 7 (rmw_security_options_t): each RMW decides what it does with the enclave.",
+    "Start it on an RMW that enforces security according to `sros doctor`.",
+)
 PROCESS_OTHER_KEYSTORE = FindingKind(
     "runtime.process-other-keystore",
     WARNING,
@@ -665,6 +674,8 @@ def _security_of(process: Process) -> Security:
         return Security.OPEN
     if process.is_without_rcl or (process.enclave and process.enclave.problem):
         return Security.UNKNOWN
+    if vendor_of(process.rmw) is None:
+        return Security.UNKNOWN
     return Security.OPEN if _why_unsecured(process) else Security.SECURED
 
 
@@ -703,6 +714,9 @@ def process_findings(
             if process.is_without_rcl and not process.is_zenoh:
                 text = f"it runs {_domain_text(process)} with {ENABLE}=true"
                 yield PROCESS_WITHOUT_RCL.found(process.label, text)
+            if vendor_of(process.rmw) is None and not process.is_zenoh:
+                text = f"it runs {_domain_text(process)} on {plain(process.rmw)}"
+                yield PROCESS_RMW_UNKNOWN.found(process.label, text)
         elif security[process.pid] is Security.OPEN:
             if _network_and_domain(process) in closed:
                 value = process.environment.get(ENABLE)

@@ -8,14 +8,14 @@ from datetime import UTC, datetime, timedelta, tzinfo
 from enum import StrEnum
 from pathlib import Path
 
-from sros_tool.checks.environment import variable_findings, zenoh_environment_findings
+from sros_tool.checks.environment import is_zenoh, variable_findings, zenoh_environment_findings
 from sros_tool.checks.keystores.keystore import with_joined_findings
 from sros_tool.checks.kind import ERROR, Finding, FindingKind
 from sros_tool.checks.processes import PROCESS_NOT_SEEN, process_findings
 from sros_tool.checks.vulnerabilities import vulnerability_findings
 from sros_tool.dds.advisories import Advisory
 from sros_tool.runtime.processes import MappedLibrary, RunningProcesses
-from sros_tool.runtime.rmw import DEFAULT_RMW, RMW
+from sros_tool.runtime.rmw import DEFAULT_RMW, RMW, vendor_of
 from sros_tool.runtime.variables import ENABLE, KEYSTORE
 from sros_tool.validity import iso, time_of_file
 
@@ -54,8 +54,9 @@ RMW_INSECURE = FindingKind(
     "runtime.rmw-without-security",
     ERROR,
     "an RMW that does not enforce DDS Security",
-    "The RMW was built without security, or does not use DDS. Nodes fail, or run unsecured.",
-    "Found by a test (`sros doctor`).",
+    "The RMW was built without security, or sros does not know that it enforces the files of an "
+    "enclave. Nodes fail, or run unsecured.",
+    "Found by a test (`sros doctor`), or by the name of the RMW.",
     "Use an RMW that enforces security according to `sros doctor`.",
 )
 CLOCK_BEHIND = FindingKind(
@@ -67,7 +68,6 @@ CLOCK_BEHIND = FindingKind(
     "RFC 5280, 6.1.3 (the current time); robots without a battery for their clock.",
     "Set the clock before nodes start, for instance by chrony with makestep.",
 )
-_NOT_DDS = ("rmw_email", "rmw_iceoryx")
 _TOLERANCE = timedelta(minutes=2)
 
 
@@ -94,8 +94,8 @@ def _rmw_findings(state: RuntimeState) -> Iterator[Finding]:
     if state.environment.get(ENABLE) != "true":
         return
     used = chosen or DEFAULT_RMW
-    if used.startswith(_NOT_DDS):
-        yield RMW_INSECURE.found(used, f"{used} does not use DDS")
+    if not (vendor_of(used) or is_zenoh(state.environment)):
+        yield RMW_INSECURE.found(used, f"sros does not know that {used} enforces security")
     elif used in state.insecure_rmws:
         yield RMW_INSECURE.found(used, state.insecure_rmws[used])
 

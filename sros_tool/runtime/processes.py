@@ -42,11 +42,11 @@ from sros_tool.runtime.environment import (
     SESSION_URI,
     enclave_argument,
 )
-from sros_tool.runtime.rmw import DEFAULT_RMW, RMW
+from sros_tool.runtime.rmw import DEFAULT_RMW, RMW, middleware_of
 from sros_tool.runtime.variables import DOMAIN, ENABLE, ENCLAVE, KEYSTORE
 
 _LIBRARIES = re.compile(
-    rb"/(lib(?:rcl|rmw_[a-z_]+?|ddsc|dds_security_auth|fastrtps|fastdds|nddsc|nddscore|zenohc"
+    rb"/(lib(?:rcl|rmw_[a-z0-9_]+?|ddsc|dds_security_auth|fastrtps|fastdds|nddsc|nddscore|zenohc"
     rb"|zenohpico)|zenoh)(?:-[0-9a-f]{6,40})?(?:\.abi3|\.cpython-[\w-]+)?\.so"
 )
 _DDS_LIBRARIES = re.compile(
@@ -180,8 +180,15 @@ class Process:
 
     @property
     def rmw(self) -> str:
-        """The RMW of the mapped middleware, or else the RMW that the process names."""
+        """The mapped RMW that sros does not know, the RMW of the mapped middleware, or else the RMW
+        that the process names.
+        """
         named = self.environment.get(RMW, "")
+        for library in sorted(self.libraries):
+            name = library.removeprefix("lib")
+            is_rmw = name.startswith("rmw_") and not name.startswith(_PARTS_OF_RMWS)
+            if is_rmw and not middleware_of(name):
+                return name
         mapped = {rmw for library, rmw in _RMW_OF.items() if library in self.libraries}
         if len(mapped) == 1 and not any(named.startswith(path) for path in mapped):
             return f"{mapped.pop()}_cpp"
@@ -272,6 +279,8 @@ _RMW_OF = {
     "zenoh": "rmw_zenoh",
     "libzenohpico": "rmw_zenoh",
 }
+_PARTS_OF_RMWS = ("rmw_implementation", "rmw_dds_common", "rmw_security_common")
+"""Beginnings of the names of libraries that belong to no RMW, or to several."""
 _DDS_NAMES = frozenset(library for library, rmw in _RMW_OF.items() if rmw != "rmw_zenoh")
 
 

@@ -278,6 +278,7 @@ CASES: dict[str, Change] = {
     "runtime.process-expired": lambda state, _: replace(state, now=state.now + 9000 * DAY),
     "runtime.process-permissive": running(0, **{STRATEGY: "Permissive"}),
     "runtime.process-without-rcl": changed(0, libraries=frozenset({"libddsc"})),
+    "runtime.process-rmw-unknown": changed(0, libraries=frozenset({"librmw_email_cpp", "librcl"})),
     "runtime.process-other-keystore": _among_strangers,
     "runtime.process-not-connected": _not_connected,
     "runtime.process-other-folder": _from_an_older_copy,

@@ -15,7 +15,7 @@ from tests.support.harness import sros
 
 pytest_plugins = ["tests.checks.sound_keystore"]
 
-RMW = Stack("rclpy", "rmw", "Fast DDS", "2.14", "", True, False, "no security", "", "rmw_x")
+RMW = Stack("rclpy", "rmw", "Fast DDS", "2.14", "", True, False, "no security", "", "rmw_opendds")
 CYCLONE = Stack("Cyclone DDS", "cyclone", "Cyclone DDS", "0.10", "", True, True, "it refused")
 
 
@@ -27,7 +27,7 @@ def test_findings(as_json: bool, bench: Bench, monkeypatch: pytest.MonkeyPatch) 
         "ROS_SECURITY_STRATEGY": "Enforce",
         "ROS_SECURITY_KEYSTORE": str(bench.root),
         "ROS_SECURITY_ENCLAVE_OVERRIDE": "/base",
-        "RMW_IMPLEMENTATION": "rmw_y",
+        "RMW_IMPLEMENTATION": "rmw_connext",
     }
     flags = ("--json",) if as_json else ()
 
@@ -40,7 +40,7 @@ def test_findings(as_json: bool, bench: Bench, monkeypatch: pytest.MonkeyPatch) 
     sound = said()
     assert "runtime.rmw-without-security" not in sound
     assert "[enclave." not in sound
-    env["RMW_IMPLEMENTATION"] = "rmw_x"
+    env["RMW_IMPLEMENTATION"] = "rmw_opendds"
     bench.path("enclaves/base/cert.pem").write_text("")
     broken = said()
     assert "runtime.rmw-without-security" in broken
@@ -59,9 +59,14 @@ BY = "DDS Security can be enforced here, by "
         ((SECURE, CYCLONE), 0, f"{BY}rclpy with rmw_s and Cyclone DDS.", True),
         ((CYCLONE,), 0, f"{BY}Cyclone DDS. No RMW is installed", None),
         ((ABSENT, CYCLONE), 0, f"{BY}Cyclone DDS. No RMW is installed", None),
-        ((RMW, CYCLONE), 1, "but NOT by ROS nodes: rmw_x does not enforce it. The ROS 2", False),
-        ((UNTRIED, CYCLONE), 1, "but NOT by ROS nodes: rmw_x could not be tried.", None),
-        ((RMW, SECURE), 1, "rmw_x does not enforce it. Set RMW_IMPLEMENTATION=rmw_s", False),
+        (
+            (RMW, CYCLONE),
+            1,
+            "but NOT by ROS nodes: rmw_opendds does not enforce it. The ROS 2",
+            False,
+        ),
+        ((UNTRIED, CYCLONE), 1, "but NOT by ROS nodes: rmw_opendds could not be tried.", None),
+        ((RMW, SECURE), 1, "rmw_opendds does not enforce it. Set RMW_IMPLEMENTATION=rmw_s", False),
         ((RMW,), 1, "Nothing here enforces DDS Security.", False),
     ],
 )

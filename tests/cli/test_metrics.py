@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -78,11 +79,12 @@ def test_the_running_processes_are_counted(keystore: Path, monkeypatch: pytest.M
     process = Process(7, ("talker",), {}, datetime.now(UTC), network="net:[1]")
     asks = {"ROS_SECURITY_ENABLE": "true", "ROS_SECURITY_STRATEGY": "Enforce"}
     other = Process(9, ("gateway",), asks, datetime.now(UTC), frozenset({"libddsc"}))
+    unknown = replace(other, libraries=frozenset({"librcl", "librmw_email_cpp", "libfastdds"}))
     unseen = UnseenProcess(8, ("init",), "Permission denied", speaks=False)
-    running = RunningProcesses((process, other), (unseen,))
+    running = RunningProcesses((process, other, unknown), (unseen,))
     monkeypatch.setattr(ProcessTable, "look", lambda *_: running)
     found = read(sros("metrics", keystore, "--runtime").ok().out)
-    assert found["sros_processes"] == {("secured",): 0, ("open",): 1, ("unknown",): 1}
+    assert found["sros_processes"] == {("secured",): 0, ("open",): 1, ("unknown",): 2}
     assert found["sros_processes_not_seen"][()] == 1
     assert found["sros_process_findings"]["note", "runtime.process-elsewhere"] == 1
     assert "sros_processes" not in read(sros("metrics", keystore).ok().out)

@@ -257,8 +257,9 @@ def test_what_zenoh_would_not_enforce_is_refused(words: tuple[str, ...], keystor
     assert len(refused.err.splitlines()) == 1
 
 
-def test_another_rmw_on_zenoh_in_the_environment_is_refused(keystore: Path) -> None:
-    refused = sros("env", keystore, "/a", env={"RMW_IMPLEMENTATION": "rmw_zenoh_pico_cpp"})
+@pytest.mark.parametrize("rmw", ["rmw_zenoh_pico_cpp", "rmw_email_cpp"])
+def test_an_unknown_rmw_in_the_environment_is_refused(keystore: Path, rmw: str) -> None:
+    refused = sros("env", keystore, "/a", env={"RMW_IMPLEMENTATION": rmw})
     assert (refused.status, refused.out) == (2, render_refusal("sh"))
 
 

@@ -97,6 +97,23 @@ def test_who_speaks(command: tuple[str, ...], maps: str, found: bool, proc: Proc
     assert bool(proc.labels()) is found
 
 
+@pytest.mark.parametrize(
+    ("maps", "named", "rmw"),
+    [
+        ("/lib/libfastrtps.so.2.14\n/lib/librmw_fastrtps_shared_cpp.so", "", "rmw_fastrtps_cpp"),
+        ("/lib/libddsc.so.0", "rmw_fastrtps_cpp", "rmw_cyclonedds_cpp"),
+        ("/lib/librmw_dds_common__rosidl_generator_c.so", "rmw_connextdds", "rmw_connextdds"),
+        ("/lib/librmw_implementation.so\n/lib/librmw_email_cpp.so", "", "rmw_email_cpp"),
+        ("/lib/librmw_iceoryx2_cxx.so\n/lib/libddsc.so.0", "", "rmw_iceoryx2_cxx"),
+    ],
+)
+def test_the_rmw_is_that_of_the_mapped_libraries(
+    maps: str, named: str, rmw: str, proc: Proc
+) -> None:
+    proc.add(7, *ROS, maps=maps, environment=f"RMW_IMPLEMENTATION={named}".encode())
+    assert [process.rmw for process in proc.look().processes] == [rmw]
+
+
 def test_kernel_threads_and_processes_that_wait_for_a_node_are_none(proc: Proc) -> None:
     proc.add(5, *ROS, flags=0x00200000)
     proc.add(7, "timeout", "60", "sros", "run", "ks", "/a", "--", *ROS)
