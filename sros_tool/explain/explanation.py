@@ -336,9 +336,12 @@ def _added_xml(right: Right, places: Iterable[tuple[str, str]]) -> str:
     known = list(places)
     fitting = [place for place in known if right.name.startswith(place[0].rstrip("/") + "/")]
     ns, node = max(fitting or known, key=lambda pair: len(pair[0]), default=_ANY_NODE)
-    group = Group(right.kind, ((right.right, right.qualifier),), (right.name,))
+    from sros_tool.graph.learn import name_as_written  # only denied questions need both
+    from sros_tool.policy.document import policy_xml
+
+    name = name_as_written(right.name, ns, node) if known else right.name
+    group = Group(right.kind, ((right.right, right.qualifier),), (name,))
     enclave = Enclave(right.enclave, (Profiles((Profile(ns, node, (group,)),)),))
-    from sros_tool.policy.document import policy_xml  # only denied questions need it
 
     return policy_xml(Policy((enclave,))).decode().rstrip()
 

@@ -101,7 +101,9 @@ def test_no_with_a_change_that_works(keystore: Path, tmp_path: Path) -> None:
     added = policy_rights(read_policy(policy)) - before
     assert [str(right) for right in added] == [f"{ENCLAVE} ALLOW request service /reset"]
     assert explain(keystore, ENCLAVE, "serve", "/reset").status == 1
-    assert "sros merge_policy" in found.out and "<service>/reset</service>" in found.out
+    assert "sros merge_policy" in found.out and "<service>reset</service>" in found.out
+    private = explain(keystore, ENCLAVE, "serve", "/talker/reset", "--policy", policy)
+    assert "<service>~/reset</service>" in private.out
 
 
 def test_the_policy_of_a_fleet_is_changed_where_it_is_and_issued_for_all(tmp_path: Path) -> None:
