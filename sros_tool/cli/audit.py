@@ -39,7 +39,7 @@ from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.errors import KeystoreError, Note, UnavailableError, UsageError
 from sros_tool.terminal import echo
 from sros_tool.values import file_change
-from sros_tool.wording import counted
+from sros_tool.wording import counted, enumerated
 
 if TYPE_CHECKING:
     from sros_tool.distributions import Distribution
@@ -137,7 +137,10 @@ def audit(
 
     check_duration(watch, spin_time)
     sources = sources or (keystore_from_environment(),)
-    environment = observer_environment(enclave, keystore, domain)
+    compared = enumerated([f"'{source}'" for source in sources])
+    environment = observer_environment(
+        enclave, keystore, domain, f"{compared} is compared with the robot"
+    )
     if force and patch is None:
         raise UsageError("--force is for --patch only", "", "Leave it out.")
     if patch is not None:

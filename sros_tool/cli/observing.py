@@ -15,13 +15,13 @@ from typing import TYPE_CHECKING
 import click
 
 from sros_tool.cli.common import (
+    KEYSTORE_VARIABLE,
     PATH,
     Decorated,
     Verb,
     dry_run_option,
     enclave_environment,
     json_option,
-    keystore_from_environment,
     print_json,
     print_notes,
     read_log,
@@ -104,9 +104,12 @@ def check_duration(watch: str | None, spin_time: float | None) -> None:
 
 
 def observer_environment(
-    enclave: str | None, keystore: Path | None, domain: str | None
+    enclave: str | None, keystore: Path | None, domain: str | None, arguments: str
 ) -> dict[str, str]:
-    """Return the environment variables that give the observer its domain and its enclave."""
+    """Return the environment variables that give the observer its domain and its enclave.
+
+    ``arguments`` says, for an error, what the arguments of the verb are: not this keystore.
+    """
     from sros_tool.runtime.variables import DOMAIN, domain_from
 
     if enclave is None:
@@ -120,8 +123,14 @@ def observer_environment(
         return {DOMAIN: str(domain_from({DOMAIN: domain}) or 0)}
     from sros_tool.keystore.reader import OpenedKeystore
 
-    opened = OpenedKeystore(keystore or keystore_from_environment())
-    return enclave_environment(opened, enclave, domain).variables
+    root = keystore or os.environ.get(KEYSTORE_VARIABLE)
+    if not root:
+        raise UsageError(
+            f"the keystore of --enclave {enclave} is not named",
+            f"Only --keystore names it: {arguments}.",
+            f"Add --keystore KEYSTORE, or set {KEYSTORE_VARIABLE}.",
+        )
+    return enclave_environment(OpenedKeystore(Path(root)), enclave, domain).variables
 
 
 def observe(
@@ -461,7 +470,8 @@ def generate_policy(
         for line in news.lines(named(observation).observation):
             echo(line, err=True)
 
-    environment = observer_environment(enclave, keystore, domain)
+    written = f"'{file}' is the policy to write"
+    environment = observer_environment(enclave, keystore, domain, written)
     snapshot, rmw = observe(
         environment,
         watch,

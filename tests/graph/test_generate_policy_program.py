@@ -61,7 +61,10 @@ def test_a_policy_that_is_broken_is_found_before_anything_else(tmp_path: Path) -
         (("robot.xml", "--accept"), "--accept is for --from-log only"),
         (("--from-log", "-", "--accept"), "--accept is given without FILE"),
         (("robot.xml", "--keystore", "ks"), "--keystore is given without --enclave"),
-        (("robot.xml", "--enclave", "/a"), "no keystore is named"),
+        (
+            ("robot.xml", "--enclave", "/a"),
+            "names it: 'robot.xml' is the policy to write. Add --key",
+        ),
         (("robot.xml", "--domain", "x"), "not a domain id"),
         (("robot.xml", "--watch", "5 minutes"), "5 minutes"),
         (("robot.xml", "--from-log", "gone.log"), "the log 'gone.log' does not exist"),
