@@ -296,7 +296,8 @@ def _notes_on_requirements(
             f"requirements that name {first_few(sorted(gone), _MOST_SHOWN)} do not apply to the "
             "new name: check them with the same --namespace and with the new name, as in `sros "
             "check POLICY --requirements FILE "
-            f"{' '.join(f'--remap {quote(option)}' for option in sorted(options))}`."
+            f"{' '.join(f'--remap {quote(option)}' for option in sorted(options))}`. Leave out "
+            "each --remap whose old name no requirement has: `check` calls it unused."
         )
         yield Note("merge.requirements-of-old-names", text)
 
