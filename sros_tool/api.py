@@ -187,6 +187,7 @@ def create_keystore(
     domains: int | str = 0,
     identity_ca: AnyPath | None = None,
     identity_key: str | None = None,
+    permissions_key: str | None = None,
     encrypt_ca_keys: bool = False,
     short_passphrase: bool = False,
     secrets: Secrets | None = None,
@@ -200,7 +201,9 @@ def create_keystore(
             file, or a `Template` from `load_template`.
         domains: The ROS domain ids of the keystore, such as 0, "0,7" or "10-19".
         identity_ca: The certificate (PEM) of an existing CA, which then is the identity CA.
-        identity_key: Its key: ``issuer:NAME`` for a CA service, ``pkcs11:...`` or ``file:PATH``.
+        identity_key: The key of the identity CA: ``issuer:NAME`` for a CA service, ``pkcs11:...``
+            or ``file:PATH``; a missing file is created.
+        permissions_key: The key of the permissions CA: ``pkcs11:...`` or ``file:PATH``.
         encrypt_ca_keys: Encrypt the CA keys with the passphrase that ``secrets`` returns.
         short_passphrase: Accept a passphrase of less than 12 characters, which is soon guessed.
         secrets: Called for the passphrase of a CA key, or the PIN of a token.
@@ -223,7 +226,11 @@ def create_keystore(
         domains=DomainSet.parse(str(domains), "domains"),
         now=_time_or_now(now),
         keyring=_make_keyring(
-            secrets, identity_key, encrypt=encrypt_ca_keys, short=short_passphrase
+            secrets,
+            identity_key,
+            permissions_key,
+            encrypt=encrypt_ca_keys,
+            short=short_passphrase,
         ),
         imported_cas={} if identity_ca is None else {"identity": _read_file(identity_ca)},
     )
@@ -366,6 +373,8 @@ def generate(
     fleet: AnyPath | None = None,
     enclaves: Iterable[str] = (),
     domain: int | None = None,
+    identity_key: str | None = None,
+    permissions_key: str | None = None,
     secrets: Secrets | None = None,
     now: datetime | None = None,
     dry_run: bool = False,
@@ -382,6 +391,9 @@ def generate(
             policies have to be paths.
         enclaves: Names of more enclaves, which get the default permissions of the template.
         domain: The ROS domain id that the enclaves will be used in; the governance must name it.
+        identity_key: The place of the identity CA's key if it is kept elsewhere: ``file:PATH``,
+            ``pkcs11:...``, or ``issuer:NAME`` for a CA service.
+        permissions_key: The place of the permissions CA's key, likewise; not a CA service.
         secrets: Called for the passphrase of an encrypted CA key, or the PIN of a token.
         now: The time from which validities count; the current time by default.
         dry_run: Report the changes without making them.
@@ -413,7 +425,7 @@ def generate(
         policies=_fleet_policies(policies, fleet) if fleet else [_as_policy(e) for e in policies],
         now=_time_or_now(now),
         domain=_checked_domain(domain),
-        keyring=_make_keyring(secrets),
+        keyring=_make_keyring(secrets, identity_key, permissions_key),
         dry_run=dry_run,
     )
 
@@ -441,6 +453,8 @@ def create_enclaves(
     enclaves: Iterable[str],
     *,
     domain: int | None = None,
+    identity_key: str | None = None,
+    permissions_key: str | None = None,
     secrets: Secrets | None = None,
     now: datetime | None = None,
     dry_run: bool = False,
@@ -453,6 +467,9 @@ def create_enclaves(
         keystore: An existing keystore, or its path.
         enclaves: The names of the enclaves.
         domain: The ROS domain id that the enclaves will be used in; the governance must name it.
+        identity_key: The place of the identity CA's key if it is kept elsewhere: ``file:PATH``,
+            ``pkcs11:...``, or ``issuer:NAME`` for a CA service.
+        permissions_key: The place of the permissions CA's key, likewise; not a CA service.
         secrets: Called for the passphrase of an encrypted CA key, or the PIN of a token.
         now: The time from which validities count; the current time by default.
         dry_run: Report the changes without making them.
@@ -466,7 +483,14 @@ def create_enclaves(
         ('/camera',)
     """
     return generate(
-        keystore, enclaves=enclaves, domain=domain, secrets=secrets, now=now, dry_run=dry_run
+        keystore,
+        enclaves=enclaves,
+        domain=domain,
+        identity_key=identity_key,
+        permissions_key=permissions_key,
+        secrets=secrets,
+        now=now,
+        dry_run=dry_run,
     )
 
 
@@ -478,6 +502,8 @@ def renew(
     expiring: timedelta | None = None,
     new_key: bool = False,
     revoke_old: bool = False,
+    identity_key: str | None = None,
+    permissions_key: str | None = None,
     secrets: Secrets | None = None,
     now: datetime | None = None,
     dry_run: bool = False,
@@ -491,6 +517,9 @@ def renew(
             validity of their own.
         new_key: Give the enclaves new keys.
         revoke_old: Revoke the earlier certificates, which otherwise work until they expire.
+        identity_key: The place of the identity CA's key if it is kept elsewhere: ``file:PATH``,
+            ``pkcs11:...``, or ``issuer:NAME`` for a CA service.
+        permissions_key: The place of the permissions CA's key, likewise; not a CA service.
         secrets: Called for the passphrase of an encrypted CA key, or the PIN of a token.
         now: The time from which validities count; the current time by default.
         dry_run: Report the changes without making them.
@@ -520,7 +549,7 @@ def renew(
         expiring=None if expiring is None else Threshold(remaining=expiring),
         new_key=new_key,
         revoke_old=revoke_old,
-        keyring=_make_keyring(secrets),
+        keyring=_make_keyring(secrets, identity_key, permissions_key),
         dry_run=dry_run,
     )
 
@@ -532,6 +561,8 @@ def revoke(
     *,
     reason: str = "unspecified",
     crl: AnyPath | None = None,
+    identity_key: str | None = None,
+    permissions_key: str | None = None,
     secrets: Secrets | None = None,
     now: datetime | None = None,
     dry_run: bool = False,
@@ -546,6 +577,9 @@ def revoke(
         enclaves: The names of the enclaves.
         reason: Why, as RFC 5280 names reasons: ``keyCompromise``, ``cessationOfOperation``, ...
         crl: The revocation list (PEM) of a CA service; only the service can sign it.
+        identity_key: The place of the identity CA's key if it is kept elsewhere: ``file:PATH``,
+            ``pkcs11:...``, or ``issuer:NAME`` for a CA service.
+        permissions_key: The place of the permissions CA's key, likewise; not a CA service.
         secrets: Called for the passphrase of an encrypted CA key, or the PIN of a token.
         now: The time of the revocation; the current time by default.
         dry_run: Report the changes without making them.
@@ -574,7 +608,7 @@ def revoke(
         now=_time_or_now(now),
         reason=reason,
         crl=b"" if crl is None else _read_file(crl),
-        keyring=_make_keyring(secrets),
+        keyring=_make_keyring(secrets, identity_key, permissions_key),
         dry_run=dry_run,
     )
 
@@ -1054,14 +1088,16 @@ def _as_policy(source: AnyPath | Policy) -> Policy:
 
 def _make_keyring(
     secrets: Secrets | None,
-    identity_key: str | None = None,
+    identity_key: str | None,
+    permissions_key: str | None,
     *,
     encrypt: bool = False,
     short: bool = False,
 ) -> Keyring:
     from sros_tool.keystore.issuing.keyring import Keyring, absolute_place, no_secrets
 
-    places = {"identity": absolute_place(identity_key)} if identity_key else {}
+    named = {"identity": identity_key, "permissions": permissions_key}
+    places = {role: absolute_place(place) for role, place in named.items() if place}
     return Keyring(_checked_secrets(secrets) if secrets else no_secrets, places, encrypt, short)
 
 

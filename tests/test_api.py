@@ -8,9 +8,11 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import fields
 from datetime import UTC, datetime, timedelta
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -101,6 +103,10 @@ def test_every_name_is_there_and_documented(name: str) -> None:
         stated = re.findall(r"^    (\w+): ", arguments.partition("\n\n")[0], re.MULTILINE)
         assert not found or stated == [*inspect.signature(value).parameters]
         assert {*re.findall(r"\b\w+Error(?=: )", text)} <= {*sros_tool.__all__}
+    elif value.__module__ == "sros_tool.api":
+        page = (PROJECT / "docs/python.md").read_text(encoding="utf-8")
+        row = page.partition(f"\n| `{name}` |")[2].partition("\n")[0]
+        assert {field.name for field in fields(value)} <= {*re.findall(r"`(\w+)`", row)}
 
 
 def test_no_name_is_also_that_of_a_room() -> None:
@@ -299,6 +305,27 @@ def test_an_encrypted_key_is_asked_for(tmp_path: Path) -> None:
     asked.clear()
     assert sros_tool.generate(made, enclaves=["/a"], secrets=secrets).created == ("/a",)
     assert "the passphrase of the identity CA key" in asked
+
+
+def test_ca_keys_that_are_kept_elsewhere_are_named(tmp_path: Path) -> None:
+    roles = ("identity", "permissions")
+    places: dict[str, Any] = {f"{role}_key": f"file:{tmp_path / role}.pem" for role in roles}
+    made = sros_tool.create_keystore(tmp_path / "ks", template="production", **places)
+    for role in roles:
+        (tmp_path / f"{role}.pem").rename(tmp_path / f"{role}-moved.pem")
+    elsewhere: dict[str, Any] = {
+        name: place.replace(".pem", "-moved.pem") for name, place in places.items()
+    }
+    changes: tuple[Callable[..., object], ...] = (
+        partial(sros_tool.generate, made, POLICY),
+        partial(sros_tool.create_enclaves, made, ["/a"]),
+        partial(sros_tool.renew, made, ["/a"]),
+        partial(sros_tool.revoke, made, ["/a"]),
+    )
+    for change in changes:
+        with pytest.raises(KeystoreError, match=r"identity\.pem"):
+            change()
+        change(**elsewhere)
 
 
 def test_a_short_passphrase_needs_insisting(tmp_path: Path) -> None:
