@@ -177,8 +177,8 @@ class Round(NamedTuple):
     restart: Sequence[str]
     """Enclaves whose processes were not yet seen with the installed files."""
     unseen: Sequence[str]
-    """Enclaves of ``restart`` without a process that was seen; some processes here cannot be seen.
-    ``--restarted`` says that these restarts are done.
+    """Enclaves of ``restart`` of which no process was seen, while some processes on this machine
+    cannot be seen. Use ``--restarted`` to say that these restarts are done.
     """
     requests: int
     """Number of signing requests in the message."""

@@ -49,17 +49,19 @@ class ClosedProcess(NamedTuple):
     enclave: str
     """The enclave of the process."""
     pid: int
-    """The id of the process; 0 if the process ended while sros watched, or is restarted by hand,
-    and no process with the same command runs now.
+    """The id of the process; 0 if no process with the command is known to run in the enclave now,
+    or if several processes fit (`alike`).
     """
     command: Sequence[str]
-    """Its command with the arguments."""
+    """Command of the process, with the arguments."""
     folder: str
-    """Its working directory."""
+    """Working directory of the process."""
     user: int
     """The id of the user who runs the process; 4294967295 if several users can control it."""
     unit: str
-    """The systemd unit that starts only this process; empty if it is restarted by hand."""
+    """The systemd unit that starts only this process; empty if you restart the process by
+    hand.
+    """
     known_by: Annotated[
         str, Words(("process id", "node name", "program", "elimination", "enclave", "command"))
     ]
@@ -69,7 +71,7 @@ class ClosedProcess(NamedTuple):
     runs a launch description; empty if no launch started it.
     """
     container: str = ""
-    """The id of the Docker container in which it runs; empty outside of containers."""
+    """The id of the process's Docker container; empty outside of containers."""
     rmw: str = ""
     """rmw_zenoh_cpp for a process on Zenoh; otherwise the RMW that its environment names; empty if
     the environment names no RMW, or an RMW that enforces no security.

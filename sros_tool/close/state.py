@@ -371,22 +371,24 @@ class CloseState(NamedTuple):
     steps: Sequence[CloseStep]
     """The steps in their order."""
     secured: Mapping[str, bool]
-    """The enclaves in which a process of the robot runs now, and whether this process has the
-    current files; otherwise it has to be restarted.
+    """The enclaves in which a process of the robot runs now: true if the process has the current
+    files, false if the process has to be restarted.
     """
     other_files: Sequence[str]
     """The enclaves whose process runs secured, but not with the files of the export."""
     outdated: Mapping[str, str]
-    """Why the processes of these enclaves have to be restarted, as text before "the processes of"
-    and the enclave."""
+    """The enclaves whose processes have to be restarted, each with the reason. Read the reason as a
+    sentence that ends with "the processes of" and the enclave.
+    """
     outdated_pids: Mapping[str, Sequence[int]]
-    """The ids of the processes that have to be restarted, by these enclaves, in the order in which
-    they should be restarted."""
+    """The enclaves of `outdated`, each with the ids of the processes to restart; restart the
+    enclaves in this order.
+    """
     not_observed: Sequence[str]
     """Processes in enclaves of the robot that sros did not observe, and further processes with an
     observed command, as "process 123 (talker) in /talker"."""
     new: Sequence[str]
-    """The enclaves of the policy without a process: no process of them was observed or runs now."""
+    """The enclaves of the policy for which no process was observed, and no process runs now."""
     absent: Sequence[str]
     """The enclaves whose process a unit starts, but whose process does not run."""
     without: Sequence[str]
@@ -398,9 +400,8 @@ class CloseState(NamedTuple):
     whose current files were brought are in `brought`.
     """
     brought: Mapping[str, datetime]
-    """The enclaves whose present files the user has brought to other machines (`--brought`), and
-    when these files in the keystore changed last, in UTC. sros cannot see whether the other machine
-    has them.
+    """The enclaves of other machines whose current files were brought there, as the user said with
+    `--brought`, and when these files in the keystore changed last, in UTC. sros cannot verify this.
     """
     expired_elsewhere: Mapping[str, datetime]
     """The enclaves of other machines whose files in the keystore have expired, and when, in UTC."""

@@ -540,7 +540,7 @@ class KeystoreSummary(NamedTuple):
     elsewhere: int = 0
     """Number of enclaves whose key is elsewhere; the demo did not try them."""
     not_tried: tuple[str, ...] = ()
-    """Tests that a proof needs and the demo did not run; with such tests, the status is not 0."""
+    """Tests that a proof of the keystore needs and that did not run: the exit status is not 0."""
 
 
 @shows("name", "title", "as_expected", "cast", "keystore", "rows", "cost")
@@ -640,7 +640,9 @@ class DemoResult:
 
     @property
     def as_expected(self) -> bool:
-        """Whether all rows are as expected, and a user's keystore is proved (exit status 0)."""
+        """Whether all rows are as expected, and with ``--keystore``, all tests ran that a proof
+        needs: the exit status is 0.
+        """
         return all(scenario.as_expected for scenario in self.scenarios)
 
     @property

@@ -77,7 +77,7 @@ class Part(NamedTuple):
     """A DDS endpoint that a right needs; ``role`` names it in ROS terms, "" for a topic."""
 
     verb: AccessVerb
-    """Whether the endpoint publishes or subscribes."""
+    """What the endpoint does; ``join`` for the participant that joins the domain."""
     topic: str
     """DDS topic of the endpoint."""
     role: str = ""

@@ -337,7 +337,7 @@ class AuditResult(NamedTuple):
     unjudged_accepted: bool
     """Whether ``--unjudged`` accepted parts that were not judged, or a graph that kept changing."""
     patch: Path | None
-    """The policy with the rights to add that was written (``--patch``), or null."""
+    """Path of the policy with the missing rights that ``--patch`` wrote, or null."""
     dry_run: DryRun
     changes: FileChanges
     notes: Notes

@@ -237,15 +237,15 @@ class RobotStatus:
     robot: str
     """Name of the robot."""
     state: State
-    """The worst state of the robot's files; ``revoked`` also if all its enclaves were revoked
-    (``enclaves`` is 0); ``restart``: they are current, but processes still run with earlier ones;
-    ``unusable``: they are current, but the robot says that no process could start in an enclave,
-    for example without its key;
-    ``expired``: one of its files has expired (`expiry`);
-    ``offline``: its last confirmation is too old (`overdue`); ``later``: it says that it has a
-    later release than was ever published for it, so that nothing in its message is reliable;
-    ``refused``: its last message was refused; ``never``: it sent no confirmation; ``none``: it has
-    no enclave in the keystore.
+    """The worst state of the robot's files, or another reason why the robot is not current.
+    ``revoked``: also if all enclaves of the robot were revoked (``enclaves`` is 0); ``restart``:
+    the files are current, but processes still run with earlier files; ``unusable``: the files are
+    current, but the robot says that no process could start in an enclave, for example because the
+    key is missing; ``expired``: a file of the robot has expired (`expiry`); ``offline``: the last
+    confirmation is too old (`overdue`); ``later``: the robot says that it has a later release than
+    was ever published for it, so nothing in its message is reliable; ``refused``: the last message
+    was refused; ``never``: the robot sent no confirmation; ``none``: the robot has no enclave in
+    the keystore.
     """
     enclaves: int
     """Number of the robot's enclaves in the keystore."""
@@ -493,8 +493,8 @@ class PublishedMetadata:
     if the metadata verifies, or if the folder is ``unseen``.
     """
     altered: Mapping[str, datetime] = field(default_factory=dict)
-    """Files that ``sros fleet publish`` found missing, changed or older than published in the last
-    day, and published again, with the time, in UTC.
+    """Files that ``sros fleet publish`` published again in the last day, because they were missing,
+    changed or older than published; each with the time, in UTC.
     """
 
     @property

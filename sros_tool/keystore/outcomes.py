@@ -64,7 +64,7 @@ class EnclaveResult(NamedTuple, Generic[Outcome]):
     """Folder of the enclave; for an enclave in an archive, its path in the archive."""
     serial: str | None
     """Serial number of the certificate, in hexadecimal; null if a dry run did not issue a
-    certificate, or if it cannot be read.
+    certificate, or if the certificate cannot be read.
     """
     sha256: str | None
     """SHA-256 of the certificate (DER), in hexadecimal; null without a certificate."""

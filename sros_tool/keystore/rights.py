@@ -677,8 +677,8 @@ class PolicyDifference(NamedTuple):
     protections: Sequence[DifferentProtection]
     """Protection that only one of two policies demands."""
     unanswered: Sequence[Right]
-    """Rights of B that lost their counterpart, such as the right of the subscriber: A has the
-    counterpart, B does not.
+    """Rights of B whose counterpart only A has, such as a right to publish a topic to which no
+    enclave of B may subscribe any more.
     """
     domains: Sequence[DifferentDomains]
     """Enclaves of both sides with different ROS domains; only enclaves for which both sides state
@@ -689,9 +689,9 @@ class PolicyDifference(NamedTuple):
     governance_differs: bool
     """Whether the governance of the enclaves differs between A and B, or cannot be read."""
     unclear: Sequence[str]
-    """Enclaves whose permissions differ in something that rights do not tell, such as partitions,
-    the order of rules, missing rules for `ros_discovery_info`, or a default that allows
-    everything; `notes` of A and B name it.
+    """Enclaves whose permissions differ in more than rights, such as partitions, the order of
+    rules, missing rules for `ros_discovery_info`, or a default that allows everything. `notes` of A
+    and B name the difference.
     """
 
 

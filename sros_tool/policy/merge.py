@@ -420,7 +420,7 @@ class MergedPolicy(NamedTuple):
     policy: Path
     """Path of the policy file, as given on the command line."""
     added: Sequence[Right]
-    """Rights that one policy allows and another one denies; the DENY wins."""
+    """Rights that the merge adds to the policy file."""
     contradictions: Sequence[Contradiction]
     """Rights that one of the policies allows and another denies; the DENY wins."""
     output: Path | None

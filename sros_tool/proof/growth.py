@@ -184,7 +184,7 @@ class NewNode(NamedTuple):
     moved_from: str
     """An enclave that had the node in BASE, and no longer has it; or empty."""
     rights: tuple[Right, ...]
-    """Rights of the enclave that the process did not have.
+    """Rights of the enclave that the node did not have in BASE.
 
     Rights that every node needs come last. Where a DENY of BASE is gone, the name is an example.
     """

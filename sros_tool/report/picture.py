@@ -120,7 +120,7 @@ class Edge:
     by: tuple[str, ...] = ()
     """Wildcards that give the right; empty if the rule has the exact name."""
     parts: tuple[str, ...] = ()
-    """Parts of the action for which the right is; empty for the whole action."""
+    """Parts of the action that the right covers; empty for the whole action."""
     mark: OverlaySide = OverlaySide.BOTH
     """The side of the comparison that has the right."""
     common: bool = False
@@ -175,7 +175,7 @@ class Name:
     protection: Protection
     """Protection of the name by the governance."""
     wildcard: bool = False
-    """Whether the name is a wildcard, drawn as a name because no right to a known name shows it."""
+    """Whether the name is a wildcard, drawn here because no arrow to a known name shows it."""
     lacks: Lack = Lack.NOTHING
     """The side (senders or receivers) of which no enclave has the right; the server of a service is
     its receiver.

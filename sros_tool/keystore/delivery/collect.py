@@ -102,7 +102,8 @@ class CollectedRequest(NamedTuple):
     enclave: str
     """The enclave of the request; empty if the request cannot be read."""
     key_sha256: str
-    """SHA-256 of the public key (DER) in the request, in hexadecimal; empty if it cannot be read.
+    """SHA-256 of the public key (DER) in the request, in hexadecimal; empty if the request
+    cannot be read.
     """
     outcome: Annotated[str, Words(REQUEST_OUTCOMES)]
     """``renewed``: the enclave has a new certificate; ``answered``: the enclave already has a new

@@ -187,8 +187,8 @@ class PublishedFleet(NamedTuple):
     later: Sequence[LaterChange]
     """With ``--restored``: changes from after the backup that the keystore lacks."""
     altered: Sequence[str]
-    """Files that this run found missing, changed or older than the keystore published them: an
-    archive as ``robots/NAME.tar.gz``, and ``metadata/timestamp.json``. This run published them
+    """Archives (``robots/NAME.tar.gz``) and ``metadata/timestamp.json``, if this run found these
+    files missing, changed, or older than the keystore had published. This run published these files
     again, and the exit status is 1.
     """
     changes: FileChanges

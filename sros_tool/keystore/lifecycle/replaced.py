@@ -64,8 +64,8 @@ class ReplacedRights:
     gained: tuple[Right, ...]
     """Rights that were added, and denials that were taken away."""
     works_until: datetime | None
-    """Expiry, in UTC, of the enclave's last permissions in the ledger: until then, they work for
-    anyone who kept them with their certificate. Null if no permissions work any more.
+    """Expiry, in UTC, of the enclave's last permissions in the ledger: until then, anyone who kept
+    these permissions with their certificate can use them. Null if no permissions work any more.
     """
     lost_domains: str = ""
     """ROS domains, such as 0,7, for which the enclave has no permissions any more."""

@@ -109,7 +109,7 @@ class AuthorityStatus:
     """SHA-256 of the CA's certificate (DER), in hexadecimal; two CAs can have the same subject."""
     validity: Window
     enclaves: int
-    """Number of enclaves whose certificate or permissions are by this CA."""
+    """Number of enclaves whose certificate or permissions this CA signed."""
 
 
 @dataclass(frozen=True, slots=True)

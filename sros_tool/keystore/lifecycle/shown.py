@@ -119,7 +119,7 @@ CreatedEnclaves = Annotated[
     "The enclaves that were created, or existed.",
 ]
 ChangedEnclave = Annotated[
-    _EnclaveCreation[Annotated[str, Words(("changed",)), "It got new permissions."]],
+    _EnclaveCreation[Annotated[str, Words(("changed",)), "The enclave got new permissions."]],
     "The enclave with its new permissions.",
 ]
 MadeEnclaves = _EnclaveCreation[
@@ -352,7 +352,7 @@ class UpdatedKeystore(NamedTuple):
     """The settings that change."""
     rights: Rights
     looser: Sequence[str]
-    """Clauses on everything that the update allows but that was not allowed before."""
+    """What the update allows and was not allowed before, as clauses."""
     enclaves: Sequence[
         EnclaveResult[
             Annotated[
@@ -384,7 +384,7 @@ class RevokedCertificate(NamedTuple):
     serial: str
     """Serial number, in hexadecimal."""
     enclave: str | None
-    """Enclave of the certificate; null if it is not in the ledger."""
+    """Enclave of the certificate; null if the certificate is not in the ledger."""
     date: datetime
     """When the certificate was revoked, in UTC."""
     reason: str

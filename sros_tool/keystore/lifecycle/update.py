@@ -136,7 +136,7 @@ class KeystoreUpdate(Changed):
 
     @property
     def looser(self) -> tuple[str, ...]:
-        """Clauses on everything that the update allows but that was not allowed before."""
+        """What the update allows and was not allowed before, as clauses."""
         gained = [
             f"{right.enclave} gains {rights_text(right.gained)}"
             for right in self.rights
