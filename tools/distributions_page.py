@@ -26,14 +26,22 @@ _HEAD = re.compile(r".*?\n## DDS and rules of each distribution\n", re.DOTALL)
 """The part of the page that is written by hand."""
 
 
+_NOT_TESTED = (
+    " For a release that is *not tested*, sros uses the rules of another release, and does not see "
+    "how the two releases differ."
+)
+
+
 def distributions_page() -> str:
     """Return the page as Markdown, with its hand-written part as it is."""
     written = _HEAD.match((CHECKOUT / "docs" / "distributions.md").read_text("utf-8"))
     assert written, "docs/distributions.md has no part '## DDS and rules of each distribution'"
     shipped = table_text(
-        *("distribution", "supported until", "default DDS", "other DDS", "rmw_zenoh", "nodes"),
+        *("distribution", "supported until", "default DDS", "other DDS", "rmw_zenoh"),
+        "nodes also serve",
         rows=_shipped(),
     )
+    all_tested = all(shipped.tested for one in SUPPORTED for shipped in one.shipped)
     parts = [
         written[0].rstrip(),
         MADE,
@@ -42,8 +50,7 @@ def distributions_page() -> str:
         "that reads the files of sros. Versions of Rolling count for the distribution that "
         "followed: Lyrical has 0.10, so 0.7 to 0.9 count for Lyrical. The versions of DDS are the "
         "latest as of November 2026; sros assumes that all patch versions of a release decide "
-        "alike. For a release that is *not tested*, sros uses the rules of another release, and "
-        "does not see how the two releases differ.",
+        "alike." + ("" if all_tested else _NOT_TESTED),
         "These rules are not the same in all tested releases:",
         table_text("rule", "where it holds", rows=_rules()),
         "`sros check --upgrade-to` reports what an update changes, and `sros check` reports what "
@@ -64,8 +71,8 @@ def _shipped() -> Iterator[tuple[str, ...]]:
         first, second = map(_release, distribution.shipped)
         release = distribution.zenoh
         zenoh = f"from {version_text(release.begin)}; sros needs {version_text(release.least)}"
-        nodes = "~/get_type_description" if has_type_descriptions(distribution.name) else ""
-        yield distribution.title, distribution.until, first, second, zenoh, nodes or "without"
+        nodes = "`~/get_type_description`" if has_type_descriptions(distribution.name) else "-"
+        yield distribution.title, distribution.until, first, second, zenoh, nodes
 
 
 def _release(shipped: Shipped) -> str:
