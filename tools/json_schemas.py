@@ -94,7 +94,7 @@ VERBS: Mapping[str, str | Shapes] = {
         },
     ),
     "view": Shapes(
-        "Who may do what; `-o FILE` writes it to FILE instead.",
+        "Who may do what; `-o FILE` writes the picture to FILE instead.",
         {
             "the picture": "sros_tool.report.picture:Picture",
             "--dry-run": "sros_tool.values:PlannedFiles",

@@ -385,12 +385,12 @@ class CloseState(NamedTuple):
     enclaves in this order.
     """
     not_observed: Sequence[str]
-    """Processes in enclaves of the robot that sros did not observe, and further processes with an
-    observed command, as "process 123 (talker) in /talker"."""
+    """Processes that run in enclaves of the robot but were not observed there, and further
+    processes with an observed command, as "process 123 (talker) in /talker"."""
     new: Sequence[str]
     """The enclaves of the policy for which no process was observed, and no process runs now."""
     absent: Sequence[str]
-    """The enclaves whose process a unit starts, but whose process does not run."""
+    """The enclaves whose process does not run, although a systemd unit starts it."""
     without: Sequence[str]
     """The enclaves of `--without`, of which no process has to run."""
     needed_elsewhere: Mapping[str, datetime]

@@ -146,7 +146,7 @@ class RowResult:
 
     @property
     def open_here(self) -> bool:
-        """Whether the attack succeeds because of the user's keystore, without being accepted."""
+        """Whether the attack succeeds because of the user's keystore, and is not accepted."""
         return self.unaccepted and self.observed is self.expected
 
     @property

@@ -183,11 +183,11 @@ class ConfirmedFile:
     kind: FileKind
     """Kind of the file."""
     state: State
-    """What the robot has instead: an ``earlier`` file of the same enclave; a ``different`` Zenoh
-    file (the ledger does not record earlier Zenoh files), or a file of another enclave of the
-    robot; no file (``missing``); a file that the keystore did not issue (``unknown``); a
-    ``revoked`` file; a file of ``another`` robot, or of no robot.  ``broken``: the file in the
-    keystore is missing, cannot be read, or is not as its CA signed it.
+    """What the robot has instead.  ``earlier``: an earlier file of the same enclave;
+    ``different``: another Zenoh file (the ledger does not record earlier Zenoh files), or a file of
+    another enclave of the robot; ``missing``: no file; ``unknown``: a file that the keystore did
+    not issue; ``revoked``: a revoked file; ``another``: a file of another robot, or of no robot.
+    ``broken``: the file in the keystore is missing, cannot be read, or is not as its CA signed it.
     """
     since: str = ""
     """When the keystore issued the robot's file, in UTC; null if the ledger does not record it."""
@@ -287,11 +287,11 @@ class RobotStatus:
     crl_in_force: bool | None
     """Whether the current revocation list, or an earlier list that revokes the same certificates,
     is in force on the robot: the robot has the list, the list has not expired, the robot says that
-    no process may run with another list or with earlier CAs, and it is not ``offline``. False if
-    this is not known, or if the keystore was restored from a backup and lacks what its robots have;
-    null if the keystore has no list, or the robot has no enclave. `sros agent` and plays know the
-    processes that lack only new permissions, governance or certificates of their own; for other
-    robots, any restart that is due counts.
+    no process may run with another list or with earlier CAs, and the robot is not ``offline``.
+    False if this is not known, or if the keystore was restored from a backup and lacks what its
+    robots have; null if the keystore has no list, or the robot has no enclave. `sros agent` and
+    plays know the processes that lack only new permissions, governance or certificates of their
+    own; for other robots, any restart that is due counts.
     """
     expiry: Mapping[Annotated[str, Words(_EXPIRING_KINDS)], datetime]
     """The first expiry of the files that the robot confirmed, by kind, in UTC, from the ledger."""

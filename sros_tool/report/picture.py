@@ -365,9 +365,11 @@ class Focus:
     receivers: tuple[str, ...]
     """Enclaves that may subscribe to, serve, execute or read the name."""
     influencing: tuple[Influence, ...]
-    """Enclaves that influence the senders, or the enclave; `hops` is 2 for direct influence."""
+    """Enclaves that influence the senders of the name, or the enclave in the focus; `hops` is 2 for
+    direct influence.
+    """
     influenced: tuple[Influence, ...] = ()
-    """Enclaves that the enclave influences; `hops` is 1 for direct influence."""
+    """Enclaves that the enclave in the focus influences; `hops` is 1 for direct influence."""
 
 
 class PicturedUse(NamedTuple):
@@ -527,7 +529,9 @@ class Picture:
     focus: tuple[Focus, ...] = ()
     """With ``--focus``: an answer for each chosen name and enclave."""
     requirements: Requirements | None = None
-    """With ``--requirements``: the requirements that hold and that do not; else null."""
+    """With ``--requirements``: the requirements that hold, and those that do not; else
+    null.
+    """
     equal: tuple[EqualUnits, ...] = ()
     """Robots, namespaces or enclaves that are equal except for their names, drawn once."""
     different: tuple[DifferentUnit, ...] = ()

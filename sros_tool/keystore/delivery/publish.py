@@ -169,7 +169,7 @@ class PublishedFleet(NamedTuple):
     folder: Path
     """The publishing folder, as given by the user."""
     robots: Sequence[RobotRelease]
-    """The robots of the fleet, and those whose releases were removed, sorted by name."""
+    """The robots of the fleet, and robots whose releases were removed, sorted by name."""
     rotated: Sequence[str]
     """Roles that have a new key."""
     versions: Mapping[str, int]
