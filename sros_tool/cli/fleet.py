@@ -773,6 +773,8 @@ _STATE_WORDS = {
 }
 """State of a file or robot → its words in the output, if they differ from the state's name."""
 _DIGITS = re.compile(r"(\d+)")
+_LONGEST_SUMMARY = 160
+"""Maximum number of characters in the last column of the table."""
 _MOST_LINES, _MOST_GROUPS = 50, 3
 """Maximum number of listed files of a robot, and of listed groups or unrecorded enclaves."""
 
@@ -1034,11 +1036,12 @@ def _groups(
     clauses_by_robot: dict[str, str] = {}
     for robot in sorted(status.robots, key=lambda robot: places[robot.robot]):
         if robots or robot.state != "current" or robot.notes or robot.problems:
-            clauses = (
+            files = (
                 *_expiry_clauses(robot, compared_fleet.at),
                 *_summary(robot, status.stage, compared_fleet.at),
-                *problems(robot),
             )
+            is_problem = robot.to_do in ("look into it", "check its server")
+            clauses = (*problems(robot), *files) if is_problem else (*files, *problems(robot))
             what = _CLOCK_SENTENCE.sub("", _without_robot_name("; ".join(clauses), robot.robot))
             clauses_by_robot[robot.robot] = what
             row = (robot.state.value, robot.to_do, *_DURATION.split(what))
@@ -1066,7 +1069,17 @@ def _rows(compared_fleet: ComparedFleet, robots: Sequence[str]) -> Iterator[tupl
     for group in groups:
         names = _robot_names(group.names, compared_fleet.status.names, compared_fleet.status.groups)
         age = _age_text(group.oldest_confirmation(compared_fleet.at), compared_fleet.at)
-        yield names, _state_text(group.state), age, group.to_do, group.what
+        what = group.what if robots else _shortened(group.what, group.names[0])
+        yield names, _state_text(group.state), age, group.to_do, what
+
+
+def _shortened(what: str, robot: str) -> str:
+    """Return the first clauses of a summary that fit into a row, and where the others are."""
+    if len(what) <= _LONGEST_SUMMARY:
+        return what
+    begin = what[:_LONGEST_SUMMARY]
+    begin = begin.rpartition("; ")[0] or f"{begin.rpartition(' ')[0]} ..."
+    return f"{begin}; more: --robot {robot}"
 
 
 def _page_rows(compared_fleet: ComparedFleet, robots: Sequence[str]) -> Iterator[tuple[str, ...]]:
@@ -1233,6 +1246,9 @@ def _summary(robot: RobotStatus, stage: str, moment: datetime) -> Iterator[str]:
     """Yield clauses on how a robot's files differ from the keystore's, the worst first."""
     from sros_tool.keystore.confirmation import enclave_of
 
+    is_explained = robot.is_doubtful or robot.state == "unknown"
+    if is_explained:
+        yield from robot.notes
     if robot.state == "never":
         yield counted(robot.enclaves, "enclave")
     if robot.revoked:
@@ -1242,8 +1258,19 @@ def _summary(robot: RobotStatus, stage: str, moment: datetime) -> Iterator[str]:
     )
     for owner, number in foreign.items():
         yield f"{counted(number, 'file')} of {owner}"
-    if revoked := sum(file.state == "revoked" for file in robot.pending):
-        yield f"{counted(revoked, 'revoked file')}"
+    revoked = [file for file in robot.pending if file.state == "revoked"]
+    if waiting := sum(not file.surplus for file in revoked):
+        new = "one waits" if waiting == 1 else "ones wait"
+        yield f"{counted(waiting, 'replaced certificate')} revoked: the new {new} for the robot"
+    if surplus := len(revoked) - waiting:
+        yield counted(surplus, "revoked file")
+    if robot.fetches and robot.lacks_key:
+        names = first_few(robot.lacks_key, _MOST_GROUPS)
+        yield f"lacks the key of {names}: releases bring no keys"
+    elif robot.lacks_ca:
+        yield "does not trust the CA that seals releases: fetching does not change this"
+    elif robot.is_locked_out(moment):
+        yield "a web server with the current CA and list refuses its certificates"
     groups: dict[tuple[str, str], Counter[str]] = {}
     for file in robot.pending:
         if file.state not in ("another", "revoked"):
@@ -1266,14 +1293,6 @@ def _summary(robot: RobotStatus, stage: str, moment: datetime) -> Iterator[str]:
     elif robot.fetches and robot.pending and not has_the_rest:
         other = f"its files differ from the published release {robot.release}"
         yield other if robot.is_published else "not published yet"
-    if robot.fetches and robot.lacks_key:
-        names = first_few(robot.lacks_key, _MOST_GROUPS)
-        yield f"lacks the key of {names}: releases bring no keys"
-    elif robot.lacks_ca:
-        yield "does not trust the CA that seals releases: fetching does not change this"
-    elif robot.is_locked_out(moment):
-        why = "have expired, were revoked, or are of a replaced identity CA"
-        yield f"all its certificates {why}: a web server with the current CA and list refuses it"
     seen = [name for name in robot.restart or () if (robot.running or {}).get(name) == "earlier"]
     if seen:
         yield f"processes of {first_few(seen, _MOST_GROUPS)} have not loaded the installed files"
@@ -1282,7 +1301,8 @@ def _summary(robot: RobotStatus, stage: str, moment: datetime) -> Iterator[str]:
         yield f"not known whether processes of {names} have loaded the installed files"
     if robot.enclaves and robot.stage not in ("", "unknown", stage):
         yield f"its CA files are of the stage '{robot.stage}'"
-    yield from robot.notes
+    if not is_explained:
+        yield from robot.notes
 
 
 def _gravest_problem(robot: RobotStatus) -> Iterator[str]:

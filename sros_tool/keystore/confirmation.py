@@ -53,6 +53,8 @@ MAX_BYTES = 4 * 1024 * 1024
 """Largest size of a confirmation in bytes; enough for a robot with 4,000 enclaves."""
 LONGEST_REASON = 400
 """Maximum number of characters in the reason for refusing a message."""
+NOT_IN_LEDGER = "its certificate is not in the ledger of the keystore"
+"""How the reason begins for refusing a message whose certificate the ledger does not record."""
 _MOST_REFUSALS = 64 * 1024 * 1024
 """Largest size of the file of refused messages, in bytes; enough for 100,000 robots.
 
@@ -89,7 +91,7 @@ _MOST_BOOTS = 8
 _MOST_CERTIFICATES = 32  # maximum number in a file
 _MOST_LIBRARIES, _MOST_UNSEEN = 100, 1_000_000
 _MOST_NUMBER = 2**53 - 1  # the largest number that every JSON reader reads exactly
-MOST_PROBLEMS, LONGEST_PROBLEM = 50, 300
+MOST_PROBLEMS, LONGEST_PROBLEM = 50, 1000
 """Maximum number of problems in a confirmation, and of characters in a problem."""
 MOST_REQUESTS = 500
 """Maximum number of signing requests in a confirmation; the agent sends others in later ones."""

@@ -17,6 +17,7 @@ from enum import StrEnum
 from functools import cached_property
 from importlib.util import find_spec
 from itertools import chain
+from shlex import quote
 from typing import Annotated, NamedTuple
 
 from sros_tool.dds.advisories import Advisory, known_vulnerabilities
@@ -33,6 +34,7 @@ from sros_tool.folders import Folder
 from sros_tool.keystore.confirmation import (
     CONFIRMED_FILES,
     EXPIRED_METADATA,
+    NOT_IN_LEDGER,
     OF_OTHER_CA,
     Confirmation,
     ReceivedConfirmation,
@@ -980,7 +982,7 @@ class _KeystoreRecords:
     ) -> None:
         self._keystore = keystore
         self._stages = stages
-        self._root = keystore.root
+        self.root = keystore.root
         self.has_list = keystore.has(CRL)
         """Whether the keystore has a revocation list."""
         # Most keystores publish nothing.
@@ -1090,7 +1092,7 @@ class _KeystoreRecords:
         # Few robots need this import.
         from sros_tool.keystore.delivery.publish import is_all_published
 
-        return is_all_published(self._root, published, compared_robot.enclaves)
+        return is_all_published(self.root, published, compared_robot.enclaves)
 
     @cached_property
     def age_clause(self) -> str:
@@ -1099,9 +1101,14 @@ class _KeystoreRecords:
 
         return age_clause(self._keystore)
 
+    @cached_property
+    def is_restored(self) -> bool:
+        """Whether the keystore was restored, and has published with ``--restored`` since."""
+        return bool(restored_at(self._keystore)) and not self.age_clause
+
     def is_ahead(self, confirmed: Confirmation) -> bool:
         """Return whether a robot reports a release from after the keystore's backup."""
-        is_from_backup = bool(self.age_clause or restored_at(self._keystore))
+        is_from_backup = bool(self.age_clause or self.is_restored)
         return bool(
             confirmed.release and is_from_backup and confirmed.release not in self._releases
         )
@@ -1138,7 +1145,7 @@ class _KeystoreRecords:
                 )
                 if has_other_key or file.path.rpartition("/")[0] not in folders:
                     enclaves_without_key.add(enclave_of(file.path))
-        keys = {name: enclave_path(self._root, name) / KEY_FILE for name in enclaves_without_key}
+        keys = {name: enclave_path(self.root, name) / KEY_FILE for name in enclaves_without_key}
         return tuple(sorted(name for name, key in keys.items() if os.path.lexists(key)))
 
     def lacks_ca(self, compared_robot: _ComparedRobot, *, is_published: bool) -> bool:
@@ -1394,6 +1401,13 @@ def _robot_status(
             "them"
         )
         compared_robot = compared_robot._replace(notes=(*compared_robot.notes, ahead_note))
+    is_lost = state is State.REFUSED and refusal and refusal.why.startswith(NOT_IN_LEDGER)
+    if (is_lost or (state is State.UNKNOWN and not is_ahead)) and records.is_restored:
+        lost_note = (
+            "the keystore was restored, and lacks what it issued after the backup. If this is the "
+            f"robot: `sros distribute_key {quote(str(records.root))} --robot NAME FOLDER --force`"
+        )
+        compared_robot = compared_robot._replace(notes=(lost_note, *compared_robot.notes))
     problems = confirmed.problems if confirmed else None
     if (
         two_computers := received.two_computers_sentence()

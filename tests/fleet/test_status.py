@@ -336,6 +336,11 @@ def test_the_gravest_problem_of_a_robot_is_shown_and_the_number_of_the_others(
     assert f"\nr1:\n{lines}" in ended and ended.count(key) == 1
     page = field.run("fleet", "status", "ks", "--robot", "r1", "--html", status=1).out
     assert all(f"it reports: {problem}" in page for problem in (key, "a", "b", "c", mended))
+    words = "word " * 199 + "end"
+    field.send("r3", problems=[words])
+    row = f"it reports: {'word ' * 29}...; more: --robot r3\n"
+    assert row in field.run("fleet", "status", "ks", status=1).out
+    assert words in field.run("fleet", "status", "ks", "--robot", "r3", status=1).out
     copied = (KEY_READABLE.title, PROCESS_KEY_READABLE.title, key)
     assert {*map(problem_rank, copied)} == {0} and problem_rank(mended) == 2
 
@@ -633,7 +638,7 @@ def test_a_robot_that_was_off_during_a_rotation_has_missed_it(field: Field) -> N
     field.age("r2", timedelta(hours=1))
     assert shown() == ("earlier", "deliver")
     said = field.run("fleet", "status", "ks", "--robot", "r2", status=1).out
-    assert "are of a replaced identity CA: a web server with" in said
+    assert "a web server with the current CA and list refuses its certificates; " in said
     field.deliver("r2")
     assert field.states()["r2"] == "current"
 
@@ -802,6 +807,35 @@ def test_a_robot_that_is_ahead_of_a_restored_keystore(field: Field) -> None:
         said = f"it says that it has release {release}, from after the backup of the keystore"
         assert said in robot["notes"][0]
         field.run("fleet", "publish", "ks", "pub", *(["--restored"] if to_do == "publish" else []))
+
+
+def test_a_robot_whose_certificate_a_restored_keystore_lacks(field: Field) -> None:
+    """The row says the cause and the command, whether it fetches or not."""
+    field.run("fleet", "publish", "ks", "pub")
+    backup = copy_of(field.root, field.folder / "backup")
+    field.run("renew", "ks", "/r1/base", "--new-key")
+    field.deliver("r1")
+    shutil.rmtree(field.root)
+    backup.rename(field.root)
+    shutil.rmtree(field.folder / "pub")
+
+    def row() -> str:
+        said = field.run("fleet", "status", "ks", status=1).out
+        return next(line for line in said.splitlines() if line.startswith("r1 "))
+
+    command = "`sros distribute_key ks --robot NAME FOLDER --force`"
+    field.confirm("r1")
+    assert "find out why" in row() and command not in row(), "not known to be restored"
+    field.run("fleet", "publish", "ks", "pub", "--restored", "--new-folder")
+    why = "the keystore was restored, and lacks what it issued after the backup."
+    assert "unknown files" in row() and why in row() and command in row()
+    (field.root / "confirmed/r1.json").unlink()
+    assert field.send("r1").status == 1
+    field.run("fleet", "publish", "ks", "pub", "--restored")
+    assert "message refused" in row() and why in row() and command in row()
+    field.deliver("r1")
+    field.send("r1", release=0)
+    assert field.states()["r1"] == "current"
 
 
 def test_what_an_agent_mended_does_not_fail_a_job_that_asks_so(field: Field) -> None:
@@ -1245,8 +1279,9 @@ def test_what_is_to_be_done_for_robots_that_do_not_fetch_what_is_published(field
     rows = said()
     assert rows["r1"][0] == "deliver" and "lacks the key of /r1/base: releases" in rows["r1"][1]
     assert "is published" not in rows["r1"][1], "no other enclave waits for it"
-    refused = "a web server with the current CA and list refuses it"
-    assert rows["r3"][0] == "wait, else deliver" and refused in rows["r3"][1]
+    refused = "a web server with the current CA and list refuses its certificates"
+    waits = "1 replaced certificate revoked: the new one waits for the robot"
+    assert rows["r3"] == ("wait, else deliver", f"{waits}; {refused}; more: --robot r3")
     assert rows["r2"][0] == "wait: it fetches"
     kept = field.root / "confirmed/r2.json"
     value = json.loads(kept.read_text())

@@ -32,6 +32,7 @@ from sros_tool.keystore.confirmation import (
     LONGEST_REASON,
     MAX_BYTES,
     MESSAGE_FILE,
+    NOT_IN_LEDGER,
     Confirmation,
     LastMessage,
     ReceivedConfirmation,
@@ -652,9 +653,8 @@ class _Verifier:
         issued = self._issued(digest(signer))
         if issued is None:
             raise _RefusedError(
-                "its certificate is not in the ledger of the keystore, though the keystore's "
-                "identity CA issued it: the keystore may have been restored from a backup that is "
-                "older than this certificate"
+                f"{NOT_IN_LEDGER}, though the keystore's identity CA issued it: the keystore may "
+                "have been restored from a backup that is older than this certificate"
             )
         owner = robot_of(self._fleet, issued.enclave)
         if owner != robot:
