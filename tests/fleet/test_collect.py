@@ -1155,7 +1155,8 @@ def test_messages_that_show_later_releases_refuse_a_new_folder(home: Home) -> No
         publish = ("fleet", "publish", "ks", folder, "--new-folder")
         refused = sros(*publish, cwd=home.folder)
         assert refused.status == 2
-        assert "the keystore 'ks' is older than its robots, as messages" in refused.err
+        assert f"r1 says that it has release {later}, which the keystore 'ks' never" in refused.err
+        assert "revoke it with `sros revoke ks --robot r1`" in refused.err
     copy_of(home.root, home.folder / "copy")
     home.run("revoke", "copy", "--robot", "r1")  # a stolen robot may claim any number
     home.run("fleet", "publish", "copy", "other", "--new-folder")

@@ -57,6 +57,7 @@ from sros_tool.keystore.delivery.release import (
 )
 from sros_tool.keystore.delivery.restored import (
     LaterChange,
+    RobotClaim,
     check_authorities,
     has_unpublished_restore,
     later_changes,
@@ -739,8 +740,8 @@ class _Publication:
         except SrosError as error:
             if self._restored_texts:
                 remedy = f"{error.remedy.rstrip('.')}. " if error.remedy else ""
-                done = " ".join(self._restored_texts)
-                error.remedy = f"{remedy}The keystore was changed already. {done}"
+                done = "; ".join(self._restored_texts)
+                error.remedy = f"{remedy}The keystore was changed already: {done}."
             raise
 
     def check_restored(self, restored: bool, new_folder: bool, keyring: Keyring) -> None:
@@ -770,11 +771,13 @@ class _Publication:
             self._check_earlier_folder()
         if not restored:
             is_new_place = is_lost or self._is_other_folder
-            if has_unpublished_restore(self.keystore) or (
-                is_new_place and self._robots_show_restore()
-            ):
+            is_known = has_unpublished_restore(self.keystore) or (
+                is_new_place and bool(restores_after_last_release(self.keystore))
+            )
+            claim = self._claim_of_later_release() if is_new_place and not is_known else None
+            if is_known or claim:
                 doing = f"Publishing to '{self._folder}'"
-                raise older_than_robots_error(self.keystore, doing, str(self._folder))
+                raise older_than_robots_error(self.keystore, doing, str(self._folder), claim)
         is_later = self._has_later_releases(restored)
         if restored and not (is_later or unknown or new_folder or self._shows_restore()):
             raise self._not_restored_error()
@@ -804,14 +807,13 @@ class _Publication:
         known, present = self.list.versions, self._present.versions()
         if self._has_later_root or any(present.get(name, 0) > known[name] for name in known):
             return True
-        return self._robots_show_restore()
+        is_recorded = bool(restores_after_last_release(self.keystore))
+        return is_recorded or self._claim_of_later_release() is not None
 
-    def _robots_show_restore(self) -> bool:
-        """Return whether the ledger or a robot shows that the keystore was restored."""
+    def _claim_of_later_release(self) -> RobotClaim | None:
+        """Return what a robot says about a release that the keystore never published, if any."""
         entries = self.keystore.ledger_with("what", "release").entries
         last = max((entry.number for entry in entries if entry.what == "release"), default=0)
-        if restores_after_last_release(self.keystore):
-            return True
         fleet = recorded_fleet(self.keystore)
         for robot, member in fleet.robots.items():
             if not enclaves_of_robot(self.keystore, fleet, member):
@@ -819,10 +821,11 @@ class _Publication:
             with suppress(SrosError):
                 if received := last_confirmation(self.keystore, robot):
                     sent = received.confirmation
-                    problems = sent.problems or ()
-                    if (sent.release or 0) > last or any(OF_SAME_NUMBER in e for e in problems):
-                        return True
-        return False
+                    if (sent.release or 0) > last:
+                        return RobotClaim(robot, f"release {sent.release}")
+                    if any(OF_SAME_NUMBER in problem for problem in sent.problems or ()):
+                        return RobotClaim(robot, "another release of the same number")
+        return None
 
     @property
     def _command(self) -> str:
@@ -1015,9 +1018,11 @@ class _Publication:
             whence = f"the last release in '{self._folder}' has"
             self._notes.append(restored_note(revocation, whence))
         self._notes += (e for e in revocation.notes if e.id != REPLACED_AFTER_BACKUP)
-        if revocation.changes and not self._dry_run:
-            texts = (note.text.rstrip(".") for note in self._notes)
-            self._restored_texts += [f"{text[:1].upper()}{text[1:]}." for text in texts]
+        if revocation.changes and self._notes and not self._dry_run:
+            self._restored_texts.append("it has recorded what later releases and lists show")
+            if self._revoked:
+                names = first_few(sorted(self._revoked), _MOST_NAMES)
+                self._restored_texts.append(f"it has revoked {names} again")
         changes = [
             LaterChange("key" if is_key else "certificate", name, "")
             for name, is_key in revocation.replaced.items()

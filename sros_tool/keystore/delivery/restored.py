@@ -115,19 +115,42 @@ def refuse_unpublished_restore(keystore: OpenedKeystore, doing: str) -> None:
         raise older_than_robots_error(keystore, doing)
 
 
+class RobotClaim(NamedTuple):
+    """What a robot says in its last message about a release that was never published."""
+
+    robot: str
+    release: str
+
+
 def older_than_robots_error(
-    keystore: OpenedKeystore, doing: str, folder: str = ""
+    keystore: OpenedKeystore, doing: str, folder: str = "", claim: RobotClaim | None = None
 ) -> KeystoreError:
-    """Return the error for a keystore that is older than its robots, as their messages show."""
+    """Return the error for a keystore that is older than its robots, as their messages show.
+
+    With ``claim``, only the word of one robot shows this.
+    """
     where = quote(str(keystore.root))
     place = quote(folder or read_published(keystore).folder or "PUB")
+    shown = f"the keystore '{keystore.root}' is older than its robots, as messages or releases show"
+    doing, other = f"The keystore was restored from a backup, or is a copy. {doing}", ""
+    if claim:
+        shown = (
+            f"the robot {claim.robot} says that it has {claim.release}, which the keystore "
+            f"'{keystore.root}' never published"
+        )
+        other = (
+            f" If the keystore was not restored, {claim.robot} has other files or lies: examine "
+            f"it, or revoke it with `sros revoke {where} --robot {claim.robot}`; then its word no "
+            "longer counts."
+        )
+        doing = "Perhaps the keystore was restored from a backup, or is a copy: then, publishing"
     return KeystoreError(
-        f"the keystore '{keystore.root}' is older than its robots, as messages or releases show",
-        f"The keystore was restored from a backup, or is a copy. {doing} would undo later changes, "
-        "such as a revocation, or bring back rights that were taken away.",
+        shown,
+        f"{doing} would undo later changes, such as a revocation, or bring back rights that were "
+        "taken away.",
         f"Restore a later backup. If there is none, run `sros fleet collect {where} INBOX`, revoke "
         f"again what was revoked, and run `sros fleet publish {where} {place} --restored`; "
-        "docs/howto/keystore_is_lost.md has the other steps.",
+        f"docs/howto/keystore_is_lost.md has the other steps.{other}",
     )
 
 
