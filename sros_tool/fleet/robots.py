@@ -19,7 +19,7 @@ from itertools import permutations
 from types import MappingProxyType
 from typing import NamedTuple, TypeVar
 
-from sros_tool.errors import DocumentError, InvalidNameError, UsageError
+from sros_tool.errors import DocumentError, InvalidNameError, Note, UsageError
 from sros_tool.names import check_enclave_name, expression_problem
 from sros_tool.policy.placeholders import (
     Parts,
@@ -281,6 +281,20 @@ def enclaves_of(fleet: Fleet, robot: Robot) -> tuple[str, ...]:
         if group_of(parts) in ("", *robot.groups):
             paths.add(path_for(parts, robot))
     return tuple(sorted(paths))
+
+
+def similar_names_notes(fleet: Fleet) -> Iterator[Note]:
+    """Yield a note on robots whose names differ only in upper and lower case."""
+    by_name: dict[str, list[str]] = defaultdict(list)
+    for name in sorted(fleet.robots):
+        by_name[name.lower()].append(name)
+    if similar := [" and ".join(names) for names in by_name.values() if len(names) > 1]:
+        yield Note(
+            "fleet.similar-names",
+            f"robots whose names differ only in upper and lower case: {first_few(similar, 5)}. "
+            "DNS, and web servers and file systems that ignore the case, give them one address or "
+            "one folder, so they get and replace each other's files: rename one of them.",
+        )
 
 
 def size_problem(fleet: Fleet) -> str:

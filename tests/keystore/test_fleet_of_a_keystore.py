@@ -312,3 +312,18 @@ def test_a_robot_with_keys_of_its_own_gets_all_files_after_a_rotation(
 
     sros("distribute_key", root, "--robot", "a", robot, "--force").ok()
     assert sros("verify", robot).out.count("  loadable in domain") == 2
+
+
+def test_names_that_differ_only_in_case_are_noted(tmp_path: Path) -> None:
+    """When the fleet is recorded, and at each publication."""
+    pytest.importorskip("tuf")
+    root, pub = tmp_path / "ks", tmp_path / "pub"
+    (tmp_path / "fleet.toml").write_text("[robots.r7]\n[robots.R7]\n[robots.r8]\n")
+    (tmp_path / "policy.xml").write_text(policy_text({"/{robot}": publish("x")}))
+    words = ("-p", tmp_path / "policy.xml", "--fleet", tmp_path / "fleet.toml")
+    note = "note [fleet.similar-names]: robots whose names differ only in upper and lower case: "
+    assert f"{note}R7 and r7. DNS" in sros("generate_artifacts", "-k", root, *words).ok().err
+    assert note in sros("fleet", "publish", root, pub, "--dry-run").ok().err
+    (tmp_path / "fleet.toml").write_text("[robots.r7]\n[robots.r8]\n")
+    assert note not in sros("generate_artifacts", "-k", root, *words).ok().err
+    assert note not in sros("fleet", "publish", root, pub, "--dry-run").ok().err

@@ -26,7 +26,7 @@ from cryptography.x509.oid import ExtensionOID
 from sros_tool import __version__
 from sros_tool.errors import DocumentError, KeystoreError, Note, SrosError
 from sros_tool.files import remove_file, staged_file
-from sros_tool.fleet.robots import Fleet
+from sros_tool.fleet.robots import Fleet, similar_names_notes
 from sros_tool.folders import Folder, make_folders, remove_folders
 from sros_tool.keystore.confirmation import OF_SAME_NUMBER, last_confirmation
 from sros_tool.keystore.delivery.archive import listed_digests, refuse_archive_name
@@ -243,7 +243,7 @@ def publish(
     """
     check_tuf()
     keystore = OpenedKeystore(root)
-    recorded_fleet(keystore)
+    fleet = recorded_fleet(keystore)
     checked_fleet(keystore)
     refuse_archive_name(folder, "Releases are published in a folder: name one, such as pub.")
     _check_apart(root, folder)
@@ -269,6 +269,7 @@ def publish(
             stack.callback(lock.release)
             lock.acquire()
         run = _Publication(keystore, folder, now, expiry or MetadataExpiry(), dry_run)
+        run.notes += similar_names_notes(fleet)
         stack.enter_context(run.reporting_restore())
         run.check_restored(restored, new_folder, keyring)
         keys = _RoleKeys(run.roots, root, root_key)
@@ -725,7 +726,7 @@ class _Publication:
         self._number = 0
         self._least = 0
         self._changes: Sequence[FileChange] = ()
-        self._notes: list[Note] = []
+        self.notes: list[Note] = []
         self._restored_texts: list[str] = []
         self._is_restored = False
         self._later: Sequence[LaterChange] = ()
@@ -792,10 +793,10 @@ class _Publication:
                     if path.endswith(_ENDS_OF_LIST_PATHS):
                         forgotten.add(content)
             else:
-                self._notes.append(self._hidden_revocations_note())
+                self.notes.append(self._hidden_revocations_note())
             self._restore(forgotten, keyring)
             if is_lost and not self._has_later_root:
-                self._notes.append(self._unseen_root_note())
+                self.notes.append(self._unseen_root_note())
             self._is_restored = True
         self._check_removed()
         if is_lost or restored:
@@ -1016,9 +1017,10 @@ class _Publication:
         self._revoked = frozenset(revocation.names("revoked"))
         if forgotten_lists.lists:
             whence = f"the last release in '{self._folder}' has"
-            self._notes.append(restored_note(revocation, whence))
-        self._notes += (e for e in revocation.notes if e.id != REPLACED_AFTER_BACKUP)
-        if revocation.changes and self._notes and not self._dry_run:
+            self.notes.append(restored_note(revocation, whence))
+        notes = [note for note in revocation.notes if note.id != REPLACED_AFTER_BACKUP]
+        self.notes += notes
+        if (forgotten_lists.lists or notes) and not self._dry_run:
             self._restored_texts.append("it has recorded what later releases and lists show")
             if self._revoked:
                 names = first_few(sorted(self._revoked), _MOST_NAMES)
@@ -1033,7 +1035,7 @@ class _Publication:
             and not (change.change == "key" and change.enclave in revocation.replaced)
         ]
         refuse_lost_changes(self.keystore, self._folder, changes)
-        self._notes += other_changes_notes(self.keystore, changes)
+        self.notes += other_changes_notes(self.keystore, changes)
         self._later = changes
 
     def _last_releases(self) -> dict[str, Release | None]:
@@ -1257,7 +1259,7 @@ class _Publication:
                 lines.append(f"{published.release.sha256}  {robot}\n")
             if not_valid:
                 text = f"{robot}: published, although the release is not valid now: {not_valid}"
-                self._notes.append(Note("fleet.release-not-valid", text))
+                self.notes.append(Note("fleet.release-not-valid", text))
         if lines or self._is_restored:
             digest = hashlib.sha256("".join(sorted(lines)).encode()).hexdigest()
             change.entries.append(Entry(iso(self._now), "release", sha256=digest, number=number))
@@ -1353,7 +1355,7 @@ class _Publication:
                 f"{first_few(sorted(self._damaged), 5)}. They are published again, with a new "
                 "number. Find out who else can write to this folder."
             )
-            self._notes.append(Note("fleet.archive-damaged", text))
+            self.notes.append(Note("fleet.archive-damaged", text))
         present, last = (
             of.get("timestamp", 0) for of in (self._present.versions(), self.list.versions)
         )
@@ -1364,7 +1366,7 @@ class _Publication:
                 "published again. Either a run was interrupted, or somebody put earlier files "
                 "there: find out who else can write to this folder."
             )
-            self._notes.append(Note("fleet.metadata-older", text))
+            self.notes.append(Note("fleet.metadata-older", text))
         self._altered = altered
         self.list.altered = {
             **altered_lately(self.list.altered, self._now),
@@ -1462,7 +1464,7 @@ class _Publication:
             self._later,
             self._altered,
             self._changes,
-            (*self._notes, *keys.notes),
+            (*self.notes, *keys.notes),
         )
 
 

@@ -25,7 +25,7 @@ from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import Governance
 from sros_tool.errors import KeystoreError, Note, SrosError
-from sros_tool.fleet.robots import Fleet, enclaves_of
+from sros_tool.fleet.robots import Fleet, enclaves_of, similar_names_notes
 from sros_tool.keystore.fleet import (
     checked_fleet,
     fleet_before_change,
@@ -292,7 +292,7 @@ class KeystoreChange:
         fleet, entries = write_fleet(self.transaction, self.keystore, fleet, patterns, self.now)
         self.fleet = fleet
         self.entries += entries
-        self.notes += _short_lived_notes(fleet, self.template)
+        self.notes += (*_short_lived_notes(fleet, self.template), *similar_names_notes(fleet))
         if self.template.zenoh:
             self.set_network(self.with_routers_of_robots(self.template.zenoh, before))
         elif any(robot.router for robot in fleet.robots.values()):
