@@ -21,7 +21,7 @@ from sros_tool.checks.keystores.opened import Circumstances
 from sros_tool.cli.common import chosen_enclaves
 from sros_tool.dds.domains import DomainSet
 from sros_tool.errors import DocumentError, KeystoreError, SrosError
-from sros_tool.files import policies_dir
+from sros_tool.files import policies_dir, staged_file
 from sros_tool.keystore.delivery import export
 from sros_tool.keystore.delivery.archive import unpack
 from sros_tool.keystore.delivery.export import (
@@ -128,6 +128,28 @@ def test_what_another_export_wrote_meanwhile_is_compared(
     monkeypatch.setattr(KeystoreLock, "acquire", acquire_late)
     with pytest.raises(KeystoreError, match="revokes 1 certificate that the keystore's"):
         distribute(OpenedKeystore(backup), ["/base"], robot, now=NOW, force=True)
+
+
+def test_an_archive_that_another_export_wrote_meanwhile_stays(
+    fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    backup, target = copy_of(fleet, tmp_path / "backup"), tmp_path / "robot.tar.gz"
+    for name in ("/armada", "/arm/camera"):  # once without an archive, once with one
+        revoke(fleet, [name], now=NOW)
+
+        def stage_late(*words: Any, **more: Any) -> Any:
+            monkeypatch.undo()
+            distribute(OpenedKeystore(fleet), ["/base"], target, now=NOW, force=True)
+            return staged_file(*words, **more)
+
+        monkeypatch.setattr(export, "staged_file", stage_late)
+        with pytest.raises(KeystoreError, match=r"another process has just written '.*/robot"):
+            distribute(OpenedKeystore(backup), ["/base"], target, now=NOW, force=True)
+        present = target.read_bytes()
+        assert not distribute(OpenedKeystore(fleet), ["/base"], target, now=NOW).changes
+        revoke(backup, [name], now=NOW)
+        refresh_crl(backup, now=NOW)
+    assert target.read_bytes() == present
 
 
 def test_a_revocation_during_an_export_comes_to_all_enclaves_of_it(

@@ -11,6 +11,7 @@ from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from functools import partial
 from pathlib import Path
+from typing import Self
 
 import pytest
 from cryptography import x509
@@ -30,6 +31,8 @@ from sros_tool.keystore.known_keys import (
     unlisted_revocations,
 )
 from sros_tool.keystore.layout import FLEET_ROOT, ROTATION, enclave_path, list_enclaves
+from sros_tool.keystore.lifecycle import rotate
+from sros_tool.keystore.lifecycle.change import KeystoreChange
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, generate_artifacts
 from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
 from sros_tool.keystore.lifecycle.rotate import RotationStep, renew_identity_ca, rotate_ca
@@ -153,6 +156,23 @@ def test_every_stage_is_whole(root: Path) -> None:
     )
     for name in NAMES:  # rights stay, word for word
         assert (enclave_path(root, name) / "permissions.xml").read_bytes() == rights[name]
+
+
+def test_two_commands_that_go_on_together_begin_one_stage(
+    separate: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The second one waits for the first, and would cut off what has not been restarted."""
+
+    class Late(KeystoreChange):
+        def __enter__(self) -> Self:
+            monkeypatch.undo()
+            rotate_ca(separate, now=NOW)
+            return super().__enter__()
+
+    monkeypatch.setattr(rotate, "KeystoreChange", Late)
+    with pytest.raises(KeystoreError, match="has just reached the stage distribute"):
+        rotate_ca(separate, now=NOW)
+    assert rotate_ca(separate, now=NOW).stage == RotationStage.REISSUE
 
 
 def test_the_keystore_can_be_used_at_every_stage(root: Path) -> None:

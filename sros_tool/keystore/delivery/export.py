@@ -635,8 +635,8 @@ def _write_archive(
     force: bool,
     dry_run: bool,
 ) -> Sequence[Change]:
-    data = pack(files)
-    if target.exists():
+    data, before = pack(files), _state_of(target)
+    if before:
         if not target.is_file():
             raise KeystoreError(
                 f"'{target}' is in the way", "It is not a regular file.", "Choose another name."
@@ -650,11 +650,24 @@ def _write_archive(
                 "Add --force to replace it, or choose another name.",
             )
         check_rollback(keystore, target, _unpack_archive(target), files, now)
-    change = Change("replace" if target.exists() else "create", target.name)
     if not dry_run:
         with staged_file(target, data) as put_in_place:
+            if _state_of(target) != before:
+                raise KeystoreError(
+                    f"another process has just written '{target}'",
+                    "Its files may be newer. Nothing was changed.",
+                    "Run this command again.",
+                )
             put_in_place()
-    return (change,)
+    return (Change("replace" if before else "create", target.name),)
+
+
+def _state_of(path: Path) -> tuple[int, ...] | None:
+    """Return numbers that change if another process replaces or writes a file; None if missing."""
+    with suppress(FileNotFoundError):
+        state = path.stat()
+        return state.st_ino, state.st_size, state.st_mtime_ns, state.st_ctime_ns
+    return None
 
 
 def _unpack_archive(target: Path) -> Mapping[str, bytes]:

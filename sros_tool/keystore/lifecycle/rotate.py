@@ -157,14 +157,19 @@ def rotate_ca(
 
     Raises:
         KeystoreError: a key is missing, an enclave cannot be moved to the new CA, robots would be
-            cut off, or vendors would refuse enclaves that they accept today.
+            cut off, vendors would refuse enclaves that they accept today, or another process has
+            begun the next stage.
         UsageError: the stage ``to`` is over, or is not the next stage; ``delete_old_key`` is set,
             but this stage deletes no old key; or ``existing`` is given for a rotation that has
             already begun.
     """
+    is_next = to is None and not finish
+    stage_before = read_rotation(OpenedKeystore(root)).stage if is_next else None
     change = KeystoreChange(root, **options)
     with change:
         rotation = read_rotation(change.keystore)
+        if is_next and rotation.stage is not stage_before:
+            raise _stage_changed_error(root, rotation.stage)
         if existing and rotation.stage is not RotationStage.NONE:
             raise UsageError(
                 f"the keystore is at the stage {rotation.stage} of a rotation to another CA",
@@ -193,6 +198,15 @@ def rotate_ca(
         files=tuple(replacement.file for replacement in rotator.replacements),
         kept_elsewhere=tuple(rotator.kept_elsewhere),
         cut_off=cut_off,
+    )
+
+
+def _stage_changed_error(root: Path, stage: RotationStage) -> KeystoreError:
+    return KeystoreError(
+        f"the CA rotation of '{root}' has just reached the stage {stage}",
+        "Another command began this stage, or an interrupted one was completed. The next stage "
+        "would cut off processes that lack the files of this stage.",
+        f"`sros rotate_ca {quote(str(root))}` shows what to do before the next stage.",
     )
 
 
