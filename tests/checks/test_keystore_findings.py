@@ -350,7 +350,9 @@ def test_an_earlier_document_is_not_exported(file: str, bench: Bench, tmp_path: 
     assert refused.status == 2 and "is an earlier document than the last one" in refused.err
 
 
-def test_an_earlier_revocation_list_is_not_exported(bench: Bench, tmp_path: Path) -> None:
+def test_an_earlier_revocation_list_is_not_exported_and_a_renewal_notes_it(
+    bench: Bench, tmp_path: Path
+) -> None:
     kind = "keystore.revocation-list-lacks"
     CASES[kind](bench)
     words = ("distribute_key", bench.root, "/base", tmp_path / "robot")
@@ -358,7 +360,11 @@ def test_an_earlier_revocation_list_is_not_exported(bench: Bench, tmp_path: Path
     assert "lacks revoked certificates of /gone" in sros(*words).err
     shutil.rmtree(bench.path("enclaves/gone"))
     secret = {"SROS_CA_PASSPHRASE": SECRET}
+    for renew in (("/base",), ("--all-expiring", "1d")):
+        noted = sros("renew", bench.root, *renew, "--dry-run", env=secret).ok().err
+        assert f"[{kind}]: the revocation list lacks certificates of /gone, which" in noted
     sros("crl", bench.root, "--refresh", env=secret).ok()
+    assert kind not in sros("renew", bench.root, "/base", "--dry-run", env=secret).ok().err
     assert kind not in ids(bench)
     sros(*words).ok()
 

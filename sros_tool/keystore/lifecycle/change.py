@@ -36,7 +36,7 @@ from sros_tool.keystore.issuing.acceptance import refuse_stopping
 from sros_tool.keystore.issuing.authority import Authorities, Authority, load_authority
 from sros_tool.keystore.issuing.enclave import EnclaveTokens, EnclaveWriter
 from sros_tool.keystore.issuing.keyring import IN_KEYSTORE, Keyring
-from sros_tool.keystore.known_keys import KnownKeys, unknown_authorities
+from sros_tool.keystore.known_keys import KnownKeys, unknown_authorities, unlisted_revocations
 from sros_tool.keystore.layout import (
     GOVERNANCE_P7S,
     IDENTITY,
@@ -337,8 +337,23 @@ class KeystoreChange:
         self.entries.append(write_settings(self.transaction, self.template, self.now))
 
     def edit_notes(self) -> tuple[Note, ...]:
-        """Return notes on manually edited files, whose edits this change does not carry out."""
-        return edit_notes(self.keystore, self.governance)
+        """Return notes on edited files, and on a revocation list that lacks revocations.
+
+        This change does not carry out the edits.
+        """
+        return (*self._lacking_list_notes(), *edit_notes(self.keystore, self.governance))
+
+    def _lacking_list_notes(self) -> Iterator[Note]:
+        names: Sequence[str] = ()
+        with suppress(SrosError):  # a list that cannot be read is refused where it is needed
+            names = unlisted_revocations(self.keystore, self.now)
+        if names:
+            yield Note(
+                "keystore.revocation-list-lacks",
+                f"the revocation list lacks certificates of {first_few(names, 5)}, which were "
+                "revoked: processes that start now accept them. Find out who put an earlier list "
+                f"back, and run `sros crl {quote(str(self.root))} --refresh`.",
+            )
 
     def unrevoked_key(self, name: str, certificate: x509.Certificate) -> PublicKey:
         """Return the public key of an enclave's ``certificate``, to certify it again.
