@@ -350,9 +350,8 @@ def test_an_earlier_document_is_not_exported(file: str, bench: Bench, tmp_path: 
     assert refused.status == 2 and "is an earlier document than the last one" in refused.err
 
 
-def test_an_earlier_revocation_list_is_not_exported_and_a_renewal_notes_it(
-    bench: Bench, tmp_path: Path
-) -> None:
+def test_an_earlier_revocation_list_is_not_exported(bench: Bench, tmp_path: Path) -> None:
+    """And a renewal notes it."""
     kind = "keystore.revocation-list-lacks"
     CASES[kind](bench)
     words = ("distribute_key", bench.root, "/base", tmp_path / "robot")
