@@ -620,14 +620,15 @@ class ComparedFleet(NamedTuple):
 @click.option(
     "--fail-on",
     type=click.Choice(["delivery", "unmended", "seen", "vulnerabilities"]),
-    default="delivery",
+    multiple=True,
+    default=["delivery"],
     show_default=True,
     help="`delivery`: the exit status is 1 only for problems with the delivery of files, and for "
     "problems that agents report. `unmended`: as `delivery`, but changed files that an agent or "
     "`sros fleet publish` has replaced (they are shown for a day) do not count. `seen`: "
     "as `delivery`, but a publishing folder that is not on this machine does not count. "
     "`vulnerabilities`: as `delivery`, and also for a DDS with known vulnerabilities that a later "
-    "release fixes.",
+    "release fixes. Can be repeated: `--fail-on unmended --fail-on seen`.",
 )
 @output_option("Replace FILE atomically instead of printing.")
 @dry_run_option
@@ -640,7 +641,7 @@ def _status(
     html: bool,
     advisories: Path | None,
     no_advisories: bool,
-    fail_on: str,
+    fail_on: tuple[str, ...],
     output: Path | None,
     dry_run: bool,
     as_json: bool,
@@ -691,7 +692,7 @@ def _status(
         raise UsageError("--json, --prometheus and --html exclude each other", "", "Choose one.")
     if as_json and output:
         raise UsageError("--json takes no --output", "", "Leave one of them out.")
-    on_vulnerabilities = fail_on == "vulnerabilities"
+    on_vulnerabilities = "vulnerabilities" in fail_on
     if no_advisories and (advisories or prometheus or on_vulnerabilities):
         other = "--prometheus" if prometheus else "--fail-on vulnerabilities"
         other = "--advisories" if advisories else other
@@ -722,7 +723,7 @@ def _status(
 
     findings = robot_findings(reported, known, names) if html else robot_findings(reported, known)
     compared = ComparedFleet(moment, status, outdated, list(findings))
-    complete = {"unmended": status.mended, "seen": status.seen}.get(fail_on, status.complete)
+    complete = status.is_settled(mended="unmended" in fail_on, unseen="seen" in fail_on)
     exit_status = 0 if complete and not (outdated and on_vulnerabilities) else 1
     if as_json:
         print_json(compared)

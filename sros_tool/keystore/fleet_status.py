@@ -615,7 +615,7 @@ class FleetStatus:
         altered in the last day, and there is no other doubt about the robots' files.  Robots whose
         enclaves were all revoked do not count.
         """
-        return self.seen and self._is_folder_seen
+        return self.is_settled()
 
     @property
     def mended(self) -> bool:
@@ -623,25 +623,28 @@ class FleetStatus:
         published again, do not count; both are shown for a day.  A key that somebody may have
         copied counts.
         """
-        in_order = self._is_in_order and self._is_folder_seen
-        return in_order and all(robot.mended for robot in self.robots)
+        return self.is_settled(mended=True)
 
     @property
     def seen(self) -> bool:
         """Like ``complete``, but a publishing folder that cannot be examined does not count."""
-        is_altered = self.publication is not None and bool(self.publication.altered)
-        in_order = self._is_in_order and not is_altered
-        return in_order and all(robot.settled for robot in self.robots)
+        return self.is_settled(unseen=True)
 
-    @property
-    def _is_folder_seen(self) -> bool:
-        return self.publication is None or not self.publication.unseen
+    def is_settled(self, *, mended: bool = False, unseen: bool = False) -> bool:
+        """Return whether nothing is left to do for the fleet.
 
-    @property
-    def _is_in_order(self) -> bool:
-        """Whether nothing but the robots' own states makes the fleet incomplete."""
-        in_order = self.publication is None or self.publication.is_in_order
-        return in_order and not (self.overdue or self.older or self.clock or self.edited)
+        With ``mended``, files that were changed and replaced do not count.  With ``unseen``, a
+        publishing folder that cannot be examined does not count.
+        """
+        publication = self.publication
+        in_order = publication is None or (
+            publication.is_in_order
+            and (unseen or not publication.unseen)
+            and (mended or not publication.altered)
+        )
+        in_doubt = self.overdue or self.older or self.clock or self.edited
+        robots = (robot.mended if mended else robot.settled for robot in self.robots)
+        return in_order and not in_doubt and all(robots)
 
     def with_overdue(self, now: datetime, max_age: timedelta | None = None) -> FleetStatus:
         """Return a copy in which silent robots are offline, with the remedy for each robot.

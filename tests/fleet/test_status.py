@@ -852,6 +852,12 @@ def test_what_an_agent_mended_does_not_fail_a_job_that_asks_so(field: Field) -> 
         assert f"\nsros_fleet_agent_mended{{{labels}}} 1\n" in told
     field.send("r1", problems=(mended,), restart=["/r1/base"])
     field.run("fleet", "status", "ks", "--fail-on", "unmended", status=1)
+    field.run("fleet", "publish", "ks", "pub")
+    field.send("r1", problems=(mended,))
+    (field.folder / "pub").rename(field.folder / "away")
+    for kinds, status in ((["unmended"], 1), (["seen"], 1), (["unmended", "seen"], 0)):
+        words = [word for kind in kinds for word in ("--fail-on", kind)]
+        field.run("fleet", "status", "ks", *words, status=status)
 
 
 def test_a_fleet_file_that_was_edited_is_not_believed(field: Field) -> None:
