@@ -68,6 +68,12 @@ _REPLACE_CA = (
     "{root} --all-expiring 30d`; then restart all processes together."
 )
 _SIGN_CRL = "Sign the list again: `sros crl {root} --refresh`, and export it to the robots again."
+_MAKE_KEY = (
+    "The key was made on this robot, and nothing else has it: restore it from a backup of the "
+    "robot. Without a backup, make another key in a new folder: `sros create_request {enclave} "
+    "NEW_FOLDER`, sign its request.pem with `sros sign_request {root} request.pem --renew`, and "
+    "install the answer with `sros import ANSWER NEW_FOLDER`."
+)
 _AUTHORITY_FILES = ("identity_ca.cert.pem", "permissions_ca.cert.pem")
 
 
@@ -459,8 +465,13 @@ class Fault(Enum):
         """Return the remedy for this fault in ``file``, with its ``{fields}`` not filled in."""
         return self._remedies.get(file, self.remedy)
 
-    def remedy_in_export(self, file: str) -> str:
-        """Return the remedy for this fault in ``file`` of an export, which has no CA keys."""
+    def remedy_in_export(self, file: str, *, key_made_here: bool = False) -> str:
+        """Return the remedy for this fault in ``file`` of an export, which has no CA keys.
+
+        ``key_made_here`` says that the export has the request for a key that was made here.
+        """
+        if key_made_here and self is Fault.FILE_MISSING and file == "key.pem":
+            return _MAKE_KEY
         text = self.remedy_in(file)
         if "`" not in text:
             return text
@@ -488,8 +499,8 @@ def remedy_in_original_keystore(remedy: str) -> str:
 
 
 NEEDS_CA_KEYS = re.compile(
-    r"`sros (create_\w+|generate_artifacts|update_keystore|renew|revoke|rotate_ca|distribute_key"
-    r"|crl KEYSTORE --refresh|zenoh) "
+    r"`sros (create_(?!request)\w+|generate_artifacts|update_keystore|renew|revoke|rotate_ca"
+    r"|distribute_key|crl KEYSTORE --refresh|zenoh) "
 )
 """The beginning of a command that works only in the keystore that has the CA keys."""
 

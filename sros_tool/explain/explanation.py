@@ -41,6 +41,7 @@ from sros_tool.keystore.layout import (
     enclave_path,
     is_original_keystore,
     is_own_copy,
+    key_on_robot,
     remedy_in_closed_robot,
 )
 from sros_tool.keystore.participant import LoadedEnclave, plan_enclave
@@ -190,7 +191,9 @@ def remedy(cause: Fault | str, root: str, enclave: str, file: str = "") -> str:
         if fault:
             is_done_here = "`" not in text or fault is Fault.GOVERNANCE_DOMAIN
             where = root if is_done_here else "KEYSTORE"
-            text = _filled_remedy(fault.remedy_in_export(file), where, enclave, file)
+            made_here = key_on_robot(enclave_path(keystore, enclave))
+            text = fault.remedy_in_export(file, key_made_here=made_here)
+            text = _filled_remedy(text, where, enclave, file)
             return remedy_in_closed_robot(keystore, text)
         if "`" not in text:
             return _filled_remedy(text, root, enclave, file)

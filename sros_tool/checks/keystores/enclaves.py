@@ -36,7 +36,9 @@ from sros_tool.keystore.layout import (
     ROUTER_FILE,
     SHARED_FILES,
     ZENOH_FILES,
+    enclave_path,
     is_own_copy,
+    key_on_robot,
     waits_for_answer,
 )
 from sros_tool.keystore.reader import weaknesses
@@ -107,7 +109,8 @@ def fault_remedy(enclave: CheckedEnclave, fault: Fault, name: str) -> str:
         elif missing and not (enclave.keystore.root / missing).exists():
             remedy = f"Restore {missing} from a backup; every exported enclave has a copy of it."
     else:
-        remedy, root = fault.remedy_in_export(name), "KEYSTORE"
+        made_here = key_on_robot(enclave_path(enclave.keystore.root, enclave.name))
+        remedy, root = fault.remedy_in_export(name, key_made_here=made_here), "KEYSTORE"
         quoted_path = f"KEYSTORE/enclaves{quote(enclave.name)}/{name}"
         path = quoted_path if "`" in remedy else quote(file)
     return remedy.format(root=root, enclave="ENCLAVE", path=path)
