@@ -500,23 +500,7 @@ def _load_system(
     from sros_tool.keystore.template import load_template
     from sros_tool.proof.system import load_system
 
-    system = load_system(paths, circumstances, load_template(template) if template else None)
-    if system.is_export:
-        for world in system.worlds:
-            world.away = _enclaves_elsewhere(paths[0])
-    return system
-
-
-def _enclaves_elsewhere(export: Path) -> Sequence[str]:
-    """Return the enclaves that `sros close` left out of its export; none for other exports."""
-    from sros_tool.close.processes import read_processes
-    from sros_tool.keystore.layout import CLOSED_PROCESSES, folder_of_closed_robot
-
-    robot = folder_of_closed_robot(export.absolute())
-    try:
-        return read_processes(robot / CLOSED_PROCESSES).not_here if robot else ()
-    except SrosError:  # without the list, the enclaves are reported as missing
-        return ()
+    return load_system(paths, circumstances, load_template(template) if template else None)
 
 
 def _suggested_requirements(system: System) -> str:

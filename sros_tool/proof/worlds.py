@@ -339,9 +339,9 @@ class World:
         self.idle = frozenset(idle)
         self.crossing = crossing
         self.elsewhere: tuple[World, ...] = ()
+        """The worlds of the same vendor, or of Zenoh, in other ROS domains."""
         self.away: Collection[str] = ()
         """The enclaves of other machines, which an export leaves out on purpose."""
-        """The worlds of the same vendor, or of Zenoh, in other ROS domains."""
         self._weak = weak
         self.demanded = demanded
         self._readers_of: dict[str, list[str]] = {}

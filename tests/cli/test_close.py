@@ -19,6 +19,7 @@ from typing import Any
 import pytest
 import yaml
 
+import sros_tool
 from sros_tool.cli import close
 from sros_tool.close import apply, assignment, nodes, preparation, proof, state, watch
 from sros_tool.close import robot as of_robot
@@ -1756,6 +1757,12 @@ def test_an_enclave_that_belongs_to_another_machine(robot: Robot) -> None:
     said = sros("check", "robot/export", *asked, cwd=robot.folder).out
     assert "there is no enclave /nobody" in said and "no enclave /listener" not in said, said
     assert "may be missing; left out on purpose, for other machines: /listener" in said
+    drawn = json.loads(
+        sros("view", "robot/export", "--requirements", required, "--json", cwd=robot.folder).out
+    )
+    assert "no enclave /listener" not in json.dumps(drawn) and "/nobody" in json.dumps(drawn)
+    asked_of_python = sros_tool.check_requirements(robot.folder / "robot/export", required)
+    assert "no enclave /listener" not in f"{asked_of_python}"
     said = sros("run", "robot/export", "/listener", "--", "true", cwd=robot.folder).err
     assert "or run `sros close" in said and "robot --here /listener`" in said, said
     assert "--elsewhere and --here both name /listener" in (
