@@ -51,7 +51,7 @@ if TYPE_CHECKING:
     from sros_tool.distributions import Distribution
     from sros_tool.explain.answer import Answer, Question
     from sros_tool.explain.asking import AskedEnclave, AskingContext
-    from sros_tool.explain.log import LogFinding
+    from sros_tool.explain.log_causes import LogFinding
     from sros_tool.explain.vendors import Comparison, DdsExplanation, ZenohNextToDds
     from sros_tool.explain.who import AnswerForAll, Decider, FollowedReach
     from sros_tool.explain.zenoh import CheckedLink, ZenohAnswer, ZenohExplanation

@@ -15,7 +15,8 @@ import pytest
 
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.explain import asking
-from sros_tool.explain.log import LogFinding, explain_log, explain_log_of
+from sros_tool.explain.log import explain_log, explain_log_of
+from sros_tool.explain.log_causes import LogFinding
 from sros_tool.files import policies_dir
 from sros_tool.keystore.ledger import Ledger, LedgerFile
 from sros_tool.keystore.participant import LoadedEnclave, load_enclave_of

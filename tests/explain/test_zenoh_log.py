@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from sros_tool.explain.log import LogFinding, explain_log
+from sros_tool.explain.log import explain_log
+from sros_tool.explain.log_causes import LogFinding
 from tests.support.harness import sros
 
 FRAME = "2026-11-22T16:20:55.041714Z  "
