@@ -24,6 +24,7 @@ from sros_tool.cli.common import (
     now,
     print_json,
     print_notes,
+    relative_path,
     save,
     verb,
 )
@@ -235,7 +236,7 @@ def audit(
         echo(f"the exit status is 1: {'; '.join(left_out)}", err=True)
     if written:
         one_policy = enclaves.what == "policy" and len(sources) == 1
-        policy = shlex.quote(str(sources[0])) if one_policy else "POLICY"
+        policy = shlex.quote(str(relative_path(sources[0]))) if one_policy else "POLICY"
         command = f"add it: sros merge_policy {policy} {shlex.quote(str(patch))} --in-place"
         by_hand = (
             _advice_to_add_by_hand(sources, read_fleet(fleet_file), audited) if fleet_file else ""

@@ -48,6 +48,7 @@ from sros_tool.cli.common import (
     print_json,
     print_notes,
     progress,
+    relative_path,
     removed_secrets,
     save,
     verb,
@@ -699,14 +700,12 @@ def _machine_findings(
 
 def _with_relative_paths(finding: Finding) -> Finding:
     """Return the finding; files below the working directory get relative paths."""
-    related = tuple(place._replace(file=_relative_path(place.file)) for place in finding.related)
-    return finding._replace(file=_relative_path(finding.file), related=related)
+    related = tuple(place._replace(file=_relative_file(place.file)) for place in finding.related)
+    return finding._replace(file=_relative_file(finding.file), related=related)
 
 
-def _relative_path(file: str) -> str:
-    path = Path(file)
-    below = path.is_absolute() and path.is_relative_to(Path.cwd())
-    return str(path.relative_to(Path.cwd())) if below else file
+def _relative_file(file: str) -> str:
+    return str(relative_path(Path(file))) if file else ""
 
 
 def _needs_renewal(root: Path, text: str, moment: datetime, form: str) -> int:

@@ -77,6 +77,13 @@ class _NamedPath(click.Path):
 PATH = _NamedPath()
 
 
+def relative_path(path: Path) -> Path:
+    """Return an absolute path below the working directory as a relative path."""
+    folder = Path.cwd()
+    below = path.is_absolute() and path.is_relative_to(folder)
+    return path.relative_to(folder) if below else path
+
+
 def json_option(function: Decorated) -> Decorated:
     """Add ``--json`` to a verb."""
     return click.option("--json", "as_json", is_flag=True, help="Print JSON.")(function)

@@ -34,6 +34,7 @@ from sros_tool.cli.common import (
     print_notes,
     progress,
     read_log,
+    relative_path,
     ros_domain,
     verb,
 )
@@ -309,6 +310,7 @@ def explain(
     names_policy = root is not None and is_policy(root)
     if names_policy and not (policy or reach):
         policy, root = root, None
+    policy = relative_path(policy) if policy else None  # for the names in printed commands
     opened = OpenedKeystore(root) if root else None
     if fleet_file and not (policy or names_policy):
         raise UsageError("--fleet goes with a policy only", "", "Leave it out.")

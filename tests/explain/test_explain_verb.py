@@ -104,6 +104,8 @@ def test_no_with_a_change_that_works(keystore: Path, tmp_path: Path) -> None:
     assert "sros merge_policy" in found.out and "<service>reset</service>" in found.out
     private = explain(keystore, ENCLAVE, "serve", "/talker/reset", "--policy", policy)
     assert "<service>~/reset</service>" in private.out
+    here = sros("explain", policy, ENCLAVE, "serve", "/talker/reset", cwd=tmp_path)
+    assert "sros merge_policy robot.xml allow.xml --in-place\n" in here.out
 
 
 def test_the_policy_of_a_fleet_is_changed_where_it_is_and_issued_for_all(tmp_path: Path) -> None:
