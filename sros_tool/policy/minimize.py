@@ -208,7 +208,7 @@ def nodes_not_as_observed(
 
     All nodes of an enclave have its rights, so in the comparison of whole enclaves, the rights of
     one node hide those of another.  A node's denials and those of the other nodes apply to it.
-    Left out are enclaves without an observed node, and enclaves with a wildcard for a node.
+    Left out are enclaves without an observed node, and enclaves with a wildcard for other nodes.
     """
     nodes = policy.nodes()
     seen: dict[str, dict[str, list[Profile]]] = defaultdict(lambda: defaultdict(list))
@@ -219,7 +219,8 @@ def nodes_not_as_observed(
     differing = {}
     for enclave in policy.enclaves:
         names = {*nodes[enclave.path], *seen[enclave.path]}
-        if len(names) == 1 or not seen[enclave.path] or any(map(is_expression, names)):
+        unseen = names - seen[enclave.path].keys()
+        if len(names) == 1 or not seen[enclave.path] or any(map(is_expression, unseen)):
             continue
         stated = Policy(tuple(_enclave_of_node(enclave, name) for name in sorted(names)))
         used = (
