@@ -228,6 +228,18 @@ def test_a_key_that_others_may_have_copied_is_to_be_replaced(
     assert "that has the CA keys: `" in readable.remedy or not exported
 
 
+@pytest.mark.parametrize("file", ["cert.pem", "permissions.p7s", "identity_ca.cert.pem"])
+def test_a_key_in_a_file_that_others_may_read(bench: Bench, file: str) -> None:
+    """A program that wants certificate and key in one file makes a user append the key."""
+    folder = bench.path("enclaves/base")
+    path, data = folder / file, (folder / file).read_bytes()
+    path.unlink()  # perhaps a link
+    path.write_bytes(data + (folder / "key.pem").read_bytes())
+    found = keystore_findings(OpenedKeystore(bench.checked), Circumstances(bench.now))
+    shown = {each.id for each in found if each.file == str(path)}
+    assert shown >= {"keystore.key-readable", "keystore.stray-key"}
+
+
 @pytest.mark.parametrize(("mode", "noted"), [(0o755, False), (0o1777, False), (0o777, True)])
 def test_a_new_keystore_that_others_can_replace_is_noted(
     mode: int, noted: bool, tmp_path: Path

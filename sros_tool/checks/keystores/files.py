@@ -342,10 +342,9 @@ def _folder_findings(
             if path in keys:
                 yield from key_mode_findings(keystore, path, info.st_mode)
             elif name in _KNOWN_FILES and inside.startswith(ENCLAVES) and name != KEY_FILE:
-                if name == KEY_URI_FILE or name.endswith("_ca.cert.pem"):
-                    with suppress(OSError):  # `check_enclave` reports an unreadable one
-                        if _holds_key(keystore, path, info):
-                            yield from _stray_file_findings(keystore, path, info, is_original)
+                with suppress(OSError):  # `check_enclave` reports an unreadable one
+                    if _holds_key(keystore, path, info):
+                        yield from _stray_file_findings(keystore, path, info, is_original)
             elif keystore.looks_like_original and _is_key_of_ca_or_revoked_enclave(
                 keystore, path, info
             ):
