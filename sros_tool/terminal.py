@@ -96,7 +96,7 @@ def echo_document(document: str | bytes) -> None:
     if sys.stdout is not None and sys.stdout.isatty():
         text = document if isinstance(document, str) else os.fsdecode(document)
         document = visible(text)
-    click.echo(document, nl=False)
+    click.echo(document, nl=False, color=True)  # otherwise click removes colors, as in a path
 
 
 def echo_bytes(data: bytes) -> None:

@@ -148,11 +148,12 @@ def test_colors_are_for_terminals_and_can_be_turned_off(keystore: Path) -> None:
 
 
 def test_a_document_is_exact_but_on_a_terminal(capsysbinary: pytest.CaptureFixture[bytes]) -> None:
-    document = b"export A='\x1b]0;x\x07\xff'\n"
+    document = b"export A='\x1b]0;x\x07\x1b[31m\xff'\n"
     echo_document(document)
-    echo_document(os.fsdecode(document[:12]))
-    assert capsysbinary.readouterr().out == document + document[:12]
-    assert on_terminal(lambda: echo_document(document)) == "export A='\\x1b]0;x\\x07\\xff'\r\n"
+    echo_document(os.fsdecode(document[:21]))
+    assert capsysbinary.readouterr().out == document + document[:21]
+    shown = "export A='\\x1b]0;x\\x07\\x1b[31m\\xff'\r\n"
+    assert on_terminal(lambda: echo_document(document)) == shown
 
 
 def test_no_character_controls_a_terminal_or_reverses_a_name() -> None:
