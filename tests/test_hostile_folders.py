@@ -373,6 +373,29 @@ def test_a_lock_file_with_two_names_changes_no_owner(keystore: Path, outside: Pa
     assert (outside / "shadow").read_text() == "precious"
 
 
+@as_root
+@pytest.mark.parametrize("left", [LOCK, STAGE, f"{STAGE}/added"])
+def test_what_a_killed_run_of_root_left_is_said_and_ended_by_root(
+    left: str, reachable: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Root is killed between making a file or folder and giving it to the owner."""
+    monkeypatch.setattr(transactions, "_LOCK_SECONDS", 0.0)
+    keystore = reachable
+    (keystore / STAGE).mkdir(mode=0o700)
+    give(keystore, OWNER)
+    path = keystore / left
+    if left == LOCK:
+        path.touch(mode=0o600)
+    elif left == STAGE:
+        give(path, 0)
+    else:
+        path.mkdir(mode=0o700)
+    said = in_process_of(OWNER, lambda: create_enclaves(keystore, ["/new"], now=NOW))
+    assert f"'{path}' is in the way" in said and "Run the command once as root" in said
+    create_enclaves(keystore, ["/new"], now=NOW)
+    assert in_process_of(OWNER, lambda: create_enclaves(keystore, ["/other"], now=NOW)) == ""
+
+
 def test_the_lock_is_of_one_holder_at_a_time(keystore: Path) -> None:
     with Folder(keystore) as one, Folder(keystore) as two:
         first = transactions.KeystoreLock(one).acquire()

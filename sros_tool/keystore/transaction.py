@@ -1037,6 +1037,9 @@ class KeystoreLock:
         while not self._try_to_lock() and time.monotonic() < deadline:
             time.sleep(_LOCK_RETRY_SECONDS)
         if not self.held:
+            state = self._folder.state(LOCK)
+            if state and os.geteuid() not in (0, state.st_uid):  # who is at work hands it over
+                raise _left_by_root_error(self._folder.path / LOCK)
             raise KeystoreError(
                 f"{self._what} '{self._folder.path}' is busy",
                 f"Another process has been writing to it for {wait:.0f} seconds.",
@@ -1127,6 +1130,25 @@ def _recover(folder: Folder) -> None:
     """Complete or undo an interrupted transaction, if there is one; the caller holds the lock."""
     if not folder.is_folder(STAGE):
         return
+    try:
+        _complete_or_undo(folder)
+    except PermissionError as error:
+        if os.geteuid() == 0:
+            raise
+        raise _left_by_root_error(Path(os.fsdecode(error.filename or STAGE))) from error
+
+
+def _left_by_root_error(path: Path) -> KeystoreError:
+    """Return the error for a file of an interrupted run that this user cannot open or remove."""
+    return KeystoreError(
+        f"'{path}' is in the way, and this user cannot open it",
+        "Perhaps a run of sros by root was killed before it gave the file to the owner of the "
+        "folder.",
+        "Run the command once as root: it completes or undoes what was interrupted.",
+    )
+
+
+def _complete_or_undo(folder: Folder) -> None:
     to, moves = check_interrupted(folder)
     if to == _AFTER:
         _LOG.info("moving the committed files to their places in the keystore '%s'", folder.path)
