@@ -1247,8 +1247,9 @@ def _summary(robot: RobotStatus, stage: str, moment: datetime) -> Iterator[str]:
     """Yield clauses on how a robot's files differ from the keystore's, the worst first."""
     from sros_tool.keystore.confirmation import enclave_of
 
-    is_explained = robot.is_doubtful or robot.state == "unknown"
-    if is_explained:
+    # The notes explain some states.
+    early, late = robot.is_doubtful, not robot.is_doubtful and robot.state != "unknown"
+    if early:
         yield from robot.notes
     if robot.state == "never":
         yield counted(robot.enclaves, "enclave")
@@ -1272,6 +1273,8 @@ def _summary(robot: RobotStatus, stage: str, moment: datetime) -> Iterator[str]:
         yield "does not trust the CA that seals releases: fetching does not change this"
     elif robot.is_locked_out(moment):
         yield "a web server with the current CA and list refuses its certificates"
+    if not (early or late):
+        yield from robot.notes
     groups: dict[tuple[str, str], Counter[str]] = {}
     for file in robot.pending:
         if file.state not in ("another", "revoked"):
@@ -1302,7 +1305,7 @@ def _summary(robot: RobotStatus, stage: str, moment: datetime) -> Iterator[str]:
         yield f"not known whether processes of {names} have loaded the installed files"
     if robot.enclaves and robot.stage not in ("", "unknown", stage):
         yield f"its CA files are of the stage '{robot.stage}'"
-    if not is_explained:
+    if late:
         yield from robot.notes
 
 
