@@ -99,7 +99,7 @@ def test_the_names_of_a_merged_policy_are_remapped(folder: Path) -> None:
     nodes = policy_text({"/cam": publish("/image"), "/b": publish("state")})
     (folder / "cam.xml").write_text(nodes.replace('node="n"', 'node="cam"', 1))
     for more, said in (
-        (("imag:=/front/image",), "no policy to merge has this name"),
+        (("imag:=/front/image",), "matches no name or node in the policies to merge"),
         (
             ("cam:__node:=eye", "--remap", "cam:image:=/i"),
             "The rule cam:__node:=eye applies first.",
