@@ -566,8 +566,8 @@ class _Round:
         if removed:
             names = sorted({enclave_of(key.path) for key in removed})
             self._problems.append(
-                f"{REMOVED_ENCLAVES}the last at {iso(max(key.at for key in removed))}, that the "
-                f"installed release lacks: {first_few(names, 3)}. If they belong to "
+                f"{REMOVED_ENCLAVES}the last at {iso(max(key.at for key in removed))}, because "
+                f"the installed release lacks them: {first_few(names, 3)}. If they belong to "
                 "another robot, somebody may have copied their keys: run `sros renew KEYSTORE "
                 "ENCLAVE --new-key --revoke-old`."
             )

@@ -267,7 +267,7 @@ def _release_number(target: TargetFile | None, source: str, robot: str) -> int:
         raise FetchError(
             FetchProblem.NOT_FOR_ROBOT,
             f"nothing is published for the robot {robot} in {source}",
-            "It is not in the fleet, or all its enclaves were revoked.",
+            "The robot is not in the fleet, or all its enclaves were revoked.",
             "On the keystore machine, run `sros fleet status KEYSTORE`.",
         )
     if target.length > OF_ONE_ROBOT.packed:

@@ -335,9 +335,9 @@ def value_text(environment: Mapping[str, str], name: str) -> str:
 
 _ZENOH_SOURCE = "rmw_zenoh_cpp (zenoh_config.cpp); Zenoh 1.10.2, tested."
 OWN_CONFIGURATION = (
-    "`sros zenoh KEYSTORE` writes the configuration of each enclave, where the CA keys are; `sros "
-    "env KEYSTORE ENCLAVE` and `sros run KEYSTORE ENCLAVE -- COMMAND...` set the variables of an "
-    "enclave."
+    "On the machine with the CA keys, `sros zenoh KEYSTORE` writes the configuration of each "
+    "enclave; `sros env KEYSTORE ENCLAVE` and `sros run KEYSTORE ENCLAVE -- COMMAND...` set the "
+    "variables of an enclave."
 )
 
 NO_SESSION_FILE = FindingKind(

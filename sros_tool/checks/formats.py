@@ -103,8 +103,8 @@ def _merge_robots(
         if others:
             count = counted(len(others), "more robot")
             names = first_few(list(of_robot)[1:], _MOST_ROBOTS, joint=", and ")
-            said = "the same, about other robots," if many else "the same"
-            yield first, f"{said} for {count}: {names}"
+            said = ", each with other robots in the text" if many else ""
+            yield first, f"the same for {count}{said}: {names}"
         else:
             yield from ((alone, "") for alone in (first, *more))
 

@@ -180,7 +180,8 @@ WIDE = FindingKind(
     "a wildcard wider than a namespace",
     "* also matches slashes, so the rule reaches nodes and namespaces that you may not expect.",
     "DDS-Security 1.1, 9.4.1.3 (POSIX fnmatch, in which * also matches a slash).",
-    "Begin the name with a whole namespace, as in /arm/*, or end it with a whole name.",
+    "Begin the name with a whole namespace, as in /arm/*, or end it with a whole "
+    "name, as in /*/scan.",
 )
 READS_EVERYTHING = FindingKind(
     "policy.reads-everything",
@@ -214,7 +215,7 @@ NO_COUNTERPART = FindingKind(
     "No enclave, in any ROS domain, may publish this subscribed topic, or serve this called "
     "service or action. The name may have a typing error, or its counterpart is in a policy that "
     "was not checked in the same command. Names that many nodes share are left out, such as /tf, "
-    "/clock and /diagnostics, and questions to any node, such as /*/get_state.",
+    "/clock and /diagnostics, and services of any node, such as /*/get_state.",
     "sros: compares the rights of all enclaves in the policies that are checked together.",
     "Compare the names that senders and receivers have after remapping, and name all policies of "
     "the robot in one command.",
@@ -815,7 +816,7 @@ def _missing_common_part_cause(lacking: Sequence[_NodeLackingRight]) -> Cause:
         addresses = "".join(f"{line}ba;" for line in lines)
         # libxml2 gives a <profile> the line where its start tag ends; the tag may begin earlier.
         edit = quote(f"{addresses}b;:a;s#(<profile |^)([^<>]*[^/<>])?>#&{_INCLUDE_ELEMENT}#")
-        put = f"put the line in this command into {place} ({at}): "
+        put = f"run this command, which adds the include to {place} ({at}): "
         remedy = f"{copy}{put}`sed -E -i {edit} {quote(str(file))}`"
     else:
         remedy = f"{copy}put this line into {place} ({at}): {_INCLUDE_ELEMENT}"
@@ -1123,7 +1124,7 @@ def _check_rules(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
         if statement.allows:
             yield from _statement_findings(statement, checked_policy.rules)
         elif not checked_policy.rules.overlaps(statement.right._replace(qualifier=ALLOW)):
-            text = f"no rule allows to {statement.right.describe()}"
+            text = f"no rule gives the right to {statement.right.describe()}"
             yield statement.found(NO_EFFECT, text, _remedy_of_denial(statement.written))
     yield from _redundancy_findings(checked_policy)
 

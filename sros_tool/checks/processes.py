@@ -393,7 +393,7 @@ class _Ledgers:
         user = min(user, _FIRST_OF_RANGES)
         if self._read[user] + size > _MOST_LEDGERS:
             most = _MOST_LEDGERS // 1024**2
-            return (), f"processes of one user need ledgers of more than {most} MiB in all"
+            return (), f"sros reads at most {most} MiB of ledgers for the processes of a user"
         self._read[user] += size
         try:
             entries = OpenedKeystore(enclave.here).ledger_with("enclave", enclave.name).entries
@@ -532,8 +532,8 @@ MIXED_VENDORS = FindingKind(
     "runtime.mixed-vendors",
     WARNING,
     "secured processes on different RMWs",
-    "In these versions, secured nodes on different DDS vendors do not communicate, and do not "
-    "report it.",
+    "Secured nodes on different DDS vendors do not communicate (in the tested versions), and do "
+    "not report it.",
     "Fast DDS 2.9.1 and 2.14.5, Cyclone DDS 0.10.2; tested.",
     "Use the same RMW for all secured nodes that communicate.",
 )

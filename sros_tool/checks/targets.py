@@ -114,7 +114,7 @@ def _policies_at(path: Path) -> list[Path]:
                 f"'{path}' is a DDS Security document without its enclave",
                 "sros checks the signature and the subject of the document with the files of its "
                 "enclave.",
-                f"Name the folder of the enclave, or: `sros inspect {quote(str(path))}`.",
+                f"Name the folder of the enclave, or run `sros inspect {quote(str(path))}`.",
             )
     if policies := list(files_of_policies(path)):
         return policies

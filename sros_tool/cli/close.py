@@ -317,7 +317,7 @@ def _renaming_advice(closed: CloseState, policy: Policy) -> str:
         return ""
     folder = closed.folder
     return (
-        f"{enumerated(several)}: named after one of several nodes; to choose another name, change "
+        f"{enumerated(several)}: named after one of its nodes; to choose another name, change "
         f"`path=` of the enclave (not `node=`) in {folder / 'policy.xml'}, and the name in "
         f"{folder / 'requirements.toml'}, before the first process runs closed"
     )
@@ -370,7 +370,7 @@ def _show_end(
     elif apply:
         for command, processes in closed.pending_by_hand.items():
             stop = _started_together(processes)
-            echo(f"stop {stop}, and start it with:" if stop else "start again with:")
+            echo(f"stop {stop}, and start again with:" if stop else "start again with:")
             echo(f"  {command}")
             if advice := processes[0].launch_advice(robot.folder.absolute()):
                 echo(f"  {advice}")
@@ -516,10 +516,10 @@ def _started_together(processes: Sequence[ClosedProcess]) -> str:
     if first.alike:
         return first.pids_text
     pids = [*dict.fromkeys(str(process.pid) for process in processes if process.pid)]
-    return f"process {enumerated(pids)}" if pids else ""
+    return f"process{'es' * (len(pids) > 1)} {enumerated(pids)}" if pids else ""
 
 
 _MOST_DENIED = 4
 _ANSWERS = {True: "yes", False: "no", None: "not checked"}
 _NOT_CURRENT = "with earlier files or other settings"
-_ACCEPT_ADVICE = "accept unchecked claims with --partial, "
+_ACCEPT_ADVICE = "accept unchecked claims with --partial, or "

@@ -207,8 +207,8 @@ def advisories_of(file: Path | None) -> tuple[Advisory, ...] | None:
     advisories = read_advisories(file)
     unread = list(dict.fromkeys(text for advisory in advisories for text in advisory.unread))
     if unread:
-        are, names = counted(len(unread), "version"), first_few(unread, 3)
-        text = f"{are} in '{file}' left out, as they are not three numbers: {names}"
+        names = first_few(unread, 3)
+        text = f"sros ignores versions in '{file}' that do not consist of three numbers: {names}"
         print_notes([Note("check.advisory-versions", text)])
     return advisories
 
@@ -864,7 +864,7 @@ class _Secrets:
                 value = ask_secret(name, confirm=confirm)
         if not value:
             names = _PIN_VARIABLE if is_pin else f"{_PASSPHRASE} or {_PASSPHRASE_FILE}"
-            unit = "" if is_pin else ", for units by `sros units --passphrase-file`"
+            unit = "" if is_pin else "; for units, use `sros units --passphrase-file`"
             raise PkiError(
                 f"{name} is needed", "There is no terminal to prompt on.", f"Set {names}{unit}."
             )

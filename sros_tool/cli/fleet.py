@@ -563,9 +563,9 @@ def _published_lines(published: PublishedFleet, moment: datetime) -> Iterator[st
     if published.refused_by:
         accepting = "robots that trust this CA accept"
         yield (
-            "refused by robots that, by their last messages, do not trust the permissions CA of "
-            f"these files: {first_few(published.refused_by, _MOST_GROUPS)}. Bring their files by "
-            f"hand: `sros distribute_key {quote(str(published.keystore))} --robot NAME FOLDER "
+            "these robots refuse the files, because by their last messages they do not trust the "
+            f"permissions CA: {first_few(published.refused_by, _MOST_GROUPS)}. Bring their files "
+            f"by hand: `sros distribute_key {quote(str(published.keystore))} --robot NAME FOLDER "
             "--force`"
         )
     if published.expires:
@@ -893,8 +893,8 @@ def _revocation_list_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
             text += f"; {waiting} more {have} the list, but perhaps not all processes there "
             text += "have loaded it and the current CAs"
         if (until := status.revoked_until) is None:
-            text += "; until when robots need it is not known, because the ledger lacks a revoked "
-            text += "certificate"
+            text += "; sros does not know until when robots need it, because the ledger lacks a "
+            text += "revoked certificate"
         elif until > compared_fleet.at:
             text += f"; robots need it until {until:%Y-%m-%d}, when "
             text += "the revoked certificates have expired"
@@ -980,7 +980,8 @@ def _expiry_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
     root = compared_fleet.status.keystore
     time_left = end - compared_fleet.at
     when = f"{end:%Y-%m-%d}" if time_left > timedelta(days=1) else iso(end)
-    label, others = "first expiry on a robot", f", within 30 days on {counted(len(soon), 'robot')}"
+    label, robots = "first expiry on a robot", counted(len(soon), "robot has", "robots have")
+    others = f"; {robots} files that expire within 30 days"
     if time_left <= timedelta(0):
         label, more = "first file that expired on a robot", counted(len(soon) - 1, "more robot")
         others = f"; files of {more} have expired or expire within 30 days" if soon[1:] else ""
@@ -1326,7 +1327,7 @@ def _file_details(robot: RobotStatus) -> Iterator[str]:
     """Yield the problems of a robot, and its files: their number by state, and what differs."""
     yield f"{robot.robot}:"
     yield from (f"  {problem}" for problem in robot.problem_clauses)
-    where = ("in its folder", "elsewhere, with its name in the path")
+    where = ("in the robot's folder", "in other folders, with the robot's name in the path")
     for names, place in zip(robot.others, where, strict=True):
         see = ", see --json" if len(names) > _MOST_GROUPS else ""
         if names:

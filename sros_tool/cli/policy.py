@@ -259,7 +259,7 @@ def diff_policy(
     that differ only in the robot of a fleet are shown as one. Two policies are also compared by the
     protection that they demand, two keystores by their governance.
 
-    The exit status is 1 if they differ, also in something that rights do not tell (a note says so),
+    The exit status is 1 if they differ (notes name differences that are not in the rights),
     or if DDS would refuse A or B.
 
     With --no-new-access, A and B can also be folders of policies, and policies at a git revision,
@@ -327,7 +327,7 @@ def diff_policy(
             echo(f"only one side has {number} without rights", err=True)
         if compared.unclear:
             number = counted(len(compared.unclear), "enclave")
-            echo(f"the permissions of {number} differ in what the notes below name", err=True)
+            echo(f"the permissions of {number} differ in ways that notes below describe", err=True)
         if protections:
             echo("the policies demand different protection", err=True)
         if compared.governance_differs:
@@ -509,10 +509,10 @@ class _SeveralObserved(SeveralValues):
     type=click.Choice(["never", "difference"]),
     default="never",
     show_default=True,
-    help="`difference`: exit with 1 if POLICY has rights or wildcards to remove or used only in "
-    "part, or lacks an observed right, or if an enclave, or a robot of it, is only in POLICY or "
-    "only in OBSERVED. Nodes of an enclave count one by one if OBSERVED has their profiles, but "
-    "not with --fleet.",
+    help="`difference`: exit with 1 if POLICY has rights to remove, wildcards to replace, or "
+    "rights that were used only in part; if it lacks an observed right; or if an enclave, or a "
+    "robot of it, is only in POLICY or only in OBSERVED. Nodes of an enclave count one by one if "
+    "OBSERVED has their profiles, but not with --fleet.",
 )
 @force_option
 @dry_run_option
@@ -1061,7 +1061,7 @@ def access_summary(
         same = f"nobody gets more access, and nothing is protected less ({worlds})"
         if dropped:
             same = (
-                f"{denials_gone}, so that other policies may allow the names; without these, {same}"
+                f"{denials_gone}, so that other policies may allow the names; if none does, {same}"
             )
         return f"{same}{rights_gone}{basis}"
     parts = []

@@ -367,7 +367,7 @@ def _problems_of(robot: LocalRobot, state: CloseState, *, partial: bool) -> Iter
         remove = f"rm -r {shlex.quote(str(enclave_path(robot.export, name)))}"
         yield (
             f"the export has {name}, which is not in the keystore and was not revoked there: "
-            f"{remove}"
+            f"remove it with {remove}"
         )
     running = RunningRobot(robot)
     yield from _copy_problems(running)
@@ -464,7 +464,9 @@ def _unknown_process_problems(running: RunningRobot, state: CloseState) -> Itera
             advice += f"of each process ({remap})"
         if state.secured:
             advice = _start_of_unknown_process(running, state)
-            advice += "stop what is not of the robot, such as your own `sros demo listener`"
+            advice += (
+                "stop processes that are not of the robot, such as your own `sros demo listener`"
+            )
             # An enclave that was added while the robot is closed may already be of this process.
             if len(observed.unknown) > len({*state.new}.difference(observed.ended)):
                 learn = how_to_learn_one_process(robot.folder, robot.domain)
@@ -516,7 +518,8 @@ def _start_of_unknown_process(running: RunningRobot, state: CloseState) -> str:
             is_unknown = process_text(process) in observed.unknown
             if is_unknown and running.may_use_files(process) and not known.unit:
                 start = known.secured_command(export.parent)
-    return f"stop what belongs in {first_few(idle, MOST_NAMES)}, and start it there: {start}; "
+    names = first_few(idle, MOST_NAMES)
+    return f"if one belongs in {names}, stop it, and start it in its enclave: {start}; "
 
 
 def _shared_program_problems(robot: LocalRobot) -> Iterator[str]:

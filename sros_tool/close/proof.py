@@ -336,7 +336,7 @@ def _proof_of_connections(robot: LocalRobot) -> Iterator[Proof]:
         reason = f"{number} of Fast DDS, each with all others"
         unknown = [process.label for process in connections.unknown]
         if unknown := [*["other machines"] * bool(robot.not_here), *unknown]:
-            reason += f"; sros cannot see this of {first_few(unknown, MOST_NAMES)}"
+            reason += f"; sros cannot see the connections of {first_few(unknown, MOST_NAMES)}"
         yield Proof(CONNECTED, True, reason)
 
 
@@ -483,8 +483,8 @@ def _why_missing(running: RunningRobot, missing: Sequence[str], observed: Observ
             f". Start each as {robot.commands_file} says. If one ended, its log says why: {log}"
         )
     if may_end := [name for name in absent if name not in {*has_start, *robot.without}]:
-        options = " ".join(f"--without {name}" for name in may_end)
-        advice += f". If it does not always run, add {options}"
+        options = ", ".join(f"--without {name}" for name in may_end)
+        advice += f". For a process that does not always run, add its option: {options}"
     if absent and (in_other_domains := running.in_other_domains()):
         advice += f". Also {in_other_domains}"
     for why in dict.fromkeys(why for processes in outdated.values() for _, why in processes):
@@ -664,7 +664,7 @@ class _TalkComparison:
             lost = _without_counterpart(self._running.robot, [right.right for right in denied])
             text += f"; left without a partner: {first_few(lost, MOST_NAMES, '; ')}" if lost else ""
         if not_now:
-            text += "; allowed, but not seen now, as in a part of the watch: "
+            text += "; allowed, but not seen now, and not always seen in the watch: "
             text += first_few(_endpoint_texts(not_now), MOST_NAMES)
         text += (
             ""
@@ -680,7 +680,7 @@ class _TalkComparison:
         )
         text += f"; new, without a profile: {first_few(new, MOST_NAMES)}" if new else ""
         if later := self._later_names(with_profile):
-            text += "; not compared, because `sros close` did not see this on the open robot: "
+            text += "; not compared, because `sros close` did not see these on the open robot: "
             text += first_few(later, MOST_NAMES)
         if topics := self._nodes.topics_without_node:
             text += "; not compared, because they belonged to no ROS node: writers or readers of "

@@ -242,8 +242,9 @@ def _lacking_text(robot: LocalRobot, nodes: Sequence[ObservedNode]) -> str:
     files = shlex.join((str(robot.policy), str(robot.observed_policy)))
     add = f"sros merge_policy {files} --in-place"
     restart = (
-        f"{first_few(meanings, MOST_NAMES)}; if the node lacks this, restart the node with it, "
-        f"and watch again: {robot.close_command} --for 1m; otherwise, " * bool(meanings)
+        f"{first_few(meanings, MOST_NAMES)}; if the node lacks this remapping or namespace, "
+        f"restart the node with it, and watch again: {robot.close_command} --for 1m; otherwise, "
+        * bool(meanings)
     )
     return (
         f"'{robot.policy}' stays as it is, and lacks {counted(len(rights), 'right')} seen now "

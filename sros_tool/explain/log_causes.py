@@ -528,8 +528,8 @@ class Examiner:
             place = self._keystore.place
             return [f"no enclave of the {place} may {PEER_RIGHT[denied.right]} {name}"], (
                 f"{remedy} Or, if another name is meant, the node lacks a remapping, or has a "
-                "wrong one: compare the command that started it with the robot's own (after `sros "
-                f"close`: start/commands.txt).{renamed or new_name}"
+                "wrong one: compare its start command with the command in the robot's launch files "
+                f"(after `sros close`: start/commands.txt).{renamed or new_name}"
             )
         return [], f"{remedy}{renamed or new_name}"
 
@@ -630,8 +630,7 @@ class Examiner:
             return
         if enclave.key_elsewhere and not enclave.as_here.key_elsewhere:
             yield (
-                f"{KEY_FILE}: missing, as in a copy without keys; if this is the robot, it is the "
-                "fault",
+                f"{KEY_FILE}: missing, as in a copy without keys; on the robot, this is the fault",
                 remedy(Fault.FILE_MISSING, self._root, enclave.name, KEY_FILE),
             )
 

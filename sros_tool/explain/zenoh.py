@@ -1053,7 +1053,7 @@ class ZenohExplanation(NamedTuple):
             return "" if self.allowed else "Give the node an enclave of its own."
         if self.allowed is self.permitted and not self.out_of_date:
             return ""
-        text = "Look at the files"
+        text = "Bring the Zenoh files up to date"
         if self.out_of_date:
             text = "Write the Zenoh files again from the permissions"
         command = f"sros zenoh {quote(str(self.keystore.root))}"

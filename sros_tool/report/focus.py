@@ -91,7 +91,7 @@ def focused_picture(
         left_out = f"; what passes between the {routers} Zenoh routers is not considered"
         focuses = tuple(replace(focus, sentence=f"{focus.sentence}{left_out}") for focus in focuses)
     if system.is_partial:
-        scope = f"of the enclaves in {picture.title}, "
+        scope = f"for the enclaves in {picture.title} alone: "
         focuses = tuple(replace(focus, sentence=f"{scope}{focus.sentence}") for focus in focuses)
     picture = system.with_shortest_paths(replace(picture, focus=focuses))
     flow = FocusFlow.of(picture)

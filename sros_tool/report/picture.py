@@ -587,9 +587,9 @@ class Picture:
         yield (
             f"{counted(number, self.unread[0].what)} with {counted(enclaves, 'enclave')} "
             f"({first_few(members, _MOST_IN_HEADLINES)}) were only compared: their permissions "
-            f"have the same text as the permissions of {likes}, except for names. Their "
-            "signatures, certificates, expiry and findings, and rights of others to their names, "
-            "are not in this picture: --robot NAME reads one, `sros check` checks all"
+            f"have the same text as the permissions of {likes}, except for names. This picture "
+            "lacks their signatures, certificates, expiry and findings, and the rights of other "
+            "enclaves to their names: --robot NAME reads one, `sros check` checks all"
         )
 
 

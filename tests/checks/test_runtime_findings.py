@@ -295,7 +295,7 @@ def test_the_ledgers_of_all_processes_of_a_user_are_bounded(
     ):
         entries, unknown = ledgers.entries(enclave, user)
         assert bool(entries) == are_read, user
-        assert ("processes of one user need ledgers of" in unknown) != are_read
+        assert ("MiB of ledgers for the processes of a user" in unknown) != are_read
 
 
 @pytest.mark.parametrize(

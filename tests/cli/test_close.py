@@ -303,8 +303,8 @@ def test_a_policy_that_was_changed_stays_and_is_followed(robot: Robot) -> None:
     assert f"lacks 1 right seen now (/listener subscribe /chatter); {remapped}" in again.out
     assert "-r /chatter:=/old/chatter, or the policy may lack --remap /old/chatter:=" in again.out
     assert (
-        "; if the node lacks this, restart the node with it, and watch again: "
-        "sros close robot --for 1m;" in again.out
+        "; if the node lacks this remapping or namespace, restart the node with it, and watch "
+        "again: sros close robot --for 1m;" in again.out
     )
     assert " otherwise, if a process should not have these rights, stop the process, " in again.out
     add = "sros merge_policy robot/policy.xml robot/seen.xml --in-place"
@@ -351,7 +351,7 @@ def test_what_is_taken_out_of_the_policy_stays_out(robot: Robot) -> None:
     said = robot.close("--apply", status=1).out
     assert (
         "the export has /lost, which is not in the keystore and was not revoked there: "
-        f"rm -r {LOST}\n" in said
+        f"remove it with rm -r {LOST}\n" in said
     )
     assert (robot.folder / LOST / "key.pem").exists()
     shutil.rmtree(robot.folder / LOST)
@@ -529,7 +529,7 @@ def test_what_systemd_does_not_start_is_done_by_hand(
     robot.close()
     ended = robot.close("--apply", status=1)
     assert robot.restarts == []
-    assert "stop process 4711, and start it with:\n  cd /opt && sros run " in ended.out
+    assert "stop process 4711, and start again with:\n  cd /opt && sros run " in ended.out
     assert ended.err.endswith("next: run these commands, and then sros close robot --proof\n")
     assert (
         "no: every process was started in its enclave: no secured process of this robot runs in "
@@ -706,11 +706,14 @@ def test_processes_that_started_after_the_watch(robot: Robot) -> None:
     assert "enclaves, except for /late (no known process); fix this first:\n" in said
     export = robot.folder / "robot/export"
     start = f"cd /opt && sros run {export} /late -- /opt/late --ros-args"
-    assert f"; stop what belongs in /late, and start it there: {start}; stop what is not" in said
+    assert (
+        f"; if one belongs in /late, stop it, and start it in its enclave: {start}; stop pro"
+        in said
+    )
     assert "such as your own `sros demo listener`; otherwise nobody would hear" in said
     robot.more = (late, replace(late, pid=8, command=("/opt/more", "--ros-args")))
     said = robot.close(status=1).out
-    assert f"it there: sros run {export} ENCLAVE -- COMMAND; stop what is not of the " in said
+    assert f"in its enclave: sros run {export} ENCLAVE -- COMMAND; stop processes that " in said
     assert "`sros demo listener`; to give another process its own enclave, let it run" in said
     learn = "`sros generate_policy robot/policy.xml --enclave-per-node`; read the added rights"
     assert f"next to the closed robot, and run {learn}" in said
@@ -751,7 +754,9 @@ def test_a_node_that_does_not_run_always(robot: Robot) -> None:
         "no: every process was started in its enclave: no secured process of this robot runs in "
         "/listener. St" in ended.out
     )
-    assert "If it does not always run, add --without /listener\n" in ended.out
+    assert (
+        "For a process that does not always run, add its option: --without /listener\n" in ended.out
+    )
     assert ended.out == robot.close("--proof", "--partial", status=1).out
     assert "has no enclave /x. It has /l" in robot.close("--proof", "--without", "/x", status=2).err
     without = "--proof", "--without", "/listener"
@@ -777,7 +782,10 @@ def test_a_node_that_does_not_run_always(robot: Robot) -> None:
     assert "process 4712 (run): in domain 0" in robot.close(*without, status=1).out
     robot.absent = {"/listener", "/talker"}
     assert "no secured process" in robot.close(*without, "--without", "/talker", status=1).out
-    assert "add --without /listener --without /talker\n" in robot.close("--proof", status=1).out
+    assert (
+        "add its option: --without /listener, --without /talker\n"
+        in robot.close("--proof", status=1).out
+    )
 
 
 def ended_before_the_audit(robot: Robot, enclave: str) -> Any:
@@ -897,7 +905,8 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     assert (
         "talk: 2 nodes with 35 endpoints as before (types are not compared); allowed, but" in said
     )
-    not_now = "allowed, but not seen now, as in a part of the watch: /listener subscribe /chatter; "
+    not_now = "allowed, but not seen now, and not always seen in the watch: "
+    not_now += "/listener subscribe /chatter; "
     assert f"{not_now}the ROS graph kept changing meanwhile, or could not be read in time\n" in said
     robot.remaining = (TALKER, ros_node("guest", "05"))
     said = robot.close("--proof", status=1).out
@@ -1211,7 +1220,7 @@ def test_a_renamed_node_is_compared_and_a_new_one_is_named(
         in said
     )
     assert (
-        "; not compared, because `sros close` did not see this on the open robot: "
+        "; not compared, because `sros close` did not see these on the open robot: "
         "/nav/bow_camera, /nav/stern_camera, /talker publish /chatter; not"
     ) in said
     assert (
@@ -1258,7 +1267,7 @@ def test_a_node_that_was_restarted_without_its_namespace(robot: Robot) -> None:
     robot.nodes = (TALKER, LISTENER)
     said = robot.close("--for", "1s", status=1).out
     hint = "perhaps /listener is /left/listener, started without its namespace (-r __ns:=/left)"
-    assert f"; {hint}; if the node lacks this, restart the node with it, and watch again" in said
+    assert f"; {hint}; if the node lacks this remapping or namespace, restart the node" in said
     robot.nodes = (TALKER, left, ros_node("listener", "010f0000071200000000"))
     assert "without its namespace" not in robot.close("--for", "1s", status=1).out
 
@@ -1352,7 +1361,7 @@ def test_a_program_that_gives_its_processes_their_enclaves(
     robot.close()
     said = robot.close("--apply", status=1).out
     run = f"sros run {robot.folder / 'robot/export'} /listener -- python3 pumps.py\n"
-    assert f"stop process 4700, and start it with:\n  cd /opt && {run}" in said
+    assert f"stop process 4700, and start again with:\n  cd /opt && {run}" in said
     assert said.count("pumps.py") == 1
 
 
@@ -1854,7 +1863,7 @@ def test_an_enclave_that_gets_another_name_keeps_its_process(robot: Robot) -> No
     robot.remaining = robot.nodes
     said = robot.close()
     policy = robot.folder / "robot/policy.xml"
-    named = "\n/logger: named after one of several nodes; to choose another name, change `path="
+    named = "\n/logger: named after one of its nodes; to choose another name, change `path="
     files = "` of the enclave (not `node=`) in robot/policy.xml, and the name in robot/requirements"
     assert f"{named}{files}.toml, before the first process runs closed\n" in said.out
     for file in (policy, robot.folder / "robot/requirements.toml"):
@@ -1912,7 +1921,7 @@ def test_containers_are_started_with_the_files_of_their_enclaves(robot: Robot) -
     assert services["listener"]["volumes"][0]["source"] == f"{place}/export/enclaves/listener"
     up = f"docker compose -f compose.yaml -f {place}/start/compose.yaml up -d"
     said = robot.close("--apply", status=1).out
-    assert f"stop the containers of /listener and /talker, and start it with:\n  {up}\n" in said
+    assert f"stop the containers of /listener and /talker, and start again with:\n  {up}\n" in said
     robot.by_hand = set(PID)
     undone = robot.close("--undo", status=1).out
     assert undone == "restart /listener and /talker open: docker compose up -d\n"
@@ -1953,7 +1962,7 @@ def test_a_process_that_was_launched_is_launched_secured(tmp_path: Path, robot: 
         f"{place}/export {place}/policy.xml my_robot all.py 'a:=b c'\n"
     )
     said = robot.close("--apply", status=1).out
-    assert f"stop the launch of /listener and /talker, and start it with:\n  {command}" in said
+    assert f"stop the launch of /listener and /talker, and start again with:\n  {command}" in said
     assert f"\n# /listener, /talker\n{command}" in (place / "start/commands.txt").read_text()
     robot.by_hand = set(PID)
     undone = robot.close("--undo", status=1).out
@@ -1980,7 +1989,9 @@ def test_a_program_that_runs_a_launch_description_starts_no_open_node(robot: Rob
         "nodes, once (docs/launch.md); without it, none of them starts.\n"
     )
     said = robot.close("--apply", status=1).out
-    assert f"the launch of /listener and /talker, and start it with:\n  {command}  {advice}" in said
+    assert (
+        f"the launch of /listener and /talker, and start again with:\n  {command}  {advice}" in said
+    )
     commands = (place / "start/commands.txt").read_text()
     assert f"\n# /listener, /talker\n# {advice}{command}" in commands
     assert "launch_params" not in commands

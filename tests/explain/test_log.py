@@ -978,7 +978,7 @@ def test_the_only_key_of_a_robot_is_missing(refused: bool, keystore: Path, tmp_p
     assert "  found     key.pem: missing\n" in here.out
     assert ("on DDS the node RAN UNSECURED" in here.out) is not refused
     elsewhere = sros("explain", copy, ENCLAVE, "--log", log)
-    row = "  found     key.pem: missing, as in a copy without keys; if this is the robot, it is"
+    row = "  found     key.pem: missing, as in a copy without keys; on the robot, this is the fault"
     assert (row in elsewhere.out) is refused
     for ended in (here, elsewhere)[: 1 + refused]:
         assert "  remedy    Export the enclave again from the keystore" in ended.out

@@ -184,7 +184,8 @@ def test_what_lies_below_a_robot_is_revoked_with_it(unknown: Path, tmp_path: Pat
     assert after["sharing_name"] == ["/desk/r3"]
     said = sros("fleet", "status", root, "--robot", "r3").out
     assert (
-        "1 enclave elsewhere, with its name in the path, but not recorded in the fleet: " in said
+        "1 enclave in other folders, with the robot's name in the path, but not recorded in the "
+        "fleet: " in said
     ), said
 
 

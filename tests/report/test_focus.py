@@ -243,7 +243,7 @@ def test_an_export_may_lack_enclaves(keystore: Path, tmp_path: Path) -> None:
         ended = sros(*asked, "--format", "markdown").ok()
         for text in (ended.err, ended.out):
             assert (f"only /a may publish {right.name}" in text.replace("\\", "")) is alone
-            assert (f"of the enclaves in {source.name}, /a may" in text) is not alone
+            assert (f"for the enclaves in {source.name} alone: /a may" in text) is not alone
             assert ("is an export, which may lack enclaves" in text) is (source == robot)
     sros("view", robot, "-o", page).ok()
     assert "is an export, which may lack enclaves" in page.read_text()

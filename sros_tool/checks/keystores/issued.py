@@ -441,7 +441,7 @@ def _ledger_findings(
     for summary in summaries:
         place = f"{keystore.root}/{enclave_folder(summary.name)}"
         if f"{summary.serial:x}" in revoked:
-            text = "the ledger has its revocation, and the revocation list lacks it"
+            text = "the ledger has its revocation, but the revocation list does not"
             yield REVOKED_BY_NEWER_LIST.found(summary.name, text, place)
         for file, sha256 in (
             ("cert.pem", summary.certificate),
