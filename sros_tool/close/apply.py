@@ -46,7 +46,7 @@ _STABLE_FOR = timedelta(seconds=2)
 
 
 def apply(robot: LocalRobot, prepared: CloseState, *, dry_run: bool) -> CloseState:
-    """Restart the units that do not run in their enclaves, with drop-ins; return the new state.
+    """Restart, with drop-ins, the units that do not run in their enclaves; return the new state.
 
     Proves that the robot is closed, if nothing is left to do by hand.
     """

@@ -137,7 +137,7 @@ def _is_named_by_command(process: Process, node: ObservedNode, _process_ids: obj
 
 
 def _is_program_named_like_node(process: Process, node: ObservedNode, _process_ids: object) -> bool:
-    """Return whether the program is called like the node."""
+    """Return whether the program has the name of the node."""
     return program_of(process.command).removesuffix(".py") == node.name
 
 

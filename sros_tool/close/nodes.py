@@ -120,7 +120,7 @@ class ObservedNodes:
     def _with_current_name(
         self, node: ObservedNode, current: Observation | None, endpoints: Iterable[Endpoint]
     ) -> ObservedNode:
-        """Return an observed node with its current name, and with only these of its endpoints."""
+        """Return an observed node with its current name, and only with the given endpoints."""
         new = self.renamed.get(node_name(node))
         if not new:
             return replace(node, endpoints=frozenset(endpoints))

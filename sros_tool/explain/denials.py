@@ -460,8 +460,8 @@ def _missing_common_part(
 ) -> tuple[str, ...]:
     """Return a tuple with the common part that a profile needs and does not include; or ().
 
-    A profile needs a part if a right of the part was denied (None: any right), and lacks the part
-    if the profile has no right of the part.
+    A profile needs a part if a right of the part was ``denied`` (None counts as any right), and
+    lacks the part if the profile has no right of the part.
     """
     if is_expression(profile[1]):
         return ()

@@ -593,7 +593,7 @@ class Examiner:
     def _private_name(self, denial: Denial, name: str, space: str) -> str:
         """Return a denied name as ``~/NAME`` if it is private to a node of the process, or "".
 
-        The log shows a renamed node, the policy any other one, in the namespace ``space``.
+        The nodes are those that logged and those in the policy, both in the namespace ``space``.
         """
         if self._policy is None or denial.remote or _in_ros_terms(denial)[0] == "call":
             return ""  # a node calls the services of other nodes

@@ -157,7 +157,7 @@ class AskedPolicy:
     def likely_namespace(self, denied: Right) -> str:
         """Return the namespace in which the policy's relative names give a denied right, or "".
 
-        "" also if the log states the namespace.
+        The result is also "" if the log states the namespace.
         """
         space, path = self.place(denied.enclave)
         stated = self.policy.enclave(path) if path and not space else None
@@ -172,8 +172,8 @@ class AskedPolicy:
     def possible_namespace(self, name: str, enclave: str) -> str:
         """Return the namespace of a name that may be a relative name on the robot, or "".
 
-        "" if the policy itself has a name in this namespace.  The node's own name is no part of the
-        namespace of its private names.
+        The result is also "" if the policy itself has a name in this namespace.  The node's own
+        name is no part of the namespace of its private names.
         """
         space = name.rpartition("/")[0]
         stated = self.policy.enclave(self.place(enclave)[1])

@@ -191,7 +191,7 @@ def note_on_names_meant(
 def first_allowing_domain(
     outcomes: Mapping[DomainSet, _Outcome],
 ) -> tuple[_Outcome, str, tuple[str, ...]]:
-    """Return the decision of the first domains that give the right, or else of the first domains.
+    """Return the first decision that gives the right, or else the first decision.
 
     Also returns text with the domains that give the right; or, if no domain gives the right, the
     parts of an action that at least one domain gives.

@@ -334,16 +334,16 @@ def test_enclaves_that_the_release_does_not_have(home: Home, r1: Robot) -> None:
     done = r1.round()
     assert done.removed == ("/r1/since",) and not any("newer" in each for each in done.problems)
     (problem,) = (each for each in r1.round().problems if "another robot, somebody" in each)
-    assert "lacks: /r1/damaged, /r1/since, /r2/x. If they" in problem
+    assert "lacks them: /r1/damaged, /r1/since, /r2/x. If they" in problem
     late = "\n".join(r1.round(moment() + timedelta(days=1, minutes=1)).problems)
-    assert "lacks: /r1/since, /r2/x. If they" in late, "for a day, if it had no certificate"
+    assert "lacks them: /r1/since, /r2/x. If they" in late, "for a day, if it had no certificate"
 
 
 def test_a_removed_enclave_is_named_until_its_certificate_is_revoked_or_a_release_has_it(
     home: Home, r1: Robot
 ) -> None:
     r1.round()
-    copied = "lacks: /r2/x. If they belong to another robot, somebody may have copied"
+    copied = "lacks them: /r2/x. If they belong to another robot, somebody may have copied"
     path, present = "enclaves/r2/x", files_of(home.root)
     own = {file: data for file, data in present.items() if file.startswith("enclaves/r1/a/")}
     taken = {file.replace("enclaves/r1/a", path): data for file, data in own.items()}
@@ -372,7 +372,9 @@ def test_a_copied_enclave_is_named_also_if_a_later_release_removes_it(
     assert set(r1.round().removed) == {"/r1/c", "/r2/x"}
     (problem,) = r1.round().problems
     names = "/r1/c, /r2/x" if seal == "gone" else "/r2/x"
-    assert f"lacks: {names}. If they belong to another robot, somebody may have copied" in problem
+    assert (
+        f"lacks them: {names}. If they belong to another robot, somebody may have copied" in problem
+    )
 
 
 def test_what_somebody_damaged_is_installed_again(home: Home, r1: Robot) -> None:

@@ -153,6 +153,7 @@ NOT_HERE = {
     "runtime.container-alone": _MACHINE,
     "runtime.process-elsewhere": _MACHINE,
     "runtime.process-not-seen": _MACHINE,
+    "runtime.process-rmw-unknown": _MACHINE,
     "runtime.rmw-without-security": _MACHINE,
 }
 """Why the commands for a finding about the runtime are not run, by its id."""
