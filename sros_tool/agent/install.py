@@ -605,7 +605,7 @@ def _commit(folder: Path, changes: Iterable[_Change]) -> None:
 
 
 def _check_seen(folder: Folder, change: _Change) -> None:
-    """Raise `KeystoreError` if files came meanwhile, which the new ones were not compared with."""
+    """Raise `KeystoreError` if files changed after the new ones were compared with them."""
     for path, before in change.seen.items():
         present = None
         with suppress(SrosError, OSError):

@@ -317,8 +317,8 @@ def _renaming_advice(closed: CloseState, policy: Policy) -> str:
         return ""
     folder = closed.folder
     return (
-        f"{enumerated(several)}: named after one of its nodes; to choose another name, change "
-        f"`path=` of the enclave (not `node=`) in {folder / 'policy.xml'}, and the name in "
+        f"sros named {enumerated(several)} after one of several nodes; to choose another name, "
+        f"change `path=` of the enclave (not `node=`) in {folder / 'policy.xml'}, and the name in "
         f"{folder / 'requirements.toml'}, before the first process runs closed"
     )
 

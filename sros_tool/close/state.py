@@ -416,7 +416,7 @@ class CloseState(NamedTuple):
     problems: Sequence[str]
     """Reasons why the robot is not closed yet, or not open again, with what to do."""
     proofs: Sequence[Proof]
-    """The proof that the robot is closed; empty before."""
+    """The claims that prove the robot closed; empty if they were not tested."""
     dry_run: DryRun
     changes: FileChanges
 

@@ -184,7 +184,7 @@ def note_on_names_meant(
     meant = same_last or likely_names(question.name, exact)
     if not meant or question.name in meant:  # the name is right, but its enclave cannot start
         return None
-    text = f"they may {question.word} {first_few(meant, 3)}: perhaps that is meant."
+    text = f"some enclaves may {question.word} {first_few(meant, 3)}: perhaps that is meant."
     return Note("explain.likely-name", text)
 
 

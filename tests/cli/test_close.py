@@ -1863,7 +1863,7 @@ def test_an_enclave_that_gets_another_name_keeps_its_process(robot: Robot) -> No
     robot.remaining = robot.nodes
     said = robot.close()
     policy = robot.folder / "robot/policy.xml"
-    named = "\n/logger: named after one of its nodes; to choose another name, change `path="
+    named = "\nsros named /logger after one of several nodes; to choose another name, change `path="
     files = "` of the enclave (not `node=`) in robot/policy.xml, and the name in robot/requirements"
     assert f"{named}{files}.toml, before the first process runs closed\n" in said.out
     for file in (policy, robot.folder / "robot/requirements.toml"):

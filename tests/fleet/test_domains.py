@@ -208,7 +208,10 @@ def test_a_process_in_a_wrong_domain_gets_the_domain_of_its_enclave(halls: Path)
 def test_a_name_that_nobody_has_leads_to_that_of_the_robot(halls: Path) -> None:
     asked = ("explain", "ks", "--who", "publish")
     ended = sros(*asked, "/north/estop", cwd=halls)
-    assert ended.status == 1 and "they may publish /hall/estop: perhaps that is meant" in ended.err
+    assert (
+        ended.status == 1
+        and "some enclaves may publish /hall/estop: perhaps that is meant" in ended.err
+    )
     for words in (("/nothing",), ("/plan", "--robot", "p01"), ("/x/plan", "--robot", "p01")):
         ended = sros(*asked, *words, cwd=halls)
         assert ended.status == 1 and "perhaps" not in ended.err, ended
