@@ -28,7 +28,12 @@ _MOST_LINKS = 40
 
 @contextlib.contextmanager
 def staged_file(
-    target: Path, data: bytes, *, mode: int = 0o600, like: os.stat_result | None = None
+    target: Path,
+    data: bytes,
+    *,
+    mode: int = 0o600,
+    like: os.stat_result | None = None,
+    for_owner: bool = False,
 ) -> Iterator[Callable[[], None]]:
     """Write a temporary file next to ``target``; yield a function that moves it there atomically.
 
@@ -41,11 +46,12 @@ def staged_file(
         data: its content.
         mode: its permission bits from the first byte on, before the umask.
         like: a file to copy the permission bits and, if permitted, the owner from.
+        for_owner: whether a file that root makes belongs to the owner of its folder.
 
     Raises:
         OSError: the file cannot be written; the earlier file at ``target`` stays.
     """
-    with Folder(target.parent) as folder:
+    with Folder(target.parent, for_owner=for_owner) as folder:
         prefix = f".{target.name[:200]}.sros-"
         _remove_stale(folder, prefix)
         spare, handle = _locked_file(folder, prefix, mode)

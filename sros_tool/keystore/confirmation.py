@@ -594,9 +594,13 @@ def store_confirmation(keystore: OpenedKeystore, received: ReceivedConfirmation)
         **({"message": as_plain(message)} if message else {}),
         "confirmation": _value_of(received.confirmation),
     }
-    with staged_file(keystore.root / path, _as_json_line(value), mode=0o644) as put_in_place:
-        put_in_place()
+    _write_for_owner(keystore.root / path, value)
     return path
+
+
+def _write_for_owner(path: Path, value: Mapping[str, Any]) -> None:
+    with staged_file(path, _as_json_line(value), mode=0o644, for_owner=True) as put_in_place:
+        put_in_place()
 
 
 class RefusedMessage(NamedTuple):
@@ -627,8 +631,7 @@ def store_refusals(
         }
         for robot, why in sorted(reasons.items())
     }
-    with staged_file(keystore.root / REFUSED, _as_json_line(value), mode=0o644) as put_in_place:
-        put_in_place()
+    _write_for_owner(keystore.root / REFUSED, value)
 
 
 def refusals(keystore: OpenedKeystore) -> dict[str, RefusedMessage]:

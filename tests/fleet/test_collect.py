@@ -65,6 +65,7 @@ from sros_tool.validity import BACKDATE, iso, parse_iso
 from tests.dds.signer_rows import signed_by
 from tests.support.harness import copy_of, policy_text, publish, sros
 from tests.support.messages import key_of, said_by, signed_message
+from tests.support.users import as_root
 
 ROBOTS = ("r1", "r2", "r3")
 FLEET = """
@@ -170,6 +171,20 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Home:
 @pytest.fixture
 def home(made: Home, tmp_path: Path) -> Home:
     return Home(copy_of(made.folder, tmp_path / "home"))
+
+
+@as_root
+def test_what_root_writes_into_a_keystore_belongs_to_its_owner(home: Home) -> None:
+    """Otherwise the timers of the owner could not read it."""
+    for path in (home.root, *home.root.rglob("*")):
+        os.chown(path, 65533, 65533, follow_symlinks=False)
+    for _ in ("new releases", "only a timestamp"):
+        home.run("fleet", "publish", "ks", "pub")
+    home.send("r1")
+    home.put("r2", b"damaged", NOW)
+    assert home.outcomes() == {"r1": "kept", "r2": "refused", "r3": "missing"}
+    others = [path for path in home.root.rglob("*") if path.lstat().st_uid != 65533]
+    assert not others, others
 
 
 # ── messages ───────────────────────────────────────────────────────────────────────────────

@@ -1398,7 +1398,8 @@ class _Publication:
         path = self.keystore.root / PUBLISHED
         self._changes = file_change(path, existed=True)
         if not self._dry_run:
-            with staged_file(path, self.list.document(self._now)) as put_in_place:
+            document = self.list.document(self._now)
+            with staged_file(path, document, for_owner=True) as put_in_place:
                 put_in_place()
 
     def keep_changes(self, change: KeystoreChange) -> None:
