@@ -98,7 +98,7 @@ class Distribution(NamedTuple):
         if not self.stands_for:
             return ""
         why = "has no releases" if self.stands_for == _ROLLING else "is not supported any more"
-        return f"ROS 2 {self.title} {why}: assumed to decide as {self.name.capitalize()}."
+        return f"ROS 2 {self.title} {why}, and is assumed to decide as {self.name.capitalize()}."
 
     def reason_for(self, vendor: Vendor) -> str:
         """Return why a vendor decides, such as ``as in ROS 2 Jazzy``, with the assumptions."""

@@ -890,7 +890,7 @@ def _other_node_note(
     if not ns:
         started = f"a node with the name {name}"
     text = (
-        f"the command starts {started}, which may not offer its parameter services: the "
+        f"the command starts {started}, which is not allowed to offer its parameter services: the "
         f"permissions of enclave {enclave} are for the node{'s' * (len(known) > 1)} {nodes}. "
         "Correct `__ns:=` or `__node:=`, or name the enclave of this node."
     )

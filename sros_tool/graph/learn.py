@@ -536,8 +536,8 @@ _NOTE_TEXTS = {
     "odd-node": "left out, because a policy cannot name these nodes or their enclaves: {}",
     "partial-action": "only parts of an action are used, so they are listed as "
     "topics and services: {}",
-    "root-enclave": "the ROS graph shows the enclave / for {}, so the policy gives the "
-    "rights of these nodes to /, and every process without an enclave has them. Either the "
+    "root-enclave": "the ROS graph shows the enclave / for {}, so the policy gives rights to "
+    "/, and every process without an enclave has these rights. Either the "
     "processes were started without an enclave, or ROS_SECURITY_ENCLAVE_OVERRIDE (as `sros run` "
     "and `sros env` set it) names an enclave that the graph does not show. --enclave-per-node "
     "gives each process an enclave of its own, with the name of its node",

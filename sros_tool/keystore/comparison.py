@@ -399,7 +399,7 @@ def _zenoh_changes(old: ZenohNetwork | None, new: ZenohNetwork | None) -> Iterat
         before, after = getattr(old, key), getattr(new, key)
         if before != after:
             first, second = (
-                ",".join(map(str, setting)) or "(as usual)"
+                ",".join(map(str, setting)) or "(default)"
                 if isinstance(setting, tuple)
                 else str(setting)
                 for setting in (before, after)

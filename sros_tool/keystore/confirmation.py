@@ -482,9 +482,9 @@ class ReceivedConfirmation:
         if alternated is None or self.time - alternated > timedelta(days=1):
             return ""
         return (
-            f"{_TWO_COMPUTERS} seem to send messages in turn: an earlier start or release came "
-            f"back, last at {iso(alternated)}. Perhaps a disk was copied or restored. The files of "
-            "the other computer are not known."
+            f"{_TWO_COMPUTERS} seem to send messages in turn: they reported an earlier start "
+            f"or release again, last at {iso(alternated)}. Perhaps a disk was copied or restored. "
+            "The files of the other computer are not known."
         )
 
     def clock_note(self) -> str:

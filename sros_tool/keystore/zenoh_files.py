@@ -1345,12 +1345,12 @@ def _vendors_differ_error(
         )
         return PolicyError(
             f"{difference}, because DDS vendors do not "
-            f"{'read its rules' if are_alike else 'decide'} alike",
+            f"{'read the rules' if are_alike else 'decide'} alike",
             f"{differing[:1].upper()}{differing[1:]}.",
             _REMEDY_STATE_RIGHTS,
         )
     return PolicyError(
-        f"{difference}, because the order of its rules matters",
+        f"{difference}, because the order of the rules matters",
         f"On DDS {next(iter(reasons))}, and rule {denying[0]} comes too late to deny it. On Zenoh, "
         "as in a policy, a deny rule wins wherever it stands.",
         f"List the names to {verb} in a policy, without that deny rule, and sign it with `sros "

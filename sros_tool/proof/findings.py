@@ -630,9 +630,9 @@ def _unnamed_finding(
         if right.right not in forbidden
     }
     if gone := [name for name in names if name in known_before]:
-        why = f"no right names {_listed_names(gone)} any more"
+        why = f"no right is stated for {_listed_names(gone)} any more"
         return _part_finding(VACUOUS, requirement, [why], _GONE_REMEDY)
-    return _part_finding(UNNAMED, requirement, [f"no right names {_listed_names(names)}"])
+    return _part_finding(UNNAMED, requirement, [f"no right is stated for {_listed_names(names)}"])
 
 
 def _assumption_finding(requirement: Requirement, name: str) -> Finding:

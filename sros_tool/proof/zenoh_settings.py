@@ -210,7 +210,7 @@ def _changes(
                 yield (
                     path[:80],
                     old_word,
-                    "stated in another way" if old_word == new_word else new_word,
+                    "another value (not shown)" if old_word == new_word else new_word,
                     meaning,
                 )
 

@@ -231,7 +231,8 @@ _ROS_TEXTS = (
         "file-unreadable", _ROS,
         r"filesystem error: [\w ]{1,40}: Permission denied "
         r"\[(?P<path>[^\]]*/(?:key\.p11|[a-z_.]+\.(?:pem|p7s)))\]",
-        "the user that runs this process may not read {path}, or enter one of the folders above it",
+        "the user that runs this process is not allowed to read {path}, or to enter one of the "
+        "folders above it",
         _MAKE_READABLE_FOR_USER,
     ),
     _log_text(

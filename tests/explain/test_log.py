@@ -623,7 +623,7 @@ def test_a_remedy_names_the_keystore_and_the_enclave_that_the_user_named(
     line = f"filesystem error: status: Permission denied [{keystore}/enclaves/a/governance.p7s]"
     (tmp_path / "user.log").write_text(f"RuntimeError: {line}\n")
     unreadable = sros("explain", keystore, ENCLAVE, "--log", tmp_path / "user.log").out
-    assert f"may not read {keystore}/enclaves/a/governance.p7s" in unreadable
+    assert f"is not allowed to read {keystore}/enclaves/a/governance.p7s" in unreadable
     assert f"As the user that runs the node, run `sros check {keystore}`" in unreadable
 
 

@@ -120,7 +120,7 @@ def test_a_list_that_every_vendor_refuses_is_not_signed(
     assert ended.status == 2, ended
     assert "no node could start in /a, /b" in ended.err
     titles = enumerated(joined_titles(vendor.title for vendor in TESTED))
-    assert f"{titles} refuse their files" in ended.err
+    assert f"{titles} refuse their new files" in ended.err
     assert "cRLSign" in ended.err and "Nothing was changed." in ended.err
     remedy = f"sros rotate_ca {corporate} --identity --identity-key URI --finish"
     assert remedy in ended.err
@@ -168,7 +168,9 @@ def test_the_user_may_name_the_vendors_on_which_nodes_stop(corporate: Path) -> N
     assert "add --allow-refusal cyclonedds-11." in ended.err
     products = "--allow-refusal all-fastdds --allow-refusal all-cyclonedds."
     assert f"add {products}" in sros("revoke", corporate, "/lost").err
-    assert "Cyclone DDS 11.0 refuses their files" in ended.err and "Fast DDS 2.14" not in ended.err
+    assert (
+        "Cyclone DDS 11.0 refuses their new files" in ended.err and "Fast DDS 2.14" not in ended.err
+    )
     said = sros("revoke", corporate, "/lost", *allowed).ok().err
     assert "Cyclone DDS 11.0 refuses /a, /b from now on" in said
     assert refused_by(corporate, "/a") == set(TESTED)

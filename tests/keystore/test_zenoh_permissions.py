@@ -41,7 +41,7 @@ USES = {
     "request": (Flow.INGRESS, Message.QUERY), "reply": (Flow.EGRESS, Message.QUERY),
 }  # fmt: skip
 NO_AGREEMENT = "because DDS vendors do not decide alike"
-ORDER = "because the order of its rules matters"
+ORDER = "because the order of the rules matters"
 
 
 def rule(qualifier: str, topic: str, *partitions: str, domains: DomainSet = ZERO) -> Rule:

@@ -990,9 +990,10 @@ def test_a_change_renames_nothing_out_of_a_requirement(change: Change) -> None:
     renamed = {"/a": publish("/drive"), "/b": publish("/*"), "/c": publish("/drive")}
     change.commit({"robot.xml": policy_text(renamed)})
     ended = change.review(*words)
-    assert "no right names topic /x any more; required: only /a, /b may publish /x" in ended.out, (
-        ended
-    )
+    assert (
+        "no right is stated for topic /x any more; required: only /a, /b may publish /x"
+        in ended.out
+    ), ended
     assert ended.status == 1
     change.base = change.commit({"README": "x"})
     change.commit({"README": "y"})
@@ -1005,7 +1006,7 @@ def test_a_name_that_nobody_may_use_may_lose_its_denial_and_its_right(change: Ch
     change.base = change.commit({"robot.xml": denied, "robot.toml": required})
     words = ("--policy", "robot.xml", "--requirements", "robot.toml", "--new-access", "allow")
     change.commit({"README": "x"})
-    said = "no right names topic /q; required: nobody may publish /q [requirement.unn"
+    said = "no right is stated for topic /q; required: nobody may publish /q [requirement.unn"
     note = f"  robot.toml:1: note: {said}"
     assert note in change.review(*words).ok().out
     change.base = change.commit({"robot.xml": policy_text({"/a": publish("/x", "/q")})})

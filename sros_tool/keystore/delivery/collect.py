@@ -971,7 +971,7 @@ def _defer_requests(
     from sros_tool.keystore.delivery.publish import age_clause
 
     if is_older := is_older or has_unpublished_restore(keystore):
-        reason = "rights that were taken away since would come back"
+        reason = "rights that were taken away after the backup would come back"
     elif is_restored or age_clause(keystore):
         reason = "the key that vouches for the new key may be revoked"
     else:

@@ -298,10 +298,10 @@ def _lost_revocations(
                 expiries = known_expiries(keystore, missing)
                 lacking = [s for s in missing if expiries.get(s, iso(now)) >= iso(now)]
                 if there.number > sent.number:
-                    has = "none" if sent.number < 0 else f"the number {sent.number}"
+                    has = "no list" if sent.number < 0 else f"the number {sent.number}"
                     shown = (
                         "is a newer revocation list than the keystore's",
-                        f"It has the number {there.number}, the keystore has {has}",
+                        f"It has the number {there.number}; the keystore has {has}",
                     )
                 elif lacking and not is_ca_service(keystore.template.identity_key):
                     shown = (

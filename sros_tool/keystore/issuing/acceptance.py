@@ -246,8 +246,8 @@ def _refused_change_error(
     whose = "its" if len(names) == 1 else "their"
     options = " ".join(f"--allow-refusal {word}" for word in words_of(refused))
     return KeystoreError(
-        f"no node could start in {_names_text(names)} of '{root}'",
-        f"{_refusal_clauses(why, f'{whose} files after the change')}. Nothing was changed.",
+        f"after this change, no node could start in {_names_text(names)} of '{root}'",
+        f"{_refusal_clauses(why, f'{whose} new files')}. Nothing was changed.",
         f"{remedy or 'Replace the file that the error names.'} If no node runs on "
         f"{enumerated(joined_titles(vendor.title for vendor in refused))}, add {options}.",
     )
@@ -362,9 +362,9 @@ def imported_notes(
     if later := {vendor: why for vendor, why in listed.items() if vendor not in refused}:
         text = (
             f"with a revocation list of this identity CA, no enclave would work any more: "
-            f"{_refusal_clauses(later, 'it')}. So `sros revoke` signs no list. To revoke enclaves, "
-            "have the CA's certificate issued again with keyUsage cRLSign, or let sros make the "
-            "identity CA."
+            f"{_refusal_clauses(later, 'every enclave')}. So `sros revoke` signs no list. "
+            "To revoke enclaves, have the CA's certificate issued again with keyUsage cRLSign, or "
+            "let sros make the identity CA."
         )
         notes.append(Note("portable.revocation-list", text))
     return tuple(notes)

@@ -788,11 +788,11 @@ def _left_out_notes(left_out: Mapping[str, str]) -> Iterable[Note]:
     for name, why in left_out.items():
         names_of[why.rstrip(".")].append(name)
     for why, names in names_of.items():
-        get, of_each = ("gets", "it") if len(names) == 1 else ("get", "each of them")
+        get, reason = ("gets", "Reason") if len(names) == 1 else ("get", "Reason for each enclave")
         yield Note(
             "zenoh.left-out",
-            f"{first_few(names, 5)} {get} no configuration for Zenoh, where all other "
-            f"enclaves deny {of_each} everything: {why}.",
+            f"{first_few(names, 5)} {get} no configuration for Zenoh, and may do nothing there. "
+            f"{reason}: {why}.",
         )
 
 

@@ -426,7 +426,7 @@ def restored_note(restored: Changed, lists_from: str) -> Note:
         f"was restored from a backup, or is a copy. Everything on the list {verb}"
     )
     if again_revoked := restored.names("revoked"):
-        text += f", with {first_few(again_revoked, _MOST_SHOWN)}"
+        text += f", including {first_few(again_revoked, _MOST_SHOWN)}"
     return Note(REVOKED_AGAIN, f"{text}.")
 
 
