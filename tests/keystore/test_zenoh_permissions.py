@@ -102,7 +102,7 @@ def test_what_every_vendor_decides_is_said(rules: list[Rule], names: list[str]) 
                 ),
                 rule("allow", "rt/a*", "*", domains=DomainSet((DomainRange(0, None),))),
             ],
-            "publish rt/a cannot be expressed in Zenoh, because DDS vendors do not read its "
+            "publish rt/a cannot be expressed in Zenoh, because DDS vendors do not read the "
             "rules alike. Rule 1 allows publish rt/a by rt/* (Fast DDS); rule 1 allows",
         ),
         (
