@@ -28,7 +28,7 @@ ONE_BY_ONE = (
     "restart the processes one by one; restarted processes communicate with all others, as long as "
     f"the files that they loaded are valid. {IF_EXPIRED}"
 )
-"""Text that says which processes to restart together.
+"""Text on restarting processes one by one, or together if they loaded files that have expired.
 
 A process that loaded expired files communicates, if at all, only with peers that it met before;
 restarted processes and this process refuse each other (Fast DDS 2.14.6 and 3.6.2, tested).

@@ -564,8 +564,8 @@ class FleetStatus:
     publication: PublishedMetadata | None = None
     """What robots fetch; null if nothing was published for a robot."""
     is_any_revoked: bool = False
-    """Whether a certificate is on the revocation list, or one of a replaced CA was revoked that a
-    robot may still trust.
+    """Whether a certificate is on the revocation list, or was revoked and is of a replaced CA that
+    a robot may still trust.
     """
     groups: Mapping[str, Sequence[str]] = field(default_factory=dict)
     """The groups of the fleet file, with their robots."""

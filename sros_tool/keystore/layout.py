@@ -264,9 +264,9 @@ _EXPORT_AGAIN = re.compile(
     r"\b([Ee])xport (?:(?:(?:the|their|its|these) enclaves?|them) )?again"
     rf"(?:(?: from the {ORIGINAL_KEYSTORE}:)? \(?`sros distribute_key [^`]+`\)?)?"
 )
-"""What remedies say of bringing changed files to an export."""
+"""The words of remedies that say to export enclaves again."""
 _SIGN_POLICY = re.compile(r"un `sros generate_artifacts -k [^`]+ -p POLICY_FILE`")
-"""What remedies say of signing a whole policy."""
+"""The words of remedies that say to sign a whole policy."""
 
 
 def remedy_in_closed_robot(root: Path, remedy: str) -> str:

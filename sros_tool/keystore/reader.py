@@ -720,7 +720,7 @@ class OpenedEnclave:
 class EnclaveIdentity(NamedTuple):
     """The certificate of an enclave, and the problems of certificate, key and identity CA.
 
-    A keystore lacks a key that was generated on the robot and stays there.
+    That a keystore lacks a key which was generated on the robot and stays there is no problem.
     """
 
     certificate: x509.Certificate | None

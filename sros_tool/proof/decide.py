@@ -337,7 +337,7 @@ def _witness_against_only(
 def _uses_of_rights(
     rights: RightNames, world: World, limit: SearchLimit, excluded: Sequence[str] = ()
 ) -> Mapping[str, Sequence[Use]]:
-    """Map each enclave that has one of the rights to uses of it, without ``excluded`` enclaves."""
+    """Map each enclave with uses of the rights to these uses; leave out ``excluded`` enclaves."""
     left_out = _matching_enclaves(excluded, world.enclaves)
     uses: defaultdict[str, list[Use]] = defaultdict(list)
     for right, part, topics in _topics_of_rights(rights):
@@ -684,9 +684,10 @@ def _witness_against_apart(requirement: Apart, world: World, limit: SearchLimit)
 def _similar_chains(
     chain: _Chain, world: World, sources: Collection[str], through: Container[str]
 ) -> Iterator[_Chain]:
-    """Yield the chain with each other enclave that can stand where the findings name one.
+    """Yield the chain once for each other enclave that can replace the enclave that findings name.
 
-    This is the source of a direct influence, else the first enclave that passes it on.
+    Findings name the source of a direct influence, or else the first enclave that passes the
+    influence on.
     """
     worlds = (world, *world.elsewhere)
     used = {ANYBODY, *(enclave for hop in chain for enclave in (hop.source, hop.target))}

@@ -134,7 +134,10 @@ class Violation:
 
     @property
     def position(self) -> int:
-        """The place, in the uses, of the enclave to change: the first that passes on, if any."""
+        """The index of the use whose enclave should change.
+
+        For an influence, this is the first enclave that passes the influence on, if there is one.
+        """
         return 2 if isinstance(self.requirement, Apart) and len(self.steps) > 2 else 0
 
     @property
@@ -421,7 +424,7 @@ def decided_findings(
 def _once(
     decided: Iterable[tuple[Requirement, tuple[str, ...]]],
 ) -> Iterable[tuple[Requirement, tuple[str, ...]]]:
-    """Return requirements with reasons, once if only the namespaces of the enclaves differ."""
+    """Return requirements with reasons, without those that differ only in their namespace."""
     pairs = reversed([*decided])
     return reversed({(r.source, r.robot, why): (r, why) for r, why in pairs}.values())
 

@@ -186,7 +186,8 @@ class NewNode(NamedTuple):
     rights: tuple[Right, ...]
     """Rights of the enclave that the node did not have in BASE.
 
-    Rights that every node needs come last. Where a DENY of BASE is gone, the name is an example.
+    Rights that every node needs come last. If a right is new only because HEAD lacks a DENY of
+    BASE, its name is an example.
     """
     place: Source
     """File and line of the node in HEAD."""

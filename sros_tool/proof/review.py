@@ -1132,7 +1132,7 @@ class _Review:
     ) -> Iterator[Finding]:
         """Yield findings on requirements that fail in another namespace only because of the change.
 
-        A requirement fails if it is broken, or if it names only what no right names any more.
+        A requirement fails if it is broken, or if no right is left for any name in it.
         Users may put the nodes of a package, and its requirements, into their own namespaces.
         ``requirements`` are the requirements in ``files`` for the namespace / of ``system``.
         """

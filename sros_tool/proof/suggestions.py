@@ -155,8 +155,9 @@ class _Stated:
     def changing_services(self) -> Mapping[str, tuple[str, ...]]:
         """The enclaves that may call services which change nodes, by the last part of the name.
 
-        Only services that some node offers for nobody.  An enclave without a counterpart, such as
-        the enclave of a package, has its users elsewhere, and does not count.
+        A service is included only if a node offers it although no enclave may call it there.  The
+        node's enclave has to have a counterpart for another right: otherwise, as in the policy of a
+        package, the callers may be in another policy.
         """
         partners = self.enclaves_with_counterpart()
         unused = {
@@ -226,7 +227,7 @@ def _few_holders(stated_rights: _Stated, right: str) -> Iterator[Only]:
 
 
 def _changing_services(stated_rights: _Stated) -> Iterator[Only | Nobody]:
-    """Yield requirements on services that change nodes, and that some nodes offer for nobody.
+    """Yield requirements on services that change nodes, and that nobody may call on some nodes.
 
     The enclaves that may call such a service of another node are exceptions.
     """
