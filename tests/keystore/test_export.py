@@ -82,7 +82,7 @@ def test_an_older_list_does_not_replace_a_newer_one(fleet: Path, tmp_path: Path)
     revoke(fleet, ["/armada"], now=NOW)
     distribute(OpenedKeystore(fleet), ["/base"], robot, now=NOW)
     with pytest.raises(
-        KeystoreError, match=r"is a newer .* number 2, the keystore has the number 1"
+        KeystoreError, match=r"is a newer .* number 2; the keystore has the number 1"
     ):
         distribute(OpenedKeystore(backup), ["/base"], robot, now=NOW, force=True)
     (robot / "enclaves/base/crl.pem").unlink()
