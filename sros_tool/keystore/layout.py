@@ -291,7 +291,7 @@ def remedy_in_closed_robot(root: Path, remedy: str) -> str:
 
 def folder_of_closed_robot(root: Path) -> Path | None:
     """Return the folder of `sros close` to which this keystore or export belongs, or None."""
-    folder = root.parent
+    folder = root / ".." if root.name in ("", "..") else root.parent  # such as "."
     made = all((folder / file).is_file() for file in (CLOSED_PROCESSES, CLOSED_POLICY))
     return folder if made else None
 

@@ -7,7 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from sros_tool.keystore.layout import enclave_path
+from sros_tool.keystore.layout import (
+    CLOSED_POLICY,
+    CLOSED_PROCESSES,
+    enclave_path,
+    folder_of_closed_robot,
+)
 from sros_tool.keystore.reader import open_enclave
 from sros_tool.keystore.rights import load_rights
 from tests.support.harness import policy_text, publish, snapshot, sros
@@ -104,3 +109,16 @@ def test_keystores_of_foxy_and_later_are_used_as_they_are(release: str, tmp_path
     assert kept == set(rights.rights)
     for name in ("/a", "/n/b", "/added"):
         assert not open_enclave(enclave_path(root, name), now=datetime.now(UTC), domain=0).problems
+
+
+@pytest.mark.parametrize("named", [".", "enclaves/..", "../keystore", "{}/robot/keystore"])
+def test_a_keystore_of_close_knows_its_robot_by_every_path(
+    named: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "robot/keystore/enclaves").mkdir(parents=True)
+    for file in (CLOSED_PROCESSES, CLOSED_POLICY):
+        (tmp_path / "robot" / file).touch()
+    monkeypatch.chdir(tmp_path / "robot/keystore")
+    robot = folder_of_closed_robot(Path(named.format(tmp_path)))
+    assert robot and robot.samefile(tmp_path / "robot")
+    assert folder_of_closed_robot(tmp_path / "robot") is None
