@@ -435,7 +435,12 @@ def make_temporary_folder(parent: Folder, prefix: str) -> tuple[str, Folder]:
         # Until the folder is locked, another process may consider it stale and remove it.
         with contextlib.suppress(FileNotFoundError):
             folder = Folder(parent.path / name)
-            locked = try_lock(handle := folder.handle(""))
+            try:
+                locked = try_lock(handle := folder.handle(""))
+            except BaseException:
+                folder.close()
+                parent.rmdir(name)
+                raise
             state = parent.state(name)
             if locked and state and os.path.samestat(state, os.fstat(handle)):
                 return name, folder
@@ -443,11 +448,23 @@ def make_temporary_folder(parent: Folder, prefix: str) -> tuple[str, Folder]:
 
 
 def try_lock(handle: int) -> bool:
-    """Lock an open file or folder; False if another process has locked it."""
+    """Lock an open file or folder; False if another process has locked it.
+
+    Raises:
+        KeystoreError: the file system has no locks.
+    """
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         return False
+    except OSError as error:
+        if error.errno not in (errno.ENOLCK, *_NOT_SUPPORTED):
+            raise
+        raise KeystoreError(
+            f"'{Path(f'/proc/self/fd/{handle}').readlink()}' cannot be locked: {error.strerror}",
+            "Without locks, two runs of sros at the same time would spoil each other's files.",
+            "Use a folder on a local disk, or let the network file system give locks.",
+        ) from error
     return True
 
 

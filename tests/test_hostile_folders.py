@@ -396,6 +396,20 @@ def test_what_a_killed_run_of_root_left_is_said_and_ended_by_root(
     assert in_process_of(OWNER, lambda: create_enclaves(keystore, ["/other"], now=NOW)) == ""
 
 
+def test_a_file_system_without_locks_is_said_and_nothing_stays(
+    keystore: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(_handle: int, _operation: int) -> None:
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    monkeypatch.setattr("fcntl.flock", refuse)
+    around = sorted(os.listdir(keystore.parent))
+    for words in (("create_enclave", keystore, "/new"), ("create_keystore", f"{keystore}2")):
+        said = sros(*words).err
+        assert "cannot be locked" in said and "Use a folder on a local disk" in said
+    assert sorted(os.listdir(keystore.parent)) == around
+
+
 def test_the_lock_is_of_one_holder_at_a_time(keystore: Path) -> None:
     with Folder(keystore) as one, Folder(keystore) as two:
         first = transactions.KeystoreLock(one).acquire()
