@@ -486,7 +486,7 @@ def _remark_on_single_names(picture: Picture, name: Name, *, sends: bool) -> str
         if (edge.kind, edge.sends, edge.qualifier) == (name.kind, sends, ALLOW)
         and matches(name.name, edge.name)
     )
-    return "others, for single names only" if name.wildcard and any(single) else ""
+    return "other enclaves, for single names only" if name.wildcard and any(single) else ""
 
 
 def _graphviz_svg(dot: str) -> str:

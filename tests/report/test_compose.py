@@ -58,7 +58,7 @@ def test_a_wildcard_is_seen_though_its_known_names_are_denied_or_stated(tmp_path
     wild = {name.name: name.lacks for name in picture.names if name.wildcard}
     assert wild == {"/arm/*": Lack.NOTHING, "/log*": Lack.RECEIVER, "/g*": Lack.RECEIVER}
     table = render(picture, Folding.of(picture), "markdown", AT)
-    assert "| topic `/arm/*` | `/a` | others, for single names only |" in table
+    assert "| topic `/arm/*` | `/a` | other enclaves, for single names only |" in table
     used = source_of(tmp_path, {"/a": group("topics", "publish", "/log")}, "used.xml")
     unused = {difference.text for difference in overlay(source, used, "use").differences}
     assert "/a ALLOW publish topic /arm/*" in unused

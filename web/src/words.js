@@ -23,5 +23,5 @@ export function markText(overlay, mark) {
 // Who may use only known names of a wildcard has rows of these names.
 export function noneText({ names, lacks }, others, nobody = "nobody") {
   if (lacks || !names.some((name) => /[*?[]/.test(name))) return nobody;
-  return others.length ? "others, for single names only" : nobody;
+  return others.length ? "other enclaves, for single names only" : nobody;
 }
