@@ -456,7 +456,7 @@ class SearchLimit:
 
     def __init__(self, maximum: int = 600_000) -> None:
         """Set the limit to ``maximum`` steps; the default takes about ten seconds."""
-        self._fewest_letters_left = maximum
+        self._steps_left = maximum
 
     def spend(self, steps: int) -> None:
         """Subtract ``steps`` from the steps that are left.
@@ -464,8 +464,8 @@ class SearchLimit:
         Raises:
             DocumentError: no steps are left.
         """
-        self._fewest_letters_left -= steps
-        if self._fewest_letters_left < 0:
+        self._steps_left -= steps
+        if self._steps_left < 0:
             raise _too_many_error()
 
 

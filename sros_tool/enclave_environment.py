@@ -149,7 +149,7 @@ def loadable_environment(
         )
     how_to_accept = "" if accept_key is None else _ACCEPT_ADVICE
     if state.token:
-        _check_token_used(state.token, name, used)
+        _check_rmw_reads_tokens(state.token, name, used)
         if not (accept_key or target):
             _check_pin(state.token, name, how_to_accept)
     elif not accept_key and not (target and state.key_on_robot):
@@ -248,7 +248,7 @@ def _with_join_faults(
     evaluation = evaluated(
         name, folder, state, moment=context.at, domain=context.domain, vendors=vendors
     )
-    # `_check_token_used` says that a vendor reads no token.
+    # `_check_rmw_reads_tokens` says that a vendor reads no token.
     refusals = evaluation.stopped(ignored=(Fault.KEY_ON_TOKEN.id,))
     if evaluation.state.problems or not refusals:
         return evaluation.state
@@ -296,7 +296,7 @@ def _missing_token_note(name: str, place: TokenUri) -> Note:
     )
 
 
-def _check_token_used(place: TokenUri, name: str, rmw: str) -> None:
+def _check_rmw_reads_tokens(place: TokenUri, name: str, rmw: str) -> None:
     """Raise `KeystoreError` if the key is on a token and the RMW reads keys only from files."""
     from sros_tool.runtime.rmw import vendor_of
 

@@ -485,7 +485,7 @@ def exchange(first_folder: int, first: str, second_folder: int, second: str) -> 
     names = os.fsencode(first), os.fsencode(second)
     if rename(first_folder, names[0], second_folder, names[1], _RENAME_EXCHANGE) == 0:
         return True
-    number = _last_error()
+    number = _last_errno()
     if number in _NOT_SUPPORTED:
         return False
     raise OSError(number, os.strerror(number), first, None, second)
@@ -495,7 +495,7 @@ def flush_file_system(handle: int) -> None:
     """Flush the file system that an open folder is on."""
     try:
         if _c_library().syncfs(handle) != 0:
-            number = _last_error()
+            number = _last_errno()
             raise OSError(number, os.strerror(number))
     except AttributeError:  # a C library without syncfs
         os.sync()
@@ -508,8 +508,8 @@ def _c_library() -> ctypes.CDLL:
     return ctypes.CDLL(None, use_errno=True)
 
 
-def _last_error() -> int:
-    """Return the OSError for the errno of this thread's last C library call."""
+def _last_errno() -> int:
+    """Return the errno of this thread's last C library call."""
     import ctypes
 
     return ctypes.get_errno()

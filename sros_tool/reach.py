@@ -206,7 +206,7 @@ _FollowedTopics = set[tuple[str, tuple[str, ...], str, DomainSet | None]]
 class Network:
     """All enclaves of a system, connected by the topics that they may write and read.
 
-    ``rights`` hold in every ROS domain unless they are mapped from sets of domains.  ``without``
+    ``rights`` hold in every ROS domain unless they are mapped from sets of domains.  ``excluded``
     are topics (ROS names) to ignore, ``questions`` are services (names or wildcards) whose requests
     are ignored.  All enclaves in ``everybody`` may use the ``unguarded`` topics, independently of
     their rights, in the domains that they can join.  ``links`` are the links between several Zenoh
@@ -259,8 +259,8 @@ class Network:
     def links(self, enclave: str, known: Container[str]) -> Iterator[tuple[str, Callable[[], Hop]]]:
         """Yield each enclave that ``enclave`` can influence directly, with a function for the hop.
 
-        The search of this function for the name of the hop takes long.  Enclaves that are
-        ``known`` by then are left out.
+        The function searches for the name of the hop, which takes long.  Enclaves in ``known`` are
+        left out, also if the caller adds them while it iterates.
         """
         for writer, reader in self._access_pairs(enclave, True, set(), known):
             if reader.enclave != enclave and self._carries_a_topic(writer, reader):

@@ -11,7 +11,7 @@ _DIGITS = re.compile(r"\d+")
 _SHORTEST_PART = 4
 """Letters of the shortest part that can have a typing error: /arm_l and /arm_r are two names."""
 _MOST_SAME_ENDS = 8
-"""Maximum number of names whose last part is the same, if that part is to say something."""
+"""Maximum number of names with the same last part; a last part of more names says nothing."""
 
 
 class NearNames:

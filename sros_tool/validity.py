@@ -105,8 +105,8 @@ class Window:
     def can_be_kept(self, new: Window, now: datetime) -> bool:
         """Return whether a document with this validity can be kept instead of a ``new`` one.
 
-        The document can be kept while more than a third of ``new`` is left, and if the document
-        does not expire after ``new``.
+        It can be kept if it is valid as soon as ``new``, expires no later than ``new``, and has
+        more than a third of the time left that ``new`` has.
         """
         return (
             self.not_before <= max(now, new.not_before)

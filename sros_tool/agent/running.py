@@ -113,9 +113,9 @@ def look_at_processes(
 
     def lacks_list(process: Process, enclave: ProcessEnclave) -> bool:
         since = list_since.get(_enclave_of(process))
-        has_list = bool(since and since < process.started)
+        same_revocations = bool(since and since < process.started)
         return _started_before(process, list_replaced) or may_lack_list(
-            process, enclave, has_list=has_list
+            process, enclave, same_revocations=same_revocations
         )
 
     names = [*names]

@@ -53,7 +53,8 @@ class Connections(NamedTuple):
     """The connections between processes of one machine.
 
     ``missing`` are the pairs of processes that do not hear each other. ``compared`` are the
-    processes that sros can compare with each other; of ``unknown`` ones, sros sees no connections.
+    processes that sros can compare with each other; ``unknown`` are processes whose connections
+    sros cannot see.
     """
 
     missing: Sequence[tuple[Process, Process]]
@@ -116,7 +117,7 @@ def restarts(missing: Sequence[tuple[Process, Process]]) -> Iterator[tuple[Proce
         pairs = [pair for pair in pairs if pair not in of_process]
 
 
-def started_before(processes: Iterable[Process], now: datetime) -> Iterator[Process]:
+def with_time_to_connect(processes: Iterable[Process], now: datetime) -> Iterator[Process]:
     """Yield the processes that had enough time to connect."""
     return (process for process in processes if process.started + CONNECTING_TIME <= now)
 

@@ -454,7 +454,10 @@ def _secured_by_zenoh(environment: Mapping[str, str], folder: Path) -> Iterator[
 
 
 def _security_in_configuration(sought_text: bytes, name: str, place: bytes | Path) -> Iterator[str]:
-    """Yield a clause if a configuration has security, or cannot be read."""
+    """Yield a clause if a configuration contains ``sought_text``, a pattern, or cannot be read.
+
+    ``name`` names the configuration in the clause; ``place`` is its content, or its path.
+    """
     try:
         data = place if isinstance(place, bytes) else read_bytes(place, "configuration")
     except SrosError as error:

@@ -420,9 +420,12 @@ def _offered_by_others_findings(unused_statements: Iterable[_Statement]) -> Iter
 
 
 def _misspelt_name_finding(
-    misspelt: _Statement, other: str, candidates: Sequence[_Statement]
+    misspelt: _Statement, counterpart: str, candidates: Sequence[_Statement]
 ) -> Finding:
-    """Return the finding on a name without counterpart, which suggests similar names."""
+    """Return the finding on a name for which no enclave has the right ``counterpart``.
+
+    The finding suggests ``candidates``, statements with similar names.
+    """
     shown, remedy = candidates[:_NAMES_SHOWN], ""
     hint, first = _candidates_text(shown), shown[0]
     if first.name == misspelt.name:
@@ -434,10 +437,10 @@ def _misspelt_name_finding(
         )
         if misspelt.right.kind == "actions":
             place = RelatedPlace("", *_source_place(first.source))
-            remedy = f"Write it at {place} {_as_action(other, first.written)}"
+            remedy = f"Write it at {place} {_as_action(counterpart, first.written)}"
         elif kind == "action":
             remedy = f"Write it {_as_action('call', misspelt.written)}"
-    text = f"no enclave may {other} {misspelt.name}; {hint}"
+    text = f"no enclave may {counterpart} {misspelt.name}; {hint}"
     places = tuple(
         RelatedPlace(
             f"{candidate.right.enclave} may {candidate.right.describe()}",

@@ -20,7 +20,7 @@ from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 from sros_tool.checks.connections import (
     connection_findings,
     connections_between,
-    started_before,
+    with_time_to_connect,
 )
 from sros_tool.checks.environment import (
     OWN_CONFIGURATION,
@@ -263,15 +263,18 @@ def newer_files(process: Process, enclave: ProcessEnclave) -> Iterator[str]:
         yield from (f"'{_plain_path(file)}' (its place or mode)" for file in moved[:1])
 
 
-def may_lack_list(process: Process, enclave: ProcessEnclave, *, has_list: bool = False) -> bool:
+def may_lack_list(
+    process: Process, enclave: ProcessEnclave, *, same_revocations: bool = False
+) -> bool:
     """Return whether a process may have loaded another revocation list, or other CAs.
 
     The process has loaded the present list and CAs if, since its start, no file of the enclave
-    changed but its certificate, permissions and governance. ``has_list`` says that all lists since
-    the start of the process revoke the same certificates, so that a changed list does not matter.
+    changed but its certificate, permissions and governance. ``same_revocations`` says that all
+    lists since the start of the process revoke the same certificates, so that a changed list does
+    not matter.
     """
     moved = any(moment > process.started for moment in enclave.moved.values())
-    same_files = _OWN_FILES | ({CRL_FILE} if has_list else set())
+    same_files = _OWN_FILES | ({CRL_FILE} if same_revocations else set())
     return moved or not {*newer_files(process, enclave)} <= same_files
 
 
@@ -730,7 +733,7 @@ def process_findings(
     yield from _mixed_vendor_findings(secured, environment if starts_nodes else None)
     yield from _other_keystore_findings(secured, environment if is_secured_here else None)
     for _, processes in _group_by_authorities(secured):
-        connections = connections_between(started_before(processes, now))
+        connections = connections_between(with_time_to_connect(processes, now))
         yield from connection_findings(connections.missing)
     if is_secured_here and environment.get(KEYSTORE):
         root = Path(environment[KEYSTORE])
@@ -986,7 +989,7 @@ def _other_keystore_findings(
 
 
 def other_folder_findings(processes: Iterable[Process], folder: Path) -> Iterator[Finding]:
-    """Yield a finding for each process: it loaded its enclave from elsewhere than ``folder``."""
+    """Yield a finding for each of ``processes``, which run in enclaves of other folders."""
     for process in processes:
         assert process.enclave
         root = _plain_path(process.enclave.keystore)
@@ -1069,10 +1072,10 @@ def _unseen_process_findings(running: RunningProcesses) -> Iterator[Finding]:
     """Yield a finding for each node that could not be examined, and a finding with their number."""
     remedy = ROOT_IS_NOT_ENOUGH if running.by_root else ""
     for process in running.unseen:
-        if process.speaks:
+        if process.uses_ros:
             text = f"it speaks ROS 2, but cannot be examined: {process.why}"
             yield PROCESS_NOT_SEEN.found(process.label, text, remedy=remedy)
-    doubtful = [process for process in running.unseen if not process.speaks]
+    doubtful = [process for process in running.unseen if not process.uses_ros]
     reasons = [running.hidden] if running.hidden else []
     if doubtful:
         processes = first_few([f"{process.label} ({process.why})" for process in doubtful], 3)

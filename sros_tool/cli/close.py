@@ -37,8 +37,11 @@ if TYPE_CHECKING:
     from sros_tool.policy.model import Policy
 
 
-def _run(words: Sequence[str], shows_output: bool) -> tuple[int, str, str]:
-    """Run a verb of sros in this process; return its status, its output and its messages."""
+def _run(words: Sequence[str], shows_messages: bool) -> tuple[int, str, str]:
+    """Run a verb of sros in this process; return its status, its output and its messages.
+
+    With ``shows_messages``, the messages are printed as usual, and returned as "".
+    """
     from sros_tool.cli.program import program
 
     outputs = io.BytesIO(), io.BytesIO()
@@ -46,7 +49,7 @@ def _run(words: Sequence[str], shows_output: bool) -> tuple[int, str, str]:
         io.TextIOWrapper(output, "utf-8", "surrogateescape", write_through=True)
         for output in outputs
     )
-    with redirect_stderr(sys.stderr if shows_output else err), redirect_stdout(out):
+    with redirect_stderr(sys.stderr if shows_messages else err), redirect_stdout(out):
         status = program.main(list(words), prog_name="sros", standalone_mode=False)
         texts = [output.getvalue().decode("utf-8", "surrogateescape") for output in outputs]
     return (status if isinstance(status, int) else 0), texts[0], texts[1]
@@ -454,7 +457,7 @@ def _state_text(closed: CloseState, *, apply: bool) -> str:
 
 
 def _how_it_runs(closed: CloseState, enclave: str) -> str:
-    """Return how the process of an enclave runs that is not as it should be."""
+    """Return how the process of an enclave runs, if not as it should."""
     if enclave in closed.secured:
         return _NOT_CURRENT
     if enclave in closed.other_files:

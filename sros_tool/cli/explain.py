@@ -299,7 +299,7 @@ def explain(
     mode = "--who" if who else "--reach" if reach else "--log" if logs else ""
     _refuse_ignored(mode)
     check_one_decider()
-    root, rest = _split_keystore(arguments, keystore, verb=0 if who else 1)
+    root, rest = _split_keystore(arguments, keystore, operation_index=0 if who else 1)
     if logs and root and policy:
         raise UsageError(
             "--log takes either a keystore or a policy",
@@ -379,11 +379,12 @@ def explain(
 
 
 def _split_keystore(
-    arguments: tuple[str, ...], keystore: Path | None, *, verb: int
+    arguments: tuple[str, ...], keystore: Path | None, *, operation_index: int
 ) -> tuple[Path | None, tuple[str, ...]]:
     """Return the keystore (the first argument, or the option) and the other arguments.
 
-    ``verb`` is the index of the operation (such as publish) in ``arguments`` without a keystore.
+    ``operation_index`` is the index of the operation (such as publish) in ``arguments`` without a
+    keystore.
     """
     from sros_tool.keystore.layout import is_keystore
 
@@ -393,9 +394,9 @@ def _split_keystore(
             "",
             "Leave one of them out.",
         )
-    if keystore is not None or not arguments or _is_operation(arguments, verb):
+    if keystore is not None or not arguments or _is_operation(arguments, operation_index):
         return keystore, arguments
-    if _is_operation(arguments, verb + 1) or Path(arguments[0]).exists():
+    if _is_operation(arguments, operation_index + 1) or Path(arguments[0]).exists():
         return Path(arguments[0]), arguments[1:]
     return None, arguments
 

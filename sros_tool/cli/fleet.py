@@ -1245,7 +1245,10 @@ def _expiry_clauses(robot: RobotStatus, moment: datetime) -> Iterator[str]:
 
 
 def _summary(robot: RobotStatus, stage: str, moment: datetime) -> Iterator[str]:
-    """Yield clauses on how a robot's files differ from the keystore's, the worst first."""
+    """Yield clauses on how a robot's files differ from the keystore's, the worst first.
+
+    ``stage`` is the stage of the CA rotation in the keystore.
+    """
     from sros_tool.keystore.confirmation import enclave_of
 
     # The notes explain some states.

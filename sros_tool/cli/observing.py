@@ -33,7 +33,7 @@ from sros_tool.values import FileChange, file_change
 from sros_tool.wording import counted
 
 if TYPE_CHECKING:
-    from sros_tool.graph.learn import AskingLine, Draft, Learned, LearnedPolicy
+    from sros_tool.graph.learn import DenialLine, Draft, Learned, LearnedPolicy
     from sros_tool.graph.observation import Observation
     from sros_tool.graph.observe import ObserverError, RosGraph, Snapshot
     from sros_tool.policy.model import Policy
@@ -108,7 +108,8 @@ def observer_environment(
 ) -> dict[str, str]:
     """Return the environment variables that give the observer its domain and its enclave.
 
-    ``arguments`` says, for an error, what the arguments of the verb are: not this keystore.
+    ``arguments`` is a clause that says what the verb's arguments are, to explain in an error why
+    they do not name the keystore.
     """
     from sros_tool.runtime.variables import DOMAIN, domain_from
 
@@ -152,7 +153,7 @@ def observe(
         ObserverError,
         RosGraph,
         Settling,
-        look_for,
+        observe_for,
         settle,
         with_certified_enclaves,
         with_owners_of_strays,
@@ -174,7 +175,7 @@ def observe(
             if watch is not None:
                 snapshot = _watch(graph, seconds, lambda seen: report(identify(seen)), at_end)
             elif spin_time is not None:
-                snapshot = look_for(graph, spin_time, time.monotonic)
+                snapshot = observe_for(graph, spin_time, time.monotonic)
             else:
                 settling = SECURED if variables.get(ENABLE) == "true" else Settling()
                 snapshot = settle(graph, settling, time.monotonic)
@@ -570,10 +571,10 @@ def _learned_json(
 
 
 def _show(plan: Draft, learned: Learned, *, written: bool) -> None:
-    from sros_tool.graph.learn import RightsFound
+    from sros_tool.graph.learn import RightsOrigin
     from sros_tool.policy.merge import merge_notes
 
-    from_log = learned.source is RightsFound.LOG
+    from_log = learned.source is RightsOrigin.LOG
     would = "" if written else "would have "
     if plan.before is None:
         enclaves = {profile.enclave for profile in learned.profiles}
@@ -600,7 +601,7 @@ def _show(plan: Draft, learned: Learned, *, written: bool) -> None:
 
 def _propose(
     learned: Learned,
-    lines: Sequence[AskingLine],
+    lines: Sequence[DenialLine],
     file: Path | None,
     accept: bool,
     dry_run: bool,
@@ -649,7 +650,7 @@ def _propose(
     return 0
 
 
-def _show_lines(lines: Sequence[AskingLine], *, err: bool = False) -> None:
+def _show_lines(lines: Sequence[DenialLine], *, err: bool = False) -> None:
     if lines:
         echo("these log lines ask for the rights; a process can print any line:", err=err)
     for line in lines:

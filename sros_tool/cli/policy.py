@@ -389,8 +389,8 @@ def rights_markdown(
 def enclave_lines(difference: SourcesDifference, fleet: Fleet | None) -> list[str]:
     """Return lines for enclaves that differ in something else than rights.
 
-    They have no rights on one side only, other ROS domains, or unclear permissions.  Equal lines of
-    robots are merged.
+    Such an enclave is on one side only and has no rights there, has other ROS domains on the other
+    side, or has unclear permissions.  Equal lines of robots are merged.
     """
     from sros_tool.fleet.robots import folded
 

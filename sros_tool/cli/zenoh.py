@@ -419,10 +419,10 @@ def _why_no_policy(subjects: Sequence[RightsOfSubject]) -> str:
 
 def _notes_on_lost_rules(subjects: Sequence[RightsOfSubject]) -> Iterator[Note]:
     """Yield notes about what the rules allow or deny but the policy does not state."""
-    from sros_tool.translate_zenoh.rights import enclave_of
+    from sros_tool.translate_zenoh.rights import enclaves_of_subject
 
     for rights in subjects:
-        if (rights.rights or rights.unsaid) and not enclave_of(rights):
+        if (rights.rights or rights.unsaid) and not enclaves_of_subject(rights):
             yield Note(
                 "zenoh.no-enclave",
                 f"the policy leaves out {_subject_text(rights)}, because a policy gives rights "

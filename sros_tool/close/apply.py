@@ -268,9 +268,9 @@ class _RemainingProcesses:
                 )
         unseen_processes = running.processes.unseen
         for unseen in unseen_processes:
-            if unseen.speaks:
+            if unseen.uses_ros:
                 yield f"{unseen.label} speaks ROS 2, and cannot be examined: {unseen.why}"
-        if running.processes.hidden or any(not unseen.speaks for unseen in unseen_processes):
+        if running.processes.hidden or any(not unseen.uses_ros for unseen in unseen_processes):
             why = "some processes cannot be examined"
             by_root = running.processes.by_root
             remedy = f". {ROOT_IS_NOT_ENOUGH}" if by_root else ": run this command as root"

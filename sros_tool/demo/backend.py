@@ -404,8 +404,8 @@ def _rmw_here(environment: Mapping[str, str]) -> str:
     return environment.get(RMW) or next(filter(vendor_of, installed), "")
 
 
-def _types_not_heard(node: HandNode, environment: Mapping[str, str]) -> str:
-    """Return a clause on ROS nodes of this shell that do not hear a secured node; "" if all do."""
+def _vendor_mismatch_clause(node: HandNode, environment: Mapping[str, str]) -> str:
+    """Return a clause if secured ROS nodes of this shell and ``node`` do not hear each other."""
     rmw = _rmw_here(environment)
     differs_in_vendor = node.backend == CYCLONE and vendor_of(rmw) not in (None, Vendor.CYCLONE)
     if not differs_in_vendor or environment.get(ENABLE) != "true":
@@ -428,7 +428,7 @@ def run_by_hand(
         SrosError: The environment demands security, and the enclave cannot be loaded.
     """
     say(f"{security_line(node, os.environ)} (stop with Ctrl-C)")
-    if not_heard := _types_not_heard(node, os.environ):
+    if not_heard := _vendor_mismatch_clause(node, os.environ):
         say(not_heard)
     events, writing = os.pipe()
     module = f"sros_tool.demo.{_MODULES[node.backend]}_node"

@@ -362,9 +362,9 @@ def _best_cast(
 ) -> tuple[dict[str, str], str]:
     """Return the best enclaves for talker, listener and guest, and their DDS topic.
 
-    An enclave that may only publish, or only subscribe, is better than an enclave that may do both.
-    The best listener is an enclave in ``without_list``, which may not know which enclaves were
-    revoked.
+    ``wanted`` is the only DDS topic to consider; "" stands for all topics.  An enclave that may
+    only publish, or only subscribe, is better than an enclave that may do both.  The best listener
+    is an enclave in ``without_list``, which may not know which enclaves were revoked.
     """
     best: tuple[int, dict[str, str], str] = (-1, {}, "")
     serving = _service_cast(rights)

@@ -199,7 +199,7 @@ def run_demo(options: DemoOptions, now: datetime, progress: Progress) -> DemoRes
             if user:
                 strong = load_template(_DEFAULT_TEMPLATE)
                 rows = tuple(
-                    _with_default_template_status(
+                    _with_acceptance(
                         user.row_if_allowed(row, topic),
                         _with_expectation(scenario_row, backend, strong, topic),
                         options,
@@ -286,7 +286,7 @@ def _with_expectation(row: Row, backend: Backend, template: Template, topic: str
     return row.with_expected_status(conditions(backend, template, _dds_topic(row, topic)))
 
 
-def _with_default_template_status(row: Row, strong_row: Row, options: DemoOptions) -> Row:
+def _with_acceptance(row: Row, strong_row: Row, options: DemoOptions) -> Row:
     """Return the row with its fields ``accepted`` and ``unaccepted`` set.
 
     An attack that the user's keystore allows, and a strong template (``strong_row``) does not, is

@@ -243,6 +243,9 @@ def packets_of(packets: Sequence[_CapturedPacket], ports: Collection[int]) -> li
 def with_changed_bit(packet: bytes, later: int, place: int, places: int) -> bytes | None:
     """Return a copy of an RTPS packet with one bit changed, or None if it has no content.
 
+    The bit is in the middle of part ``place`` (from 0), if the content is divided into ``places``
+    equal parts.
+
     An attacker without keys can change encrypted packets in the same way.  The sequence number of a
     readable DATA submessage is raised by ``later``, so that a DataReader takes it for a later
     message of the writer (RTPS 2.3 §9.4.5.3).

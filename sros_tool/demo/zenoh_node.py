@@ -298,14 +298,14 @@ class _Eraser(NodeRole):
     """A node that takes the nodes of talkers out of the graph."""
 
     def __init__(self, node: _ZenohNode, options: NodeOptions, events: EventWriter) -> None:
-        self._graph = node
+        self._zenoh_node = node
         super().__init__(node, options, events)
 
     def prepare(self) -> None:
-        self._graph.watch()
+        self._zenoh_node.watch()
 
     def act(self) -> None:
-        if self._graph.erase("talker"):
+        if self._zenoh_node.erase("talker"):
             self.sent(f"erased {self._sent + 1}")
 
 

@@ -34,7 +34,7 @@ from sros_tool.fleet.robots import Fleet
 from sros_tool.graph.learn import (
     UNSHOWN,
     Learned,
-    RightsFound,
+    RightsOrigin,
     enclave_per_node,
     first_subjects,
     is_tool,
@@ -395,7 +395,7 @@ class Audit:
     def missing(self) -> Learned:
         """The rights to add to the policy."""
         learned = learn(_nodes_using_denied(self.denied, self.observation))
-        return replace(learned, source=RightsFound.AUDIT)
+        return replace(learned, source=RightsOrigin.AUDIT)
 
 
 def _base_name(node: str) -> str:

@@ -20,12 +20,12 @@ from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.errors import Note, UsageError
 from sros_tool.files import policies_dir
 from sros_tool.graph.learn import (
-    AskingLine,
     CommonParts,
+    DenialLine,
     Learned,
     LearnedProfile,
     NodeRight,
-    RightsFound,
+    RightsOrigin,
     common_parts,
     groups_of,
 )
@@ -268,7 +268,7 @@ def learned_from_logs(
     enclave: str,
     node: tuple[str, str] | None,
     present: Policy | None,
-) -> tuple[Learned, list[AskingLine], bool]:
+) -> tuple[Learned, list[DenialLine], bool]:
     """Return rights that logs report missing, the log lines, and whether a right was denied.
 
     Args:
@@ -284,7 +284,7 @@ def learned_from_logs(
     learned = as_learned(missing, enclave, node, present, common, written=file is not None)
     asked = {profile.enclave for profile in learned.profiles}
     lines = [
-        AskingLine(
+        DenialLine(
             log,
             denial.lines[0],
             process=denial.process or None,
@@ -299,14 +299,14 @@ def learned_from_logs(
     return learned, lines, any(denials.values())
 
 
-def lines_asking_for(added: Iterable[Right], lines: Iterable[AskingLine]) -> list[AskingLine]:
+def lines_asking_for(added: Iterable[Right], lines: Iterable[DenialLine]) -> list[DenialLine]:
     """Return the log lines that ask for any of the rights ``added``.
 
     Leaves out lines whose right the policy already states or denies.
     """
     rules = Rules(added)
 
-    def asks(line: AskingLine) -> bool:
+    def asks(line: DenialLine) -> bool:
         asked = propose([Denial(line.topic, line.direction, line.enclave or "")]).rights
         return any(
             rules.overlaps(Right(enclave, ALLOW, right.right, right.name))
@@ -383,7 +383,7 @@ def as_learned(
         )
         if reasons
     ]
-    return Learned(tuple(profiles), (*_notes(missing_rights), *notes), source=RightsFound.LOG)
+    return Learned(tuple(profiles), (*_notes(missing_rights), *notes), source=RightsOrigin.LOG)
 
 
 def _lacking_parameter_services(denied: Set[NodeRight], rights: Set[NodeRight]) -> str:

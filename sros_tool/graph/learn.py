@@ -103,7 +103,7 @@ class LearnedProfile:
     groups: tuple[Group, ...]
 
 
-class RightsFound(StrEnum):
+class RightsOrigin(StrEnum):
     """The source of learned rights.
 
     ``graph`` stands for rights in the observed ROS graph, ``log`` for rights that a log reports as
@@ -124,7 +124,7 @@ class Learned:
 
     profiles: tuple[LearnedProfile, ...]
     notes: tuple[Note, ...] = ()
-    source: RightsFound = RightsFound.GRAPH
+    source: RightsOrigin = RightsOrigin.GRAPH
 
     def noting(self, notes: Iterable[Note]) -> Learned:
         """Return a copy with ``notes`` in front of the current notes."""
@@ -705,17 +705,17 @@ _XINCLUDE = "http://www.w3.org/2001/XInclude"
 _INDENT = "  "
 _DECLARATION = """<?xml version="1.0" encoding="UTF-8"?>\n"""
 _HEADERS = {
-    RightsFound.GRAPH: """\
+    RightsOrigin.GRAPH: """\
 <!-- Written by sros generate_policy: rights that the robot was observed to use.
      Review it before you enforce it: rights that were not observed are not allowed, and rights
      that were observed may be unwanted. -->
 """,
-    RightsFound.LOG: """\
+    RightsOrigin.LOG: """\
 <!-- Written by sros generate_policy: rights that were denied, by the lines of logs.
      Review it before you enforce it: a process can print any line, also one that looks like a
      denial, to get a right that it should not have. -->
 """,
-    RightsFound.AUDIT: """\
+    RightsOrigin.AUDIT: """\
 <!-- Written by sros audit: rights that nodes were observed to use, and that the policy or keystore
      denies. Review it before you add it (sros merge_policy): rights that were observed may be
      unwanted. -->
@@ -724,7 +724,7 @@ _HEADERS = {
 """Source of rights → comment at the head of a learned policy."""
 
 
-class AskingLine(NamedTuple):
+class DenialLine(NamedTuple):
     """A log line that reports a denied topic."""
 
     log: Path
@@ -747,7 +747,7 @@ class LearnedPolicy(NamedTuple):
 
     file: Path | None
     """Path of the policy file; null without FILE."""
-    source: RightsFound
+    source: RightsOrigin
     """The source of the rights."""
     created: bool
     """Whether the policy file is new, or would be with `--accept`."""
@@ -770,7 +770,7 @@ class LearnedPolicy(NamedTuple):
     """Paths of common parts that are copied next to the policy."""
     accepted: bool | None
     """For a log: whether `--accept` was given; without it, no right is written."""
-    denials: Sequence[AskingLine] | None
+    denials: Sequence[DenialLine] | None
     """For a log: the lines that ask for the rights."""
     changes: FileChanges
     notes: Notes

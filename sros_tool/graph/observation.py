@@ -264,7 +264,7 @@ class Reading(NamedTuple):
     """Nodes (enclave, namespace, name) and endpoints of the graph, in the RMW's order.
 
     With ``nodes_changed``, nodes came or went during the reading: ``listed`` has the nodes before
-    and after it, so that nobody hides others by nodes that come and go all the time.
+    and after it.  Otherwise, a program could hide nodes by starting and ending others all the time.
     """
 
     listed: list[Any]
@@ -282,8 +282,8 @@ class GraphObserver(Protocol):
 def report_graph(observer: GraphObserver, report: Any, period: float, *, ordered: bool) -> None:
     """Report each reading, with the graph after a change, until standard input is closed.
 
-    ``began`` is the begin of the reading by the monotonic clock, which all processes share: others
-    can make a graph so large that a reading takes minutes, and what came since is not in it.
+    The key ``began`` of a report is when its reading began, by the monotonic clock, which all
+    processes share.  A reading of a very large graph can take minutes, and may lack later changes.
 
     After a change, the graph is read again immediately, not after ``period`` seconds: a node may
     not show all its endpoints yet, and may exit before the next regular reading.  ``ordered`` says

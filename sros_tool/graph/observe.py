@@ -1,7 +1,7 @@
 """Observe the live ROS graph through rclpy, and find the enclave of each node.
 
-`RosGraph` runs rclpy in a separate process (`observation.main`); `settle`, `look_for` and `watch`
-end the observation.  Times are in seconds; clock and source are passed in.
+`RosGraph` runs rclpy in a separate process (`observation.main`); `settle`, `observe_for` and
+`watch` end the observation.  Times are in seconds; clock and source are passed in.
 
 rclpy lists nodes with their enclaves, but without their processes; it lists endpoints with the
 names of their nodes and with their participants (processes), but without enclaves.  `resolve`
@@ -62,8 +62,8 @@ class Readings(NamedTuple):
     last: float = float("-inf")
     gap: float = 0.0
 
-    def and_one(self, began: float) -> Readings:
-        """Return these readings and one that ``began`` later."""
+    def with_next(self, began: float) -> Readings:
+        """Return these readings and the next one, which began at the moment ``began``."""
         gap = began - self.last if self.last > float("-inf") else 0.0
         return Readings(began, max(self.gap, gap))
 
@@ -160,7 +160,7 @@ class RosGraph:
             line = self._line(max(deadline - time.monotonic(), 0))
             if line is None:
                 return None
-            self.readings = self.readings.and_one(line["began"])
+            self.readings = self.readings.with_next(line["began"])
             if "listed" in line:
                 break
         endpoints = tuple(
@@ -316,7 +316,7 @@ def settle(source: GraphSource, settling: Settling, clock: Clock) -> Snapshot:
             seen, all_seen, changed = news, all_seen.union(news), clock()
 
 
-def look_for(source: GraphSource, seconds: float, clock: Clock) -> Snapshot:
+def observe_for(source: GraphSource, seconds: float, clock: Clock) -> Snapshot:
     """Return the graph after exactly ``seconds`` seconds."""
     begin = clock()
     seen = all_seen = Observation()

@@ -484,7 +484,7 @@ def _key_algorithm(certificate: x509.Certificate) -> list[der.Value]:
 
 @lru_cache(maxsize=256)
 def _algorithms(certificate: x509.Certificate) -> tuple[der.Value, der.Value]:
-    """Return the two fields for the signature algorithm: of the signed part, and of the whole.
+    """Return both fields for the signature algorithm: first the one inside the signed part.
 
     OpenSSL compares the two fields when it verifies the signature.  OpenSSL does not verify the
     signature of a self-signed CA (RFC 5280, 4.1.1.2).
@@ -728,7 +728,7 @@ def read_form(data: bytes) -> CertificateForm | None:
     return None
 
 
-def holds_at(form: CertificateForm, now: datetime) -> bool | None:
+def is_valid_at(form: CertificateForm, now: datetime) -> bool | None:
     """Return whether a certificate is valid at ``now``; None if its dates cannot be read."""
     times = _validity_times(form.validity)
     return times and times[0] <= now.astimezone(UTC).strftime("%Y%m%d%H%M%SZ") <= times[1]
@@ -893,9 +893,9 @@ def load_request(data: bytes, label: str) -> SigningRequest:
 
 
 def _states_key(request: x509.CertificateSigningRequest, key: rsa.RSAPublicKey) -> bool:
-    """Return whether a request states its key as a certificate would, which RSA-PSS alone is not.
+    """Return whether a request states ``key`` as an RSA key for any use, not only for RSA-PSS.
 
-    `cryptography` reads a key for RSA-PSS alone as one of any use.
+    `cryptography` reads both kinds of keys alike.
     """
     stated = key.public_bytes(
         serialization.Encoding.DER, serialization.PublicFormat.SubjectPublicKeyInfo

@@ -126,7 +126,7 @@ class EnclaveUse:
         return self.observed_at_all and not self.differing()
 
     def differing(self) -> tuple[Right, ...]:
-        """Return the rights that were not observed as the enclave has them, or that it lacks."""
+        """Return the rights whose observed use differs: unused, used in part, or not allowed."""
         wide = (wildcard.rule for wildcard in self.wildcards)
         return (*self.never_observed, *wide, *self.in_part, *self.not_allowed)
 
@@ -149,7 +149,7 @@ def minimize(
     """
     observed = frozenset(observed)
     used = join_actions(right for right in observed if right.qualifier is ALLOW)
-    unused = Rules(right for right in observed if right.qualifier is DENY)
+    observed_denials = Rules(right for right in observed if right.qualifier is DENY)
     by_enclave: dict[str, set[Right]] = defaultdict(set)
     for right in used:
         by_enclave[right.enclave].add(right)
@@ -160,7 +160,7 @@ def minimize(
     enclaves, uses = [], []
     for enclave in policy.enclaves:
         enclave, use = _Narrowing(
-            enclave, frozenset(by_enclave.get(enclave.path, ())), unused, common, names
+            enclave, frozenset(by_enclave.get(enclave.path, ())), observed_denials, common, names
         ).result()
         enclaves.append(enclave)
         uses.append(use)
@@ -207,7 +207,7 @@ def nodes_not_as_observed(
     """Return the nodes of each enclave whose rights differ from what these nodes were seen to use.
 
     All nodes of an enclave have its rights, so in the comparison of whole enclaves, the rights of
-    one node hide those of another.  A node's denials and those of the other nodes apply to it.
+    one node hide those of another.  The denials of all nodes of the enclave apply to each node.
     Left out are enclaves without an observed node, and enclaves with a wildcard for other nodes.
     """
     nodes = policy.nodes()
@@ -273,13 +273,13 @@ class _Narrowing:
         self,
         enclave: Enclave,
         observed: frozenset[Right],
-        unused: Rules,
+        observed_denials: Rules,
         common: Sequence[Group],
         names: _KnownNames,
     ) -> None:
         self._enclave = enclave
         self._names = names
-        self._unused = unused
+        self._observed_denials = observed_denials
         stated = policy_rights(Policy((enclave,)))
         self._stated = sorted((r for r in stated if r.qualifier is ALLOW), key=order)
         self._denied = [right for right in stated if right.qualifier is DENY]
@@ -346,7 +346,7 @@ class _Narrowing:
                 yield right
         for part in self._in_use:
             denials = self._rules.overlapping(part._replace(qualifier=DENY))
-            if not (self._rules.cover(part) and all(map(self._unused.cover, denials))):
+            if not (self._rules.cover(part) and all(map(self._observed_denials.cover, denials))):
                 yield part
 
     # ── rules that stay, and replacements of wildcards ─────────────────────────────────────

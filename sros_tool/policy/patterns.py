@@ -410,7 +410,7 @@ def _letters_of(expression: str) -> str:
 
 
 def _four_letter_parts(run: str) -> Iterator[str]:
-    """Yield all parts of a text with four letters, or the whole text if it is shorter."""
+    """Yield all sequences of four letters in ``run``; the whole text if it is shorter."""
     for i in range(max(len(run) - _PART_LENGTH, 0) + 1):
         yield run[i : i + _PART_LENGTH]
 
@@ -421,7 +421,10 @@ def _four_letter_parts(run: str) -> Iterator[str]:
 # Most callers need no automata, which take long to import.
 @cache
 def _ros_names(absolute: bool, elsewhere: bool) -> NameSet:
-    """Return the set of all valid ROS names: with "/" first or without, or in `OTHER_NAMESPACE`."""
+    """Return the set of all valid ROS names; if ``absolute``, with "/" at the beginning.
+
+    If ``elsewhere``, the names are the absolute names in `OTHER_NAMESPACE`.
+    """
     from sros_tool.automata import Automaton, Letters, NameSet
 
     word, slash = Letters.between([("A", "Z"), ("a", "z"), ("_", "_")]), Letters.of("/")

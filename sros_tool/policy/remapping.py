@@ -55,10 +55,10 @@ class Remapping(NamedTuple):
 
 
 class UsedRule(NamedTuple):
-    """A use of a rule, which changed a node (``kind`` is ""), or a name in a group of the node.
+    """A use of a rule: it changed the name of ``node``, or a name in a group of the node.
 
-    ``kind`` is the kind of the group; ``old`` and ``new`` are the full name, of the node or in the
-    group, before and after the change.
+    ``kind`` is the kind of the group, or "" if the name of the node changed.  ``old`` and ``new``
+    are the full names before and after the change.
     """
 
     rule: Remapping
@@ -128,7 +128,7 @@ def _namespace_advice(rule: Remapping) -> str:
 
 
 def remapped_name(name: str, ns: str, rules: Iterable[Remapping]) -> list[str]:
-    """Return the full names that replace the full name ``name`` by ``rules`` for nodes in ``ns``.
+    """Return the full names that ``rules`` give to the full name ``name``, for nodes in ``ns``.
 
     The ``rules`` are results of `parse_remapping_of_names`.  A wildcard that matches an old name
     stays, and the new name is added.
@@ -165,7 +165,7 @@ def has_new_name(rule: Remapping, names: Iterable[str], namespaces: Iterable[str
 
 
 def renamed_action_text(rule: Remapping) -> str:
-    """Return how to start a node with a renamed action: as all releases of ROS take it."""
+    """Return a clause on how every release of ROS starts a node with a renamed action."""
     parts = (
         f"-r {quote(str(rule._replace(old=rule.old + part, new=rule.new + part)))}"
         for _, part in ACTION_PARTS["call"]
@@ -410,8 +410,8 @@ def _more_denials(
 ) -> Iterator[Group]:
     """Yield a group with the additional names, if any, that a DENY of ``group`` must deny.
 
-    These are the new names in ``moved_names``, and the names in ``by_wildcards`` that no node has
-    as its new name.
+    These are the new names in ``moved_names``, and the old names in ``by_wildcards``, which a
+    wildcard would otherwise allow.  An old name that is a new name of some node is left out.
     """
     denials = tuple(right for right in group.rights if right[1] is DENY)
     if not denials:

@@ -214,7 +214,7 @@ class Rules:
 
     def __init__(self, rights: Iterable[Right]) -> None:
         self._stated = split_actions(rights)
-        names: dict[_Place, list[str]] = defaultdict(list)
+        names: dict[_EnclaveRight, list[str]] = defaultdict(list)
         for enclave, qualifier, right, name in sorted(self._stated):
             names[enclave, qualifier, right].append(name)
         limit = ComparisonLimit()
@@ -231,14 +231,14 @@ class Rules:
 
     def overlaps(self, right: Right) -> bool:
         """Return whether a right of the set has a name in common with ``right``."""
-        return any(self._names_at(part).overlaps(part.name) for part in parts(right))
+        return any(self._names_of(part).overlaps(part.name) for part in parts(right))
 
     def overlapping(self, right: Right) -> tuple[Right, ...]:
         """Return the rights of the set that have a name in common with ``right``."""
         return tuple(
             Right(*part[:3], name)
             for part in parts(right)
-            for name in self._names_at(part).overlapping(part.name)
+            for name in self._names_of(part).overlapping(part.name)
         )
 
     def allow(self, enclave: str, right: str, name: str) -> bool:
@@ -252,18 +252,18 @@ class Rules:
                 return False
         return True
 
-    def _names_at(self, part: Right) -> Names:
+    def _names_of(self, part: Right) -> Names:
         return self._names.get(part[:3], _NO_NAMES)
 
     def _covering_right(self, part: Right) -> Right | None:
         if part in self._stated:
             return part
-        wide = next(self._names_at(part).covering(part.name), None)
+        wide = next(self._names_of(part).covering(part.name), None)
         return Right(*part[:3], wide) if wide else None
 
 
 _NO_NAMES = Names(())
-_Place = tuple[str, Qualifier, str]
+_EnclaveRight = tuple[str, Qualifier, str]
 
 
 class RightsDifference(NamedTuple):
@@ -443,7 +443,7 @@ def nodes_of_rights(rights: Iterable[Right]) -> tuple[NodeName, ...]:
 
 
 def denied_nodes(rights: Iterable[Right]) -> tuple[NodeName, ...]:
-    """Return the nodes whose standard services some rules allow, and other rules all deny.
+    """Return the nodes whose standard services are allowed by rules, and all denied by others.
 
     Nodes that may offer any of their standard services are left out.  If a denial matches some of
     the nodes that a wildcard allows, the result has all nodes that the denial matches.

@@ -180,8 +180,10 @@ class Process:
 
     @property
     def rmw(self) -> str:
-        """The mapped RMW that sros does not know, the RMW of the mapped middleware, or else the RMW
-        that the process names.
+        """The RMW of the process.
+
+        A mapped RMW that sros does not know comes first, then the RMW of the mapped middleware,
+        then the RMW that the process names.
         """
         named = self.environment.get(RMW, "")
         for library in sorted(self.libraries):
@@ -217,8 +219,8 @@ class Process:
     def is_without_rcl(self) -> bool:
         """Whether the process uses DDS without rcl, which reads the variables of security.
 
-        The nodes of the demo read these variables themselves.  Only what Python itself runs counts
-        as one, not an argument of another program.
+        The nodes of the demo read these variables themselves, so the result is False for them.  A
+        process counts as such a node only if Python itself runs the node's module.
         """
         flags = list(takewhile(lambda word: word.startswith("-"), self.command[1:]))
         module = "".join(self.command[len(flags) + 1 : len(flags) + 2])
@@ -287,13 +289,14 @@ _DDS_NAMES = frozenset(library for library, rmw in _RMW_OF.items() if rmw != "rm
 class UnseenProcess(NamedTuple):
     """A process that could not be examined; ``why`` is a clause.
 
-    ``speaks`` is true if the command shows that the process uses ROS 2; false means unknown.
+    ``uses_ros`` is true if the command shows that the process uses ROS 2 or Zenoh; false means
+    unknown.
     """
 
     pid: int
     command: tuple[str, ...]
     why: str
-    speaks: bool
+    uses_ros: bool
 
     @property
     def label(self) -> str:
@@ -396,7 +399,7 @@ class ProcessTable:
                     if looked.process:
                         processes.append(self._with_files(looked.process, folder))
             except PermissionError:
-                closed.append(UnseenProcess(pid, (), "/proc hides it", speaks=False))
+                closed.append(UnseenProcess(pid, (), "/proc hides it", uses_ros=False))
             except OSError:  # it has ended
                 continue
         waiting = self._waiting_processes(processes)
@@ -429,9 +432,9 @@ class ProcessTable:
     ) -> _ProcessData | None:
         """Return the data of a process; None if it has ended or runs no program.
 
-        ``begin`` is the moment when the machine started, from which the kernel counts the start
-        times of processes; ``longest_advance`` returns the time by which the clock was set forward
-        since then.
+        ``before`` is the data from the last look, if any.  ``begin`` is the moment when the machine
+        started, from which the kernel counts the start times of processes; ``longest_advance``
+        returns the time by which the clock was set forward since then.
         """
         for _ in range(_MOST_TRIES):
             stat = _stat(folder)
@@ -553,7 +556,7 @@ def _with_versions(
 
 
 def _with_version(library: MappedLibrary, root: ProcessRoot) -> MappedLibrary:
-    """Return a library with the version in the name of its only copy: wheels have no links."""
+    """Return a library with the version in the name of its only copy, as in Python wheels."""
     versions = {_version(name) for name in root.copies(library.path)} - {""}
     return library._replace(version=versions.pop()) if len(versions) == 1 else library
 
@@ -728,7 +731,8 @@ def process_origin(pid: int, proc: Path = Path("/proc")) -> ProcessOrigin:
 def _runs_launch(folder: int, pid: int, command: Sequence[str], child: Sequence[str]) -> bool:
     """Return whether a Python program runs a launch description, by ``launch.LaunchService``.
 
-    A child process that launch_ros started shows it: ``child``, or a child of the main thread.
+    The command of a child process shows this if it names temporary files of launch_ros.  ``child``
+    is the command of one child process; the child processes of the main thread are looked up.
     """
     is_python = Path(command[0]).name.startswith("python")
     if not is_python or without_launch_files(command) != tuple(command):

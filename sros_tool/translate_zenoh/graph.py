@@ -412,8 +412,8 @@ def example_token(
                 f"{begin}zid/0/0",
                 _NODE,
                 _token_form(enclave),
-                _wildcard_like(name, ns),
-                _wildcard_like(name, node),
+                _example_chunk(name, ns),
+                _example_chunk(name, node),
             )
         )
         for name in ("node", *ascii_lowercase)
@@ -422,7 +422,7 @@ def example_token(
     return next(filter(passes, tokens), tokens[0])
 
 
-def _wildcard_like(name: str, part: str) -> str:
+def _example_chunk(name: str, part: str) -> str:
     """Return an example for a chunk of a token's key expression.
 
     The example is ``name`` if the chunk ``part`` is only a wildcard; otherwise it is the chunk

@@ -896,7 +896,7 @@ def _topic_keys(key: str) -> list[str]:
 # ── as a policy ────────────────────────────────────────────────────────────────────────────
 
 
-def enclave_of(rights: RightsOfSubject) -> tuple[str, ...]:
+def enclaves_of_subject(rights: RightsOfSubject) -> tuple[str, ...]:
     """Return the enclaves for which a subject stands, or ().
 
     If a session limits itself, the id of its subject is the enclave's name: zenoh_security_tools
@@ -921,7 +921,7 @@ def policy_of(subjects: Iterable[RightsOfSubject]) -> Policy:
     """
     rights: dict[str, set[Right]] = {}
     for subject in subjects:
-        for enclave in enclave_of(subject):
+        for enclave in enclaves_of_subject(subject):
             rights.setdefault(enclave, set()).update(
                 Right(enclave, ALLOW, stated.right, stated.name) for stated in subject.rights
             )

@@ -129,7 +129,7 @@ class AccessControl:
         return bool(rules) and all(rules)
 
     def passing(self, common_name: str, flow: Flow, message: Message) -> KeyExpressions:
-        """Return the key expressions of the rules that allow a message, to search many keys."""
+        """Return the key expressions of the rules that allow a message, with a fast search."""
         return self._expressions(common_name, flow, message, allows=True)
 
     def denied(self, common_name: str, flow: Flow, message: Message) -> KeyExpressions:
@@ -316,8 +316,8 @@ class RightsBetween:
         self._mirrored: dict[str, list[_RuleOfPeer]] = {}
         for peer in rights:
             name = peer.common_name
-            self._rules[name] = _RuleOfPeer.rights_for_others(peer)
-            self._mirrored[name] = _RuleOfPeer.rights_for_others(peer.mirrored(name))
+            self._rules[name] = _RuleOfPeer.of_rights(peer)
+            self._mirrored[name] = _RuleOfPeer.of_rights(peer.mirrored(name))
         self._plain = {
             name: frozenset().union(*(rule_of_peer.keys.plain for rule_of_peer in rules))
             for name, rules in self._rules.items()
@@ -335,24 +335,24 @@ class RightsBetween:
         for remote, theirs in self._rules.items():
             shared: dict[_RuleKind, tuple[str, ...]] = {}
             are_apart = self._plain[own_name].isdisjoint(self._plain[remote])
-            for place, _, keys in theirs:
-                if place not in meeting:
-                    meeting[place] = [
+            for kind, _, keys in theirs:
+                if kind not in meeting:
+                    meeting[kind] = [
                         (messages, rule_of_peer.keys)
                         for rule_of_peer in mine
-                        if (messages := _shared_messages(place, rule_of_peer.place))
+                        if (messages := _shared_messages(kind, rule_of_peer.kind))
                     ]
-                for messages, other_keys in meeting[place]:
+                for messages, other_keys in meeting[kind]:
                     if are_apart and keys.is_plain and other_keys.is_plain:
                         continue
                     if common_keys := keys.common(other_keys):
-                        common = (place[0], messages, True)
+                        common = (kind[0], messages, True)
                         shared[common] = _added_keys(shared.get(common, ()), common_keys)
-            for place, rule, _ in (
+            for kind, rule, _ in (
                 *(rule_of_peer for rule_of_peer in theirs if not rule_of_peer.rule.allows),
                 *denied,
             ):
-                shared[place] = _added_keys(shared.get(place, ()), rule.key_expressions)
+                shared[kind] = _added_keys(shared.get(kind, ()), rule.key_expressions)
             rules = (
                 AccessRule(flow, messages, keys, allows)
                 for (flow, messages, allows), keys in shared.items()
@@ -365,12 +365,12 @@ _RuleKind = tuple[Flow, tuple[Message, ...], bool]
 
 
 class _RuleOfPeer(NamedTuple):
-    place: _RuleKind
+    kind: _RuleKind
     rule: AccessRule
     keys: RuleKeys
 
     @classmethod
-    def rights_for_others(cls, rights: RemoteRights) -> list[_RuleOfPeer]:
+    def of_rights(cls, rights: RemoteRights) -> list[_RuleOfPeer]:
         return [
             cls((rule.flow, rule.messages, rule.allows), rule, rights.keys_of(rule))
             for rule in rights.rules

@@ -97,17 +97,20 @@ If a route has only a session and its router, only the rights of the session's e
 
 
 def route(
-    source: ZenohProcess, target: ZenohProcess, router: ZenohProcess, to: ZenohProcess | None = None
+    source: ZenohProcess,
+    target: ZenohProcess,
+    router: ZenohProcess,
+    target_router: ZenohProcess | None = None,
 ) -> Route:
     """Return the route from ``source`` to ``target``.
 
     Peers send directly to each other. Messages from or to a client pass through ``router`` and
-    then, if the target has another router, through ``to``.
+    then, if the target has another router, through ``target_router``.
     """
     if source.mode is Mode.PEER and target.mode is Mode.PEER:
         return source, target
-    if to and to.name != router.name:
-        return source, router, to, target
+    if target_router and target_router.name != router.name:
+        return source, router, target_router, target
     return source, router, target
 
 

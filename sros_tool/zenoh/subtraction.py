@@ -286,7 +286,7 @@ def _first_chunks(expression: Chunks) -> Iterator[tuple[str, Chunks]]:
 
 @lru_cache(maxsize=_CACHE_SIZE)
 def _kinds(first: str, first_chunks: tuple[str, ...]) -> Mapping[frozenset[str], Chunks]:
-    """Map the kinds of chunks that ``first`` matches to expressions for the chunks of this kind.
+    """Map each kind of chunks that ``first`` matches to expressions for the chunks of the kind.
 
     The kind of a chunk is the set of matching chunks in ``first_chunks``.
     """

@@ -136,7 +136,7 @@ class Robot:
         started = self.started
         if self.systemctl and self.starting:
             self.starting, started = self.starting - 1, {}
-        unseen = (UnseenProcess(9, ("x",), "it is closed", speaks=False),) if self.unseen else ()
+        unseen = (UnseenProcess(9, ("x",), "it is closed", uses_ros=False),) if self.unseen else ()
         return RunningProcesses(tuple(map(self.process, started)), unseen)
 
     def process(self, name: str) -> Process:

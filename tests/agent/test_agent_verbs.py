@@ -147,7 +147,7 @@ def test_renewal_without_anybody_at_the_robot(world: World) -> None:
 
 def test_what_is_said_restarted_has_no_files_of_the_same_round(world: World) -> None:
     """They came after the restart, so that its processes have the files of before."""
-    unseen = RunningProcesses((), (UnseenProcess(9, ("x",), "it is closed", speaks=False),))
+    unseen = RunningProcesses((), (UnseenProcess(9, ("x",), "it is closed", uses_ros=False),))
     world.monkeypatch.setattr(ProcessTable, "look", lambda *_: unseen)
     world.run(*INIT).ok()
     world.agent("--restarted").ok()

@@ -206,7 +206,7 @@ def _from_an_older_copy(state: RuntimeState, bench: Bench) -> RuntimeState:
 
 
 def _unseen(state: RuntimeState, _: Bench) -> RuntimeState:
-    unseen = UnseenProcess(9, ("/sbin/init",), "Permission denied", speaks=False)
+    unseen = UnseenProcess(9, ("/sbin/init",), "Permission denied", uses_ros=False)
     return replace(state, running=RunningProcesses(unseen=(unseen,)))
 
 

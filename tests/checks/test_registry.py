@@ -227,7 +227,7 @@ def test_the_runtime_and_the_keystore_it_names(
 def test_what_could_not_be_looked_at_is_neither_nothing_nor_a_finding(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    unseen = UnseenProcess(9, ("talker", "--ros-args"), "Permission denied", speaks=True)
+    unseen = UnseenProcess(9, ("talker", "--ros-args"), "Permission denied", uses_ros=True)
     monkeypatch.setattr(ProcessTable, "look", lambda *_: RunningProcesses(unseen=(unseen,)))
     ended = sros("check", "runtime")
     assert ended.status == 2

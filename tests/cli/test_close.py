@@ -645,9 +645,9 @@ def test_what_systemd_does_not_start_is_done_by_hand(
     secured = f"process 4711 (run) runs secured with the files of '{robot.folder}/copy', not of"
     assert secured in undone.out
     robot.more = ()
-    robot.unseen = (UnseenProcess(9, ("talker", "--ros-args"), "/proc hides it", speaks=True),)
+    robot.unseen = (UnseenProcess(9, ("talker", "--ros-args"), "/proc hides it", uses_ros=True),)
     assert "process 9 (talker) speaks ROS 2, and ca" in robot.close("--undo", status=1).out
-    robot.unseen, robot.named = (UnseenProcess(9, (), "/proc hides it", speaks=False),), True
+    robot.unseen, robot.named = (UnseenProcess(9, (), "/proc hides it", uses_ros=False),), True
     robot.more = (replace(robot.process("/listener", is_secured=False), pid=12),)
     robot.absent = {"/listener", "/talker"}
     policy = robot.folder / "robot/policy.xml"
@@ -772,7 +772,7 @@ def test_a_node_that_does_not_run_always(robot: Robot) -> None:
         in ended.out
     )
     assert "the robot is closed, without a process of /listener\n  the files are" in ended.err
-    robot.unseen = (UnseenProcess(9, (), "/proc hides it", speaks=False),)
+    robot.unseen = (UnseenProcess(9, (), "/proc hides it", uses_ros=False),)
     ended = robot.close(*without, "--partial")
     assert "; not counted: /listener (not seen)\n" in ended.out
     robot.unseen = ()
@@ -977,8 +977,8 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     assert "accept with --partial" not in ended.err
     robot.remaining = (TALKER, LISTENER)
     robot.unseen = (
-        UnseenProcess(9, (), "/proc hides it", speaks=False),
-        UnseenProcess(10, ("init",), "Permission denied", speaks=False),
+        UnseenProcess(9, (), "/proc hides it", uses_ros=False),
+        UnseenProcess(10, ("init",), "Permission denied", uses_ros=False),
     )
     policy = robot.folder / "robot/policy.xml"
     policy.write_text(policy.read_text().replace("chatter", "old/chatter", 1))

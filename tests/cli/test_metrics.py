@@ -80,7 +80,7 @@ def test_the_running_processes_are_counted(keystore: Path, monkeypatch: pytest.M
     asks = {"ROS_SECURITY_ENABLE": "true", "ROS_SECURITY_STRATEGY": "Enforce"}
     other = Process(9, ("gateway",), asks, datetime.now(UTC), frozenset({"libddsc"}))
     unknown = replace(other, libraries=frozenset({"librcl", "librmw_email_cpp", "libfastdds"}))
-    unseen = UnseenProcess(8, ("init",), "Permission denied", speaks=False)
+    unseen = UnseenProcess(8, ("init",), "Permission denied", uses_ros=False)
     running = RunningProcesses((process, other, unknown), (unseen,))
     monkeypatch.setattr(ProcessTable, "look", lambda *_: running)
     found = read(sros("metrics", keystore, "--runtime").ok().out)

@@ -50,7 +50,7 @@ def test_a_command_is_written_so_that_it_controls_no_terminal() -> None:
 def test_a_process_to_stop_is_named_by_the_id_that_it_has_now() -> None:
     talker = ClosedProcess("/talker", 7, ("talk", "a"), "/opt", 0, "", "program")
     again, other = process(8, "talk", "a"), process(7, "talk", "b")
-    unseen = UnseenProcess(7, (), "another user's", speaks=False)
+    unseen = UnseenProcess(7, (), "another user's", uses_ros=False)
     for processes, pid in (
         (RunningProcesses((process(7, "talk", "a"), again)), 7),
         (RunningProcesses((other, again)), 8),

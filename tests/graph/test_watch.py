@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from sros_tool.graph.observation import Endpoint, Observation, make_observation
-from sros_tool.graph.observe import Readings, Settling, look_for, settle, watch
+from sros_tool.graph.observe import Readings, Settling, observe_for, settle, watch
 from tests.graph.graphs import graph, node
 
 ONE = graph(node("/a", "publish x"))
@@ -47,7 +47,7 @@ class Script:
         began, ended = (self.begin + each for each in self.reading)
         during = began < self.now < ended
         if not during or self.readings.last < began:
-            self.readings = self.readings.and_one(began if during else self.now)
+            self.readings = self.readings.with_next(began if during else self.now)
 
 
 def test_a_still_graph_takes_the_least_time() -> None:
@@ -88,7 +88,7 @@ def test_a_graph_that_nobody_read_in_time_has_not_settled() -> None:
     """Others can make a graph so large that a reading lasts longer than the observation."""
     for reading, is_settled in (((0.5, 4.5), True), ((0.5, 99.0), False), ((3.0, 9.0), False)):
         observed = [
-            look_for((script := Script([(0.1, ONE)], reading=reading)), 12.0, script.clock),
+            observe_for((script := Script([(0.1, ONE)], reading=reading)), 12.0, script.clock),
             watch(
                 (script := Script([(0.1, ONE)], reading=reading)),
                 12.0,
@@ -106,7 +106,7 @@ def test_a_graph_that_nobody_read_in_time_has_not_settled() -> None:
 
 def test_a_given_time_is_kept() -> None:
     script = Script([(0.1, ONE), (4.0, TWO)])
-    assert look_for(script, 3.0, script.clock).observation == ONE
+    assert observe_for(script, 3.0, script.clock).observation == ONE
     assert abs(script.now - 103.0) < 0.01
 
 

@@ -9,7 +9,7 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec
 
-from sros_tool.pki.certificates import CertificateForm, common_name, holds_at, pem, read_form
+from sros_tool.pki.certificates import CertificateForm, common_name, is_valid_at, pem, read_form
 
 NOW = datetime(2026, 3, 1, tzinfo=UTC)
 LATER = NOW + timedelta(days=30)
@@ -82,20 +82,20 @@ def test_what_vendors_judge_makes_another_form(other: bytes) -> None:
 def test_serial_and_dates_are_those_of_the_certificate() -> None:
     read = form(certificate(serial=77))
     assert read.serial == 77
-    assert holds_at(read, NOW)
-    assert holds_at(read, LATER)
-    assert holds_at(read, NOW - timedelta(seconds=1)) is False
-    assert holds_at(read, LATER + timedelta(seconds=1)) is False
+    assert is_valid_at(read, NOW)
+    assert is_valid_at(read, LATER)
+    assert is_valid_at(read, NOW - timedelta(seconds=1)) is False
+    assert is_valid_at(read, LATER + timedelta(seconds=1)) is False
 
 
 def test_dates_after_2049_are_read() -> None:
     read = form(certificate(end=datetime(2060, 1, 1, tzinfo=UTC)))
-    assert holds_at(read, datetime(2059, 12, 31, tzinfo=UTC))
-    assert holds_at(read, datetime(2060, 1, 2, tzinfo=UTC)) is False
+    assert is_valid_at(read, datetime(2059, 12, 31, tzinfo=UTC))
+    assert is_valid_at(read, datetime(2060, 1, 2, tzinfo=UTC)) is False
 
 
 def test_dates_that_cannot_be_read_are_unknown() -> None:
-    assert holds_at(form(certificate())._replace(validity=b"\x17\x01x\x17\x01x"), NOW) is None
+    assert is_valid_at(form(certificate())._replace(validity=b"\x17\x01x\x17\x01x"), NOW) is None
 
 
 @pytest.mark.parametrize(
@@ -109,4 +109,4 @@ def test_unusual_files_have_no_form(data: bytes) -> None:
 
 def test_two_digits_of_a_year_from_50_are_of_the_last_century() -> None:
     period = b"\x17\x0d500101000000Z\x17\x0d490101000000Z"  # 1950 to 2049 (RFC 5280, 4.1.2.5.1)
-    assert holds_at(form(certificate())._replace(validity=period), NOW)
+    assert is_valid_at(form(certificate())._replace(validity=period), NOW)

@@ -233,7 +233,7 @@ def test_endless_texts_are_not_looked_at_and_named(proc: Proc) -> None:
     with (folder / "environ").open("wb") as file:
         file.truncate(5 * 1024**2)
     (unseen,) = proc.look().unseen
-    assert unseen.speaks
+    assert unseen.uses_ros
     assert unseen.why == "/proc/PID/environ is longer than 4 MiB"
 
 

@@ -54,8 +54,8 @@ from sros_tool.keystore.transaction import Transaction
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import (
     enclave_subject,
-    holds_at,
     is_self_issued,
+    is_valid_at,
     issued_by,
     load_certificates,
     pem,
@@ -571,7 +571,7 @@ def _certificate_kind(
     form = read_form(data)
     if form is None:
         return (data,)
-    return (form.common, holds_at(form, now), form.serial in listed_serials)
+    return (form.common, is_valid_at(form, now), form.serial in listed_serials)
 
 
 def _listed_serials(crl: bytes) -> frozenset[int]:
