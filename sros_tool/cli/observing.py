@@ -487,7 +487,7 @@ def generate_policy(
     if not learned.profiles:
         if as_json:
             value = _learned_json(None, file, learned, seen.observation, dry_run)
-            print_json(value._replace(settled=snapshot.settled))
+            print_json(value._replace(settled=snapshot.settled and not snapshot.grew))
         echo(_NO_NODES, err=True)
         print_notes(learned.notes)
         echo(why_no_node_was_observed(environment, snapshot.seconds, rmw, enclave), err=True)
@@ -500,7 +500,7 @@ def generate_policy(
             _learned_json(plan, file, learned, seen.observation, dry_run)._replace(
                 ended=ended,
                 intermittent=sorted(snapshot.intermittent),
-                settled=snapshot.settled,
+                settled=snapshot.settled and not snapshot.grew,
             )
         )
     else:
@@ -514,6 +514,12 @@ def generate_policy(
         echo(
             f"the ROS graph kept changing for {snapshot.seconds:.0f} s, or could not be read in "
             "time, so nodes may be missing; --watch collects nodes that come and go.",
+            err=True,
+        )
+    elif snapshot.grew:
+        echo(
+            "new nodes or endpoints still appeared when the watch ended, so others may be missing; "
+            "watch again for longer.",
             err=True,
         )
     return 0

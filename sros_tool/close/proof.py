@@ -555,10 +555,10 @@ def _remedy(robot: LocalRobot, difference: str) -> str:
         "denied": "if a node needs this right, add the right to the node's profile in "
         f"{policy}, and {restart}; if you changed a name only in the policy, also start the node "
         "with the new name",
-        "gone": f"if the node uses another name now, replace the old name in {policy}, in the "
-        "profiles of the node and of the nodes that it talks to, and "
-        f"{restart}; if the node does not always use the name, ask again while it does; if not, "
-        f"start the node as before ({robot.commands_file})",
+        "not seen this time": "if the node does not always use the name, ask again while it does; "
+        f"if it uses another name now, replace the old name in {policy}, in the profiles of the "
+        "node and of the nodes that it talks to (this takes away the right to the old name), and "
+        f"{restart}; otherwise, start the node as before ({robot.commands_file})",
         "left alone": f"give both sides one name, in {policy} and in their programs, and {restart}",
         "refused": f"ask `sros check {shlex.quote(str(robot.export))}`",
     }
@@ -624,7 +624,9 @@ class _TalkComparison:
                 for node in unseen
                 if node["enclave"] not in ended
             ],
-            "gone": _endpoint_texts(self._lost_endpoints(present) - self._intermittent),
+            "not seen this time": _endpoint_texts(
+                self._lost_endpoints(present) - self._intermittent
+            ),
             "left alone": [
                 *_abandoned_names(before, expected, moved, self._denied),
                 *_endpoints_without_peer(

@@ -111,6 +111,12 @@ def watch(robot: LocalRobot, words: Sequence[str]) -> list[str]:
     _show_variables(running, observed)
     number = counted(len(observed.processes), "process", "processes")
     robot.shell.say(f"saw {nodes_text(nodes)}, and {number} of this machine")
+    if not learned["settled"]:
+        robot.shell.say(
+            f"nodes or endpoints may be missing in '{robot.policy}': the ROS graph still changed "
+            "at the end, or could not be read in time; when the whole robot runs, watch again: "
+            f"{robot.close_command} --for 5m"
+        )
     if others := running.in_other_domains():
         robot.shell.say(others)
     if os.path.lexists(robot.observed_policy):  # a file of an earlier watch

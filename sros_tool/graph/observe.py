@@ -277,7 +277,8 @@ class Snapshot:
 
     ``everything`` also has the nodes that left while the graph was observed.  ``settled`` says
     whether the graph had stopped changing, or was watched without a gap.  ``intermittent`` are
-    endpoints of the nodes in ``observation`` that a watch saw for a part of its time.
+    endpoints of the nodes in ``observation`` that a watch saw for a part of its time.  ``grew``
+    says whether a watch still found new nodes or endpoints in its last seconds.
     """
 
     observation: Observation
@@ -285,6 +286,7 @@ class Snapshot:
     seconds: float
     settled: bool
     intermittent: frozenset[IntermittentEndpoint] = frozenset()
+    grew: bool = False
 
     @property
     def gone(self) -> frozenset[str]:
@@ -373,7 +375,9 @@ def watch(
     stayed = {(node.fqn, node.participant) for node in seen.nodes}
     intermittent = frozenset(lost for lost in missed if (lost.node, lost.participant) in stayed)
     end = clock()
-    return Snapshot(seen, union, end - begin, source.readings.show_everything(end), intermittent)
+    grew = end - changed < Settling().still
+    is_complete = source.readings.show_everything(end)
+    return Snapshot(seen, union, end - begin, is_complete, intermittent, grew)
 
 
 def _missing_endpoints(before: Observation, now: Observation) -> Iterator[IntermittentEndpoint]:

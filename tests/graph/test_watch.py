@@ -138,6 +138,18 @@ def test_an_endpoint_that_goes_while_its_node_stays_is_intermittent() -> None:
         assert snapshot.intermittent == expected, changes
 
 
+def test_a_watch_says_whether_the_graph_still_grew_at_its_end() -> None:
+    for changes, grew in (
+        ([(0.1, ONE)], False),
+        ([(0.1, ONE), (7.0, TWO)], True),
+        ([(0.1, TWO), (7.0, ONE)], False),
+        ([(0.1, TWO), (4.0, ONE), (7.0, TWO)], False),
+    ):
+        script = Script(changes)
+        snapshot = watch(script, 9.0, script.clock, stop=lambda: False, report=lambda _: None)
+        assert (snapshot.grew, snapshot.settled) == (grew, True), changes
+
+
 def test_what_is_half_discovered_is_not_told_for_a_moment() -> None:
     half = graph(node("/a"))
     script = Script([(0.1, half), (0.3, ONE)])
