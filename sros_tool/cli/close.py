@@ -431,7 +431,7 @@ def _show_undone(robot: LocalRobot, closed: CloseState) -> None:
         return
     if closed.problems:
         ask = f"ask again with sros close {shlex.quote(str(robot.folder))} --undo"
-        echo(f"the robot is not open yet; next: restart these processes, and {ask}", err=True)
+        echo(f"the robot is not open yet; next: do what each line says, and {ask}", err=True)
     else:
         more = ""
         if other_machines := closed.observed.not_here:

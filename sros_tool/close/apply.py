@@ -221,12 +221,17 @@ class _RemainingProcesses:
             if process.enclave in self._secured or running.runs_open(process):
                 continue
             names, old_name = nodes.names_in(process.enclave)
-            under = f", under its old name {old_name}" if old_name else ""
+            named = node_argument(process.command)
+            has_old_name = old_name and (not named or expand("~", *named) == old_name)
+            under = f", under its old name {old_name}" if has_old_name else ""
             state, start = "does not run; ", "start it"
-            if labels := [
-                other.label for other in unknown if _may_be_process(other, process, names)
+            if similar := [
+                (len({*process.command}.intersection(other.program[1])), other.label)
+                for other in unknown
+                if _may_be_process(other, process, names)
             ]:
-                state = f"may run open by another command ({labels[0]}); if that is not so, "
+                _, label = max(similar)
+                state = f"may run open by another command ({label}); if that is not so, "
                 start = f"start {process.enclave}"
             command = process.open_command(self._robot.domain)
             self._robot.shell.say(f"{process.enclave} {state}{start} open{under}: {command}")
@@ -264,12 +269,16 @@ class _RemainingProcesses:
                 yield (
                     f"{process.label} runs secured with the files of "
                     f"'{keystore_text(enclave)}'{why}, "
-                    "not of this folder; open processes do not hear this process"
+                    "not of this folder, and open processes do not hear it: stop it, or restart it "
+                    "open"
                 )
         unseen_processes = running.processes.unseen
         for unseen in unseen_processes:
             if unseen.uses_ros:
-                yield f"{unseen.label} speaks ROS 2, and cannot be examined: {unseen.why}"
+                yield (
+                    f"{unseen.label} speaks ROS 2, and cannot be examined ({unseen.why}): if it "
+                    "runs secured, stop it, or restart it open"
+                )
         if running.processes.hidden or any(not unseen.uses_ros for unseen in unseen_processes):
             why = "some processes cannot be examined"
             by_root = running.processes.by_root

@@ -193,8 +193,18 @@ class RunningRobot:
             for secured in self.secured
             if secured.enclave.name != OBSERVER and not _is_tool(secured.process)
         ]
-        further = self.further_processes(secured, self.robot.processes)
-        return [f"{process.label} in {enclave.name}" for process, enclave in further]
+        observed = self.robot.processes
+        known = {process.enclave for process in observed.processes}
+        count = Counter(
+            name for name, _ in {(enclave.name, process.program[0]) for process, enclave in secured}
+        )
+        further = self.further_processes(secured, observed)
+        alone = " (by another command than the observed process)"
+        return [
+            f"{process.label} in {enclave.name}"
+            f"{alone * (count[enclave.name] == 1 and enclave.name in known)}"
+            for process, enclave in further
+        ]
 
     def further_processes(
         self, secured: Sequence[SecuredProcess], observed: ObservedProcesses
@@ -386,7 +396,8 @@ class CloseState(NamedTuple):
     """
     not_observed: Sequence[str]
     """Processes that run in enclaves of the robot but were not observed there, and further
-    processes with an observed command, as "process 123 (talker) in /talker"."""
+    processes with an observed command, as "process 123 (talker) in /talker". If such a process is
+    alone in the enclave of an observed process, the text adds that it runs by another command."""
     new: Sequence[str]
     """The enclaves of the policy for which no process was observed, and no process runs now."""
     absent: Sequence[str]

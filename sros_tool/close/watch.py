@@ -7,7 +7,7 @@ import os
 import re
 import shlex
 import threading
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 
 from sros_tool.close.assignment import (
@@ -104,8 +104,8 @@ def watch(robot: LocalRobot, words: Sequence[str]) -> list[str]:
     replace_file(robot.observer, (policies_dir() / "observer.xml").read_bytes())
     learned = json.loads(document)
     all_nodes = observation_from_json(learned).nodes
-    in_enclaves = ObservedNodes(robot, all_nodes).in_their_enclaves()
-    nodes = [node for node in in_enclaves if not is_tool(node)]
+    observed_nodes = ObservedNodes(robot, all_nodes)
+    nodes = [node for node in observed_nodes.in_their_enclaves() if not is_tool(node)]
     observed = _observed_processes(running, nodes, learned["ended"], started)
     _write_observation(robot, document, observed)
     _show_variables(running, observed)
@@ -123,7 +123,9 @@ def watch(robot: LocalRobot, words: Sequence[str]) -> list[str]:
         remove_file(robot.observed_policy)
     without_enclave = [node.fqn for node in all_nodes if not node.enclaves and not is_tool(node)]
     problems = [_text_on_nodes_without_enclave(robot, without_enclave)] if without_enclave else []
-    lacking = _lacking_text(robot, nodes) if learned["dry_run"] else ""
+    lacking = ""
+    if learned["dry_run"]:
+        lacking = _lacking_text(robot, nodes, observed_nodes.renamed)
     return problems + [lacking] * bool(lacking)
 
 
@@ -227,10 +229,13 @@ def _show_variables(running: RunningRobot, observed: ObservedProcesses) -> None:
         )
 
 
-def _lacking_text(robot: LocalRobot, nodes: Sequence[ObservedNode]) -> str:
+def _lacking_text(
+    robot: LocalRobot, nodes: Sequence[ObservedNode], renamed: Mapping[str, tuple[str, str]]
+) -> str:
     """Return a sentence on rights of nodes that the policy lacks; "" if the policy has all.
 
-    The rights that the nodes use are written into a separate policy file.
+    The rights that the nodes use are written into a separate policy file.  ``renamed`` are the
+    nodes that the policy has by another namespace and name.
     """
     from sros_tool.graph.learn import draft, learn, write  # only after another watch
 
@@ -241,15 +246,18 @@ def _lacking_text(robot: LocalRobot, nodes: Sequence[ObservedNode]) -> str:
         return ""
     write(draft(robot.observed_policy, learned, common))
     rights = [f"{right.enclave} {right.right} {right.name}" for right in lacking]
+    private = tuple(f"{name}/" for name in renamed)
+    others = [right for right in lacking if not right.name.startswith(private)]
     meanings = [
         *_lost_namespaces(nodes, policy),
-        *_likely_meanings(lacking, policy_rights(learned.policy()), policy_rights(policy)),
+        *_lost_names(renamed),
+        *_likely_meanings(others, policy_rights(learned.policy()), policy_rights(policy)),
     ]
     files = shlex.join((str(robot.policy), str(robot.observed_policy)))
     add = f"sros merge_policy {files} --in-place"
     restart = (
-        f"{first_few(meanings, MOST_NAMES)}; if the node lacks this remapping or namespace, "
-        f"restart the node with it, and watch again: {robot.close_command} --for 1m; otherwise, "
+        f"{first_few(meanings, MOST_NAMES)}; if the node's command is wrong, restart the node with "
+        f"the right one, and watch again: {robot.close_command} --for 1m; otherwise, "
         * bool(meanings)
     )
     return (
@@ -295,4 +303,14 @@ def _lost_namespaces(nodes: Sequence[ObservedNode], policy: Policy) -> Iterator[
             yield (
                 f"perhaps {node_name(node)} is {expand('~', lost[0], node.name)}, started without "
                 f"its namespace (-r __ns:={lost[0]})"
+            )
+
+
+def _lost_names(renamed: Mapping[str, tuple[str, str]]) -> Iterator[str]:
+    """Yield a clause for each node that the policy has only by another name."""
+    for old, (ns, name) in renamed.items():
+        if old.rpartition("/")[2] != name:
+            yield (
+                f"perhaps {old} is {expand('~', ns, name)}, started without its name "
+                f"(-r __node:={name})"
             )

@@ -515,13 +515,16 @@ class Examiner:
             is_meant = f"{' and '.join(names)}: perhaps that is meant"
             facts = [f"the enclave may {question.word} {is_meant}"]
             if is_used:
-                return facts, f"{remedy} Or, if the node lacks a remapping that its policy has{add}"
+                return facts, (
+                    f"{remedy} Or, if the node lacks a remapping that its policy has{add} If the "
+                    f"node has a remapping to {name} that its policy lacks, remove it."
+                )
             misspelled = ""
             if is_typing_error(name, meant):
                 misspelled = f"If the program misspells the name, write {meant} there. "
             return facts, (
                 f"{misspelled}If the node lacks a remapping{add} If the policy lacks a remapping "
-                f"that the node has, write {name} in place of {meant} in the policy, or merge the "
+                f"that the node has, remove it from the node, write {name} in place of {meant} in the policy, or merge the "
                 f"policy with `--remap {quote(meant)}:={quote(name)}`. Otherwise, {remedy}"
             )
         if is_used is False and self._keystore:

@@ -304,10 +304,16 @@ def test_a_policy_that_was_changed_stays_and_is_followed(robot: Robot) -> None:
     assert f"lacks 1 right seen now (/listener subscribe /chatter); {remapped}" in again.out
     assert "-r /chatter:=/old/chatter, or the policy may lack --remap /old/chatter:=" in again.out
     assert (
-        "; if the node lacks this remapping or namespace, restart the node with it, and watch "
-        "again: sros close robot --for 1m;" in again.out
+        "; if the node's command is wrong, restart the node with the right one, and watch again: "
+        "sros close robot --for 1m;" in again.out
     )
     assert " otherwise, if a process should not have these rights, stop the process, " in again.out
+    policy.write_text(changed.replace('node="listener"', 'node="hearer"'))
+    renamed = robot.close("--for", "1s", status=1).out
+    assert "; perhaps /listener is /hearer, started without its name (-r __node:=hearer)" in renamed
+    assert "/listener/get_parameters:=" not in renamed
+    policy.write_text(changed)
+    robot.close("--for", "1s", status=1)
     add = "sros merge_policy robot/policy.xml robot/seen.xml --in-place"
     assert f"; if it needs them: {add}\n" in again.out
     sros(*add.split()[1:], cwd=robot.folder).ok()
@@ -634,7 +640,7 @@ def test_what_systemd_does_not_start_is_done_by_hand(
     undone = robot.close("--undo", status=1)
     assert would.out == undone.out and not would.err
     assert undone.err == (
-        "the robot is not open yet; next: restart these processes, and ask again with sros close "
+        "the robot is not open yet; next: do what each line says, and ask again with sros close "
         "robot --undo\n"
     )
     robot.by_hand = set()
@@ -644,12 +650,14 @@ def test_what_systemd_does_not_start_is_done_by_hand(
     robot.more = (robot.process("/talker", is_secured=True),)
     undone = robot.close("--undo", status=1)
     secured = f"process 4711 (run) runs secured with the files of '{robot.folder}/copy', not of"
-    assert secured in undone.out
+    assert f"{secured} this folder, and open processes do not hear it: stop it, or " in undone.out
     robot.more = ()
     robot.unseen = (UnseenProcess(9, ("talker", "--ros-args"), "/proc hides it", uses_ros=True),)
     assert "process 9 (talker) speaks ROS 2, and ca" in robot.close("--undo", status=1).out
     robot.unseen, robot.named = (UnseenProcess(9, (), "/proc hides it", uses_ros=False),), True
     robot.more = (replace(robot.process("/listener", is_secured=False), pid=12),)
+    other_run = ("/other/run", *robot.more[0].command[2:])
+    robot.more = (replace(robot.more[0], pid=11, command=other_run), *robot.more)
     robot.absent = {"/listener", "/talker"}
     policy = robot.folder / "robot/policy.xml"
     policy.write_text(policy.read_text().replace('node="listener"', 'node="hearer"'))
@@ -659,6 +667,12 @@ def test_what_systemd_does_not_start_is_done_by_hand(
         "start /listener open, under its old name /listener: cd /opt && /opt/run listener\n"
         "/talker does not run; start it open: cd /opt "
     )
+    processes = robot.folder / "robot/processes.json"
+    known = json.loads(processes.read_text())
+    (listener,) = (each for each in known["processes"] if each["enclave"] == "/listener")
+    listener["command"] += ["--ros-args", "-r", "__node:=hearer"]
+    processes.write_text(json.dumps(known))
+    assert "/listener open: cd /opt && /opt/run listener --ro" in robot.close("--undo").err
     assert "\nsome processes cannot be examined: run this command as root\n" in undone.err
     assert "the robot is open: " in undone.err
     looked = replace(robot.look(None, datetime.now(UTC)), by_root=True)
@@ -873,6 +887,11 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
         replace(talker, pid=pid, command=command, started=talker.started + timedelta(pid))
         for pid, command in ((6, ("/tmp/thief",)), (7, talker.command), (8, ("ros2", "topic")))
     )
+    robot.absent, others = {"/talker"}, robot.more
+    robot.more = (replace(talker, command=("/opt/b",)),)
+    by_other = "see process 4711 (b) in /talker (by another command than the observed process) when"
+    assert f"there: sros did not {by_other}" in robot.close("--proof", status=1).out
+    robot.absent, robot.more = set(), others
     more = "sros did not see process 6 (thief) in /talker, process 7 (run) in /talker when it wat"
     more = f"every process in an enclave belongs there: {more}"
     guest = "in domain 0; process 5 (guest) runs open in domain 7\n"
@@ -1269,7 +1288,7 @@ def test_a_node_that_was_restarted_without_its_namespace(robot: Robot) -> None:
     robot.nodes = (TALKER, LISTENER)
     said = robot.close("--for", "1s", status=1).out
     hint = "perhaps /listener is /left/listener, started without its namespace (-r __ns:=/left)"
-    assert f"; {hint}; if the node lacks this remapping or namespace, restart the node" in said
+    assert f"; {hint}; if the node's command is wrong, restart the node with the right " in said
     robot.nodes = (TALKER, left, ros_node("listener", "010f0000071200000000"))
     assert "without its namespace" not in robot.close("--for", "1s", status=1).out
 

@@ -88,7 +88,7 @@ def lacks(used: str, allowed: str) -> str:
     node = f"the node may lack the remapping -r {used}:={allowed}"
     return (
         f"; perhaps the policy means {allowed} ({node}, or the policy may lack "
-        f"--remap {allowed}:={used})"
+        f"--remap {allowed}:={used}, or the node has a remapping to {used} that is to be removed)"
     )
 
 
