@@ -505,8 +505,8 @@ class Examiner:
         rule = Remapping("", name, meant)
         add, renamed = f", add `--ros-args -r {quote(str(rule))}`.", ""
         new_name = (
-            f" If the node is started with `-r OLD:={quote(name)}`, its policy needs the same "
-            f"remapping: `sros merge_policy POLICY OTHER --remap OLD:={quote(name)}`."
+            f" If the node is started with `-r OLD:={quote(name)}`, remove this remapping, or give "
+            f"it to the policy: `sros merge_policy POLICY OTHER --remap OLD:={quote(name)}`."
         )
         if question.type == "action" and not is_used:
             add = f": {renamed_action_text(rule)}"
@@ -524,8 +524,9 @@ class Examiner:
                 misspelled = f"If the program misspells the name, write {meant} there. "
             return facts, (
                 f"{misspelled}If the node lacks a remapping{add} If the policy lacks a remapping "
-                f"that the node has, remove it from the node, write {name} in place of {meant} in the policy, or merge the "
-                f"policy with `--remap {quote(meant)}:={quote(name)}`. Otherwise, {remedy}"
+                f"that the node has, remove it from the node, write {name} in place of {meant} in "
+                f"the policy, or merge the policy with `--remap {quote(meant)}:={quote(name)}`. "
+                f"Otherwise, {remedy}"
             )
         if is_used is False and self._keystore:
             place = self._keystore.place

@@ -1406,7 +1406,7 @@ def test_the_other_side_of_a_name_tells_whether_a_remapping_may_be_forgotten(
     rear = "Or, if the node lacks a remapping that its policy has, add `--ros-args -r /rear/image:="
     for topic, facts in (
         ("/rear/image", (rear, "has a remapping to /rear/image that its policy lacks, remove it")),
-        ("/map_a", ("If the node is started with `-r OLD:=/map_a`, its policy needs the same",)),
+        ("/map_a", ("If the node is started with `-r OLD:=/map_a`, remove this remapping, or",)),
         ("/frnt/image", ("-r /frnt/image:=/front/image",)),
         (
             "/odometry",
