@@ -576,7 +576,7 @@ def test_what_systemd_does_not_start_is_done_by_hand(
     idle = "  to prove it without a process of /listener: sros close robot --proof --without /lis"
     assert f"and then sros close robot --proof\n{idle}tener\n" in ended.err
     robot.absent = set()
-    assert "start it with" in (said := robot.close("--apply", status=1).out)
+    assert "start again with" in (said := robot.close("--apply", status=1).out)
     assert "process 4712" in said and "process 4711" not in said
     robot.by_hand, robot.named = {"/talker", "/listener"}, True
     ended = robot.close()
