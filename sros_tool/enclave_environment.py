@@ -625,8 +625,8 @@ def container_text(
         form: one of `sros_tool.runtime.environment.CONTAINER_FORMS`.
         target: the keystore in the container and, for Compose, on the machine that runs it.
         variables: the environment of the enclave there.
-        name: the name of the service or object; "" stands for a name made from the enclave's, which
-            no other enclave gets.
+        name: the name of the service or object; "" stands for a name made from the enclave's name,
+            which no other enclave gets.
         image: the image, or "".
         now: the current time.
 

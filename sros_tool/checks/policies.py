@@ -737,7 +737,7 @@ _NAME_NODES_REMEDY = "Name the {} of this enclave in place of the wildcard."
 
 @dataclass(slots=True)
 class _NodeLackingRight:
-    """A finding about a node without a right that every node needs.
+    """A node without a right that every node needs, with the finding about it.
 
     ``included`` is the folder of the common parts that the node's profile includes, or "".
     """

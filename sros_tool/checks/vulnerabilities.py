@@ -95,12 +95,12 @@ def vulnerability_findings(
 def robot_findings(
     robots: Mapping[str, RobotDds | None],
     advisories: Sequence[Advisory] | None = None,
-    names: Callable[[Sequence[str]], str] = names_text,
+    names_as_text: Callable[[Sequence[str]], str] = names_text,
 ) -> Iterator[Finding]:
     """Yield a finding for each DDS library of robots, and one on robots whose DDS is not known.
 
-    ``robots`` maps names of robots to the DDS that they reported, or to None.  ``names`` returns
-    names of robots as a text.
+    ``robots`` maps names of robots to the DDS that they reported, or to None.  ``names_as_text``
+    returns names of robots as a text.
     """
     seen: dict[MappedLibrary, dict[Seen, list[str]]] = {}
     lacking: dict[str, list[str]] = {}
@@ -116,12 +116,12 @@ def robot_findings(
         if dds.unseen:
             lacking.setdefault(_UNSEEN_TEXT, []).append(robot)
     by = {
-        library: [f"{_SEEN_TEXTS[how]} {names(where[how])}" for how in Seen if how in where]
+        library: [f"{_SEEN_TEXTS[how]} {names_as_text(where[how])}" for how in Seen if how in where]
         for library, where in seen.items()
     }
     yield from _library_findings(by, advisories)
     if lacking:
-        parts = (template.format(names(robots)) for template, robots in lacking.items())
+        parts = (template.format(names_as_text(robots)) for template, robots in lacking.items())
         remedy = _UNSEEN_REMEDY if lacking.keys() == {_UNSEEN_TEXT} else ""
         yield ROBOTS_UNKNOWN.found("DDS of robots", "; ".join(parts), remedy=remedy)
 

@@ -29,7 +29,10 @@ _CLOSED_SHOWN = 3
 
 
 def json_form(result: Changed, form: str, **more: object) -> tuple[object, ...]:
-    """Convert a change to the ``--json`` class with the name ``form`` in `lifecycle.shown`."""
+    """Convert a change to the ``--json`` class with the name ``form`` in `lifecycle.shown`.
+
+    ``more`` are fields that the change does not have.
+    """
     from sros_tool.keystore.lifecycle import shown
 
     return shown.shown(result, getattr(shown, form), **more)

@@ -281,17 +281,20 @@ def fleet_policies(
     return policies
 
 
-def enclave_filter_options(when: str = "Only") -> Callable[[Decorated], Decorated]:
-    """Add ``--match PATTERN`` and ``--robot NAME`` to a verb whose default is all enclaves."""
+def enclave_filter_options(help_begin: str = "Only") -> Callable[[Decorated], Decorated]:
+    """Add ``--match PATTERN`` and ``--robot NAME`` to a verb whose default is all enclaves.
+
+    ``help_begin`` begins the helps of both options, before "the enclaves ...".
+    """
 
     def add(function: Decorated) -> Decorated:
-        function = robot_option(f"{when} the enclaves of this robot of the fleet.")(function)
+        function = robot_option(f"{help_begin} the enclaves of this robot of the fleet.")(function)
         return click.option(
             "--match",
             "patterns",
             multiple=True,
             metavar="PATTERN",
-            help=f"{when} enclaves that match, such as '/arm/*'.  Can be repeated.",
+            help=f"{help_begin} enclaves that match, such as '/arm/*'.  Can be repeated.",
         )(function)
 
     return add

@@ -483,7 +483,7 @@ def generate_policy(
     seen = named(snapshot.observation if watch is None else snapshot.everything)
     stayed = {node.participant for node in snapshot.observation.nodes}
     ended = sorted({node.participant for node in seen.observation.nodes} - stayed)
-    learned = learn(seen.observation, None if flat else common).noting(seen.notes)
+    learned = learn(seen.observation, None if flat else common).with_notes(seen.notes)
     if not learned.profiles:
         if as_json:
             value = _learned_json(None, file, learned, seen.observation, dry_run)

@@ -126,7 +126,7 @@ class Learned:
     notes: tuple[Note, ...] = ()
     source: RightsOrigin = RightsOrigin.GRAPH
 
-    def noting(self, notes: Iterable[Note]) -> Learned:
+    def with_notes(self, notes: Iterable[Note]) -> Learned:
         """Return a copy with ``notes`` in front of the current notes."""
         return replace(self, notes=(*notes, *self.notes))
 
@@ -956,9 +956,9 @@ def _with_includes(
         if profile is None:
             continue
         if place in known:
-            text.insert(element.inner, _put_in_front(profile, element, text))
+            text.insert(element.inner, _includes_xml(profile, element, text))
         elif all(rules.allow(profile.enclave, right.right, right.name) for right in profile.rights):
-            text.insert(element.inner, _put_inside(profile, element, text), element.close)
+            text.insert(element.inner, _content_xml(profile, element, text), element.close)
         else:
             continue
         included.update(profile.includes)
@@ -1099,7 +1099,7 @@ def _profiles_of(path: Path, document: bytes) -> frozenset[tuple[str, str, str]]
     return frozenset(_profiles(EditedText(document, f"the policy file '{path}'")))
 
 
-def _put_in_front(profile: LearnedProfile, element: PlacedElement, text: EditedText) -> str:
+def _includes_xml(profile: LearnedProfile, element: PlacedElement, text: EditedText) -> str:
     """Return the XML of a profile's includes, to insert before the profile's content."""
     include = f"{_prefix(text) or 'xi'}:include"
     outer = text.indent_of(element)
@@ -1107,7 +1107,7 @@ def _put_in_front(profile: LearnedProfile, element: PlacedElement, text: EditedT
     return "".join(lead + line for line in _includes(profile, include))
 
 
-def _put_inside(profile: LearnedProfile, element: PlacedElement, text: EditedText) -> str:
+def _content_xml(profile: LearnedProfile, element: PlacedElement, text: EditedText) -> str:
     """Return the XML of a profile's content, indented like its neighbors."""
     include = f"{_prefix(text) or 'xi'}:include"
     outer = text.indent_of(element)

@@ -57,7 +57,7 @@ def configuration(variables: Mapping[str, str], *, router: bool = False) -> zeno
 
 
 class _TokenObserver:
-    """The live tokens of a domain."""
+    """An observer of the live tokens of a domain."""
 
     def __init__(self, session: zenoh.Session, domain: str) -> None:
         self._tokens: set[str] = set()

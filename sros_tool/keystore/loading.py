@@ -276,13 +276,13 @@ def _read_certificates(traits: VendorTraits, data: bytes, file: str) -> Certific
     ):
         return (load_certificate(data, file, trusted=False),)
     if file == CERTIFICATE_FILE:
-        return (load_certificate(data, file, settings=TrustSettingsUse.READ),)
+        return (load_certificate(data, file, settings_use=TrustSettingsUse.READ),)
     of_file = (
         TrustSettingsUse.OF_DOCUMENTS
         if file == PERMISSIONS_CA_FILE
         else TrustSettingsUse.OF_ANY_USE
     )
-    return load_certificates(data, file, settings=of_file)
+    return load_certificates(data, file, settings_use=of_file)
 
 
 def _signature_problems(

@@ -217,41 +217,41 @@ def load_certificate(
     name: str,
     *,
     trusted: bool = True,
-    settings: TrustSettingsUse = TrustSettingsUse.IGNORED,
+    settings_use: TrustSettingsUse = TrustSettingsUse.IGNORED,
 ) -> x509.Certificate:
     """Return the first certificate of a PEM file; ``name`` names the file in errors.
 
     Without ``trusted``, blocks ``TRUSTED CERTIFICATE`` are ignored, as Cyclone DDS does.
 
     Raises:
-        PkiError: sros or OpenSSL cannot read the certificate, or its trust ``settings`` forbid its
-            use.
+        PkiError: sros or OpenSSL cannot read the certificate, or its trust settings forbid its use
+            (``settings_use``).
     """
-    return _first_certificate(data, name, trusted, settings)
+    return _first_certificate(data, name, trusted, settings_use)
 
 
 @lru_cache(maxsize=16)  # several readers load the certificate of an enclave, and the same few CAs
 def _first_certificate(
-    data: bytes, name: str, trusted: bool, settings: TrustSettingsUse
+    data: bytes, name: str, trusted: bool, settings_use: TrustSettingsUse
 ) -> x509.Certificate:
     unreadable = f"the certificate {name} cannot be read"
     labels = pem_file.CERTIFICATES if trusted else pem_file.CERTIFICATES[:-1]
     for block in _certificate_blocks(data, unreadable):
         if block.label in labels:
-            return _certificate_in(block, unreadable, settings)
+            return _certificate_in(block, unreadable, settings_use)
     why = f"It is not a PEM certificate: {pem_file.missing_block_reason(data, 'CERTIFICATE')}."
     raise PkiError(unreadable, why, _RESTORE)
 
 
 @lru_cache(maxsize=16)
 def load_certificates(
-    data: bytes, name: str, *, settings: TrustSettingsUse = TrustSettingsUse.IGNORED
+    data: bytes, name: str, *, settings_use: TrustSettingsUse = TrustSettingsUse.IGNORED
 ) -> tuple[x509.Certificate, ...]:
     """Return all certificates of a PEM file, at least one; ``name`` names the file in errors.
 
     Raises:
         PkiError: the file has no certificate, sros or OpenSSL cannot read a part of it, or the
-            trust ``settings`` of a ``TRUSTED CERTIFICATE`` forbid its use.
+            trust settings of a ``TRUSTED CERTIFICATE`` forbid its use (``settings_use``).
     """
     load_certificate(data, name)
     unreadable = f"the certificates {name} cannot be read"
@@ -260,7 +260,9 @@ def load_certificates(
         if block.label in pem_file.CERTIFICATES:
             why = "A certificate after the first one is damaged." if certificates else _UNREADABLE
             of_block = (
-                settings if block.label == pem_file.CERTIFICATES[-1] else TrustSettingsUse.IGNORED
+                settings_use
+                if block.label == pem_file.CERTIFICATES[-1]
+                else TrustSettingsUse.IGNORED
             )
             certificates.append(_certificate_in(block, unreadable, of_block, why))
         elif block.label == "X509 CRL":
@@ -295,7 +297,7 @@ def _undamaged_blocks(data: bytes) -> tuple[tuple[pem_file.Block, ...], str]:
 
 
 def _certificate_in(
-    block: pem_file.Block, unreadable: str, settings: TrustSettingsUse, why: str = _UNREADABLE
+    block: pem_file.Block, unreadable: str, settings_use: TrustSettingsUse, why: str = _UNREADABLE
 ) -> x509.Certificate:
     if block.headers:
         why = f"It has PEM headers ('{block.headers.splitlines()[0].decode('ascii', 'replace')}')."
@@ -306,15 +308,15 @@ def _certificate_in(
         certificate, remainder = der.split(block.content)
         if (
             not remainder
-            or settings is TrustSettingsUse.IGNORED
-            or _permits_use(remainder, settings)
+            or settings_use is TrustSettingsUse.IGNORED
+            or _permits_use(remainder, settings_use)
         ):
             return _load_der(certificate)
     why = "It is a TRUSTED CERTIFICATE that is not trusted for this use."
     raise PkiError(unreadable, why, "Write it with the label CERTIFICATE.")
 
 
-def _permits_use(trust_settings: bytes, settings: TrustSettingsUse) -> bool:
+def _permits_use(trust_settings: bytes, settings_use: TrustSettingsUse) -> bool:
     """Return whether the trust settings after a certificate allow its use (OpenSSL, obj_trust).
 
     Raises:
@@ -324,10 +326,12 @@ def _permits_use(trust_settings: bytes, settings: TrustSettingsUse) -> bool:
     if value.tag != der.SEQUENCE:
         raise ValueError("not settings of a certificate")
     parts = {part.tag: _purposes(part) for part in der.children(value.content)}
-    if settings is TrustSettingsUse.READ:
+    if settings_use is TrustSettingsUse.READ:
         return True
     uses = (
-        {_OID_ANY_USE, _OID_S_MIME} if settings is TrustSettingsUse.OF_DOCUMENTS else {_OID_ANY_USE}
+        {_OID_ANY_USE, _OID_S_MIME}
+        if settings_use is TrustSettingsUse.OF_DOCUMENTS
+        else {_OID_ANY_USE}
     )
     trusted, rejected = parts.get(der.SEQUENCE), parts.get(der.CONTEXT_0)
     return not (rejected and rejected & uses) and (trusted is None or bool(trusted & uses))
@@ -706,7 +710,7 @@ _UNUSUAL_CHARACTERS = re.compile(rb"[^A-Za-z0-9/_]")
 
 
 class CertificateForm(NamedTuple):
-    """The parts of a certificate file that are usually equal for all enclaves.
+    """The form of a certificate file: ``common`` has what is usually equal for all enclaves.
 
     Two files with equal ``common`` differ only in values of their own, such as the key.
     ``validity`` is the period in DER.

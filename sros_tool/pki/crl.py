@@ -573,8 +573,8 @@ class _EntryExtensions(NamedTuple):
 
 
 @lru_cache(maxsize=16)
-def _entry_extensions(content: _HashableList) -> _EntryExtensions:
-    crl = content.crl
+def _entry_extensions(hashable_list: _HashableList) -> _EntryExtensions:
+    crl = hashable_list.crl
     unknown = any(ext.critical and ext.oid not in _READ_IF_CRITICAL for ext in crl.extensions)
     in_entry = any(
         ext.critical and ext.oid != CRLEntryExtensionOID.CERTIFICATE_ISSUER
@@ -585,8 +585,8 @@ def _entry_extensions(content: _HashableList) -> _EntryExtensions:
 
 
 @lru_cache(maxsize=16)
-def _is_signed(content: _HashableList, issuer: x509.Certificate) -> bool:
-    return is_signed(content.crl, content.crl.tbs_certlist_bytes, issuer)
+def _is_signed(hashable_list: _HashableList, issuer: x509.Certificate) -> bool:
+    return is_signed(hashable_list.crl, hashable_list.crl.tbs_certlist_bytes, issuer)
 
 
 def _is_in_scope(

@@ -240,8 +240,8 @@ def merge_notes(contradictions: Sequence[Contradiction]) -> tuple[Note, ...]:
 def counterpart_notes(policies: Iterable[Policy], merged: Collection[Right]) -> Iterator[Note]:
     """Yield a note on ``merged`` rights that lost their counterpart in one of ``policies``.
 
-    The counterpart of a right to subscribe is a right to publish, for instance.  A DENY of another
-    policy denies the counterpart, or the other policy uses another name.
+    The counterpart of a right to subscribe is a right to publish, for instance.  The cause is a
+    DENY of another policy that denies the counterpart, or another name in the other policy.
     """
     lost: set[Right] = set()
     for rights in map(policy_rights, policies):

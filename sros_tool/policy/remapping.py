@@ -256,8 +256,8 @@ def _notes_on_requirements(
 ) -> Iterator[Note]:
     """Yield notes on names that no node has any more.
 
-    A requirement for such a name would hold, regardless of who may use the new name.  With other
-    rules, `sros check` puts requirements into a namespace, too.
+    A requirement for such a name would hold, regardless of who may use the new name.  `sros check`
+    can remap the names in requirements, but not by a rule for a namespace.
     """
     for rule in rules:
         if rule.old == _NAMESPACE:

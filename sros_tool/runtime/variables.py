@@ -47,7 +47,7 @@ def domain_from(environment: Mapping[str, str]) -> int | None:
 
 
 class SecurityChoice(NamedTuple):
-    """The enclave directory that rcl chooses (None: no security), and the reason."""
+    """The enclave directory that rcl chooses (None: no security), and a note on the choice."""
 
     enclave: Path | None
     note: str

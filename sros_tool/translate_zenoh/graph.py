@@ -340,12 +340,12 @@ def _is_wide(node: str) -> bool:
     return "*" in node
 
 
-def _included_nodes(nodes: AnnouncedNodes, in_order: Sequence[str]) -> Iterator[str]:
-    """Yield the nodes without wildcards in ``in_order`` that are in the set ``nodes``."""
+def _included_nodes(nodes: AnnouncedNodes, sorted_nodes: Sequence[str]) -> Iterator[str]:
+    """Yield the nodes without wildcards in ``sorted_nodes`` that are in the set ``nodes``."""
     never = KeyExpressions(nodes.denied)
     for wide in nodes.allowed:
         begin = _begin(wide)
-        for node in in_order[bisect_left(in_order, begin) :]:
+        for node in sorted_nodes[bisect_left(sorted_nodes, begin) :]:
             if not node.startswith(begin):
                 break
             if includes(wide, node) and not never.include(node):

@@ -578,7 +578,7 @@ class Enforcement:
         )
 
     def unclear_reason(self) -> str:
-        """Return a clause on why not only the common name decides, or ""."""
+        """Return a clause on why the common name alone does not decide, or ""."""
         for subject in self.subjects:
             stated = {name for name in PROPERTIES if getattr(subject, name) is not None}
             if subject.cert_common_names is not None and len(stated) > 1:
@@ -682,12 +682,16 @@ class Enforcement:
         )
 
     def passing(
-        self, remote: Remote, flow: Flow, message: Message, of: Callable[[Iterable[str]], NameSet]
+        self,
+        remote: Remote,
+        flow: Flow,
+        message: Message,
+        names_of_keys: Callable[[Iterable[str]], NameSet],
     ) -> NameSet:
         """Return the keys, without wildcards, on which `decide` lets a message pass.
 
-        ``of`` maps key expressions to a set of names: the included keys, or names that stand for
-        these keys.
+        ``names_of_keys`` maps key expressions to a set of names: the included keys, or names that
+        stand for these keys.
         """
         all_names = ~NameSet()
         if not self.enabled:
@@ -698,8 +702,12 @@ class Enforcement:
         passing = []
         for combination in combinations:
             rules = self._in_force[combination].get((flow, message), ())
-            denied = of(key for rule in rules if not rule.allows for key in rule.key_expressions)
-            allowed = of(key for rule in rules if rule.allows for key in rule.key_expressions)
+            denied = names_of_keys(
+                key for rule in rules if not rule.allows for key in rule.key_expressions
+            )
+            allowed = names_of_keys(
+                key for rule in rules if rule.allows for key in rule.key_expressions
+            )
             passing.append((all_names if self.allows_by_default else allowed) - denied)
         return NameSet.union(passing)
 

@@ -324,7 +324,7 @@ def _matches(wide: str, narrow: str) -> bool:
 
 @lru_cache(maxsize=_CACHE_SIZE)
 def _chunks(first: str, first_chunks: tuple[str, ...], kinds: frozenset[frozenset[str]]) -> Chunks:
-    """Return few chunks that together match the names of ``first`` that are of some ``kinds``.
+    """Return few chunks that together match the names that ``first`` matches, of some ``kinds``.
 
     The kind of a name is the set of matching chunks in ``first_chunks``. For each kind in
     ``kinds``, all kinds that are subsets must be in ``kinds``, too.
