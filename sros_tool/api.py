@@ -230,7 +230,7 @@ def create_keystore(
             identity_key,
             permissions_key,
             encrypt=encrypt_ca_keys,
-            short=short_passphrase,
+            short_passphrase=short_passphrase,
         ),
         imported_cas={} if identity_ca is None else {"identity": _read_file(identity_ca)},
     )
@@ -1092,13 +1092,15 @@ def _make_keyring(
     permissions_key: str | None,
     *,
     encrypt: bool = False,
-    short: bool = False,
+    short_passphrase: bool = False,
 ) -> Keyring:
     from sros_tool.keystore.issuing.keyring import Keyring, absolute_place, no_secrets
 
     named = {"identity": identity_key, "permissions": permissions_key}
     places = {role: absolute_place(place) for role, place in named.items() if place}
-    return Keyring(_checked_secrets(secrets) if secrets else no_secrets, places, encrypt, short)
+    return Keyring(
+        _checked_secrets(secrets) if secrets else no_secrets, places, encrypt, short_passphrase
+    )
 
 
 def _checked_secrets(secrets: Secrets) -> Secrets:

@@ -95,8 +95,8 @@ class Hop(NamedTuple):
     """A flow of information from enclave ``source`` to enclave ``target`` by one ROS name.
 
     ``right`` is the right of the source (publish, request, reply; call or execute for an action),
-    ``kind`` is topics, services, actions or dds.  ``name`` is a name that both may use; ``said``
-    and ``heard`` are the names or wildcards in the rights of source and target.
+    ``kind`` is topics, services, actions or dds.  ``name`` is a name that both may use;
+    ``stated_by_source`` and ``stated_by_target`` are the names or wildcards in their rights.
     """
 
     source: str
@@ -108,8 +108,8 @@ class Hop(NamedTuple):
     """The right of the source: publish, request, reply, call or execute."""
     name: str
     """The ROS name that carries the information."""
-    said: str
-    heard: str
+    stated_by_source: str
+    stated_by_target: str
 
     def __str__(self) -> str:
         """Return text like ``/a -publish /x-> /b``."""
@@ -162,11 +162,11 @@ class _Direction:
     """
 
     def __init__(self, ends: Iterable[_Access]) -> None:
-        self.of: dict[str, list[_Access]] = defaultdict(list)
+        self.by_enclave: dict[str, list[_Access]] = defaultdict(list)
         self._exact: dict[str, list[_Access]] = defaultdict(list)
         self._wild: dict[str, list[_Access]] = defaultdict(list)
         for end in ends:
-            self.of[end.enclave].append(end)
+            self.by_enclave[end.enclave].append(end)
             if is_expression(end.topic):
                 self._wild[literal_prefix(end.topic)].append(end)
             else:
@@ -254,7 +254,7 @@ class Network:
     @property
     def enclaves(self) -> tuple[str, ...]:
         """The enclaves that may write or read at least one topic, sorted."""
-        return tuple(sorted({name for side in self._sides.values() for name in side.of}))
+        return tuple(sorted({name for side in self._sides.values() for name in side.by_enclave}))
 
     def links(self, enclave: str, known: Container[str]) -> Iterator[tuple[str, Callable[[], Hop]]]:
         """Yield each enclave that ``enclave`` can influence directly, with a function for the hop.
@@ -321,7 +321,7 @@ class Network:
         """Yield the accesses of writers and readers that `_steps` has to compare."""
         directions = ("publish", "subscribe") if forward else ("subscribe", "publish")
         own_side, other_side = (self._sides[direction] for direction in directions)
-        for end in own_side.of.get(enclave, ()):
+        for end in own_side.by_enclave.get(enclave, ()):
             like = (end.topic, end.without, self._router_of.get(enclave, ""), end.domains)
             if like in followed:
                 continue

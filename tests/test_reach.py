@@ -110,7 +110,12 @@ def test_topics_that_ros_has_no_word_for() -> None:
     reach = Network(found).reach("/all")
     assert path_text(reach.influences["/b"]) == "/all -reply /add-> /b"
     (hop,) = Network([*rights("/more subscribe *"), *found]).reach("/all").influences["/more"]
-    assert (hop.kind, hop.name, hop.said, hop.heard) == ("topics", "/a", "*", "*")
+    assert (hop.kind, hop.name, hop.stated_by_source, hop.stated_by_target) == (
+        "topics",
+        "/a",
+        "*",
+        "*",
+    )
     assert reached(rights("/a publish foreign", "/b subscribe f*"), "/a") == ({"/b"}, set())
     kept = rights("/a publish *", "/b subscribe rt/*", "/a !publish r?/a")
     assert Network(kept).reach("/a").influences["/b"][0].name != "/a"
@@ -152,7 +157,11 @@ def test_requests_that_change_something_count() -> None:
 def test_hops_of_one_enclave() -> None:
     hops = [hop() for _, hop in Network(CHAIN).links("/b", ())]
     assert [str(hop) for hop in hops] == ["/b -publish /y-> /c"]
-    assert (hops[0].said, hops[0].heard, hops[0].kind) == ("/y", "/y", "topics")
+    assert (hops[0].stated_by_source, hops[0].stated_by_target, hops[0].kind) == (
+        "/y",
+        "/y",
+        "topics",
+    )
 
 
 def test_links_are_found_without_the_name_of_each_hop() -> None:
@@ -213,7 +222,9 @@ def test_against_the_closure_over_every_name(found: list[Right]) -> None:
             for hop in path:
                 assert rules.allow(hop.source, "publish", hop.name), path_text(path)
                 assert rules.allow(hop.target, "subscribe", hop.name), path_text(path)
-                assert matches(hop.said, hop.name) and matches(hop.heard, hop.name)
+                assert matches(hop.stated_by_source, hop.name) and matches(
+                    hop.stated_by_target, hop.name
+                )
 
 
 def test_what_the_governance_leaves_open_carries_for_everybody() -> None:

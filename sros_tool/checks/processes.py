@@ -753,7 +753,7 @@ def _domain_text(process: Process) -> str:
     return f"in domain {process.domain}{network}"
 
 
-def _daemon_findings(process: Process, wanted: Mapping[str, str]) -> Iterator[Finding]:
+def _daemon_findings(process: Process, environment: Mapping[str, str]) -> Iterator[Finding]:
     if not process.asks_for_security:
         text = f"{ENABLE} is not 'true' in the environment of {process.label}"
         yield DAEMON_UNSECURED.found(process.label, text)
@@ -761,7 +761,7 @@ def _daemon_findings(process: Process, wanted: Mapping[str, str]) -> Iterator[Fi
     differing = [
         name
         for name in (KEYSTORE, ENCLAVE)
-        if process.environment.get(name, "") != wanted.get(name, "")
+        if process.environment.get(name, "") != environment.get(name, "")
     ]
     if differing:
         text = f"{', '.join(differing)} differ from this environment"

@@ -554,20 +554,20 @@ def enclave_grant(root: Path, enclave: str) -> Grant | None:
     return grants[0] if grants else None
 
 
-def allows(grant: Grant, verb: str, topic: str) -> bool:
-    """Return whether a grant allows ``verb`` (publish or subscribe) on a DDS topic."""
-    return bool(_allowing(grant, verb, topic))
+def allows(grant: Grant, direction: str, topic: str) -> bool:
+    """Return whether a grant allows ``direction`` (publish or subscribe) on a DDS topic."""
+    return bool(_allowing(grant, direction, topic))
 
 
-def _allowing(grant: Grant, verb: str, topic: str) -> str:
-    """Return the expression by which a grant allows ``verb`` on a DDS topic; "" if denied.
+def _allowing(grant: Grant, direction: str, topic: str) -> str:
+    """Return the expression by which a grant allows ``direction`` on a DDS topic; "" if denied.
 
     As with the vendors, the first rule that names the topic decides; of several matching
     expressions in this rule, the exact name is returned.  A topic that no rule names is denied.
     """
     for rule in grant.rules:
         fitting = [
-            expression for expression in _expressions(rule, verb) if matches(expression, topic)
+            expression for expression in _expressions(rule, direction) if matches(expression, topic)
         ]
         if fitting:
             return (topic if topic in fitting else fitting[0]) if rule.allow else ""
@@ -579,8 +579,8 @@ def _is_denied(grant: Grant, topic: str) -> bool:
     return any(
         matches(expression, topic)
         for rule in grant.rules
-        for verb in ("publish", "subscribe")
-        for expression in (() if rule.allow else _expressions(rule, verb))
+        for direction in ("publish", "subscribe")
+        for expression in (() if rule.allow else _expressions(rule, direction))
     )
 
 
@@ -627,8 +627,8 @@ def _topics_to_publish(grant: Grant) -> Iterator[str]:
                 yield topic
 
 
-def _expressions(rule: Rule, verb: str) -> Iterator[str]:
-    for criteria in rule.publish if verb == "publish" else rule.subscribe:
+def _expressions(rule: Rule, direction: str) -> Iterator[str]:
+    for criteria in rule.publish if direction == "publish" else rule.subscribe:
         yield from criteria.topics
 
 

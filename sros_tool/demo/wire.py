@@ -291,9 +291,9 @@ _CERTIFICATE = "-----BEGIN CERTIFICATE-----"
 class Wiretap:
     """A capture of the packets of a demo row; ``problem`` says why it is not permitted, or "".
 
-    ``texts`` maps parties to their texts; ``topic`` is the topic in the form of packets. The
-    capture starts immediately, so create a wiretap in the network of the row, and in a running
-    asyncio loop.
+    ``texts`` maps parties to their texts; ``topic`` is the topic in the form of packets. With
+    ``replayed``, packets are kept, and can be sent again or changed.  The capture starts
+    immediately, so create a wiretap in the network of the row, and in a running asyncio loop.
     """
 
     def __init__(self, texts: Mapping[str, str], topic: str, *, replayed: bool) -> None:

@@ -557,7 +557,7 @@ class ZenohEvaluator:
         data = self.keystore.read(path, "Zenoh configuration")
         rendered = self._rendered.read(data)
         # In this form of the file, each rule is written once, with the id from the file.
-        if rendered and rendered.settings is SettingsEdition.RULES_ONCE:
+        if rendered and rendered.edition is SettingsEdition.RULES_ONCE:
             texts = rendered.listen if rendered.mode is Mode.ROUTER else rendered.connect
             return rendered.mode, rendered.access_control, tuple(map(ZenohEndpoint, texts))
         document = parse_configuration(data, str(path), lines=False)

@@ -279,7 +279,7 @@ class GraphObserver(Protocol):
         """Return a reading, of a single moment if possible."""
 
 
-def report_graph(observer: GraphObserver, report: Any, period: float, *, ordered: bool) -> None:
+def report_graph(observer: GraphObserver, output: Any, period: float, *, ordered: bool) -> None:
     """Report each reading, with the graph after a change, until standard input is closed.
 
     The key ``began`` of a report is when its reading began, by the monotonic clock, which all
@@ -297,7 +297,7 @@ def report_graph(observer: GraphObserver, report: Any, period: float, *, ordered
             in_order = ordered and not now.nodes_changed
             message |= {"ordered": in_order, "listed": now.listed, "endpoints": now.endpoints}
             before = now
-        send(report, message)
+        send(output, message)
         if select.select([sys.stdin], [], [], _REREAD_SECONDS if changes else period)[0]:
             return
 
@@ -361,9 +361,9 @@ class _Observer:
         return sorted(endpoint for endpoint in endpoints if (endpoint[0], endpoint[2]) != own)
 
 
-def send(report: Any, value: object) -> None:
+def send(output: Any, value: object) -> None:
     """Write ``value`` as a line of JSON to the observer's output."""
-    report.write(json.dumps(value) + "\n")
+    output.write(json.dumps(value) + "\n")
 
 
 if __name__ == "__main__":

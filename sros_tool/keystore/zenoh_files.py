@@ -421,7 +421,7 @@ def _without_rules_for(
     if not names:
         return document
     configuration = reader.read(document)
-    if configuration is None or configuration.settings is not SettingsEdition.RULES_ONCE:
+    if configuration is None or configuration.edition is not SettingsEdition.RULES_ONCE:
         return None
     remotes = configuration.access_control.remotes
     kept = tuple(rights for rights in remotes if rights.common_name not in names)

@@ -327,16 +327,16 @@ def unread_date(certificate: x509.Certificate) -> str:
 
 
 def date(
-    of: x509.Certificate | x509.CertificateRevocationList | x509.RevokedCertificate, name: str
+    dated: x509.Certificate | x509.CertificateRevocationList | x509.RevokedCertificate, name: str
 ) -> Any:
     """Return the date in the attribute ``name``, in UTC; None for a date that a list lacks.
 
     `cryptography` 41 has only attributes for dates without a time zone.
     """
     try:
-        return getattr(of, f"{name}_utc")
+        return getattr(dated, f"{name}_utc")
     except AttributeError:
-        moment = getattr(of, name)
+        moment = getattr(dated, name)
         return moment and moment.replace(tzinfo=UTC)
 
 

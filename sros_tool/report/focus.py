@@ -342,8 +342,8 @@ class _System:
         added = set()
         for hop in {hop for path in self._paths for hop in path}:
             for enclave, right, stated, fits in (
-                (hop.source, hop.right, hop.said, _may_write),
-                (hop.target, PEER_RIGHT[hop.right], hop.heard, _may_read),
+                (hop.source, hop.right, hop.stated_by_source, _may_write),
+                (hop.target, PEER_RIGHT[hop.right], hop.stated_by_target, _may_read),
             ):
                 if (enclave, hop.kind, hop.name, fits) not in drawn:
                     by = () if stated == hop.name else (stated,)

@@ -169,7 +169,7 @@ class Configuration:
 
     The process listens at ``listen`` and connects to ``connect``, in the form ``tls/HOST:PORT``.
     ``revoked`` is the time of the last revocation in UTC, which identifies older files; "" if no
-    enclave was revoked, or if the age of the file does not matter.  ``settings`` is the edition of
+    enclave was revoked, or if the age of the file does not matter.  ``edition`` is the edition of
     a file that was read.
     """
 
@@ -178,16 +178,16 @@ class Configuration:
     connect: tuple[str, ...]
     access_control: AccessControl
     revoked: str = ""
-    settings: SettingsEdition = field(default=SettingsEdition.RULES_ONCE, compare=False)
+    edition: SettingsEdition = field(default=SettingsEdition.RULES_ONCE, compare=False)
 
-    def render(self, settings: SettingsEdition = SettingsEdition.RULES_ONCE) -> bytes:
+    def render(self, edition: SettingsEdition = SettingsEdition.RULES_ONCE) -> bytes:
         """Return the file as JSON; equal configurations have equal files.
 
         The file does not name the TLS files, which $ZENOH_CONFIG_OVERRIDE has to name.
         """
         rights = [render_rights(remote) for remote in self.access_control.remotes]
         return render_configuration(
-            self.mode, self.listen, self.connect, rights, self.revoked, settings
+            self.mode, self.listen, self.connect, rights, self.revoked, edition
         )
 
 
@@ -204,11 +204,11 @@ def render_configuration(
     connect: tuple[str, ...],
     rights: Iterable[RenderedRights],
     revoked: str = "",
-    settings: SettingsEdition = SettingsEdition.RULES_ONCE,
+    edition: SettingsEdition = SettingsEdition.RULES_ONCE,
 ) -> bytes:
     """Return the bytes of `Configuration.render`, from rights that are already rendered."""
-    control = _access_control_text([*rights], once=settings is SettingsEdition.RULES_ONCE)
-    without_control = _text_without_control(mode, listen, connect, revoked, settings)
+    control = _access_control_text([*rights], once=edition is SettingsEdition.RULES_ONCE)
+    without_control = _text_without_control(mode, listen, connect, revoked, edition)
     return f"{without_control}{_CONTROL_BEGIN}{control}".encode()
 
 
@@ -247,7 +247,7 @@ def _text_without_control(
     listen: tuple[str, ...],
     connect: tuple[str, ...],
     revoked: str,
-    settings: SettingsEdition,
+    edition: SettingsEdition,
 ) -> str:
     """Return the text of a configuration without access control and the closing brace."""
     document: dict[str, Any] = {
@@ -283,7 +283,7 @@ def _text_without_control(
         },
         "adminspace": {"enabled": False},
     }
-    if settings is not SettingsEdition.FEW:
+    if edition is not SettingsEdition.FEW:
         _add_settings_of_rmw_zenoh(document, mode)
     if revoked:
         document["metadata"] = {_REVOKED_KEY: revoked}
@@ -396,19 +396,19 @@ class RenderedReader:
                 return None
             configuration = self._parse_without_rules(beginning)
             rights = self._rendered_rights(sections)
-            settings = configuration.settings
+            edition = configuration.edition
             if (
-                settings is not SettingsEdition.FEW
+                edition is not SettingsEdition.FEW
                 and _access_control_text(rights, once=True) == control
             ):
-                settings = SettingsEdition.RULES_ONCE
+                edition = SettingsEdition.RULES_ONCE
             elif _access_control_text(rights, once=False) != control:
                 return None
             remotes = tuple(
                 RemoteRights(rendered.name, tuple(map(self._rule, rendered.rules)))
                 for rendered in rights
             )
-            return replace(configuration, access_control=AccessControl(remotes), settings=settings)
+            return replace(configuration, access_control=AccessControl(remotes), edition=edition)
         except (ValueError, KeyError, IndexError, TypeError, RecursionError):
             return None
 

@@ -167,9 +167,11 @@ def token_delivery(
     )
 
 
-def _checks_on_route(way: Sequence[ZenohProcess], message: Message, key: str) -> Iterator[Check]:
-    """Yield the checks that a message must pass on all links of a route."""
-    for sender, receiver in pairwise(way):
+def _checks_on_route(
+    processes: Sequence[ZenohProcess], message: Message, key: str
+) -> Iterator[Check]:
+    """Yield the checks that a message must pass on its way through ``processes``."""
+    for sender, receiver in pairwise(processes):
         for enforcer, remote, flow in (
             (sender, receiver.name, Flow.EGRESS),
             (receiver, sender.name, Flow.INGRESS),
