@@ -306,8 +306,8 @@ def _check_lists(name: str, files: Mapping[str, bytes], present: Mapping[str, by
             "from "
             "a backup, first run `sros fleet collect KEYSTORE INBOX`, which takes the list from "
             "the "
-            "message of this robot; in a rotation, also `sros crl KEYSTORE --refresh --crl FILE`, "
-            f"with {IDENTITY_CA_FILE} of this robot as FILE.",
+            "message of this robot; in a rotation, also `sros crl KEYSTORE --refresh --crl FILE`: "
+            f"FILE is the {IDENTITY_CA_FILE} of this robot, which then has revocation lists, too.",
         )
 
 
@@ -613,7 +613,8 @@ def _check_seen(folder: Folder, change: _Change) -> None:
         if present != before:
             raise KeystoreError(
                 "its files changed meanwhile",
-                f"'{folder.path / path}' came from elsewhere; the next round compares again",
+                f"Another program changed or removed '{folder.path / path}'; the next round "
+                "compares again",
             )
 
 

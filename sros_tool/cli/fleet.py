@@ -654,7 +654,8 @@ def _status(
     restart. Confirmations by the Ansible collection and `sros agent` say which restarts are due.
     Confirmations by `sros fleet report` say this only if it saw all processes, or with --restarted.
     A robot without a recent confirmation is offline. Robots with the same state share a line. A
-    robot that reports a release which was never published is shown even if its files are current.
+    robot that reports a release which was never published has a line of its own, even if its files
+    are current.
     The first line also counts the robots whose DDS has known vulnerabilities that a later release
     of the same major version fixes, by the advisories of sros; --advisories FILE lists them, and so
     does --robot NAME with --fail-on vulnerabilities.

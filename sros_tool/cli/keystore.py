@@ -120,7 +120,8 @@ def create_permission(
 ) -> None:
     """Give ENCLAVE... the permissions that POLICY_FILE states for them: all or none.
 
-    Enclaves that --robot, --match or --all choose keep permissions that state the same rights.
+    A named ENCLAVE always gets new permissions; an enclave chosen by --robot, --match or --all
+    gets them only if its rights change.
 
     Anyone who has a copy of the replaced permissions, and of the certificate and key used with
     them, can use them until they expire. With --revoke-old, processes that load the new crl.pem

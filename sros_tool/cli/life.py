@@ -415,9 +415,9 @@ _STAGE_DONE_TEXTS = {
 @click.option(
     "--identity-ca",
     type=PATH,
-    help="Certificate (PEM) of an existing CA that replaces the identity CA, such as one that a "
-    "restored backup lacks; needs --identity-key. With --same-key: the later certificate of the CA "
-    "service.",
+    help="Certificate (PEM) of an existing CA that replaces the identity CA, for example of a CA "
+    "that is younger than a restored backup; needs --identity-key. With --same-key, if a CA "
+    "service signs: the new certificate of its CA.",
 )
 @click.option(
     "--permissions-ca",

@@ -718,7 +718,8 @@ def _owner(root: Path) -> str:
     try:
         number = root.stat().st_uid
     except FileNotFoundError:
-        raise UsageError(f"keystore '{root}' does not exist here", "", "Add --user NAME.") from None
+        what = f"keystore '{root}' does not exist here, so that its owner is not known"
+        raise UsageError(what, "", "Name the user of the units with --user NAME.") from None
     try:
         return pwd.getpwuid(number).pw_name
     except KeyError:

@@ -380,8 +380,8 @@ def _configuration_lines(
                     else ""
                 )
                 yield f"  may {VERBS[right]} {stated.name}{domain}{lacks}"
-        yield from _key_lines("may also", rights.unsaid)
-        yield from _key_lines("is denied, except by wildcards,", rights.denied)
+        yield from _key_lines("may also {}", rights.unsaid)
+        yield from _key_lines("may {} only by a wildcard", rights.denied)
 
 
 def _key_lines(clause: str, pairs: Sequence[tuple[str, str]]) -> Iterator[str]:
@@ -390,7 +390,7 @@ def _key_lines(clause: str, pairs: Sequence[tuple[str, str]]) -> Iterator[str]:
     for right, word in VERBS.items():
         keys = [key for of, key in pairs if of == right]
         if keys:
-            yield f"  {clause} {word} the keys {first_few(keys, _MOST_KEYS)}"
+            yield f"  {clause.format(word)} the keys {first_few(keys, _MOST_KEYS)}"
 
 
 def _kind(document: ConfigurationDocument) -> str:

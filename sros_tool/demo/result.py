@@ -401,7 +401,7 @@ def _judge_view(case: _ClaimRecords) -> _ClaimFinding:
         e for e in observer.events if e.kind is EventKind.SEEN and _is_in_window(e, case.record)
     ]
     if not looks:
-        return _undecided(f"{claim.subject} counted nothing in the window")
+        return _undecided(f"{claim.subject} made no count in the window")
     most = max(event.publishers.get(topic, 0) for event in looks)
     counted = f"{most} {'servers' if serves else 'publishers'} on {topic}"
     return case.result(most > 0, f"{observer.through} counts {counted} in {len(looks)} polls")
@@ -418,7 +418,7 @@ def _judge_loss(case: _ClaimRecords) -> _ClaimFinding:
     # Only inside the window, because the talker ends after it.
     inside = [event for event in looks if _is_in_window(event, case.record)]
     if not inside:
-        return _undecided(f"{claim.subject} counted nothing in the window")
+        return _undecided(f"{claim.subject} made no count in the window")
     left = inside[-1].publishers.get(topic, 0)
     detail = f"{case.subject.through} counts {most} publishers on {topic}, and {left} after "
     return case.result(not left, f"{detail}{claim.talker} tried to remove the node")

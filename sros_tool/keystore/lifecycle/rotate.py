@@ -398,8 +398,8 @@ def renew_identity_ca(
         if len(change.keystore.authority_files) == 1:
             raise KeystoreError(
                 f"the CA of keystore '{root}' cannot be renewed with the same key",
-                "It is also the permissions CA, and DDS accepts permissions only with the "
-                "certificate that they embed.",
+                "It is also the permissions CA: signed permissions contain its present "
+                "certificate, and DDS would refuse them with a new one.",
                 "Rotate it without --same-key.",
             )
         if read_rotation(change.keystore).stage is not RotationStage.NONE:
