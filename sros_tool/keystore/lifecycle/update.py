@@ -784,7 +784,7 @@ def set_zenoh(
     """
     with KeystoreChange(root, **options) as change:
         change.begin_issuing(None)
-        _check_settings(change, edited=bool(change.notes))
+        _check_settings(change)
         before = change.template.zenoh
         if network:
             network = _with_routers_of_robots(change, network)
@@ -839,8 +839,8 @@ def _moved_router_note(old: str, new: str) -> Note:
     )
 
 
-def _check_settings(change: KeystoreChange, *, edited: bool) -> None:
-    """Raise `KeystoreError` if the settings are missing, or files were ``edited`` by hand."""
+def _check_settings(change: KeystoreChange) -> None:
+    """Raise `KeystoreError` if the settings are missing, or files were edited by hand."""
     root, where = change.root, quote(str(change.root))
     if not (root / SETTINGS).exists():
         raise KeystoreError(
@@ -849,8 +849,7 @@ def _check_settings(change: KeystoreChange, *, edited: bool) -> None:
             f"Run `sros update_keystore {where} --template sros2 --dry-run`, which shows the "
             "changed settings, and then without --dry-run.",
         )
-    if edited:
-        edits = found_edits(change.keystore, change.governance)
+    if edits := found_edits(change.keystore, change.governance):
         raise KeystoreError(
             f"files of keystore '{root}' were edited by hand: {'; '.join(edits.clauses())}",
             "Writing the settings would undo the edit, or apply it unnoticed.",
