@@ -437,8 +437,8 @@ def _choose_domain(
     """Return the ROS domain for a process: ``wanted_domain``, or a default.
 
     ``wanted_domain`` comes from an option or ROS_DOMAIN_ID, ``domains`` are the domains of the
-    keystore, and ``joined`` those of them that the enclave may join. The default is 0, as in ROS,
-    if the enclave may join it, or else the first domain of the enclave.
+    keystore, and ``joined`` the domains that the enclave may join. The default is domain 0, as in
+    ROS, if the enclave may join domain 0, or else the first domain of the enclave.
 
     Raises:
         KeystoreError: the keystore is not for ``wanted_domain``.
@@ -462,7 +462,7 @@ def _zenoh_domain(
 ) -> int | None:
     """Return the ROS domain that the Zenoh configuration of a process has to name.
 
-    Without ``wanted_domain``, it is preferably one of ``domains``.
+    Without ``wanted_domain``, the result is preferably one of ``domains``.
 
     If the configuration names no domain, the result is ``wanted_domain``, which may be None.
 

@@ -103,7 +103,7 @@ def write_new_file(
 ) -> None:
     """Write a file that only its owner can read, and flush it to disk unless ``flush`` is False.
 
-    If root writes it into a folder of the user ``for_user``, that user becomes its owner.
+    If root writes into a folder of the user ``for_user``, that user becomes the file's owner.
 
     Raises:
         FileExistsError: ``path`` exists already, perhaps as a link that leads nowhere.

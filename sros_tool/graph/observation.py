@@ -314,7 +314,7 @@ class _Observer:
         self._participant = ""
 
     def snapshot(self) -> Reading:
-        """Return a reading; only if nodes changed in every attempt, it is not of one moment."""
+        """Return a reading of a single moment, unless nodes changed in every attempt."""
         after = self._listed()
         for _ in range(_ATTEMPTS):
             before, endpoints, after = after, self._endpoints(), self._listed()

@@ -340,13 +340,13 @@ def watch(
 ) -> Snapshot:
     """Return the union of all graphs in ``seconds`` (None: no limit), or until ``stop()`` is true.
 
-    When the union has grown, ``report`` is called with it after ``still`` seconds without a change,
-    so that no node is reported before it is discovered completely.  At the latest, it is called
-    after ``patience`` seconds.  If a node that has just started is not announced yet, the watch
+    When the union has grown, ``report`` gets the union after ``still`` seconds without a change, at
+    the latest after ``patience`` seconds.  So no node is reported before it is discovered
+    completely.  If a node that has just started is not announced yet, the watch
     lasts up to ``patience`` seconds longer.
 
-    An endpoint is intermittent if the graph stood still without it after the endpoint was seen,
-    while its node was there: a graph that changes may show a node that is just ending.
+    An endpoint that was seen is intermittent if the graph later stood still with the endpoint's
+    node, but without the endpoint.  A graph that changes may show a node that is just ending.
     """
     begin = clock()
     seen = union = reported = Observation()

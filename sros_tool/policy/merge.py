@@ -77,7 +77,7 @@ class Contradiction:
 
 @dataclass(frozen=True, slots=True)
 class AddedName:
-    """A name to add to a profile, in its form there, with its rights and its protection level."""
+    """A name to add to a profile, in the form for the profile, with rights and protection level."""
 
     kind: str
     name: str

@@ -122,7 +122,7 @@ class EnclaveUse:
 
     @property
     def is_as_observed(self) -> bool:
-        """Whether the enclave was observed, with neither more nor fewer rights than it has."""
+        """Whether the enclave was observed, and its use does not differ from its rights."""
         return self.observed_at_all and not self.differing()
 
     def differing(self) -> tuple[Right, ...]:

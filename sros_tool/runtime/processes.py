@@ -116,7 +116,7 @@ class MemoryPort(NamedTuple):
     """A port of Fast DDS in shared memory.
 
     ``number`` is its port number. ``memory`` is the file system of the shared memory, and ``file``
-    is the inode there, which is another one when a process opens the port again.
+    is the inode there: after a process opens the port again, the inode is another one.
     """
 
     number: int
@@ -128,10 +128,11 @@ class MemoryPort(NamedTuple):
 class Process:
     """A running process that uses ROS 2, DDS or Zenoh.
 
-    ``started`` is the earliest moment at which it can have loaded its files, by the clock of that
-    moment; ``clock_advanced`` is the time by which the clock was set forward since then, which
-    makes ``started`` too early by a minute or more. ``libraries`` are the names of mapped libraries
-    of ROS 2, DDS and Zenoh, such as "libddsc", and ``dds`` the DDS libraries with their versions.
+    ``started`` is the earliest moment at which the process can have loaded its files, by the clock
+    of that moment; ``clock_advanced`` is the time by which the clock was set forward since then,
+    which makes ``started`` too early by a minute or more. ``libraries`` are the names of mapped
+    libraries of ROS 2, DDS and Zenoh, such as "libddsc", and ``dds`` the DDS libraries with their
+    versions.
     ``network`` names the network namespace; "" is the namespace of sros. ``enclave`` is the enclave
     that the process names, if it asks for security, and ``configuration`` the Zenoh configuration
     that the process names. ``forked_by`` are the id and command of the first process of the same
@@ -231,7 +232,7 @@ class Process:
     def demo_command(self) -> tuple[str, ...]:
         """The `sros demo` command that started this node or router; () for other processes.
 
-        The node's own command cannot be used again, because it has a file descriptor of one start.
+        The node's own command cannot be used again, because it names an open file descriptor.
         """
         words = self.command
         for flag, module, role in zip(words, words[1:], words[2:], strict=False):
