@@ -42,7 +42,7 @@ def is_for_root_alone(mode: int) -> bool:
 
 
 def replaceable_on_the_way(path: Path, trusted_users: frozenset[int]) -> Iterator[tuple[Path, str]]:
-    """Yield the folders and links above ``path`` through which others can replace it, and why.
+    """Yield the folders and links above ``path`` that let others replace ``path``, and why.
 
     In a sticky folder such as ``/tmp``, only the owner of a file can rename the file.  So a sticky
     folder counts only if others own the next part of the path.

@@ -175,13 +175,15 @@ def _topic_rule(expression: str, protection: TopicProtection) -> TopicRule:
 
 
 def _rule_attributes(
-    protection: DomainProtection | TopicProtection, rule: type[DomainRule | TopicRule]
+    protection: DomainProtection | TopicProtection, rule_class: type[DomainRule | TopicRule]
 ) -> dict[str, Any]:
-    """Map the name of each attribute of a rule to its value in ``protection``.
+    """Map the name of each attribute of ``rule_class`` to its value in ``protection``.
 
     The attribute's ``term`` is the name of the field of ``protection``.
     """
-    chosen = {attribute: getattr(protection, attribute.term) for attribute in attributes(rule)}
+    chosen = {
+        attribute: getattr(protection, attribute.term) for attribute in attributes(rule_class)
+    }
     return {
         attribute.name: value if attribute.is_flag else ProtectionKind(value)
         for attribute, value in chosen.items()

@@ -118,7 +118,7 @@ from sros_tool.pki.certificates import (
 )
 from sros_tool.pki.crl import list_number, load_crls, newest_list, read_lists
 from sros_tool.pki.keys import PrivateKey, generate_key, key_pem, load_key
-from sros_tool.pki.token import Secrets, open_enclave_key, place_in
+from sros_tool.pki.token import Secrets, open_enclave_key, place_in_file
 from sros_tool.runtime.processes import RunningProcesses, boot_id
 from sros_tool.validity import elapsed, iso, time_of_file
 from sros_tool.wording import counted, first_few
@@ -1290,7 +1290,7 @@ def _enclave_key(folder: Path, name: str, secrets: Secrets) -> PrivateKey:
     place = enclave_path(folder, name)
     if (place / KEY_FILE).exists():
         return load_key(read_bytes(place / KEY_FILE, "private key"), f"of enclave {name}")
-    return open_enclave_key(place_in(place / KEY_URI_FILE), secrets)
+    return open_enclave_key(place_in_file(place / KEY_URI_FILE), secrets)
 
 
 class Renewals(NamedTuple):

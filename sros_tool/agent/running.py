@@ -182,7 +182,7 @@ def _runs_in_folder(process: Process, folder: Path) -> bool:
     enclave = process.enclave
     if enclave is None:
         return False
-    if enclave.is_of(folder):
+    if enclave.is_in_keystore(folder):
         return True
     named = os.path.abspath(enclave.keystore) == os.path.abspath(folder)  # noqa: PTH100
     return named and not _folder_is_known(process)

@@ -435,7 +435,7 @@ def secured_by(environment: Mapping[str, str], folder: Path) -> Iterator[str]:
 
 
 def _secured_by_zenoh(environment: Mapping[str, str], folder: Path) -> Iterator[str]:
-    """Yield the variables that give a session of rmw_zenoh certificates, rules or a password."""
+    """Yield a clause if variables give rmw_zenoh certificates, rules or a password, or may do."""
     uri, override = environment.get(SESSION_URI, ""), environment.get(OVERRIDE, "")
     named = " with ".join(name for name in (SESSION_URI, OVERRIDE) if environment.get(name))
     try:

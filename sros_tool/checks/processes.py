@@ -72,7 +72,7 @@ from sros_tool.runtime.processes import (
     Process,
     ProcessEnclave,
     RunningProcesses,
-    domain_number,
+    domain_text,
     plain,
 )
 from sros_tool.runtime.rmw import DEFAULT_RMW, RMW, vendor_of
@@ -696,7 +696,7 @@ def process_findings(
     is not enabled here, all open nodes share one finding, unless ``finding_per_node`` is set.
     """
     is_secured_here = environment.get(ENABLE) == "true"
-    own_domain = ("", domain_number(environment.get(DOMAIN, "")))
+    own_domain = ("", domain_text(environment.get(DOMAIN, "")))
     nodes = [process for process in running.processes if not process.is_daemon]
     security = {node.pid: _security_of(node) for node in nodes}
     secured = [node for node in nodes if security[node.pid] is Security.SECURED]
@@ -943,9 +943,7 @@ def _mixed_vendor_findings(
     ``environment`` is the environment of this shell if it enables security, otherwise None.
     """
     places = dict(_group_by_network_and_domain(secured))
-    own_domain = (
-        ("", domain_number(environment.get(DOMAIN, ""))) if environment is not None else None
-    )
+    own_domain = ("", domain_text(environment.get(DOMAIN, ""))) if environment is not None else None
     if own_domain:
         places.setdefault(own_domain, [])
     for place, processes in places.items():
@@ -968,9 +966,7 @@ def _other_keystore_findings(
     The expected CA is the CA of most neighbors; in the network and domain of ``environment``, the
     expected CA is the one of the enclave in ``environment``.
     """
-    own_domain = (
-        ("", domain_number(environment.get(DOMAIN, ""))) if environment is not None else None
-    )
+    own_domain = ("", domain_text(environment.get(DOMAIN, ""))) if environment is not None else None
     own_keys = _authorities_here(environment) if environment is not None else frozenset()
     for place, processes in _group_by_network_and_domain(secured).items():
         groups = _group_by_authorities(process for process in processes if not process.is_zenoh)
@@ -1003,7 +999,11 @@ def has_other_files(enclave: ProcessEnclave, root: Path) -> bool:
     """Return whether ``root`` also has the enclave, with other files than the process loaded."""
     with suppress(SrosError, OSError):
         place = enclave_path(root, check_enclave_name(f"/{enclave.name.strip('/')}"))
-        if enclave.is_of(root) or not enclave.is_there or not (place / CERTIFICATE_FILE).exists():
+        if (
+            enclave.is_in_keystore(root)
+            or not enclave.is_there
+            or not (place / CERTIFICATE_FILE).exists()
+        ):
             return False
         for name in (CERTIFICATE_FILE, PERMISSIONS_FILE, GOVERNANCE_FILE, CRL_FILE):
             has, loaded = (place / name).exists(), enclave.file(name)

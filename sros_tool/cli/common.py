@@ -817,10 +817,11 @@ def change_options(*, dry_run: bool, allow_refusal: Sequence[Vendor] = ()) -> Ch
 
 
 def try_passphrase(root: Path, keyring: Keyring) -> None:
-    """Open the CA keys of a keystore if nobody can be asked, although nothing is to be signed.
+    """Check that the CA keys of a keystore can be opened, though nothing is to be signed now.
 
     So a timer with a wrong passphrase, or without one, fails today, and not when files are about
     to expire. Without a passphrase, keys may be missing, because they are elsewhere on purpose.
+    Nothing is checked if the user would have to be asked for a passphrase.
 
     Raises:
         SrosError: a key cannot be opened.
@@ -958,7 +959,7 @@ def _read_at_most(path: Path, count: int) -> bytes:
     handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     try:
         is_pipe = stat.S_ISFIFO(os.fstat(handle).st_mode)
-        data = bytearray(_first_bytes_of_pipe(handle, path) if is_pipe else b"")
+        data = bytearray(_first_byte_of_pipe(handle, path) if is_pipe else b"")
         poll = select.poll()
         poll.register(handle, select.POLLIN)
         while len(data) < count:
@@ -982,7 +983,7 @@ _CHUNK_BYTES = 1024 * 1024
 """Number of bytes that are read at a time."""
 
 
-def _first_bytes_of_pipe(handle: int, path: Path) -> bytes:
+def _first_byte_of_pipe(handle: int, path: Path) -> bytes:
     """Wait for a writer of a pipe; return the first byte, or b"" if the writer wrote nothing.
 
     Raises:
@@ -1096,7 +1097,7 @@ def _wrapped_lines(text: str, indent: str) -> list[str]:
     return [line.replace("\0", " ") for line in lines]
 
 
-def print_signed(groups: Sequence[Sequence[Finding]], files: Iterable[str]) -> None:
+def print_findings_after_signing(groups: Sequence[Sequence[Finding]], files: Iterable[str]) -> None:
     """Print on stderr the findings about policies whose permissions were just signed."""
     from sros_tool.checks.kind import Severity
 

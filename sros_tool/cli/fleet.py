@@ -379,10 +379,10 @@ def _collected_lines(collected: CollectedInbox) -> Iterator[str]:
     messages = Counter(robot.outcome for robot in collected.robots)
     asked = Counter(request.outcome for _, request in requests)
     line = f"{counted(len(collected.robots), 'robot')}: "
-    line += _outcome_numbers(messages, MESSAGE_OUTCOMES, would_be)
+    line += _outcomes_text(messages, MESSAGE_OUTCOMES, would_be)
     if requests:
         line += f"; {counted(len(requests), 'request')}: "
-        line += _outcome_numbers(asked, REQUEST_OUTCOMES, would_be)
+        line += _outcomes_text(asked, REQUEST_OUTCOMES, would_be)
     yield line
     by_outcome = sorted(collected.robots, key=lambda robot: MESSAGE_OUTCOMES.index(robot.outcome))
     similar_texts: dict[tuple[str, ...], dict[str, str]] = {}
@@ -410,7 +410,7 @@ def _collected_lines(collected: CollectedInbox) -> Iterator[str]:
 _OUTCOME_WORDS = {"missing": "by hand or without a message"}
 
 
-def _outcome_numbers(numbers: Mapping[str, int], outcomes: Sequence[str], verb_form: str) -> str:
+def _outcomes_text(numbers: Mapping[str, int], outcomes: Sequence[str], verb_form: str) -> str:
     """Return the number of messages or requests with each outcome, in words."""
     present_outcomes = (outcome for outcome in outcomes if numbers.get(outcome))
     return ", ".join(
@@ -739,7 +739,7 @@ def _status(
         from sros_tool.values import as_plain
 
         rows = list(_page_rows(compared, robots))
-        in_force, total = _list_in_force(status) or (0, 0)
+        in_force, total = _counts_of_list_in_force(status) or (0, 0)
         list_lacking = "".join(_revocation_list_facts(compared)) if in_force < total else ""
         text = render_fleet_page(
             as_plain(compared),
@@ -883,7 +883,7 @@ def _fleet_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
 def _revocation_list_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
     """Yield the number of robots on which the revocation list is in force, if a list exists."""
     status = compared_fleet.status
-    if numbers := _list_in_force(status):
+    if numbers := _counts_of_list_in_force(status):
         in_force, robots = numbers
         number = f"{in_force} of " if in_force < robots else "all " if in_force > 1 else ""
         text = f"the revocation list is in force on {number}{counted(robots, 'robot')}"
@@ -902,7 +902,7 @@ def _revocation_list_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
         yield text
 
 
-def _list_in_force(status: FleetStatus) -> tuple[int, int] | None:
+def _counts_of_list_in_force(status: FleetStatus) -> tuple[int, int] | None:
     """Return two numbers of robots: where the revocation list is in force, and where it has to be.
 
     Returns None if nothing is revoked, or if no robot has to have the list.

@@ -115,7 +115,7 @@ def inspect(
     if enclave is not None:
         if history:
             raise UsageError("--history is for a whole keystore", "", f"Leave {enclave} out.")
-        path = _enclave_of(keystore, enclave)
+        path = _folder_of_enclave(keystore, enclave)
     if history:
         return _show_history(keystore, policy, as_json)
     if policy:
@@ -142,7 +142,7 @@ def inspect(
     return 1 if signature and signature.signature_verified is False else 0
 
 
-def _enclave_of(keystore: OpenedKeystore, name: str) -> Path:
+def _folder_of_enclave(keystore: OpenedKeystore, name: str) -> Path:
     """Return the folder of an enclave of a keystore."""
     from sros_tool.keystore.selection import missing_enclave_error
 

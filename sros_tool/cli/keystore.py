@@ -37,8 +37,8 @@ from sros_tool.cli.common import (
     keystore_arguments,
     keystore_from_environment,
     now,
+    print_findings_after_signing,
     print_json,
-    print_signed,
     progress,
     robot_option,
     ros_domain,
@@ -338,7 +338,7 @@ def _show(
         after=filter(None, (old_program_text(result.rights), lasting_text(root, result.rights))),
     )
     if findings and not as_json:
-        print_signed(findings, [policy.file for policy in policies])
+        print_findings_after_signing(findings, [policy.file for policy in policies])
 
 
 def _created_lines(result: Creation) -> Iterator[str]:

@@ -553,7 +553,7 @@ def rotate_ca(
                 RotationStage(to) if to else None,
                 roles=roles,
                 finish=finish,
-                new_keys=_new_keys(identity_key, permissions_key, encrypt_ca_keys),
+                new_keys=_new_keyring(identity_key, permissions_key, encrypt_ca_keys),
                 existing=existing,
                 validity=validity,
                 delete_old_key=delete_old_key,
@@ -674,7 +674,7 @@ def _show_status(status: RotationStatus, unconfirmed: Sequence[str] | str, as_js
         echo(remark)
 
 
-def _new_keys(identity: str | None, permissions: str | None, encrypt: bool) -> Keyring:
+def _new_keyring(identity: str | None, permissions: str | None, encrypt: bool) -> Keyring:
     """Return a keyring for new CA keys.
 
     Only options state the places of new keys; environment variables state the places of the current

@@ -401,7 +401,10 @@ class _Outputs:
 
 
 def _check_outside(file: Path, top: Path) -> None:
-    """Raise `UsageError` if the reviewed change could control the output file, by a link."""
+    """Raise `UsageError` if the reviewed change could control the output file, by a link.
+
+    ``top`` is the top folder of the repository, which has the change.
+    """
     parent = Path(os.path.realpath(file.absolute().parent))
     if parent.is_relative_to(os.path.realpath(top)):
         raise UsageError(
@@ -609,7 +612,7 @@ def _lines_to_read(step: ReviewStep) -> list[str]:
             differing = folded_differences(before, after, compared.rights, ("BASE", "HEAD"))
             differing += enclave_lines(compared, after.fleet or before.fleet)
             differing += protection_lines(compared.protections)
-            return [*unanswered, *_absolute_lines(step.content), *differing]
+            return [*unanswered, *_lines_of_changed_form(step.content), *differing]
         case (ChosenFindings() as chosen) | DroppedRequirements(chosen=chosen):
             one_per_group = ((finding,) for finding in chosen.shown)
             return [
@@ -629,7 +632,7 @@ def _finding_line(finding: Finding) -> str:
     return line + "".join(f" ({place.text}: {place})" for place in places)
 
 
-def _absolute_lines(change: RightsChange) -> Iterator[str]:
+def _lines_of_changed_form(change: RightsChange) -> Iterator[str]:
     """Yield a line for each name that became absolute, or relative to its node's namespace."""
     from sros_tool.fleet.robots import folded
     from sros_tool.policy.model import ALLOW
@@ -731,7 +734,7 @@ def _detail(result: Review, step: ReviewStep, request: ReviewRequest) -> str:
             return access_markdown(before, after, growth, dropped, elsewhere)
         case RightsChange(before=before, after=after, compared=compared) as change:
             parts = [rights_markdown(before, after, compared)] if compared else []
-            if lines := list(_absolute_lines(change)):
+            if lines := list(_lines_of_changed_form(change)):
                 title = f"### {counted(len(lines), 'name')} made absolute or relative"
                 parts += [title, bounded_list(map(code, lines), 6000, shown_by)]
             return "\n\n".join(part.rstrip("\n") for part in parts)

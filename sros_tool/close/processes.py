@@ -156,7 +156,9 @@ class ClosedProcess(NamedTuple):
         in_enclave = [
             other
             for other in in_domain
-            if (enclave := other.enclave) and enclave.name == self.enclave and enclave.is_of(export)
+            if (enclave := other.enclave)
+            and enclave.name == self.enclave
+            and enclave.is_in_keystore(export)
         ]
         pids = [
             *dict.fromkeys(

@@ -93,7 +93,7 @@ class RunningRobot:
         return [
             SecuredProcess(process, process.enclave)
             for process in self.processes.processes
-            if process.enclave and process.enclave.is_of(export)
+            if process.enclave and process.enclave.is_in_keystore(export)
         ]
 
     @cached_property

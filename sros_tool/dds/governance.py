@@ -153,11 +153,11 @@ def attributes(rule: type[DomainRule | TopicRule]) -> tuple[Attribute, ...]:
     return _ATTRIBUTES[rule]
 
 
-def settings(rule: type[DomainRule | TopicRule], *, protect: bool) -> dict[str, Any]:
-    """Map attribute names to portable values that protect, or else to open values."""
+def attribute_values(rule_class: type[DomainRule | TopicRule], *, protect: bool) -> dict[str, Any]:
+    """Map the names of a rule's attributes to portable values that protect, or to open values."""
     return {
         attribute.name: attribute.portable if protect else attribute.open
-        for attribute in attributes(rule)
+        for attribute in attributes(rule_class)
     }
 
 

@@ -306,7 +306,7 @@ def _read_enclaves(keystore: OpenedKeystore, now: datetime, domain: int) -> _Enc
             revoked[name] = by_own_list
         elif faults and all(fault.fault is Fault.PERMISSIONS_DOMAIN for fault in faults):
             other_domain.append(name)
-        elif reason := str(faults[0]) if faults else _file_with_strange_authority(keystore, state):
+        elif reason := str(faults[0]) if faults else _fault_of_ca_file(keystore, state):
             faulty[name] = reason
         elif grant := state.grant:
             rules = tuple(rule for rule in grant.rules if domain in rule.domains.closed())
@@ -348,8 +348,8 @@ def _content(path: Path) -> bytes:
         return b""
 
 
-def _file_with_strange_authority(keystore: OpenedKeystore, state: OpenedEnclave) -> str:
-    """Return the name of an enclave's CA file with a CA that the keystore does not have, or ""."""
+def _fault_of_ca_file(keystore: OpenedKeystore, state: OpenedEnclave) -> str:
+    """Return a clause if a CA file of an enclave has no CA of the keystore, or else ""."""
     for file, role in ((IDENTITY_CA_FILE, IDENTITY), (PERMISSIONS_CA_FILE, PERMISSIONS)):
         known = {digest(certificate) for certificate in keystore.authority(role)}
         if fingerprints(state.files[file]).isdisjoint(known):

@@ -22,9 +22,9 @@ from sros_tool.dds.governance import (
     DomainRule,
     Governance,
     TopicRule,
+    attribute_values,
     parse_governance,
     render_governance,
-    settings,
 )
 from sros_tool.dds.permissions import (
     Criteria,
@@ -253,9 +253,9 @@ def _weak_governance(copy: KeystoreCopy) -> bytes:
             tuple(
                 replace(
                     rule,
-                    **settings(DomainRule, protect=False),
+                    **attribute_values(DomainRule, protect=False),
                     topic_access_rules=tuple(
-                        replace(topic, **settings(TopicRule, protect=False))
+                        replace(topic, **attribute_values(TopicRule, protect=False))
                         for topic in rule.topic_access_rules
                     ),
                 )

@@ -355,7 +355,7 @@ class ZenohEvaluator:
     def _router_of(self, enclave: str) -> ZenohFile:
         """Return the file of the router whose rules name an enclave, or of the first router."""
         for file in self.routers.values():
-            if file.process and file.process.access.rules_for(enclave):
+            if file.process and file.process.access.number_of_rules(enclave):
                 return file
         return next(iter(self.routers.values()))
 

@@ -312,7 +312,7 @@ def _criteria(endpoints: Iterable[Endpoint], direction: str) -> tuple[Criteria, 
 
 
 def groups_of(rights: Iterable[NodeRight], ns: str, node: str) -> tuple[Group, ...]:
-    """Return three groups of rights: for topics, for services, and for actions.
+    """Return a group of names for each right (publish, request, call...) that the node has.
 
     Names in a group are sorted, and relative to the node where that is shorter.
     """

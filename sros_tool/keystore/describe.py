@@ -60,7 +60,7 @@ from sros_tool.pki.certificates import (
 from sros_tool.pki.chains import Checks, chain_fault
 from sros_tool.pki.crl import CRL_MARK, RevocationList, load_crl
 from sros_tool.pki.keys import algorithm, holds_private_key, load_key
-from sros_tool.pki.token import TokenUri, read_token_file
+from sros_tool.pki.token import TokenUri, parse_token_file
 from sros_tool.policy.rights import KIND_OF
 from sros_tool.translate import ros_rights
 from sros_tool.translate_zenoh.rights import domains_of, stated_names
@@ -599,7 +599,7 @@ def _describe_file(
     if CRL_MARK in data:
         return DescribedList(path, _describe_revocation_list(load_crl(data, "in it"), now))
     if path.name == KEY_URI_FILE:
-        return DescribedKeyOnToken(path, _describe_token(read_token_file(data)))
+        return DescribedKeyOnToken(path, _describe_token(parse_token_file(data)))
     if holds_private_key(data):
         mode = path.stat().st_mode & 0o777
         return DescribedKey(path, algorithm(load_key(data, "in it")), f"{mode:04o}")

@@ -907,10 +907,10 @@ class _EnclaveFiles:
             self._add(KEY_URI_FILE, text, Fault.KEY_TWICE)
         if not data:  # already reported
             return None
-        from sros_tool.pki.token import read_token_file
+        from sros_tool.pki.token import parse_token_file
 
         try:
-            return read_token_file(data)
+            return parse_token_file(data)
         except PkiError as error:
             self._add(KEY_URI_FILE, error.clause, Fault.TOKEN_URI)
             return None

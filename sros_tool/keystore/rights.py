@@ -396,7 +396,7 @@ def _zenoh_rights(path: Path, document: ConfigurationDocument) -> RightsSource:
     if any(subject.cert_common_names is None for subject in access.subjects):
         text = "its rules for subjects without certificate common names are left out"
         notes.append(Note("rights.zenoh-nameless", f"{path}: {text}; `sros check` shows them."))
-    if unclear := document.open_link():
+    if unclear := document.open_link_clause():
         text = (
             f"{path}: {unclear}: a process that connects there has no name that a rule could "
             "require."

@@ -778,7 +778,7 @@ def _certificate_form(certificate: bytes) -> CertificateForm:
 
 
 def _form_of_name(name: bytes) -> tuple[object, ...]:
-    """Return the kinds of a name's attributes, by RDN, and the unusual characters in it."""
+    """Return the kinds of a name's attributes, by RDN, and the unusual characters of the name."""
     kinds: list[object] = []
     unusual: set[bytes] = set()
     for part in der.children(name):

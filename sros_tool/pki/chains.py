@@ -219,7 +219,7 @@ def _find_issuer(
     moment: datetime,
     chain: Sequence[x509.Certificate] = (),
 ) -> x509.Certificate | None:
-    """Return the issuer of ``certificate``, or None.
+    """Return the issuer of ``certificate``, or None; certificates in ``chain`` are left out.
 
     The first candidate that is valid at ``moment`` is chosen, otherwise the candidate that expires
     last.

@@ -337,7 +337,7 @@ def few_rounds_clause(pem: bytes) -> str:
 
 
 def _integers(data: bytes, depth: int = 3) -> Iterator[int]:
-    """Yield the integers in ``data`` in order, including those in nested sequences."""
+    """Yield the integers in ``data`` in order, also from sequences nested up to ``depth``."""
     for value in der.children(data):
         if value.tag == der.INTEGER:
             yield der.integer(value)

@@ -472,7 +472,7 @@ def _public_key(certificate: x509.Certificate) -> object:
 
 
 def _checked_parts(value: der.Value, *tags: int) -> list[der.Value]:
-    """Return the values in a constructed value; raise `ValueError` if their tags differ."""
+    """Return the values in a constructed value; raise `ValueError` unless they have ``tags``."""
     parts = der.children(value.content)
     if tuple(part.tag for part in parts) != tags:
         raise ValueError("not the structure of a CMS signature")

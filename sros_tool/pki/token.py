@@ -90,7 +90,7 @@ class TokenKey(ec.EllipticCurvePrivateKey):
     @property
     def file(self) -> bytes:
         """The content of a ``key.p11`` that names this key."""
-        return token_file(self.place)
+        return token_file_content(self.place)
 
     @property
     def never_left(self) -> bool:
@@ -249,7 +249,7 @@ def _usable_uri(uri: str, *, named: bool) -> TokenUri:
 
 
 def _with_library(parsed: TokenUri, *, named: bool) -> TokenUri:
-    """Return the URI with the path of its library.
+    """Return the URI with the path of its library; ``named``: the user gave the URI.
 
     Raises:
         UsageError, UnavailableError: tokens cannot be used on this machine.
@@ -488,7 +488,7 @@ def token_places(uri: str, names: Sequence[str]) -> Mapping[str, TokenUri]:
     return places
 
 
-def token_file(parsed: TokenUri) -> bytes:
+def token_file_content(parsed: TokenUri) -> bytes:
     """Return the content of a ``key.p11``: one line, which Fast DDS gives to OpenSSL.
 
     The line does not name the module: libp11 0.4.12 refuses this attribute, and takes the module
@@ -501,7 +501,7 @@ def token_file(parsed: TokenUri) -> bytes:
     return f"{uri}\n".encode()
 
 
-def read_token_file(data: bytes) -> TokenUri:
+def parse_token_file(data: bytes) -> TokenUri:
     """Return the URI in a ``key.p11``; errors do not quote the content, which may contain a PIN.
 
     RMWs read only the first word of the file, so nothing may follow the URI.
@@ -534,7 +534,8 @@ def _percent_encoded(text: str) -> str:
 def _attributes(parts: Sequence[str], known: Set[str]) -> dict[str, str]:
     """Map the attributes in ``parts`` of a URI to their decoded values.
 
-    Errors do not quote values, which may be secret.
+    Attributes that are not in ``known`` are refused. Errors do not quote values, which may be
+    secret.
     """
     attributes: dict[str, str] = {}
     for part in filter(None, parts):
@@ -550,14 +551,14 @@ def _attributes(parts: Sequence[str], known: Set[str]) -> dict[str, str]:
     return attributes
 
 
-def place_in(path: Path) -> TokenUri:
+def place_in_file(path: Path) -> TokenUri:
     """Return the place on a token that the file ``key.p11`` at ``path`` names.
 
     Raises:
         SrosError: the file cannot be read, or names no key on a token.
     """
     try:
-        return read_token_file(read_bytes(path, "place of the key"))
+        return parse_token_file(read_bytes(path, "place of the key"))
     except PkiError as error:
         raise PkiError(
             f"'{path}' does not name a key on a token", error.why, "Write it again."

@@ -521,7 +521,7 @@ def _parse_extensions(
     strict: _StrictReader,
     loose: Mapping[ObjectIdentifier, _LooseReader],
 ) -> x509.Extensions:
-    """Parse extensions in DER.
+    """Parse extensions in DER, each with the reader ``strict`` or else with one of ``loose``.
 
     Raises:
         PkiError: one of ``parts`` is not an extension.

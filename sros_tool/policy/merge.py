@@ -475,7 +475,7 @@ def merge_all(path: Path, policies: Iterable[Policy]) -> Merged:
 
 
 def _shared_enclaves(before: Policy, policies: Iterable[Policy], after: Policy) -> Iterator[str]:
-    """Yield a text on each enclave for which the merged ``policies`` have only other nodes.
+    """Yield a text on each enclave that gets other nodes, and whose own are not in ``policies``.
 
     Nodes that have the same name in other namespaces are instances of a node, for which there is
     another note.

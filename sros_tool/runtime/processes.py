@@ -176,8 +176,8 @@ class Process:
 
     @property
     def domain(self) -> str:
-        """The ROS domain that the process names, as a number; see `domain_number`."""
-        return domain_number(self.environment.get(DOMAIN, ""))
+        """The ROS domain that the process names, as a number; see `domain_text`."""
+        return domain_text(self.environment.get(DOMAIN, ""))
 
     @property
     def rmw(self) -> str:
@@ -253,22 +253,22 @@ class Process:
         return any(mark in word for word in self.command for mark in _DAEMON)
 
 
-def domain_number(named: str) -> str:
-    """Return the ROS domain of a value of ROS_DOMAIN_ID, as a number.
+def domain_text(variable: str) -> str:
+    """Return the ROS domain that ``variable``, a value of ROS_DOMAIN_ID, names, in digits.
 
     rcl reads the value with strtoul(3), which accepts 0x39, and ignores what follows a number other
     than 0. DDS keeps 32 bits of it. A value that rcl refuses is returned in quotes, safe to print.
     """
-    number = _DOMAIN_NUMBER.match(named or "0", 0, _LONGEST_NUMBER)
+    number = _DOMAIN_NUMBER.match(variable or "0", 0, _LONGEST_NUMBER)
     if number is not None:
         digits = number[2].lower()
         base = 16 if digits.startswith("0x") else 8 if digits.startswith("0") else 10
         value = int(digits, base)
-        if value < _NUMBERS and (value or not named[number.end() :]):
+        if value < _NUMBERS and (value or not variable[number.end() :]):
             value = -value % _NUMBERS if number[1] == "-" else value
             # The highest number stands for the default domain.
             return str(value % 2**32 if value != _NUMBERS - 1 else 0)
-    return f"'{plain(named)}'"
+    return f"'{plain(variable)}'"
 
 
 _NUMBERS = 2**64
@@ -834,7 +834,7 @@ def _configuration_of(process: Process) -> LoadedFile | None:
 
 
 def _stat(folder: int) -> _Stat:
-    """Return the numbers of a process.
+    """Return what /proc/PID/stat says about a process; ``folder`` is its open /proc/PID.
 
     Raises:
         OSError: The process has ended.
@@ -998,7 +998,7 @@ class ProcessEnclave:
         """Return the file of the enclave with this name."""
         return next((file for file in self.files if file.name == name), LoadedFile(name))
 
-    def is_of(self, keystore: Path) -> bool:
+    def is_in_keystore(self, keystore: Path) -> bool:
         """Return whether this is an enclave of a keystore on this machine, also by another path.
 
         The folder of the enclave decides, or the folder of the keystore: links, ``..`` and the
@@ -1069,7 +1069,10 @@ class ProcessRoot:
         self._reader = reader
 
     def load(self, name: str, path: str, *, read: bool = True) -> LoadedFile:
-        """Return the state of a file at an absolute path, with its content if ``read``."""
+        """Return the state of a file at an absolute path, with its content if ``read``.
+
+        ``name`` is the name of the file in the result.
+        """
         try:
             with self._opened(path) as (handle, way):
                 links = [status for _, status in way[:-1] if stat.S_ISLNK(status.st_mode)]

@@ -289,7 +289,7 @@ def _allowed_keys(
             if not is_expression(name) and not denials.overlaps(name)
         }
         wild = {name: place for name, place in places.items() if is_expression(name)}
-        difference = Difference(str(domain), end, _forms(wild), _forms(never))
+        difference = Difference(str(domain), end, _chunks_of_names(wild), _chunks_of_names(never))
         names = _with_keys_below(exact | _names_of(difference, right, wild, never))
         keys = tuple([canonical((str(domain), *name)) + end for name in names])
         # Exact names that are now part of a wildcard's expression also belong to the difference.
@@ -297,7 +297,7 @@ def _allowed_keys(
         yield right, keys, full_difference if wild else None
 
 
-def _forms(places: Mapping[str, Source]) -> frozenset[Chunks]:
+def _chunks_of_names(places: Mapping[str, Source]) -> frozenset[Chunks]:
     """Return the chunks of the key expressions that match the names in ``places``."""
     return frozenset(
         chunks
@@ -323,7 +323,7 @@ def _names_of(
         pass
     for (wide, place), (name, denying) in product(sorted(allowed.items()), sorted(denied.items())):
         try:
-            subtract_all(_forms({wide: place}), _forms({name: denying}))
+            subtract_all(_chunks_of_names({wide: place}), _chunks_of_names({name: denying}))
         except CannotSubtract as error:
             if error.denied:
                 why = "for text between two wildcards there is no such list"

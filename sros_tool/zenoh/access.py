@@ -191,7 +191,7 @@ class AccessControl:
         """Return the common names for which there are rules."""
         return frozenset(self._by_name)
 
-    def rules_for(self, common_name: str) -> int:
+    def number_of_rules(self, common_name: str) -> int:
         """Return the number of rules for the remote process with this common name."""
         remote = self._by_name.get(common_name)
         return len(remote.rules) if remote else 0
@@ -388,20 +388,22 @@ def _added_keys(first_keys: tuple[str, ...], second_keys: tuple[str, ...]) -> tu
     return tuple(sorted({*first_keys, *second_keys})) if first_keys else second_keys
 
 
-def narrowed_rights(rights: RemoteRights, most: Iterable[AccessRule], kept: str) -> RemoteRights:
-    """Return the part of ``rights`` that the rules in ``most`` also allow.
+def narrowed_rights(
+    rights: RemoteRights, limit: Iterable[AccessRule], graph_prefix: str
+) -> RemoteRights:
+    """Return the part of ``rights`` that the rules in ``limit`` also allow.
 
-    Rules for keys that begin with ``kept`` are not narrowed.  These are keys of graph tokens, in
-    which the names of nodes and topics are only parts of a key.
+    Rules for graph tokens are not narrowed, because the names of nodes and topics are only parts
+    of their keys. These keys begin with ``graph_prefix``.
 
     Raises:
         TooManyExpressions: the result needs too many key expressions.
     """
-    graph = [rule for rule in rights.rules if rule.key_expressions[0].startswith(kept)]
+    graph = [rule for rule in rights.rules if rule.key_expressions[0].startswith(graph_prefix)]
     other_rules = tuple(rule for rule in rights.rules if rule not in graph)
-    limit = RemoteRights("", tuple(rule.mirrored() for rule in most))
+    limiting_rights = RemoteRights("", tuple(rule.mirrored() for rule in limit))
     other_rights = RemoteRights(rights.common_name, other_rules, rights.differences)
-    common_rights, _ = RightsBetween((other_rights, limit)).rights_for_others("")
+    common_rights, _ = RightsBetween((other_rights, limiting_rights)).rights_for_others("")
     return RemoteRights(rights.common_name, sorted_rules((*graph, *common_rights.rules)))
 
 
@@ -535,7 +537,7 @@ class MessageFilter(Protocol):
     def allowed_keys(self, common_name: str, flow: Flow, message: Message) -> tuple[str, ...]:
         """Return the key expressions that rules allow, including denied ones."""
 
-    def rules_for(self, common_name: str) -> int:
+    def number_of_rules(self, common_name: str) -> int:
         """Return the number of rules for the remote process with this common name."""
 
     def names(self) -> frozenset[str]:
@@ -673,7 +675,7 @@ class Enforcement:
             for key in rule.key_expressions
         )
 
-    def rules_for(self, common_name: str) -> int:
+    def number_of_rules(self, common_name: str) -> int:
         """Return the number of rules of the subjects with this common name."""
         return sum(
             len(self.rules_of(subject.id))

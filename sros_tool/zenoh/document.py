@@ -152,7 +152,7 @@ class ConfigurationDocument:
     settings: Mapping[str, str] = field(default_factory=dict, compare=False, repr=False)
     lines: Mapping[str, int] = field(default_factory=dict, compare=False, repr=False)
 
-    def open_link(self) -> str:
+    def open_link_clause(self) -> str:
         """Return a clause on how a process without a certificate can connect, or ""."""
         for endpoint in (*self.listen, *self.connect):
             if self.protocols is not None and endpoint.protocol not in self.protocols:

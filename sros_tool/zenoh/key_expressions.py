@@ -203,7 +203,7 @@ def sequence_includes(wide: Sequence[str], narrow: Sequence[str]) -> bool:
 
 
 def _with_skipped_wildcards(positions: set[int], wide: Sequence[str]) -> set[int]:
-    """Return ``positions``, and the positions after a ``**`` at them: it can match no chunk."""
+    """Return ``positions``, and those after a ``**`` at them, which may match no chunk."""
     places = set(positions)
     for at in sorted(positions):
         while at < len(wide) and wide[at] == ANY_CHUNKS:

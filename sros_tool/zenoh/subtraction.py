@@ -585,7 +585,10 @@ class Difference(NamedTuple):
         )
 
     def include_all(self, begin: str, name: Chunks, end: str) -> bool:
-        """Return whether the difference has all keys of an expression; False may be wrong."""
+        """Return whether the difference has all keys of an expression, given in three parts.
+
+        False may be wrong.
+        """
         return (
             begin == self.begin
             and _common_end(end, self.end) == end

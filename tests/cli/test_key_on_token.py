@@ -19,8 +19,8 @@ from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.pki.token import (
     TokenUri,
     parse_enclave_uri,
-    read_token_file,
-    token_file,
+    parse_token_file,
+    token_file_content,
 )
 from tests.support.harness import Ended, copy_of, forked, sros
 
@@ -57,13 +57,13 @@ def place(root: Path, uri: str) -> None:
     ],
 )
 def test_what_is_written_is_read_and_has_no_separator_in_a_name(place: TokenUri) -> None:
-    line = token_file(place)
-    assert read_token_file(line) == place
+    line = token_file_content(place)
+    assert parse_token_file(line) == place
     assert len(line.split()) == 1
     path, _, query = line.decode().strip().partition("?")
     assert [len(path.split(";")), path.count("="), query.count("=")] == [3, 3, bool(query)]
     module = TokenUri(place.token, place.object, "/m.so", place.pin_source)
-    assert token_file(module) == line  # libp11 0.4.12 takes no URI with a module
+    assert token_file_content(module) == line  # libp11 0.4.12 takes no URI with a module
 
 
 HOSTILE = (
@@ -98,7 +98,7 @@ def test_a_hostile_place_is_refused_and_not_shown() -> None:
     """Whatever it says, nothing of it is in the error: it may have a PIN."""
     for data in HOSTILE:
         with pytest.raises(PkiError) as error:
-            read_token_file(data.encode())
+            parse_token_file(data.encode())
         assert PIN not in f"{error.value} {error.value.why} {error.value.remedy}", data
 
 
@@ -118,7 +118,7 @@ def test_verbs_refuse_a_hostile_place_and_show_nothing_of_it(data: str, root: Pa
 def test_a_place_that_is_no_text_or_no_file(root: Path) -> None:
     for data in (b"\xff\xfe", b"pkcs11:\xff=1", b"x" * 5_000_000):
         with pytest.raises(PkiError):
-            read_token_file(data)
+            parse_token_file(data)
     path = root / "enclaves/arm/key.p11"
     path.unlink()
     os.mkfifo(path)

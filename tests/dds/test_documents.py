@@ -24,10 +24,10 @@ from sros_tool.dds.governance import (
     Governance,
     ProtectionKind,
     TopicRule,
+    attribute_values,
     attributes,
     parse_governance,
     render_governance,
-    settings,
 )
 from sros_tool.dds.permissions import (
     LARGE_BYTES,
@@ -72,20 +72,20 @@ grants = st.builds(Grant, texts, texts, dates, dates, rules.map(tuple), st.boole
 permissions = st.lists(grants, min_size=1, max_size=2).map(lambda each: Permissions(tuple(each)))
 
 
-def attribute_values(rule: type[DomainRule | TopicRule]) -> dict[str, st.SearchStrategy[object]]:
+def value_strategies(rule: type[DomainRule | TopicRule]) -> dict[str, st.SearchStrategy[object]]:
     return {each.name: st.sampled_from(each.values) for each in attributes(rule)}
 
 
 topic_rules = st.builds(
     TopicRule,
     topic_expression=texts.filter(lambda text: text == text.strip()),
-    **attribute_values(TopicRule),
+    **value_strategies(TopicRule),
 )
 domain_rules = st.builds(
     DomainRule,
     domains=domains,
     topic_access_rules=st.lists(topic_rules, min_size=1, max_size=4).map(tuple),
-    **attribute_values(DomainRule),
+    **value_strategies(DomainRule),
 )
 governances = st.lists(domain_rules, min_size=1, max_size=2).map(
     lambda each: Governance(tuple(each))
@@ -309,11 +309,11 @@ def test_every_vendor_reads_what_sros_writes_alike(seed: int) -> None:
 def test_a_document_that_vendors_may_read_in_their_own_ways_is_left_to_them(
     old: bytes, new: bytes
 ) -> None:
-    plain = settings(TopicRule, protect=True)
+    plain = attribute_values(TopicRule, protect=True)
     rule = DomainRule(
         domains=DomainSet.of((0, 0)),
         topic_access_rules=(TopicRule(topic_expression="*", **plain),),
-        **settings(DomainRule, protect=True),
+        **attribute_values(DomainRule, protect=True),
     )
     document = render_governance(Governance((rule,)))
     assert canonical_governance(document)

@@ -400,11 +400,11 @@ def test_an_enclave_is_known_by_whatever_path_a_process_names(
     }.items():
         environment = {ENABLE: "true", KEYSTORE: path, ENCLAVE: "/a"}
         process = with_files(Process(1, (), environment, datetime.now(UTC)), root, "/")
-        assert process.enclave and process.enclave.is_of(export) == is_own, path
+        assert process.enclave and process.enclave.is_in_keystore(export) == is_own, path
     # Another folder of the same path, as a copy in the image of a container.
     (tmp_path / "root" / export.relative_to("/") / "enclaves/a").mkdir(parents=True)
     other = with_files(process, root, "/").enclave
-    assert other and other.is_there and not other.is_of(export)
+    assert other and other.is_there and not other.is_in_keystore(export)
 
 
 def test_a_replaced_link_is_a_change(root: ProcessRoot, tmp_path: Path) -> None:

@@ -78,7 +78,7 @@ from sros_tool.pki.certificates import (
     validity_of,
 )
 from sros_tool.pki.keys import holds_private_key
-from sros_tool.pki.token import read_token_file
+from sros_tool.pki.token import parse_token_file
 from sros_tool.values import DryRun, FileChanges, NamedKeystore, Notes, Words
 from sros_tool.wording import first_few
 from sros_tool.xml import read_bytes
@@ -187,7 +187,7 @@ def _token_notes(files: Mapping[str, bytes]) -> Iterator[Note]:
     for path in files:
         folder, _, file = path.rpartition("/")
         if file == KEY_URI_FILE:
-            place = read_token_file(files[path])
+            place = parse_token_file(files[path])
             text = (
                 f"{folder.removeprefix(ENCLAVES) or '/'}: the key is not exported. It is "
                 f"{place.object} on the token {place.token}, which has to be in the robot."

@@ -90,8 +90,8 @@ from sros_tool.pki.token import (
     TokenUri,
     make_enclave_key,
     open_enclave_key,
-    place_in,
-    token_file,
+    place_in_file,
+    token_file_content,
     token_notes,
     token_places,
 )
@@ -162,7 +162,7 @@ def create_request(
             )
         made: PrivateKey
         if again and on_token.exists() and not path.exists():
-            made = open_enclave_key(place_in(on_token), secrets)
+            made = open_enclave_key(place_in_file(on_token), secrets)
         elif again:
             made = load_enclave_key(read_bytes(path, "private key"), f"'{path}'")
         elif (folder / place / CERTIFICATE_FILE).exists():
@@ -172,7 +172,7 @@ def create_request(
                 "Restore the key, or choose another folder.",
             )
         elif place_of_key and dry_run:
-            transaction.write(f"{place}/{KEY_URI_FILE}", token_file(place_of_key))
+            transaction.write(f"{place}/{KEY_URI_FILE}", token_file_content(place_of_key))
             made = generate_key()  # a dry run does not open the token
         elif place_of_key:
             made = make_enclave_key(place_of_key, secrets)

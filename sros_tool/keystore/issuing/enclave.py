@@ -69,9 +69,9 @@ from sros_tool.pki.token import (
     TokenUri,
     make_enclave_key,
     open_enclave_key,
-    place_in,
+    place_in_file,
     planned_key,
-    token_file,
+    token_file_content,
 )
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import Enclave, Policy
@@ -124,7 +124,7 @@ class EnclaveTokens:
     def check_present(self, name: str, root: Path) -> None:
         """Raise `KeystoreError` if the key of an existing enclave is not at the chosen place."""
         path = enclave_path(root, name) / KEY_URI_FILE
-        if not path.exists() or read_bytes(path, "place of the key") != token_file(
+        if not path.exists() or read_bytes(path, "place of the key") != token_file_content(
             self.places[name]
         ):
             where = quote(str(root))
@@ -397,7 +397,7 @@ class EnclaveWriter:
         if key is None and (folder / KEY_FILE).exists():
             key = load_key(read_bytes(folder / KEY_FILE, "private key"), f"'{folder / KEY_FILE}'")
         elif key is None and (folder / KEY_URI_FILE).exists():
-            key = open_enclave_key(place_in(folder / KEY_URI_FILE), self._secrets)
+            key = open_enclave_key(place_in_file(folder / KEY_URI_FILE), self._secrets)
         if key:
             return make_request(key, identity.subject)
         with suppress(SrosError):

@@ -31,7 +31,7 @@ from sros_tool.dds.decision.expressions import ExpressionIndex
 from sros_tool.dds.decision.expressions import matches as dds_matches
 from sros_tool.dds.decision.vendors import Style, Vendor
 from sros_tool.dds.domains import DomainSet
-from sros_tool.dds.governance import DomainRule, Governance, TopicRule, settings
+from sros_tool.dds.governance import DomainRule, Governance, TopicRule, attribute_values
 from sros_tool.dds.permissions import Permissions
 from sros_tool.errors import KeystoreError
 from sros_tool.names import ROS_DISCOVERY_TOPIC, expand, is_expression
@@ -339,11 +339,11 @@ def _access(vendor: Vendor, permissions: Permissions, domain: int) -> Access:
 
 
 def _everything_controlled(domain: int) -> Governance:
-    topic = TopicRule("*", **settings(TopicRule, protect=True))
+    topic = TopicRule("*", **attribute_values(TopicRule, protect=True))
     rule = DomainRule(
         domains=DomainSet.of((domain, domain)),
         topic_access_rules=(topic,),
-        **settings(DomainRule, protect=True),
+        **attribute_values(DomainRule, protect=True),
     )
     return Governance((rule,))
 

@@ -110,7 +110,7 @@ from sros_tool.pki.token import (
     TokenKey,
     TokenUri,
     open_enclave_key,
-    place_in,
+    place_in_file,
     token_notes,
     token_places,
 )
@@ -1051,7 +1051,7 @@ class _EnclaveMaker:
         public = (
             load_key(read_bytes(path, "private key"), f"'{path}'")
             if path.name == KEY_FILE
-            else open_enclave_key(place_in(path), self._tokens.secrets)
+            else open_enclave_key(place_in_file(path), self._tokens.secrets)
         ).public_key()
         remedy = f"Move '{path}' away: then a new key is created."
         change.known.refuse_revoked(public, f"enclave {name}", remedy)
