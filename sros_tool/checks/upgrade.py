@@ -68,7 +68,7 @@ NO_NODE = FindingKind(
 BUFFERS = FindingKind(
     "upgrade.zenoh-buffers",
     WARNING,
-    "Zenoh files that lack the keys on which the other release sends images",
+    "Zenoh files that lack the keys on which rmw_zenoh sends images after the update",
     "rmw_zenoh of Lyrical sends messages with arrays of bytes, such as images and point clouds, on "
     "keys below the key of the topic. With files of an earlier sros, Zenoh drops them without a "
     "log line.",

@@ -790,7 +790,7 @@ _PERMISSIONS_ROWS: tuple[Row, ...] = (
         _successful_injection_row(
             "the same permissions, signed by the permissions CA",
             _SIGNED_BY_CA,
-            "the wrong signature",
+            "the wrong permissions",
         ),
     ),
     *tries(

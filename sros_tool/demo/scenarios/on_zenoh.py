@@ -399,7 +399,7 @@ _CONNECTION_ROWS = (
         _accepted_connection_row(
             "no certificate, and none is asked for",
             zenoh_forger.certificates_not_asked_for,
-            "mutual TLS and rules that trust only known names",
+            "mutual TLS and without rules that trust only known names",
         ),
     ),
     *tries(
@@ -427,7 +427,7 @@ _CONNECTION_ROWS = (
         _accepted_connection_row(
             "TCP instead of TLS, with a router that also accepts TCP",
             zenoh_forger.tcp_next_to_tls,
-            "the list of protocols and rules that trust only known names",
+            "the list of protocols and without rules that trust only known names",
         ),
     ),
     *tries(
@@ -593,7 +593,7 @@ def _through_the_router(party: Party, attack: str, denied: RowStatus, done: RowS
             "a process that does not enforce its own rules is not limited by them",
             zenoh_forger.sessions_that_limit_themselves,
             "limited by themselves",
-            "rules that others enforce",
+            "rules that other processes enforce",
         ),
     ]
 
@@ -618,7 +618,7 @@ def _trespass_rows() -> tuple[Row, ...]:
                 "the rules allow it",
                 zenoh_forger.guest_may_use_the_topic,
                 "rule added",
-                "the deny rule",
+                "least privilege",
             ),
         )
     return tuple(rows)
@@ -798,8 +798,8 @@ _WILDCARD_ROWS = (
                 attack,
                 party,
                 denied,
-                "Zenoh applies a rule to a wildcard only if the rule covers every key of the"
-                " wildcard, and sros writes no deny rules inside wildcards",
+                "Zenoh passes a wildcard only if a rule allows every key that the wildcard"
+                " matches; sros lists the allowed names, and does not rely on deny rules",
                 OWN,
                 _PEERS,
             ),
@@ -984,8 +984,8 @@ def _earlier_file_row(
         expected,
         "only this file decides what its own process may do"
         if defence_removed
-        else "a session file limits only other enclaves; their files decide what "
-        "this enclave may do",
+        else "the files of the other enclaves decide what an enclave may do, "
+        "not its own session file",
         hears("listener", guest.name),
         (*_topic_pair(keystore), guest),
         _CHATTER,
@@ -1026,7 +1026,7 @@ _EARLIER_ROWS = (
             "session file of an earlier policy, sessions that limit themselves",
             zenoh_forger.earlier_session_file_of_one_that_limits_itself,
             RowStatus.HEARD,
-            "rules that others enforce",
+            "rules that other processes enforce",
         ),
     ),
     *tries(
