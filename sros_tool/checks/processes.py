@@ -308,7 +308,7 @@ class _LoadedFiles:
 def _loaded_files(
     enclave: ProcessEnclave, newer_files: Sequence[str], process: Process, ledgers: _Ledgers
 ) -> _LoadedFiles:
-    """Return the files that a process loaded; the ledger has files that changed since."""
+    """Return data of the files that a process loaded; for ``newer_files``, from the ledger."""
     windows: dict[str, Window] = {}
     changed = {file.split()[0] for file in newer_files}
     certificate = next(iter(_certificates_in(enclave, CERTIFICATE_FILE)), None)

@@ -188,7 +188,7 @@ _LONGEST_PATH = 200
 def vulnerability_metrics(
     running: RunningProcesses, advisories: Sequence[Advisory] | None = None
 ) -> tuple[Metric, Metric]:
-    """Return how many vulnerabilities each DDS has, and how many releases are unknown.
+    """Return metrics: how many vulnerabilities each DDS has, and how many releases are unknown.
 
     The version is not a label: hostile processes or robots could make up any number of versions.
     """

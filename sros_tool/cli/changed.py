@@ -112,7 +112,7 @@ def print_follow_up(
 ) -> None:
     """Print the next steps after a change on standard error; arguments as for `print_changed`."""
     if not result.dry_run:
-        print_closed(result.root, result.changes)
+        print_closed_and_adopted(result.root, result.changes)
     if rights:  # on stderr: stdout has the same lines as with ros2/sros2
         _print_to_stderr(rights_lines(result.root, result.rights, dry_run=result.dry_run))
     _print_to_stderr(after)
@@ -170,7 +170,9 @@ def _change_lines(root: Path, paths: Sequence[str]) -> Iterator[str]:
     yield from folded(fleet, lines)
 
 
-def print_closed(root: Path, changes: Sequence[Change], *, keystore: Path | None = None) -> None:
+def print_closed_and_adopted(
+    root: Path, changes: Sequence[Change], *, keystore: Path | None = None
+) -> None:
     """Report on stderr keys that were closed to other users, and adoption of an sros2 keystore.
 
     ``root`` is an export of ``keystore``, or, without that argument, the keystore itself.

@@ -11,7 +11,12 @@ from typing import TYPE_CHECKING
 
 import click
 
-from sros_tool.cli.changed import print_changed, print_closed, print_follow_up, print_plan
+from sros_tool.cli.changed import (
+    print_changed,
+    print_closed_and_adopted,
+    print_follow_up,
+    print_plan,
+)
 from sros_tool.cli.common import (
     PATH,
     allow_refusal_option,
@@ -157,7 +162,7 @@ def distribute_key(
             if word := {"replace": "replaced", "remove": "removed"}.get(change.action):
                 echo(f"{word} {change.path}", err=True)
         if done:
-            print_closed(below, export.changes, keystore=root)
+            print_closed_and_adopted(below, export.changes, keystore=root)
     notes = (*older_keystore_notes(keystore), *notes)
     if keyless:
         notes += tuple(included_keys_notes(keystore, selection.names))

@@ -338,15 +338,17 @@ def explain(
     if who:
         asking = asking._replace(domain=domain_of(domain))  # without --domain, all domains
         chosen = None if why_zenoh else chosen_vendor(vendor, distro, os.environ)
-        question, only = _question_to_all(rest, kind), (patterns, robots)
+        question, enclave_filter = _question_to_all(rest, kind), (patterns, robots)
         if policy:
-            decider, where = _policy_to_decide(policy, opened, chosen, asking, only)
+            decider, who_context = _decider_of_policy(
+                policy, opened, chosen, asking, enclave_filter
+            )
         else:
             by_stated = not (vendor or distro)
-            decider, where = _keystore_to_decide(
-                opened, chosen, why_zenoh, asking, only, stated=by_stated
+            decider, who_context = _decider_of_keystore(
+                opened, chosen, why_zenoh, asking, enclave_filter, stated=by_stated
             )
-        return _print_answer_for_all(decider, question, kind, where, as_json)
+        return _print_answer_for_all(decider, question, kind, who_context, as_json)
     question = _parse_question(opened, rest, kind)
     asked = _open_enclave(opened, rest[0], policy, asking)
     context = asking.context(asked.enclave.joined_domains)
@@ -843,12 +845,12 @@ _EnclaveFilter = tuple[tuple[str, ...], tuple[str, ...]]
 """The values of --match and --robot."""
 
 
-def _keystore_to_decide(
+def _decider_of_keystore(
     keystore: OpenedKeystore | None,
     chosen_vendor: tuple[Vendor, str] | None,
     why_zenoh: str,
     asking: AskingContext,
-    only: _EnclaveFilter,
+    enclave_filter: _EnclaveFilter,
     *,
     stated: bool,
 ) -> tuple[Decider, _WhoContext]:
@@ -863,7 +865,7 @@ def _keystore_to_decide(
 
     keystore = keystore or _keystore_of_environment()
     keystore.check()
-    patterns, robots = only
+    patterns, robots = enclave_filter
     names = select_enclaves(keystore, (), patterns, robots=robots) if patterns or robots else None
     decider: Decider
     if chosen_vendor:
@@ -892,18 +894,18 @@ def _keystore_to_decide(
     return decider, (fleet, asking.domain, domains, asked_in)
 
 
-def _policy_to_decide(
+def _decider_of_policy(
     policy: Path,
     keystore: OpenedKeystore | None,
     chosen_vendor: tuple[Vendor, str] | None,
     asking: AskingContext,
-    only: _EnclaveFilter,
+    enclave_filter: _EnclaveFilter,
 ) -> tuple[Decider, _WhoContext]:
     """Return the decider for the enclaves of a policy, and the policy's fleet and domains."""
     from sros_tool.explain.asking import fleet_of, policy_to_ask
     from sros_tool.explain.vendors import VendorOfPolicy
 
-    patterns, robots = only
+    patterns, robots = enclave_filter
     if keystore:
         text = "In a keystore, the signed permissions decide, not a policy."
         raise UsageError(
@@ -936,7 +938,7 @@ def _question_to_all(other_arguments: tuple[str, ...], kind: str | None) -> Ques
 
 
 def _print_answer_for_all(
-    decider: Decider, question: Question, kind: str | None, where: _WhoContext, as_json: bool
+    decider: Decider, question: Question, kind: str | None, who_context: _WhoContext, as_json: bool
 ) -> int:
     """Print the decisions on all enclaves; return 0 if any enclave may do the operation, else 1."""
     from sros_tool.explain.who import answer_for_all, note_on_callable_action, note_on_names_meant
@@ -946,7 +948,7 @@ def _print_answer_for_all(
     if as_json:
         print_json(decider.printed(answer.question, answer.outcomes))
     else:
-        _echo_answer(_who_lines(answer, *where))
+        _echo_answer(_who_lines(answer, *who_context))
         echo(f"decided by {decider.title}", err=True)
         if not (kind or answer.allowed or any(outcome.in_part for outcome in answer.outcomes)):
             enclaves = {outcome.enclave for outcome in answer.outcomes}

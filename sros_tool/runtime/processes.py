@@ -1083,7 +1083,7 @@ class ProcessRoot:
         return LoadedFile(name, _moment(changed), data, mode=stat.S_IMODE(way[-1][1].st_mode))
 
     def copies(self, path: str) -> list[str]:
-        """Return files next to a library with the same size, and a name that begins with its name.
+        """Return the names of files next to a library that have its size, and begin with its name.
 
         The result is empty if the folder cannot be examined, or has too many entries.
         """

@@ -129,9 +129,9 @@ def graph_rules(
     left = [node for node in offering if not any(map(node.is_within, without))]
     known = dict.fromkeys((*nodes, *left))
     tokens = _Tokens(enclave, domain, known if known or offering else [_ANY_NODE])
-    allowed, denied = tokens.of(rights)
+    allowed, denied = tokens.keys_of_rights(rights)
     # A denial is left out if it only concerns nodes in ``nodes``, which may be announced.
-    denied += tokens.of_nodes_and_endpoints(
+    denied += tokens.keys_of_nodes_and_endpoints(
         [
             denial
             for denial in without
@@ -161,7 +161,7 @@ class _Tokens:
             if "*" not in ns + name
         }
 
-    def of(self, rights: Iterable[Right]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    def keys_of_rights(self, rights: Iterable[Right]) -> tuple[tuple[str, ...], tuple[str, ...]]:
         """Return two tuples of key expressions: allowed tokens, and denied tokens among these."""
         sides: dict[bool, dict[str, dict[str, None]]] = {True: {}, False: {}}
         for _, qualifier, right, name in rights:
@@ -190,7 +190,7 @@ class _Tokens:
             ]
         return tuple(allowed), tuple(denied)
 
-    def of_nodes_and_endpoints(self, nodes: Sequence[NodeName]) -> tuple[str, ...]:
+    def keys_of_nodes_and_endpoints(self, nodes: Sequence[NodeName]) -> tuple[str, ...]:
         """Return key expressions for nodes, and for all endpoints that these nodes can have."""
         named = (
             # "$*" can match nothing, but the namespace "/*" does not include the namespace "/".

@@ -197,7 +197,7 @@ def parse_configuration(
 
 
 def _override(root: _Section, path: str, value: str) -> None:
-    """Replace a setting.
+    """Set the setting with the name ``path`` in ``root`` to ``value``, a JSON5 text.
 
     Raises:
         DocumentError: Zenoh refuses the path or the value.

@@ -695,7 +695,9 @@ def governance_findings(
                 yield kind.found(subject, f"the range {problem}", file)
 
 
-def _unauthenticated_text(rule: DomainRule, vendors: Sequence[Vendor]) -> tuple[FindingKind, str]:
+def _unauthenticated_kind_and_text(
+    rule: DomainRule, vendors: Sequence[Vendor]
+) -> tuple[FindingKind, str]:
     """Return the kind and the text of the finding about participants without a certificate."""
     kind = UNAUTHENTICATED_KEPT_OUT
     clauses: dict[str, list[str]] = {}
@@ -733,7 +735,7 @@ def _domain_rule(rule: DomainRule, vendors: Sequence[Vendor]) -> Iterator[tuple[
     for attribute, text in _open_attributes(rule):
         kind = _OPEN_KINDS[attribute]
         if kind is UNAUTHENTICATED:
-            kind, reach = _unauthenticated_text(rule, vendors)
+            kind, reach = _unauthenticated_kind_and_text(rule, vendors)
             text = f"{text}: {reach}"
         yield kind, text
 

@@ -101,7 +101,7 @@ class _FnmatchSets:
         index = start
         negated = text[index : index + 1] in ("!", "^")
         index += negated
-        closed, plain = self._end_of(index, is_first=True)
+        closed, plain = self._closed_and_plain_from(index, is_first=True)
         if not closed:
             return (_OPENING if plain else _NOTHING), start
         members: list[Letters] = []
@@ -116,7 +116,7 @@ class _FnmatchSets:
             return _NOTHING, index + 1
         return _set_of(members, negated), index + 1
 
-    def _end_of(self, index: int, *, is_first: bool) -> tuple[bool, bool]:
+    def _closed_and_plain_from(self, index: int, *, is_first: bool) -> tuple[bool, bool]:
         """Return whether a set is closed after ``index``, and whether its ``[`` matches itself.
 
         The second value counts only if the set is not closed.
