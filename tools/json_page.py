@@ -18,7 +18,7 @@ _BEGINNING = """\
 
 Every verb but `run`, `completion`, `fleet inventory` and `fleet report` takes `--json`, and \
 prints one JSON object on standard output. Its first key is `version`, which is 1: the \
-number is raised when a key is removed or changes its meaning. It stays the same when a key is \
+number is raised when a key is removed or changes its meaning. It is not raised when a key is \
 added, so ignore keys that you do not know.
 
 - The exit status is the same as without `--json`; look at it first. After an error, standard \
@@ -29,10 +29,11 @@ after an error, it prints variables that keep every node from starting.
 - Moments are in UTC, as `2027-05-21T12:50:48Z`; serial numbers and SHA-256 are lower-case \
 hexadecimal.
 
-Each verb has a JSON Schema (draft 2020-12) in `sros_tool/schemas/`. A schema allows no other \
-keys, and fits the sros with which it ships. `python -m tools.json_page` makes this page from the \
-schemas. A key followed by `?` is left out if it has no value; \
-`[]` stands for each element of a list, `*` for each key of an object.
+Each verb has a JSON Schema (draft 2020-12) in `sros_tool/schemas/`. A schema allows only the keys \
+that it names, and belongs to the sros with which it ships. `python -m tools.json_page` makes this \
+page from the schemas. A key followed by `?` is left out if it has no value. `[]` stands for each \
+element of a list. In an "object of moment", each value is a moment, and the keys are names, such \
+as enclaves; `*` stands for these keys.
 
 <!-- not run: jq is not part of sros; tests/cli/test_json.py compares outputs and schemas -->
 ```sh

@@ -165,8 +165,8 @@ class Round(NamedTuple):
     release: int
     """Number of the release that is installed with all its enclaves; 0 for none."""
     accepted: int
-    """Highest number of a verified release; if this number is higher than ``release``, some
-    enclaves wait for that release.
+    """Number of the last release that was verified; if it is higher than ``release``, some
+    enclaves do not have the files of this release yet.
     """
     fetched: bool
     """Whether the agent reached the source, and trusted its metadata."""
@@ -177,11 +177,11 @@ class Round(NamedTuple):
     restart: Sequence[str]
     """Enclaves whose processes were not yet seen with the installed files."""
     unseen: Sequence[str]
-    """Enclaves of ``restart`` of which no process was seen, while some processes on this machine
-    cannot be seen. Use ``--restarted`` to say that these restarts are done.
+    """Enclaves of ``restart`` of which no process was seen, although some processes on this
+    machine cannot be seen. Use ``--restarted`` to say that these restarts are done.
     """
     requests: int
-    """Number of signing requests in the message."""
+    """Number of signing requests in the message to the inbox."""
     sent: bool
     """Whether the message reached the inbox."""
     problems: Sequence[str]

@@ -285,8 +285,8 @@ class AgentStatus(NamedTuple):
     release: int
     """Number of the release that is installed with all its enclaves; 0 for none."""
     accepted: int
-    """Highest number of a verified release; if this number is higher than ``release``, some
-    enclaves wait for that release.
+    """Number of the last release that was verified; if it is higher than ``release``, some
+    enclaves do not have the files of this release yet.
     """
     fetched: datetime | None
     """When the source was last reached, by the clock of the robot, in UTC; null for never."""
@@ -295,9 +295,9 @@ class AgentStatus(NamedTuple):
     restart: Sequence[str]
     """Enclaves whose processes were not yet seen with the installed files."""
     unseen: Sequence[str]
-    """Enclaves of ``restart`` of which no process was seen, while some processes on this machine
-    cannot be seen. Use `sros agent run FOLDER --once --restarted` to say that these restarts are
-    done.
+    """Enclaves of ``restart`` of which no process was seen, although some processes on this
+    machine cannot be seen. Use ``sros agent run FOLDER --once --restarted`` to say that these
+    restarts are done.
     """
     problems: Sequence[str]
     """What the last round could not do, and what is wrong with the files now, as sentences."""

@@ -366,7 +366,7 @@ class SharedCause(NamedTuple):
     remedy: str
     """How to resolve all these findings."""
     findings: Sequence[int]
-    """Positions in ``findings`` of the findings with this cause, from 0."""
+    """The findings with this cause, as positions in ``findings``, from 0."""
 
 
 class FindingCounts(NamedTuple):
@@ -379,13 +379,15 @@ class FindingCounts(NamedTuple):
     note: int
     """Number of notes that are shown."""
     accepted: int
-    """Number of findings that the keystore's template accepts; ``--strict`` counts them too."""
+    """Number of findings that the keystore's template accepts; ``--strict`` reports them like
+    other findings.
+    """
     hidden: int
     """Number of findings below ``--severity``."""
 
 
 class ShownFindings(NamedTuple):
-    """The findings of ``sros check``, and their numbers."""
+    """The findings of ``sros check``, and how many there are."""
 
     findings: Sequence[Finding]
     """The findings that are shown."""

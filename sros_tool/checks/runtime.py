@@ -128,7 +128,9 @@ class ChangeKind(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class FindingChange:
-    """A change of a finding about processes; ``--json`` prints one object on each line."""
+    """A change of a finding about processes; ``--json`` prints each change as an object on its own
+    line.
+    """
 
     time: datetime
     """Time of the check that saw the change, in UTC."""

@@ -65,7 +65,7 @@ class ClosedProcess(NamedTuple):
     known_by: Annotated[
         str, Words(("process id", "node name", "program", "elimination", "enclave", "command"))
     ]
-    """The evidence that this process has the nodes of the enclave."""
+    """What shows that this process has the nodes of the enclave."""
     launch: Sequence[str] = ()
     """The command of the launch that started the process: `ros2 launch`, or a Python program that
     runs a launch description; empty if no launch started it.
@@ -77,12 +77,16 @@ class ClosedProcess(NamedTuple):
     the environment names no RMW, or an RMW that enforces no security.
     """
     shares: Sequence[str] = ()
-    """The other enclaves whose processes the same command starts, as `multiprocessing` does."""
+    """The other enclaves whose processes the same command starts, for example with
+    `multiprocessing`.
+    """
     chooses: bool = False
     """Whether the program itself gives the process its enclave, by ROS_SECURITY_ENCLAVE_OVERRIDE.
     """
     alike: Sequence[int] = ()
-    """The ids of several processes that fit equally; sros does not choose, and `pid` is 0."""
+    """The ids of several processes that fit equally well; sros does not choose one, and `pid` is
+    0.
+    """
 
     @classmethod
     def from_process(

@@ -337,7 +337,7 @@ class CloseStep(NamedTuple):
     """A step of closing a robot."""
 
     command: str
-    """The command line that does the same."""
+    """The command line that does the same as the step."""
     state: Annotated[str, Words(("done", "kept", "findings", "open"))]
     """Whether the step was done now, was not repeated because its result existed, found something,
     or is not done.
@@ -373,7 +373,7 @@ class Proof(NamedTuple):
 
 @shows(spread=("observed",))
 class CloseState(NamedTuple):
-    """How far a robot is closed."""
+    """What is done to close a robot, and what is missing."""
 
     folder: Path
     """The folder with everything that was made."""
@@ -396,32 +396,36 @@ class CloseState(NamedTuple):
     """
     not_observed: Sequence[str]
     """Processes that run in enclaves of the robot but were not observed there, and further
-    processes with an observed command, as "process 123 (talker) in /talker". If such a process is
-    alone in the enclave of an observed process, the text adds that it runs by another command."""
+    processes with an observed command, as "process 123 (talker) in /talker". If such a process
+    runs in place of an observed process, the text adds that it was started with another command.
+    """
     new: Sequence[str]
-    """The enclaves of the policy for which no process was observed, and no process runs now."""
+    """The enclaves of the policy in which no process was observed, and none runs now."""
     absent: Sequence[str]
     """The enclaves whose process does not run, although a systemd unit starts it."""
     without: Sequence[str]
     """The enclaves of `--without`, of which no process has to run."""
     needed_elsewhere: Mapping[str, datetime]
-    """The enclaves of other machines, and when their files in the keystore changed last, in UTC. A
-    machine with earlier files still trusts certificates that were revoked since, and needs the
-    current files. Enclaves that the policy does not have are in `problems` instead, and enclaves
-    whose current files were brought are in `brought`.
+    """The enclaves of other machines, and when their files changed last in the keystore, in UTC. A
+    machine with earlier files needs the current files: it still trusts certificates that were
+    revoked since then. Enclaves that the policy does not have are in `problems` instead, and
+    enclaves whose current files were brought are in `brought`.
     """
     brought: Mapping[str, datetime]
-    """The enclaves of other machines whose current files were brought there, as the user said with
-    `--brought`, and when these files in the keystore changed last, in UTC. sros cannot verify this.
+    """The enclaves of other machines that have the current files, as the user said with
+    `--brought` (sros cannot verify this), and when these files changed last in the keystore, in
+    UTC.
     """
     expired_elsewhere: Mapping[str, datetime]
-    """The enclaves of other machines whose files in the keystore have expired, and when, in UTC."""
+    """The enclaves of other machines whose files in the keystore have expired, and when they
+    expired, in UTC.
+    """
     valid_until: datetime | None
     """When the first enclave of the export expires, in UTC; null without an export."""
     expires_soon: Sequence[str]
     """The enclaves of the export that should be renewed now, because they expire soon."""
     denied: Sequence[str]
-    """What the observed nodes do although the keystore denies it, as sentences."""
+    """What the observed nodes did while sros watched, but the keystore denies, as sentences."""
     newly_denied: Sequence[str]
     """The part of `denied` that the keystore did not deny before this command."""
     problems: Sequence[str]

@@ -49,7 +49,7 @@ class Diagnosis(NamedTuple):
     """The stacks of this machine, and advice if none enforces security."""
 
     stacks: tuple[Stack, ...]
-    """The DDS stacks that were tried, with their results."""
+    """The DDS stacks that were tried, each with the result."""
 
     @property
     def enforces(self) -> bool:

@@ -133,7 +133,7 @@ class RowResult:
 
     @property
     def as_expected(self) -> bool:
-        """Whether the row was observed as expected, skipped or accepted."""
+        """Whether the observed outcome is the expected one, or the row was skipped or accepted."""
         expected = self.observed in (self.expected, RowStatus.SKIPPED) and not self.open_here
         return expected or self.known_open
 
@@ -540,7 +540,9 @@ class KeystoreSummary(NamedTuple):
     elsewhere: int = 0
     """Number of enclaves whose key is elsewhere; the demo did not try them."""
     not_tried: tuple[str, ...] = ()
-    """Tests that a proof of the keystore needs and that did not run: the exit status is not 0."""
+    """Tests that did not run, but that a proof of the keystore needs; if there are any, the exit
+    status is not 0.
+    """
 
 
 @shows("name", "title", "as_expected", "cast", "keystore", "rows", "cost")
@@ -605,7 +607,7 @@ class DemoResult:
     template: str
     """Template of the keystores."""
     topic: str
-    """The ROS topic of the demo, for parties that name no other topic."""
+    """The ROS topic that a part of a scenario uses if it names no other topic."""
     names: tuple[str, ...]
     """The topics, services and actions that the rows use, such as `topic /chatter`."""
     own_network: bool
@@ -624,7 +626,7 @@ class DemoResult:
 
     @property
     def vulnerabilities(self) -> str:
-        """The known vulnerabilities with which the demo ran, in sentences."""
+        """The known vulnerabilities of the DDS that the demo used, in sentences."""
         return self.known_vulnerabilities(_ALL_IDS)
 
     def known_vulnerabilities(self, maximum: int) -> str:
@@ -640,8 +642,8 @@ class DemoResult:
 
     @property
     def as_expected(self) -> bool:
-        """Whether all rows are as expected, and with ``--keystore``, all tests ran that a proof
-        needs: the exit status is 0.
+        """Whether the exit status is 0: all rows are as expected and, with ``--keystore``, all
+        tests ran that a proof needs.
         """
         return all(scenario.as_expected for scenario in self.scenarios)
 

@@ -367,7 +367,11 @@ class StatedInPolicy(NamedTuple):
     file: str
     """Path of the policy file."""
     provenance: Provenance
-    """Whether the permissions were made from the policy file."""
+    """Whether the permissions were made from the policy file. ``same``: from this file as it is
+    now; ``equal``: from another version or file with the same rights; ``changed``: the file states
+    other rights; ``unknown``: no ledger shows it; ``planned``: nothing is signed yet, and the
+    answer is about the policy.
+    """
     lines: tuple[PolicyLine, ...]
     """The policy lines that the deciding rule comes from."""
     would_allow: bool
@@ -384,7 +388,9 @@ class AppliedProtection(NamedTuple):
     liveliness: ProtectionKind
     """Protection of liveliness messages."""
     topic_expression: str | None
-    """The topic rule that applies, or null; without a rule, the following fields are null too."""
+    """The expression of the topic rule that applies; null if none applies: then the following keys
+    are also null.
+    """
     data: ProtectionKind | None
     """Protection of the payload."""
     metadata: ProtectionKind | None
@@ -397,7 +403,7 @@ class AppliedProtection(NamedTuple):
 
 @shows("part", "decision", spread=("part", "decision"))
 class DecidedPart(NamedTuple):
-    """A DDS endpoint, and the decision on it."""
+    """A DDS endpoint, and the decision about it."""
 
     part: Part
     decision: Decision

@@ -326,8 +326,8 @@ class AuditResult(NamedTuple):
     judged.
     """
     unjudged: Sequence[str]
-    """Observed parts that were not judged, as texts with a number and some names; ``notes`` has
-    more.
+    """Parts of the observed graph that were not judged, as texts with a number and some names;
+    ``notes`` has more.
     """
     observation: Observation
     settled: bool
@@ -337,7 +337,7 @@ class AuditResult(NamedTuple):
     unjudged_accepted: bool
     """Whether ``--unjudged`` accepted parts that were not judged, or a graph that kept changing."""
     patch: Path | None
-    """Path of the policy with the missing rights that ``--patch`` wrote, or null."""
+    """Path of the policy that ``--patch`` wrote, with the missing rights; or null."""
     dry_run: DryRun
     changes: FileChanges
     notes: Notes

@@ -47,7 +47,7 @@ class ExplainedLog(NamedTuple):
     """The different security messages."""
     secured: bool | None
     """Whether a line says that a node of the named enclave ran secured; null if no enclave is
-    named, and on Zenoh, which logs no such line.
+    named, or on Zenoh, which logs no such line.
     """
     notes: Sequence[Note]
     """Notes, which text output prints on standard error."""

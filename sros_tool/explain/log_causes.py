@@ -103,7 +103,7 @@ class LogFinding:
 
     @property
     def vendor(self) -> str | None:
-        """The DDS vendor that printed the message, zenoh, or null for ROS 2."""
+        """The DDS vendor that printed the message; ``zenoh`` for Zenoh, null for ROS 2."""
         if self.zenoh:
             return "zenoh"
         return self.dds.value if self.dds else None

@@ -155,8 +155,9 @@ class Comparison(NamedTuple):
     vendors: Sequence[Answer] | None
     """The decision of each vendor; present only with ``--all-vendors``."""
     distributions: Sequence[DistributionAnswer] | None
-    """The decision of each DDS of each distribution, the earliest distribution first; present only
-    with ``--all-distros``."""
+    """The decision for each DDS of each distribution, the earliest distribution first; present
+    only with ``--all-distros``.
+    """
     beside: ZenohNextToDds | None
     allowed: bool
     notes: tuple[Note, ...]
@@ -509,8 +510,8 @@ class VendorOutcome(NamedTuple):
     opened: AccessWithoutIdentity = AccessWithoutIdentity()
     """The rights that the enclave's governance gives to processes without an identity."""
     in_part: Sequence[str] = ()
-    """If the enclave does not have the whole right: the parts of an action, such as ``send_goal``,
-    by which it can command the server (with call) or inform the clients (with execute).
+    """If the enclave has only a part of a right to an action: the parts, such as ``send_goal``,
+    with which it can command the server (for ``call``) or inform the clients (for ``execute``).
     """
     by_permissions_of: Sequence[str] = ()
     """The other enclaves whose permissions fit the certificate of this enclave and allow the
@@ -557,7 +558,7 @@ class WhoByVendor(NamedTuple):
     domain: int | None
     """The ROS domain of ``--domain``; null for every domain."""
     enclaves: Sequence[VendorOutcome]
-    """All enclaves, with the vendor's decision on the enclave."""
+    """All enclaves, with the vendor's decision for each."""
     export: bool = False
     """Whether the question was about an export, which may lack enclaves of its keystore."""
 
@@ -568,8 +569,8 @@ class WhoByVendor(NamedTuple):
 
     @property
     def anybody_in_part(self) -> tuple[str, ...]:
-        """If processes without an identity do not have the whole right: the parts by which they can
-        command the server or inform the clients.
+        """If processes without an identity have only a part of a right to an action: the parts
+        with which they can command the server or inform the clients.
         """
         return AccessWithoutIdentity.joined(outcome.opened for outcome in self.enclaves).parts
 

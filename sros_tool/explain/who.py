@@ -255,7 +255,9 @@ class FollowedReach(NamedTuple):
     path: Path
     """Path of the keystore or policy."""
     left_out: Sequence[str]
-    """Names that do not count: topics, and services (as */NAME) whose requests change nothing."""
+    """Names that do not count: topics of every node, and services (as */NAME) whose requests only
+    ask.
+    """
     domain: int | None
     """The ROS domain in which information flows; null for every domain."""
     reach: Reach

@@ -140,7 +140,7 @@ class DecidingWildcard(NamedTuple):
     expression: str
     """The key expression."""
     reaches: tuple[str, ...]
-    """The enclaves that receive a put or a query on the whole wildcard."""
+    """The enclaves that receive a put or a query with this key expression."""
 
 
 class CheckedLink(NamedTuple):
@@ -180,7 +180,8 @@ class ZenohAnswer:
     text: str
     checks: tuple[Check, ...] = ()
     reached: tuple[Reached, ...] = ()
-    """The enclaves with the matching right, such as to subscribe to a published topic."""
+    """The enclaves with the matching right, such as the right to subscribe to a published topic.
+    """
     wildcards: tuple[DecidingWildcard, ...] = ()
     """Key expressions with wildcards on which the decision depends."""
     until: datetime | None = None
@@ -189,8 +190,8 @@ class ZenohAnswer:
     """The deciding files that the permissions CA has not signed."""
     domains: str = ""
     in_part: tuple[str, ...] = ()
-    """If the enclave does not have the whole right: the parts of an action, such as ``send_goal``,
-    by which it can command the server (with call) or inform the clients (with execute).
+    """If the enclave has only a part of a right to an action: the parts, such as ``send_goal``,
+    with which it can command the server (for ``call``) or inform the clients (for ``execute``).
     """
 
     @property
@@ -265,12 +266,12 @@ class ZenohEnclaveOutcome(NamedTuple):
     in_brief: ZenohInBrief
     outcome: _OutcomeWord
     wildcard: str
-    """The key expression that allows the right, if it is a wildcard, or null."""
+    """The key expression that allows the right, if it is a wildcard; otherwise null."""
     domains: str
     """The ROS domains in which the enclave has the right, such as ``10`` or ``10,20``, or null."""
     in_part: Sequence[str] = ()
-    """If the enclave does not have the whole right: the parts of an action, such as ``send_goal``,
-    by which it can command the server (with call) or inform the clients (with execute).
+    """If the enclave has only a part of a right to an action: the parts, such as ``send_goal``,
+    with which it can command the server (for ``call``) or inform the clients (for ``execute``).
     """
 
 
@@ -1006,7 +1007,9 @@ class ZenohExplanation(NamedTuple):
     """Reason for the choice of Zenoh."""
     answer: ZenohAnswer
     out_of_date: tuple[str, ...] | None
-    """The deciding files that do not match the permissions for the question; null if unknown."""
+    """The deciding files whose answer to the question differs from that of the permissions; null
+    if this is not known.
+    """
     stated: Answer
     keystore: OpenedKeystore
     notes: tuple[Note, ...]
@@ -1018,7 +1021,7 @@ class ZenohExplanation(NamedTuple):
 
     @property
     def vendor_title(self) -> str:
-        """The name of Zenoh."""
+        """Always ``Zenoh``."""
         return "Zenoh"
 
     @property
@@ -1028,7 +1031,9 @@ class ZenohExplanation(NamedTuple):
 
     @property
     def policy(self) -> StatedInPolicy | None:
-        """The part of the policy that `--policy` names, or null without `--policy`."""
+        """The part of the policy file of `--policy` that the answer concerns; null without
+        `--policy`.
+        """
         return self.stated.policy
 
     @property

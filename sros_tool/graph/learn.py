@@ -736,7 +736,7 @@ class DenialLine(NamedTuple):
     enclave: str | None
     """The enclave that the line names, or null."""
     direction: Annotated[str, Words((PUBLISH, SUBSCRIBE))]
-    """The denied direction."""
+    """Whether writing (``publish``) or reading (``subscribe``) was denied."""
     topic: str
     """The DDS topic that was denied."""
 
@@ -771,7 +771,7 @@ class LearnedPolicy(NamedTuple):
     accepted: bool | None
     """For a log: whether `--accept` was given; without it, no right is written."""
     denials: Sequence[DenialLine] | None
-    """For a log: the lines that ask for the rights."""
+    """For a log: the lines that report denied rights."""
     changes: FileChanges
     notes: Notes
 

@@ -72,8 +72,9 @@ class ObservedNode:
     name: str
     """Name of the node, without its namespace."""
     participant: str
-    """DDS participant of the node's process: the GUID prefix, in hexadecimal. On Zenoh, zenoh- and
-    the id of the session."""
+    """DDS participant of the node's process: the GUID prefix, in hexadecimal. On Zenoh, ``zenoh-``
+    followed by the id of the session.
+    """
     endpoints: frozenset[Endpoint]
 
     @property

@@ -96,7 +96,7 @@ class CertificateFacts(NamedTuple):
     serial: str
     """Serial number, in hexadecimal."""
     is_ca: bool
-    """Whether the certificate is that of a CA."""
+    """Whether this is the certificate of a CA."""
     key: str
     """Kind of the public key, such as ``EC secp256r1``."""
     signature: str
@@ -279,7 +279,7 @@ class RouterFacts(NamedTuple):
     enclaves: Sequence[str]
     """The enclaves whose sessions connect to the router, perhaps with wildcards."""
     crossing: Sequence[str]
-    """Names that may pass between this router and others; empty for all names of the network."""
+    """Names that may pass between this router and others; empty if those of the network apply."""
 
 
 def router_facts(router: ZenohRouter) -> RouterFacts:
@@ -384,9 +384,7 @@ class DescribedKeystore(NamedTuple):
     authorities: Mapping[str, AuthorityFile | UnreadableFile]
     """CAs of the keystore, by role (``identity``, ``permissions``)."""
     unknown_authorities: Sequence[str]
-    """CAs unknown to the keystore, as text, that somebody else added to CA files of the keystore or
-    of an enclave.
-    """
+    """CAs in CA files of the keystore or of an enclave that sros did not put there, as text."""
     governance: DescribedGovernance | UnreadableFile | None
     """Governance of the keystore, or null."""
     zenoh: NetworkFacts | None
@@ -471,7 +469,7 @@ class DescribedPermissions(NamedTuple):
 class DescribedGovernance(NamedTuple):
     """Governance, signed or not."""
 
-    path: NamedPath
+    path: Annotated[Path, "Path of the governance."]
     domain_rules: Sequence[DomainRuleFacts]
     """Domain rules of the governance."""
     signature: SignatureFacts

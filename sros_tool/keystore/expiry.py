@@ -139,7 +139,7 @@ class ExpiringEnclaves(NamedTuple):
     unreadable: Sequence[EnclaveProblem]
     """Enclaves whose expiry cannot be read."""
     short_lived: Sequence[DueEnclave]
-    """Short-lived enclaves with their expiry; only naming them renews them."""
+    """Short-lived enclaves with their expiry; ``sros renew`` renews these only by name."""
 
 
 def expiring_enclaves(renewals: ExpiryCheck) -> ExpiringEnclaves:

@@ -620,8 +620,8 @@ class FleetStatus:
     @property
     def mended(self) -> bool:
         """Like ``complete``, but changed files that an agent replaced, and altered files that were
-        published again, do not count; both are shown for a day.  A key that somebody may have
-        copied counts.
+        published again, do not count; both are shown for a day. A key that somebody may have
+        copied still counts.
         """
         return self.is_settled(mended=True)
 

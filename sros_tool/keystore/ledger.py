@@ -131,7 +131,7 @@ class Entry(NamedTuple):
     not_after: str = ""
     """Expiry, in UTC; for a revocation, the expiry of the revoked certificate."""
     policy: str = ""
-    """SHA-256 of the policy with its includes from which the permissions were made."""
+    """SHA-256 of the policy, with its includes, from which the permissions were made."""
     reason: str = ""
     """The reason of a revocation; the fault that a gap records; what showed a restore; why a
     document was signed again; or, if the keystore did not issue the certificate with this line, how
@@ -147,9 +147,7 @@ class Entry(NamedTuple):
     settings: str = ""
     """The settings of the keystore, as TOML."""
     nodes: str = ""
-    """Nodes (namespaces and names) that are in the policy of the permissions, but not in the
-    permissions.
-    """
+    """Nodes (namespaces and names) that the policy names, but that the permissions do not show."""
     previous: str = ""
     """SHA-256 of the line before."""
 

@@ -685,7 +685,7 @@ class PolicyDifference(NamedTuple):
     domains.
     """
     enclaves: Sequence[DifferentEnclave]
-    """Enclaves without rights that only one side has."""
+    """Enclaves that have no rights, and that only one side has."""
     governance_differs: bool
     """Whether the governance of the enclaves differs between A and B, or cannot be read."""
     unclear: Sequence[str]

@@ -97,7 +97,7 @@ _JOIN = "join"
 )
 @dataclass(frozen=True, slots=True)
 class Gain:
-    """An access that enclaves have on only one side of a comparison.
+    """Access that enclaves have on only one side of a comparison.
 
     ``name`` and ``domains`` are examples.
     """
@@ -182,7 +182,7 @@ class NewNode(NamedTuple):
     enclave: str
     """The enclave that has the node in HEAD, and not in BASE."""
     moved_from: str
-    """An enclave that had the node in BASE, and no longer has it; or empty."""
+    """An enclave that had the node in BASE, and no longer has it; empty if there is none."""
     rights: tuple[Right, ...]
     """Rights of the enclave that the node did not have in BASE.
 
@@ -204,7 +204,8 @@ class DroppedDenial(NamedTuple):
     name: str
     """Example of a name that is no longer denied; empty if HEAD denies none of the names."""
     moved_from: str
-    """The enclave that denied the name in BASE, if another enclave has its node in HEAD; or empty.
+    """The enclave that denied the name in BASE, if HEAD moves its node to another enclave;
+    otherwise empty.
     """
 
 
@@ -242,7 +243,9 @@ class Growth:
     left_out: tuple[str, ...]
     """Parts that the comparison leaves out on purpose."""
     not_compared: tuple[str, ...]
-    """Parts that could not be compared; if nothing is new, this is an error with exit status 2."""
+    """Parts that could not be compared. If there are any, and nothing is new, this is an error
+    with exit status 2.
+    """
     new_nodes: tuple[NewNode, ...]
     """Nodes that HEAD assigns to an enclave of BASE, and that thereby get more rights."""
     dropped_denials: tuple[DroppedDenial, ...]
@@ -255,10 +258,8 @@ class Growth:
 
     @property
     def reach_known(self) -> bool:
-        """Whether ``reach`` is known.
-
-        It is not known if a side has only some enclaves, or if there are too many hops between
-        enclaves.
+        """Whether ``reach`` is known: false if a side has only some enclaves, or if there are too
+        many hops between enclaves.
         """
         return not self.reach_unknown
 

@@ -175,10 +175,12 @@ class Name:
     protection: Protection
     """Protection of the name by the governance."""
     wildcard: bool = False
-    """Whether the name is a wildcard, drawn here because no arrow to a known name shows it."""
+    """Whether the name is a wildcard that is drawn by itself, because no arrow to a known name
+    shows it.
+    """
     lacks: Lack = Lack.NOTHING
-    """The side (senders or receivers) of which no enclave has the right; the server of a service is
-    its receiver.
+    """The side (senders or receivers) on which no enclave has a right to the name; empty if no
+    side is missing. The server of a service is its receiver.
     """
     spelling: Spelling = Spelling.UNKNOWN
 
@@ -270,7 +272,7 @@ class Validity:
     not_before: str
     """Start of the validity, in UTC."""
     kind: str
-    """Kind of the document that is valid, such as ``permissions`` or ``revocation list``."""
+    """Kind of the document, such as ``permissions`` or ``revocation list``."""
     title: str
     """Title of the document."""
     enclave: str = ""
@@ -365,11 +367,11 @@ class Focus:
     receivers: tuple[str, ...]
     """Enclaves that may subscribe to, serve, execute or read the name."""
     influencing: tuple[Influence, ...]
-    """Enclaves that influence the senders of the name, or the enclave in the focus; `hops` is 2 for
-    direct influence.
+    """Enclaves that influence the senders of the name, or the enclave in the focus; `hops` is 2 if
+    they do so directly.
     """
     influenced: tuple[Influence, ...] = ()
-    """Enclaves that the enclave in the focus influences; `hops` is 1 for direct influence."""
+    """Enclaves that the enclave in the focus influences; `hops` is 1 if it does so directly."""
 
 
 class PicturedUse(NamedTuple):
@@ -447,7 +449,7 @@ class EqualUnits(NamedTuple):
     members: tuple[str, ...]
     """Names of the units."""
     domains: str = ""
-    """ROS domains of the units; empty unless other units have other domains."""
+    """ROS domains of the units; empty if all units in the picture have the same domains."""
 
     @property
     def title(self) -> str:
@@ -519,7 +521,7 @@ class Picture:
     edges: tuple[Edge, ...]
     """Rights and denials, one entry for each enclave, name and right."""
     overlay: Overlay | None = None
-    """The kind of comparison, or null for a single source."""
+    """The comparison; null for a single source."""
     differences: tuple[OverlayDifference, ...] = ()
     """Rights that only one source has."""
     validities: tuple[Validity, ...] = ()

@@ -69,7 +69,7 @@ OutcomeWord = Annotated[
     "denies`), the process does not start (`refused`), or the process or its peers crash "
     "(`crashes`).",
 ]
-ReasonWord = Annotated[str, "Why, as a stable word such as `no-rule`."]
+ReasonWord = Annotated[str, "Reason of the decision, as a stable word such as `no-rule`."]
 
 
 @shows("outcome", "reason", "expression")

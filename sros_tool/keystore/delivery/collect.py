@@ -123,10 +123,10 @@ class CollectedMessage(NamedTuple):
     """Name of the robot."""
     outcome: Annotated[str, Words(MESSAGE_OUTCOMES)]
     """``kept``: a new message, now the robot's last confirmation; ``unchanged``: the same message
-    as last time, even if its certificate was revoked since; ``older``: an earlier message, written
-    before the last one came, for example in an inbox that the robot used before; ``missing``: the
-    inbox has no message; ``revoked``: all enclaves of the robot were revoked, so its message is not
-    read; ``refused``: the message proves nothing.
+    as last time, even if its certificate was revoked since then; ``older``: a message from before
+    the last one, for example in an inbox that the robot used before; ``missing``: the inbox has no
+    message; ``revoked``: all enclaves of the robot were revoked, so its message is not read;
+    ``refused``: the message proves nothing.
     """
     why: str
     """Why the message was refused or not read, as a clause; empty for other outcomes."""

@@ -182,8 +182,8 @@ class PublishedFleet(NamedTuple):
     root_sha256: str
     """SHA-256 of the root metadata, in hexadecimal."""
     refused_by: Sequence[str]
-    """Robots that refuse their release, because by their last message they do not trust the
-    permissions CA that sealed it: their files have to be brought by hand.
+    """Robots that refuse their release, because their last message shows that they do not trust
+    the permissions CA that sealed it: you have to bring their files to them by hand.
     """
     later: Sequence[LaterChange]
     """With ``--restored``: changes from after the backup that the keystore lacks."""

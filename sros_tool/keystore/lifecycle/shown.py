@@ -116,11 +116,11 @@ CreatedEnclaves = Annotated[
             "`created`; `completed`: missing files were added; `kept`: nothing changed.",
         ]
     ],
-    "The enclaves that were created, or existed.",
+    "The enclaves that were created or already existed.",
 ]
 ChangedEnclave = Annotated[
     _EnclaveCreation[Annotated[str, Words(("changed",)), "The enclave got new permissions."]],
-    "The enclave with its new permissions.",
+    "The enclaves with new permissions.",
 ]
 MadeEnclaves = _EnclaveCreation[
     Annotated[
@@ -151,7 +151,7 @@ class NewKeystore(NamedTuple):
     domains: str
     """The ROS domains of the keystore, such as ``0`` or ``10-19``."""
     authorities: Sequence[KeystoreAuthority]
-    """CAs of the keystore; a single CA with both roles with ``--ca-layout single``."""
+    """CAs of the keystore; with ``--ca-layout single``, one CA with both roles."""
     changes: FileChanges
     notes: Notes
 
@@ -284,9 +284,8 @@ class RenewedEnclaves(NamedTuple):
     ]
     """The renewed enclaves."""
     replaced_work_until: datetime | None
-    """When the last earlier certificate of these enclaves in the ledger stops working, in UTC: when
-    the certificate expires, or the last permissions for it expire. Null if all have expired or were
-    revoked.
+    """When the last earlier certificate of these enclaves in the ledger stops working, in UTC: it
+    or the last permissions for it expire. Null if all have expired or were revoked.
     """
     may_work_longer: bool
     """Whether certificates that the ledger lacks may work longer, because the keystore is an old
@@ -352,7 +351,7 @@ class UpdatedKeystore(NamedTuple):
     """The settings that change."""
     rights: Rights
     looser: Sequence[str]
-    """What the update allows and was not allowed before, as clauses."""
+    """What the update newly allows, as clauses."""
     enclaves: Sequence[
         EnclaveResult[
             Annotated[
@@ -364,7 +363,7 @@ class UpdatedKeystore(NamedTuple):
     ]
     """Enclaves that got a certificate or permissions."""
     replaced_work_until: datetime | None
-    """When the replaced certificates stop working with their permissions, in UTC; null if no
+    """When the last replaced certificate, or its permissions, expire, in UTC; null if no
     certificate was replaced, or all were revoked.
     """
     revoked: int
@@ -532,9 +531,9 @@ class RotationChange(NamedTuple):
     old_keys_elsewhere: Sequence[str]
     """Places outside of the keystore with old CA keys; sros never deletes these keys."""
     cut_off: Sequence[str]
-    """The robots of the fleet that have not confirmed the previous stage, and therefore cannot
-    communicate with robots that have the files of this stage, until they get these files, too
-    (``--allow-unconfirmed``).
+    """The robots of the fleet that have not confirmed the previous stage
+    (``--allow-unconfirmed``). They cannot communicate with robots that have the files of this
+    stage, until they also get these files.
     """
     remarks: Sequence[str]
     """Next steps, as sentences; empty in a dry run."""

@@ -136,7 +136,7 @@ class KeystoreUpdate(Changed):
 
     @property
     def looser(self) -> tuple[str, ...]:
-        """What the update allows and was not allowed before, as clauses."""
+        """What the update newly allows, as clauses."""
         gained = [
             f"{right.enclave} gains {rights_text(right.gained)}"
             for right in self.rights
