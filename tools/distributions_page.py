@@ -46,8 +46,8 @@ def distributions_page() -> str:
         written[0].rstrip(),
         MADE,
         shipped,
-        "The column rmw_zenoh has the first version of the distribution, and the first version "
-        "that reads the files of sros. Versions of Rolling count for the distribution that "
+        "The column rmw_zenoh has the first version that the distribution shipped, and the first "
+        "version that reads the files of sros. Versions of Rolling count for the distribution that "
         "followed: Lyrical has 0.10, so 0.7 to 0.9 count for Lyrical. The versions of DDS are the "
         "latest as of November 2026; sros assumes that all patch versions of a release decide "
         "alike." + ("" if all_tested else _NOT_TESTED),

@@ -318,7 +318,7 @@ def _shared_memory_row(name: str, keystore: KeystoreChoice, *, readable: bool) -
         RowStatus.READABLE if readable else RowStatus.NOT_READABLE,
         "a large message lies in shared memory unencrypted"
         if readable
-        else "the files switch shared memory off: TLS carries large messages, too",
+        else "the Zenoh files switch shared memory off: TLS carries large messages, too",
         (wide, replace(talker, size=_LARGE_BYTES), listener),
         (Claim(Relation.READABLE, "talker", holds=readable, wire=Wire.MEMORY),),
         _CHATTER,
@@ -582,7 +582,8 @@ def _through_the_router(party: Party, attack: str, denied: RowStatus, done: RowS
             attack,
             party,
             denied,
-            "the router enforces everybody's rights, whatever the attacker's own session does",
+            "the router enforces the rights of all enclaves, whatever the attacker's own session "
+            "does",
             zenoh_forger.through_the_router,
             _CLIENTS,
         ),
@@ -647,7 +648,8 @@ def _rogue_router_row(
         RowStatus.HEARD if succeeds else RowStatus.NOT_HEARD,
         "sessions trust this router"
         if succeeds
-        else "a session accepts data from the router only if the certificate has the router's name",
+        else "a session accepts data from the router only if the sender's certificate has the "
+        "router's name",
         hears(rogue.name, "talker") if router_reads else hears("listener", rogue.name),
         (rogue, *_topic_pair(keystore)[1:]),
         () if part == "router" else _CHATTER,
