@@ -318,7 +318,7 @@ class Network:
     def _access_pairs(
         self, enclave: str, forward: bool, followed: _FollowedTopics, known: Container[str]
     ) -> Iterator[tuple[_Access, _Access]]:
-        """Yield the accesses of writers and readers that `_steps` has to compare."""
+        """Yield the accesses of writers and readers to compare; arguments as for `_steps`."""
         directions = ("publish", "subscribe") if forward else ("subscribe", "publish")
         own_side, other_side = (self._sides[direction] for direction in directions)
         for end in own_side.by_enclave.get(enclave, ()):

@@ -565,15 +565,15 @@ def why_configuration_is_open(data: bytes, name: str, override: str) -> str:
 
 
 def _override_findings(
-    stated: ConfigurationDocument,
+    document: ConfigurationDocument,
     effective: ConfigurationDocument,
     overrides: tuple[tuple[str, str], ...],
 ) -> Iterator[Finding]:
     """Yield a finding if the overrides change more than the router address and the TLS paths."""
     unchanged = replace(
-        effective, connect=stated.connect, tls=replace(effective.tls, named=stated.tls.named)
+        effective, connect=document.connect, tls=replace(effective.tls, named=document.tls.named)
     )
-    if unchanged != stated:
+    if unchanged != document:
         keys = ", ".join(dict.fromkeys(key.strip().strip("/")[:60] for key, _ in overrides))
         yield OVERRIDDEN.found(OVERRIDE, f"it has {keys[:300]}", effective.name)
 

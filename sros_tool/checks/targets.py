@@ -127,8 +127,8 @@ def _policies_at(path: Path) -> list[Path]:
 
 
 def findings_in_keystore(
-    root: Path, circumstances: Circumstances, only: str | None = None
+    root: Path, circumstances: Circumstances, only_enclave: str | None = None
 ) -> list[Finding]:
-    """Return findings about a keystore or an export, or about one enclave of it."""
-    enclaves = None if only is None else (only,)
+    """Return findings about a keystore or an export, or only about one of its enclaves."""
+    enclaves = None if only_enclave is None else (only_enclave,)
     return keystore_findings(circumstances.keystore(root), circumstances, only_enclaves=enclaves)

@@ -705,7 +705,10 @@ def enclave_environment(
     accept_key: bool | None = None,
     target: Path | None = None,
 ) -> EnclaveEnvironment:
-    """Return the environment of an enclave, after checking that a process can start in it now."""
+    """Return the environment of an enclave, after checking that a process can start in it now.
+
+    The arguments are those of `loadable_environment`.
+    """
     from sros_tool.enclave_environment import loadable_environment
 
     return loadable_environment(
@@ -840,7 +843,10 @@ def secrets() -> Callable[[str], str]:
 
 
 class _Secrets:
-    """A secrets handler: takes a passphrase or PIN from the environment, a file, or one prompt."""
+    """A secrets handler: takes a passphrase or PIN from the environment, a file, or one prompt.
+
+    ``new`` says that passphrases are for new keys: the prompt then asks for each of them twice.
+    """
 
     def __init__(self, new: bool) -> None:
         self._new = new

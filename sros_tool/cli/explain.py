@@ -403,8 +403,8 @@ def _split_keystore(
     return None, arguments
 
 
-def _is_operation(arguments: tuple[str, ...], place: int) -> bool:
-    return arguments[place : place + 1] != () and arguments[place] in _OPERATIONS
+def _is_operation(arguments: tuple[str, ...], index: int) -> bool:
+    return arguments[index : index + 1] != () and arguments[index] in _OPERATIONS
 
 
 def _circumstances(

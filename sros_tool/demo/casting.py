@@ -679,22 +679,25 @@ def node_names(role: Role, grant: Grant | None) -> tuple[str, ...]:
     wanted = [f"/{name}" for name in DEFAULT_NODE_NAMES[role]]
     if grant is None:
         return tuple(wanted)
-    kept = {name for name in wanted if is_node_allowed(grant, name)}
-    named = [*dict.fromkeys(nodes_named(grant))]
-    free = [name for name in named if name not in kept]
-    return tuple(_names(wanted, kept, free, named))
+    allowed = {name for name in wanted if is_node_allowed(grant, name)}
+    granted = [*dict.fromkeys(nodes_named(grant))]
+    free = [name for name in granted if name not in allowed]
+    return tuple(_allowed_or_similar_names(wanted, allowed, free, granted))
 
 
-def _names(
-    wanted_names: Sequence[str], kept: set[str], free_names: list[str], named: Sequence[str]
+def _allowed_or_similar_names(
+    wanted_names: Sequence[str],
+    allowed_names: set[str],
+    free_names: list[str],
+    granted_names: Sequence[str],
 ) -> Iterator[str]:
     for name in wanted_names:
-        if name in kept or not named:
+        if name in allowed_names or not granted_names:
             yield name
             continue
         # With more nodes than names, two nodes share a name: DDS allows that in a process.
         similar_names = [enclave for enclave in free_names if name[1:] in enclave.lower()]
-        chosen = (similar_names or free_names or named)[0]
+        chosen = (similar_names or free_names or granted_names)[0]
         if chosen in free_names:
             free_names.remove(chosen)
         yield chosen

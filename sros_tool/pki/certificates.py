@@ -733,7 +733,7 @@ def read_form(data: bytes) -> CertificateForm | None:
 
 
 def is_valid_at(form: CertificateForm, now: datetime) -> bool | None:
-    """Return whether a certificate is valid at ``now``; None if its dates cannot be read."""
+    """Return whether the certificate with this form is valid at ``now``; None if unreadable."""
     times = _validity_times(form.validity)
     return times and times[0] <= now.astimezone(UTC).strftime("%Y%m%d%H%M%SZ") <= times[1]
 

@@ -122,28 +122,28 @@ class _Chain:
         """Return why the chain is not valid, or ""."""
         if checks not in self._known:
             # If the chain passes the checks that all vendors make, only the optional checks remain.
-            new = not checks or bool(self.fault(Checks.NONE))
-            self._known[checks] = next(self._faults(checks, new=new), "")
+            with_common = not checks or bool(self.fault(Checks.NONE))
+            self._known[checks] = next(self._faults(checks, with_common=with_common), "")
         return self._known[checks]
 
-    def _faults(self, checks: Checks, *, new: bool) -> Iterator[str]:
+    def _faults(self, checks: Checks, *, with_common: bool) -> Iterator[str]:
         chain = self._certificates
-        if new:
+        if with_common:
             yield from _key_faults(chain[0])
             for certificate in chain:
                 yield from _extension_faults(certificate)
             yield from _network_faults(chain)
-        if new or Checks.STRICT in checks:
+        if with_common or Checks.STRICT in checks:
             yield from _authority_faults(chain, checks)
         if Checks.DOCUMENTS in checks:
             yield from purpose_faults(chain)
         if Checks.STRICT in checks:
             yield from _strict_faults(chain)
-        if new:
+        if with_common:
             yield from _time_faults(chain, self._at)
-        if new or Checks.ROOT_SIGNATURE in checks:
+        if with_common or Checks.ROOT_SIGNATURE in checks:
             yield from _signature_faults(chain, checks)
-        if new:
+        if with_common:
             yield from _name_faults(chain)
         if Checks.POLICIES in checks:
             yield from _policy_faults(chain)

@@ -614,18 +614,24 @@ def _is_in_scope(
     )
 
 
-def _is_at_point(place: x509.DistributionPoint, crl: x509.CertificateRevocationList) -> bool:
-    if place.crl_issuer is None:
+def _is_at_point(
+    distribution_point: x509.DistributionPoint, crl: x509.CertificateRevocationList
+) -> bool:
+    if distribution_point.crl_issuer is None:
         return True
-    names = [name.value for name in place.crl_issuer if isinstance(name, x509.DirectoryName)]
+    names = [
+        name.value for name in distribution_point.crl_issuer if isinstance(name, x509.DirectoryName)
+    ]
     return any(same_name(name, crl.issuer) for name in names)
 
 
-def _have_common_name(place: x509.DistributionPoint, point: x509.IssuingDistributionPoint) -> bool:
-    if place.full_name is None and place.relative_name is None:
+def _have_common_name(
+    distribution_point: x509.DistributionPoint, point: x509.IssuingDistributionPoint
+) -> bool:
+    if distribution_point.full_name is None and distribution_point.relative_name is None:
         return True
-    if place.full_name is not None and point.full_name is not None:
-        ours = [_general_name(name) for name in place.full_name]
+    if distribution_point.full_name is not None and point.full_name is not None:
+        ours = [_general_name(name) for name in distribution_point.full_name]
         return any(_general_name(name) in ours for name in point.full_name)
     return False  # sros does not compare names relative to the issuer, which are rare
 

@@ -28,8 +28,8 @@ Secrets = Callable[[str], str]
 """A function that returns a secret for a prompt, such as "the PIN of the token X"."""
 
 
-def _module_to_load(parsed: TokenUri, *, named: bool) -> str:
-    """Return the path of the PKCS#11 library to load; ``named``: the user gave the URI.
+def _module_to_load(parsed: TokenUri, *, is_from_user: bool) -> str:
+    """Return the path of the PKCS#11 library to load; ``is_from_user``: the user gave the URI.
 
     If the URI comes from elsewhere, for instance from the settings of a received keystore, the
     library is loaded only if root owns the file, because loading a library runs its code.
@@ -39,7 +39,7 @@ def _module_to_load(parsed: TokenUri, *, named: bool) -> str:
     """
     chosen_module = os.environ.get(MODULE_VARIABLE, "")
     path = Path(parsed.module)
-    if parsed.module and named:
+    if parsed.module and is_from_user:
         return parsed.module
     if path.is_absolute() and (real := file_of_root(path)):
         return str(real)
@@ -174,21 +174,21 @@ class TokenKey(ec.EllipticCurvePrivateKey):
         return self
 
 
-def holds_token_key(uri: str, secrets: Secrets, *, named: bool) -> bool:
+def holds_token_key(uri: str, secrets: Secrets, *, is_from_user: bool) -> bool:
     """Return whether the token has the key that ``uri`` names.
 
     Args:
         uri: the URI of the key.
         secrets: returns the PIN.
-        named: whether the user of this process gave the URI, and so chose the library.  The library
-            of any other URI, such as in a keystore's settings, is loaded only if root owns the
-            file.
+        is_from_user: whether the user of this process gave the URI, and so chose the library.  The
+            library of any other URI, such as in a keystore's settings, is loaded only if root owns
+            the file.
 
     Raises:
         UsageError: the URI is not valid, or its library must not be loaded.
         PkiError: the token cannot be used.
     """
-    return _holds_key(_usable_uri(uri, named=named), secrets)
+    return _holds_key(_usable_uri(uri, is_from_user=is_from_user), secrets)
 
 
 def _holds_key(parsed: TokenUri, secrets: Secrets) -> bool:
@@ -201,21 +201,21 @@ def _holds_key(parsed: TokenUri, secrets: Secrets) -> bool:
         raise _unusable_token_error(parsed, error) from error
 
 
-def open_token_key(uri: str, secrets: Secrets, *, named: bool) -> TokenKey:
+def open_token_key(uri: str, secrets: Secrets, *, is_from_user: bool) -> TokenKey:
     """Return the key that ``uri`` names.
 
-    It has the arguments and errors of `holds_token_key`.
+    Arguments and errors are those of `holds_token_key`.
     """
-    return _open_key(_usable_uri(uri, named=named), secrets, create=False)
+    return _open_key(_usable_uri(uri, is_from_user=is_from_user), secrets, create=False)
 
 
-def create_token_key(uri: str, secrets: Secrets, *, named: bool) -> TokenKey:
-    """Generate a key on the token, and return it.
+def create_token_key(uri: str, secrets: Secrets, *, is_from_user: bool) -> TokenKey:
+    """Generate a key on the token, and return it; arguments as for `holds_token_key`.
 
     Raises:
         PkiError: the token has a key with this label, or cannot be used.
     """
-    return _open_key(_usable_uri(uri, named=named), secrets, create=True)
+    return _open_key(_usable_uri(uri, is_from_user=is_from_user), secrets, create=True)
 
 
 def make_enclave_key(place: TokenUri, secrets: Secrets) -> TokenKey:
@@ -225,7 +225,7 @@ def make_enclave_key(place: TokenUri, secrets: Secrets) -> TokenKey:
         UsageError: no library is named.
         PkiError: the token cannot be used.
     """
-    usable = _with_library(place, named=True)
+    usable = _with_library(place, is_from_user=True)
     return _open_key(usable, secrets, create=not _holds_key(usable, secrets))
 
 
@@ -236,7 +236,7 @@ def open_enclave_key(place: TokenUri, secrets: Secrets) -> TokenKey:
         UsageError: no library is named.
         PkiError: the token cannot be used.
     """
-    return _open_key(_with_library(place, named=False), secrets, create=False)
+    return _open_key(_with_library(place, is_from_user=False), secrets, create=False)
 
 
 def planned_key(place: TokenUri) -> TokenKey:
@@ -244,17 +244,17 @@ def planned_key(place: TokenUri) -> TokenKey:
     return TokenKey(None, ec.generate_private_key(ec.SECP256R1()).public_key(), place)
 
 
-def _usable_uri(uri: str, *, named: bool) -> TokenUri:
-    return _with_library(parse_token_uri(uri), named=named)
+def _usable_uri(uri: str, *, is_from_user: bool) -> TokenUri:
+    return _with_library(parse_token_uri(uri), is_from_user=is_from_user)
 
 
-def _with_library(parsed: TokenUri, *, named: bool) -> TokenUri:
-    """Return the URI with the path of its library; ``named``: the user gave the URI.
+def _with_library(parsed: TokenUri, *, is_from_user: bool) -> TokenUri:
+    """Return the URI with the path of its library; ``is_from_user``: the user gave the URI.
 
     Raises:
         UsageError, UnavailableError: tokens cannot be used on this machine.
     """
-    parsed = parsed._replace(module=_module_to_load(parsed, named=named))
+    parsed = parsed._replace(module=_module_to_load(parsed, is_from_user=is_from_user))
     if importlib.util.find_spec("pkcs11") is None:
         raise UnavailableError(
             "keys on PKCS#11 tokens need the Python package python-pkcs11",

@@ -137,7 +137,9 @@ class _Planner:
             self._contradictions += self._contradictions_between_nodes(enclave)
         entries = {
             place: tuple(sorted(_entries(place_names), key=_entry_order))
-            for place, place_names in sorted(names.items(), key=lambda item: _place_order(item[0]))
+            for place, place_names in sorted(
+                names.items(), key=lambda item: _profile_order(item[0])
+            )
             if place_names
         }
         added = [right for right, wanted in self._wanted.items() if wanted]
@@ -206,8 +208,8 @@ def _entries(names: dict[tuple[str, str], _NewName]) -> Iterable[AddedName]:
             yield AddedName(kind, name.written, qualifiers, name.protect)
 
 
-def _place_order(place: ProfileKey) -> tuple[str, str, str]:
-    return place.enclave, place.ns, place.node
+def _profile_order(key: ProfileKey) -> tuple[str, str, str]:
+    return key.enclave, key.ns, key.node
 
 
 def _entry_order(entry: AddedName) -> tuple[int, GroupRights, str]:
@@ -577,8 +579,8 @@ def _groups(entries: Sequence[AddedName]) -> list[_NewElement]:
     ]
 
 
-def _profile(place: ProfileKey, entries: Sequence[AddedName]) -> _NewElement:
-    return _NewElement(f'profile ns="{place.ns}" node="{place.node}"', children=_groups(entries))
+def _profile(key: ProfileKey, entries: Sequence[AddedName]) -> _NewElement:
+    return _NewElement(f'profile ns="{key.ns}" node="{key.node}"', children=_groups(entries))
 
 
 # ── positions ──────────────────────────────────────────────────────────────────────────────

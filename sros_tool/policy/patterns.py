@@ -482,11 +482,13 @@ def common_name(
 
 
 @lru_cache(maxsize=4096)
-def _search(wanted: tuple[str, ...], unwanted_names: tuple[str, ...], absolute: bool) -> str | None:
+def _search(
+    wanted_names: tuple[str, ...], unwanted_names: tuple[str, ...], absolute: bool
+) -> str | None:
     from sros_tool.automata import NameSet
 
-    elsewhere = any(name.startswith(OTHER_NAMESPACE) for name in wanted)
-    both = reduce(and_, map(_names_of, wanted), _ros_names(absolute, elsewhere))
+    elsewhere = any(name.startswith(OTHER_NAMESPACE) for name in wanted_names)
+    both = reduce(and_, map(_names_of, wanted_names), _ros_names(absolute, elsewhere))
     return (both - NameSet.union(map(_names_of, unwanted_names))).example()
 
 

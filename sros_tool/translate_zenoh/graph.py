@@ -106,9 +106,9 @@ def nodes_in_rules(rules: Iterable[AccessRule], enclave: str) -> tuple[NodeName,
     return tuple(dict.fromkeys(nodes))
 
 
-def _node_of(place: str) -> NodeName:
-    """Return the node for the form ``DOMAIN/NAMESPACE/NAME`` of tokens."""
-    _, ns, name = map(_ros_name_of_chunk, place.split("/"))
+def _node_of(chunks: str) -> NodeName:
+    """Return the node for ``chunks``, which have the form DOMAIN/NAMESPACE/NAME as in tokens."""
+    _, ns, name = map(_ros_name_of_chunk, chunks.split("/"))
     return NodeName(ns, name)
 
 

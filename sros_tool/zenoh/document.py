@@ -329,15 +329,15 @@ class _Section:
             raise self.invalid_value_error(member, "is not a text")
         return value
 
-    def choice(self, member: str, kind: type[_E]) -> _E | None:
+    def choice(self, member: str, enum_class: type[_E]) -> _E | None:
         text = self.text(member)
-        return None if text is None else self._chosen(member, text, kind)
+        return None if text is None else self._chosen(member, text, enum_class)
 
-    def _chosen(self, member: str, text: str, kind: type[_E]) -> _E:
+    def _chosen(self, member: str, text: str, enum_class: type[_E]) -> _E:
         try:
-            return kind(text)
+            return enum_class(text)
         except ValueError:
-            known = ", ".join(choice.value for choice in kind)
+            known = ", ".join(choice.value for choice in enum_class)
             raise self.invalid_value_error(
                 member, f"is {text[:40]!r}, which is none of: {known}"
             ) from None
@@ -356,13 +356,13 @@ class _Section:
             raise self.invalid_value_error(member, "is missing or empty")
         return texts
 
-    def choices(self, member: str, kind: type[_E]) -> tuple[_E, ...] | None:
+    def choices(self, member: str, enum_class: type[_E]) -> tuple[_E, ...] | None:
         texts = self.texts(member)
         if texts is None:
             return None
         if not texts:
             raise self.invalid_value_error(member, "is empty")
-        return tuple(dict.fromkeys(self._chosen(member, text, kind) for text in texts))
+        return tuple(dict.fromkeys(self._chosen(member, text, enum_class) for text in texts))
 
     def sections(self, member: str) -> tuple[_Section, ...] | None:
         value = self.value.get(member)

@@ -380,7 +380,10 @@ def _order_findings(grant: Grant, name: str, file: str) -> Iterator[Finding]:
 def _unreachable_rule_findings(
     stated: Mapping[tuple[str, bool], _Topics], rule: Rule, index: int, name: str, file: str
 ) -> Iterator[Finding]:
-    """Yield a finding if earlier deny rules deny topics that a rule allows."""
+    """Yield a finding if earlier deny rules deny topics that a rule allows.
+
+    ``stated`` maps a direction, and whether rules allow or deny, to the topics in such rules.
+    """
     hidden: dict[str, dict[str, list[str]]] = {}
     left = 0
     for direction in _DIRECTIONS:

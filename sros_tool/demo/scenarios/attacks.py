@@ -485,7 +485,7 @@ _BOTH_DIRECTIONS = "permissions for * allow both directions"
 
 
 def _trespass_rows(
-    kind: Callable[..., Row],
+    make_row: Callable[..., Row],
     attack: str,
     part: str,
     mechanism: str,
@@ -494,15 +494,15 @@ def _trespass_rows(
 ) -> tuple[Row, ...]:
     """Return rows in which an enclave exceeds its rights, and control rows with wider rights.
 
-    ``forge`` gives the enclave of the ``part`` wide permissions, and ``opened`` names these
-    permissions.
+    ``make_row`` returns a row. ``forge`` gives the enclave of the ``part`` wide permissions, and
+    ``opened`` names these permissions.
     """
     unless_granted = " that it was not given" if attack.startswith("an enclave ") else ""
-    done = RowStatus.ANSWERED if kind in (_call_row, _false_server_row) else RowStatus.HEARD
+    done = RowStatus.ANSWERED if make_row in (_call_row, _false_server_row) else RowStatus.HEARD
     return tries(
         attack,
-        kind(f"{attack}{unless_granted}", Identity(OWN, part), RowStatus.REFUSED, mechanism),
-        kind(
+        make_row(f"{attack}{unless_granted}", Identity(OWN, part), RowStatus.REFUSED, mechanism),
+        make_row(
             f"{attack}, wildcard permissions",
             Identity(Undefended(forge), part),
             done,

@@ -114,7 +114,9 @@ class Keyring:
         _refuse_ca_service(role, place)
         try:
             if is_token_uri(place):
-                token_key = open_token_key(place, self.secrets, named=self._is_from_user(role))
+                token_key = open_token_key(
+                    place, self.secrets, is_from_user=self._is_from_user(role)
+                )
                 _LOG.info("opened the key of the %s CA, on the token at %s", role, place)
                 return token_key
             path = key_path(root, place)
@@ -174,13 +176,13 @@ class Keyring:
             parse_token_uri(place)
             if transaction.dry_run and not compared:
                 return generate_key()
-            named = self._is_from_user(role)
-            if holds_token_key(place, self.secrets, named=named):
+            is_from_user = self._is_from_user(role)
+            if holds_token_key(place, self.secrets, is_from_user=is_from_user):
                 self._check_chosen(role, place, compared=compared)
-                return open_token_key(place, self.secrets, named=named)
+                return open_token_key(place, self.secrets, is_from_user=is_from_user)
             if transaction.dry_run:
                 return generate_key()
-            return create_token_key(place, self.secrets, named=named)
+            return create_token_key(place, self.secrets, is_from_user=is_from_user)
         if place and key_path(transaction.root, place).exists():
             self._check_chosen(role, place, compared=compared)
             return self.open(OpenedKeystore(transaction.root), role, template)
