@@ -85,7 +85,7 @@ def _(bench: Bench) -> None:
     bench.permissions(("<dds ", "<policy "), ("</dds>", "</policy>"))
 
 
-@cause("enclave.refused", "where it has <enable_key_revision>")
+@cause("enclave.refused", "has <enable_key_revision> where")
 def _(bench: Bench) -> None:
     new = "<enable_key_revision>true</enable_key_revision>"
     bench.governance(("<topic_access_rules>", f"{new}<topic_access_rules>"))
