@@ -383,7 +383,7 @@ class FindingCounts(NamedTuple):
     other findings.
     """
     hidden: int
-    """Number of findings below ``--severity``."""
+    """Number of findings that are not shown, because they are below ``--severity``."""
 
 
 class ShownFindings(NamedTuple):

@@ -135,7 +135,7 @@ class FindingChange:
     time: datetime
     """Time of the check that saw the change, in UTC."""
     change: ChangeKind
-    """Whether the finding is new, has a new text, or is resolved."""
+    """Whether the finding is new, has a new text (``changed``), or is resolved (``over``)."""
     finding: Finding
     """The finding that changed; of a resolved finding, its last form."""
 

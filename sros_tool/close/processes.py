@@ -65,7 +65,9 @@ class ClosedProcess(NamedTuple):
     known_by: Annotated[
         str, Words(("process id", "node name", "program", "elimination", "enclave", "command"))
     ]
-    """What shows that this process has the nodes of the enclave."""
+    """What shows that this process has the nodes of the enclave; ``elimination``: no other process
+    is left for them.
+    """
     launch: Sequence[str] = ()
     """The command of the launch that started the process: `ros2 launch`, or a Python program that
     runs a launch description; empty if no launch started it.

@@ -291,18 +291,19 @@ class RobotStatus:
     is in force on the robot: the robot has the list, the list has not expired, the robot says that
     no process may run with another list or with earlier CAs, and the robot is not ``offline``.
     False if this is not known, or if the keystore was restored from a backup and lacks what its
-    robots have; null if the keystore has no list, or the robot has no enclave. `sros agent` and
-    plays know the processes that lack only new permissions, governance or certificates of their
-    own; for other robots, any restart that is due counts.
+    robots have; null if the keystore has no list, or the robot has no enclave. A restart that is
+    due only for new permissions, a new governance or a new certificate of the process itself does
+    not count if ``sros agent`` or a play reported it; on other robots, any restart that is due
+    counts.
     """
     expiry: Mapping[Annotated[str, Words(_EXPIRING_KINDS)], datetime]
     """The first expiry of the files that the robot confirmed, by kind, in UTC, from the ledger."""
     dds: RobotDds | None
     """The DDS of the robot by its last confirmation; null if the confirmation does not tell."""
     problems: tuple[str, ...] | None
-    """Problems of the robot, in its agent's words: what the agent could not do, what is wrong on
-    the robot, or that the robot fetches from an old copy of the publication; null if the
-    confirmation does not tell.
+    """Problems that the robot's agent reported: what the agent could not do, what is wrong on the
+    robot, or that the robot fetches from an old copy of the publication; null if the confirmation
+    does not tell.
     """
     notes: tuple[str, ...]
     """Remarks (clauses), such as on the robot's clock."""
@@ -476,15 +477,15 @@ class PublishedMetadata:
     expiry.
     """
     root_expires: datetime | None = None
-    """Expiry of the root metadata, in UTC; only the root key can renew them.  Null if the last
-    publication was by a release of sros that recorded no expiry.
+    """Expiry of the root metadata, in UTC; renewing the root metadata needs the root key. Null if
+    the last publication was by a release of sros that recorded no expiry.
     """
     accepted: bool | None = None
     """Whether robots still accept the metadata; null if ``expires`` is null."""
     unseen: str = ""
     """Why ``folder`` cannot be examined here, as a clause: it is not on this machine, or the
-    package ``tuf`` is missing.  Then it is not known whether robots can fetch, or whether the
-    folder has later releases than the keystore knows.  Null if the folder was examined.
+    package ``tuf`` is missing. Then sros does not know whether robots can fetch, or whether the
+    folder has later releases than the keystore. Null if the folder was examined.
     """
     lacks: str = ""
     """Path of a published file that is missing in ``folder``, such as metadata or a robot's
@@ -557,8 +558,8 @@ class FleetStatus:
     may be missing.  Null if the file does not differ.
     """
     revoked_until: datetime | None = None
-    """Until when robots need the revocation list, in UTC: the expiry of the last certificate on the
-    list, or of the last revoked certificate of a replaced CA that a robot may still trust.  Null if
+    """Until when robots need the revocation list, in UTC: when the last certificate on the list
+    expires, or the last revoked certificate of a replaced CA that a robot may still trust. Null if
     no certificate is revoked, or if the ledger lacks a revoked certificate.
     """
     publication: PublishedMetadata | None = None

@@ -172,9 +172,9 @@ class PublishedFleet(NamedTuple):
     robots: Sequence[RobotRelease]
     """The robots of the fleet, and robots whose releases were removed, sorted by name."""
     rotated: Sequence[str]
-    """Roles that have a new key."""
+    """Roles of the metadata that have a new key."""
     versions: Mapping[str, int]
-    """Versions of the metadata by name; the bins are named ``robots-0`` and so on."""
+    """Versions of the metadata by name; ``robots-0`` and so on list the archives of robots."""
     expires: Mapping[str, datetime]
     """Expiry of the metadata by name, including ``root``, in UTC."""
     root: Path
