@@ -740,17 +740,18 @@ class _NodeLackingRight:
     """A node without a right that every node needs, with the finding about it.
 
     ``included`` is the folder of the common parts that the node's profile includes, or "".
+    ``is_listener`` says that the node belongs to a listener of tf2_ros.
     """
 
     finding: Finding
     node: str
-    listener: bool
+    is_listener: bool
     included: str
 
     @property
     def needs_include(self) -> bool:
         """Whether the remedy is to include ``common/node.xml``."""
-        return not self.listener and self.finding.severity is ERROR
+        return not self.is_listener and self.finding.severity is ERROR
 
 
 def _common_folder(profile: Profile) -> str:
@@ -854,10 +855,10 @@ def _lacking_basics(
     checked_policy: _CheckedPolicy, enclave: Enclave, profile: Profile
 ) -> Iterator[_NodeLackingRight]:
     node = expand("~", profile.ns, profile.node)
-    listener = profile.node.startswith(_TF_LISTENER_PREFIX)
+    is_listener = profile.node.startswith(_TF_LISTENER_PREFIX)
     lacks_others = False
     for kind, right, names in _NODE_BASICS:
-        if listener and kind not in _KINDS_OF_LISTENERS:
+        if is_listener and kind not in _KINDS_OF_LISTENERS:
             continue
         if kind is NO_TYPE_DESCRIPTION and not has_type_descriptions(checked_policy.distribution):
             continue
@@ -875,7 +876,7 @@ def _lacking_basics(
         finding = kind.found(
             enclave.path, text, profile.source.file, profile.source.line, remedy=remedy
         )
-        yield _NodeLackingRight(finding, node, listener, _common_folder(profile))
+        yield _NodeLackingRight(finding, node, is_listener, _common_folder(profile))
 
 
 DOCUMENT_SIZE = FindingKind(

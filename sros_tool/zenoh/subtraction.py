@@ -399,7 +399,7 @@ class _LetterSearch:
 
     backwards: bool = False
     kept: dict[str, None] = field(default_factory=dict)
-    effort: int = _MOST_CHARACTERS
+    effort_left: int = _MOST_CHARACTERS
 
     def run(self, start: _SearchState) -> None:
         """Search from the state ``start`` until nothing is left to read."""
@@ -414,8 +414,8 @@ class _LetterSearch:
     def _following(self, state: _SearchState) -> Iterable[_SearchState]:
         """Return the next states of a state; () if all its names are already kept or denied."""
         read, wide, denied, _ = state
-        self.effort -= sum(map(len, denied)) + len(denied) * len(wide) + len(read)
-        if self.effort < 0:
+        self.effort_left -= sum(map(len, denied)) + len(denied) * len(wide) + len(read)
+        if self.effort_left < 0:
             raise CannotSubtract
         denied = tuple(chunk for chunk in denied if _overlap(chunk, wide))
         if not denied:
@@ -455,7 +455,7 @@ class _LetterSearch:
     def _keep_backwards(self, read: str, wide: str, denied: tuple[str, ...]) -> None:
         if self.backwards:
             raise CannotSubtract((wide,))
-        ends = _LetterSearch(backwards=True, effort=self.effort)
+        ends = _LetterSearch(backwards=True, effort_left=self.effort_left)
         ends.run(_SearchState("", wide[::-1], tuple(chunk[::-1] for chunk in denied), _LETTERS))
         for chunk in ends.kept:
             self._keep(read + chunk[::-1])

@@ -654,12 +654,12 @@ class _ChosenByTemplate:
     kind: FindingKind
     text: str
     domains: DomainSet
-    asked: Sequence[Vendor]
+    vendors: Sequence[Vendor]
 
     def __call__(self, settings: Template) -> bool:
         governance = governance_for(settings.protection, self.domains)
         return any(
-            (self.kind, self.text) in _rule_findings(rule, self.asked)
+            (self.kind, self.text) in _rule_findings(rule, self.vendors)
             for rule in governance.domain_access_rules
         )
 

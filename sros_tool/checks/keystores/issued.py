@@ -206,16 +206,20 @@ _AUTHORITY_FILES = (IDENTITY_CA_FILE, PERMISSIONS_CA_FILE)
 
 
 class EnclaveSummary(NamedTuple):
-    """The digests and names by which an enclave is compared with other enclaves."""
+    """The digests and names by which an enclave is compared with other enclaves.
+
+    ``governance_digest`` is "" if the keystore has a governance document.  ``trusted`` has the
+    fingerprints of the CAs in each CA file of the enclave.
+    """
 
     name: str
     serial: int
     issuer: str
-    key: bytes
-    certificate: str
-    permissions: str
-    governance: str
-    unique: bool
+    key_digest: bytes
+    certificate_digest: str
+    permissions_digest: str
+    governance_digest: str
+    has_unique_subject: bool
     trusted: tuple[frozenset[str], ...]
     list_number: int
     """CRL number of the enclave's revocation list, or -1 without a list signed by a trusted CA."""
@@ -275,11 +279,11 @@ def check_issued(
     keystore: CheckedKeystore, summaries: Sequence[EnclaveSummary]
 ) -> Iterator[Finding]:
     """Yield findings from comparing enclaves with each other, the ledger and the policies."""
-    certificates = {summary.name: summary.certificate for summary in summaries}
-    different = {summary.certificate: summary for summary in summaries}.values()
+    certificates = {summary.name: summary.certificate_digest for summary in summaries}
+    different = {summary.certificate_digest: summary for summary in summaries}.values()
     for (_, serial), names in _shared_values(((t.issuer, t.serial), t.name) for t in different):
         yield SERIAL_TWICE.found(", ".join(names), f"the serial number is {serial:x}")
-    for _, names in _shared_values((summary.key, summary.name) for summary in summaries):
+    for _, names in _shared_values((summary.key_digest, summary.name) for summary in summaries):
         if len({certificates[name] for name in names}) > 1:
             text, remedy = "their certificates have the same public key", ""
         else:
@@ -289,7 +293,7 @@ def check_issued(
             )
         yield KEY_TWICE.found(", ".join(names), text, remedy=remedy)
     # A subject name with a unique part matches no other subject name.
-    plain = {summary.name for summary in summaries if not summary.unique}
+    plain = {summary.name for summary in summaries if not summary.has_unique_subject}
     names = [summary.name for summary in summaries]
     pairs = [(inner, outer) for inner, outer in mistaken_names(names) if inner in plain]
     if pairs:
@@ -385,9 +389,9 @@ def _exported_governance_findings(
     keystore: CheckedKeystore, summaries: Sequence[EnclaveSummary]
 ) -> Iterator[Finding]:
     """Yield findings about exported enclaves whose governance differs from the first enclave's."""
-    copies = [summary for summary in summaries if summary.governance]
+    copies = [summary for summary in summaries if summary.governance_digest]
     for copy in copies[1:]:
-        if copy.governance != copies[0].governance:
+        if copy.governance_digest != copies[0].governance_digest:
             file = f"{keystore.root}/{enclave_folder(copy.name)}/governance.p7s"
             text = f"its governance differs from the governance of {copies[0].name}"
             yield GOVERNANCE_DIFFERS.found(copy.name, text, file)
@@ -444,15 +448,15 @@ def _ledger_findings(
             text = "the ledger has its revocation, but the revocation list does not"
             yield REVOKED_BY_NEWER_LIST.found(summary.name, text, place)
         for file, sha256 in (
-            ("cert.pem", summary.certificate),
-            ("permissions.p7s", summary.permissions),
+            ("cert.pem", summary.certificate_digest),
+            ("permissions.p7s", summary.permissions_digest),
         ):
             if sha256 and sha256 not in known:
                 text = f"{file} is not in the ledger"
                 yield UNEXPLAINED.found(summary.name, text, f"{place}/{file}")
         if (
-            summary.permissions in signed[summary.name]
-            and summary.permissions != signed[summary.name][-1]
+            summary.permissions_digest in signed[summary.name]
+            and summary.permissions_digest != signed[summary.name][-1]
         ):
             text = "the ledger has permissions that were signed later"
             yield OLD_PERMISSIONS.found(summary.name, text, f"{place}/permissions.p7s")

@@ -246,7 +246,7 @@ class RuleVerdict(NamedTuple):
 class _TopicEntry(NamedTuple):
     """A ``<topic>`` of a rule, with the ``partitions`` that the vendor compares for the topic."""
 
-    criteria: int
+    criteria_index: int
     rule: int
     allow: bool
     expression: str
@@ -334,9 +334,9 @@ class _GrantRules:
         passed = 0
         for position in self._index.matching(topic):
             entry = self._entries[position]
-            if entry.criteria == passed:
+            if entry.criteria_index == passed:
                 continue  # of each criteria, only the first matching topic counts
-            passed = entry.criteria
+            passed = entry.criteria_index
             fits = self._matches_partitions(entry, wanted)
             if fits or self._traits.topic_decides or not entry.expression:
                 return entry.verdict(fits=fits)
@@ -357,9 +357,9 @@ class _GrantRules:
         passed = 0
         for position in self._index.matching(topic):
             entry = self._entries[position]
-            if entry.criteria != passed and not entry.expression:
+            if entry.criteria_index != passed and not entry.expression:
                 return entry.verdict(fits=True)
-            passed = entry.criteria
+            passed = entry.criteria_index
         return None
 
     def only_allows(self) -> bool:
@@ -370,7 +370,7 @@ class _GrantRules:
         """Return the topics for which `crash_verdict` returns None."""
         from sros_tool.automata import NameSet
 
-        groups = groupby(self._entries, key=lambda entry: entry.criteria)
+        groups = groupby(self._entries, key=lambda entry: entry.criteria_index)
         crashing = [self._crashing_topics(list(group)) for _, group in groups]
         return _every_topic() - NameSet.union(filter(None, crashing))
 
@@ -388,7 +388,7 @@ class _GrantRules:
         from sros_tool.automata import NameSet
 
         rules: list[tuple[NameSet, bool]] = []
-        for _, entries in groupby(self._entries, key=lambda entry: entry.criteria):
+        for _, entries in groupby(self._entries, key=lambda entry: entry.criteria_index):
             group = list(entries)
             fits = self._matches_partitions(group[0], _DEFAULT_PARTITION)
             if fits or self._traits.topic_decides:
