@@ -1501,6 +1501,9 @@ def test_what_a_restored_keystore_cannot_know_is_not_published_in_silence(
         with pytest.raises(KeystoreError, match="the governance was changed") as refused:
             publisher.publish(restored=True, dry_run=dry_run)
     assert "rtps_protection_kind SIGN" in refused.value.what
+    lacking = "The keystore lacks /r5/base, which robots have. If a robot made their keys, sign its"
+    before, _, after = refused.value.remedy.partition(lacking)
+    assert "sign_request" in after and "generate_artifacts" in after and "Sign" not in before
     assert "/r2/base: not known, because the archive of the last release of r2" in str(
         refused.value
     )
@@ -1520,6 +1523,7 @@ def test_what_a_restored_keystore_cannot_know_is_not_published_in_silence(
     assert [(e.change, e.enclave) for e in done.later] == [("missing", "/r5/base")]
     (note,) = (note.text for note in done.notes if note.id == "fleet.changed-after-backup")
     assert "/r5/base is in the last release of its robot, and the keystore lacks it" in note
+    assert lacking in note
 
 
 @pytest.mark.parametrize("steps", [(0, 1), (1, 3)])

@@ -429,6 +429,8 @@ def refuse_lost_changes(
                 f"{renew(on_robots, ' --revoke-old')}. If the key of a request was revoked, first "
                 "make a new key on the robot (docs/howto/rotate.md, A key in wrong hands)."
             )
+    if missing := names["missing"]:
+        steps.append(_missing_step(root, missing))
     if rights := names["rights_taken"]:
         taken = [
             (e.enclave, f"{e.enclave}: {e.what}") for e in changes if e.change == "rights_taken"
@@ -456,6 +458,18 @@ def refuse_lost_changes(
             "Publishing would undo this.",
             f"{' '.join(steps)} Then repeat this command, with --restored.",
         )
+
+
+def _missing_step(root: str, missing: Sequence[str]) -> str:
+    """Return what to do before the policy is signed, because the keystore lacks enclaves.
+
+    Signing the policy would make new keys for them; releases do not show who made the present keys.
+    """
+    return (
+        f"The keystore lacks {first_few(missing, _NAMED)}, which robots have. If a robot made "
+        "their keys, sign its requests again before you sign the policy, with `sros sign_request "
+        f"{root} REQUEST --no-answer -p POLICY_FILE --fleet FLEET_FILE`."
+    )
 
 
 def check_authorities(keystore: OpenedKeystore, folder: Path, last: Release) -> None:
@@ -519,9 +533,11 @@ def other_changes_notes(keystore: OpenedKeystore, changes: Sequence[LaterChange]
     ]
     if lines:
         shown = first_few([*folded(recorded_fleet(keystore), lines)], _SHOWN)
+        missing = [change.enclave for change in changes if change.change == "missing"]
+        first = f"{_missing_step(quote(str(keystore.root)), missing)} " if missing else ""
         yield Note(
             "fleet.changed-after-backup",
-            f"the releases from after the backup show other changes: {shown}. Sign the present "
-            "policy and fleet again with `sros generate_artifacts`, and remove the enclaves that "
-            "robots should not have any more.",
+            f"the releases from after the backup show other changes: {shown}. {first}Sign the "
+            "present policy and fleet again with `sros generate_artifacts`, and remove the "
+            "enclaves that robots should not have any more.",
         )
