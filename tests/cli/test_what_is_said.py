@@ -127,8 +127,16 @@ def test_a_denial_takes_a_right_away(root: Path) -> None:
     (root.parent / "denied.xml").write_text(
         policy_text({"/robot": publish("/scan", "/secret") + denied})
     )
-    ended = sros("create_permission", "ks", "/robot", "denied.xml", cwd=root.parent).ok()
+    words = ("create_permission", "ks", "/robot", "denied.xml")
+    ended = sros(*words, cwd=root.parent).ok()
     assert "/robot loses: publish topic /secret (by a DENY)" in ended.err
+    # A protective DENY of a name that was never allowed takes nothing away.
+    also = denied.replace("/secret", "/*other")
+    (root.parent / "denied.xml").write_text(
+        policy_text({"/robot": publish("/scan", "/secret") + denied + also})
+    )
+    ended = sros(*words, cwd=root.parent).ok()
+    assert "/robot" in ended.out and "loses" not in ended.err and "work until" not in ended.err
 
 
 # ── templates ──────────────────────────────────────────────────────────────────────────────

@@ -32,6 +32,7 @@ from sros_tool.pki.certificates import key_digest, subject_text, validity_of
 from sros_tool.policy.model import ALLOW, DENY, Enclave, Policy
 from sros_tool.policy.rights import (
     Right,
+    Rules,
     compare,
     lost_counterparts_text,
     policy_rights,
@@ -54,7 +55,7 @@ class EarlierPermissions:
 class ReplacedRights:
     """The rights that an enclave gains and loses with its new permissions.
 
-    A new denial counts as lost, a removed denial as gained.
+    A new denial counts as lost, a removed denial as gained, if it denies an allowed name.
     """
 
     enclave: str
@@ -128,17 +129,23 @@ def replaced_rights(
     Other permissions of the enclave may work longer than ``earlier_permissions``;
     `with_expiries_in_ledger` adds their expiry.
     """
-    difference = compare(grant_rights(name, earlier_permissions.grant), grant_rights(name, grant))
+    earlier = earlier_permissions.grant
+    rights_before, rights_after = grant_rights(name, earlier), grant_rights(name, grant)
+    difference = compare(rights_before, rights_after)
+    rules = Rules(rights_before | rights_after)
+    all_allowed = earlier.default_allow or grant.default_allow
     lost: list[Right] = []
     gained: list[Right] = []
     for sign, right in difference.lines():
-        if right not in difference.covered:
+        # A denial changes nothing unless something it denies is allowed before or after.
+        matters = all_allowed or rules.overlaps(right._replace(qualifier=ALLOW))
+        if matters and right not in difference.covered:
             taken = (sign == "-") == (right.qualifier is ALLOW)
             (lost if taken else gained).append(right)
     end = validity_of(earlier_permissions.certificate).not_after
     with suppress(SrosError):  # the expiry is before the beginning
-        end = min(end, earlier_permissions.grant.validity.not_after)
-    before, after = earlier_permissions.grant.domains().closed(), grant.domains().closed()
+        end = min(end, earlier.validity.not_after)
+    before, after = earlier.domains().closed(), grant.domains().closed()
     lost_domains, gained_domains = (
         str(DomainSet.of(*((domain, domain) for domain in here if domain not in there)))
         for here, there in ((before, after), (after, before))
