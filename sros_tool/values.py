@@ -202,7 +202,7 @@ class FileChange(NamedTuple):
 
     action: Annotated[str, FILE_ACTIONS]
     """What is done with the file; ``close``: a private key or a folder of keys that other users
-    could open is closed to them; ``adopt``: a keystore of ros2/sros2 gets its settings and ledger.
+    could open is closed to them; ``adopt``: a keystore of ros2/sros2 gets settings and a ledger.
     """
     path: str
     """The file; for ``send``, its path in the archive on standard output."""

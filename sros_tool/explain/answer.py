@@ -545,7 +545,9 @@ class Answer(NamedTuple):
 
     @property
     def protection(self) -> AppliedProtection | None:
-        """The protection that the governance demands for the topic; null if no rule applies."""
+        """The protection that the governance demands for the topic; null if no domain rule
+        applies.
+        """
         topic, domain = self.topic_rule, self.domain_rule
         if domain is None:
             return None

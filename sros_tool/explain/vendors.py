@@ -136,7 +136,7 @@ class DistributionAnswer(NamedTuple):
 
     @property
     def text(self) -> str:
-        """The decision and its reason as a sentence."""
+        """The decision and its reason, as a sentence."""
         return self.answer.text
 
 

@@ -366,7 +366,9 @@ class RemoteFacts(NamedTuple):
     enclave: str
     """Name of the remote enclave."""
     own_rights_by_router: bool
-    """Whether the remote is the router of a client: ``may`` then has the client's own rights."""
+    """Whether the remote enclave is the router of this client; ``may`` then has the rights of the
+    client itself.
+    """
     may: RightNames
     """Names by kind (``topics``, ``services``) and by right, such as ``publish``; wildcards are
     written as in Zenoh.
@@ -497,7 +499,7 @@ class DescribedConfiguration(NamedTuple):
     rights: Sequence[RemoteFacts]
     """The rights of remote enclaves; empty if sros did not write the configuration."""
     problems: Sequence[str]
-    """How the configuration differs from its signed document or contradicts its enclave."""
+    """How the configuration differs from its signed document, or does not fit its enclave."""
     signature: SignatureFacts
     """Signature of the configuration."""
     kind: Annotated[Literal["Zenoh configuration"], "What PATH is."] = "Zenoh configuration"

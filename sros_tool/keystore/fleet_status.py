@@ -201,7 +201,7 @@ class ConfirmedFile:
 
     @property
     def action(self) -> Annotated[str, Words(("deliver", "remove"))]:
-        """Whether to deliver the file to the robot, or to remove it from the robot."""
+        """Whether you have to deliver the file to the robot, or to remove it from the robot."""
         return "remove" if self.surplus else "deliver"
 
 
@@ -539,11 +539,12 @@ class FleetStatus:
     """The robots, sorted by name."""
     unassigned: int
     """Number of enclaves that belong to no robot, so that no confirmation includes them; 0 with
-    --robot.
+    ``--robot``.
     """
     overdue: frozenset[str] = frozenset()
-    """The robots whose last confirmation is older than --max-age, sorted by name; without that
-    option, the robots that fetch and have sent nothing for more than a day."""
+    """The robots whose last confirmation is older than ``--max-age``, sorted by name; without that
+    option, the robots that fetch and have sent nothing for more than a day.
+    """
     older: str = ""
     """Why the keystore lacks what its robots have, as a clause: the keystore was restored from a
     backup, or is a copy, and has not yet published with ``--restored``.  Null if nothing shows

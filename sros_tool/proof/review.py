@@ -363,7 +363,9 @@ class ReviewResult(NamedTuple):
     head: str
     """The full id of the commit that was reviewed."""
     status: int
-    """Exit status: 0 nothing found that fails, 1 findings, 2 a step could not be decided."""
+    """Exit status: 0 if nothing fails the review, 1 for findings that fail it, 2 if a step could
+    not be decided.
+    """
     steps: Sequence[StepResult]
     """The steps of the review."""
     findings: Sequence[Finding]

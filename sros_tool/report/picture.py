@@ -276,7 +276,7 @@ class Validity:
     title: str
     """Title of the document."""
     enclave: str = ""
-    """Path of the enclave, or an empty string for CAs and CRLs."""
+    """Path of the enclave, or an empty string for CAs and revocation lists."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -292,7 +292,7 @@ class PicturedFinding:
     remedy: str = ""
     """What to do about the finding."""
     enclave: str = ""
-    """Path of the enclave, or another subject."""
+    """Path of the enclave, or another subject of the finding."""
 
 
 class SourceTitle(NamedTuple):

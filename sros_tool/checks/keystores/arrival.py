@@ -73,7 +73,7 @@ class VerifiedFolder(NamedTuple):
     enclaves: Sequence[ArrivedEnclave]
     """The enclaves."""
     findings: Sequence[ArrivalFinding]
-    """What is wrong."""
+    """The faults that were found."""
     at: datetime
     """The moment for which the enclaves were checked, in UTC."""
     domain: int | None

@@ -108,7 +108,7 @@ class MinimizedEnclave(NamedTuple):
     bytes: PermissionsBytes
     """Size of the signed permissions."""
     proposals: tuple[WildcardProposal, ...]
-    """Wildcards that would make the permissions small enough."""
+    """Wildcards that would make the permissions smaller than ``bytes.limit``."""
 
 
 class PolicyMinimization(NamedTuple):
