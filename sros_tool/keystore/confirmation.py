@@ -484,7 +484,8 @@ class ReceivedConfirmation:
         return (
             f"{_TWO_COMPUTERS} seem to send messages in turn: they reported an earlier start "
             f"or release again, last at {iso(alternated)}. Perhaps a disk was copied or restored. "
-            "The files of the other computer are not known."
+            "The files of the other computer are not known. Give the robot new keys, and revoke "
+            "the others (docs/howto/one_robot.md: Same name, new hardware)."
         )
 
     def clock_note(self) -> str:

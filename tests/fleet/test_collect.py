@@ -395,6 +395,26 @@ def test_two_computers_that_are_alike_are_seen_by_their_starts(home: Home) -> No
     assert not r1.problems, "only the last day counts"
 
 
+@pytest.mark.parametrize(("new_key", "revoke_old"), [(True, True), (True, False), (False, True)])
+def test_new_keys_end_the_alarm_of_two_computers(
+    home: Home, new_key: bool, revoke_old: bool
+) -> None:
+    """Unless the earlier certificates are valid, or the other computer has the key, too."""
+    boots = ("1" * 64, "2" * 64)
+    for boot in (*boots, boots[0]):
+        home.send("r1", boot=boot)
+        home.collect()
+    later = NOW + timedelta(hours=1)
+    names = [name for name in OpenedKeystore(home.root).names if name.startswith("/r1/")]
+    renew(home.root, names, new_key=new_key, revoke_old=revoke_old, now=later)
+    shutil.copytree(home.root / "enclaves/r1", home.folder / "r1/enclaves/r1", dirs_exist_ok=True)
+    later += timedelta(hours=1)
+    home.send("r1", later, boot=boots[1])
+    assert home.of("r1", later).outcome == "kept"
+    (r1,) = fleet_status(OpenedKeystore(home.root), ["r1"]).robots
+    assert r1.is_doubtful != (new_key and revoke_old)
+
+
 def test_requests_of_strangers_neither_speak_for_sros_nor_fill_the_terminal(home: Home) -> None:
     names = ("Run it", "/r1/base\x1b[2J", *(f"/r1/x{number}" for number in range(200)))
     home.send(

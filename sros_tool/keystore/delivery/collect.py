@@ -546,9 +546,11 @@ class _Verifier:
         arrived = self._arrival(file, last)
         message = LastMessage(sequence, sha256, verified.enclave)
         installed = verified.confirmation.release
-        before_it = (last.confirmation.release if last else None) or 0
+        known = None if last and self._has_new_keys(robot, last) else last
+        before_it = (known.confirmation.release if known else None) or 0
         went_back = installed is not None and installed < before_it and not is_restored
-        boots, alternated = (before or message).successor(verified.confirmation.boot, arrived)
+        predecessor = (known.message if known else None) or message
+        boots, alternated = predecessor.successor(verified.confirmation.boot, arrived)
         # A new agent begins without a release, and a robot can only claim unpublished releases.
         if went_back and installed and self._is_published(before_it):
             alternated = arrived
@@ -567,6 +569,30 @@ class _Verifier:
             )
         return _ReceivedMessage(
             robot, "kept", verified=verified, received=received, remarks=remarks
+        )
+
+    def _has_new_keys(self, robot: Robot, last: ReceivedConfirmation) -> bool:
+        """Return whether a robot got new keys after its last message, and the others are revoked.
+
+        Then no other computer can have a key of the robot from before, and still use it.
+        """
+        if restored_at(self._keystore):  # the ledger may lack a certificate
+            return False
+        names = {
+            *enclaves_of_robot(self._keystore, self._fleet, robot),
+            *last.confirmation.enclaves(),
+        }
+        entries = [
+            entry
+            for entry in self._keystore.ledger_file.with_values("enclave", names).entries
+            if entry.what == "certificate" and entry.enclave in names
+        ]
+        earlier = [entry for entry in entries if entry.time <= iso(last.time)]
+        later_keys = {entry.key for entry in entries if entry not in earlier}
+        return bool(earlier) and all(
+            entry.key not in {"", *later_keys}
+            and (entry.not_after <= iso(self._now) or int(entry.serial, 16) in self._revoked)
+            for entry in earlier
         )
 
     def _is_published(self, release: int) -> bool:
