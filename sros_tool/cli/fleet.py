@@ -1005,6 +1005,10 @@ def _expiry_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
 _KIND_WORDS = {"crl": "revocation list"}
 
 
+_OFTEN_BY_PROBLEM = ("look into it", "check its server", "check whether it is on")
+"""Tasks for which the problems of a robot come before the differences of its files."""
+
+
 class _Group(NamedTuple):
     """Robots that share a row of the status."""
 
@@ -1043,7 +1047,7 @@ def _groups(
                 *_expiry_clauses(robot, compared_fleet.at),
                 *_summary(robot, status.stage, compared_fleet.at),
             )
-            is_problem = robot.to_do in ("look into it", "check its server")
+            is_problem = robot.to_do in _OFTEN_BY_PROBLEM
             clauses = (*problems(robot), *files) if is_problem else (*files, *problems(robot))
             what = _CLOCK_SENTENCE.sub("", _without_robot_name("; ".join(clauses), robot.robot))
             clauses_by_robot[robot.robot] = what

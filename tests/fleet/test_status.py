@@ -1294,10 +1294,13 @@ def test_what_is_to_be_done_for_robots_that_do_not_fetch_what_is_published(field
     value["confirmation"]["problems"] = ["Make room on the disk."]
     kept.write_text(json.dumps(value))
     assert said()["r2"][0] == "look into it"
-    value["confirmation"]["problems"] = []
-    kept.write_text(json.dumps(value))
     for robot in ("r2", "r3"):
         field.age(robot, timedelta(minutes=31))
+    silent = said()["r2"]
+    assert silent[0] == "check whether it is on" and silent[1].startswith("it reports: Make room")
+    value = json.loads(kept.read_text())
+    value["confirmation"]["problems"] = []
+    kept.write_text(json.dumps(value))
     page = field.run("fleet", "status", "ks", "--html", status=1).out
     assert page.count(">check whether it is on</td>") == 1
     field.age("r2", timedelta(minutes=-62))
