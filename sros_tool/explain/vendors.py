@@ -515,7 +515,7 @@ class VendorOutcome(NamedTuple):
     """
     by_permissions_of: Sequence[str] = ()
     """The other enclaves whose permissions fit the certificate of this enclave and allow the
-    access, so that a process with the key of this enclave has the right, too.
+    access. So a process with the key of this enclave has the right, too.
     """
     subject: str = ""
     granted: str = ""

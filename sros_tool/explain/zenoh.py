@@ -287,7 +287,7 @@ class WhoOnZenoh(NamedTuple):
     domain: int | None
     """The ROS domain of ``--domain``; null for every domain."""
     enclaves: Sequence[ZenohEnclaveOutcome]
-    """All enclaves; the enclave of the router may do whatever passes through the router."""
+    """All enclaves. The enclave of the router may do whatever passes through the router."""
     export: bool = False
     """Whether the question was about an export, which may lack enclaves of its keystore."""
 

@@ -386,7 +386,7 @@ class DescribedKeystore(NamedTuple):
     authorities: Mapping[str, AuthorityFile | UnreadableFile]
     """CAs of the keystore, by role (``identity``, ``permissions``)."""
     unknown_authorities: Sequence[str]
-    """CAs in CA files of the keystore or of an enclave that sros did not put there, as text."""
+    """CAs that somebody else added to CA files of the keystore or of an enclave, as text."""
     governance: DescribedGovernance | UnreadableFile | None
     """Governance of the keystore, or null."""
     zenoh: NetworkFacts | None

@@ -352,7 +352,9 @@ class StepResult(NamedTuple):
     result: str
     """The result as a sentence, or the reason why the step could not be decided."""
     lines: Sequence[str]
-    """New access, dropped requirements, changed rights, or findings."""
+    """What the step found, one text for each: new access, a dropped requirement, a changed right
+    or a finding.
+    """
 
 
 class ReviewResult(NamedTuple):

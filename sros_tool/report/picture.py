@@ -175,7 +175,7 @@ class Name:
     protection: Protection
     """Protection of the name by the governance."""
     wildcard: bool = False
-    """Whether the name is a wildcard that is drawn by itself, because no arrow to a known name
+    """Whether the name is a wildcard, which is drawn like a name because no arrow to a known name
     shows it.
     """
     lacks: Lack = Lack.NOTHING
@@ -541,7 +541,7 @@ class Picture:
     exports: tuple[str, ...] = ()
     """The sources that are exports, which may lack enclaves of their keystore."""
     revoked: tuple[str, ...] = ()
-    """Revoked enclaves that a keystore no longer has, which are not drawn."""
+    """Revoked enclaves that a keystore no longer has; they are not drawn."""
     unread: tuple[UnreadUnits, ...] = ()
     join_needs_right: bool = False
     """Whether an enclave can join only the ROS domains in which it has a right."""
