@@ -693,6 +693,8 @@ class _Editor:
 
     def _put_into_empty(self, parent: PlacedElement, new: Iterable[_NewElement]) -> None:
         text, outer = self._text, self._text.indent_of(parent)
+        if parent.tag == "enclaves" and outer is None:
+            outer = ""  # otherwise, a policy that begins empty would stay on one line
         indent = None if outer is None else outer + text.unit
         rendered = "".join(self._rendered(element, indent) for element in new)
         # An element without end tag, such as <profile .../>.

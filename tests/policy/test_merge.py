@@ -246,6 +246,8 @@ def test_a_policy_without_enclaves_gets_the_rights_of_others_alone(tmp_path: Pat
     both = Policy((Enclave("/a", profiles), Enclave("/b", profiles)))
     result = merge_into(path, moved := policy_in_namespace(both, "/left"))
     assert policy_rights(read_policy(path, result.document)) == policy_rights(moved)
+    lines = result.document.decode().splitlines()  # one for each right, as git and sros name lines
+    assert lines[1] == '  <enclave path="/left/a">' and lines[-1] == "</enclaves></policy>"
 
 
 TOPICS = group("topics", "/x /cam/*", publish="ALLOW")
