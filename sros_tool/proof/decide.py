@@ -785,6 +785,7 @@ def _unused_names(
     clauses, waiting, unnamed = [], [], []
     for right, name, parts in _restricted_names(requirement):
         verb = "use" if isinstance(requirement, Nobody | Protected) else right
+        peer = PEER_RIGHT[right]
         named = _named_right(right, name)
         stated = [world.stated_names(part.begin, part.end) for part in _parts_of(right)]
         known = is_expression(name) or any(name in names for names in stated)
@@ -793,7 +794,6 @@ def _unused_names(
             other = _RIGHT_OF_OTHER_KIND.get(right, "")
             if other and _is_used_by_anybody(world, _sufficient_parts(other), name, limit):
                 meant = f", but some enclaves may {other} {_named_right(other, name)}"
-            peer = PEER_RIGHT[right]
             if isinstance(requirement, Nobody) and not meant:
                 unnamed.append(named)
             elif meant or verb != right:
@@ -808,7 +808,26 @@ def _unused_names(
             clauses.append(f"only wildcards match {named}{meant}")
         elif not known:
             unnamed.append(named)
+        elif verb in ("request", "call") and (served := _served_instead(world, peer, name, limit)):
+            clauses.append(f"no enclave may {peer} {named} (perhaps {served} is meant)")
     return clauses, waiting, unnamed
+
+
+def _served_instead(world: World, right: str, name: str, limit: SearchLimit) -> str | None:
+    """Return a served name that ends like ``name``, if nobody serves ``name``, or None.
+
+    The server was perhaps renamed, and enclaves keep the right to request its earlier name.
+    """
+    parts = _sufficient_parts(right)
+    if is_expression(name) or _is_used_by_anybody(world, parts, name, limit):
+        return None
+    end = f"/{name.rpartition('/')[2]}"
+    return shortest(
+        other
+        for part in parts
+        for other in world.stated_names(part.begin, part.end)
+        if other.endswith(end) and _is_used_by_anybody(world, parts, other, limit)
+    )
 
 
 def _restricted_names(

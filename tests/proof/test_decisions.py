@@ -443,6 +443,23 @@ def test_a_renamed_node_has_no_side_of_its_names(names: str, text: str) -> None:
     assert any(each.text.startswith(f"{text}; ") for each in findings), findings
 
 
+@pytest.mark.parametrize(
+    ("served", "meant"),
+    [
+        ("/left/gate/open", "/left/gate/open"),
+        ("/left/driver/open", ""),
+        ("/left/driver/close", ""),
+        ("/left/*/open", ""),
+    ],
+)
+def test_a_renamed_server_leaves_a_right_that_nobody_serves(served: str, meant: str) -> None:
+    """A requirement for the earlier name would hold, regardless of who requests the new name."""
+    rights = {"/panel": may("request", "/left/driver/open"), "/gate": may("reply", served)}
+    found = decided(rights, '[[only]]\nrequest = ["/left/driver/open"]\nenclaves = ["/panel"]')
+    reason = f"no enclave may reply service /left/driver/open (perhaps {meant} is meant)"
+    assert [each for _, reasons in found.vacuous for each in reasons] == [reason] * bool(meant)
+
+
 def test_whom_nobody_reaches_needs_no_search(monkeypatch: pytest.MonkeyPatch) -> None:
     """Proposals for 300 robots ask for each enclave whether one gate alone reaches it."""
     rights = {"/a": may("publish", "/x"), "/gate": may("publish", "/y")}
