@@ -119,7 +119,7 @@ class RowResult:
     defence_removed: str = ""
     """Defense that the row removes, or an empty string."""
     open_because: str = ""
-    """Reason that the attack is known to succeed, or an empty string."""
+    """Why the attack is known to succeed, or an empty string."""
     remedy: str = ""
     """Defense against the attack, or an empty string."""
     accepted: bool = False

@@ -131,7 +131,7 @@ class Reached(NamedTuple):
     """The enclave."""
     deliveries: tuple[Delivery, ...]
     problem: str
-    """Reason that the process of the enclave opens no session, or null."""
+    """Why the process of the enclave opens no session, or null."""
 
 
 class DecidingWildcard(NamedTuple):

@@ -297,7 +297,9 @@ class RobotStatus:
     counts.
     """
     expiry: Mapping[Annotated[str, Words(_EXPIRING_KINDS)], datetime]
-    """The first expiry of the files that the robot confirmed, by kind, in UTC, from the ledger."""
+    """By kind of file, the first expiry of the files that the robot confirmed, in UTC, according
+    to the ledger.
+    """
     dds: RobotDds | None
     """The DDS of the robot by its last confirmation; null if the confirmation does not tell."""
     problems: tuple[str, ...] | None
@@ -306,7 +308,7 @@ class RobotStatus:
     does not tell.
     """
     notes: tuple[str, ...]
-    """Remarks (clauses), such as on the robot's clock."""
+    """Remarks (clauses), for example about the robot's clock."""
     to_do: str = ""
     """What you have to do for the robot, in a few words; empty if there is nothing to do."""
     has_release: bool = False
@@ -564,7 +566,7 @@ class FleetStatus:
     no certificate is revoked, or if the ledger lacks a revoked certificate.
     """
     publication: PublishedMetadata | None = None
-    """What robots fetch; null if nothing was published for a robot."""
+    """What robots fetch; null if nothing was published for any robot."""
     is_any_revoked: bool = False
     """Whether a certificate is on the revocation list, or was revoked and is of a replaced CA that
     a robot may still trust.
