@@ -244,17 +244,21 @@ def test_a_request_that_is_signed_for_a_fleet_is_recorded(
     assert not (root / "enclaves/cams/a").exists()
 
 
-def test_a_request_for_robots_that_the_keystore_does_not_know(made: Path, tmp_path: Path) -> None:
-    """It is signed, and the user hears that no `--robot` chooses the enclave."""
-    root = tmp_path / "ks"
+def test_requests_for_robots_that_the_keystore_does_not_know(made: Path, tmp_path: Path) -> None:
+    """They are signed, and one note says that no `--robot` chooses the enclaves."""
+    root, robots = tmp_path / "ks", ("new", "other")
     copy_of(made / "ks", root)
-    sros("create_request", "/new", tmp_path / "robot").ok()
-    (tmp_path / "fleet.toml").write_text("[robots.new]\n")
+    for robot in robots:
+        sros("create_request", f"/{robot}", tmp_path / "robot").ok()
+    (tmp_path / "fleet.toml").write_text("".join(f"[robots.{robot}]\n" for robot in robots))
     (tmp_path / "policy.xml").write_text(policy_text({"/{robot}": publish("x")}))
     words = ("-p", tmp_path / "policy.xml", "--fleet", tmp_path / "fleet.toml")
-    request = tmp_path / "robot/enclaves/new/request.pem"
-    ended = sros("sign_request", root, request, *words, "-o", tmp_path / "answer.tgz").ok()
-    assert "its fleet does not have the robot" in ended.err, ended
+    requests = tmp_path / "requests.pem"
+    files = (tmp_path / f"robot/enclaves/{robot}/request.pem" for robot in robots)
+    requests.write_text("".join(file.read_text() for file in files))
+    said = sros("sign_request", root, requests, *words, "--no-answer").ok().err
+    assert said.count("note [fleet.unrecorded-enclaves]") == 1
+    assert "which robot has /new, /other: its fleet does not have the robot" in said
 
 
 def test_many_enclaves_are_counted_with_the_next_step(tmp_path: Path) -> None:

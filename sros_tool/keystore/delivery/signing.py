@@ -380,19 +380,22 @@ class _RequestCertifier:
             before = EnclaveDomains(change.domains, fleet)
             fleet = change.write_fleet(fleet, paths)
             refuse_stale_domains(change.keystore, before, fleet, stated)
-        for name, of_enclave in stated.items():
-            if of_enclave.path and not (fleet and robot_of(fleet, name)):
-                lacks = "its fleet does not have the robot" if fleet else "it has no fleet"
-                change.notes.append(
-                    Note(
-                        "fleet.unrecorded-enclaves",
-                        f"enclave {name} belongs to a robot, but the keystore does not know which: "
-                        f"{lacks}. So `--robot`, as in `sros renew KEYSTORE --robot ROBOT`, does "
-                        "not choose this enclave: name the enclave itself, or first run `sros "
-                        f"generate_artifacts -k {quote(str(root))} -p POLICY_FILE --fleet "
-                        "FLEET_FILE`.",
-                    )
+        unrecorded = [
+            name
+            for name, of_enclave in stated.items()
+            if of_enclave.path and not (fleet and robot_of(fleet, name))
+        ]
+        if unrecorded:
+            lacks = "its fleet does not have the robot" if fleet else "it has no fleet"
+            change.notes.append(
+                Note(
+                    "fleet.unrecorded-enclaves",
+                    f"the keystore does not know which robot has {first_few(unrecorded, 3)}: "
+                    f"{lacks}. So `--robot`, as in `sros renew KEYSTORE --robot ROBOT`, does not "
+                    "choose these enclaves until you run `sros generate_artifacts -k "
+                    f"{quote(str(root))} -p POLICY_FILE --fleet FLEET_FILE`.",
                 )
+            )
 
     def certify(self, request: SigningRequest, *, renew: bool, named: bool) -> Issued:
         """Write all files of the request's enclave except its key.
