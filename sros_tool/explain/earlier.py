@@ -59,8 +59,8 @@ def note_on_earlier_permissions(
         which = quote(names[0]) if len(names) == 1 else "ENCLAVE..."
         text = (
             f"the rights in earlier permissions of {first_few(names, 3)} are not known here: they "
-            "were signed from another policy. Whoever kept these permissions and the key has the "
-            f"rights until {max(ends.values())}. To end these rights, run `sros renew {root} "
+            "were signed from an earlier policy. Whoever kept these permissions and the key has "
+            f"the rights until {max(ends.values())}. To end these rights, run `sros renew {root} "
             f"{which} --revoke-old`."
         )
         yield Note("explain.earlier-permissions", text)

@@ -909,6 +909,7 @@ def test_earlier_permissions_that_still_allow_it(keystore: Path, tmp_path: Path)
         denied = explain(*words, *asked)
         assert denied.status == 1
         assert f"the rights in earlier permissions of {ENCLAVE} are not known here: " in denied.err
+        assert "signed from an earlier policy" in denied.err
     assert "earlier-permissions" not in explain(keystore, "--who", "publish", "/other").err
     ledger = keystore / "ledger.jsonl"
     lines = ledger.read_text().splitlines(keepends=True)
