@@ -557,20 +557,28 @@ def rights_without_counterpart(
         return []
     names = {(PEER_RIGHT[e.right], e.name) for e in asked if not is_expression(e.name)}
     before, after = _allowed_pairs(first_rights, names), _allowed_pairs(second_rights, names)
-    present = split_actions(right for right in second_rights if right.qualifier is not DENY)
-    others = {
-        word: Names(sorted(right.name for right in present if right.right == word))
-        for word in touched
-    }
+    others_before, others_after = (
+        _allowed_names(side, touched) for side in (first_rights, second_rights)
+    )
     lost = before - after
     lost |= {
-        (PEER_RIGHT[right.right], right.name)
+        (other, right.name)
         for right in asked
         if is_expression(right.name)
         and right.right not in ("call", "execute")
-        and not others[PEER_RIGHT[right.right]].overlaps(right.name)
+        and others_before[other := PEER_RIGHT[right.right]].overlaps(right.name)
+        and not others_after[other].overlaps(right.name)
     }
     return sorted(right for right in asked if (PEER_RIGHT[right.right], right.name) in lost)
+
+
+def _allowed_names(rights: Iterable[Right], words: Iterable[str]) -> dict[str, Names]:
+    """Map each right in ``words`` to the names for which some enclave has an ALLOW."""
+    allowed = split_actions(right for right in rights if right.qualifier is not DENY)
+    return {
+        word: Names(sorted(right.name for right in allowed if right.right == word))
+        for word in words
+    }
 
 
 def is_of_every_node(name: str) -> bool:

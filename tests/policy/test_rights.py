@@ -138,6 +138,13 @@ def test_rights_whose_other_side_is_gone(
     assert unanswered == sorted([name, *([wildcard] if is_wildcard_unanswered else [])])
 
 
+def test_a_new_denial_takes_nothing_from_a_wildcard_that_never_had_another_side() -> None:
+    allowed = Right("/a", ALLOW, "publish", "/*motor_cmd")
+    after = [allowed, Right("/b", DENY, "subscribe", "/*motor_cmd")]
+    for before in ([allowed], [allowed._replace(qualifier=DENY)]):
+        assert rights_without_counterpart(before, after, compare(before, after)) == []
+
+
 def test_a_right_reads_as_people_say_it() -> None:
     assert str(Right("/a", ALLOW, "publish", "/x")) == "/a ALLOW publish topic /x"
     assert str(Right("/a", DENY, "call", "/x")) == "/a DENY call action /x"
