@@ -417,10 +417,10 @@ def likely_meaning(right: Right, used: Collection[Right], named: Iterable[Right]
 
 
 def remapping_clause(name: str, meant: str) -> str:
-    """Return which remapping the node or the policy may lack or have too much, as a clause."""
+    """Return why the node may use another name than its policy states, as a clause."""
     return (
         f"the node may lack the remapping -r {name}:={meant}, or the policy may lack "
-        f"--remap {meant}:={name}, or the node has a remapping to {name} that is to be removed"
+        f"--remap {meant}:={name}, or a remapping or parameter gives the node the wrong name {name}"
     )
 
 

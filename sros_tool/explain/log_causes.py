@@ -505,10 +505,11 @@ class Examiner:
         rule = Remapping("", name, meant)
         add, renamed = f", add `--ros-args -r {quote(str(rule))}`.", ""
         new_name = (
-            f" If the node is started with `-r OLD:={quote(name)}`, remove this remapping, or give "
-            f"it to the policy: `sros merge_policy POLICY OTHER --remap OLD:={quote(name)}`."
+            f" If `-r OLD:={quote(name)}` or a parameter gives the node this name, remove it from "
+            "the node's command, or give the name to the policy: `sros merge_policy POLICY OTHER "
+            f"--remap OLD:={quote(name)}`."
         )
-        if question.type == "action" and not is_used:
+        if question.type == "action" and (not is_used or len(own) == 1):
             add = f": {renamed_action_text(rule)}"
             renamed = f" If the node's command renames the action{add}"
         if names:
@@ -517,7 +518,8 @@ class Examiner:
             if is_used:
                 return facts, (
                     f"{remedy} Or, if the node lacks a remapping that its policy has{add} If the "
-                    f"node has a remapping to {name} that its policy lacks, remove it."
+                    f"node has a remapping to {name} that its policy lacks (or a parameter with "
+                    "this name), remove it."
                 )
             misspelled = ""
             if is_typing_error(name, meant):
@@ -535,6 +537,8 @@ class Examiner:
                 "wrong one: compare its start command with the command in the robot's launch files "
                 f"(after `sros close`: start/commands.txt).{renamed or new_name}"
             )
+        if renamed and is_used:  # its peers may mean the new name, or the old one
+            return [], f"{remedy}{renamed}{new_name}"
         return [], f"{remedy}{renamed or new_name}"
 
     def _misspelled_in_policy(self, denied: Right, named: Iterable[Right]) -> str:

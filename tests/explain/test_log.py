@@ -1397,16 +1397,20 @@ def test_the_other_side_of_a_name_tells_whether_a_remapping_may_be_forgotten(
     """A name that a peer has is no mistake; without any, the right alone gives a silent node."""
     drawer = '<services reply="ALLOW"><service>/drawer/open</service></services>'
     calls = '<services request="ALLOW"><service>/drawer/opn</service></services>'
-    camera = publish("/front/image", "/rear/image", "/map_*") + drawer
-    enclaves = {"/camera": camera, "/weed": subscribe("/front/image") + calls}
+    dock, park = (
+        f'<actions {does}="ALLOW"><action>/{name}</action></actions>'
+        for does, name in (("execute", "dock"), ("call", "park"))
+    )
+    camera = publish("/front/image", "/rear/image", "/map_*") + drawer + dock
+    enclaves = {"/camera": camera, "/weed": subscribe("/front/image") + calls + park}
     (policy := tmp_path / "policy.xml").write_text(policy_text(enclaves))
     keystore, log = tmp_path / "keystore", tmp_path / "robot.log"
     sros("create_keystore", keystore).ok()
     sros("generate_artifacts", "-k", keystore, "-p", policy).ok()
     rear = "Or, if the node lacks a remapping that its policy has, add `--ros-args -r /rear/image:="
     for topic, facts in (
-        ("/rear/image", (rear, "has a remapping to /rear/image that its policy lacks, remove it")),
-        ("/map_a", ("If the node is started with `-r OLD:=/map_a`, remove this remapping, or",)),
+        ("/rear/image", (rear, "has a remapping to /rear/image that its policy lacks (or a para")),
+        ("/map_a", ("If `-r OLD:=/map_a` or a parameter gives the node this name, remove it",)),
         ("/frnt/image", ("-r /frnt/image:=/front/image",)),
         (
             "/odometry",
@@ -1430,6 +1434,7 @@ def test_the_other_side_of_a_name_tells_whether_a_remapping_may_be_forgotten(
     client, export = tmp_path / "client.log", tmp_path / "export"
     for service, fact in (
         ("drawer/open", "call /drawer/opn, which no enclave may reply: perhaps /drawer/open is me"),
+        ("dock/_action/send_goal", "-r /dock/_action/send_goal:=/park/_action/send_goal -r /dock/"),
         ("camera/get_parameters", "set_parameters and set_parameters_atomically of /camera."),
     ):
         client.write_text(
