@@ -572,8 +572,8 @@ def rotate_ca(
         )
     cannot = "could not" if dry_run else "cannot"
     cut_off = (
-        f"cut off: {', '.join(step.cut_off)} {cannot} talk to robots with the files of this stage "
-        "until they get these files, too"
+        f"cut off until they have the files of this stage: {', '.join(step.cut_off)}. Robots with "
+        f"and without these files {cannot} talk to each other"
     )
     is_published = bool(publish_command(root))
     if is_published and step.stage == "retire" and step.replaces_identity:
