@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from shlex import quote
 
 from sros_tool.automata import SearchLimit
 from sros_tool.checks.kind import Finding, FindingKind, RelatedPlace
@@ -54,6 +55,7 @@ from sros_tool.proof.requirements import (
     Only,
     Protected,
     Requirement,
+    RightsRequirement,
     demand,
     unused_remappings,
 )
@@ -393,7 +395,10 @@ def decided_findings(
 ) -> list[Finding]:
     """Return the findings of decisions: broken requirements first, in order."""
     findings = [_violation_finding(violation) for violation in decided.violations]
-    findings += [_part_finding(VACUOUS, each, why) for each, why in _once(decided.vacuous)]
+    findings += [
+        _part_finding(VACUOUS, requirement, why, _namespace_remedy(requirement, system.rights))
+        for requirement, why in _once(decided.vacuous)
+    ]
     for kind, decisions in (
         (MISSPELLED_ENCLAVE, decided.misspelled),
         (UNKNOWN_ENCLAVE, decided.absent),
@@ -612,6 +617,27 @@ def _part_finding(
     place = requirement.source
     text = f"{'; '.join(why)}; required: {demand(requirement)}"
     return kind.found(place.file, text, place.file, place.line, remedy)
+
+
+def _namespace_remedy(requirement: Requirement, rights: Iterable[Right]) -> str:
+    """Return a remedy if the rights have a requirement's name only in other namespaces, or "".
+
+    Only requirements with relative names that were read without a namespace have this remedy.
+    """
+    was_moved = requirement.elsewhere is None
+    if was_moved or not requirement.is_relative or not isinstance(requirement, RightsRequirement):
+        return ""
+    stated = {right.name for right in rights if right.qualifier is ALLOW}
+    absent = (name for _, names in requirement.rights for name in names if name not in stated)
+    for name in absent:
+        moved = (other.removesuffix(name) for other in stated if other.endswith(name))
+        if namespaces := sorted(ns for ns in moved if not is_expression(ns)):
+            options = " ".join(f"--namespace {quote(ns)}" for ns in namespaces[:_MOST_SHOWN])
+            return (
+                f"The rights have {namespaces[0]}{name}: check the requirements of a package with "
+                f"its namespace: `{options}`. Otherwise, correct the name, here or in the policy."
+            )
+    return ""
 
 
 _GONE_REMEDY = (

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -458,6 +458,21 @@ def test_a_renamed_server_leaves_a_right_that_nobody_serves(served: str, meant: 
     found = decided(rights, '[[only]]\nrequest = ["/left/driver/open"]\nenclaves = ["/panel"]')
     reason = f"no enclave may reply service /left/driver/open (perhaps {meant} is meant)"
     assert [each for _, reasons in found.vacuous for each in reasons] == [reason] * bool(meant)
+
+
+@pytest.mark.parametrize(
+    ("name", "namespaces", "is_told"),
+    [("x", (), True), ("/x", (), False), ("y", (), False), ("x", ("/middle",), False)],
+)
+def test_the_namespace_of_a_package_that_requirements_lack_is_named(
+    name: str, namespaces: Sequence[str], is_told: bool
+) -> None:
+    rights = {f"/{place}/a": may("publish", f"/{place}/x") for place in ("left", "right")}
+    text = f'[[only]]\npublish = ["{name}"]\nenclaves = ["/a"]'.encode()
+    required = parse_requirements(text, "r.toml", namespaces=namespaces)
+    (finding,) = (e for e in requirement_findings(required, robot(rights)) if e.id == VACUOUS)
+    told = "its namespace: `--namespace /left --namespace /right`."
+    assert (told in finding.remedy) is is_told
 
 
 def test_whom_nobody_reaches_needs_no_search(monkeypatch: pytest.MonkeyPatch) -> None:
