@@ -488,6 +488,12 @@ def _other_machines_lines(robot: LocalRobot, closed: CloseState) -> list[str]:
             f"run `sros renew {keystore} {' '.join(expired)}`, and bring the new files to the "
             "machine"
         )
+    if earlier := closed.earlier_elsewhere:
+        lines.append(
+            "whoever kept earlier files has the rights until they expire: "
+            f"{_times_text(earlier)}; to end this, run "
+            f"`sros renew {keystore} {' '.join(earlier)} --revoke-old`"
+        )
     return lines
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence, Set
 from datetime import datetime
 from functools import cached_property
 from pathlib import Path
@@ -20,6 +20,7 @@ from sros_tool.close.processes import (
 )
 from sros_tool.close.robot import MOST_NAMES, OBSERVER, LocalRobot, check_enclaves
 from sros_tool.keystore.expiry import Threshold, survey
+from sros_tool.keystore.known_keys import IssuedEarlier
 from sros_tool.keystore.layout import (
     CRL_FILE,
     KEY_FILE,
@@ -420,6 +421,10 @@ class CloseState(NamedTuple):
     """The enclaves of other machines whose files in the keystore have expired, and when they
     expired, in UTC.
     """
+    earlier_elsewhere: Mapping[str, datetime]
+    """The enclaves of `expired_elsewhere` of which earlier files still work for whoever kept them,
+    and until when, in UTC.
+    """
     valid_until: datetime | None
     """When the first enclave of the export expires, in UTC; null without an export."""
     expires_soon: Sequence[str]
@@ -541,7 +546,8 @@ def current_state(robot: LocalRobot, policy: Policy | None) -> CloseState:
             name: changed for name, changed in changed_at.items() if name not in brought
         },
         brought=brought,
-        expired_elsewhere=_expired(robot, changed_at),
+        expired_elsewhere=(expired := _expired(robot, changed_at)),
+        earlier_elsewhere=_earlier_files_until(robot, expired),
         valid_until=(until := _valid_until(robot)),
         expires_soon=_expiring(robot) if until else (),
         denied=(),
@@ -581,3 +587,12 @@ def _expiring(robot: LocalRobot) -> Sequence[str]:
     lifetimes, _ = survey(OpenedKeystore(robot.export))
     now = robot.shell.now()
     return [lifetime.name for lifetime in lifetimes if lifetime.due(Threshold(), now)]
+
+
+def _earlier_files_until(robot: LocalRobot, names: Collection[str]) -> Mapping[str, datetime]:
+    """Map those of the named enclaves whose earlier files still work to the moment they expire."""
+    if not names:
+        return {}
+    issued, now = IssuedEarlier(OpenedKeystore(robot.keystore), names), robot.shell.now()
+    moments = {name: issued.permissions_until(name) for name in names}
+    return {name: until for name, until in moments.items() if until and until > now}

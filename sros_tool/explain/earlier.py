@@ -6,7 +6,7 @@ import hashlib
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
-from datetime import datetime
+from datetime import timedelta
 from pathlib import Path
 from shlex import quote
 from typing import NamedTuple
@@ -21,24 +21,35 @@ from sros_tool.keystore.layout import LEDGER, PERMISSIONS_FILE, REVOKED, ROUTER_
 from sros_tool.keystore.ledger import Entry
 from sros_tool.keystore.participant import LoadedEnclave
 from sros_tool.keystore.reader import OpenedKeystore
-from sros_tool.validity import iso
+from sros_tool.validity import iso, parse_iso
 from sros_tool.wording import first_few
+
+_MOST_NAMED = 20
+"""The most enclaves that a note names one by one, so that a user can renew them."""
 
 
 def note_on_earlier_permissions(
-    keystore: OpenedKeystore, denied: Collection[str], now: datetime
+    keystore: OpenedKeystore,
+    denied: Collection[str],
+    stopped: Collection[str],
+    question: Question,
+    vendor: Vendor,
+    asking: AskingContext,
 ) -> Iterator[Note]:
-    """Yield a note on enclaves that are ``denied`` now, but perhaps allowed by earlier permissions.
+    """Yield notes on enclaves that are ``denied`` now, but perhaps allowed by earlier permissions.
 
     Permissions cannot be revoked: earlier permissions work with every fitting certificate, until
     the permissions or the certificate expire, or the certificate is revoked. The ledger does not
-    have the rights of earlier permissions; permissions from the same policy as the present
-    permissions do not count. The note also reports a ledger or revocation list that is unreadable
-    or lacks lines.
+    have the rights of earlier permissions. Permissions from the same policy as the present
+    permissions give the same rights: they count for the enclaves ``stopped``, whose present files
+    the vendor refuses, for example because they have expired. A note also reports a ledger or
+    revocation list that is unreadable or lacks lines.
     """
     if not denied or not keystore.has(LEDGER):  # an export, or a keystore of ros2/sros2
         return
-    ends: dict[str, str] = {}
+    now = iso(asking.at)
+    unknown: dict[str, str] = {}
+    same: dict[str, str] = {}
     try:
         issued = IssuedEarlier(keystore, denied)
     except SrosError as error:
@@ -52,18 +63,56 @@ def note_on_earlier_permissions(
     for name in denied:
         permissions = issued.permissions(name)
         for earlier, end in permissions:
-            if earlier.policy != permissions[-1][0].policy and end > iso(now):
+            if end > now:
+                ends = same if earlier.policy == permissions[-1][0].policy else unknown
                 ends[name] = max(end, ends.get(name, ""))
-    if ends:
-        names, root = sorted(ends), quote(str(keystore.root))
-        which = quote(names[0]) if len(names) == 1 else "ENCLAVE..."
+        if name in same and not (
+            name in stopped
+            and _present_rights_allow(keystore, permissions[-1][0], question, vendor, asking)
+        ):
+            del same[name]
+    if unknown:
+        names = first_few(sorted(unknown), _MOST_NAMED)
         text = (
-            f"the rights in earlier permissions of {first_few(names, 3)} are not known here: they "
-            "were signed from an earlier policy. Whoever kept these permissions and the key has "
-            f"the rights until {max(ends.values())}. To end these rights, run `sros renew {root} "
-            f"{which} --revoke-old`."
+            f"the rights in earlier permissions of {names} are not known here: they were signed "
+            "from an earlier policy. Whoever kept these permissions and the key has the rights "
+            f"until {max(unknown.values())}. {_end_of_rights(keystore, unknown)}"
         )
         yield Note("explain.earlier-permissions", text)
+    if same:
+        names = first_few(sorted(same), _MOST_NAMED)
+        text = (
+            f"the present files of {names} do not work, but whoever kept earlier files may still "
+            f"do it until {max(same.values())}. {_end_of_rights(keystore, same)}"
+        )
+        yield Note("explain.earlier-permissions", text)
+
+
+def _end_of_rights(keystore: OpenedKeystore, names: Collection[str]) -> str:
+    listed = " ".join(quote(name) for name in sorted(names))
+    which = listed if len(names) <= _MOST_NAMED else "ENCLAVE..."
+    return f"To end this, run `sros renew {quote(str(keystore.root))} {which} --revoke-old`."
+
+
+def _present_rights_allow(
+    keystore: OpenedKeystore,
+    present: Entry,
+    question: Question,
+    vendor: Vendor,
+    asking: AskingContext,
+) -> bool:
+    """Return whether the present permissions gave a right one second after they became valid.
+
+    Faults of other files do not count. Without the permissions that the ledger has as ``present``,
+    or if they cannot be read, the result is True: their rights are not known.
+    """
+    document = _documents(keystore, [keystore.folder(present.enclave)]).get(present.sha256)
+    if document is None:
+        return True
+    asking = asking._replace(at=parse_iso(present.not_before) + timedelta(seconds=1))
+    with suppress(SrosError):
+        return _allows(keystore, document, present, question, vendor, asking)
+    return True
 
 
 def note_on_revoked_enclaves(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import stat
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from datetime import datetime
 from enum import Enum, auto
 from fnmatch import fnmatchcase
 from shlex import quote
@@ -224,7 +223,7 @@ def explain_on_dds(
         *_note_on_fitting_permissions(evaluator, answer),
         *(note_on_lacking_keys(copied) if copied else ()),
         *_notes_on_files(enclave),
-        *_earlier_permissions_notes(answer, context.at),
+        *_earlier_permissions_notes(answer, context),
         *_note_on_anybody([_access_without_identity(evaluator, question)], refuse),
     )
     asked = Asked(enclave.name, question, context)
@@ -301,12 +300,22 @@ def _export_notes(answer: Answer) -> Iterator[Note]:
         yield Note("explain.exported", text)
 
 
-def _earlier_permissions_notes(answer: Answer, now: datetime) -> Iterator[Note]:
+def _earlier_permissions_notes(answer: Answer, context: JoinContext) -> Iterator[Note]:
     """Yield a note if earlier permissions of the enclave may allow what is denied."""
     if (keystore := answer.enclave.keystore) and not answer.allowed:
         from sros_tool.explain.earlier import note_on_earlier_permissions  # only for denials
 
-        yield from note_on_earlier_permissions(keystore, {answer.enclave.name}, now)
+        denied = {answer.enclave.name}
+        stopped = denied if _is_stopped(answer.outcome) else ()
+        asking = AskingContext(context.at, context.zone, context.domain)
+        yield from note_on_earlier_permissions(
+            keystore, denied, stopped, answer.question, answer.vendor, asking
+        )
+
+
+def _is_stopped(outcome: Outcome) -> bool:
+    """Return whether no process runs in the enclave, whatever its permissions allow."""
+    return outcome in (Outcome.REFUSED, Outcome.CRASHES)
 
 
 def _note_on_action(evaluator: Evaluator, answer: Answer, kind: str | None) -> Iterator[Note]:
@@ -538,8 +547,7 @@ class VendorOutcome(NamedTuple):
     @property
     def stopped(self) -> str:
         """The reason that no process can run in the enclave with its current files, or ""."""
-        runs = self.outcome not in (Outcome.REFUSED, Outcome.CRASHES)
-        return "" if runs else self.text.partition(": ")[2]
+        return self.text.partition(": ")[2] if _is_stopped(self.outcome) else ""
 
 
 @shows(
@@ -785,7 +793,10 @@ class VendorOfKeystore(NamedTuple):
         refuse = remedy_in_keystore(self.keystore.root, f"Run {REFUSE_STRANGERS}.")
         yield from _note_on_anybody((outcome.opened for outcome in outcomes), refuse)
         denied = {outcome.enclave for outcome in outcomes if not outcome.allowed}
-        yield from note_on_earlier_permissions(self.keystore, denied, self.asking.at)
+        stopped = {outcome.enclave for outcome in outcomes if outcome.stopped}
+        yield from note_on_earlier_permissions(
+            self.keystore, denied, stopped, question, self.vendor, self.asking
+        )
         if self.names is None:
             allowed = {outcome.enclave for outcome in outcomes if outcome.allowed}
             yield from note_on_revoked_enclaves(

@@ -20,6 +20,7 @@ import pytest
 import yaml
 
 import sros_tool
+from sros_tool.api import renew
 from sros_tool.cli import close
 from sros_tool.close import apply, assignment, nodes, preparation, proof, state, watch
 from sros_tool.close import robot as of_robot
@@ -1723,11 +1724,12 @@ def test_a_process_with_a_new_key_is_restarted_before_others(tmp_path: Path) -> 
 
 def test_a_robot_whose_files_expire_soon(keystore: Path, tmp_path: Path) -> None:
     sros("distribute_key", keystore, "/a", "/b", tmp_path / "export").ok()
+    sros("create_enclave", keystore, "/operator/look").ok()  # works for a day
     (tmp_path / "keystore").symlink_to(keystore)
 
     def robot_at(moment: datetime) -> LocalRobot:
         shell = Shell(close._run, print, {}, lambda: moment, UTC)
-        return LocalRobot(tmp_path, 0, shell, elsewhere=["/b"])
+        return LocalRobot(tmp_path, 0, shell, elsewhere=["/b", "/operator/look"])
 
     def state_at(moment: datetime) -> state.CloseState:
         found = state.current_state(robot_at(moment), None)
@@ -1739,7 +1741,16 @@ def test_a_robot_whose_files_expire_soon(keystore: Path, tmp_path: Path) -> None
     assert soon.endswith("Z; renew them now: sros renew robot/keystore --all-expiring soon")
     later = now.valid_until + timedelta(seconds=1)
     said = close._other_machines_lines(robot_at(later), state_at(later))[-1]
-    assert f"have expired: /b ({iso(now.valid_until)}); to renew them, run `sros renew" in said
+    assert f"have expired: /b ({iso(now.valid_until)}), /operator/look (" in said
+    assert "; to renew them, run `sros renew" in said
+    assert not state_at(later).earlier_elsewhere
+    for days in (5, 0):
+        renew(keystore, ["/operator/look"], now=datetime.now(UTC) + timedelta(days=days))
+    expired = datetime.now(UTC) + timedelta(days=2)
+    said = close._other_machines_lines(robot_at(expired), state_at(expired))[-1]
+    (until,) = state_at(expired).earlier_elsewhere.values()
+    assert timedelta(days=3) < until - expired < timedelta(days=5)
+    assert f"the rights until they expire: /operator/look ({iso(until)}); to end this" in said
     (tmp_path / "export/enclaves/b/permissions.p7s").write_bytes(b"damaged")
     assert state_at(datetime.now(UTC)).valid_until is None, "nobody knows until when /b works"
 

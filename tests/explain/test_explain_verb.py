@@ -937,6 +937,29 @@ def test_earlier_permissions_that_still_allow_it(keystore: Path, tmp_path: Path)
             ledger.mkdir()
 
 
+@pytest.mark.parametrize("vendor", ["fastdds", "cyclonedds"])
+def test_earlier_files_of_an_enclave_whose_present_files_have_expired(
+    vendor: str, keystore: Path
+) -> None:
+    note = f"the present files of {ENCLAVE} do not work, but whoever kept earlier files may still"
+    asked = ("publish", "/chatter", "--vendor", vendor)
+    settings = keystore / "sros.toml"
+    settings.write_text(
+        settings.read_text().replace('"/operator/*"', f'"/operator/*", "{ENCLAVE}"')
+    )
+    sros("update_keystore", keystore, "--take-edits").ok()
+    assert note not in explain(keystore, "--who", *asked).ok().err
+    renew(keystore, [ENCLAVE], now=now() - timedelta(days=3))
+    for words in ((keystore, ENCLAVE), (keystore, "--who")):
+        denied = explain(*words, *asked)
+        assert denied.status == 1 and note in denied.err, denied
+        assert note not in explain(*words, "publish", "/other", *asked[2:]).err
+        assert note not in explain(*words, *asked, "--at", "2090-01-01").err
+    assert note in explain(keystore, ENCLAVE, "join", *asked[2:]).err
+    renew(keystore, [ENCLAVE], revoke_old=True, now=now() - timedelta(days=3))
+    assert note not in explain(keystore, "--who", *asked).err
+
+
 @pytest.mark.parametrize("role", ["--permissions", "--identity"])
 def test_earlier_permissions_of_a_ca_that_is_retired(
     keystore: Path, role: str, tmp_path: Path
