@@ -493,7 +493,7 @@ def _shared_enclaves(before: Policy, policies: Iterable[Policy], after: Policy) 
             yield (
                 f"{enclave} has {_nodes_text(nodes)}, and now also {_nodes_text(come)}: each "
                 "process in this enclave has the rights of all of them. Unless they run in one "
-                "process, rename the enclave in one of the policies."
+                "process, give one of them another enclave, with --enclave or in its policy."
             )
 
 

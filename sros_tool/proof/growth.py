@@ -1299,7 +1299,9 @@ def undenied_name(denied: Right, stated: Rules) -> str | None:
     if denied.kind == "dds":  # such a right has no ROS name to search for
         return None if allowed else denied.name
     names = [right.name for right in (*allowed, *stated.overlapping(denied))]
-    return common_name([denied.name], names)
+    # A DENY of "/*stop" is for all namespaces: a name in a namespace shows best what it lost.
+    in_namespace = denied.name.startswith("/*") and common_name([denied.name, "/*/*"], names)
+    return in_namespace or common_name([denied.name], names)
 
 
 # ── what a side does not state ─────────────────────────────────────────────────────────────

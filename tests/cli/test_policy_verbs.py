@@ -64,6 +64,7 @@ def test_a_merge_notes_an_enclave_that_gets_nodes_of_another_policy(folder: Path
     said = sros("merge_policy", "a.xml", "package.xml", "--in-place").ok().err.splitlines()
     (note,) = [line for line in said if "merge.shared-enclave" in line]
     assert "/a has the node /n, and now also the node /driver: each process" in note
+    assert "give one of them another enclave, with --enclave or" in note
     # A later version of the same package is no surprise.
     (folder / "package.xml").write_text(of_package.replace("/p1", "/p3"))
     assert "merge.shared-enclave" not in sros("merge_policy", "a.xml", "package.xml").ok().err
