@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
-from collections.abc import Collection, Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Container, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from ipaddress import ip_address
@@ -476,8 +476,8 @@ def folded(fleet: Fleet | None, lines: Iterable[tuple[str, str]]) -> Iterator[st
     That line has placeholders for the robot's name and namespace, and lists the robots at its end.
     The robot of a line is the robot of the enclave, or, for an enclave of no robot, the only robot
     that the text names.  Lines that name one *other* robot, and differ only in that robot, share a
-    line with ``{other}``; many lines that differ in both robots become one line with the number of
-    pairs.
+    line with ``{other}``; lines that differ in both robots become one line if they are many, or are
+    about each robot of one set with each robot of another set.
 
     Args:
         fleet: the robots; None leaves every line as it is.
@@ -488,7 +488,12 @@ def folded(fleet: Fleet | None, lines: Iterable[tuple[str, str]]) -> Iterator[st
         return
     foldings = ((text, _foldings(fleet, enclave, text)) for enclave, text in lines)
     read = [(text, possible[:2], possible[2:]) for text, possible in foldings]
-    for (folding, _), by_robot in grouped_by_robot(read, _MOST_TARGETS).items():
+    pairs: dict[_Folding, list[str]] = defaultdict(list)
+    for _, _, wide in read:
+        for folding, pair in wide:
+            pairs[folding].append(pair)
+    whole = {folding for folding, named in pairs.items() if _two_sets(named)}
+    for (folding, _), by_robot in grouped_by_robot(read, _MOST_TARGETS, whole).items():
         if len(by_robot) == 1:
             yield from (text for texts in by_robot.values() for text in texts)
         else:
@@ -498,14 +503,15 @@ def folded(fleet: Fleet | None, lines: Iterable[tuple[str, str]]) -> Iterator[st
 def grouped_by_robot(
     items: Iterable[tuple[_Item, Sequence[tuple[_Kind, str]], Sequence[tuple[_Kind, str]]]],
     most: int,
+    always: Container[_Kind] = (),
 ) -> dict[tuple[_Kind, bool], dict[str, list[_Item]]]:
     """Group items that differ only in one robot: kind -> robot -> items.
 
     Each item comes with two lists of pairs of a kind and a robot.  The first list has narrow kinds:
     the items of such a kind differ only in this robot.  The second list has wide kinds: their items
     also differ in other robots.  Of each list, the kind with the most robots is used.  A wide kind
-    replaces its narrow kinds if it joins more than ``most`` of them; its key in the result has
-    True.
+    replaces its narrow kinds if it joins more than ``most`` of them, or is in ``always``; its key
+    in the result has True.
     """
     robots: dict[_Kind, set[str]] = defaultdict(set)
     read = list(items)
@@ -525,7 +531,7 @@ def grouped_by_robot(
             parts[wide[0]].add(kind)
     groups: dict[tuple[_Kind, bool], dict[str, list[_Item]]] = {}
     for item, narrow, wide in chosen:
-        many = wide is not None and len(parts[wide[0]]) > most
+        many = wide is not None and (len(parts[wide[0]]) > most or wide[0] in always)
         kind, robot = wide if wide and many else narrow
         groups.setdefault((kind, many), {}).setdefault(robot, []).append(item)
     return groups
@@ -603,12 +609,23 @@ def _whole_name_expression(value: str) -> re.Pattern[str]:
     return re.compile(f"{before}{re.escape(value)}(?![A-Za-z0-9_}}])")
 
 
+def _two_sets(pairs: Sequence[str]) -> tuple[list[str], list[str]] | None:
+    """Return two sets of robots if ``pairs`` are each robot of one with each of the other."""
+    names = [pair.split(" and ") for pair in pairs]
+    first, second = ([*dict.fromkeys(pair[place] for pair in names)] for place in (0, 1))
+    is_whole = len(set(pairs)) == len(first) * len(second) and min(len(first), len(second)) > 1
+    return (first, second) if is_whole else None
+
+
 def _robots_text(fleet: Fleet, names: Sequence[str], folding: _Folding) -> str:
     """Return a list of robots in words, such as "r1, r2 and 3 more robots"."""
     if folding.pairs:
         sources = list(dict.fromkeys(pair.split()[0] for pair in names))
         if {*names} == {f"{first} and {second}" for first, second in permutations(sources, 2)}:
             return f"{_robots_text(fleet, sources, _Folding(''))}, each with every other"
+        if sets := _two_sets(names):
+            first, second = (_robots_text(fleet, one, _Folding("")) for one in sets)
+            return f"{first}, each with {second}"
         return f"{len(names)} pairs of robots, such as {names[0]}"
     own = folding.own
     count = f"{len(names)}{' other' if own else ''} robots"

@@ -117,8 +117,14 @@ def test_pairs_are_said_to_be_all_only_if_they_are_all() -> None:
     (line,) = each_other
     assert line.endswith("a6, each with every other)")
     # As many pairs as of seven robots with each other, but with other robots.
-    (line,) = told([*product(sources, targets[1:])])
+    every = [*product(sources, targets[1:])]
+    (line,) = told([*every[:-1], ("a6", "b0")])
     assert line == "/{robot}/x to /{other}/y  (42 pairs of robots, such as a0 and b1)"
+    (line,) = told(every)
+    assert line.endswith("a6, each with 6 robots: b1, b2, b3, b4, b5, b6)")
+    few = [*product(sources[:2], targets[:2])]
+    assert told(few) == ["/{robot}/x to /{other}/y  (2 robots: a0, a1, each with 2 robots: b0, b1)"]
+    assert len(told(few[1:])) == 2
 
 
 @pytest.fixture(scope="module")
