@@ -126,7 +126,7 @@ def connection_findings(missing: Sequence[tuple[Process, Process]]) -> Iterator[
     """Yield findings about secured processes that trust the same CA, and are not connected."""
     for process, peers in restarts(missing):
         names = first_few([_named(peer) for peer in peers], _MOST_NAMES)
-        text = f"it has not connected to {names}: neither hears the other"
+        text = f"it has not connected to {names}: they do not hear each other"
         yield PROCESS_NOT_CONNECTED.found(_named(process), text, remedy=_remedy(process, peers))
 
 

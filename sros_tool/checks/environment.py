@@ -87,8 +87,8 @@ STRATEGY_MISSPELT = FindingKind(
     "runtime.strategy-misspelt",
     ERROR,
     "ROS_SECURITY_STRATEGY is neither Enforce nor Permissive",
-    "Only the exact value `Enforce` enforces security. With any other value a node whose enclave "
-    "is missing runs unsecured.",
+    "Only the exact value `Enforce` enforces security. With any other value a node runs "
+    "unsecured if its enclave, or a file of the enclave, is missing.",
     _RCL_SOURCE,
     f"Write ROS_SECURITY_STRATEGY=Enforce. {_ENV_REMEDY}",
 )
@@ -96,8 +96,8 @@ NOT_ENFORCED = FindingKind(
     "runtime.not-enforced",
     WARNING,
     "security is enabled but not enforced",
-    "A node runs unsecured if its enclave or one of its files is missing, even if it logs that it "
-    "found a security directory.",
+    "A node runs unsecured if its enclave, or a file of the enclave, is missing, even if the "
+    "node logs that it found a security directory.",
     _RCL_SOURCE,
     f"Write ROS_SECURITY_STRATEGY=Enforce. {_ENV_REMEDY}",
 )
@@ -135,8 +135,8 @@ OTHER_DISTRIBUTION = FindingKind(
     "distribution can allow or deny other accesses, without any message.",
     "sros: `distributions` in the settings of a keystore, `distribution` in its fleet file.",
     "Source one of these distributions. Or check your distribution (`sros check KEYSTORE` with "
-    "`--upgrade-to`), and add it to the keystore: `sros update_keystore KEYSTORE --set "
-    "distributions=NAME,...`, or `distribution` in the fleet file.",
+    "`--upgrade-to`), and then name it: for the keystore, with `sros update_keystore KEYSTORE "
+    "--set distributions=NAME,...`; for one robot, as `distribution` in the fleet file.",
 )
 ENCLAVE_NOT_FOUND = FindingKind(
     "runtime.enclave-not-found",
@@ -191,7 +191,7 @@ CA_KEY_HERE = FindingKind(
     "An attacker who takes over a node can create any enclave, with any rights.",
     "ROS 2 design, ROS 2 Security Enclaves; NIST SP 800-57 part 1, 6.",
     "Run nodes with an export (`sros distribute_key KEYSTORE ENCLAVE TARGET`), and keep this "
-    "keystore elsewhere.",
+    "keystore on another machine.",
 )
 
 _VARIABLES_READ = (
@@ -344,8 +344,8 @@ NO_SESSION_FILE = FindingKind(
     "runtime.zenoh-open",
     ERROR,
     "rmw_zenoh runs open although security is enabled",
-    "rmw_zenoh reads no ROS_SECURITY_* variable and no file of an enclave. Without a session file, "
-    "every node uses the default of rmw_zenoh_cpp: no TLS, no access control.",
+    "rmw_zenoh ignores the ROS_SECURITY_* variables. Without a session file, every node uses "
+    "the default of rmw_zenoh_cpp: no TLS, no access control.",
     _ZENOH_SOURCE,
     f"Set ZENOH_SESSION_CONFIG_URI to the session.json5 of the enclave. {OWN_CONFIGURATION}",
 )
@@ -353,7 +353,8 @@ FILE_NOT_FOUND = FindingKind(
     "runtime.zenoh-file-not-found",
     ERROR,
     "a variable of rmw_zenoh names no file that Zenoh can read",
-    "No node starts; with ZENOH_ROUTER_CONFIG_URI, no router starts.",
+    "With ZENOH_SESSION_CONFIG_URI, no node starts; with ZENOH_ROUTER_CONFIG_URI, no router "
+    "starts.",
     _ZENOH_SOURCE,
     f"Correct the path. {OWN_CONFIGURATION}",
 )
@@ -361,17 +362,17 @@ UNREAD = FindingKind(
     "runtime.zenoh-unread",
     WARNING,
     "a Zenoh configuration that sros cannot read",
-    "Zenoh reads forms that sros does not: YAML, TOML, lists in place of objects, pipes, more than "
-    "16 MiB. So sros does not know whether the configuration enforces anything.",
+    "Zenoh reads what sros cannot read: YAML, TOML, lists in place of objects, pipes, and files "
+    "of more than 16 MiB. So sros does not know whether the configuration enforces anything.",
     _ZENOH_SOURCE,
-    f"Write it as JSON5 objects into a file. {OWN_CONFIGURATION}",
+    f"Write it as JSON5 objects into a file of at most 16 MiB. {OWN_CONFIGURATION}",
 )
 TOO_OLD = FindingKind(
     "runtime.zenoh-too-old",
     ERROR,
     "an rmw_zenoh that is too old for the files that sros writes",
-    "No session opens in an enclave: an earlier rmw_zenoh does not read ZENOH_CONFIG_OVERRIDE, and "
-    "its Zenoh does not accept all settings.",
+    "No session opens in an enclave: such an rmw_zenoh does not read ZENOH_CONFIG_OVERRIDE, and "
+    "its Zenoh does not accept all settings in the files.",
     "Changelogs of rmw_zenoh_cpp; Zenoh wheels, tested.",
     "Install a later version of the same distribution.",
 )
@@ -379,10 +380,11 @@ OVERRIDDEN = FindingKind(
     "runtime.zenoh-overridden",
     WARNING,
     "ZENOH_CONFIG_OVERRIDE changes what a Zenoh configuration protects",
-    "Zenoh applies it after the file, in nodes and in the router, so it can switch off access "
-    "control, TLS and everything else that the file states.",
+    "Zenoh applies the variable after the file, in nodes and in the router, so the variable can "
+    "switch off access control, TLS and everything else that the file states.",
     _ZENOH_SOURCE,
-    f"Leave only the paths of certificates and keys in it. {OWN_CONFIGURATION}",
+    "Leave in the variable only the paths of certificates and keys, and the address of the "
+    f"router. {OWN_CONFIGURATION}",
 )
 NO_CERTIFICATE = FindingKind(
     "runtime.zenoh-no-certificate",
@@ -442,7 +444,7 @@ def _secured_by_zenoh(environment: Mapping[str, str], folder: Path) -> Iterator[
         data = read_bytes(folder / uri, "Zenoh configuration") if uri else b"{}"
         document = parse_configuration(data, uri or OVERRIDE, override_pairs(override), lines=False)
     except SrosError as error:
-        yield f"{named} is set, and sros cannot read it ({error.what})"
+        yield f"{named} cannot be read ({error.what})"
         return
     has_password = any(
         name.startswith("transport/auth/") and value not in ("null", "{}")
@@ -461,7 +463,7 @@ def _security_in_configuration(sought_text: bytes, name: str, place: bytes | Pat
     try:
         data = place if isinstance(place, bytes) else read_bytes(place, "configuration")
     except SrosError as error:
-        yield f"{name} is set, and sros cannot read it ({error.what})"
+        yield f"{name} cannot be read ({error.what})"
         return
     if re.search(sought_text, data):
         yield f"{name} has security"

@@ -213,9 +213,10 @@ NO_COUNTERPART = FindingKind(
     NOTE,
     "a name for which no enclave has the counterpart right",
     "No enclave, in any ROS domain, may publish this subscribed topic, or serve this called "
-    "service or action. The name may have a typing error, or its counterpart is in a policy that "
-    "was not checked in the same command. Names that many nodes share are left out, such as /tf, "
-    "/clock and /diagnostics, and services of any node, such as /*/get_state.",
+    "service or action. The name may have a typing error, or its counterpart is in a policy "
+    "that was not checked in the same command. This check leaves out names that many nodes "
+    "share, such as /tf, /clock and /diagnostics, and services of any node, such as "
+    "/*/get_state.",
     "sros: compares the rights of all enclaves in the policies that are checked together.",
     "Compare the names that senders and receivers have after remapping, and name all policies of "
     "the robot in one command.",
@@ -582,7 +583,7 @@ NO_PARAMETER_EVENTS = FindingKind(
 NO_PARAMETER_SERVICES = FindingKind(
     "policy.no-parameter-services",
     ERROR,
-    "a node that may not offer all of its parameter services",
+    "a node that is denied some or all of its parameter services",
     "Every node offers all six unless it was created without them, and fails when it starts if "
     "one is denied.",
     "ROS 2 Jazzy, rclcpp 28 (ParameterService) and rclpy 7 (start_parameter_services).",
@@ -787,8 +788,8 @@ def _denied_start_actions_sentence(lacking: Sequence[_NodeLackingRight]) -> str:
         if kinds[kind]
     ]
     return (
-        f"{names_text(nodes)} may not {', '.join(verbs)}. A node exits at its start if this is "
-        "denied."
+        f"{names_text(nodes)} may not {', '.join(verbs)}. A node that is denied such an action "
+        "exits at its start."
     )
 
 
@@ -796,11 +797,11 @@ def _different_common_part_cause(folder: str, lacking: Sequence[_NodeLackingRigh
     """Return the common cause of findings: an included common part is not the shipped part."""
     new, old = quote(folder), quote(f"{folder}.old")
     return Cause(
-        f"the included '{folder}/node.xml' lacks rights that the file of this sros has",
+        f"the included '{folder}/node.xml' lacks rights that the file in this version of sros has",
         _denied_start_actions_sentence(lacking),
-        f"'{folder}/node.xml' is included and differs from the file of this sros. Replace it: "
-        f"`mv {new} {old} && sros policies --copy {new}`. Files and changes of your own are then "
-        f"in {old} only: copy them back.",
+        f"'{folder}/node.xml' is included and differs from the file in this version of sros. "
+        f"Replace it: `mv {new} {old} && sros policies --copy {new}`. Files and changes of your "
+        f"own are then in {old} only: copy them back.",
         len(lacking),
     )
 
@@ -950,7 +951,7 @@ SEVERAL_PROFILES = FindingKind(
     "sros joins all <profiles>. ros2/sros2 makes one grant from each of them, and DDS uses only "
     "the first grant.",
     "ros2/sros2 0.13; DDS-Security 1.1, 9.4.1.3; Fast DDS 2.14.5 and Cyclone DDS 0.10.2.",
-    "Put all <profile> of an enclave into one <profiles>.",
+    "Put all <profile> elements of an enclave into one <profiles>.",
 )
 
 _PORTABILITY_KINDS = {
@@ -1242,8 +1243,8 @@ SHARED_NAMESPACE = FindingKind(
     "policy.shared-namespace",
     WARNING,
     "robots with the same namespace, or with one namespace inside the other",
-    "Both robots publish and subscribe to the same names; and a wildcard in the outer namespace "
-    "also matches the names in the inner namespace.",
+    "In one namespace, both robots publish and subscribe to the same names. A wildcard in an "
+    "outer namespace also matches the names in the inner namespace.",
     "rcl (puts the node's namespace before relative names); sros (placeholder {namespace}).",
     "Give each robot a namespace of its own in the fleet file, or a ROS domain of its own. "
     "Computers of one robot may share its namespace: put them, and no other robot, into one group, "
@@ -1458,7 +1459,7 @@ def _robots_in_unknown_groups(named: Collection[str], fleet: Fleet) -> str:
                 clauses.append(f"{robot.name} (group {group}: perhaps {first_few(meant, 2)})")
         if not (robot.groups or for_all):
             clauses.append(f"{robot.name} (in no group)")
-    return f"no enclave for the group of {first_few(clauses, 5)}" if clauses else ""
+    return f"no enclave is for {first_few(clauses, 5)}" if clauses else ""
 
 
 def _written_out_robot_findings(policies: Sequence[Policy], fleet: Fleet) -> Iterator[Finding]:

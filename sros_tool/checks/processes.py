@@ -105,7 +105,7 @@ PROCESS_WITHOUT_FILES = FindingKind(
     "runtime.process-without-files",
     WARNING,
     "a process whose enclave is not there any more",
-    "The process runs with files that were removed since it started, and does not start again. "
+    "The process runs with files that were removed since it started, and could not start again. "
     "Without the ledger, as on a robot, sros cannot tell whether the enclave was revoked.",
     "rcl 9 (rcl/src/rcl/security.c); tested with ROS 2 Jazzy.",
     (
@@ -232,7 +232,11 @@ def _changed_text(process: Process, files: str) -> str:
 def why_order_is_unknown(process: Process) -> str:
     """Return why times of files do not show changes since the start of a process; "" if they do."""
     advanced = process.clock_advanced
-    return f"the clock was set forward by {elapsed(advanced)} while it ran" if advanced else ""
+    return (
+        f"the clock was set forward by {elapsed(advanced)} while the process ran"
+        if advanced
+        else ""
+    )
 
 
 def _required_files(enclave: ProcessEnclave) -> Sequence[str]:
@@ -545,8 +549,8 @@ PROCESS_PERMISSIVE = FindingKind(
     "runtime.process-permissive",
     WARNING,
     "a process that runs without security if its enclave was missing at its start",
-    "The ROS_SECURITY_STRATEGY of the process is not exactly `Enforce`: if its enclave, or a file "
-    "of the enclave, is missing, it starts unsecured.",
+    "The ROS_SECURITY_STRATEGY of the process is not exactly `Enforce`: if its enclave, or a "
+    "file of the enclave, is missing, the process starts unsecured.",
     "rcl 9 (rcl/src/rcl/security.c); tested with ROS 2 Jazzy.",
     "Start it with `sros run KEYSTORE ENCLAVE -- COMMAND...`.",
 )
@@ -594,7 +598,7 @@ ZENOH_UNREAD = FindingKind(
     "runtime.zenoh-process-unread",
     WARNING,
     "a Zenoh process whose configuration sros cannot read",
-    "Zenoh reads forms that sros does not, such as YAML, and a process without an RMW chooses its "
+    "Zenoh reads what sros cannot read, such as YAML, and a process without an RMW chooses its "
     "configuration itself. sros does not know whether the process enforces anything.",
     "Zenoh 1.10.2, tested.",
     "Write the configuration as JSON5 objects, or start the process with the configuration of its "
@@ -604,8 +608,8 @@ ZENOH_CHANGED = FindingKind(
     "runtime.zenoh-process-changed",
     WARNING,
     "a Zenoh process with other settings than sros sets for its enclave",
-    "Zenoh reads the file that a variable names, and then applies ZENOH_CONFIG_OVERRIDE. So both "
-    "can let strangers in, whatever the files of the enclave say.",
+    "Zenoh reads the file that a variable names, and then applies ZENOH_CONFIG_OVERRIDE. So "
+    "each of the two can let strangers in, whatever the files of the enclave say.",
     "rmw_zenoh_cpp (zenoh_config.cpp); Zenoh 1.10.2, tested.",
     "Find out who changed the file or set the variables, undo this, and restart the process. "
     f"{OWN_CONFIGURATION}",
@@ -764,7 +768,10 @@ def _daemon_findings(process: Process, environment: Mapping[str, str]) -> Iterat
         if process.environment.get(name, "") != environment.get(name, "")
     ]
     if differing:
-        text = f"{', '.join(differing)} differ from this environment"
+        text = (
+            f"{', '.join(differing)} {'differs' if len(differing) == 1 else 'differ'} from "
+            "this environment"
+        )
         yield DAEMON_OTHER.found(process.label, text)
 
 
@@ -915,7 +922,7 @@ def _unsecured_node_findings(
         for node in nodes:
             yield NOT_SECURED.found(node.label, f"it runs open {_domain_text(node)}")
         return
-    running = f"; running without it: {_first_nodes(nodes)}" if nodes else ""
+    running = f"; open nodes: {_first_nodes(nodes)}" if nodes else ""
     yield NOT_SECURED.found(ENABLE, value_text(environment, ENABLE) + running)
 
 
@@ -991,7 +998,7 @@ def other_folder_findings(processes: Iterable[Process], folder: Path) -> Iterato
         root = _plain_path(process.enclave.keystore)
         other = f"'{root}' of its own file system" if root == str(folder) else f"'{root}'"
         name = plain(f"/{process.enclave.name.strip('/')}", _LONGEST_PATH)
-        text = f"{name} from {other}, not from '{folder}'"
+        text = f"it runs in {name} from {other}, not from '{folder}'"
         yield PROCESS_OTHER_FOLDER.found(process.label, text)
 
 
@@ -1082,7 +1089,10 @@ def _unseen_process_findings(running: RunningProcesses) -> Iterator[Finding]:
         may_be = "may be a node" if len(doubtful) == 1 else "may be nodes"
         reasons.append(f"{processes} {may_be}, but cannot be examined")
     if running.container:
-        text = f"{len(running.processes)} of them speak ROS 2"
+        text = (
+            f"{len(running.processes)} of them "
+            f"{'speaks' if len(running.processes) == 1 else 'speak'} ROS 2"
+        )
         yield CONTAINER_ALONE.found("processes", text)
     if reasons:
         yield PROCESS_NOT_SEEN.found("processes", "; ".join(reasons), remedy=remedy)

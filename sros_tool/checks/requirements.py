@@ -29,8 +29,8 @@ UNKNOWN_ENCLAVE = FindingKind(
     "requirement.unknown-enclave",
     NOTE,
     "a requirement with an exception for an enclave that does not exist",
-    "The requirement protects as much without this enclave. Perhaps the enclave is only on other "
-    "robots, or its name is misspelled.",
+    "The exception has no effect. Perhaps the enclave is only on other robots, or its name is "
+    "misspelled.",
     "The requirements file.",
     "Compare the name with those of the robot's enclaves; ignore this finding if only other "
     "robots, or robots of a package's users, have the enclave.",
@@ -125,8 +125,8 @@ REMAPPING_UNUSED = FindingKind(
     "requirement.remapping-unused",
     NOTE,
     "a remapping that changes no requirement",
-    "The policy has the new name or node, but no requirement has the old name. If the old name is "
-    "misspelled here, the requirements about it are not applied to the new name.",
+    "The policy has the new name or node, but no requirement has the old name. If the old name "
+    "is misspelled in the remapping, the requirements about it are not applied to the new name.",
     "The requirements file.",
     "Compare the old name with the names in the requirements; ignore this finding if no "
     "requirement "

@@ -120,7 +120,7 @@ DIFFER = FindingKind(
     "distribution.differ",
     ERROR,
     "an access that is open on one distribution of the keystore and closed on another",
-    "The settings of the keystore or its fleet name both distributions. The same signed "
+    "The settings of the keystore, or its fleet file, name both distributions. The same signed "
     "permissions give an enclave more rights on one of them.",
     _ENGINE_SOURCE,
     _DECIDE_ALIKE_REMEDY,
@@ -129,7 +129,7 @@ DISTRIBUTION_REFUSES = FindingKind(
     "distribution.refused",
     ERROR,
     "an enclave that runs on one distribution of the keystore and not on another",
-    "The settings of the keystore or its fleet name both distributions.",
+    "The settings of the keystore, or its fleet file, name both distributions.",
     _ENGINE_SOURCE,
     "Replace the refused file, or correct `distributions` in the settings of the keystore: `sros "
     "update_keystore KEYSTORE --set distributions=NAME,...`.",

@@ -67,7 +67,7 @@ ROBOTS_UNKNOWN = FindingKind(
     "runtime.robots-dds-unknown",
     NOTE,
     "robots with DDS libraries that are not known",
-    "sros cannot tell which known vulnerabilities they have.",
+    "sros cannot tell which known vulnerabilities these robots have.",
     "The last confirmations of the robots.",
     "If no library was reported or seen, confirm again with this version of sros (`sros fleet "
     "report` on the robot), while the nodes run. If sros could not examine some processes: "
@@ -233,9 +233,8 @@ def _users_by_library(
 def _vulnerability_counts_clause(advisories: Sequence[Advisory], version: str) -> str:
     """Return a clause with numbers of vulnerabilities: in all, by precondition, and by fix."""
     secured = sum("security" in advisory.needs for advisory in advisories)
-    needs = (
-        [f"{len(advisories) - secured} affect all processes"] if secured < len(advisories) else []
-    )
+    of_all = len(advisories) - secured
+    needs = [f"{of_all} {'affects' if of_all == 1 else 'affect'} all processes"] if of_all else []
     needs += [f"{secured} only those with DDS Security"] if secured else []
     needs = ["only with DDS Security"] if secured == len(advisories) else needs
     numbers = version_numbers(version)
@@ -252,7 +251,10 @@ def _vulnerability_counts_clause(advisories: Sequence[Advisory], version: str) -
 
 
 def _unclear_text(advisories: Sequence[Advisory]) -> str:
-    return f"Not known for this release: {', '.join(advisory.id for advisory in advisories)}"
+    return (
+        "These advisories do not mention the release line: "
+        f"{', '.join(advisory.id for advisory in advisories)}"
+    )
 
 
 def _remedy(kind: FindingKind, library: MappedLibrary) -> str:

@@ -12,7 +12,7 @@ from sros_tool.errors import DocumentError
 from sros_tool.policy.patterns import ComparisonLimit
 from sros_tool.translate_zenoh.rights import RightsOfSubject, is_self_limiting
 from sros_tool.values import DryRun, FileChange, Notes, Words
-from sros_tool.wording import first_few
+from sros_tool.wording import counted, first_few
 from sros_tool.xml import read_bytes
 from sros_tool.zenoh.access import PROPERTIES, AclRule, AclSubject, Enforcement, Flow, Message
 from sros_tool.zenoh.configuration import Mode
@@ -384,7 +384,7 @@ def _subject_findings(document: ConfigurationDocument) -> Iterator[Finding]:
     access = document.access
     open_to_all = _allowing_subjects_of_everybody(document)
     if open_to_all and is_self_limiting(document):
-        text = f"no subject states certificate common names: {_ids_text(open_to_all)}"
+        text = f"no certificate common name is stated by {_ids_text(open_to_all)}"
         yield SELF_LIMITING.found(document.mode.value, text, document.name, open_to_all[0].line)
     else:
         for subject in open_to_all:
@@ -394,7 +394,7 @@ def _subject_findings(document: ConfigurationDocument) -> Iterator[Finding]:
     if pairs:
         first, second = pairs[0]
         least = "at least " if len(pairs) > _MOST_PAIRS else ""
-        further = f", and {least}{len(pairs) - 1} more pairs" if len(pairs) > 1 else ""
+        further = f", and {least}{counted(len(pairs) - 1, 'more pair')}" if len(pairs) > 1 else ""
         text = f"subjects {first.id} and {second.id} can match the same process{further}"
         yield OVERLAPPING.found(f"subject {second.id}", text, document.name, second.line)
 

@@ -98,7 +98,7 @@ def test_few_processes_are_named_for_a_restart() -> None:
 def test_processes_of_two_users_need_one_user_rather_than_a_restart() -> None:
     first, second = robot(1, 2, deaf=[(1, 2)])
     (same,) = connection_findings([(first, second)])
-    assert same.text == "it has not connected to process 2 (node2): neither hears the other"
+    assert same.text == "it has not connected to process 2 (node2): they do not hear each other"
     assert "restart the process" in same.remedy
     (different,) = connection_findings([(first, replace(second, user=1000))])
     assert different.remedy.startswith("Run these processes as one user")

@@ -434,9 +434,9 @@ def test_a_misspelled_group_is_found(tmp_path: Path) -> None:
     words = ("check", file, "--fleet", fleet, "--include", "policy.unknown-group")
     said = sros(*words).out
     c2, h2 = "c2 (group carst: perhaps carts)", "h2 (group cart: perhaps carts)"
-    assert f"no enclave for the group of {c2}, {h2}, h3 (in no group)\n" in said
+    assert f"no enclave is for {c2}, {h2}, h3 (in no group)\n" in said
     file.write_text(policy(carts, enclave("", "/h3/look", "/")))
     text = "/h3/look is no enclave of the robot h3: write /{robot}/look"
     assert text in sros("check", file, "--fleet", fleet).out
     file.write_text(policy(carts, enclave("", "/{robot}/all", "{namespace}")))
-    assert f"no enclave for the group of {c2}, {h2}\n" in sros(*words).out
+    assert f"no enclave is for {c2}, {h2}\n" in sros(*words).out

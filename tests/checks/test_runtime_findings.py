@@ -96,7 +96,7 @@ def test_without_security_each_open_node_is_named(sound_one: RuntimeState, bench
     state = with_processes(replace(sound_one, environment={}), *nodes)
     (found,) = runtime_findings(state)
     assert found.text.startswith(
-        "ROS_SECURITY_ENABLE is not set; running without it: process 100 (talker) in domain 3, "
+        "ROS_SECURITY_ENABLE is not set; open nodes: process 100 (talker) in domain 3, "
     )
     assert found.text.endswith("process 119 (talker) in domain 3 and 10 more")
     for severity, shown in ((NOTE, True), (WARNING, True), (ERROR, False)):
@@ -120,7 +120,7 @@ def test_the_name_of_a_process_cannot_be_taken_for_another_one(sound_one: Runtim
     name = f"x) in domain 0, process 1 (y\x1b[2J{'z' * 500}"
     node = Process(7, (name,), {DOMAIN: "all, 4"}, sound_one.now, libraries=frozenset({"librcl"}))
     (found,) = runtime_findings(with_processes(replace(sound_one, environment={}), node))
-    text = found.text.partition("without it: ")[2]
+    text = found.text.partition("open nodes: ")[2]
     assert text == f"process 7 (x? in domain 0? process 1 ?y??2J{'z' * 8}) in domain 'all? 4'"
 
 
@@ -270,7 +270,7 @@ def test_a_process_whose_start_the_clock_does_not_tell(
     (found,) = runtime_findings(changed(0, **set_forward)(sound_one, bench))
     assert found.id == "runtime.process-outdated"
     assert found.text.startswith(
-        "the clock was set forward by 1 d 1 h while it ran, so it is not known whether "
+        "the clock was set forward by 1 d 1 h while the process ran, so it is not known whether "
     )
 
 
@@ -515,18 +515,18 @@ WITH_KEY = 'transport/link/tls/connect_private_key="/key.pem"'
         ({"ROS_SECURITY_ENABLE": "true"}, "ROS_SECURITY_ENABLE is set"),
         ({CYCLONE: "<General><Tracing/></General>"}, ""),
         ({CYCLONE: "<CycloneDDS><Domain><DDSSecurity>"}, f"{CYCLONE} has security"),
-        ({CYCLONE: "<General>${MORE}</General>"}, f"{CYCLONE} is set, and sros cannot read it"),
+        ({CYCLONE: "<General>${MORE}</General>"}, f"{CYCLONE} cannot be read"),
         ({CYCLONE: "file://plain,secured"}, f"{CYCLONE} has security"),
         ({CYCLONE: "plain"}, ""),
         ({PROFILES: "plain"}, ""),
         ({PROFILES: "secured"}, f"{PROFILES} has security"),
-        ({PROFILES: "none"}, f"{PROFILES} is set, and sros cannot read it"),
+        ({PROFILES: "none"}, f"{PROFILES} cannot be read"),
         ({PROFILES: "hidden"}, f"{PROFILES} has security"),
         ({"FASTDDS_ENVIRONMENT_FILE": "secured"}, "FASTDDS_ENVIRONMENT_FILE has security"),
         ({"FASTDDS_ENVIRONMENT_FILE": "hidden"}, "FASTDDS_ENVIRONMENT_FILE has security"),
         ({**ON_ZENOH, PROFILES: "secured"}, ""),
         ({**ON_ZENOH, SESSION: "session"}, ""),
-        ({**ON_ZENOH, SESSION: "plain"}, f"{SESSION} is set, and sros cannot read it"),
+        ({**ON_ZENOH, SESSION: "plain"}, f"{SESSION} cannot be read"),
         ({**ON_ZENOH, "ZENOH_CONFIG_OVERRIDE": WITH_KEY}, "ZENOH_CONFIG_OVERRIDE has security"),
         (
             {**ON_ZENOH, SESSION: "session", "ZENOH_CONFIG_OVERRIDE": WITH_KEY},

@@ -63,7 +63,9 @@ def test_a_mended_release_has_no_known_vulnerability() -> None:
     library = MappedLibrary("Fast DDS", "3.2.5", "/opt/ros/kilted/lib/libfastdds.so.3.2.5")
     (finding,) = vulnerability_findings(running(library))
     assert finding.id == "runtime.vulnerabilities-unclear"
-    assert finding.text.endswith("Not known for this release: CVE-2024-30258, CVE-2024-30259")
+    assert finding.text.endswith(
+        "These advisories do not mention the release line: CVE-2024-30258, CVE-2024-30259"
+    )
     (finding,) = vulnerability_findings(running(library._replace(version="3.2.4")))
     assert finding.id == "runtime.known-vulnerabilities"
     fixed = MappedLibrary("Cyclone DDS", "11.0.1", "/opt/ros/lyrical/lib/libddsc.so.11.0.1")

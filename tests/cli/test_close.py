@@ -871,7 +871,7 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     long_ago = talker.started - timedelta(days=400)
     robot.more = (replace(talker, started=long_ago, clock_advanced=timedelta(days=2)),)
     said = robot.close("--proof", status=1).out
-    assert "its enclave: the clock was set forward by 2 d while it ran, and " in said
+    assert "its enclave: the clock was set forward by 2 d while the process ran, and " in said
     assert " may have changed after the start of the processes of /talker (process 4711); " in said
     lax = {**talker.environment, "ROS_SECURITY_STRATEGY": "Permissive"}
     for changed, why in (

@@ -50,7 +50,7 @@ from sros_tool.pki.crl import signed_by
 from sros_tool.pki.keys import algorithm, few_rounds_clause, load_key
 from sros_tool.pki.token import is_token_uri
 from sros_tool.validity import AUTHORITY_SOON, iso
-from sros_tool.wording import first_few
+from sros_tool.wording import counted, first_few
 
 NOT_A_CA = FindingKind(
     "keystore.not-a-ca",
@@ -116,8 +116,9 @@ WEAK = FindingKind(
     "keystore.weak-cryptography",
     ERROR,
     "a weak key, or a signature with a weak hash",
-    "An attacker who computes the key, or finds another document with the same signature, can "
-    "issue any identity or any permissions. DDS accepts weak keys and weak hashes.",
+    "An attacker who computes the key of a CA, or finds another document with the same "
+    "signature, can issue any identity or any permissions. An attacker who computes the key of "
+    "an enclave can act as the enclave. DDS accepts weak keys and weak hashes.",
     "NIST SP 800-57 part 1, 5.6, and SP 800-131A: RSA under 2048 bits, EC under 256 bits, SHA-1.",
     "Replace a CA with `sros rotate_ca KEYSTORE`; renew an enclave with `sros renew KEYSTORE "
     "ENCLAVE`.",
@@ -413,7 +414,7 @@ def _left_enclave_findings(keystore: CheckedKeystore, fleet: Fleet) -> Iterator[
         clause = f"{robot}: {first_few(names, _SHOWN)}"
         yield LEFT_ENCLAVES.found("fleet", clause, keystore.shown(FLEET))
     if (more_robots := len(robots) - _MOST_LEFT) > 0:
-        clause = f"{more_robots} more robots also left enclaves"
+        clause = f"enclaves of {counted(more_robots, 'more robot')}"
         yield LEFT_ENCLAVES.found("fleet", clause, keystore.shown(FLEET))
 
 
@@ -467,7 +468,9 @@ def _settings_and_ledger_findings(keystore: CheckedKeystore) -> Iterator[Finding
     for gap in keystore.ledger.gaps:
         yield LEDGER_DAMAGED.found("ledger", gap, file)
     if count := keystore.ledger.unchained:
-        yield LEDGER_UNCHAINED.found("ledger", f"{count} lines have no chain", file)
+        yield LEDGER_UNCHAINED.found(
+            "ledger", f"{counted(count, 'line')} without a hash chain", file
+        )
         from sros_tool.keystore.rights import RecordedRights
 
         unproven = RecordedRights(keystore.opened, keystore.ledger).unproven_entries()

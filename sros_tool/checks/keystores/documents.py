@@ -135,8 +135,8 @@ TIME_WINDOW = FindingKind(
     "portable.validity-window",
     WARNING,
     "a validity that in some time zones begins too late or expires too early",
-    "Fast DDS reads the dates of permissions in the host's local time: they begin up to 12 hours "
-    "late in the west, and expire up to 14 hours early in the east.",
+    "Fast DDS reads the dates of permissions in the host's local time: the permissions begin up "
+    "to 12 hours late in the west, and expire up to 14 hours early in the east.",
     "Fast DDS 2.6 to 3.6 (mktime); tested in Los Angeles and Tokyo.",
     "Let the hosts run in UTC, or renew the enclave at least 14 hours before its permissions "
     "expire (`sros renew KEYSTORE ENCLAVE`). If its permissions are valid for less than a day, "
@@ -276,7 +276,7 @@ def _form_findings(grant: Grant, name: str, file: str) -> Iterator[Finding]:
         if not (match := _PORTABLE_DATE.match(moment)) or int(match[1]) > _LAST_YEAR
     ]
     if dates:
-        yield TIME_FORMAT.found(name, f"of its validity: {' and '.join(dates)}", file)
+        yield TIME_FORMAT.found(name, f"its validity has {' and '.join(dates)}", file)
     allow_rules = sum(rule.allow for rule in grant.rules)
     if allow_rules > 1:
         yield ALLOW_RULES.found(name, f"the grant has {allow_rules} allow rules", file)
@@ -478,9 +478,9 @@ UNAUTHENTICATED = FindingKind(
     ERROR,
     "participants without an identity may join",
     "On Fast DDS, they can read and write each topic that has neither access control nor "
-    "protection; on Cyclone DDS, each topic that has no protection, even if it has access control. "
-    "If the governance also protects RTPS messages, Fast DDS refuses it; only Fast DDS 2.9 accepts "
-    "it, and ignores allow_unauthenticated_participants.",
+    "protection; on Cyclone DDS, each topic that has no protection, even if it has access "
+    "control. If the governance also protects RTPS messages, Fast DDS refuses the governance; "
+    "only Fast DDS 2.9 accepts it, and ignores allow_unauthenticated_participants.",
     f"{_GOVERNANCE_SOURCE} (allow_unauthenticated_participants); Fast DDS 2.9.1 and 2.14.5, "
     "Cyclone DDS 0.10 and 11.0; tested.",
     f"Run {REFUSE_STRANGERS}.",
@@ -489,9 +489,9 @@ UNAUTHENTICATED_KEPT_OUT = FindingKind(
     "governance.unauthenticated-kept-out",
     NOTE,
     "participants without an identity are allowed, but the vendor keeps them out",
-    "Fast DDS 2.9 ignores the attribute, and Cyclone DDS refuses such participants if RTPS "
-    "messages are protected. Another vendor may open topics to these participants, or refuse the "
-    "document.",
+    "Fast DDS 2.9 ignores allow_unauthenticated_participants, and Cyclone DDS refuses such "
+    "participants if RTPS messages are protected. Another vendor may open topics to these "
+    "participants, or refuse the document.",
     UNAUTHENTICATED.source,
     UNAUTHENTICATED.remedy,
 )

@@ -164,7 +164,8 @@ NOT_UNIQUE = FindingKind(
     WARNING,
     "a subject without the unique part that the keystore adds",
     "The keystore adds a unique part to every subject, so that neither permissions of another "
-    "enclave nor earlier permissions match it. This certificate is older, or was issued elsewhere.",
+    "enclave nor earlier permissions match it. This certificate was issued before the keystore "
+    "did so, or elsewhere.",
     "Cyclone DDS 0.10.2 (subsets of subjects); ros2/sros2 issue 275; tested with both vendors.",
     "Run `sros renew KEYSTORE ENCLAVE`.",
 )
@@ -190,7 +191,7 @@ ANY_NODE = FindingKind(
     "enclave.any-node",
     NOTE,
     "an enclave that may offer the parameter services of every node",
-    "An enclave without a policy may start nodes of any name. So a process in it can read and "
+    "A process in an enclave without a policy may start nodes of any name. So it can read and "
     "answer requests to the parameter services of other enclaves' nodes.",
     "ROS 2 design, ROS 2 DDS-Security Integration; sros (template production).",
     EVERYTHING.remedy,

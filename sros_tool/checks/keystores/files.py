@@ -87,7 +87,8 @@ FOREIGN_OWNER = FindingKind(
     WARNING,
     "a keystore of another user",
     "The owner can replace all its files, and so decides whom your nodes trust. Files that root "
-    "unpacks from an archive may belong to the user who has the archive's user id on this machine.",
+    "unpacks from an archive may belong to the user of this machine whose user id the archive "
+    "states.",
     "POSIX owners; CWE-283.",
     "Run the check as the user that runs the nodes, or make that user the owner: "
     "`chown -R USER KEYSTORE`.",
@@ -188,7 +189,7 @@ HOME_OR_ROBOT = FindingKind(
     "keystore.home-or-robot",
     ERROR,
     "a keystore with keys that must not be on a robot",
-    "The keys belong where the keystore is kept. On a robot, an attacker who gets a CA key can "
+    "The keys belong on the keystore machine. On a robot, an attacker who gets a CA key can "
     "create any enclave, with any rights. The files do not show whether this folder is on a "
     "robot.",
     "ROS 2 design, ROS 2 Security Enclaves; NIST SP 800-57 part 1, 6 (protection of keys).",
@@ -210,8 +211,8 @@ HIDDEN_ENCLAVE = FindingKind(
     "lists, renews, revokes or exports the enclave, and the check of enclaves leaves it out.",
     "rcl 9 (rcl/src/rcl/security.c) takes a folder of any name; sros keystore layout.",
     "Remove the folder. If you need the enclave, create one without a dot in its name (`sros "
-    "create_enclave`). If others had the folder, replace the CA (`sros rotate_ca`), because the "
-    "enclave's certificate stays valid.",
+    "create_enclave`). If others had access to the folder, replace the CA (`sros rotate_ca`), "
+    "because the enclave's certificate stays valid.",
 )
 UNKNOWN_FILE = FindingKind(
     "keystore.unknown-file",
@@ -547,4 +548,4 @@ def _stray_file_findings(
         or (place == CONFIRMED and name.endswith(".json"))
     )
     if not known:
-        yield UNKNOWN_FILE.found(path, "neither ROS 2 nor sros uses this name there", path)
+        yield UNKNOWN_FILE.found(path, "neither ROS 2 nor sros uses this name in this folder", path)

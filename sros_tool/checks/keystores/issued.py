@@ -94,8 +94,8 @@ STALE = FindingKind(
     "enclave.stale-permissions",
     WARNING,
     "permissions that differ from the policy",
-    "The policy was changed and not signed again, or the permissions were made from another "
-    "policy.",
+    "The policy was changed after the permissions were signed, or the permissions were made "
+    "from another policy.",
     "sros: the rights of policy and permissions, in ROS terms.",
     "Run `sros generate_artifacts -k KEYSTORE -p POLICY_FILE`; `sros diff_policy` shows all "
     "differences.",
@@ -146,7 +146,8 @@ AUTHORITIES_DIFFER = FindingKind(
     "enclaves that do not trust the same CAs",
     "Their nodes never communicate, and neither Fast DDS nor Cyclone DDS reports why.",
     "DDS-Security 1.1, 9.3; Fast DDS 2.9.1, Cyclone DDS 0.10.2; tested.",
-    "Export the enclave again from the keystore of the other enclaves, or create it again there.",
+    "Export the enclave again from the keystore of the other enclaves, or create it again in "
+    "that keystore.",
 )
 
 UNKNOWN_AUTHORITY = FindingKind(
@@ -164,8 +165,8 @@ REVOKED_BY_NEWER_LIST = FindingKind(
     "keystore.enclave-revoked",
     ERROR,
     "an enclave that a newer revocation list, or the ledger, revokes",
-    "The enclave was revoked after it was exported, or its files were put back. It can still "
-    "start, and communicates with all processes that have not loaded the newer list.",
+    "The enclave was revoked after it was exported, or its files were put back. Its processes "
+    "can still start, and communicate with all processes that have not loaded the newer list.",
     "RFC 5280, 5; rmw_dds_common (crl.pem).",
     "Remove the enclave's folder.",
 )
@@ -175,8 +176,9 @@ REMOVED = FindingKind(
     "an enclave that was removed from the keystore, and not revoked",
     "Whoever kept its files, such as a robot or a backup, has its rights until they expire.",
     "sros: ledger.jsonl has the certificate, and no revocation of it.",
-    "Restore its folder; or create it again with `sros create_enclave KEYSTORE ENCLAVE`, and run "
-    "`sros revoke KEYSTORE ENCLAVE`, which revokes all its certificates.",
+    "Restore the enclave's folder from a backup. Or create the enclave again with `sros "
+    "create_enclave KEYSTORE ENCLAVE`, and run `sros revoke KEYSTORE ENCLAVE`, which revokes "
+    "all its certificates.",
 )
 OLDER_LIST = FindingKind(
     "enclave.crl-older",
@@ -318,7 +320,10 @@ def check_issued(
             for name in missing:
                 yield NOT_IN_KEYSTORE.found(name, "the keystore does not have this enclave", root)
         elif missing:
-            text = f"{len(missing)} of {len(wanted)} enclaves of the policy are not in this export"
+            text = (
+                f"{len(missing)} of {len(wanted)} enclaves of the policy "
+                f"{'is' if len(missing) == 1 else 'are'} not in this export"
+            )
             yield NOT_IN_EXPORT.found(missing[0], f"{text}: {first_few(missing, 3)}", root)
         yield from _lower_protection_findings(keystore)
 
@@ -488,8 +493,8 @@ def check_policy(
         signed, stated = grant.domains().closed(), DomainSet.of((robot.domain, robot.domain))
         if signed != stated:
             text = (
-                f"the fleet has {robot.name} in domain {stated}, but the permissions are for "
-                f"domain {signed}"
+                f"the fleet file has {robot.name} in domain {stated}, but the permissions are "
+                f"for domain {signed}"
             )
             yield STALE.found(
                 name, text, enclave.file("permissions.p7s"), remedy=_SIGN_FOR_THE_FLEET

@@ -66,8 +66,9 @@ PEERS_ACCEPT = FindingKind(
     "A node with this list still communicates with enclaves that only the other list revokes, for "
     "example with the thief of a key.",
     "RFC 5280, 5.2.3; rmw_dds_common (crl.pem).",
-    "Export the enclaves with this list again from their keystore, with `sros distribute_key "
-    "KEYSTORE ENCLAVE TARGET --force`, bring the files to the robot, and restart the processes.",
+    "Export the enclaves that have this list again (`sros distribute_key KEYSTORE ENCLAVE "
+    "TARGET --force` in their keystore), bring the files to the robot, and restart the "
+    "processes.",
 )
 _REVOKE_AGAIN = (
     "This keystore was perhaps restored from a backup: before its next export, revoke the "
@@ -85,8 +86,8 @@ PEERS_PROTECTION = FindingKind(
     "keystore.peers-protection",
     WARNING,
     "keystores or exports whose governance protects messages differently",
-    "Both ends of a connection have to protect messages in the same way. Where they differ, nodes "
-    "do not hear each other, and Fast DDS does not log why.",
+    "Both ends of a connection have to protect messages in the same way. Otherwise, nodes do "
+    "not hear each other, and Fast DDS does not log why.",
     "DDS-Security 1.1, 9.4.1.2; Fast DDS 2.9.1 and 2.14.5, Cyclone DDS 0.10.2; tested.",
     "If one of the two is an earlier export, export its enclaves again, and restart the processes. "
     "Otherwise give both keystores the same protection (`sros inspect` shows it, `sros "
@@ -96,8 +97,8 @@ PEERS_DOMAINS = FindingKind(
     "keystore.peers-domains",
     NOTE,
     "keystores or exports for different ROS domains",
-    "Nodes find each other only in one ROS domain, and no node of one keystore or export may join "
-    "a domain of the other one.",
+    "Nodes find each other only in the same ROS domain, and no node of one keystore or export "
+    "may join a domain of the other one.",
     "DDS-Security 1.1, 9.4.1.2 and 9.4.1.3; tested.",
     "If their nodes have to communicate, name a common domain with `sros update_keystore KEYSTORE "
     "--domain IDS --allow-looser`, and export the enclaves again; if not, ignore this.",

@@ -63,8 +63,8 @@ SOME_REFUSE = FindingKind(
     "an enclave that some DDS vendors refuse",
     "With one RMW, a node runs in the enclave; with another RMW, it fails or finds no peer.",
     _ENGINE_SOURCE,
-    "Use an RMW of a vendor that accepts it, or replace the files that the other vendors "
-    f"refuse. {_SEE_VENDORS_REMEDY}",
+    "Use an RMW of a vendor that accepts the enclave, or replace the files that the other "
+    f"vendors refuse. {_SEE_VENDORS_REMEDY}",
 )
 DIFFER = FindingKind(
     "portable.vendors-differ",

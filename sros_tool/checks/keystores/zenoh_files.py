@@ -27,8 +27,8 @@ MISSING = FindingKind(
     "zenoh.missing",
     ERROR,
     "an enclave without its Zenoh configuration",
-    "Processes of rmw_zenoh_cpp do not run in it with `sros run`; without sros, they run with the "
-    "default of rmw_zenoh_cpp, which is open.",
+    "`sros run` starts no process of rmw_zenoh_cpp in the enclave; without sros, such a process "
+    "runs with the default of rmw_zenoh_cpp, which is open.",
     _ZENOH_SOURCE,
     _WRITE_AGAIN_REMEDY,
 )
@@ -94,7 +94,9 @@ SHARED_NODE = FindingKind(
     "Name each node in the policy of one enclave. If a wildcard gives an enclave the services of "
     "all nodes, deny the services of other enclaves' nodes, such as `/camera/*`.",
 )
-_RENEW_REMEDY = "Renew it with `sros renew KEYSTORE ENCLAVE`, or revoke it if nobody needs it."
+_RENEW_REMEDY = (
+    "Renew the enclave with `sros renew KEYSTORE ENCLAVE`, or revoke it if nobody needs it."
+)
 _EXPIRY_FAULTS = {Fault.CERTIFICATE_EXPIRED, Fault.PERMISSIONS_EXPIRED}
 CANNOT_BE_MADE = FindingKind(
     "zenoh.cannot-be-made",
