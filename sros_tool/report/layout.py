@@ -202,7 +202,7 @@ def scenes_of(
     """
     groups = {enclave.path: enclave.group for enclave in picture.enclaves}
     titles = sorted(set(groups.values()))
-    essential = [edge for edge in picture.edges if not edge.common]
+    essential = _essential_edges(picture.edges)
     if len(groups) <= _MOST_ENCLAVES or len(titles) < 2 or len(titles) > len(groups) // 2:
         scenes = [
             _scene(
@@ -236,6 +236,22 @@ def scenes_of(
             )
         )
     return tuple(scenes)
+
+
+def _essential_edges(edges: Iterable[Edge]) -> list[Edge]:
+    """Return the edges without rights that every node needs.
+
+    If an enclave may call a service by its exact name, the rights to serve this service stay.
+    """
+    edges = tuple(edges)
+    called = {
+        edge.name
+        for edge in edges
+        if (edge.right, edge.qualifier) == ("request", ALLOW) and not edge.by
+    }
+    return [
+        edge for edge in edges if not edge.common or (edge.right == "reply" and edge.name in called)
+    ]
 
 
 def _scene(
@@ -391,10 +407,14 @@ class _Draft:
 
     def _names_card(self, number: int, bundle: Bundle) -> Card:
         drawn = {tie.node for tie in bundle.ties}
-        shared = len(self._everybody[bundle.kind, bundle.names[0]] - drawn) > 0
+        hidden = {
+            node for name in bundle.names for node in self._everybody[bundle.kind, name]
+        } - drawn
         tags = {self._tags[tie.node, tie.right] for tie in bundle.ties if self._is_onlooker(tie)}
         x = MARGIN + _SIDE_WIDTH + _GUTTER
-        notes = (_COMMON_NAME_NOTES[bundle.kind],) if shared else ()
+        notes = (_COMMON_NAME_NOTES[bundle.kind],) if hidden else ()
+        if bundle.kind == "services" and len(hidden) == 1:
+            notes = (f"served by {hidden.pop().removeprefix(':')}",)
         card = names_card(f"n{number}", bundle, 1, notes)
         return replace(card, x=x, width=_NAMES_WIDTH, tags="".join(sorted(tags)))
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from sros_tool.names import NODE_SERVICES
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import DENY
 from sros_tool.policy.rights import policy_rights
@@ -149,6 +150,26 @@ def test_what_one_enclave_has_alone_is_drawn_where_there_is_little(tmp_path: Pat
     assert [card.members for card in scene.cards if card.kind] == [("/x",), ("/y",)]
     notes = [note for card in scene.cards for note in card.notes]
     assert notes == ["nobody may subscribe", "nobody may publish"]
+
+
+def test_a_service_of_every_node_that_an_enclave_may_call_by_name_is_drawn_whole(
+    tmp_path: Path,
+) -> None:
+    served = group("services", "reply", *(f"/guardian/{service}" for service in NODE_SERVICES))
+    enclaves = {
+        "/watchdog": served,
+        "/tuner": group("services", "request", "/guardian/set_parameters"),
+        "/look": group("services", "request", "/guardian/list_*"),
+    }
+    scene = scenes_of(picture_of(tmp_path, enclaves))[0]
+    of = {card.members: card for card in scene.cards if card.kind}
+    called, listed = of["/guardian/set_parameters",], of["/guardian/list_parameters",]
+    assert {(link.source, link.target) for link in scene.links} == {
+        ("s/tuner", called.id),
+        (called.id, "l/watchdog"),
+        ("s/look", listed.id),
+    }
+    assert (called.notes, listed.notes) == ((), ("served by /watchdog",))
 
 
 def test_what_differs_is_never_folded_into_an_enclave(tmp_path: Path) -> None:
