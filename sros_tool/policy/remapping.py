@@ -232,11 +232,12 @@ def _unused_rule_error(
     policies = tuple(policies)
     for other in rules:
         if users(policies, [each for each in rules if each != other]):
+            example = f", as in {rule._replace(node=other.new)}" if other.old == _NODE else ""
             return UsageError(
                 f"--remap {rule} changes nothing",
                 f"The rule {other} applies first.",
-                "Write the node and the name as they are after that rule, or leave out one of the "
-                "two rules.",
+                f"Write the node and the name as they are after that rule{example}, or leave out "
+                "one of the two rules.",
             )
     if nodes := users(left_out, rules):
         return UsageError(
@@ -293,11 +294,11 @@ def _notes_on_requirements(
             if use.old in gone or f"{use.old}/*" in gone
         }
         text = (
-            f"requirements that name {first_few(sorted(gone), _MOST_SHOWN)} do not apply to the "
-            "new name: check them with the same --namespace and with the new name, as in `sros "
-            "check POLICY --requirements FILE "
-            f"{' '.join(f'--remap {quote(option)}' for option in sorted(options))}`. Leave out "
-            "each --remap whose old name no requirement has: `check` calls it unused."
+            f"if requirements name {first_few(sorted(gone), _MOST_SHOWN)}, check them with "
+            "the new name, and with the same --namespace, as in `sros check POLICY --requirements "
+            f"FILE {' '.join(f'--remap {quote(option)}' for option in sorted(options))}` (without "
+            "each --remap whose old name no requirement has). Otherwise, they protect only the old "
+            "name."
         )
         yield Note("merge.requirements-of-old-names", text)
 

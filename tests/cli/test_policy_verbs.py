@@ -103,7 +103,8 @@ def test_the_names_of_a_merged_policy_are_remapped(folder: Path) -> None:
         (("imag:=/front/image",), "matches no name or node in the policies to merge"),
         (
             ("cam:__node:=eye", "--remap", "cam:image:=/i"),
-            "The rule cam:__node:=eye applies first.",
+            "The rule cam:__node:=eye applies first. Write the node and the name as they are after "
+            "that rule, as in eye:image:=/i, or leave out",
         ),
         (("image:=/one", "--remap", "image:=/two"), "The rule image:=/one applies first."),
         (("/state:=/s", "--remap", "__ns:=/l"), "The rule __ns:=/l applies first."),
