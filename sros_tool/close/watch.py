@@ -167,7 +167,8 @@ def _write_observation(robot: LocalRobot, document: str, observed: ObservedProce
     """
     enclaves_here = {process.enclave for process in observed.processes}
     not_here = (robot.not_here - enclaves_here).union(robot.named_elsewhere)
-    robot.check_machines()
+    if robot.observed is None:  # otherwise checked before the watch
+        robot.check_machines()
     # A process that does not run now is still started by its remembered command.
     absent = robot.policy_enclaves() - enclaves_here - not_here
     kept = [process for process in robot.processes.processes if process.enclave in absent]

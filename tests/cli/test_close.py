@@ -1817,6 +1817,11 @@ def test_an_enclave_that_belongs_to_another_machine(robot: Robot) -> None:
     assert "/listener: new, start it with: sros run " in ended.out
     assert "already belongs to this" in robot.close("--here", "/listener", status=2).err
     robot.close("--elsewhere", "/listener")
+    robot.absent = set()
+    ended = robot.close("--for", "1s", "--here", "/listener")
+    assert "/listener: process 4712" in ended.out, ended
+    robot.absent = {"/listener"}
+    robot.close("--elsewhere", "/listener")
     assert not (robot.folder / left).exists()
     robot.by_hand = {"/talker"}
     sros("renew", "robot/keystore", "/talker", "--new-key", "--revoke-old", cwd=robot.folder).ok()
