@@ -546,11 +546,13 @@ class _Verifier:
         arrived = self._arrival(file, last)
         message = LastMessage(sequence, sha256, verified.enclave)
         installed = verified.confirmation.release
-        known = None if last and self._has_new_keys(robot, last) else last
-        before_it = (known.confirmation.release if known else None) or 0
+        before_it = (last.confirmation.release if last else None) or 0
         went_back = installed is not None and installed < before_it and not is_restored
-        predecessor = (known.message if known else None) or message
-        boots, alternated = predecessor.successor(verified.confirmation.boot, arrived)
+        boot = verified.confirmation.boot
+        boots, alternated = (before or message).successor(boot, arrived)
+        if last and (alternated or went_back) and self._has_new_keys(robot, last):
+            went_back = False
+            boots, alternated = message.successor(boot, arrived)
         # A new agent begins without a release, and a robot can only claim unpublished releases.
         if went_back and installed and self._is_published(before_it):
             alternated = arrived
