@@ -82,11 +82,11 @@ HOLDS_ALONE = FindingKind(
     "requirement.holds-alone",
     NOTE,
     "a requirement that no enclave of this policy can break",
-    "It has relative names, as the requirements of a package do, and only enclaves that users add "
-    "could break it.",
+    "Its names are relative, as in the requirements of a package, and only enclaves that users of "
+    "the package add could break it. So this check did not test it.",
     "The requirements file.",
-    "Check it with enclaves of others: `sros check ROBOT_POLICY --requirements FILE --namespace "
-    "NS`.",
+    "To test it, check a policy that has other enclaves, too: `sros check ROBOT_POLICY "
+    "--requirements FILE --namespace NS`.",
     prominent=True,
 )
 NOT_CROSSING = FindingKind(
