@@ -254,7 +254,7 @@ def _run(folder: Path, once: bool, interval: str, restarted: bool, as_json: bool
     A round fetches the robot's release, verifies it, and installs it whole or not at all. It
     restarts units, or reports the restarts that are due, and checks the running processes. It asks
     for renewal in the last third of a certificate's validity (after `sros agent init --new-key`:
-    when 60 % of the validity of the certificate or of the permissions are over, whichever is
+    when 60 % of the validity of the certificate or of the permissions is over, whichever is
     first), and sends a signed report to the keystore machine.
     If one step fails, the others still run, and the next round tries the failed step again.
 

@@ -338,19 +338,21 @@ class HandNode:
     def __post_init__(self) -> None:
         if self.role is Role.ROUTER and self.backend != ZENOH:
             raise UsageError(
-                "only Zenoh has routers", "Nodes on DDS find each other.", "Add --backend zenoh."
+                "only Zenoh has routers",
+                "Nodes on DDS find each other without a router.",
+                "Add --backend zenoh.",
             )
         if self.type != STRING and (self.role is not Role.TALKER or self.backend != RCLPY):
             raise UsageError(
                 "only a talker on rclpy takes a type",
-                "A listener hears all types, and rclpy has the types of your ROS packages.",
+                "Only rclpy has the types of your ROS packages, and a listener hears all types.",
                 "Use `sros demo talker --backend rclpy` in an environment of ROS 2.",
             )
         if re.fullmatch(r"[A-Za-z]\w*/msg/[A-Za-z]\w*", self.type, re.ASCII) is None:
             raise UsageError(
-                f"{self.type!r} is no type of messages",
+                f"{self.type!r} is not a message type",
                 "",
-                "Write for example geometry_msgs/msg/Twist.",
+                "Write PACKAGE/msg/NAME, such as geometry_msgs/msg/Twist.",
             )
         if self.backend == ZENOH:
             zenoh_backend()
@@ -367,7 +369,9 @@ def security_line(node: HandNode, environment: Mapping[str, str]) -> str:
         uri = environment.get(f"ZENOH_{kind}_CONFIG_URI", "")
         security = f"configured by {uri}" if uri else "WITHOUT security"
         if not uri and environment.get(ENABLE) == "true":
-            security += ", as Zenoh ignores ROS_SECURITY_*: add --rmw rmw_zenoh_cpp to `sros run`"
+            security += (
+                ", because Zenoh ignores ROS_SECURITY_*: add --rmw rmw_zenoh_cpp to `sros run`"
+            )
     else:
         choice = choose_loadable(environment)
         name = environment.get(ENCLAVE) or "/"
@@ -498,7 +502,7 @@ def run_by_hand(
         result = results.get(node.role, "")
         was_short = duration is not None and duration.total_seconds() < _SILENCE_SECONDS
         if result and was_short and not (heard or seen):
-            result += ", but the time may be too short to find other nodes: add --for 10s"
+            result += ", but the time may be too short to find other nodes: use --for 10s"
         say(f"stopped{by_force}{result}")
     elif last and last.stage is ProcessStage.ENDPOINT and os.environ.get(ENABLE) == "true":
         verb = "publish" if node.role is Role.TALKER else "subscribe"

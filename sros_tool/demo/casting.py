@@ -66,7 +66,7 @@ from sros_tool.names import ACTION_SEPARATOR, NODE_SERVICES, dds_names, service_
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import digest, fingerprints
 from sros_tool.policy.patterns import matches
-from sros_tool.wording import first_few
+from sros_tool.wording import counted, first_few
 from sros_tool.xml import read_bytes
 
 _RIGHT_OF_ROLE = {
@@ -175,7 +175,7 @@ class UserKeystore(NamedTuple):
         return replace(
             row,
             expected=success,
-            mechanism="its signed permissions allow it",
+            mechanism="the attacker's signed permissions allow the attack",
             parties=tuple(
                 party for party in row.parties if party.name in (claim.subject, claim.talker)
             ),
@@ -211,7 +211,8 @@ def open_user_keystore(root: Path, topic: str, scenario: Scenario, now: datetime
             f"no two enclaves of keystore '{root}' may talk on {topic or 'a topic'}",
             "An attack needs an enclave that may publish a topic (named without wildcards), and"
             " another enclave that may subscribe to it." + read.faults_text(),
-            "Name the topic with --topic, or attack a keystore that `sros demo --keep` made.",
+            "Name a topic that two enclaves may use with --topic, or attack a keystore that"
+            " `sros demo --keep` made.",
         )
     service = _service(rights, cast) if "server" in cast else ""
     attacked = chosen.removeprefix("rt")
@@ -265,13 +266,14 @@ class _Enclaves(NamedTuple):
         """Yield the tests that a proof of the keystore needs and this cast cannot run."""
         more = len(self.revoked) + len(self.faulty) - _MOST_FAULTY
         if more > 0:
-            yield f"{more} more enclaves with faulty files or revoked certificates"
+            yield f"{counted(more, 'more enclave')} with faulty files or revoked certificates"
         if self.unreadable:
             yield f"{first_few(sorted(self.unreadable), 1)} with files that cannot be read"
         if self.without_list and cast["listener"] not in self.without_list:
             yield f"{first_few(sorted(self.without_list), 1)} without the newest revocation list"
         if self.other_governance:
-            yield f"{first_few(sorted(self.other_governance), 1)} with another governance"
+            names = first_few(sorted(self.other_governance), 1)
+            yield f"{names} with another governance than the others"
         if self.other_domain:
             yield f"{first_few(sorted(self.other_domain), 1)} outside domain {self.domain}"
 

@@ -289,7 +289,7 @@ def _versions() -> list[str]:
 
 
 def _system() -> list[str]:
-    release = "another system than Linux"
+    release = "unknown system"
     with suppress(OSError):
         about = platform.freedesktop_os_release()
         version = about.get("VERSION_ID", "")

@@ -188,14 +188,17 @@ class UncastError(KeystoreError):
         super().__init__("no enclave of the keystore fits this row", f"The row needs {needed}.")
 
 
-_SERVICE_OF_TWO = "an enclave that offers a service of its own, and another that may call it"
+_SERVICE_OF_TWO = (
+    "an enclave that offers a service that not every node has, and another enclave that may call"
+    " this service"
+)
 _NEEDED_ENCLAVES = {
     "guest": "a third enclave, next to the enclaves of the talker and the listener",
-    "admin": "two more enclaves: one that may not publish the topic, and one below it that may, as"
-    " /arm and /arm/tool",
+    "admin": "two more enclaves, such as /arm and /arm/tool: the first may not publish the topic,"
+    " and the second may; the second path has all parts of the first",
     "server": _SERVICE_OF_TWO,
     "client": _SERVICE_OF_TWO,
-    "newcomer": "an enclave that the demo made without a policy",
+    "newcomer": "an enclave without a policy, which only the demo's own keystores have",
 }
 """Part → the enclave that a keystore needs, if no enclave fits the part."""
 

@@ -290,7 +290,7 @@ class OtherTypes:
         if kind == self._own:
             return text
         if self._count is None:
-            return f"{text}, which does not take this talker's {self._own}: add --type {kind}"
+            return f"{text}, but this talker sends {self._own}: add --type {kind}"
         if kind not in self._why_not:
             self._heard[kind] = 0
             self._why_not[kind] = self._count(kind, partial(self._keep, kind))

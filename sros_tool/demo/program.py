@@ -168,7 +168,7 @@ def run_demo(options: DemoOptions, now: datetime, progress: Progress) -> DemoRes
         raise UsageError(
             "--keystore cannot be used with --backend zenoh",
             "The demo on Zenoh attacks keystores of its own.",
-            "Leave out one of them.",
+            "Leave out one of the two options.",
         )
     user = _user_keystore(options, now)
     if user:
@@ -307,7 +307,7 @@ def _check_accepted(options: DemoOptions) -> None:
         raise UsageError(
             "--accept-open is given without --keystore",
             "Only attacks that your own keystore allows can be accepted.",
-            "Leave it out, or name the keystore.",
+            "Leave out --accept-open, or add --keystore KEYSTORE.",
         )
     rows = {
         row.name
@@ -344,8 +344,8 @@ def _user_keystore(options: DemoOptions, now: datetime) -> UserKeystore | None:
     for scenario in options.scenarios:
         if not scenario.any_keystore:
             raise UsageError(
-                f"the scenario {scenario.name} cannot run in a keystore of yours",
-                "It needs enclaves with the rights of the scenario's policy.",
+                f"the scenario {scenario.name} cannot run in your keystore",
+                "The scenario needs enclaves with the rights of its own policy.",
                 "Use --keystore only with --scenario attacks.",
             )
     topic = "" if options.topic is None else check_topic(options.topic)
@@ -398,7 +398,7 @@ def _domains(
             raise UnavailableError(
                 "cannot attack a keystore here",
                 f"Each row needs a separate network namespace ({isolation.reason}).",
-                "Run it as root, or where unprivileged user namespaces are allowed.",
+                "Run the demo as root, or where unprivileged user namespaces are allowed.",
             )
         return (next(iter(user.domains)),) * len(scenario.rows)
     if scenario.router:  # each row has its own router, so domains may repeat
@@ -413,7 +413,7 @@ def _domains(
     if not 0 <= options.domain <= last:
         raise UsageError(
             f"the demo cannot start at domain {options.domain}",
-            f"It uses {len(scenario.rows)} domains in a row, and the highest is {MAX_DOMAIN}.",
+            f"The demo uses {len(scenario.rows)} consecutive domains; the highest is {MAX_DOMAIN}.",
             f"Choose a domain from 0 to {last}.",
         )
     return tuple(range(options.domain, options.domain + len(scenario.rows)))

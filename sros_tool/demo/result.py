@@ -263,7 +263,8 @@ def _judge_claim(claim: Claim, record: RowRecord) -> _ClaimFinding:
         if problem := _why_not_running(name, record.parties[name]):
             unexpected = problem.status is RowStatus.REFUSED is not claim.expected
             if unexpected and _is_of_user(name, record.row):
-                hint = f'to expect this, write {{ party = "{name}", expected = "refused" }}'
+                expected = f'{{ party = "{name}", expected = "refused" }}'
+                hint = f"if you expect this, write the claim {expected}"
                 return problem._replace(detail=f"{problem.detail}; {hint}")
             return _with_evidence(problem, claim, record)
     if claim.relation is Relation.IS_REFUSED:
@@ -284,7 +285,7 @@ def _judge_hearing(case: _ClaimRecords) -> _ClaimFinding:
     claim, record = case.claim, case.record
     sent = {event.text for event in case.messages_sent(case.talker)}
     if not sent:
-        return _undecided(f"{claim.talker} sent nothing in the window")
+        return _undecided(f"{claim.talker} sent nothing during the observation")
     heard = case.heard()
     if record.row.meanwhile is not None:  # messages before the change prove nothing
         heard = [event for event in heard if _is_in_window(event, record)]
@@ -296,7 +297,7 @@ def _judge_hearing(case: _ClaimRecords) -> _ClaimFinding:
 def _judge_answers(case: _ClaimRecords) -> _ClaimFinding:
     claim, asked = case.claim, case.messages_sent(case.subject)
     if not asked:
-        return _undecided(f"{claim.subject} sent no request in the window")
+        return _undecided(f"{claim.subject} sent no request during the observation")
     answers = case.heard()
     within = sum(_is_in_window(event, case.record) for event in answers)
     right = f"{min(within, len(asked))} right answers from the {claim.talker}"
@@ -307,7 +308,7 @@ def _judge_execution(case: _ClaimRecords) -> _ClaimFinding:
     """Judge a call by the requests that the server executed, because a reply may be lost."""
     claim, asked = case.claim, case.messages_sent(case.talker)
     if not asked:
-        return _undecided(f"{claim.talker} sent no request in the window")
+        return _undecided(f"{claim.talker} sent no request during the observation")
     reached = case.heard()
     number = f"{min(len(reached), len(asked))} of {len(asked)} requests of the {claim.talker}"
     return case.result(bool(reached), f"{claim.subject} executed {number}")
@@ -364,8 +365,8 @@ def _judge_replay(case: _ClaimRecords) -> _ClaimFinding:
     repeated = sum(event.time >= injected.time for event in case.heard())
     return case.result(
         repeated > 0,
-        f"{claim.subject} heard {repeated} messages in {injected.packets} packets of the "
-        f"{claim.talker} that were sent again, twice, after the talker had left",
+        f"{claim.subject} heard {repeated} messages when {injected.packets} packets of the "
+        f"{claim.talker} were sent again (twice) after the {claim.talker} had left",
     )
 
 
@@ -396,12 +397,12 @@ def _judge_view(case: _ClaimRecords) -> _ClaimFinding:
     serves = case.record.row.party(claim.talker).role is Role.SERVER
     # A server only has to exist; no client has to call it.
     if not serves and not case.messages_sent(case.talker):
-        return _undecided(f"{claim.talker} sent nothing in the window")
+        return _undecided(f"{claim.talker} sent nothing during the observation")
     looks = [
         e for e in observer.events if e.kind is EventKind.SEEN and _is_in_window(e, case.record)
     ]
     if not looks:
-        return _undecided(f"{claim.subject} made no count in the window")
+        return _undecided(f"{claim.subject} made no count during the observation")
     most = max(event.publishers.get(topic, 0) for event in looks)
     counted = f"{most} {'servers' if serves else 'publishers'} on {topic}"
     return case.result(most > 0, f"{observer.through} counts {counted} in {len(looks)} polls")
@@ -410,7 +411,7 @@ def _judge_view(case: _ClaimRecords) -> _ClaimFinding:
 def _judge_loss(case: _ClaimRecords) -> _ClaimFinding:
     claim, topic = case.claim, case.talker.topic
     if not any(event.kind is EventKind.SENT for event in case.talker.events):
-        return _undecided(f"{claim.talker} found no node")
+        return _undecided(f"{claim.talker} found no node to remove")
     looks = [event for event in case.subject.events if event.kind is EventKind.SEEN]
     most = max((event.publishers.get(topic, 0) for event in looks), default=0)
     if not most:
@@ -418,7 +419,7 @@ def _judge_loss(case: _ClaimRecords) -> _ClaimFinding:
     # Only inside the window, because the talker ends after it.
     inside = [event for event in looks if _is_in_window(event, case.record)]
     if not inside:
-        return _undecided(f"{claim.subject} made no count in the window")
+        return _undecided(f"{claim.subject} made no count during the observation")
     left = inside[-1].publishers.get(topic, 0)
     detail = f"{case.subject.through} counts {most} publishers on {topic}, and {left} after "
     return case.result(not left, f"{detail}{claim.talker} tried to remove the node")
@@ -657,7 +658,7 @@ class DemoResult:
 
 _MOST_IDS, _ALL_IDS = 3, 10_000
 _MOST_NAMES = 4
-_UNKNOWN = "its version is not known, or no advisory is about it"
+_UNKNOWN = "sros does not know the loaded version, or has no advisory about this library"
 
 
 class UsedLibrary(NamedTuple):
@@ -843,7 +844,7 @@ def _left_out_clauses(result: DemoResult) -> Iterator[str]:
             yield f"{scenario.keystore.elsewhere} could not (no key in the keystore)"
         if scenario.not_tried:
             names = "; ".join(scenario.not_tried)
-            yield f"not proved, because something was not tried ({names})"
+            yield f"the proof is incomplete, because these tests did not run: {names}"
 
 
 def summary_page(result: DemoResult, now: datetime) -> str:
@@ -854,8 +855,8 @@ def summary_page(result: DemoResult, now: datetime) -> str:
     lines = [
         "# Security demo: expected and observed",
         "",
-        f"Run {iso(now)} with `sros demo` on {result.dds}; expected statuses are those of"
-        f" the keystore template `{result.template}`: **{_verdict(result, wrong)}**",
+        f"Run {iso(now)} with `sros demo` on {result.dds}. The expected results are those of"
+        f" the keystore template `{result.template}`. **{_verdict(result, wrong)}**",
         "",
         result.vulnerabilities,
         "",
@@ -896,10 +897,10 @@ def _summary_cast(members: Sequence[CastMember]) -> list[str]:
 
 def _verdict(result: DemoResult, wrong: Sequence[RowResult]) -> str:
     known = sum(1 for row in result.rows if row.known_open)
-    good = "as expected" if result.as_expected else "as expected where it was tried"
+    good = "as expected" if result.as_expected else "as expected in all rows that ran"
     parts = [f"{len(wrong)} of {len(result.rows)} rows not as expected" if wrong else good]
     if known:
-        parts.append(f"{known} attacks that are known to succeed")
+        parts.append(f"{counted(known, 'attack')} known to succeed")
     return ", ".join([*parts, *_left_out_clauses(result)]) + "."
 
 

@@ -101,7 +101,7 @@ def test_a_talker_on_rclpy_takes_a_type() -> None:
     for role, on, kind, said in (
         (Role.LISTENER, "rclpy", "geometry_msgs/msg/Twist", "only a talker on rclpy takes a type"),
         (Role.TALKER, "cyclone", "geometry_msgs/msg/Twist", "only a talker on rclpy takes a type"),
-        (Role.TALKER, "rclpy", "Twist", "is no type of messages"),
+        (Role.TALKER, "rclpy", "Twist", "is not a message type"),
     ):
         with pytest.raises(UsageError, match=said):
             HandNode(role, on, "/cmd_vel", kind)
@@ -245,7 +245,7 @@ def test_a_node_by_hand_says_what_others_have_of_another_type(tmp_path: Path) ->
 
     heard, driven, seen = apart(played)
     assert heard == " message of nav_msgs/msg/Odometry"
-    assert driven.startswith("/cmd_vel has 1 subscription of geometry_msgs/msg/Twist, which does")
+    assert driven.startswith("/cmd_vel has 1 subscription of geometry_msgs/msg/Twist, but this ")
     assert seen == "/odom has 1 publisher of nav_msgs/msg/Odometry"
 
 

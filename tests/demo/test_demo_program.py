@@ -199,7 +199,7 @@ def test_rows_that_nobody_has_are_refused() -> None:
     [
         (("--scenario", "nothing"), "no scenario 'nothing'"),
         (("--summary", "no/such/folder/x.md"), "Its folder does not exist"),
-        (("--keystore", "x"), "isolation cannot run in a keystore of yours"),
+        (("--keystore", "x"), "isolation cannot run in your keystore"),
         (("--topic", ""), "not a topic name"),
         (("--accept-open", "x"), "--accept-open is given without --keystore"),
     ],

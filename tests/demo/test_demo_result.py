@@ -93,7 +93,7 @@ OLD = MappedLibrary("Fast DDS", "2.14.5", "/opt/ros/jazzy/lib/libfastrtps.so.2.1
             "has no known vulnerability; 2 other vulnerabilities may affect it.",
         ),
         (OLD._replace(version=""), "of unknown version, which the processes loaded, may have"),
-        (None, "Cyclone DDS 0.10.2 may have vulnerabilities: its version is not known"),
+        (None, "Cyclone DDS 0.10.2 may have vulnerabilities: sros does not"),
     ],
 )
 def test_the_known_holes_with_which_it_ran_are_named(

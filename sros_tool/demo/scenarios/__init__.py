@@ -186,7 +186,7 @@ class _Table(NamedTuple):
         value = self.data.get(key, default)
         if not isinstance(value, str) or (default is None and not value):
             lacks = f"the {self.kind or 'scenario'} has no {key}"
-            present = f"{key} is {value!r}, not a string"
+            present = f"{key} is {value!r}, not a string" if value else f"{key} is empty"
             raise self.error(key, present if key in self.data else lacks)
         return value
 
@@ -224,8 +224,9 @@ def _read_scenario(table: _Table) -> Scenario:
     for party_table in table.tables("party"):
         party = _read_party(party_table, policy)
         file = party.name.replace(" ", "_")
-        if any(name.replace(" ", "_") == file for name in parties):
-            raise party_table.error("name", f"there are two parties {party.name!r}")
+        if twin := next((name for name in parties if name.replace(" ", "_") == file), ""):
+            spelt = "" if twin == party.name else f": {twin!r} differs only in blanks"
+            raise party_table.error("name", f"there are two parties {party.name!r}{spelt}")
         parties[party.name] = party
     rules = Rules(policy_rights(policy))
     rows = tuple(_read_row(row_table, parties, rules) for row_table in table.tables("row"))
@@ -237,7 +238,10 @@ def _read_party(table: _Table, policy: Policy) -> Party:
     name = table.text("name")
     if not _NAME.fullmatch(name):
         problem = f"{name!r} cannot be the name of a party"
-        remedy = "Use at most 64 letters, digits, blanks, '.', '_' and '-'."
+        remedy = (
+            "Start with a letter or digit, and use at most 64 letters, digits, blanks, '.', '_'"
+            " and '-'."
+        )
         raise table.error("name", problem, remedy)
     roles = {role.value: role for role in Role if role not in _ZENOH_ROLES}
     word = table.text("role")
@@ -246,7 +250,7 @@ def _read_party(table: _Table, policy: Policy) -> Party:
     role = roles[word]
     topic = table.text("topic", "")
     if not topic and role in _ROLES_WITH_NAMES:
-        problem = f"the {word} {name!r} needs a topic: the name of its service or action"
+        problem = f"the {word} {name!r} needs the key topic: the name of its service or action"
         raise table.error("name", problem)
     try:
         topic = check_topic(topic) if topic else ""
@@ -266,12 +270,12 @@ def _read_identity(table: _Table, policy: Policy) -> Identity:
         for key in ("keystore", "variables"):
             if key in table.data:
                 problem = f"{key} needs an enclave, but this party is unsecured"
-                raise table.error(key, problem, "Give it an enclave.")
+                raise table.error(key, problem, "Give the party an enclave.")
         return UNSECURED
     if policy.enclave(enclave) is None:
         paths = [known.path for known in policy.enclaves]
         close = difflib.get_close_matches(enclave, paths, n=1)
-        hint = f"; did you mean {close[0]}?" if close else f"; it has {', '.join(paths)}"
+        hint = f"; did you mean {close[0]}?" if close else f"; its enclaves are {', '.join(paths)}"
         raise table.error("enclave", f"the policy has no enclave {enclave!r}{hint}")
     variables = table.data.get("variables", {})
     if not isinstance(variables, dict) or not all(
@@ -280,7 +284,7 @@ def _read_identity(table: _Table, policy: Policy) -> Identity:
         raise table.error("variables", "variables is not a table of strings")
     for variable in variables:
         if variable not in _VARIABLES:
-            problem = f"{variable!r} is not a variable for a party; use {', '.join(_VARIABLES)}"
+            problem = f"a party cannot set {variable!r}, only {', '.join(_VARIABLES)}"
             raise table.error("variables", problem)
     return Identity(keystores[word], enclave, tuple(variables.items()))
 
@@ -333,15 +337,17 @@ def _read_claim(table: _Table, key: str, claim: Any, parties: Mapping[str, Party
             raise table.error(key, problem)
         role = parties[name].role
         if role not in (SPEAKING if relation is Relation.READABLE else _ROLES_OF_KEY[side]):
-            problem = f"{name} is a {role}, and cannot be the {side} of a claim {expected!r}"
+            problem = (
+                f"{name} has the role {role}, so it cannot be the {side} of a claim {expected!r}"
+            )
             raise table.error(key, problem)
     if relation is Relation.IS_ANSWERED:
         client, server = (parties[name].role for name in names)
         if (client is Role.ACTION_CLIENT) is not (server is Role.ACTION_SERVER):
-            problem = f"{names[0]} has the role {client}, and {names[1]} {server}"
+            problem = f"{names[0]} has the role {client}, and {names[1]} the role {server}"
             remedy = (
-                "A client of an action has the role action_client, its server action_server; "
-                "those of a service are client and server."
+                "For an action, use the roles action_client and action_server; for a service, "
+                "client and server."
             )
             raise table.error(key, problem, remedy)
     return Claim(relation, names[0], names[1] if len(names) > 1 else "", holds)
@@ -372,8 +378,8 @@ def _check_controls(
         elif claim.talker and not _may_send(talker, rules):
             problem = f"{talker.identity.enclave} lacks the right to speak, so nobody hears it"
             remedy = (
-                f"A process of this enclave is refused. Claim that: {{ party = "
-                f'"{talker.name}", expected = "refused" }}, with a control that something works.'
+                f'Claim the refusal: {{ party = "{talker.name}", expected = "refused" }}. '
+                "Add a control that something works."
             )
         raise table.error("claim", f"{problem}: a crash would look the same", remedy)
 
@@ -435,6 +441,8 @@ def choose_scenarios(names: Sequence[str], *, on_zenoh: bool = False) -> tuple[S
             raise UsageError(
                 f"there is no scenario {name!r}",
                 f"sros has {', '.join(known)}{' on Zenoh' if on_zenoh else ''}.",
-                "Name one of them, `all`, or a TOML file.",
+                "Name one of them or `all`."
+                if on_zenoh
+                else "Name one of them, `all`, or a TOML file.",
             )
     return tuple(chosen.values())

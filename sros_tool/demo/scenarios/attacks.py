@@ -52,7 +52,7 @@ _LET_IN = (
 )
 _UNCONTROLLED = (
     "the template does not control access to this topic",
-    "keep read_access_control and write_access_control on",
+    "switch read_access_control and write_access_control on in the template",
 )
 
 
@@ -305,7 +305,7 @@ _NETWORK_ROWS: tuple[Row, ...] = (
                     (Condition.IN_CLEAR,),
                     RowStatus.READABLE,
                     "the template does not encrypt the payload of this topic",
-                    'set data = "ENCRYPT" for this topic',
+                    'set data = "ENCRYPT" for this topic in the template',
                 ),
             ),
         ),
@@ -326,7 +326,7 @@ _NETWORK_ROWS: tuple[Row, ...] = (
                 "packets of a secured talker sent again",
                 Relation.HEARS_AGAIN,
                 RowStatus.NOT_HEARD_AGAIN,
-                "each pair of participants agrees on new keys, so that old packets are rejected",
+                "each pair of participants agrees on new keys, so old packets are rejected",
                 OWN,
             ),
             variants=(
@@ -334,8 +334,8 @@ _NETWORK_ROWS: tuple[Row, ...] = (
                     (Condition.UNAUTHENTICATED, Condition.FAST),
                     RowStatus.NOT_HEARD_AGAIN,
                     mechanism=(
-                        "the packets show an identity: Fast DDS waits until their sender "
-                        "authenticates"
+                        "the packets announce an identity, so Fast DDS waits until their "
+                        "sender authenticates"
                     ),
                 ),
                 *_variants_without_defense(RowStatus.HEARD_AGAIN, RowStatus.NOT_HEARD_AGAIN),
@@ -369,7 +369,7 @@ _NETWORK_ROWS: tuple[Row, ...] = (
                     (Condition.UNSIGNED,),
                     RowStatus.DECEIVED,
                     "the template neither signs nor encrypts the messages of this topic",
-                    'set rtps = "SIGN" or "ENCRYPT", or protect the topic',
+                    'set rtps = "SIGN" or "ENCRYPT" in the template, or protect this topic',
                 ),
             ),
         ),
@@ -448,7 +448,7 @@ _NETWORK_ROWS: tuple[Row, ...] = (
             "an unsecured node injects",
             UNSECURED,
             RowStatus.NOT_HEARD,
-            "a listener in a closed domain ignores a talker that cannot authenticate",
+            "a secured listener ignores a talker that cannot authenticate",
         ),
         _injection_row(
             "an unsecured node injects, open governance",
@@ -646,13 +646,13 @@ def revoked_enclave_row(enclave: str, has_list: bool) -> Row:
         f"{enclave}, revoked, joins the other enclaves",
         Identity(OWN, enclave),
         RowStatus.NOT_LET_IN if has_list else RowStatus.NOT_VISIBLE,
-        "the revocation list of the keystore names its certificate",
+        "the keystore's revocation list contains the certificate of this enclave",
     )
 
 
 # ── with certificates and keys ─────────────────────────────────────────────────────────────
 
-_DATES_CHECKED = "the attacker's own DDS checks the dates of its certificate before it joins"
+_DATES_CHECKED = "before the attacker's own DDS joins, it checks the dates of the certificate"
 _NO_LIST = "without crl.pem, DDS does not check for revocation"
 
 _IDENTITY_ROWS: tuple[Row, ...] = (
@@ -752,21 +752,21 @@ _ONE_CA = Variant(
     (Condition.ONE_CA,),
     RowStatus.HEARD,
     "with one CA for identity and permissions, this DDS accepts permissions that any enclave has"
-    " signed (the class of CVE-2023-24011)",
+    " signed (as in CVE-2023-24011)",
     "use a keystore with separate CAs (template development or production)",
 )
 _TRUSTED_AS_SIGNER = _injection_row(
     "permissions signed by the enclave itself, a trusted signer",
     Identity(Undefended(forger.enclave_among_the_signers), "guest"),
     RowStatus.HEARD,
-    "every certificate in the file of the permissions CA may sign",
+    "DDS accepts every certificate in the file of the permissions CA as signer",
     defence_removed="a permissions CA file that contains only the CA",
 )
 _SAME_SUBJECT = _injection_row(
     "permissions borrowed, the same subject",
     Identity(Undefended(forger.borrowed_permissions_and_subject), "guest"),
     RowStatus.HEARD,
-    "the same permissions are valid for two certificates with one subject name",
+    "permissions are valid for every certificate with their subject name",
     defence_removed="a unique subject name",
 )
 
@@ -799,14 +799,14 @@ _PERMISSIONS_ROWS: tuple[Row, ...] = (
             "the attacker's own permissions CA",
             Identity(forger.own_permissions_ca, "guest"),
             RowStatus.NOT_HEARD,
-            "the attacker's DDS accepts this CA; its peers verify with the CA that they trust",
+            "the attacker's DDS accepts this CA, but its peers trust only the real CA",
             Variant((Condition.FAST,), RowStatus.NOT_HEARD),
         ),
         _injection_row(
             "the attacker's own permissions CA, trusted by the listener",
             Identity(Undefended(forger.another_permissions_ca_trusted), "guest"),
             RowStatus.HEARD,
-            "the listener accepts what the permissions CA that it trusts has signed",
+            "the listener trusts this CA, so it accepts the permissions",
             defence_removed="the listener's permissions CA",
         ),
     ),
@@ -816,7 +816,8 @@ _PERMISSIONS_ROWS: tuple[Row, ...] = (
             "permissions signed by the enclave itself",
             Identity(forger.permissions_signed_by_itself, "guest"),
             RowStatus.NOT_LET_IN,
-            "the permissions CA signs only documents, and never the certificate of an enclave",
+            "the enclave's certificate is not from the permissions CA, so it cannot sign"
+            " permissions",
             Variant(
                 (Condition.EXACT_SIGNER,),
                 RowStatus.NOT_LET_IN,
@@ -828,7 +829,7 @@ _PERMISSIONS_ROWS: tuple[Row, ...] = (
             "permissions and governance signed by the enclave",
             Identity(forger.permissions_and_governance_signed_by_itself, "guest"),
             RowStatus.NOT_HEARD,
-            "the attacker changes the CA file for its DDS; its peers verify with the real CA",
+            "the attacker changes only its own CA file; its peers verify with the real CA",
             Variant(
                 (Condition.EXACT_SIGNER, Condition.CYCLONE),
                 RowStatus.NOT_LET_IN,
@@ -837,7 +838,7 @@ _PERMISSIONS_ROWS: tuple[Row, ...] = (
             Variant(
                 (Condition.EXACT_SIGNER,),
                 RowStatus.NOT_HEARD,
-                mechanism="the attacker changes the CA file for its DDS; its peers accept only the"
+                mechanism="the attacker changes only its own CA file; its peers accept only the"
                 " real CA",
             ),
             _ONE_CA,
@@ -862,7 +863,7 @@ _PERMISSIONS_ROWS: tuple[Row, ...] = (
             "permissions borrowed from a longer enclave name",
             Identity(forger.borrowed_permissions, "guest"),
             RowStatus.NOT_LET_IN,
-            "every subject name has a unique part",
+            "every subject name has a unique part, so none contains another",
             Variant(
                 (Condition.FAST,),
                 RowStatus.NOT_LET_IN,
@@ -871,7 +872,8 @@ _PERMISSIONS_ROWS: tuple[Row, ...] = (
             Variant(
                 (Condition.SHARED_SUBJECTS, Condition.CYCLONE),
                 RowStatus.HEARD,
-                "Cyclone DDS 0.10 accepts permissions for a longer subject with the same parts",
+                "Cyclone DDS 0.10 accepts permissions for a longer subject name that contains all"
+                " parts of the certificate's",
                 "use the template production (unique_subject), or enclave names that do not contain"
                 " each other",
             ),
@@ -893,11 +895,11 @@ _PERMISSIONS_ROWS: tuple[Row, ...] = (
                 "old permissions put back",
                 Identity(forger.permissions_signed_by_the_ca, "guest"),
                 RowStatus.HEARD,
-                "what the CA has signed is valid until it expires",
+                "permissions that the CA has signed are valid until they expire",
             ),
             "DDS Security 1.1 cannot revoke permissions (sros2#275)",
-            "after taking rights away: `sros renew` with the template production, or `sros revoke`"
-            " and a new enclave",
+            "after you take rights away, run `sros renew` (template production), or `sros revoke`"
+            " and make a new enclave",
         ),
     ),
     *tries(
@@ -911,7 +913,8 @@ _PERMISSIONS_ROWS: tuple[Row, ...] = (
                 (Condition.SHARED_SUBJECTS,),
                 RowStatus.HEARD,
                 "the renewed certificate has the same subject name as the old one",
-                "use the template production (unique_subject), or `sros revoke` and a new enclave",
+                "use the template production (unique_subject), or run `sros revoke` and make a new"
+                " enclave",
             ),
         ),
         _injection_row(
@@ -952,7 +955,8 @@ _PERMISSIONS_ROWS: tuple[Row, ...] = (
                 (Condition.OPEN_JOIN, Condition.UNCONTROLLED),
                 RowStatus.HEARD,
                 "the template controls neither who joins nor who uses the topic",
-                "leave join_access_control and the access control of topics switched on",
+                "switch join_access_control, read_access_control and write_access_control on in the"
+                " template",
             ),
             Variant(
                 (Condition.FAST,),
@@ -963,14 +967,16 @@ _PERMISSIONS_ROWS: tuple[Row, ...] = (
                 (Condition.OPEN_JOIN,),
                 RowStatus.REFUSED,
                 "the template does not control who joins the domain",
-                "keep join_access_control on",
-                mechanism="its DDS joins, and then finds no rule for the topic in this domain",
+                "switch join_access_control on in the template",
+                mechanism="the attacker's DDS joins, but finds no rule for the topic in this"
+                " domain",
             ),
             *_variants_without_defense(RowStatus.HEARD, RowStatus.NOT_HEARD),
             Variant(
                 (Condition.UNCONTROLLED,),
                 RowStatus.NOT_HEARD,
-                mechanism="its DDS controls no topic; its peers find no rule for the domain",
+                mechanism="the attacker's DDS checks no topics; its peers find no rule for the"
+                " domain",
             ),
         ),
         _discovery_row(
@@ -982,7 +988,7 @@ _PERMISSIONS_ROWS: tuple[Row, ...] = (
                 (Condition.OPEN_JOIN,),
                 RowStatus.VISIBLE,
                 "the template does not control who joins the domain",
-                "keep join_access_control on",
+                "switch join_access_control on in the template",
             ),
             Variant(
                 (Condition.FAST,),
@@ -998,7 +1004,8 @@ _PERMISSIONS_ROWS: tuple[Row, ...] = (
             Variant(
                 (Condition.UNCONTROLLED,),
                 RowStatus.NOT_VISIBLE,
-                mechanism="its DDS controls no topic; its peers find no rule for the domain",
+                mechanism="the attacker's DDS checks no topics; its peers find no rule for the"
+                " domain",
             ),
         ),
         _successful_injection_row(
@@ -1027,8 +1034,8 @@ _PERMISSIONS_ROWS: tuple[Row, ...] = (
                 forger.weaker_governance,
             ),
             "DDS Security 1.1 cannot revoke a governance document",
-            "after strengthening the governance (`sros update_keystore`): `sros rotate_ca "
-            "--permissions`, so that nobody trusts the CA of the weaker governance",
+            "after you strengthen the governance (`sros update_keystore`), run `sros rotate_ca "
+            "--permissions`: then nobody trusts the CA that signed the weaker governance",
         ),
         _injection_row(
             "weaker governance, signed by the permissions CA",

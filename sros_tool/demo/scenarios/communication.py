@@ -97,7 +97,7 @@ ROWS: tuple[Row, ...] = (
     Row(
         "unsecured talker to secured listener",
         RowStatus.NOT_HEARD,
-        "a listener in a closed domain ignores a talker that cannot authenticate",
+        "a secured listener ignores a talker that cannot authenticate",
         (_OPEN_TALKER, _SECURED_LISTENER, _OPEN_LISTENER),
         (_SECURED_HEARS_NOT,),
         (_OPEN_HEARS,),

@@ -477,8 +477,8 @@ def check_topic(topic: str) -> str:
     if len(topic) > _MAX_TOPIC_LENGTH or not _ROS_TOPIC.match(topic):
         raise UsageError(
             f"{topic!r} is not a topic name that the demo can use",
-            "It must be made of letters, digits and underscores, in parts joined by '/', none of"
-            f" which starts with a digit, and have at most {_MAX_TOPIC_LENGTH} characters.",
+            f"A name has at most {_MAX_TOPIC_LENGTH} characters. Its parts, joined by '/', consist"
+            " of letters, digits and underscores, and do not start with a digit.",
             "Use a name such as /chatter or /robot/camera.",
         )
     absolute = topic if topic.startswith("/") else f"/{topic}"

@@ -155,7 +155,7 @@ def _topic_rows(link_mode: str, keystore: KeystoreChoice, world: str) -> tuple[R
         _attempt_row(
             f"talker to listener, {link_mode}",
             RowStatus.HEARD,
-            "the rules allow the topic to both, by the names in their certificates",
+            "the rules allow the topic to the names in both certificates",
             hears("listener", "talker"),
             pair,
             world=world,
@@ -169,7 +169,7 @@ def _topic_rows(link_mode: str, keystore: KeystoreChoice, world: str) -> tuple[R
             _attempt_row(
                 f"{party.name}, {link_mode}",
                 RowStatus.NOT_HEARD,
-                "no rule allows it, and what no rule allows is dropped",
+                "no rule gives the enclave this right, and Zenoh drops what no rule allows",
                 claim,
                 (*pair, party),
                 _CHATTER,
@@ -187,7 +187,7 @@ _ISOLATION = _scenario(
     _attempt_row(
         "unsecured talker to unsecured listener",
         RowStatus.HEARD,
-        "no security: what rmw_zenoh does by itself",
+        "by default, rmw_zenoh has no security",
         hears("unsecured listener", "unsecured talker"),
         (
             _router(None),
@@ -198,7 +198,7 @@ _ISOLATION = _scenario(
     _attempt_row(
         "talker in the graph of another enclave",
         RowStatus.VISIBLE,
-        "every node needs the graph, and its token names the enclave of its certificate",
+        "every node may see the graph, and the talker's token names the enclave of its certificate",
         Claim(Relation.SEES, "observer", "talker"),
         (*_topic_pair(), _permitted_party("observer", Role.OBSERVER, OWN, "client")),
         world=_PEERS,
@@ -246,7 +246,7 @@ _SERVICES = _scenario(
     _unpermitted_service_row(
         "enclave that poses as the server",
         Role.SERVER,
-        "nobody hears that it offers the service",
+        "nobody receives its announcement of the service",
         "posing server",
         "server",
         "client",
@@ -270,7 +270,7 @@ _SERVICES = _scenario(
     _unpermitted_service_row(
         "enclave that poses as the action server",
         Role.ACTION_SERVER,
-        "nobody hears that it offers the action",
+        "nobody receives its announcement of the action",
         "posing action server",
         "action server",
         "action client",
@@ -286,7 +286,7 @@ def _wiretap_rows(attack: str, wire: Wire, *, readable: bool) -> tuple[Row, ...]
     row = Row(
         f"{attack}, without TLS" if readable else attack,
         RowStatus.READABLE if readable else RowStatus.NOT_READABLE,
-        "TCP sends it unencrypted" if readable else hidden,
+        "TCP encrypts nothing" if readable else hidden,
         _topic_pair(zenoh_forger.links_in_the_clear if readable else OWN),
         (Claim(Relation.READABLE, "talker", holds=readable, wire=wire),),
         _CHATTER,
@@ -316,14 +316,14 @@ def _shared_memory_row(name: str, keystore: KeystoreChoice, *, readable: bool) -
     return Row(
         name,
         RowStatus.READABLE if readable else RowStatus.NOT_READABLE,
-        "a large message lies in shared memory unencrypted"
+        "large messages lie unencrypted in shared memory"
         if readable
-        else "the Zenoh files switch shared memory off: TLS carries large messages, too",
+        else "the Zenoh files switch shared memory off, so large messages also go through TLS",
         (wide, replace(talker, size=_LARGE_BYTES), listener),
         (Claim(Relation.READABLE, "talker", holds=readable, wire=Wire.MEMORY),),
         _CHATTER,
         brief=True,
-        defence_removed="`shared_memory` off" if readable else "",
+        defence_removed="switching shared memory off" if readable else "",
     )
 
 
@@ -365,7 +365,7 @@ def _accepted_connection_row(name: str, keystore: KeystoreChoice, defence_remove
     return _attempt_row(
         name,
         RowStatus.HEARD,
-        "it gets a connection, and rules without a name let it through",
+        "the attacker gets a connection, and the rules let every name through",
         hears("listener", party.name),
         (wide, listener, party),
         defence_removed=defence_removed,
@@ -560,7 +560,8 @@ def _past_the_router(party: Party, attack: str, denied: RowStatus, done: RowStat
             attack,
             party,
             denied,
-            "every session enforces the rights of all others, by their certificates",
+            "every session enforces the rights of all other enclaves, which it knows by their "
+            "certificates",
             OWN,
             _PEERS,
         ),
@@ -714,7 +715,7 @@ _ROUTERS = _scenario(
     _attempt_row(
         "talker to listener at another router",
         RowStatus.HEARD,
-        "both routers pass on a name that --cross allows and to which both enclaves have rights",
+        "both routers pass on a name if --cross allows it and both enclaves have rights to it",
         hears("listener", "talker"),
         _far_pair(zenoh_forger.far_router),
     ),
@@ -748,7 +749,8 @@ def _rogue_far_router_row(name: str, keystore: KeystoreChoice, defence_removed: 
         RowStatus.HEARD if defence_removed else RowStatus.NOT_HEARD,
         "the router trusts this router"
         if defence_removed
-        else "a router trusts another router only by the name in its certificate",
+        else "a router accepts a sender as another router only if the sender's certificate has a "
+        "router's name",
         hears(rogue.name, "talker"),
         (rogue, replace(wide, turn=1), replace(talker, turn=2), replace(observer, turn=2)),
         (Claim(Relation.SEES, "observer", "talker"),),
@@ -934,7 +936,8 @@ def _erased_token_row(
     return _attempt_row(
         f"{_ERASING}{name_suffix}",
         RowStatus.ERASED if defence_removed else RowStatus.NOT_ERASED,
-        "when a token ends, the graph compares its session and name, but not the enclave"
+        "when a token ends, the graph removes the node with the same session and name, whatever "
+        "the enclave"
         if defence_removed
         else "a token passes only if the policy of its sender names the node",
         Claim(Relation.LOSES, "observer", "eraser"),
@@ -984,7 +987,7 @@ def _earlier_file_row(
     return _attempt_row(
         name,
         expected,
-        "only this file decides what its own process may do"
+        "only the session file of a process decides what this process may do"
         if defence_removed
         else "the files of the other enclaves decide what an enclave may do, "
         "not its own session file",
@@ -1043,7 +1046,7 @@ _EARLIER_ROWS = (
             "revoked identity, the rules not written again",
             zenoh_forger.revoked_talker_in_the_rules,
             RowStatus.HEARD,
-            "its name is still in the rules",
+            "the name of the enclave is still in the rules",
             "the new rules",
         ),
     ),
@@ -1068,14 +1071,15 @@ _OPEN_ROWS = (
             "the rules know only the name, which the old certificate has, too",
         ),
         "Zenoh has no revocation list (zenoh#2749)",
-        "give the enclave another name, or run `sros rotate_ca`; use a short validity",
+        "give the enclave another name, or run `sros rotate_ca`; a short validity ends such an "
+        "attack earlier",
     ),
     replace(
         _succeeding_attack(
             _attempt_row(
                 "rights taken away from running nodes",
                 RowStatus.HEARD,
-                "Zenoh reads its configuration at start",
+                "Zenoh reads its configuration only at start",
                 hears("listener", "talker"),
                 _topic_pair(zenoh_forger.rights_to_take_away),
             ),
