@@ -12,6 +12,7 @@ services are remapped (rcl, pull request 1170), which every version does.
 from __future__ import annotations
 
 import re
+from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
@@ -28,7 +29,15 @@ from sros_tool.names import (
 )
 from sros_tool.policy.model import ALLOW, DENY, Group, Policy, Profile
 from sros_tool.policy.patterns import matches
-from sros_tool.policy.rights import Right, Rules, placed_rights, policy_rights
+from sros_tool.policy.rights import (
+    NodeName,
+    Right,
+    Rules,
+    node_of,
+    placed_rights,
+    policy_rights,
+    profile_rights,
+)
 from sros_tool.wording import enumerated, first_few
 
 _RULE = re.compile(r"(?:([A-Za-z_]\w*):)?([^:=]+):=([^:=]+)")
@@ -185,8 +194,8 @@ def remapped_policies(
     """Return remapped policies, and notes on changes of the nodes' rights.
 
     ``texts`` are rules.  There is also a note for each DENY in ``file``, the policy to merge into,
-    that denies an old name but not its new name.  ``left_out`` are policies with nodes that --node
-    leaves out, for the error.
+    that denies an old name but not its new name, and for each node that keeps other names there.
+    ``left_out`` are policies with nodes that --node leaves out, for the error.
 
     Raises:
         UsageError: (or another error of `parse_remapping`) a text is not a rule, or a rule changes
@@ -214,7 +223,8 @@ def remapped_policies(
             notes.append(Note("merge.remapped-action", text))
     result = [policy for policy, _ in remapped]
     notes += _notes_on_requirements(policies, rules)
-    return result, [*notes, *_notes_on_old_names(file, result, moved)]
+    notes += _notes_on_old_names(file, result, moved)
+    return result, [*notes, *_notes_on_earlier_names(file, result, moved)]
 
 
 def _unused_rule_error(
@@ -327,6 +337,48 @@ def _notes_on_old_names(
                     "it there."
                 )
                 yield Note("merge.old-name-denied", text)
+
+
+def _notes_on_earlier_names(
+    file: Policy, remapped: Iterable[Policy], moved_names: Iterable[UsedRule]
+) -> Iterator[Note]:
+    """Yield a note for each node that gets a new name, and that has others in ``file``.
+
+    An earlier merge with other rules perhaps added these: a merge takes no name away.
+    """
+    before, after = (_rights_by_node(side) for side in ([file], remapped))
+    new_names = {(use.kind, use.new) for use in moved_names}
+    for node in sorted(before.keys() & after.keys()):
+        present, merged = Rules(before[node]), Rules(after[node])
+        words = {
+            right.right
+            for right in after[node]
+            if right.qualifier is not DENY
+            and (right.kind, right.name) in new_names
+            and not present.cover(right)
+        }
+        kept = [
+            right.describe()
+            for right in sorted(before[node])
+            if right.right in words and right.qualifier is not DENY and not merged.cover(right)
+        ]
+        if kept:
+            text = (
+                f"the node {expand('~', *node)} keeps rights that it does not have in the "
+                f"policies to merge: {first_few(kept, _MOST_SHOWN)}. If a merge with another "
+                "--remap added them, remove them by hand."
+            )
+            yield Note("merge.earlier-names", text)
+
+
+def _rights_by_node(policies: Iterable[Policy]) -> dict[NodeName, set[Right]]:
+    """Map the nodes of policies to their rights, without the enclave."""
+    rights: dict[NodeName, set[Right]] = defaultdict(set)
+    for policy in policies:
+        for enclave in policy.enclaves:
+            for profile in enclave.all_profiles():
+                rights[node_of(profile)].update(profile_rights("", profile))
+    return rights
 
 
 def remapped_policy(

@@ -168,6 +168,20 @@ def test_a_denial_of_an_old_name_in_the_file_is_told() -> None:
         assert [note.id for note in notes] == [OF_REQUIREMENTS]
 
 
+def test_names_of_an_earlier_merge_that_a_node_keeps_are_told() -> None:
+    camera = one(group("topics", "x y", publish="ALLOW"))
+    for names, rule, kept in (
+        ("/a y", "x:=/b", "to merge: publish topic /a. If"),
+        ("/a y", "x:=/a", ""),  # the same merge again
+        ("/* y", "x:=/b", ""),  # nothing is added
+        ("y", "x:=/b", ""),
+    ):
+        file = one(group("topics", names, publish="ALLOW"))
+        _, notes = remapped_policies([camera], [rule], file)
+        told = [note.text for note in notes if note.id == "merge.earlier-names"]
+        assert len(told) == bool(kept) and all(kept in text for text in told), (names, told)
+
+
 def test_a_name_of_no_single_node_is_remapped() -> None:
     for name, texts, names in (
         ("/l/a", ["a:=/b"], ["/b"]),
