@@ -1383,6 +1383,33 @@ def test_a_key_that_was_replaced_is_found_where_all_certificates_begin_at_a_fixe
     assert publisher.publish(restored=True).names("published") == ["r1", "r2", "r5"]
 
 
+def test_a_restored_keystore_makes_no_key_for_a_robot_that_made_its_own(publisher: Home) -> None:
+    """The robot came after the backup; only its release and its request have its key."""
+    root, fleet = publisher.root, publisher.folder / "fleet.toml"
+    policy = ("-p", "policy.xml", "--fleet", "fleet.toml")
+    backup = copy_of(root, publisher.folder / "backup")
+    fleet.write_text(f"{fleet.read_text()}[robots.r9]\n")
+    request = create_request(publisher.folder / "r9", "/r9/base").file
+    sign = ("sign_request", "ks", request, "--no-answer", *policy)
+    generate = ("generate_artifacts", "-k", "ks", *policy)
+    publisher.run(*sign)
+    publisher.run(*generate)
+    publisher.publish()
+    shutil.rmtree(root)
+    backup.rename(root)
+    publisher.publish(restored=True)
+    refused = sros(*generate, cwd=publisher.folder)
+    assert refused.status == 2 and "lacks /r9/base, certified after the last backup" in refused.err
+    assert "`sros sign_request ks REQUEST --no-answer -p POLICY_FILE --fleet" in refused.err
+    copy = copy_of(root, publisher.folder / "copy")
+    publisher.run("generate_artifacts", "-k", copy, "-e", "/r9/base", *policy)
+    publisher.run(*sign)
+    publisher.run(*generate)
+    assert not (root / "enclaves/r9/base/key.pem").exists()
+    assert (copy / "enclaves/r9/base/key.pem").exists()
+    assert "r9" in publisher.publish().names("published")
+
+
 def test_a_later_key_of_a_robot_is_certified_again_as_publishing_advises(publisher: Home) -> None:
     """Publishing records the certificate of this key, so that `revoke` would revoke the key."""
     root, name = publisher.root, "/r2/base"

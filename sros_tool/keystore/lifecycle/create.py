@@ -52,7 +52,7 @@ from sros_tool.keystore.issuing.enclave import (
     present_files,
     stated_enclave,
 )
-from sros_tool.keystore.known_keys import revoked_serials, subjects_since_restore
+from sros_tool.keystore.known_keys import restored_at, revoked_serials, subjects_since_restore
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     ENCLAVES,
@@ -388,22 +388,48 @@ def _revoked_before_notes(
     """Return a note for each revoked enclave that is created again because it is ``named``.
 
     Raises:
-        KeystoreError: a revoked enclave is not named, but still in a policy.
+        KeystoreError: an enclave is not named, but still in a policy, and was revoked, or got a
+            certificate after the backup from which the keystore was restored.
     """
     existing, known, root = frozenset(change.names), change.known, change.root
     missing = [name for name in wanted_names if name not in existing]
     revoked = known.revoked_before(missing) if missing else ()
     revoked_before = [name for name in missing if name in revoked]
+
+    def command(names: Sequence[str]) -> str:
+        return (
+            f"`sros generate_artifacts -k {quote(str(root))} -e {' '.join(names)} -p POLICY_FILE"
+            f"{' --fleet FLEET_FILE' if fleet else ''}`"
+        )
+
     if unasked := [name for name in revoked_before if name not in named]:
         raise KeystoreError(
             f"a policy names {', '.join(unasked)}, revoked in keystore '{root}'",
             "The policy would create it again, and `distribute_key --all` would export it.",
             f"Remove it from the policy{' or its robot from the fleet file' if fleet else ''}; or, "
             "to create it again with a new key and the rights of the policy, name it with -e: "
-            f"`sros generate_artifacts -k {quote(str(root))} -e {' '.join(unasked)} -p POLICY_FILE"
-            f"{' --fleet FLEET_FILE' if fleet else ''}`.",
+            f"{command(unasked)}.",
+        )
+    later = _certified_after_backup(change, missing) - {*revoked_before, *named}
+    if unasked := [name for name in missing if name in later]:
+        raise KeystoreError(
+            f"the keystore '{root}' lacks {first_few(unasked, 3)}, certified after the last backup",
+            "If a robot made its own key for such an enclave, a new key from here would not fit.",
+            "For keys that robots made, sign the requests again, with `sros sign_request "
+            f"{quote(str(root))} REQUEST --no-answer -p POLICY_FILE"
+            f"{' --fleet FLEET_FILE' if fleet else ''}`. For keys that were made here, name the "
+            f"enclaves with -e, so that they get new keys: {command(unasked)}. Then repeat this "
+            "command.",
         )
     return list(known.revoked_before_notes(revoked_before))
+
+
+def _certified_after_backup(change: KeystoreChange, missing: Sequence[str]) -> frozenset[str]:
+    """Return the enclaves in ``missing`` that got a valid certificate after the last backup."""
+    if not missing or not restored_at(change.keystore):
+        return frozenset()
+    shown = change.known.shown_after_restore(missing)
+    return frozenset(entry.enclave for entry in shown if entry.not_after > iso(change.now))
 
 
 def refuse_other_template(root: Path, template: Template) -> None:
