@@ -258,6 +258,11 @@ def _show(robot: LocalRobot, closed: CloseState) -> None:
             "  if this is a mistake, change the policy; otherwise, expect that the node may end "
             "when it starts"
         )
+    for name, rules in closed.denied_remappings.items():
+        echo(
+            f"the start command of {name} gives a name that the policy denies, by the remapping "
+            f"{enumerated(rules)}: change it before you start the process"
+        )
     if stays := len(closed.denied) - len(closed.newly_denied):
         rights = counted(stays, "right")
         echo(

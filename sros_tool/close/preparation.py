@@ -36,6 +36,7 @@ from sros_tool.close.state import (
 )
 from sros_tool.close.watch import check_watchable, watch
 from sros_tool.errors import SrosError, UsageError
+from sros_tool.explain.audit import DeniedRight
 from sros_tool.files import replace_file
 from sros_tool.folders import Folder
 from sros_tool.keystore.layout import (
@@ -49,10 +50,11 @@ from sros_tool.keystore.layout import (
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.rights import load_rights
 from sros_tool.keystore.selection import revocation_of
+from sros_tool.names import expand
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.rights import policy_rights
 from sros_tool.proof.requirements import RightsRequirement, read_requirements
-from sros_tool.runtime.environment import RMW_ZENOH, node_argument
+from sros_tool.runtime.environment import RMW_ZENOH, node_argument, remapping_rules
 from sros_tool.runtime.processes import SEVERAL_USERS, without_launch_files
 from sros_tool.runtime.rmw import (
     RMW,
@@ -116,7 +118,7 @@ def prepare(robot: LocalRobot, duration: str | None, *, partial: bool, dry_run: 
     denied_before: Sequence[str] = ()
     if robot.export.exists() and robot.observation_file.exists():
         with suppress(SrosError):  # the steps report the error
-            denied_before = _denied_access(robot)
+            denied_before = [str(right) for right in _denied_rights(robot)]
     done, problems, is_stopped = _run_steps(robot, duration, partial=partial, dry_run=dry_run)
     ignored = [] if dry_run else _ignore_in_git(robot)
     removed = [] if dry_run or is_stopped else _remove_enclaves(robot)
@@ -125,8 +127,11 @@ def prepare(robot: LocalRobot, duration: str | None, *, partial: bool, dry_run: 
     state = current_state(robot, robot.read_policy())._replace(steps=done, dry_run=dry_run)
     if dry_run or is_stopped:
         return state._replace(problems=problems, changes=ignored)
+    denied_rights = _denied_rights(robot)
+    remappings = _denied_remappings(denied_rights, state.observed.processes)
+    state = state._replace(denied_remappings=remappings)
     changes = [*ignored, *write_start_files(robot, state), *removed]
-    denied = _denied_access(robot)
+    denied = [str(right) for right in denied_rights]
     newly_denied = [right for right in denied if right not in denied_before]
     problems += _problems_of(robot, state, partial=partial)
     if not state.secured:
@@ -208,10 +213,32 @@ def _with_renamed_enclaves(robot: LocalRobot, observed: ObservedProcesses) -> Ob
     return observed._replace(processes=renamed)
 
 
-def _denied_access(robot: LocalRobot) -> list[str]:
-    """Return sentences on the access that observed nodes need and the keystore denies."""
+def _denied_rights(robot: LocalRobot) -> Sequence[DeniedRight]:
+    """Return the rights that observed nodes need and the keystore denies."""
     nodes = ObservedNodes(robot)
-    return [str(right) for right in nodes.denied_rights(nodes.expected())]
+    return nodes.denied_rights(nodes.expected())
+
+
+def _denied_remappings(
+    denied: Sequence[DeniedRight], processes: Sequence[ClosedProcess]
+) -> dict[str, Sequence[str]]:
+    """Map enclaves to the remapping rules of their start commands that give a denied name."""
+    remappings: dict[str, Sequence[str]] = {}
+    for process in processes:
+        names = {
+            (*node.rsplit("/", 1), right.right.name)
+            for right in denied
+            if right.right.enclave == process.enclave
+            for node in right.nodes
+        }
+        rules = [
+            f"{old}:={new}"
+            for _, old, new in remapping_rules(process.command)
+            if any(expand(new, ns or "/", node) == name for ns, node, name in names)
+        ]
+        if rules:
+            remappings[process.enclave] = rules
+    return remappings
 
 
 def _run_steps(

@@ -22,6 +22,7 @@ from sros_tool.runtime.environment import (
 from sros_tool.runtime.rmw import no_security_text
 from sros_tool.runtime.units import unit_changes, unit_instance, unit_words, write_units
 from sros_tool.runtime.variables import KEYSTORE
+from sros_tool.terminal import visible
 from sros_tool.values import FileChange
 from sros_tool.xml import read_bytes
 
@@ -114,14 +115,14 @@ def _commands_text(robot: LocalRobot, state: CloseState) -> str:
         lines = [f"# Stop each of these processes, and start it {place}", together]
     if not state.secured:
         lines = [*map(_warning_of_rmw, robot.rmws_without_security()), *lines]
-    lines = [*lines, *_commands(due, folder)] if due else []
+    lines = [*lines, *_commands(due, folder, state.denied_remappings)] if due else []
     for name in state.new:
         start = state.observed.command_of_new(robot.export.absolute(), name)
         why = "has ended" if name in state.observed.ended else "is new"
         lines += ["", f"# {name} {why}: COMMAND is what starts it", start]
     if rest:
         lines += ["", "# These processes run closed, with the current files."]
-    lines += _commands(rest, folder)
+    lines += _commands(rest, folder, state.denied_remappings)
     if shutil.which("ros2", path=robot.shell.environment.get("PATH")):
         launch = shlex.join(launch_words(folder, ("ros2", "launch"), ("PACKAGE", "FILE")))
         lines += ["", "# Any launch file; each process needs name= in it.", launch]
@@ -133,12 +134,20 @@ def _warning_of_rmw(rmw: str) -> str:
     return f"# NOT YET: {no_security_text(rmw)}. First find an RMW that enforces it: sros doctor"
 
 
-def _commands(by_hand: Mapping[str, Sequence[ClosedProcess]], folder: Path) -> Iterator[str]:
+def _commands(
+    by_hand: Mapping[str, Sequence[ClosedProcess]],
+    folder: Path,
+    denied_remappings: Mapping[str, Sequence[str]],
+) -> Iterator[str]:
     """Yield the lines of commands, below comments with the enclaves of their processes."""
     for command, processes in by_hand.items():
         advice = processes[0].launch_advice(folder)
         yield from ("", f"# {', '.join(process.enclave for process in processes)}")
-        yield from (*((f"# {advice}",) if advice else ()), command)
+        yield from (f"# {advice}",) if advice else ()
+        for process in processes:
+            for rule in denied_remappings.get(process.enclave, ()):
+                yield f"# First change its remapping {visible(rule)}: the policy denies this name."
+        yield command
 
 
 def _text(lines: Iterable[str]) -> str:

@@ -433,6 +433,10 @@ class CloseState(NamedTuple):
     """What the observed nodes did while sros watched, but the keystore denies, as sentences."""
     newly_denied: Sequence[str]
     """The part of `denied` that the keystore did not deny before this command."""
+    denied_remappings: Mapping[str, Sequence[str]]
+    """The enclaves whose start command gives a node a denied name, each with the remapping rules
+    that give these names.
+    """
     problems: Sequence[str]
     """Reasons why the robot is not closed yet, or not open again, with what to do."""
     proofs: Sequence[Proof]
@@ -552,6 +556,7 @@ def current_state(robot: LocalRobot, policy: Policy | None) -> CloseState:
         expires_soon=_expiring(robot) if until else (),
         denied=(),
         newly_denied=(),
+        denied_remappings={},
         problems=(),
         proofs=(),
         dry_run=False,

@@ -283,7 +283,7 @@ def started_nodes(command: Sequence[str]) -> Iterator[tuple[str, str]]:
 
 def nodes_with_rules(command: Sequence[str]) -> list[str]:
     """Return the nodes for which a command has remapping rules (``-r talker:a:=b``)."""
-    return [node for node in dict.fromkeys(node for node, _, _ in _rules(command)) if node]
+    return [node for node in dict.fromkeys(node for node, _, _ in remapping_rules(command)) if node]
 
 
 def _node_rules(command: Sequence[str]) -> tuple[dict[str, str], dict[str, str]]:
@@ -295,7 +295,7 @@ def _node_rules(command: Sequence[str]) -> tuple[dict[str, str], dict[str, str]]
     """
     names: dict[str, str] = {}
     namespaces: dict[str, str] = {}
-    for node, what, value in _rules(command):
+    for node, what, value in remapping_rules(command):
         if value and what in _NODE_RULES:
             names.setdefault(node, value)
         elif value and what == _NAMESPACE_RULE:
@@ -303,7 +303,7 @@ def _node_rules(command: Sequence[str]) -> tuple[dict[str, str], dict[str, str]]
     return names, namespaces
 
 
-def _rules(command: Sequence[str]) -> Iterator[tuple[str, str, str]]:
+def remapping_rules(command: Sequence[str]) -> Iterator[tuple[str, str, str]]:
     """Yield the node ("": all nodes), the left and the right side of each remapping rule."""
     of_ros = False
     for before, word in pairwise(("", *command)):

@@ -120,7 +120,7 @@ class Robot:
     def process(self, enclave: str, *, is_secured: bool) -> Process:
         command: tuple[str, ...] = ("/opt/run", enclave.strip("/"))
         if self.named:
-            command += ("--ros-args", "-r", f"__node:={enclave.strip('/')}")
+            command += ("--ros-args", "-r", f"__node:={command[1]}", "-r", "words:=chatter")
         if self.launch_file:
             command += ("--params-file", self.launch_file)
         libraries, now = frozenset({"libfastrtps", "librcl"}), datetime.now(UTC)
@@ -284,12 +284,20 @@ def test_everything_is_prepared_and_nothing_is_closed(robot: Robot) -> None:
 
 @sometimes("a_policy_that_was_changed_stays_and_is_followed", 1 / 2)
 def test_a_policy_that_was_changed_stays_and_is_followed(robot: Robot) -> None:
-    robot.units = UNITS
+    robot.named = True
     robot.close()
     policy = robot.folder / "robot/policy.xml"
     policy.write_text(policy.read_text().replace("chatter", "old/chatter", 1))
     changed = policy.read_text()
     ended = robot.close()
+    denied = (
+        "start command of /listener gives a name that the policy denies, by the remapping words"
+    )
+    assert f"{denied}:=chatter: change it before you start the process\n" in ended.out
+    commands = (robot.folder / "robot/start/commands.txt").read_text()
+    change = "First change its remapping words:=chatter: the policy denies this name.\ncd /opt && "
+    assert f"\n# /listener\n# {change}" in commands and commands.count("First change") == 1
+    robot.units = UNITS
     assert "/listener: the rights that it lost still work until 20" in ended.err
     assert sros("diff_policy", "robot/keystore", "robot/policy.xml", cwd=robot.folder).ok()
     assert policy.read_text() == changed
@@ -582,7 +590,7 @@ def test_what_systemd_does_not_start_is_done_by_hand(
     robot.by_hand, robot.named = {"/talker", "/listener"}, True
     ended = robot.close()
     assert "  /talker: process 4711: closed\n" in ended.out
-    now = "/opt/run talker --ros-args -r __node:=talker"
+    now = "/opt/run talker --ros-args -r __node:=talker -r words:=chatter"
     remembered = "/talker runs by another command than before; sros remembers the new one: "
     assert f"{remembered}cd /opt && {now}; before: cd /opt && /opt/run talker\n" in ended.err
     commands = (robot.folder / "robot/start/commands.txt").read_text()
@@ -1770,8 +1778,10 @@ def test_a_process_with_older_files_of_an_enclave_is_no_closed_process(robot: Ro
         ended = robot.close(status=status)
         runs = "enclaves, except for /talker (secured with other files); fix this first:\n"
         assert (runs in ended.out) == bool(status), ended
-        said = f"  process 13 (run): /talker from '{copy}', not from '{robot.folder}/robot/export'"
-        assert (f"{said}: stop it; if it belongs to the robot" in ended.out) == bool(status), ended
+        said = f"  process 13 (run): it runs in /talker from '{copy}', not from '{robot.folder}"
+        assert (f"{said}/robot/export': stop it; if it belongs to the robot" in ended.out) == bool(
+            status
+        ), ended
 
 
 @sometimes("an_enclave_that_belongs_to_another_machine")
