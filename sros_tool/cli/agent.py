@@ -82,7 +82,7 @@ def agent() -> None:
 )  # fmt: skip
 @click.option(
     "--tls-ca", metavar="FILE", type=PATH,
-    help="CA certificates of the servers. [default: the system's]",
+    help="CA certificates for HTTPS, to verify the servers. [default: the system's]",
 )  # fmt: skip
 @click.option(
     "--new-key",
@@ -244,8 +244,8 @@ def _parse_unit(text: str) -> Unit:
 @click.option(
     "--restarted", is_flag=True,
     help="With --once: confirm that all processes were restarted since the last round, even "
-        "processes that the agent cannot see. This does not count for files that this round "
-        "installs.",
+        "processes that the agent cannot see. The confirmation does not count for files that "
+        "this round installs.",
 )  # fmt: skip
 @json_option
 def _run(folder: Path, once: bool, interval: str, restarted: bool, as_json: bool) -> int:
@@ -253,10 +253,10 @@ def _run(folder: Path, once: bool, interval: str, restarted: bool, as_json: bool
 
     A round fetches the robot's release, verifies it, and installs it whole or not at all. It
     restarts units, or reports the restarts that are due, and checks the running processes. It asks
-    for renewal in the last third of a certificate's validity (after `sros agent init --new-key`:
-    when 60 % of the validity of the certificate or of the permissions is over, whichever is
-    first), and sends a signed report to the keystore machine.
-    If one step fails, the others still run, and the next round tries the failed step again.
+    for renewal in the last third of a certificate's validity, and sends a signed report to the
+    keystore machine. After `sros agent init --new-key`, it asks when 60 % of the validity of the
+    certificate or of the permissions is over, whichever is first.
+    If one step fails, the other steps still run, and the next round tries the failed step again.
 
     Example:
       $ sros agent run /etc/sros/keystore --once
@@ -356,14 +356,14 @@ def _due_lines(folder: Path, due_enclaves: Sequence[str], unseen: Sequence[str])
 @click.option(
     "--max-age", metavar="DURATION", default="1d", show_default=True,
     help=(
-        "Longest time since the agent last reached the source and the inbox; after that, the exit "
-        "status is 1."),
+        "Exit with 1 if the agent has not reached the source or the inbox for longer than "
+        "DURATION."),
 )  # fmt: skip
 @json_option
 def _status(folder: Path, max_age: str, as_json: bool) -> int:
     """Show the result of the agent's last round in FOLDER, what is due, and what is wrong now.
 
-    sros examines the files now, as `sros verify` does; the processes are those of the last round.
+    sros examines the files now, as `sros verify` does; it shows the processes of the last round.
 
     Example:
       $ sros agent status /etc/sros/keystore

@@ -72,13 +72,12 @@ if TYPE_CHECKING:
 @click.option(
     "--partial",
     is_flag=True,
-    help="Exit with 0 if nothing is denied, even if some nodes were not seen.",
+    help="Do not exit with 1 because some nodes were not seen.",
 )
 @click.option(
     "--unjudged",
     is_flag=True,
-    help="Exit with 0 if nothing is denied, even if sros could not judge a part of the graph, or "
-    "the "
+    help="Do not exit with 1 because sros could not judge a part of the graph, or because the "
     "graph kept changing.",
 )
 @fleet_option("The robots that the placeholders of POLICY stand for.")
@@ -105,17 +104,18 @@ def audit(
     """Report what policies or a keystore would deny to the nodes that are running now.
 
     Nothing is denied: DDS has no permissive mode, so sros observes the ROS graph and decides about
-    every endpoint as the DDS vendor would. sros looks a node up in the enclave that the graph
-    shows, or else in the enclave whose profiles name the node. By default, sros observes until the
+    every endpoint as the DDS vendor would. A node has the rights of the enclave that the graph
+    shows, or else of the enclave whose profiles name the node. By default, sros observes until the
     graph stops changing; --watch also sees endpoints that nodes create later. Several policies
-    count as one. The default is the keystore of $ROS_SECURITY_KEYSTORE. For nodes on Zenoh, the
-    files that `sros zenoh` wrote into KEYSTORE decide, unless --vendor is given.
+    count as one. Without POLICY and KEYSTORE, the keystore of $ROS_SECURITY_KEYSTORE decides. For
+    nodes on Zenoh, the files that `sros zenoh` wrote into KEYSTORE decide, unless --vendor is
+    given.
 
     Example:
       $ sros audit robot.xml
       /talker publish topic /status (/talker): no rule allows publish rt/status
       1 right would be denied to 2 nodes with 47 endpoints, on Fast DDS 2.14
-      to allow what is denied, add --patch missing.xml to this command: ...
+      to allow the denied access, add --patch missing.xml: ...
       $ sros audit robot.xml --watch 1h --patch missing.xml
       watching for 3600 s, or until Ctrl-C; then the result is shown
       denied: /talker publish topic /status (/talker): no rule allows ...
@@ -140,7 +140,10 @@ def audit(
     sources = sources or (keystore_from_environment(),)
     compared = enumerated([f"'{source}'" for source in sources])
     environment = observer_environment(
-        enclave, keystore, domain, f"{compared} is compared with the robot"
+        enclave,
+        keystore,
+        domain,
+        f"{compared} {'is' if len(sources) == 1 else 'are'} compared with the robot",
     )
     if force and patch is None:
         raise UsageError("--force is for --patch only", "", "Leave it out.")
@@ -324,6 +327,9 @@ def _show(
         )
     echo(verdict, err=True)
     if any(denied_right.by_rule for denied_right in audited.denied):
-        echo("a DENY denies some rights; no additional right overrides a DENY", err=True)
+        echo(
+            "some of these rights are denied by a DENY; no additional right overrides a DENY",
+            err=True,
+        )
     if any(denied_right.by_files for denied_right in audited.denied):
         echo(_WRITE_ZENOH_FILES, err=True)

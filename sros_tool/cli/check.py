@@ -93,14 +93,14 @@ _VENDORS = (*(vendor.value for vendor in TESTED), ZENOH)
     metavar="ID",
     multiple=True,
     shell_complete=_complete_id,
-    help="Report only findings with this id; * and ? are wildcards.",
+    help="Report only findings with this id; * and ? are wildcards. Can be repeated.",
 )
 @click.option(
     "--exclude",
     metavar="ID",
     multiple=True,
     shell_complete=_complete_id,
-    help="Leave out findings with this id.",
+    help="Leave out findings with this id; * and ? are wildcards. Can be repeated.",
 )
 @click.option(
     "--severity",
@@ -134,7 +134,8 @@ _VENDORS = (*(vendor.value for vendor in TESTED), ZENOH)
     type=PATH,
     multiple=True,
     metavar="FILE",
-    help="Check that the requirements in this TOML file hold for the policy or keystore.",
+    help="Check that the requirements in this TOML file hold for the policy or keystore. "
+    "Can be repeated.",
 )
 @click.option(
     "--requirements-before",
@@ -143,7 +144,7 @@ _VENDORS = (*(vendor.value for vendor in TESTED), ZENOH)
     multiple=True,
     metavar="FILE",
     help="An earlier version of the --requirements file: report requirements that the current file "
-    "lacks.",
+    "lacks. Can be repeated.",
 )
 @click.option(
     "--namespace",
@@ -166,7 +167,7 @@ _VENDORS = (*(vendor.value for vendor in TESTED), ZENOH)
     "--template",
     metavar="TEMPLATE",
     shell_complete=complete_template,
-    help="With --requirements: assume the protection of this keystore template.",
+    help="With --requirements or --suggest: assume the protection of this keystore template.",
 )
 @click.option(
     "--suggest",
@@ -218,7 +219,7 @@ _VENDORS = (*(vendor.value for vendor in TESTED), ZENOH)
     metavar="DURATION|PERCENT|soon",
     help="List only the enclaves that expire within DURATION (30d) or have used PERCENT of their "
     "validity (66%). `soon`: a file of the enclave expires within 30 days, or within a third of "
-    "its validity, if that is shorter.",
+    "its validity if this third is shorter.",
 )
 @advisories_option
 def check(
@@ -254,8 +255,8 @@ def check(
 
     PATH is a policy, a folder of policies, a keystore or an enclave. sros detects the type, unless
     the word `policy` or `keystore` before the first PATH states it. `sros check keystore` checks
-    the keystore in the folder named `keystore` here. Without PATH, the keystore of
-    $ROS_SECURITY_KEYSTORE and the runtime are checked: the environment and the processes of this
+    the folder `keystore` here; if there is none, the keystore of $ROS_SECURITY_KEYSTORE. Without
+    PATH, sros checks this keystore and the runtime: the environment and the processes of this
     machine.
 
     Example:
@@ -360,7 +361,9 @@ def check(
     if template and not requirements:
         raise UsageError("--template is for --requirements and --suggest", "", "Leave it out.")
     if earlier and not requirements:
-        raise UsageError("--requirements-before needs --requirements", "", "Name the new file.")
+        raise UsageError(
+            "--requirements-before needs --requirements", "", "Add --requirements CURRENT_FILE."
+        )
     for option, given in (("--namespace", namespaces), ("--remap", remaps)):
         if given and not requirements:
             raise UsageError(f"{option} is for --requirements", "", "Leave it out.")
@@ -467,7 +470,7 @@ def _one_path(family: str, paths: tuple[Path, ...], option: str) -> Path:
         if not path.is_dir() or is_keystore(path):
             return path
     raise UsageError(
-        f"{option} takes one policy file or keystore", "", "Run the command once for each argument."
+        f"{option} takes one policy file or keystore", "", "Run the command once for each of these."
     )
 
 
@@ -491,7 +494,7 @@ def _not_one_system_error(option: str) -> UsageError:
     return UsageError(
         f"{option} takes one keystore, or the policies of one robot or fleet",
         "Several policies count as one.",
-        "Run the command once for each argument.",
+        "Run the command once for each keystore, robot or fleet.",
     )
 
 
@@ -725,10 +728,10 @@ def _needs_renewal(root: Path, text: str, moment: datetime, form: str) -> int:
     else:
         lines = [describe_lifetime(enclave, moment) for enclave in expiring.due]
         lines += [f"{enclave.name}  unknown: {enclave.error}" for enclave in expiring.unreadable]
-        none_due = "the only enclave does not need" if expiring.lasting == 1 else ""
-        none_due = (
-            f"{none_due or f'none of {expiring.lasting} enclaves needs'} to be renewed ({text})"
+        none_due = {0: "no enclave needs", 1: "the only enclave does not need"}.get(
+            expiring.lasting, f"none of {expiring.lasting} enclaves needs"
         )
+        none_due += f" to be renewed ({text})"
         if expiring.short_lived and not expiring.lasting:
             none_due = ""
         left_out = expiring.short_lived_text()
@@ -866,9 +869,9 @@ def doctor(report: Path | None, force: bool, advisories: Path | None, as_json: b
     """Find out which DDS stacks and RMWs of this machine enforce security.
 
     Each DDS and RMW is tried in a separate process, in a temporary enclave, because its name and
-    version do not show whether it was built with security. Also names the known vulnerabilities of
-    each DDS, and reports the findings of `sros check runtime`, such as misspelled ROS_SECURITY_*
-    values, missing files or a wrong clock.
+    version do not show whether it was built with security. sros also names the known
+    vulnerabilities of each DDS, and reports the findings of `sros check runtime`, such as
+    misspelled ROS_SECURITY_* values, missing files or a wrong clock.
 
     Example:
       $ sros doctor
@@ -890,7 +893,7 @@ def doctor(report: Path | None, force: bool, advisories: Path | None, as_json: b
     from sros_tool.demo.doctor import diagnosis_text, examine, security_provider, support_report
 
     if force and not report:
-        raise UsageError("--force is for --report", "", "Name a file, or leave --force out.")
+        raise UsageError("--force is for --report", "", "Add --report FILE, or leave --force out.")
     if report:
         check_output(report, force=force)
     known = advisories_of(advisories)

@@ -70,7 +70,9 @@ def _run(words: Sequence[str], shows_messages: bool) -> tuple[int, str, str]:
 @click.option("--apply", is_flag=True, help="Restart the robot's systemd units with security.")
 @click.option("--proof", "prove", is_flag=True, help="Prove that the robot is closed.")
 @click.option(
-    "--undo", is_flag=True, help="Restart the robot's systemd units without security again."
+    "--undo",
+    is_flag=True,
+    help="Open the robot again: restart its systemd units without security.",
 )
 @click.option(
     "--partial",
@@ -229,7 +231,7 @@ def _show(robot: LocalRobot, closed: CloseState) -> None:
         echo(f"  enclaves that the policy lacks, and that keep their signed rights: {signed}")
     for left_open in unguarded(keystore.governance):
         does = f"{left_open.direction} DDS topic {left_open.topic}"
-        echo(f"  every enclave may {does}: the governance of the keystore leaves it open")
+        echo(f"  every enclave may {does}: the governance of the keystore leaves the topic open")
     echo(f"how to restart each process with security (all files: {robot.start}):")
     for process in closed.observed.processes:
         echo(f"  {_process_line(process, closed, policy)}")
@@ -237,7 +239,7 @@ def _show(robot: LocalRobot, closed: CloseState) -> None:
         names = [name for name, other in closed.outdated.items() if other == why]
         echo(f"  {why} the processes of {enumerated(names)}: restart them")
     for process_text in closed.not_observed:
-        echo(f"  not observed before: {process_text}; if it does not belong there, stop it")
+        echo(f"  not observed before: {process_text}; if it does not belong to the robot, stop it")
     for name in closed.new:
         why = "has ended" if name in closed.observed.ended else "new"
         start = closed.observed.command_of_new(robot.export.absolute(), name)
@@ -246,17 +248,20 @@ def _show(robot: LocalRobot, closed: CloseState) -> None:
         echo(naming)
     if not_here := sorted({*closed.observed.not_here}.difference(outside)):
         bring = f"sros distribute_key {shlex.quote(str(robot.keystore))} ENCLAVE FOLDER"
-        echo(f"not on this machine: {', '.join(not_here)} (to bring an enclave there: {bring})")
+        echo(
+            f"not on this machine: {', '.join(not_here)} (to bring an enclave to its machine: "
+            f"{bring})"
+        )
     if dropped := robot.processes.enclaves_outside(policy):
         echo(f"the policy lacks enclaves that sros saw when it watched: {', '.join(dropped)}")
     for right in closed.newly_denied[:_MOST_DENIED]:
         echo(f"the policy now denies a right that the robot used when sros watched: {right}")
     if more := closed.newly_denied[_MOST_DENIED:]:
-        echo(f"  and {counted(len(more), 'right')} more (--json has all)")
+        echo(f"  and {counted(len(more), 'more right')} (--json has all)")
     if closed.newly_denied:
         echo(
-            "  if this is a mistake, change the policy; otherwise, expect that the node may end "
-            "when it starts"
+            "  if this is a mistake, change the policy; otherwise, expect that a node without such "
+            "a right may end when it starts"
         )
     for name, rules in closed.denied_remappings.items():
         echo(
@@ -266,7 +271,8 @@ def _show(robot: LocalRobot, closed: CloseState) -> None:
     if stays := len(closed.denied) - len(closed.newly_denied):
         rights = counted(stays, "right")
         echo(
-            f"the policy still denies {rights} that the robot used when sros watched (--json: all)"
+            f"the policy still denies {rights} that the robot used when sros watched (--json "
+            "lists them)"
         )
 
 
@@ -291,8 +297,8 @@ def _process_line(process: ClosedProcess, closed: CloseState, policy: Policy) ->
         sign = signs.get(process.known_by, f"its {process.known_by}")
         state = f"process {process.pid}" + ("" if runs else f", known by {sign}")
     elif runs:
-        state = "runs by a new command; sros keeps the observed command (to replace "
-        state += "it, watch the open robot again)"
+        state = "runs by a new command; sros keeps the observed command (to replace the observed "
+        state += "command, watch the open robot again)"
     else:
         ended = process.enclave in closed.observed.ended
         state = "has ended" if ended else "no process runs its command"
@@ -418,7 +424,7 @@ def _idle_lines(closed: CloseState, ask: str) -> list[str]:
     if not (stopped := sorted(idle.intersection(closed.pending))):
         return []
     options = "".join(f" --without {name}" for name in stopped)
-    return [f"to prove it without a process of {enumerated(stopped)}: {ask}{options}"]
+    return [f"to prove the robot closed without a process of {enumerated(stopped)}: {ask}{options}"]
 
 
 def _advice_without_security(robot: LocalRobot, closed: CloseState) -> str:
@@ -440,7 +446,8 @@ def _show_undone(robot: LocalRobot, closed: CloseState) -> None:
     else:
         more = ""
         if other_machines := closed.observed.not_here:
-            more = f"; on other machines, also start {enumerated(other_machines)} without sros run"
+            more = f"; on other machines, also start the processes of {enumerated(other_machines)} "
+            more += "without sros run"
         echo(
             f"the robot is open: sros sees no process in an enclave of this folder{more}", err=True
         )
@@ -484,7 +491,7 @@ def _other_machines_lines(robot: LocalRobot, closed: CloseState) -> list[str]:
         )
     if brought := closed.brought:
         lines.append(
-            "on other machines, as you said with --brought: the current files of "
+            "other machines have, as you said with --brought, the current files of "
             f"{_times_text(brought)}"
         )
     if expired := closed.expired_elsewhere:

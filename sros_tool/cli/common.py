@@ -294,7 +294,8 @@ def enclave_filter_options(help_begin: str = "Only") -> Callable[[Decorated], De
             "patterns",
             multiple=True,
             metavar="PATTERN",
-            help=f"{help_begin} enclaves that match, such as '/arm/*'.  Can be repeated.",
+            help=f"{help_begin} enclaves that match PATTERN, for example '/arm/*'.  Can be "
+            "repeated.",
         )(function)
 
     return add
@@ -311,7 +312,8 @@ def several_enclaves(function: Decorated) -> Decorated:
         "patterns",
         multiple=True,
         metavar="PATTERN",
-        help="Enclaves whose names match, such as '/arm/*'; * also matches '/'.  Can be repeated.",
+        help="Enclaves that match PATTERN, for example '/arm/*'; * also matches '/'.  Can be "
+        "repeated.",
     )(function)
 
     @wraps(function)
@@ -892,7 +894,8 @@ def passphrase_file_notes(path: Path) -> Iterator[Note]:
         if stat.S_ISREG(mode) and mode & 0o077:
             text = (
                 f"others can access the passphrase file '{path}' (mode {stat.S_IMODE(mode):04o}): "
-                f"run `chmod 600 {quote(str(path))}`. If anybody read it, replace the CAs."
+                f"run `chmod 600 {quote(str(path))}`. If anybody may have read it, replace the CAs "
+                "(`sros rotate_ca`)."
             )
             yield Note("keystore.passphrase-readable", text)
 
@@ -919,7 +922,7 @@ def _first_line(path: Path) -> str:
         raise PkiError(
             f"the passphrase file '{path}' cannot be used",
             f"Its first line is longer than {LONGEST_PASSPHRASE} bytes.",
-            f"Write the passphrase into it, or set {_PASSPHRASE}.",
+            f"Write the passphrase alone into the first line, or set {_PASSPHRASE}.",
         )
     return line.decode("utf-8", "surrogateescape")
 

@@ -69,7 +69,7 @@ _STREAM = Path("-")
 @click.option(
     "--keyless",
     is_flag=True,
-    help="Also export enclaves whose keys were made on their robots, without the keys, as --robot "
+    help="Also export the documents of enclaves whose keys were made on their robots, as --robot "
     "does. Keys in KEYSTORE are exported in any case.",
 )
 @dry_run_option
@@ -229,7 +229,7 @@ def _refuse_terminal() -> None:
 @keystore_argument("folder", "[DIR]")
 @click.option("--domain", metavar="ID", help="Also check that the enclaves may join this domain.")
 @click.option(
-    "--at", metavar="MOMENT", help="Check as of a date (2027-06-01) or time from now (90d)."
+    "--at", metavar="MOMENT", help="Check as of a date (2027-06-01) or a time from now (90d)."
 )
 @enclave_filter_options()
 @click.option(
@@ -249,8 +249,8 @@ def verify(
 ) -> int:
     """On a robot: report whether the enclaves in DIR, or the enclave DIR, can be used.
 
-    Checks that enclaves are complete, consistent, valid and loadable, that only the owner can read
-    their keys, that no CA key was exported, and that all enclaves trust the same CAs. The exit
+    sros checks that enclaves are complete, consistent, valid and loadable, that only the owner can
+    read their keys, that no CA key was exported, and that all enclaves trust the same CAs. The exit
     status is 0 if there are no findings.
 
     Example:
@@ -291,7 +291,7 @@ def verify(
         state = (
             f"loadable in domain {enclave.domains}{until}"
             if enclave.loadable
-            else "its key is on its robot: verify it there"
+            else "its key is on its robot: verify the enclave there"
             if enclave.key_on_robot
             else Colored("NOT LOADABLE")
         )
@@ -316,8 +316,8 @@ def create_request(
     """On a robot: create the key of ENCLAVE in the folder DIR, and a signing request.
 
     The key never leaves DIR. With --key, the key is made on the robot's PKCS#11 token, and never
-    leaves it; DIR then holds only the key's URI. The PIN comes from the URI's pin-source=, from
-    $SROS_PKCS11_PIN or from a prompt.
+    leaves the token; DIR then holds only the key's URI. The PIN comes from the URI's pin-source=,
+    from $SROS_PKCS11_PIN or from a prompt.
 
     Send the request to the keystore, where `sros sign_request` answers it; `sros import` installs
     the answer next to the key.
@@ -411,8 +411,9 @@ def sign_request(
 ) -> None:
     r"""At the keystore: certify the key in REQUEST (or -), and sign the enclave's permissions.
 
-    The answer is one .tar.gz for `sros import` on the robot.  The answer contains certificate,
-    permissions, governance, the certificates of the CAs and revocation lists, and no secret.  The
+    The answer is one .tar.gz for `sros import` on the robot.  The answer contains the
+    certificate, permissions, governance, revocation lists and the certificates of the CAs, and no
+    secret.  The
     keystore then contains the enclave, without its private key.  Compare the key's SHA-256 with the
     one that the robot printed.
 
@@ -549,7 +550,7 @@ def import_verb(
       imported enclave /arm/camera, which can run until 2027-05-20T07:45:12Z
         it trusts CN=sros identity CA 4f122aed, SHA-256 5fe417aa...
         and CN=sros permissions CA 4f122aed, SHA-256 e15ab4af...
-        compare both with the output of sign_request, or use --ca: ...
+        compare each SHA-256 with the output of sign_request, or use --ca: ...
       $ sros import request.answer.tar.gz robot --ca e15ab4af9ee8c94bd8a5e4c6c1...
       $ sros run robot /arm/camera -- ros2 run camera driver
     """
@@ -587,8 +588,8 @@ def _imported_lines(imported_enclave: ImportedEnclave, *, pinned: bool) -> Itera
         yield f"  and {_ca_text(imported_enclave.permissions_ca)}"
     if imported_enclave.first and not pinned:
         yield (
-            "  compare both with the output of sign_request, or use --ca: without it, import does "
-            "not verify them"
+            "  compare each SHA-256 with the output of sign_request, or use --ca: without --ca, "
+            "import does not verify the CAs"
         )
 
 

@@ -210,7 +210,7 @@ def _refuse_ignored(mode: str) -> None:
 @click.option(
     "--time-zone",
     metavar="ZONE",
-    help="Time zone of the robot, in which Fast DDS reads dates: Asia/Tokyo. "
+    help="Time zone of the robot, such as Asia/Tokyo; Fast DDS reads dates in this zone. "
     "[default: this machine's]",
 )
 @click.option("--who", is_flag=True, help="Show which enclaves may do the operation on NAME.")
@@ -262,14 +262,14 @@ def explain(
 
     call and serve are about services, execute is about actions. If the rights name an action NAME
     but no service NAME, call and serve are about the action; use --type to choose. KEYSTORE is a
-    keystore, here or on a robot; ENCLAVE can also be an enclave's folder. With a policy and no
+    keystore, or an export on a robot; ENCLAVE can also be an enclave's folder. With a policy and no
     keystore, sros decides by the permissions that the policy would give.
 
     The exit status is 0 if the operation is allowed (with --who: to at least one enclave), and 1 if
     it is denied. With --log, it is 1 if the log reports a fault, or if no line says that a node
-    runs secured in ENCLAVE (Zenoh logs no such line). An action is allowed only if all of its
-    services and topics are allowed. With --who, "in part" marks an enclave that has only some of
-    these rights, but can command the action's server, for example by send_goal.
+    runs secured in ENCLAVE (not on Zenoh, which logs no such line). An action is allowed only if
+    all of its services and topics are allowed. With --who, "in part" marks an enclave that has only
+    some of these rights, but can command the action's server, for example by send_goal.
 
     Example:
       $ sros explain keystore /talker publish /chatter --policy robot.xml
@@ -765,7 +765,9 @@ def _zenoh_lines(explanation: ZenohExplanation) -> Iterator[str]:
     yield _labeled_row("why", answer.text)
     yield from _link_lines(answer)
     if dropped := answer.dropped:
-        dropper = f"{dropped.enforcer}, which drops it silently: {answer.enclave} gets no error"
+        dropper = (
+            f"{dropped.enforcer}, which drops the message silently: {answer.enclave} gets no error"
+        )
         yield _labeled_row("denied by", dropper)
     if allowed and answer.question.word in _RECEIVER_WORDS:
         yield from _reached_lines(answer)
@@ -793,7 +795,8 @@ def _link_lines(answer: ZenohAnswer) -> Iterator[str]:
         passing = sum(link.passes for link in more)
         yield _labeled_row(
             "link",
-            f"{len(more)} more links: {passing} pass the message, {len(more) - passing} drop it",
+            f"{counted(len(more), 'more link')}: the message passes on {passing}, and is dropped "
+            f"on {len(more) - passing}",
         )
 
 
@@ -917,9 +920,7 @@ def _decider_of_policy(
         text = "A policy has no Zenoh files; `sros zenoh KEYSTORE` writes them."
         raise UsageError("--who on Zenoh takes no policy", text, "Name the keystore.")
     if robots:
-        raise UsageError(
-            "--robot takes a keystore", "", f"Add --match '/{robots[0]}/*' in place of it."
-        )
+        raise UsageError("--robot takes a keystore", "", f"Write --match '/{robots[0]}/*' instead.")
     fleet = fleet_of(asking.fleet_file, None)
     _, stated = policy_to_ask(policy, fleet)
     decider = VendorOfPolicy(stated, *chosen_vendor, asking, patterns or ("*",))
@@ -1156,8 +1157,8 @@ def _lines_without_findings(log: str, count: int) -> Iterator[str]:
     elif match := next(filter(None, map(security_directory, log_lines(plain_text(log)))), None):
         yield f"{not_found}; a node found its enclave '{match['folder']}'"
         yield (
-            "not shown: whether peers drop its messages (explain their logs, or compare both "
-            f"keystores: `sros check FOLDER OTHER`); {_SILENT_ON_ZENOH}"
+            "not shown: whether peers drop the node's messages (explain their logs, or compare "
+            f"both keystores: `sros check FOLDER OTHER`); {_SILENT_ON_ZENOH}"
         )
     else:
         yield f"{not_found}, and no line 'Found security directory'"
@@ -1169,7 +1170,7 @@ def _lines_without_findings(log: str, count: int) -> Iterator[str]:
 
 _ZENOH_TESTS = "caching permissions for `"
 _ONLY_TESTS = (
-    "the log only has Zenoh's tests of declared keys, which do not show which message was "
+    "the log has only Zenoh's tests of declared keys, which do not show which message was "
     "dropped. `sros explain KEYSTORE ENCLAVE publish|subscribe|call|serve NAME --vendor zenoh` "
     "shows whether a message is denied."
 )

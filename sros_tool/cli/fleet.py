@@ -270,7 +270,8 @@ def _confirm(arguments: tuple[str, ...], robot: str, dry_run: bool, as_json: boo
     multiple=True,
     metavar="ROBOT",
     shell_complete=complete_robot,
-    help="Accept an earlier message from this robot, because its disk was restored.",
+    help="Accept an earlier message from this robot, because its disk was restored. Can be "
+    "repeated.",
 )
 @click.option(
     "--publish",
@@ -427,10 +428,11 @@ def _validity_options(function: Decorated) -> Decorated:
 
 
 _VALIDITIES = {
-    "timestamp": "How long robots accept the metadata before you publish again (1d).",
-    "snapshot": "How long the list of versions is valid (7d).",
-    "targets": "How long the lists of releases are valid (90d).",
-    "root": "How long the list of the keys is valid (365d).",
+    "timestamp": "How long robots accept the published files without a new publication. [default: "
+    "1d]",
+    "snapshot": "How long the list of versions is valid. [default: 7d]",
+    "targets": "How long the lists of releases are valid. [default: 90d]",
+    "root": "How long the list of the keys is valid. [default: 365d]",
 }
 """Role of published metadata → help of the option for its validity."""
 
@@ -441,14 +443,16 @@ _VALIDITIES = {
     "--root-key",
     type=PATH,
     metavar="FILE",
-    help="File of the root key, to keep the key outside of the keystore; created the first time.",
+    help="File of the root key, to keep the key outside of the keystore. The first publication "
+    "creates the file.",
 )
 @click.option(
     "--rotate-key",
     "rotated",
     type=click.Choice(tuple(_VALIDITIES)),
     multiple=True,
-    help="Give this role a new key, which needs the root key; repeatable.",
+    help="Give this role a new key; sros signs the new list of keys with the root key. Can be "
+    "repeated.",
 )
 @_validity_options
 @click.option(
@@ -478,11 +482,11 @@ def _publish(
 ) -> int:
     """Publish a release for each robot of KEYSTORE in the folder PUB.
 
-    PUB has plain files for any web server, bucket or USB stick, and no private key. For each
-    robot, PUB has an archive with the files of the robot's enclaves, signed by the permissions CA.
-    PUB also has metadata of The Update Framework, with which `sros agent` on the robot refuses
-    old files, forged files, and files from different versions of PUB. Run this verb after each
-    change, and before the time that it prints, for example each hour. Archives of unchanged robots
+    PUB has plain files for any web server, bucket or USB stick, and no private key. For each robot,
+    PUB has an archive with the files of the robot's enclaves, signed by the permissions CA. PUB
+    also has metadata of The Update Framework, with which `sros agent` on the robot refuses old
+    files, forged files, and files from different versions of PUB. Run this verb after each change,
+    and again before the time that it prints, for example each hour. Archives of unchanged robots
     stay; archives of robots that were revoked or left the fleet are removed.
 
     The keys that sign PUB are in KEYSTORE/private.  The root key only signs the list of the other
@@ -656,9 +660,9 @@ def _status(
     A robot without a recent confirmation is offline. Robots with the same state share a line. A
     robot that reports a release which was never published has a line of its own, even if its files
     are current.
-    The first line also counts the robots whose DDS has known vulnerabilities that a later release
-    of the same major version fixes, by the advisories of sros; --advisories FILE lists them, and so
-    does --robot NAME with --fail-on vulnerabilities.
+    The first line also counts the robots whose DDS has known vulnerabilities (advisories of sros)
+    that a later release of the same major version fixes. --advisories FILE lists these
+    vulnerabilities, and so does --robot NAME with --fail-on vulnerabilities.
 
     The revocation list is in force on a robot if the robot has the list, and confirms that no
     process has to restart for it. An earlier list that revokes the same certificates counts, too.
@@ -681,8 +685,8 @@ def _status(
     in the last day, and robots still accept the published files. Otherwise it is 1, also if the
     publishing folder is not on this machine. With --fail-on unmended, changed files that an agent
     or `sros fleet publish` has replaced do not count. With --fail-on seen, a publishing folder that
-    is not on this machine does not count, as for a copy of the keystore. With --fail-on
-    vulnerabilities, it is also 1 if a robot has a DDS to upgrade.
+    is not on this machine does not count: use it on a copy of the keystore. With --fail-on
+    vulnerabilities, the exit status is also 1 if a robot has a DDS to upgrade.
     """
     from sros_tool.checks.vulnerabilities import is_fixed_later, robot_findings
     from sros_tool.keystore.fleet_status import fleet_status
@@ -863,8 +867,8 @@ def _fleet_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
         ago = elapsed(compared_fleet.at - max(publication.altered.values()))
         yield (
             "published files were missing, changed or older than published: "
-            f"{first_few(list(publication.altered), _MOST_GROUPS)} (last seen {ago} ago). They are "
-            "published again; find out who else can write to the folder"
+            f"{first_few(list(publication.altered), _MOST_GROUPS)} (last seen {ago} ago). sros "
+            "published them again; find out who else can write to the folder"
         )
     if status.stage != "complete":
         behind, robots = len(status.unconfirmed), sum(bool(each.enclaves) for each in status.robots)
@@ -931,8 +935,8 @@ def _remedies(status: FleetStatus, to_dos: Collection[str]) -> Mapping[str, str]
         "may have a wrong name, or a copied disk. If it has files of another robot, it can act "
         f"as that robot until you run `sros renew {where} --robot OTHER --new-key --revoke-old`; "
         "then deliver to both robots",
-        "check its clock": "set the clock of the robot; its next round continues. If its clock is "
-        "right, somebody held its message back",
+        "check its clock": "set the clock of the robot; the next round of its agent then "
+        "continues. If the clock is right, somebody held the robot's message back",
         "deliver": by_hand,
         "publish": publish_command(root),
         "renew": f"`{renewal_command(root)}`, then {_delivery_advice(root, to_renew)}",

@@ -103,7 +103,7 @@ def inspect(
       ...
       $ sros inspect keystore --history --policy robot.xml
       2026-11-20T05:59:44Z  permissions  current     /talker  until 2027-05-20...
-      permissions of 1 enclave were signed from 'robot.xml', as it is now; ...
+      permissions of 1 enclave were signed from the current 'robot.xml'; ...
     """
     from sros_tool.errors import DocumentError, UsageError
     from sros_tool.keystore.describe import describe, problems_of
@@ -282,7 +282,7 @@ def _enclave_lines(enclave: DescribedEnclave) -> Iterator[str]:
     for problem in facts.problems:
         yield f"  {problem}"
     yield f"  expires {_moment_text(facts.expires)} (the first of its files)"
-    yield f"  subject {facts.subject}, certificate until {_moment_text(facts.valid_until)}"
+    yield f"  subject {facts.subject}, certificate expires {_moment_text(facts.valid_until)}"
     identity = _authority_name(facts.identity_ca, facts.identity_ca_sha256)
     permissions = _authority_name(facts.permissions_ca, facts.permissions_ca_sha256)
     yield f"  identity CA {identity}, permissions CA {permissions}"
@@ -335,7 +335,7 @@ def _list_text(crl: RevocationListFacts) -> str:
 def _key_lines(key: DescribedKey) -> Iterator[str]:
     yield f"private key {key.path}: {key.algorithm}, mode {key.mode}"
     if key.mode not in ("0600", "0400"):
-        yield "  others can read it: chmod 600"
+        yield "  its mode should be 0600: run `chmod 600` on the file"
 
 
 def _token_place_text(place: TokenPlace) -> str:

@@ -118,14 +118,14 @@ def create_permission(
     dry_run: bool,
     as_json: bool,
 ) -> None:
-    """Give ENCLAVE... the permissions that POLICY_FILE states for them: all or none.
+    """Give ENCLAVE... the permissions that POLICY_FILE states for them.
 
-    A named ENCLAVE always gets new permissions; an enclave chosen by --robot, --match or --all
-    gets them only if its rights change.
+    If this fails for an enclave, no enclave changes. A named ENCLAVE always gets new permissions;
+    an enclave chosen by --robot, --match or --all gets them only if its rights change.
 
-    Anyone who has a copy of the replaced permissions, and of the certificate and key used with
-    them, can use them until they expire. With --revoke-old, processes that load the new crl.pem
-    refuse these copies.
+    Anyone who has copies of the replaced permissions, of the certificate and of the key can use
+    these copies until the permissions or the certificate expires. With --revoke-old, processes that
+    load the new crl.pem refuse these copies.
 
     Example:
       $ sros create_permission keystore /talker_listener/talker policy.xml
@@ -168,7 +168,8 @@ def create_permission(
     ]
     if left_out:
         text = (
-            "left out, because the keystore lacks them, or because they belong to no robot there: "
+            "left out, because the keystore lacks these enclaves, or because they belong to no "
+            "robot of its fleet: "
         )
         text += f"{shown_names(left_out)}. `sros generate_artifacts --robot` creates them, too."
         result = replace(result, notes=(*result.notes, Note("enclave.left-out", text)))
@@ -439,8 +440,8 @@ def list_enclaves(
         echo(name)
     if hidden:
         echo(
-            f"DDS also loads {counted(len(hidden), 'enclave')} in a hidden folder, which sros "
-            f"leaves out: {first_few(hidden, 5)}. `sros check {quote(str(root))}` says what to do.",
+            f"not listed, but loaded by DDS: {counted(len(hidden), 'enclave')} in a hidden folder: "
+            f"{first_few(hidden, 5)}. `sros check {quote(str(root))}` says what to do.",
             err=True,
         )
 
@@ -479,7 +480,12 @@ if TYPE_CHECKING:
     help="Validity of the CAs: a duration (5y), an expiry date (2031-01-01), or an "
     "interval (2026-12-01/5y).",
 )
-@click.option("--validity", metavar="SPAN", help="Validity of certificates, such as 90d or 1y.")
+@click.option(
+    "--validity",
+    metavar="SPAN",
+    help="Validity of certificates, such as 90d or 1y. Without --permissions-validity, permissions "
+    "are valid for at most as long.",
+)
 @click.option(
     "--permissions-validity",
     metavar="SPAN",
@@ -493,7 +499,7 @@ if TYPE_CHECKING:
 @click.option(
     "--permissions-ca",
     type=PATH,
-    help="Certificate of an existing permissions CA, with --permissions-key.",
+    help="Certificate of an existing permissions CA; needs --permissions-key.",
 )
 @click.option(
     "--identity-key",
@@ -685,7 +691,8 @@ def _open_rights_notes(root: Path, template: Template) -> list[Note]:
     "values",
     multiple=True,
     metavar="KEY=VALUE",
-    help="Change one setting, such as protection.rtps=ENCRYPT or permissions.validity=90d.",
+    help="Change one setting, such as protection.rtps=ENCRYPT or permissions.validity=90d. "
+    "Can be repeated.",
 )
 @click.option(
     "--rule",
@@ -693,14 +700,14 @@ def _open_rights_notes(root: Path, template: Template) -> list[Note]:
     multiple=True,
     metavar="RULE",
     help="Set the protection of a topic, service or action: 'topic /camera/* data=NONE "
-    "metadata=SIGN'.",
+    "metadata=SIGN'. Can be repeated.",
 )
 @click.option(
     "--drop-rule",
     "dropped",
     multiple=True,
     metavar="RULE",
-    help="Remove a rule that --rule made: 'topic /camera/*'.",
+    help="Remove a rule that --rule made: 'topic /camera/*'. Can be repeated.",
 )
 @click.option(
     "--domain",
@@ -750,11 +757,12 @@ def update_keystore(
     KEY is a setting of sros.toml. Prints which settings become looser and which tighter; looser
     settings need --allow-looser. The enclaves keep their keys and their rights.
 
-    By default, everything changes together. With --next, the change has two stages: first the
-    certificates and permissions, after which you can restart processes one by one (together, if
-    files that they loaded have expired); then, with the same command, the governance. If the
-    governance changes the protection of messages, processes with the old and with the new
-    governance do not communicate (Cyclone DDS 0.10.2, Fast DDS 2.14.5): restart them together.
+    By default, everything changes together. With --next, the change has two stages. The first stage
+    signs certificates and permissions; then restart the processes one by one, or all together if
+    files that they loaded have expired. The second stage, with the same command, signs the
+    governance. If the governance changes the protection of messages, processes with the old and
+    with the new governance do not communicate (Cyclone DDS 0.10.2, Fast DDS 2.14.5): restart them
+    together.
 
     The exit status of a dry run is 1 if --allow-looser is needed and missing.
 
@@ -779,7 +787,7 @@ def update_keystore(
     if sum((template_name is not None, take_edits, discard_edits)) > 1 and not (
         template_name and discard_edits
     ):
-        raise UsageError("give only one of --template, --take-edits and --discard-edits")
+        raise UsageError("--take-edits excludes --template and --discard-edits")
     chosen = (template_name, values, rules, dropped, domain, take_edits, discard_edits)
     if trust_records:
         from sros_tool.keystore.lifecycle.update import trust_records as trust
@@ -930,7 +938,7 @@ def _show_update(
     if update.left:
         echo(
             f"stage {update.done[-1]} {'would be' if update.dry_run else 'is'} done; left: "
-            f"{', '.join(update.left)}. Once the processes were restarted, run `{command}`.",
+            f"{', '.join(update.left)}. Once the processes have been restarted, run `{command}`.",
             err=True,
         )
 

@@ -52,8 +52,9 @@ _crl_option = click.option(
     "--crl",
     "crl_file",
     type=PATH,
-    help="Revocation list (PEM) that the CA service signed, for a keystore with a CA service; with "
-    "`sros crl`, also a list that a keystore from a backup has lost, such as a robot's crl.pem.",
+    help="Revocation list (PEM) that the CA service signed, for a keystore with a CA service. With "
+    "`sros crl`, after the keystore was restored from a backup: a list made after the backup, such "
+    "as a robot's crl.pem.",
 )
 
 
@@ -65,7 +66,8 @@ _crl_option = click.option(
     metavar="DURATION|PERCENT|soon",
     help="Renew the named enclaves, and all that expire within DURATION (30d) or have used PERCENT "
     "of their validity (66%). `soon`: a file of the enclave expires within 30 days, or within a "
-    "third of its validity, if that is shorter. Short-lived enclaves are renewed only if named.",
+    "third of its validity if this third is shorter. Short-lived enclaves are renewed only if "
+    "named.",
 )
 @click.option("--new-key", is_flag=True, help="Also create new private keys.")
 @key_option
@@ -91,12 +93,13 @@ def renew(
 ) -> None:
     """Issue new certificates for ENCLAVE..., and sign their permissions again.
 
-    The rights stay the same.  Running processes keep the files they have loaded: restart them
-    before those files expire, or all together if some have expired.
+    The rights stay the same.  Running processes keep the files that they have loaded: restart the
+    processes before these files expire. If some of these files have expired, restart all processes
+    together.
 
-    Anyone who has a copy of a replaced certificate and its permissions can use them until they
-    expire. With --revoke-old, processes that load the new crl.pem refuse these copies: restart the
-    renewed processes first, then all others.
+    Anyone who has copies of a replaced certificate, of its key and of the permissions can use these
+    copies until the certificate or the permissions expire. With --revoke-old, processes that load
+    the new crl.pem refuse these copies: restart the renewed processes first, then all others.
 
     With --key, ENCLAVE... get new keys on a token, and their key.pem files are removed.
 
@@ -172,8 +175,8 @@ def _replaced_lines(result: Changed, *, has_new_keys: bool) -> Iterator[str]:
         yield remedy_in_closed_robot(
             result.root,
             "exports and running processes still have the earlier certificates and permissions: "
-            f"{deliver}, and restart the processes before these files expire; if some have "
-            "expired, restart all processes together",
+            f"{deliver}, and restart the processes before these files expire; if some of "
+            "these files have expired, restart all processes together",
         )
     if has_new_keys and result.outcomes and publish_command(result.root):
         yield (
@@ -228,7 +231,7 @@ def revoke(
     """Revoke ENCLAVE...: processes that load the new crl.pem refuse them.
 
     The files of ENCLAVE... move to the folder "revoked" of the keystore.  Export the other enclaves
-    to their robots again: they need the new crl.pem and, during a CA rotation, the CA files.
+    to their robots again: the robots need the new crl.pem and, during a CA rotation, the CA files.
 
     During a rotation both CAs revoke, because Fast DDS trusts both. If the key of the old CA is
     gone, the certificates of that CA are refused only after `sros rotate_ca --to retire`;
@@ -286,8 +289,8 @@ def crl(
 ) -> int:
     """Show the revocation list of KEYSTORE, or sign it again.
 
-    DDS refuses every participant once the list has expired, so the exit status is 1 if it expires
-    within 30 days, or within a third of its validity, if that is shorter.
+    DDS refuses every participant once the list has expired, so the exit status is 1 if the list
+    expires within 30 days, or within a third of its validity if this third is shorter.
 
     With --refresh --crl FILE, a keystore that was restored from a backup revokes again the
     certificates in FILE: a revocation list made after the backup, such as a robot's crl.pem.
@@ -340,7 +343,8 @@ def crl(
         return 0
     if soon:
         echo(
-            "the list expires soon, and DDS then refuses every participant: "
+            "the list expires soon, or has expired; with an expired list, DDS refuses every "
+            "participant: "
             f"run `sros crl {quote(str(root))} --refresh`.",
             err=True,
         )
@@ -528,7 +532,11 @@ def rotate_ca(
                 f"--{role}-ca needs the key of this CA", "", f"Name it with --{role}-key."
             )
         if file and (identity or permissions) and not is_chosen:
-            raise UsageError(f"--{role}-ca has no effect without --{role}", "", "Leave one out.")
+            raise UsageError(
+                f"--{role}-ca has no effect without --{role}",
+                "",
+                f"Add --{role}, or leave --{role}-ca out.",
+            )
         if file:
             existing[role] = read_bytes(file, "CA certificate")
     validity = parse_span(ca_validity) if ca_validity is not None else None
@@ -537,7 +545,7 @@ def rotate_ca(
             raise UsageError(
                 "the permissions CA cannot keep its key",
                 "DDS accepts signed documents only from exactly the same CA certificate.",
-                "Leave out --permissions or --same-key.",
+                "Leave out --same-key, or the options for the permissions CA.",
             )
         step = renew_identity_ca(
             root,
@@ -579,8 +587,8 @@ def rotate_ca(
     if is_published and step.stage == "retire" and step.replaces_identity:
         cut_off += (
             ". A web server that has only the new identity CA refuses robots with certificates of "
-            "the old one: until these robots have their new files, give it both CAs with their "
-            "lists (docs/fetching.md, The last stage of a rotation)"
+            "the old one: until these robots have their new files, give the server both CAs with "
+            "their revocation lists (docs/fetching.md, The last stage of a rotation)"
         )
     if is_published and step.replaces_seals:
         cut_off += (

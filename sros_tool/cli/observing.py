@@ -256,7 +256,7 @@ def _observer_error(error: ObserverError, environment: dict[str, str]) -> SrosEr
         )
     name = environment.get(ENCLAVE) or os.environ.get(ENCLAVE) or "/"
     is_by_shell = ENABLE not in environment and os.environ.get(ENABLE) == "true"
-    by_shell = f", in which the observer runs because {ENABLE} is set" if is_by_shell else ""
+    by_shell = f" (the observer runs in it because {ENABLE} is set)" if is_by_shell else ""
     if line := endpoint_refusal(error_text):
         return SrosError(
             f"the enclave {name} does not permit an observer{by_shell}",
@@ -348,8 +348,8 @@ class _ObservingCommand(Watching):
     multiple=True,
     type=PATH,
     metavar="LOG...",
-    help="Do not observe: add the rights that Fast DDS or Cyclone DDS denied in these logs"
-    " (- is stdin).",
+    help="Do not observe: add the rights that Fast DDS or Cyclone DDS denied, as these logs say "
+    "(- is stdin).",
 )
 @click.option(
     "--node",
@@ -393,9 +393,9 @@ def generate_policy(
     robot that is not secured yet, an attacker's nodes are observed, too.
 
     With --from-log, the rights are those that logs report as denied. Any process can print such a
-    line, so the rights are shown with the lines that report them, and written only with --accept;
-    without --accept, the exit status is 2. Without FILE, the rights are printed as a policy, for
-    merge_policy.
+    line, so the rights are shown with the lines that report them, and written only with --accept.
+    If FILE lacks some of these rights, the exit status without --accept is 2. Without FILE, the
+    rights are printed as a policy, for merge_policy.
 
     Example:
       $ sros generate_policy robot.xml
@@ -412,7 +412,7 @@ def generate_policy(
             --from-log talker.log --accept
       added 1 right to 'robot.xml'
         /talker_listener/talker ALLOW publish topic /nope
-      these lines of logs ask for it; a process can print any line:
+      these log lines ask for the rights; a process can print any line:
         talker.log:7: talker-1: publish rt/nope in /talker_listener/talker
 
     On a secured robot, observe in a separate enclave. Create this enclave with `sros

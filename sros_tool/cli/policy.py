@@ -63,7 +63,7 @@ if TYPE_CHECKING:
     "remaps",
     metavar="[NODE:]FROM:=TO",
     multiple=True,
-    help="Remap a name of OTHER, as -r does when its nodes start; also __node:=NAME and __ns:=NS. "
+    help="Remap a name of OTHER, as `--ros-args -r` does for a node; also __node:=NAME, __ns:=NS. "
     "Applies after --namespace.  Requirements need the same rules (`sros check --remap`), but "
     "cannot follow __ns.  Can be repeated.",
 )
@@ -262,16 +262,16 @@ def diff_policy(
     The exit status is 1 if they differ (notes name differences that are not in the rights),
     or if DDS would refuse A or B.
 
-    With --no-new-access, A and B can also be folders of policies, and policies at a git revision,
-    as git:REVISION:PATH. The exit status is 0 only if, for every vendor, domain and name, B gives
-    no enclave access that A does not give. Also, B must not assign a node to an enclave with more
-    rights, or protect anything less. The exit status is 2 if sros cannot decide this. sros assumes
-    that a policy is signed with a governance that controls all access. If A is a policy, and B is a
-    keystore that protects less than the template production, this counts as more access. If A is a
-    keystore, and B is a policy, B never counts as less protection. The last line says what is
-    assumed and what is left out, such as dates. "!" marks a DENY of A that B lacks, for names that
-    B does not allow. If only a DENY is missing, nobody gets access, so the exit status is 0, but
-    `sros review` fails.
+    With --no-new-access, A and B can also be folders of policies, or policies at a git revision, as
+    git:REVISION:PATH; the output calls A BASE, and B HEAD. The exit status is 0 only if, for every
+    vendor, domain and name, B gives no enclave any access that A does not give. Also, B must not
+    assign a node to an enclave with more rights, or protect anything less. The exit status is 2 if
+    sros cannot decide this. sros assumes that a policy is signed with a governance that controls
+    all access. If A is a policy, and B is a keystore that protects less than the template
+    production, this counts as more access. If A is a keystore, and B is a policy, B never counts as
+    less protection. The last line says what is assumed and what is left out, such as dates. "!"
+    marks a DENY of A that B lacks, for names that B does not allow. If only a DENY is missing,
+    nobody gets access, so the exit status is 0, but `sros review` fails.
 
     Example:
       $ sros diff_policy robot.xml keystore
@@ -324,10 +324,13 @@ def diff_policy(
             echo(f"the ROS domains of {number} differ", err=True)
         if compared.enclaves:
             number = counted(len(compared.enclaves), "enclave")
-            echo(f"only one side has {number} without rights", err=True)
+            echo(f"{number} without rights, on one side only", err=True)
         if compared.unclear:
             number = counted(len(compared.unclear), "enclave")
-            echo(f"the permissions of {number} differ in ways that notes below describe", err=True)
+            echo(
+                f"the permissions of {number} differ in ways that the notes below describe",
+                err=True,
+            )
         if protections:
             echo("the policies demand different protection", err=True)
         if compared.governance_differs:
@@ -589,7 +592,7 @@ def _ratio_text(ratio: float | None) -> str:
 def _use_lines(enclave: MinimizedEnclave) -> Iterator[str]:
     use, sizes = enclave.use, enclave.bytes
     if not use.observed_at_all:
-        yield f"{use.enclave}: {use.allowed} is allowed and was never observed; not changed"
+        yield f"{use.enclave}: allowed {use.allowed}, never observed; not changed"
     else:
         counts = f"allowed {use.allowed}, observed {use.observed}"
         yield f"{use.enclave}: {counts}: {_ratio_text(use.ratio)}"
@@ -676,7 +679,7 @@ def policies(
     as_json: bool,
     dry_run: bool,
 ) -> int:
-    """List the policies that ship with sros and their enclaves, or copy the policies.
+    """List the policies that ship with sros, each with its enclaves, or copy them.
 
     --copy adds missing files to an existing folder, and replaces nothing: if a file differs,
     nothing is copied.
@@ -897,7 +900,7 @@ def added_lines(base: AccessSource, head: AccessSource, growth: Growth) -> list[
     unrenamed = growth.without_renames(renamed)
     return [
         *(
-            f"{line}; these accesses count as new, so that a reviewer has to allow them"
+            f"{line}; rights under a new name count as new, so that a reviewer has to allow them"
             for line in _renamed_lines(renamed, head.fleet)
         ),
         *_folded_gains(head, "+", unrenamed.added, growth),
@@ -994,7 +997,7 @@ def _reach_lines(head: AccessSource, reach: Sequence[NewReach]) -> list[str]:
     more = len(lines) - _MOST_NEW_LINES
     if more > 0:
         lines[_MOST_NEW_LINES:] = [
-            f"+ and {more} more enclaves that can influence others (--json has all)"
+            f"+ and {counted(more, 'more line')} on influence (--json has all)"
         ]
     return lines
 
@@ -1070,11 +1073,14 @@ def access_summary(
     if growth.new_nodes:
         parts.append(f"{_count(len(growth.new_nodes), 'node')} new in an enclave of BASE")
     if growth.lost:
-        parts.append(f"{_count(len(growth.lost), 'protection')} less")
+        parts.append(f"{_count(len(growth.lost), 'protection')} weaker")
     if growth.reach:
         pairs = len(growth.reach)
         text = "1 enclave can influence another one"
-        parts.append((text if pairs == 1 else f"{pairs} pairs of enclaves can influence") + " now")
+        parts.append(
+            (text if pairs == 1 else f"in {pairs} pairs, an enclave can influence the other")
+            + " now"
+        )
     if growth.added and growth.reach_unknown:
         parts.append(f"the influence of enclaves on others is unknown now: {growth.reach_unknown}")
     return "; ".join(parts) + rights_gone + (f"; {denials_gone}" if dropped else "") + basis

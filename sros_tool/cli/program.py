@@ -53,7 +53,7 @@ FAMILIES: dict[str, dict[str, VerbEntry]] = {
         "renew": VerbEntry("life", "Renew certificates and permissions of enclaves."),
         "revoke": VerbEntry("life", "Revoke enclaves."),
         "rotate_ca": VerbEntry("life", "Replace the CAs, stage by stage."),
-        "crl": VerbEntry("life", "Who is revoked, until when? Sign the list again."),
+        "crl": VerbEntry("life", "Who is revoked? Show the revocation list, or sign it again."),
     },
     "Deployment": {
         "distribute_key": VerbEntry(
@@ -83,7 +83,9 @@ FAMILIES: dict[str, dict[str, VerbEntry]] = {
         "policies": VerbEntry("policy", "List or copy the policies that ship with sros."),
     },
     "Checks": {
-        "check": VerbEntry("check", "Is it right? A policy, a keystore, and what runs here."),
+        "check": VerbEntry(
+            "check", "What is wrong in this policy, in this keystore, or in what runs here?"
+        ),
         "review": VerbEntry("review", "May this change of policies and keystores be merged?"),
         "metrics": VerbEntry("check", "What should Prometheus alert on?"),
         "audit": VerbEntry("audit", "What would a policy deny to the robot that runs now?"),
@@ -411,7 +413,7 @@ def _outdated_dependency_advice() -> str:
                 return (
                     f"sros needs the Python package {name} {least} or newer, "
                     f"and {present} installed for {sys.executable}. "
-                    "Install it with the pip of that Python."
+                    f"Install version {least} or newer with the pip of that Python."
                 )
     return ""
 

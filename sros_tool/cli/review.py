@@ -469,7 +469,10 @@ def _sentence(result: Review, step: ReviewStep) -> str:
             unread = f", {len(unreadable)} cannot be read" if unreadable else ""
             left_out = expiry.short_lived_text()
             left_out = f"; not counted: {left_out}" if left_out else ""
-            return f"{len(due)} of {count} enclaves need to be renewed{unread}{left_out}"
+            need = "needs" if len(due) == 1 else "need"
+            return (
+                f"{len(due)} of {counted(count, 'enclave')} {need} to be renewed{unread}{left_out}"
+            )
         case StepFindings() as facts:
             lines = facts.lines
             further = f", and {len(lines) - 1} more" if len(lines) > 1 else ""
@@ -637,10 +640,8 @@ def _lines_of_changed_form(change: RightsChange) -> Iterator[str]:
     from sros_tool.fleet.robots import folded
     from sros_tool.policy.model import ALLOW
 
-    made_absolute = (
-        "has a / at its beginning, so that it does not move with the namespace of its node"
-    )
-    made_relative = "has no / at its beginning, so that it moves with the namespace of its node"
+    made_absolute = "begins with / now, so that the namespace of its node does not apply"
+    made_relative = "no longer begins with /, so that the namespace of its node applies"
     for made, changed in ((made_absolute, change.absolute), (made_relative, change.relative)):
         lines = []
         for right, _, source, _, _ in changed:

@@ -163,7 +163,7 @@ def _form_of(arguments: Sequence[str]) -> str:
     "--target",
     "target_dir",
     metavar="DIR",
-    help="The path of the keystore where the process runs: on the robot, in the container. "
+    help="The path of the keystore where the process runs: on the robot or in the container. "
     f"[default: KEYSTORE; for containers {INSTALLED}]",
 )
 @click.option(
@@ -553,7 +553,9 @@ def units(
     if passphrase is not None and not SIGNING_JOBS.intersection(jobs):
         raise UsageError("--passphrase-file is only for --job renew and --job collect")
     if {inbox is not None, publishing is not None} != {Job.COLLECT in jobs}:
-        raise UsageError("--job collect needs --inbox INBOX and --publish PUB; no other job does")
+        raise UsageError(
+            "--job collect needs --inbox INBOX and --publish PUB; no other job takes them"
+        )
     if max_age is not None and Job.FLEET not in jobs:
         raise UsageError("--max-age is only for --job fleet")
     if user is not None and Job.GUARD in jobs:

@@ -282,7 +282,9 @@ def _format(form: str | None, output: Path | None, graphviz: bool) -> str:
         )
     chosen = chosen or "html"
     if graphviz and chosen != "svg":
-        raise UsageError("--graphviz is for SVG only", "", "Add --format svg, or leave it out.")
+        raise UsageError(
+            "--graphviz is for SVG only", "", "Add --format svg, or leave --graphviz out."
+        )
     return chosen
 
 

@@ -146,9 +146,9 @@ def zenoh(
       $ sros zenoh --from session.json5 -o policy.xml
 
     Exit status: 0 if the files are written, or up to date. With --check, 1 if a file is missing or
-    out of date, or an enclave of the network's ROS domains has no file, for example without
-    permissions. With --from, 1 if the configuration lets anybody in, or does not work. 2 if sros
-    cannot do it, for example for rights that Zenoh cannot enforce.
+    out of date, or an enclave of the network's ROS domains has no file, for example because it has
+    no permissions. With --from, 1 if the configuration lets anybody in, or does not work. 2 if sros
+    cannot write the files, for example because Zenoh cannot enforce a right.
     """
     from sros_tool.keystore.layout import ZENOH_FILES, check_keystore
     from sros_tool.keystore.lifecycle.update import set_zenoh
@@ -177,7 +177,9 @@ def zenoh(
     chosen_settings = {f"zenoh.{key}": text for key, text in chosen.items() if text}
     further = [name.partition("=")[::2] for name in routers if "=" in name]
     if off and (chosen_settings or further or crossing):
-        raise UsageError("--off takes no options of the network", "", "Leave one of them out.")
+        raise UsageError(
+            "--off takes no options of the network", "", "Leave --off or these options out."
+        )
     network = None if off else _network(settings, chosen_settings, further, crossing)
     with progress("writing the Zenoh files"):
         work = read_consistently(set_zenoh) if only_check else set_zenoh
@@ -260,7 +262,7 @@ def _with_router(network: ZenohNetwork, name: str, endpoint: str) -> ZenohNetwor
             raise UsageError(
                 f"the network has no further router {name}",
                 f"It has {', '.join(known) or 'none'} besides {network.router}.",
-                "Name one of them.",
+                "Name one of these further routers, or leave the option out.",
             )
         return replace(network, routers=tuple(known.values()))
     folder = name.rpartition("/")[0]
@@ -380,8 +382,8 @@ def _configuration_lines(
                     else ""
                 )
                 yield f"  may {VERBS[right]} {stated.name}{domain}{lacks}"
-        yield from _key_lines("may also {}", rights.unsaid)
-        yield from _key_lines("may {} only by a wildcard", rights.denied)
+        yield from _key_lines("may also {} the keys {}", rights.unsaid)
+        yield from _key_lines("may {} the keys {}, but only by a wildcard", rights.denied)
 
 
 def _key_lines(clause: str, pairs: Sequence[tuple[str, str]]) -> Iterator[str]:
@@ -390,7 +392,7 @@ def _key_lines(clause: str, pairs: Sequence[tuple[str, str]]) -> Iterator[str]:
     for right, word in VERBS.items():
         keys = [key for of, key in pairs if of == right]
         if keys:
-            yield f"  {clause.format(word)} the keys {first_few(keys, _MOST_KEYS)}"
+            yield f"  {clause.format(word, first_few(keys, _MOST_KEYS))}"
 
 
 def _kind(document: ConfigurationDocument) -> str:
@@ -432,9 +434,8 @@ def _notes_on_lost_rules(subjects: Sequence[RightsOfSubject]) -> Iterator[Note]:
             keys = ", ".join(key for _, key in rights.unsaid[:_MOST_KEYS])
             yield Note(
                 "zenoh.unsaid",
-                f"{_subject_text(rights)}: the policy lacks {len(rights.unsaid)} rights that "
-                "cannot "
-                f"be stated exactly by a ROS name: {keys}",
+                f"{_subject_text(rights)}: the policy lacks {counted(len(rights.unsaid), 'right')} "
+                f"that no ROS name states exactly: {keys}",
             )
     domains = sorted(
         {right.domain for rights in subjects for right in rights.rights} - {"0", "*"}, key=int
@@ -442,7 +443,7 @@ def _notes_on_lost_rules(subjects: Sequence[RightsOfSubject]) -> Iterator[Note]:
     if domains:
         yield Note(
             "zenoh.domains",
-            f"a policy names no domains: the rights of domains {', '.join(domains)} apply in every "
+            f"a policy names no domains: the rights of domain {', '.join(domains)} apply in every "
             "domain of a keystore that is made from it. Write one policy for each domain if their "
             "rights differ.",
         )
@@ -450,6 +451,7 @@ def _notes_on_lost_rules(subjects: Sequence[RightsOfSubject]) -> Iterator[Note]:
         "zenoh.node-names",
         "Zenoh rules do not name nodes: in the policy, the name of each node is the last part of "
         "its enclave's name, and all names of topics and services are absolute. Write the real "
-        "namespaces and names of the nodes into it: on Zenoh, others do not see a node that "
+        "namespaces and names of the nodes into the policy: on Zenoh, others do not see a node "
+        "that "
         "the policy does not name.",
     )

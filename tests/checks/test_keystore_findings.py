@@ -443,7 +443,7 @@ def test_enclaves_in_hidden_folders_are_named_where_enclaves_are_listed(bench: B
     copy_of(bench.path("enclaves/base"), bench.path("enclaves/.h"))
     ended = sros("list_enclaves", bench.root).ok()
     assert "/.h" not in ended.out.splitlines()
-    assert "DDS also loads 1 enclave in a hidden folder, which sros leaves out: /.h" in ended.err
+    assert "not listed, but loaded by DDS: 1 enclave in a hidden folder: /.h" in ended.err
     assert json.loads(sros("list_enclaves", bench.root, "--json").ok().out)["hidden"] == ["/.h"]
 
 

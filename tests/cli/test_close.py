@@ -303,8 +303,8 @@ def test_a_policy_that_was_changed_stays_and_is_followed(robot: Robot) -> None:
     assert policy.read_text() == changed
     assert "/listener subscribe topic /chatter (/listener)" in ended.out
     told_again = robot.close().out
-    still = "the policy still denies 1 right that the robot used when sros watched (--json: all)\n"
-    assert still in told_again
+    still = "the policy still denies 1 right that the robot used when sros watched (--json lists"
+    assert f"{still} them)\n" in told_again
     assert "/listener subscribe topic /chatter" not in told_again
     again = robot.close("--for", "1s", status=1)
     assert policy.read_text() == changed
@@ -582,8 +582,8 @@ def test_what_systemd_does_not_start_is_done_by_hand(
     commands = (robot.folder / "robot/start/commands.txt").read_text()
     assert "\nros2 launch --secured " in commands
     assert "except for /listener (not running); next: start this process by the com" in ended.err
-    idle = "  to prove it without a process of /listener: sros close robot --proof --without /lis"
-    assert f"and then sros close robot --proof\n{idle}tener\n" in ended.err
+    idle = "  to prove the robot closed without a process of /listener: sros close robot --proof"
+    assert f"and then sros close robot --proof\n{idle} --without /listener\n" in ended.err
     robot.absent = set()
     assert "start again with" in (said := robot.close("--apply", status=1).out)
     assert "process 4712" in said and "process 4711" not in said
@@ -603,7 +603,7 @@ def test_what_systemd_does_not_start_is_done_by_hand(
     robot.more += (replace(robot.more[0], pid=14, command=("/opt/c",)),)
     ended = robot.close()
     assert "\n  not observed before: process 14 (c) in /talker; if it does not belong" in ended.out
-    kept = "runs by a new command; sros keeps the observed command (to replace it, watch "
+    kept = "runs by a new command; sros keeps the observed command (to replace the observed "
     assert (
         f"  /talker: {kept}" in ended.out and "sros remembers: cd /opt && /opt/b" not in ended.err
     )
@@ -1798,7 +1798,7 @@ def test_an_enclave_that_belongs_to_another_machine(robot: Robot) -> None:
     left = "robot/export/enclaves/listener"
     assert f"removed {left}: its enclave belongs to another machine\n" in ended.err
     assert (
-        "\nnot on this machine: /listener (to bring an enclave there: sros distribute_key r"
+        "\nnot on this machine: /listener (to bring an enclave to its machine: sros distribute_key "
         in ended.out
     )
     assert not (robot.folder / left).exists() and "/listener: process" not in ended.out
@@ -1847,7 +1847,7 @@ def test_an_enclave_that_belongs_to_another_machine(robot: Robot) -> None:
     assert "differs from the signed permissions" not in ended.out
     assert "talk: 2 nodes with 36 endpoints as before (types are not compared)\n" in ended.out
     assert "--brought cannot name /talker" in robot.close("--brought", "/talker", status=2).err
-    brought = "\n  on other machines, as you said with --brought: the current files of /listener ("
+    brought = "  other machines have, as you said with --brought, the current files of /listener ("
     for words in (("--brought", "/listener"), ("--proof",)):
         said = robot.close(*words).err
         assert brought in said and needed not in said
@@ -1899,8 +1899,8 @@ def test_an_enclave_that_belongs_to_another_machine(robot: Robot) -> None:
     sros("create_enclave", "robot/keystore", "/operator/look", cwd=robot.folder).ok()
     robot.close("--elsewhere", "/operator/look", status=1)
     robot.by_hand = set()
-    there = "on other machines, also start /listener and /operator/look without sros run"
-    assert f"sros sees no process in an enclave of this folder; {there}\n" in (
+    there = "on other machines, also start the processes of /listener and /operator/look"
+    assert f"sros sees no process in an enclave of this folder; {there} without sros run\n" in (
         robot.close("--undo").err
     )
 

@@ -368,7 +368,7 @@ def test_verify_reports_faults_and_sets_its_exit_status(keystore: Path, tmp_path
 def test_verify_at_home_says_which_keys_are_on_their_robots(keystore: Path, tmp_path: Path) -> None:
     sros("sign_request", keystore, asked(tmp_path), "-o", tmp_path / "a.tgz").ok()
     said = sros("verify", keystore)
-    assert "/arm/camera  its key is on its robot: verify it there\n" in said.out
+    assert "/arm/camera  its key is on its robot: verify the enclave there\n" in said.out
     assert "/a  loadable" in said.out
     assert "camera/key.pem" not in said.out
     (home,) = [

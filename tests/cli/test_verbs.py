@@ -410,7 +410,7 @@ def test_create_keystore_by_options(tmp_path: Path) -> None:
     for place in ("ks", "ks/enclaves/a"):
         shown = sros("inspect", tmp_path / place).ok().out
         assert f"expires {enclave['expires']}" in shown
-    assert f"certificate until {enclave['valid_until']}\n" in shown
+    assert f"certificate expires {enclave['valid_until']}\n" in shown
     assert (
         described["authorities"]["identity"]["subject"]
         == (described["authorities"]["permissions"]["subject"])

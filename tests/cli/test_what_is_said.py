@@ -110,7 +110,7 @@ def test_a_request_that_is_answered_with_less(root: Path) -> None:
 
 def test_processes_whose_files_have_expired_are_restarted_together(root: Path) -> None:
     renewed = sros("renew", root, "--all").ok()
-    assert "before these files expire; if some have expired, restart all" in renewed.err
+    assert "before these files expire; if some of these files have expired, restart" in renewed.err
     for stage in ("--same-key", "--next", "--next", "--next"):
         assert IF_EXPIRED in sros("rotate_ca", root, stage).ok().err
 

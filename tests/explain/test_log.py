@@ -678,7 +678,7 @@ def test_nothing_found_is_said_of_what_was_read(tmp_path: Path) -> None:
         ended = sros("explain", "--log", tmp_path / "robot.log").ok()
         first, second = ended.err.splitlines()
         assert first == f"{none} 1 line; a node found its enclave '/k/enclaves/talker'"
-        assert second.startswith("not shown: whether peers drop its messages (explain their logs,")
+        assert second.startswith("not shown: whether peers drop the node's messages (explain their")
         assert "`sros check FOLDER OTHER`" in second
         assert len(second) < 200
 

@@ -273,7 +273,7 @@ def test_changed_rights_are_named_and_decided_over_all_policies(change: Change) 
     assert "\n  + /b protect topic /y with sign\n" in ended.out, ended
     assert "  - /a ALLOW publish topic /x" in said
     (absolute,) = (line for line in said if line.startswith("  ~"))
-    assert "/c subscribe topic /x has a / at its beginning, so that it does" in absolute
+    assert "/c subscribe topic /x begins with / now, so that the namespace of" in absolute
     assert absolute.endswith("(second.xml:3)")
     # Users in /left and /right now share /x: this is new access for them.
     change.base = change.commit({"other": "1", "second.xml": policy_text({"/c": reads})})
@@ -288,9 +288,7 @@ def test_changed_rights_are_named_and_decided_over_all_policies(change: Change) 
     change.commit({"second.xml": policy_text({"/c": split})})
     ended = change.review("--policy", "robot.xml\nsecond.xml")
     assert "1 name made relative" in ended.out
-    assert (
-        "  ~ /c DENY publish topic /stop has no / at its beginning, so that it moves" in ended.out
-    )
+    assert "  ~ /c DENY publish topic /stop no longer begins with /, so that the name" in ended.out
     assert ended.status == 1 and "! /c DENY publish topic /stop is gone" in ended.out
     change.base = change.commit({"second.xml": policy_text({"/c": denies.format("stop")})})
     change.commit({"second.xml": policy_text({"/c": denies.format("/stop")})})
@@ -301,7 +299,7 @@ def test_changed_rights_are_named_and_decided_over_all_policies(change: Change) 
     both = reads.replace(">x<", ">*/x</topic><topic>/arm/x<")
     change.commit({"second.xml": policy_text({"/c": both})})
     ended = change.review("--policy", "robot.xml\nsecond.xml")
-    assert "  ~ /c subscribe topic /arm/x has a / at its beginning, so that it does" in ended.out
+    assert "  ~ /c subscribe topic /arm/x begins with / now, so that the namespace of" in ended.out
     # A DENY of what nobody allows is a promise to those who merge the policy with others.
     # Names that are still denied, or are allowed now, do not count: /cmd* is only split.
     allows = publish("/lidar/*")
@@ -364,8 +362,8 @@ def test_a_name_has_a_line_only_if_it_is_new_in_another_namespace(change: Change
         change.base = change.commit(rights(*before))
         change.commit(rights(*after))
         ended = change.review("--policy", "robot.xml")
-        assert ended.out.count("  ~ /e publish topic /one has a /") == lines, ended
-        assert "has no / at" not in ended.out
+        assert ended.out.count("  ~ /e publish topic /one begins with / now") == lines, ended
+        assert "no longer begins" not in ended.out
 
 
 def test_some_namespaces_are_not_every_namespace(change: Change) -> None:
@@ -416,7 +414,8 @@ def test_a_renamed_enclave_is_one_line_and_still_new_access(change: Change) -> N
         # Whom the enclave is influenced by is only new if other access is.
         reach = ["  + /a can influence /new/b: /a -publish /x-> /new/b"] * len(also)
         assert lines == [
-            f"{renamed}; these accesses count as new, so that a reviewer has to allow them",
+            f"{renamed}; rights under a new name count as new, so that a reviewer has to "
+            "allow them",
             *(*(f"  + {right}" for right in also), *reach),
             *(renamed, *(f"  + {right}".replace(" publish", " ALLOW publish") for right in also)),
         ]
@@ -962,7 +961,7 @@ def test_a_keystore_fails_for_a_finding_an_expiry_and_a_link_out_of_it(
     steps = {each["step"]: (each["status"], each["result"]) for each in damaged["steps"]}
     assert (damaged["status"], steps["keystore"][0]) == (2, 1), damaged
     assert steps["keystore"][1].startswith("1 error"), damaged
-    assert steps["expiry"] == (2, "0 of 1 enclaves need to be renewed, 1 cannot be read"), damaged
+    assert steps["expiry"] == (2, "0 of 1 enclave need to be renewed, 1 cannot be read"), damaged
     certificate.unlink()
     certificate.symlink_to("../../../robot.xml")
     change.commit({})
