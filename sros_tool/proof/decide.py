@@ -36,7 +36,7 @@ from sros_tool.names import (
 )
 from sros_tool.policy.model import PEER_RIGHT, RIGHTS
 from sros_tool.policy.patterns import covers
-from sros_tool.policy.rights import KIND_OF
+from sros_tool.policy.rights import KIND_OF, is_of_every_node
 from sros_tool.proof.requirements import (
     EXCEPT,
     Apart,
@@ -814,20 +814,30 @@ def _unused_names(
 
 
 def _served_instead(world: World, right: str, name: str, limit: SearchLimit) -> str | None:
-    """Return a served name that ends like ``name``, if nobody serves ``name``, or None.
+    """Return the only name like ``name`` that is served, if nobody serves ``name``, or None.
 
-    The server was perhaps renamed, and enclaves keep the right to request its earlier name.
+    The two names differ in the part before the last, which is often the name of the server's node:
+    it was perhaps renamed, and enclaves keep the right to request the earlier name.
     """
     parts = _sufficient_parts(right)
-    if is_expression(name) or _is_used_by_anybody(world, parts, name, limit):
+    if is_expression(name) or is_of_every_node(name):
         return None
-    end = f"/{name.rpartition('/')[2]}"
-    return shortest(
+    if _is_used_by_anybody(world, parts, name, limit):
+        return None
+    served = {
         other
         for part in parts
         for other in world.stated_names(part.begin, part.end)
-        if other.endswith(end) and _is_used_by_anybody(world, parts, other, limit)
-    )
+        if _without_node(other) == _without_node(name)
+        and _is_used_by_anybody(world, parts, other, limit)
+    }
+    return served.pop() if len(served) == 1 else None
+
+
+def _without_node(name: str) -> tuple[list[str], str]:
+    """Return a name's parts before the part that may be a node's name, and the part after it."""
+    words = name.split("/")
+    return words[:-2], words[-1]
 
 
 def _restricted_names(

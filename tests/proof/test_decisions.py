@@ -449,6 +449,8 @@ def test_a_renamed_node_has_no_side_of_its_names(names: str, text: str) -> None:
         ("/left/gate/open", "/left/gate/open"),
         ("/left/driver/open", ""),
         ("/left/driver/close", ""),
+        ("/right/gate/open", ""),
+        ("/left/gate/x/open", ""),
         ("/left/*/open", ""),
     ],
 )
