@@ -541,7 +541,9 @@ def renew(
 
     names = tuple(enclaves)
     if not names and expiring is None:
-        raise UsageError("nothing is given to renew", "", "Pass enclaves, or a time as expiring.")
+        raise UsageError(
+            "nothing is given to renew", "", "Pass enclaves, or expiring=timedelta(...)."
+        )
     return lifecycle.renew(
         Path(keystore),
         names,
@@ -749,7 +751,7 @@ def explain_access(
         raise UsageError(f"unknown vendor {vendor!r}", "", f"Choose {', '.join(vendors)}.")
     if vendor == ZENOH and distribution:
         text = "On Zenoh, the decision is the same in every distribution."
-        raise UsageError("vendor 'zenoh' takes no distribution", text, "Leave it out.")
+        raise UsageError("vendor 'zenoh' takes no distribution", text, "Leave distribution= out.")
     (vendor,) = _selected_vendors(vendor, distribution)
     asking = AskingContext(_time_or_now(now), zone, domain)
     asked = _enclave_to_ask(keystore, enclave, policy, asking)
@@ -813,7 +815,8 @@ def _enclave_to_ask(
 
     if not isinstance(keystore, str | PathLike) or is_policy(Path(keystore)):
         if policy is not None:
-            raise UsageError("two policies are named", "", "Leave policy= out.")
+            why = "The first argument is a policy already."
+            raise UsageError("two policies are named", why, "Leave policy= out.")
         alone = _as_policy(keystore)
         stated_enclave = alone.enclave(name)
         if stated_enclave is None:

@@ -98,7 +98,9 @@ class Distribution(NamedTuple):
         if not self.stands_for:
             return ""
         why = "has no releases" if self.stands_for == _ROLLING else "is not supported any more"
-        return f"ROS 2 {self.title} {why}, and is assumed to decide as {self.name.capitalize()}."
+        return (
+            f"ROS 2 {self.title} {why}; sros assumes that it decides as {self.name.capitalize()}."
+        )
 
     def reason_for(self, vendor: Vendor) -> str:
         """Return why a vendor decides, such as ``as in ROS 2 Jazzy``, with the assumptions."""
@@ -129,7 +131,7 @@ class Distribution(NamedTuple):
         raise UsageError(
             f"ROS 2 {self.title} does not ship {vendor.title}",
             f"It ships {' and '.join(known.release for known in self.shipped)}.",
-            "Name only one of them, or a vendor that it ships.",
+            "Name only the distribution, only the vendor, or a vendor that the distribution ships.",
         )
 
 
@@ -154,7 +156,7 @@ def find_distribution(name: str) -> Distribution:
     if distribution_problem(name):
         raise UsageError(
             f"{name!r} is not a ROS 2 distribution that sros knows",
-            f"It knows {', '.join(DISTRIBUTIONS)}.",
+            f"sros knows {', '.join(DISTRIBUTIONS)}.",
             "Name one of them.",
         )
     later = DISTRIBUTIONS[DISTRIBUTIONS.index(name) :]
@@ -203,10 +205,13 @@ def unknown_distribution_notes(environment: Mapping[str, str]) -> list[Note]:
     name = environment.get(ROS_DISTRO, "")
     if not name or not distribution_problem(name):
         return []
-    text = (
-        f"{ROS_DISTRO} is {name!r}, which sros does not know; sros decides as if it were not set. "
-    )
-    return [Note("distribution.unknown", f"{text}Name the sourced distribution, such as jazzy.")]
+    text = f"{ROS_DISTRO} is {name!r}, which sros does not know, so sros ignores this variable. "
+    return [
+        Note(
+            "distribution.unknown",
+            f"{text}Set {ROS_DISTRO} to the sourced distribution, such as jazzy.",
+        )
+    ]
 
 
 def _tested_vendor(product: str, version: str) -> Vendor:

@@ -175,8 +175,8 @@ def loadable_environment(
     notes = () if target else tuple(unknown_distribution_notes(environment))
     if state.certificate and (other := other_enclave(keystore, name, state.certificate)):
         text = (
-            f"a process in enclave {name} has the rights of {other}: the files of {name} are those "
-            f"of the other enclave. See `sros check {quote(str(keystore.root))}`."
+            f"a process in enclave {name} has the rights of {other}, because the folder of {name} "
+            f"has the files of {other}. See `sros check {quote(str(keystore.root))}`."
         )
         notes += (Note("env.other-enclave", text),)
     if wanted is None and any(other_domain != domain for other_domain in joined or ()):
@@ -287,12 +287,12 @@ def _check_dates_here(
 
 
 def _missing_token_note(name: str, place: TokenUri) -> Note:
-    pin = f"its PIN in '{place.pin_source}'" if place.pin_source else "its PIN"
+    pin = f"the PIN in '{place.pin_source}'" if place.pin_source else "the PIN"
     return Note(
         "token.there",
-        f"the key of {name} is on the token {place.token!r}: where the process runs, it needs the "
-        f"device or socket of this token, its PKCS #11 module, and {pin}. None of them is in this "
-        "output.",
+        f"the key of {name} is on the token {place.token!r}: the process needs the device or "
+        f"socket of this token, the token's PKCS #11 module, and {pin}. This output contains "
+        "none of them.",
     )
 
 
@@ -304,7 +304,8 @@ def _check_rmw_reads_tokens(place: TokenUri, name: str, rmw: str) -> None:
     if rmw and not (vendor and vendor.traits.reads_tokens):
         raise KeystoreError(
             f"a process of {rmw} cannot run in enclave {name}",
-            f"Its key is on the token {place.token!r}, but {rmw} reads a key only from key.pem.",
+            f"The key of the enclave is on the token {place.token!r}, but {rmw} reads keys only "
+            "from key.pem.",
             "Use rmw_fastrtps_cpp of ROS 2 Jazzy or later, or an enclave with a key in a file.",
         )
 
@@ -427,7 +428,7 @@ def _refuse_outdated(keystore: OpenedKeystore, name: str, now: datetime) -> None
         raise KeystoreError(
             f"the Zenoh configuration of enclave {name} does not match the keystore",
             "It contains rights of other enclaves that differ from their permissions.",
-            f"Write it again: `sros zenoh {where}`, and restart the processes that it names.",
+            f"Run `sros zenoh {where}`, and restart the processes that this command names.",
         )
 
 
@@ -600,8 +601,8 @@ def target_path(text: str) -> Path:
     if not path.is_absolute() or ".." in path.parts or str(path) != text or text.startswith("//"):
         raise UsageError(
             f"--target {text!r} is not the path of a keystore on another machine",
-            "It must be absolute, without '..', '//' and a '/' at the end.",
-            f"Write it as {INSTALLED}.",
+            "The path must be absolute, and have no '..', no '//' and no '/' at the end.",
+            f"Write for example {INSTALLED}.",
         )
     return Path(text)
 
@@ -666,7 +667,7 @@ def _check_mounted(keystore: OpenedKeystore, enclave: str, target: Path) -> None
     export = f"`sros distribute_key {quote(str(keystore.root))} {quote(enclave)} DIR`"
     if inner := enclaves_below(keystore.root, enclave):
         raise KeystoreError(
-            f"the folder of enclave {enclave} also has {', '.join(inner[:3])}",
+            f"the folder of enclave {enclave} also has {first_few(inner, 3)}",
             "The container would get the private keys of all these enclaves.",
             f"Export only this enclave, {export}, and name DIR as the keystore.",
         )
@@ -756,10 +757,9 @@ def enclave_of_node(file: Path, command: Sequence[str]) -> str:
     ns, name = nodes[""]
     full = _full_name(ns, name)
     why = "A process runs in one enclave."
-    remedy = f'Give it a profile in one enclave: `<profile ns="{ns}" node="{name}">`.'
+    remedy = f'Give the node a profile in one enclave: `<profile ns="{ns}" node="{name}">`.'
     if enclaves:
-        names = ", ".join(enclaves[:3])
-        where = f"in {len(enclaves)} enclaves, such as {names}"
+        where = f"in {len(enclaves)} enclaves: {first_few(enclaves, 3)}"
     else:
         where = "in no enclave"
         every = {known for nodes in policy.nodes().values() for known in nodes}
@@ -767,15 +767,16 @@ def enclave_of_node(file: Path, command: Sequence[str]) -> str:
             known for known in every if known.endswith(f"/{name}") and not is_expression(known)
         )
         if similar_names:
-            why = f"It has the node {first_few(similar_names, 3)}."
+            why = f"Similar nodes in the policy: {first_few(similar_names, 3)}."
             other = quote(similar_names[0].rpartition("/")[0] or "/")
             remedy = (
                 f"Name the namespace: `-r __ns:={other}` after --ros-args. Or, if {full} is right, "
-                f'give it a profile: `<profile ns="{ns}" node="{name}">`.'
+                f'give the node a profile: `<profile ns="{ns}" node="{name}">`.'
             )
         elif close := get_close_matches(full, every, 2):
             remedy = (
-                f"Perhaps you mean {' or '.join(close)}. If {full} is right, give it a profile."
+                f"Perhaps you mean {' or '.join(close)}. If {full} is right, give the node a "
+                "profile in one enclave."
             )
     raise UsageError(f"the policy '{file}' has the node {full} {where}", why, remedy)
 
@@ -789,8 +790,8 @@ def _unnamed_node_error(policy: Policy, command: Sequence[str]) -> UsageError:
 
     *_, (ns, _) = started_nodes(command)
     remedy = (
-        "Start a launch file with `ros2 launch --secured KEYSTORE POLICY ...`, which finds the "
-        "enclave of each of its nodes. Start any other command in an enclave of its own: `sros run "
+        "Start a launch file with `ros2 launch --secured KEYSTORE POLICY ...`: this finds the "
+        "enclave of each node. Start any other command in an enclave of its own: `sros run "
         "KEYSTORE ENCLAVE -- COMMAND`."
     )
     for name in nodes_with_rules(command):
@@ -798,7 +799,7 @@ def _unnamed_node_error(policy: Policy, command: Sequence[str]) -> UsageError:
         if len(enclaves) == 1:
             run = f"`sros run KEYSTORE {quote(enclaves[0].path)} -- COMMAND`"
             node = _full_name(ns, name)
-            remedy = f"If the process has the node {node}, which a remapping rule names: {run}."
+            remedy = f"If the process has the node {node} (a remapping rule names it), run {run}."
     return UsageError(
         f"the command '{command[0]}' names no node",
         "The policy assigns enclaves to node names, and `--ros-args -r __node:=NAME` sets the "
@@ -877,7 +878,8 @@ def _other_node_note(
     named = [node for node in known if not name or overlap(node.name, name)]
     if not known or any(overlap(node.ns, f"/{ns.strip('/')}") for node in named):
         return None
-    nodes = first_few([_full_name(*node) for node in named or known], 3)
+    allowed = named or known
+    nodes = first_few([_full_name(*node) for node in allowed], 3)
     if named and not ns:
         rule = "NAMESPACE" if is_expression(named[0].ns) else quote(named[0].ns)
         text = (
@@ -891,8 +893,8 @@ def _other_node_note(
         started = f"a node with the name {name}"
     text = (
         f"the command starts {started}, which is not allowed to offer its parameter services: the "
-        f"permissions of enclave {enclave} are for the node{'s' * (len(known) > 1)} {nodes}. "
-        "Correct `__ns:=` or `__node:=`, or name the enclave of this node."
+        f"permissions of enclave {enclave} are for the node{'s' * (len(allowed) > 1)} {nodes}. "
+        "Correct `__ns:=` or `__node:=`, or start the node in its own enclave."
     )
     return Note("run.other-node", text)
 

@@ -118,7 +118,7 @@ class Fault(Enum):
         "DDS cannot read it. If a file to be mounted into a container does not exist, some "
         "container programs make a folder with its name.",
         _SOURCE_RCL,
-        f"Remove the folder or pipe, and put the file there. {_RESTORE_FILE}",
+        f"Remove the folder or pipe. {_RESTORE_FILE}",
     )
     FILE_EMPTY = (
         "file-empty",
@@ -191,7 +191,7 @@ class Fault(Enum):
         '"Error obtaining private key").',
         "rmw_fastrtps 8.4 and rmw_cyclonedds 2.2 (they set no password property).",
         f"{_NEW_KEY} Or remove the passphrase: `openssl pkey -in "
-        "{path} -out FILE`, and protect the file with mode 0600.",
+        "{path} -out NEW_FILE && chmod 600 NEW_FILE && mv NEW_FILE {path}`.",
     )
     KEY_MISMATCH = (
         "key-mismatch",
@@ -206,8 +206,8 @@ class Fault(Enum):
         "a key.p11 that does not name a key on a token",
         "Either no ROS 2 node finds the key, or whoever can read the file has the PIN.",
         "RFC 7512; rmw_dds_common of ROS 2 Jazzy (security.cpp); libp11 0.4.12 (eng_parse.c).",
-        "Write one line into {path}: pkcs11:token=TOKEN;object=LABEL;type=private. If a file "
-        "has the PIN, add ?pin-source=file:PATH at the end.",
+        "Write one line into {path}: pkcs11:token=TOKEN;object=LABEL;type=private. If the "
+        "PIN is in a file, add ?pin-source=file:PATH at the end.",
     )
     KEY_TWICE = (
         "key-twice",
@@ -302,10 +302,10 @@ class Fault(Enum):
     )
     SIGNER_NO_CA = (
         "signer-no-ca",
-        "a document that no CA signed, and that vendors accept",
+        "a document that no CA signed, but some vendors accept",
         "Cyclone DDS 0.10 and Fast DDS 2.9.1 accept every signer whose certificate the "
         "permissions CA issued. If that CA also issues identities, each enclave can sign rights "
-        "for itself: someone with the signer's key signed this document.",
+        "for itself. Someone with the signer's key signed this document.",
         "CVE-2023-24011; Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; tested.",
         "Unless you signed the document on purpose, treat the signer's key as stolen: `sros revoke "
         "{root} {enclave}`. If one CA is for identities and documents, use separate CAs, as "
@@ -373,21 +373,21 @@ class Fault(Enum):
         "Fast DDS reads the whole CA file, and refuses it if any part is damaged; Cyclone DDS "
         "reads only the first certificate, and does not read 'TRUSTED CERTIFICATE'.",
         "OpenSSL 3.0 (pem_info.c); Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; tested.",
-        "Keep only the certificates in the file, as '-----BEGIN CERTIFICATE-----'.",
+        "Keep only certificates in the file, each under the line '-----BEGIN CERTIFICATE-----'.",
     )
     CA_CRASH = (
         "ca-crash",
         "a CA file that crashes a vendor",
         "If the first certificate of a CA file is not signed with SHA-256, Fast DDS (except 2.9.1) "
-        "frees its memory and then uses it.",
+        "uses memory that it has already freed.",
         "Fast DDS 2.6 to 3.6 (FileProvider.cpp); tested.",
         "Put a CA that is signed with SHA-256 first in the file.",
     )
     CERTIFICATE_CRASH = (
         "certificate-crash",
         "a certificate that crashes a vendor",
-        "Fast DDS crashes on a certificate with an empty subject: its own, or a peer's that is not "
-        "verified yet.",
+        "Fast DDS crashes on a certificate with an empty subject, even on the certificate of a "
+        "peer that is not verified yet.",
         "Fast DDS 2.6 to 3.6 (PKIDH.cpp); tested.",
         "Issue a certificate with the common name of the enclave.",
     )
@@ -404,12 +404,12 @@ class Fault(Enum):
         "a CA certificate that a vendor refuses",
         "Fast DDS (except 2.9.1) also verifies the CA certificate, by the strict rules of OpenSSL.",
         "RFC 5280, 6.1; Fast DDS 2.6 to 3.6 (FileProvider.cpp); tested.",
-        "Use a self-signed CA with keyCertSign, first in its file.",
+        "Use a self-signed CA with keyCertSign, and put its certificate first in the CA file.",
     )
     SIGNATURE_HASH = (
         "signature-hash",
         "a certificate that is not signed with SHA-256",
-        "Fast DDS refuses other digests, and RSA-PSS, in a CA and in an enclave's certificate.",
+        "Fast DDS refuses other digests, and RSA-PSS, in the certificate of a CA or an enclave.",
         "Fast DDS 2.6 to 3.6 (PKIDH.cpp); tested.",
         "Issue the certificate again with SHA-256, which every vendor accepts.",
     )
@@ -436,7 +436,7 @@ class Fault(Enum):
         "The node starts, and the handshake with its peers never finishes, if the permissions and "
         "the certificate do not fit into one message of 64 KB.",
         "Fast DDS 2.9.1; tested.",
-        "Make the permissions smaller, with wildcards, or split the enclave.",
+        "Make the permissions smaller (use wildcards), or split the enclave into several.",
     )
 
     def __new__(cls, identifier: str, *_: object) -> Fault:

@@ -94,8 +94,8 @@ class SecuredNodes(Action):  # type: ignore[misc]  # launch has no types where i
             raise RuntimeError("secured_nodes needs a keystore and a policy: one of them is empty.")
         if context.launch_configurations.get(_FILTER):
             raise RuntimeError(
-                f"secured_nodes cannot be used with {_FILTER}: the processes that it leaves out "
-                "would be in no enclave. Leave the filter out."
+                f"secured_nodes cannot be used with {_FILTER}: the processes that the filter "
+                "excludes would run in no enclave. Remove the filter."
             )
         secured = _launch_node_environment(Path(keystore), Path(policy), enclave)
         if secured:
@@ -136,8 +136,8 @@ def _launch_node_environment(
         enclaves = read_policy(policy).enclaves_of_node("/", "launch_ros_*")
         if not enclave and len(enclaves) > 1:
             raise RuntimeError(
-                f"the policy has the node launch_ros_* in {len(enclaves)} enclaves: name one as "
-                "enclave of secured_nodes."
+                f"the policy has the node launch_ros_* in {len(enclaves)} enclaves: name one of "
+                "them with the argument enclave of secured_nodes."
             )
         name = enclave or next((named.path for named in enclaves), "")
         return enclave_environment(OpenedKeystore(keystore), name) if name else None
@@ -160,13 +160,13 @@ class SecuredOption:
             "--secured",
             nargs=2,
             metavar=("KEYSTORE", "POLICY_FILE"),
-            help="Start each node, by sros, in the enclave of KEYSTORE that POLICY_FILE names.",
+            help="Start each node in the enclave of KEYSTORE that POLICY_FILE names for this node.",
         )
 
     def prestart(self, args: Namespace) -> None:
         """Raise `RuntimeError` if a prefix of the command line would replace the prefix of sros."""
         if args.secured and (args.launch_prefix or args.launch_prefix_filter):
-            raise RuntimeError("--secured cannot be used with --launch-prefix.")
+            raise RuntimeError("--secured cannot be used with --launch-prefix or its filter.")
 
     def prelaunch(self, description: LaunchDescription, args: Namespace) -> tuple[Any]:
         """Return the launch description, with `SecuredNodes` in front if the option was given."""

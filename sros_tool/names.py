@@ -142,7 +142,7 @@ def check_enclave_name(name: str) -> str:
     if problem:
         remedy = "Use an absolute name of letters, digits and underscores, such as /robot/camera."
         if is_expression(name) and re.fullmatch(r"[\w/*?]+", name, re.ASCII):
-            remedy += f" A verb that takes several also has --match '{name}'."
+            remedy += f" Verbs that take several enclaves also have --match '{name}'."
         raise InvalidNameError(f"{name!r} is not a valid enclave name", problem, remedy)
     return name
 
@@ -218,7 +218,7 @@ def expression_problem(text: str) -> str:
     if not _EXPRESSION.match(text):
         return "It contains a character that is not allowed in ROS names."
     if any(first > last for first, last in _SET_RANGE.findall(text)):
-        return "It contains a range of characters that runs backwards."
+        return "It contains a range of characters in reverse order: write for example [a-z]."
     if "//" in text:
         return "It contains '//'."
     if text.endswith("/"):
@@ -251,7 +251,9 @@ def check_namespace(ns: str) -> str:
 def check_plain_namespace(ns: str) -> str:
     """Return a normalized namespace as `check_namespace` does; refuse wildcards, too."""
     if is_expression(ns):
-        raise InvalidNameError(f"the namespace {ns!r} has a wildcard", "", "Write it as /left.")
+        raise InvalidNameError(
+            f"the namespace {ns!r} has a wildcard", "", "Write a namespace such as /left."
+        )
     return check_namespace(ns)
 
 
@@ -263,7 +265,7 @@ def node_name_problem(name: str) -> str:
     if problem := expression_problem(name):
         return problem
     if "/" in name or "~" in name:
-        return "A node name has no '/' and no '~'; its namespace goes into ns=."
+        return "A node name has no '/' and no '~'; the namespace of the node goes into ns=."
     if len(name) > _MAX_NODE_NAME and not is_expression(name):
         return f"It has {len(name)} characters, more than {_MAX_NODE_NAME}."
     return ""

@@ -43,7 +43,7 @@ class Metric:
     def __post_init__(self) -> None:
         for name in (self.name, *(label for sample in self.samples for label in sample.labels)):
             if not _NAME.match(name) or name.startswith("__"):
-                raise ValueError(f"{name!r} is not a name of Prometheus")
+                raise ValueError(f"{name!r} is not a valid name in Prometheus")
 
 
 class KeystoreMetrics(NamedTuple):

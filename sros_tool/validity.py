@@ -209,7 +209,7 @@ def parse_duration(text: str) -> timedelta:
         f"{text!r} is not a duration",
         "",
         "Write a whole number above zero and one of s, m, h, d, w, y, as in 90d or 72h; "
-        "100y is the longest.",
+        "the longest duration is 100y.",
     )
 
 

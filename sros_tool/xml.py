@@ -160,8 +160,8 @@ def parse(
     if as_bytes and encoding.upper() not in _UTF_8_NAMES:
         raise DocumentError(
             f"{name} is not in UTF-8",
-            f"It has the encoding {encoding}, but DDS vendors read all documents as UTF-8, and "
-            "could read other rights.",
+            f"It has the encoding {encoding}, but DDS vendors read all documents as UTF-8, so "
+            "they could read other rights than you wrote.",
             "Write it in UTF-8.",
         )
     return root
@@ -182,7 +182,8 @@ def require_child(root: etree._Element, tag: str, name: str, label: str) -> etre
     space = etree.QName(root).namespace
     why = f"<dds><{tag}> is missing."
     if space and root.prefix:
-        why = f"Its elements have the prefix {root.prefix}: (as <{root.prefix}:dds>); DDS has none."
+        prefix = f"the prefix {root.prefix}: (as <{root.prefix}:dds>)"
+        why = f"Its elements have {prefix}, which DDS does not know."
     elif space:
         why = (
             f"Its elements are in the namespace {space} (xmlns), but elements of DDS have no "

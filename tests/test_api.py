@@ -186,7 +186,7 @@ def test_findings_are_for_the_nodes_of_a_distribution(tmp_path: Path) -> None:
         for name in ("humble", "lyrical", "")
     ]
     assert ids[1] - ids[0] == {"policy.no-type-description"} and ids[1] == ids[2]
-    with pytest.raises(UsageError, match="It knows ardent"):
+    with pytest.raises(UsageError, match="sros knows ardent"):
         sros_tool.check(policy, distribution="lunar")
 
 
@@ -382,7 +382,7 @@ def test_a_short_passphrase_needs_insisting(tmp_path: Path) -> None:
         ),
         *(
             (call, UsageError, text)
-            for name, text in (("lunar", "It knows ardent"), ("kilted", "ships"))
+            for name, text in (("lunar", "sros knows ardent"), ("kilted", "ships"))
             for call in (
                 lambda ks, of=name: sros_tool.explain_access(
                     ks, TALKER, "join", vendor="fastdds-2.9", distribution=of

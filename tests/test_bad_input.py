@@ -224,7 +224,7 @@ POLICIES: dict[str, tuple[str | Callable[[], str], str]] = {
     "class": (_topic("[[:digit:]]"), "vendors interpret"),
     "open set": (_topic("[ab"), "not allowed in ROS names"),
     "empty set": (_topic("[]"), "not allowed in ROS names"),
-    "backward range": (_topic("[z-a]"), "backwards"),
+    "backward range": (_topic("[z-a]"), "in reverse order"),
     "double slash": (_topic("/a//b"), "//"),
     "slash at the end": (_topic("/a/"), "ends with"),
     "only a slash": (_topic("/"), "ends with"),

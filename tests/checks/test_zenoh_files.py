@@ -136,7 +136,9 @@ def test_an_enclave_with_the_files_of_another(folder: Path) -> None:
     }
     assert remedies.items() & again.items() == again.items()
     assert remedies.keys().isdisjoint({"keystore.serial-twice", "zenoh.out-of-date"})
-    other = "a process in enclave /b has the rights of /a: the files of /b are those of the other"
+    other = (
+        "a process in enclave /b has the rights of /a, because the folder of /b has the files of /a"
+    )
     assert [other in sros("env", "robot", name, cwd=folder).ok().err for name in ("/a", "/b")] == [
         False,
         True,

@@ -95,8 +95,8 @@ def test_the_keystore_may_come_from_the_environment(made: Path) -> None:
         (
             ("-r", "listener:/a:=/b"),
             "names no node. The policy assigns enclaves to node names, and `--ros-args -r "
-            "__node:=NAME` sets the name. If the process has the node /listener, which a "
-            "remapping rule names: `sros run KEYSTORE /line/listener -- COMMAND`.",
+            "__node:=NAME` sets the name. If the process has the node /listener (a remapping "
+            "rule names it), run `sros run KEYSTORE /line/listener -- COMMAND`.",
         ),
         (("-r", "both:/a:=/b"), "in an enclave of its own"),
         (
@@ -108,9 +108,12 @@ def test_the_keystore_may_come_from_the_environment(made: Path) -> None:
         (("-r", "__node:="), "names no node"),
         (("-r", "__node:=nobody"), "has the node /nobody in no enclave"),
         (("-r", "__node:=talker", "-r", "__ns:=/left"), "node /left/talker in no enclave"),
-        (("-r", "__node:=hidden"), "the node /left/hidden. Name the namespace: `-r __ns:=/left`"),
+        (
+            ("-r", "__node:=hidden"),
+            "in the policy: /left/hidden. Name the namespace: `-r __ns:=/left`",
+        ),
         (("-r", "__node:=taker"), "Perhaps you mean /talker"),
-        (("-r", "__node:=both"), "in 2 enclaves, such as /line/listener, /line/other"),
+        (("-r", "__node:=both"), "in 2 enclaves: /line/listener, /line/other"),
         (("-r", "__node:=\x1b[2Jtalker"), "\\x1b[2Jtalker in no enclave"),
     ],
 )

@@ -351,7 +351,7 @@ def test_a_distribution_that_is_none_is_no_choice(whole: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "why"),
     [
-        (("--distro", "lunar"), "It knows ardent, bouncy"),
+        (("--distro", "lunar"), "sros knows ardent, bouncy"),
         (("--distro", "jazzy", "--vendor", "fastdds-2.9"), "does not ship Fast DDS 2.9.1"),
         (("--distro", "jazzy", "--vendor", "zenoh"), "On Zenoh, the decision is the same"),
         (("--distro", "jazzy", "--all-distros"), "exclude each other"),
