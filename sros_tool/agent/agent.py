@@ -145,9 +145,9 @@ _REPAIRS_REPORTED_FOR = timedelta(days=1)
 """How long the agent reports that it replaced files which differed from the release."""
 _BRING_KEY = (
     " A release has no keys: run `sros distribute_key KEYSTORE --robot {} DIR --force` on the "
-    "keystore machine, and bring DIR here. If the key was made on a robot, and another computer "
-    "replaced this one, switch this computer off; otherwise make a new key, as for new hardware "
-    "(docs/howto/one_robot.md)."
+    "keystore machine, and bring DIR here. If the key was made on a robot, the keystore does "
+    "not have it: make a new key, as for new hardware (docs/howto/one_robot.md). If another "
+    "computer replaced this one, switch this computer off instead."
 )
 _DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 _ServerAnswer = TypeVar("_ServerAnswer")
@@ -341,7 +341,7 @@ class _Round:
             documents_made = (
                 "verified documents were made at"
                 if self._state.latest
-                else "its certificates begin at"
+                else "the certificates of this robot begin at"
             )
             self._problems.append(
                 f"The clock shows {iso(now)}, but {documents_made} {iso(proven_time)}: "

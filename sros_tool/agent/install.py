@@ -255,8 +255,8 @@ def _check_release(
         raise KeystoreError(
             f"the release of robot {robot} has none of the enclaves that this robot has",
             f"'{folder}' has {enumerated(usable)}, the release has "
-            f"{enumerated(sorted(release.enclaves()))}. Installing it would remove the keys of "
-            "these enclaves. Nothing was changed.",
+            f"{enumerated(sorted(release.enclaves()))}. Installing the release would remove the "
+            "keys that this robot has. Nothing was changed.",
             "Check whether this robot has the right name (`sros agent init --robot`).",
         )
 

@@ -401,7 +401,10 @@ def restart_units(
             )
         except (OSError, subprocess.SubprocessError) as error:
             why = plain(str(error), 120)
-            return Restarts((), (f"The agent could not ask whether units may restart: {why}.",))
+            return Restarts(
+                (),
+                (f"No unit is restarted, because the command `restart_if` gave no answer: {why}.",),
+            )
         if allowed.returncode:
             return Restarts()
     try:

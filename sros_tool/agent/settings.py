@@ -244,4 +244,4 @@ def _is_list_of_texts(value: object) -> bool:
 
 
 def _invalid_settings_error(name: str, why: str) -> DocumentError:
-    return DocumentError(f"{name} are not the settings of an agent", f"{why}.", "Correct it.")
+    return DocumentError(f"{name} are not the settings of an agent", f"{why}.", "Correct the file.")

@@ -256,8 +256,8 @@ class _RemainingProcesses:
         """
         if self._running.may_use_files(process):
             return ""
-        owner = f"not the owner of the enclave's files ({user_text(process.user)})"
-        return f"end {process.label}, which runs as {owner}"
+        user = user_text(process.user)
+        return f"end {process.label}, which runs as {user}, not as the owner of the enclave's files"
 
     def unknown_processes(self) -> Iterator[str]:
         """Yield processes that may run secured, although this folder did not start them."""

@@ -351,8 +351,8 @@ def _lost_protection(robot: LocalRobot) -> Iterator[str]:
             yield (
                 f"{robot.requirements}:{requirement.source.line} protects {enumerated(lost)}, "
                 "which the policy does not name any more; nothing was signed. If the policy "
-                "renamed it, also rename it in the requirement. If nobody needs it any more, "
-                "remove it there (or accept this with --partial)"
+                "renamed a name, also rename it in the requirement. If nobody needs a name any "
+                "more, remove it there (or accept this with --partial)"
             )
 
 
@@ -589,9 +589,9 @@ def _shared_node_problems(robot: LocalRobot) -> Iterator[str]:
         if len(twins) > 1:
             yield (
                 f"{enumerated([*twins.values()])} call themselves {enclave}, and the enclave of "
-                "this name would have the rights of all; nothing was signed. If one process is not "
-                f"of the robot, stop it, remove '{robot.policy}', and watch again: "
-                f"{robot.close_command} --for 1m. If all are of the robot: --partial"
+                "this name would have the rights of all; nothing was signed. If one process is "
+                f"not of the robot, stop it, remove '{robot.policy}', and watch again: "
+                f"{robot.close_command} --for 1m. If all are of the robot, add --partial"
             )
 
 

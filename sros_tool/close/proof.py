@@ -208,11 +208,11 @@ def _misplaced_keys_text(robot: LocalRobot) -> str:
     if robot.keystore.exists():
         return f"{text}`{robot.close_command}` removes them"
     remove = shlex.join(("rm", "-r", *(str(folders[name]) for name in names)))
-    return f"{text}run `{remove}`, and export by the names of this robot's enclaves, not --all"
+    return f"{text}run `{remove}`, and export the enclaves of this robot by name, not with --all"
 
 
 def _revoking_advice(robot: LocalRobot) -> str:
-    return f"`{robot.close_command}` says how to revoke or keep this"
+    return f"`{robot.close_command}` says how to revoke or keep such an enclave"
 
 
 def _expired_enclaves(robot: LocalRobot, root: Path) -> list[str]:
@@ -720,7 +720,10 @@ def _renamed_text(nodes: ObservedNodes, current: Observation | None, *, fails: b
             text += f", and so {enumerated(moved)}"
             text += " (to keep a name, write it in policy.xml with a leading /)"
         if fails:
-            text += " (if the new name is another node: remove the unused rights from its profile)"
+            text += (
+                " (if the new name belongs to another node, remove the unused rights from "
+                "the profile of that node)"
+            )
     _, without_profile = nodes.divide_by_profile(nodes.as_observed)
     not_compared = {
         node_name(node) for node in without_profile if not is_tool(node)

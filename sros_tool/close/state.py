@@ -161,11 +161,11 @@ class RunningRobot:
         one.
         """
         if not self.may_use_files(process):
-            return f"users other than the owner of the files ({user_text(process.user)}) run"
+            return f"{user_text(process.user)}, not the owner of the files, can control"
         if process.environment.get(STRATEGY) != "Enforce":
             return f"{STRATEGY} is not 'Enforce' in"
         if not enclave.is_there:
-            return f"no files are there{f' ({enclave.problem})' * bool(enclave.problem)} for"
+            return f"there are no files{f' ({enclave.problem})' * bool(enclave.problem)} for"
         names = [*newer_files(process, enclave)]
         newer = first_few(names, MOST_NAMES)
         if not newer:

@@ -233,7 +233,8 @@ def note_on_lacking_keys(keystore: OpenedKeystore) -> Iterator[Note]:
     if is_keystore(keystore.root) and not keystore.has_keys:
         text = (
             f"no enclave in '{keystore.root}' has its key: this is answered as if the keys were "
-            f"there. On the robot, `sros verify {quote(str(keystore.root))}` says whether they are."
+            f"there. On the robot, `sros verify {quote(str(keystore.root))}` says whether the "
+            "keys are there."
         )
         yield Note("explain.without-keys", text)
 

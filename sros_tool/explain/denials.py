@@ -238,8 +238,8 @@ _NO_PROFILE_TEXT = (
     "with --node /NAMESPACE/NAME: {}"
 )
 _ASSUMED_NODE_TEXT = (
-    "the log does not name the node, so the last part of its enclave's name is taken; if this is "
-    "wrong, name the node with --node /NAMESPACE/NAME: {}"
+    "the log does not name the node, so sros takes the last part of the enclave's name as the "
+    "node's name; if this is wrong, name the node with --node /NAMESPACE/NAME: {}"
 )
 _ALL_BASIC_RIGHTS_TEXT = (
     "the profile has none of the rights that every node needs, so all of them are proposed "
@@ -413,7 +413,7 @@ def _rights_by_enclave(
             raise UsageError(
                 "the log does not say in which enclave the node ran",
                 "rcl's line 'Found security directory', which names it, is missing.",
-                "Name it with --enclave.",
+                "Name the enclave with --enclave.",
             )
         path = check_enclave_name(named or enclave)
         rights_by_enclave[path] = rights_by_enclave.get(path, frozenset()) | rights

@@ -133,15 +133,15 @@ def _with_policy_change(evaluator: Evaluator, answer: Answer) -> Answer | None:
 
 _ROTATION_REMEDY = (
     "The CAs of this keystore are being replaced: do the next stage with `sros rotate_ca {root} "
-    "--next`, and restart the processes after it."
+    "--next`, and then restart the processes."
 )
 _RIGHTS_REMEDY = (
     "Sign the intended permissions: `sros create_permission {root} {enclave} POLICY`; `sros renew` "
     "refuses the present permissions, because the ledger has later ones."
 )
 _VENDOR_REMEDY = (
-    "Write it in the form that all vendors read alike: `sros create_permission {root} {enclave} "
-    "POLICY`."
+    "Write the permissions in the form that all vendors read alike: `sros create_permission "
+    "{root} {enclave} POLICY`."
 )
 
 _FAULT_OF_REASON: dict[str, str | Fault] = {

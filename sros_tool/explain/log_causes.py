@@ -226,8 +226,8 @@ class Examiner:
             return ""
         command = f"sros env {quote(self._root)} {quote(f'/{name}')}"
         return (
-            f"ROS_SECURITY_KEYSTORE names {place} and has to be {self._root}: `{command}` prints "
-            "all variables."
+            f"ROS_SECURITY_KEYSTORE names {place}, but has to name {self._root}: `{command}` "
+            "prints all variables."
         )
 
     def _with_names(self, text: str, enclave: LoadedEnclave | None, hit: LogHit) -> str:
@@ -375,10 +375,11 @@ class Examiner:
             elsewhere, remedy = self._other_folder_cause(denial, enclave)
             facts += elsewhere
             remedy = remedy or (
-                "The process loaded permissions of another policy. Perhaps that policy is earlier "
-                "or edited. Or it was merged with --remap, and the process lacks the remapping. "
-                "Ask for the robot's policy, and name it in place of this one. If this is the "
-                "robot's policy, sign it, export the enclave, and restart the process."
+                "The process loaded permissions of another policy. Perhaps it is an earlier "
+                "version of this policy, or an edited one. Or this policy was merged with "
+                "--remap, and the process lacks the remapping. Ask for the robot's policy, and "
+                "name it in place of this one. If this is the robot's policy, sign it, export "
+                "the enclave, and restart the process."
                 if self._policy
                 else "Restart the process: it loaded earlier permissions. If it runs from an "
                 "export, export the enclave again first."
@@ -761,7 +762,7 @@ def _renaming_advice(nodes: Sequence[str], wrong: str, enclave: str) -> str:
     meant = likely_enclaves(wrong, nodes) or nodes
     ns, _, name = meant[0].rpartition("/")
     rules = f"`--ros-args -r __node:={quote(name)} -r __ns:={quote(ns or '/')}`"
-    start = f"Start the node under that name ({rules})"
+    start = f"Start the node as {meant[0]} ({rules})"
     if len(nodes) > 1:
         # rcl looks up the rule for the namespace by the node's new name.
         rules = f"`--ros-args -r {quote(wrong.rpartition('/')[2])}:__node:={quote(name)} "

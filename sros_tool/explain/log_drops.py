@@ -95,8 +95,8 @@ def _remedy_for_dropped(
     asked = dropped_right if name_of_key(dropped.key)[1] else ""
     if not asked:
         return (
-            "If it is an enclave of the keystore, `sros zenoh KEYSTORE --check` shows whether the "
-            "files are up to date."
+            "If the process runs in an enclave of the keystore, `sros zenoh KEYSTORE --check` "
+            "shows whether the files are up to date."
         ).replace(
             "KEYSTORE", quote(root) if root and is_original_keystore(Path(root)) else "KEYSTORE"
         )

@@ -839,9 +839,10 @@ def _unusable_file(enclave: str, file: str, problem: str) -> ZenohFile:
 
 _ROUTERS_KEY = Note(
     "explain.zenoh-router",
-    "anyone with the router's key may send and receive everything that passes through the router, "
-    "whatever its permissions say, because forwarding needs this. In peer mode, every session also "
-    "trusts a second process with that key, besides the router. Give the key to no other process.",
+    "anyone with the router's key may send and receive everything that passes through the "
+    "router, whatever the router's permissions say, because forwarding needs this. In peer "
+    "mode, every session also trusts a second process with that key, besides the router. Give "
+    "the key to no other process.",
 )
 
 

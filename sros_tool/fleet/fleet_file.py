@@ -495,7 +495,7 @@ class _Inventory:
         if not isinstance(host, str) or "[" in host:
             raise self._error(
                 f"the host {host!r} is not a plain name",
-                "A range such as r[1:50] is only read by Ansible.",
+                "Only Ansible reads a range such as r[1:50].",
                 _WRITE_INVENTORY,
             )
         values = self._own.setdefault(host, self._used_variables(self._of_list.get(host), host))
@@ -549,7 +549,7 @@ class _Inventory:
                 )
             if name in named:
                 raise self._error(
-                    f"the hosts {named[name]!r} and {host!r} are both the robot {name}",
+                    f"the hosts {named[name]!r} and {host!r} have the same robot name {name}",
                     "",
                     f"Give them different values of {_ROBOT_VARIABLE}.",
                 )

@@ -200,7 +200,7 @@ def address_problem(address: str) -> str:
     except ValueError:
         return "It is neither a host name nor an IP address, such as r7.example.com or 10.0.7.1."
     # The zone of an IPv6 address can have any characters.
-    return "" if "%" not in address else "It has a zone: write the address without it."
+    return "" if "%" not in address else "It has a zone: write the address without the zone."
 
 
 def router_problem(router: str) -> str:

@@ -197,7 +197,7 @@ def _style(palette: Mapping[str, tuple[str, str]]) -> str:
 def _summary(picture: Picture, scene: Scene) -> str:
     """Return the numbers of enclaves and names in a scene, and of left out names, in words."""
     text = f"{counted(len(picture.enclaves), 'enclave')}, {counted(scene.shown, 'name')}"
-    return text + (f", {scene.hidden} that every node needs are left out" if scene.hidden else "")
+    return text + (f", without {scene.hidden} that every node needs" if scene.hidden else "")
 
 
 def _lines(text: str, width: int) -> list[str]:

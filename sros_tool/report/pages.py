@@ -60,7 +60,9 @@ def render_page(
     origins = ", ".join(f"{origin.kind} {origin.title}" for origin in picture.origins)
     made = f"{origins}. Findings are as of {iso(now)[:10]}."
     if unread := sum(units.enclaves for units in picture.unread):
-        made += f" {unread} enclaves were only compared: they have no findings and expiry here."
+        made += (
+            f" Only compared, and without findings and expiry here: {counted(unread, 'enclave')}."
+        )
     return _document(
         f"{picture.title}: who may do what",
         Template(_asset("view.html")).substitute(title=escape(picture.title), made=escape(made)),
@@ -395,7 +397,12 @@ def _demo_vulnerabilities(result: Json) -> str:
             continue
         number = counted(len(ids), "known vulnerability", "known vulnerabilities")
         fixed = " (its package may have the fixes)" if used["packaged"] and ids else ""
-        listed = ", ".join((*ids, *(f"{name} (not known for this release)" for name in unclear)))
+        listed = ", ".join(
+            (
+                *ids,
+                *(f"{name} (this advisory does not mention the release line)" for name in unclear),
+            )
+        )
         lines.append(_unfolding_html(f"{name}: {number}{fixed}", listed))
     shown = "".join(lines) or f"<p>{_with_marks(result['vulnerabilities'])}</p>"
     return f"<section><h2>Known vulnerabilities</h2>{shown}</section>"

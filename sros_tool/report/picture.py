@@ -426,7 +426,7 @@ class Requirements(NamedTuple):
             return (holds,)
         number = len(self.violations)
         more = (
-            (f"{number - _MOST_IN_HEADLINES} more do not hold",)
+            (f"also violated: {number - _MOST_IN_HEADLINES} more",)
             if number > _MOST_IN_HEADLINES
             else ()
         )
@@ -570,7 +570,7 @@ class Picture:
         equal = (f"{units.title} are drawn as one" for units in self.equal)
         more = len(self.different) - _MOST_IN_HEADLINES
         different = [unit.sentence() for unit in self.different[:_MOST_IN_HEADLINES]]
-        different += [f"{more} more differ"] if more > 0 else []
+        different += [f"also different: {more} more"] if more > 0 else []
         revoked = [self.revoked_sentence] if self.revoked else []
         return (*equal, *different, *revoked)
 

@@ -682,7 +682,7 @@ def test_a_clock_before_the_first_certificates_is_said(r1: Robot) -> None:
     r1.release = None
     (problem,) = r1.round(moment() - timedelta(days=9)).problems
     assert problem.startswith("The clock shows") and problem.endswith("; set the clock.")
-    assert "its certificates begin at" in problem
+    assert "the certificates of this robot begin at" in problem
     assert r1.message().clock is RobotClock.BEHIND
     assert r1.round().problems == ()
 

@@ -625,8 +625,8 @@ def test_what_systemd_does_not_start_is_done_by_hand(
     assert robot.close("--undo", status=1).out == (
         f"{undone.out}process 13 (idle) in /talker {advice}/opt/idle\n"
         f"process 14 (run) in /talker {advice}/opt/run talker\n"
-        "process 15 (idle) in /talker was not observed; end process 15 (idle), which runs as not "
-        f"the owner of the enclave's files ({user_text(os.geteuid() + 1)})\n"
+        "process 15 (idle) in /talker was not observed; end process 15 (idle), which runs as "
+        f"{user_text(os.geteuid() + 1)}, not as the owner of the enclave's files\n"
     )
     robot.absent = {"/listener", "/talker"}
     robot.more = (foreign, replace(foreign, pid=16, command=("/opt/other",)))
@@ -884,7 +884,7 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     lax = {**talker.environment, "ROS_SECURITY_STRATEGY": "Permissive"}
     for changed, why in (
         (replace(talker, environment=lax), "ROS_SECURITY_STRATEGY is not 'Enforce' in"),
-        (replace(talker, user=12345), "users other than the owner of the files (user 12345) run"),
+        (replace(talker, user=12345), "user 12345, not the owner of the files, can control"),
     ):
         robot.more = (changed,)
         named = f"{why} the processes of /talker (process {PID['/talker']}); restart them\n"
@@ -1028,7 +1028,7 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     rogue.write_text(policy_text({"/rogue": publish("x")}))
     sros("generate_artifacts", "-k", "robot/keystore", "-p", rogue, cwd=robot.folder).ok()
     said = robot.close("--proof", status=1).out
-    advice = "`sros close robot` says how to revoke or keep this"
+    advice = "`sros close robot` says how to revoke or keep such an enclave"
     assert (
         f"no: the files are accepted: the keystore has /rogue, and the policy does not; {advice}"
         in said

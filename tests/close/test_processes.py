@@ -253,10 +253,10 @@ def test_an_enclave_is_closed_only_if_all_its_processes_are(tmp_path: Path) -> N
         ((fresh, replace(old, user=4321)), None),
         ((fresh, old), "cert.pem changed, or got another mode, after the start of"),
         ((old, fresh), "cert.pem changed, or got another mode, after the start of"),
-        ((replace(fresh, user=4321),), "users other than the owner of the files (user 4321) run"),
+        ((replace(fresh, user=4321),), "user 4321, not the owner of the files, can control"),
         (
             (replace(fresh, user=SEVERAL_USERS),),
-            "users other than the owner of the files (several users) run",
+            "several users, not the owner of the files, can control",
         ),
         (
             (replace(fresh, configuration=unread),),

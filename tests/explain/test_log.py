@@ -1336,7 +1336,7 @@ def test_a_folder_that_is_missing_is_looked_for_in_the_keystore(
 ) -> None:
     log = tmp_path / "robot.log"
     for folder, told in (
-        (f"/tmp/nowhere/enclaves{ENCLAVE}", f"names /tmp/nowhere and has to be {keystore}: "),
+        (f"/tmp/nowhere/enclaves{ENCLAVE}", f"names /tmp/nowhere, but has to name {keystore}: "),
         (f"{keystore}/enclaves{ENCLAVE}x", f"Perhaps you mean {ENCLAVE}."),
         (f"{keystore}/enclaves/qqq", "Correct the name: `sros list_enclaves"),
     ):

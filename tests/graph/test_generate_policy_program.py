@@ -136,7 +136,7 @@ def test_a_log_without_denials(tmp_path: Path) -> None:
 def test_the_enclave_has_to_be_known() -> None:
     ended = sros("generate_policy", "--from-log", LOG)
     assert ended.status == 2
-    assert "Name it with --enclave." in ended.err
+    assert "Name the enclave with --enclave." in ended.err
 
 
 BARE = """<policy version="0.2.0">
