@@ -326,15 +326,14 @@ def _notes_on_old_names(
     if not denials:
         return
     rules = Rules(right for policy in (file, *remapped) for right in policy_rights(policy))
-    for use in sorted(moved_names):
+    for kind, old, new in sorted({(use.kind, use.old, use.new) for use in moved_names}):
         for denied in denials:
             right = denied.right
-            is_old = right.kind == use.kind and matches(right.name, use.old)
-            if is_old and not rules.cover(right._replace(name=use.new)):
+            is_old = right.kind == kind and matches(right.name, old)
+            if is_old and not rules.cover(right._replace(name=new)):
                 text = (
-                    f"{right} at {denied.source} does not change, and does not apply to {use.new}, "
-                    f"the new name of {use.old} in {use.node}. If the new name is meant, too, add "
-                    "it there."
+                    f"{right} at {denied.source} does not change, and does not apply to {new}, "
+                    f"the new name of {old}. If the new name is meant, too, add it there."
                 )
                 yield Note("merge.old-name-denied", text)
 

@@ -157,7 +157,8 @@ def test_a_denial_of_an_old_name_in_the_file_is_told() -> None:
     """What was merged before, such as another node of the same package, does not change."""
     file = one(group("topics", "/*x", publish="DENY"), node="m")
     camera = one(group("topics", "x", publish="ALLOW"))
-    _, notes = remapped_policies([camera], ["x:=/mux/speed"], file)
+    reader = one(group("topics", "x", subscribe="ALLOW"), node="reader")
+    _, notes = remapped_policies([camera, reader], ["x:=/mux/speed"], file)
     assert [note.id for note in notes] == [OF_REQUIREMENTS, "merge.old-name-denied"]
     assert "/a DENY publish topic /*x at" in notes[1].text
     for others, rule in (
