@@ -59,9 +59,9 @@ def page() -> str:
 def _verb(name: str, schema: Mapping[str, Any]) -> str:
     text = f"## {schema['title']}\n\n{schema['description']}\n"
     if "properties" in schema:
-        return f"{text}\n{_table(schema)}"
-    named = schema["$defs"]
-    shapes = [each["$ref"].rpartition("/")[2] for each in schema["oneOf"]]
+        text += f"\n{_table(schema)}"
+    named = schema.get("$defs", {})
+    shapes = [each["$ref"].rpartition("/")[2] for each in schema.get("oneOf", ())]
     for shape in shapes:
         text += f"\n**{_code(named[shape]['title'])}**: {named[shape]['description']}\n"
         text += f"\n{_table(named[shape])}"

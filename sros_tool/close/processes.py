@@ -305,6 +305,10 @@ class ObservedProcesses(NamedTuple):
     brought: Mapping[str, str] = {}
     """Enclaves of `--brought`, and when their files in the keystore had changed last, in ISO 8601.
     """
+    moved: Sequence[ClosedProcess] = ()
+    """The processes of `not_here` that sros saw on this machine before `--elsewhere` named their
+    enclaves.
+    """
 
     @property
     def units(self) -> set[str]:
@@ -330,8 +334,14 @@ class ObservedProcesses(NamedTuple):
     def belonging_elsewhere(self, names: Iterable[str]) -> ObservedProcesses:
         """Return a copy in which the enclaves ``names`` belong to other machines."""
         not_here = {*self.not_here, *names}
+        moved = [process for process in self.processes if process.enclave in not_here]
+        seen_again = {process.enclave for process in moved}
         return self._replace(
             processes=[process for process in self.processes if process.enclave not in not_here],
+            moved=[
+                *moved,
+                *(process for process in self.moved if process.enclave in not_here - seen_again),
+            ],
             elsewhere=[enclave for enclave in self.elsewhere if enclave not in not_here],
             not_here=sorted(not_here),
         )
@@ -340,7 +350,13 @@ class ObservedProcesses(NamedTuple):
         """Return a copy in which the enclaves ``names`` belong to this machine again."""
         not_here = {*self.not_here}.difference(names)
         brought = {name: of for name, of in self.brought.items() if name in not_here}
-        return self._replace(not_here=sorted(not_here), brought=brought)
+        back = [process for process in self.moved if process.enclave not in not_here]
+        return self._replace(
+            processes=[*self.processes, *back],
+            moved=[process for process in self.moved if process.enclave in not_here],
+            not_here=sorted(not_here),
+            brought=brought,
+        )
 
     def within(self, policy: Policy) -> ObservedProcesses:
         """Return a copy without enclaves that the policy does not have any more."""
@@ -352,6 +368,7 @@ class ObservedProcesses(NamedTuple):
                 if process.enclave in names
             ],
             elsewhere=[enclave for enclave in self.elsewhere if enclave in names],
+            moved=[process for process in self.moved if process.enclave in names],
         )
 
     def enclaves_outside(self, policy: Policy) -> list[str]:
@@ -448,11 +465,12 @@ def _observed_from(value: Any) -> ObservedProcesses:
         ValueError, TypeError, KeyError: the value has another form.
     """
     processes = [ClosedProcess(**process) for process in value["processes"]]
-    observed = ObservedProcesses(**value)
-    observed = observed._replace(processes=processes, brought=dict(observed.brought))
+    moved = [ClosedProcess(**process) for process in value.get("moved", ())]
+    observed = ObservedProcesses(**value)._replace(processes=processes, moved=moved)
+    observed = observed._replace(brought=dict(observed.brought))
     names = (*observed.unknown, *observed.elsewhere, *observed.ended, *observed.not_here)
     _check_types((*names, *observed.brought.values()), (observed.domain,))
-    for process in processes:
+    for process in (*processes, *moved):
         words = (process.enclave, process.folder, process.container, process.rmw)
         texts = (*words, *process.command, *process.launch, *process.shares)
         _check_types((*texts, process.known_by), (process.pid, process.user, *process.alike))

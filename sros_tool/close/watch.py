@@ -173,7 +173,9 @@ def _write_observation(robot: LocalRobot, document: str, observed: ObservedProce
     absent = robot.policy_enclaves() - enclaves_here - not_here
     kept = [process for process in robot.processes.processes if process.enclave in absent]
     remembered = observed._replace(
-        processes=[*observed.processes, *kept], brought=robot.processes.brought
+        processes=[*observed.processes, *kept],
+        brought=robot.processes.brought,
+        moved=robot.processes.moved,
     )
     replace_file(robot.observation_file, document.encode())
     robot.write_processes(remembered.belonging_elsewhere(not_here))

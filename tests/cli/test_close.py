@@ -1802,6 +1802,9 @@ def test_an_enclave_that_belongs_to_another_machine(robot: Robot) -> None:
         in ended.out
     )
     assert not (robot.folder / left).exists() and "/listener: process" not in ended.out
+    commands = robot.folder / "robot/start/commands.txt"
+    there = "\n# cd /opt && sros run FOLDER/export /listener -- /opt/run listener\n"
+    assert there in commands.read_text()
     required = robot.folder / "required.toml"
     widest = '[[widest]]\nenclaves = ["%s"]\npublish = ["/x"]\n'
     only = '[[only]]\npublish = ["/chatter"]\nenclaves = ["/talker", "/listener"]\n'
@@ -1824,7 +1827,8 @@ def test_an_enclave_that_belongs_to_another_machine(robot: Robot) -> None:
     ended = robot.close("--here", "/listener")
     assert (robot.folder / left / "key.pem").exists(), ended
     assert "not on this machine" not in ended.out
-    assert "/listener: new, start it with: sros run " in ended.out
+    assert "/listener: no process runs its command: by hand\n" in ended.out
+    assert there not in commands.read_text()
     assert "already belongs to this" in robot.close("--here", "/listener", status=2).err
     robot.close("--elsewhere", "/listener")
     robot.absent = set()
