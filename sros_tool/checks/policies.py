@@ -584,8 +584,8 @@ NO_PARAMETER_SERVICES = FindingKind(
     "policy.no-parameter-services",
     ERROR,
     "a node that is denied some or all of its parameter services",
-    "Every node offers all six unless it was created without them, and fails when it starts if "
-    "one is denied.",
+    "Every node offers all six, unless it was created without them. It fails when it starts if "
+    "one of them is denied.",
     "ROS 2 Jazzy, rclcpp 28 (ParameterService) and rclpy 7 (start_parameter_services).",
     'Allow <services reply="ALLOW"> with ~/get_parameters and the other parameter services. '
     f"{_INCLUDE_HINT}",
@@ -1217,8 +1217,8 @@ NODE_IN_TWO_ENCLAVES = FindingKind(
     "policy.node-in-two-enclaves",
     WARNING,
     "a node that several enclaves have",
-    "Names of nodes are unique in ROS, and a process runs in one enclave: `sros run --policy` and "
-    "`ros2 launch --secured` refuse to choose one for the node.",
+    "Names of nodes are unique in ROS, and a process runs in one enclave: `sros run --policy` "
+    "and `ros2 launch --secured` refuse to choose an enclave for the node.",
     "rcl (node names are unique); sros.",
     "Leave the profile in the enclave of the node's process. If these are nodes of several robots, "
     "check the policy of each robot by itself, or write the policy for a fleet.",

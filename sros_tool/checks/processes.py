@@ -513,7 +513,8 @@ DAEMON_OTHER = FindingKind(
     "runtime.daemon-differs",
     WARNING,
     "the ros2 daemon runs with another keystore or enclave",
-    "`ros2 topic list` and other commands ask the daemon, and show only what its enclave may see.",
+    "`ros2 topic list` and other commands ask the daemon, and show only what the daemon's "
+    "enclave may see.",
     "ros2cli 0.32 (daemon); it keeps the environment in which it was started.",
     "Run `ros2 daemon stop`; the next command starts it again, with this environment.",
 )
@@ -523,7 +524,7 @@ PROCESS_UNSECURED = FindingKind(
     "a node without security next to secured nodes",
     "This node and the secured nodes do not see each other.",
     "DDS-Security 1.1, 9.4.1.2 (allow_unauthenticated_participants is false).",
-    "Start it with `sros run KEYSTORE ENCLAVE -- COMMAND...`.",
+    "Restart it with `sros run KEYSTORE ENCLAVE -- COMMAND...`.",
 )
 PROCESS_RUNS_UNSECURED = FindingKind(
     "runtime.process-runs-unsecured",
@@ -552,7 +553,7 @@ PROCESS_PERMISSIVE = FindingKind(
     "The ROS_SECURITY_STRATEGY of the process is not exactly `Enforce`: if its enclave, or a "
     "file of the enclave, is missing, the process starts unsecured.",
     "rcl 9 (rcl/src/rcl/security.c); tested with ROS 2 Jazzy.",
-    "Start it with `sros run KEYSTORE ENCLAVE -- COMMAND...`.",
+    "Restart it with `sros run KEYSTORE ENCLAVE -- COMMAND...`.",
 )
 PROCESS_WITHOUT_RCL = FindingKind(
     "runtime.process-without-rcl",
@@ -571,7 +572,7 @@ PROCESS_RMW_UNKNOWN = FindingKind(
     "With other RMWs, ROS_SECURITY_ENABLE=true may change nothing: then everybody on the network "
     "hears the process and can send to it.",
     "rmw 7 (rmw_security_options_t): each RMW decides what it does with the enclave.",
-    "Start it on an RMW that enforces security according to `sros doctor`.",
+    "Restart it on an RMW that enforces security according to `sros doctor`.",
 )
 PROCESS_OTHER_KEYSTORE = FindingKind(
     "runtime.process-other-keystore",
@@ -652,7 +653,7 @@ NODE_OPEN = FindingKind(
     "a node that runs open in a domain without secured nodes",
     "Everybody on the network hears the node and can send to it.",
     "rcl 9 (rcl/src/rcl/security.c); tested with ROS 2 Jazzy.",
-    "Start it with `sros run KEYSTORE ENCLAVE -- COMMAND...`, or end the node if nobody needs it.",
+    "Restart it with `sros run KEYSTORE ENCLAVE -- COMMAND...`, or end it if nobody needs it.",
 )
 
 _MOST_NODES = 20

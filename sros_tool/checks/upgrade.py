@@ -39,8 +39,8 @@ REFUSED = FindingKind(
     "upgrade.refused",
     ERROR,
     "an enclave that runs now and is refused after the update",
-    "The DDS of the other distribution does not accept a file of the enclave, or its peers do not "
-    "accept the enclave.",
+    "The DDS of the other distribution does not accept a file of the enclave, or other enclaves "
+    "refuse its nodes.",
     _ENGINE_SOURCE,
     "Before the update, replace the refused files, which `sros check KEYSTORE --all-distros` "
     "names.",

@@ -66,9 +66,9 @@ SESSION_WITHOUT_RULES = FindingKind(
     "zenoh.session-without-rules",
     ERROR,
     "a session without access control",
-    "Anyone who impersonates the router, or in peer mode connects to the session directly, can "
-    "read everything that the session publishes and send it anything. The rules of the real router "
-    "do not apply.",
+    "Anyone who impersonates the router, or who connects to the session directly in peer mode, "
+    "can read everything that the session publishes and send it anything. The rules of the real "
+    "router do not apply.",
     _TESTED_SOURCE,
     _WRITE_BY_SROS_REMEDY,
 )
@@ -85,8 +85,8 @@ NOTHING_ALLOWED = FindingKind(
     "zenoh.nothing-allowed",
     WARNING,
     "access control under which no message passes",
-    "The default is to deny, and no policy gives a subject a rule: sessions open, but Zenoh drops "
-    "every message without a log line.",
+    "The default is to deny, and no entry of `policies` gives a subject a rule: sessions open, "
+    "but Zenoh drops every message without a log line.",
     _TESTED_SOURCE,
     _WRITE_BY_SROS_REMEDY,
 )
@@ -141,9 +141,9 @@ UNUSED = FindingKind(
     "zenoh.unused",
     WARNING,
     "a rule or a subject without effect",
-    "No policy names the rule or subject, so it neither allows nor denies anything.",
+    "No entry of `policies` names the rule or subject, so it neither allows nor denies anything.",
     "Zenoh 1.9 (authorization.rs).",
-    "Name the rule or subject in a policy, or remove it.",
+    "Name the rule or subject in `policies`, or remove it.",
 )
 PLAIN_ENDPOINT = FindingKind(
     "zenoh.plain-endpoint",
@@ -366,7 +366,7 @@ def _rule_findings(document: ConfigurationDocument) -> Iterator[Finding]:
         if not access.rules_of(subject.id)
     ]
     for name, line in unused:
-        yield UNUSED.found(name, f"no policy names {name}", document.name, line)
+        yield UNUSED.found(name, f"no entry of policies names {name}", document.name, line)
 
 
 def _allowing_subjects_of_everybody(document: ConfigurationDocument) -> list[AclSubject]:

@@ -243,7 +243,7 @@ CA_KEY_FEW_ROUNDS = FindingKind(
 SETTINGS_MISSING = FindingKind(
     "keystore.settings-missing",
     WARNING,
-    "a keystore that has a ledger of sros but lacks its settings",
+    "a keystore with a ledger of sros, but without settings",
     "New enclaves then follow the defaults of ros2/sros2: without a policy they may do "
     "everything, for ten years.",
     "sros: sros.toml holds the settings of a keystore.",
@@ -262,7 +262,7 @@ SETTINGS_EDITED = FindingKind(
 FLEET_EDITED = FindingKind(
     "keystore.fleet-edited",
     WARNING,
-    "a keystore's copy of the fleet file that was edited by hand",
+    "an edit by hand in the keystore's copy of the fleet file",
     "The file decides which enclaves belong to a robot, and which domains they may join. Verbs "
     "that use the file to issue, revoke or export refuse it after such an edit.",
     "sros: the ledger has the SHA-256 of the file as sros wrote it.",
@@ -289,7 +289,7 @@ NOT_AS_SETTINGS = FindingKind(
 LEDGER_MISSING = FindingKind(
     "keystore.ledger-missing",
     WARNING,
-    "a keystore made by sros without its ledger",
+    "a keystore that sros made, but that has no ledger",
     "Without the ledger, sros cannot detect replaced permissions, or certificates from another "
     "source.",
     "sros: ledger.jsonl lists everything that was issued.",
@@ -318,7 +318,7 @@ LEDGER_UNCHAINED = FindingKind(
 LEDGER_UNPROVEN = FindingKind(
     "keystore.ledger-unproven",
     WARNING,
-    "enclaves whose rights are recorded only in ledger lines without a chain",
+    "enclaves whose rights are recorded only in ledger lines without a hash chain",
     "Version 0.1 of sros wrote such lines. Anyone who can remove such a line can put earlier "
     "permissions back, so `sros renew`, `sros zenoh` and `sros rotate_ca` leave these enclaves out "
     "or refuse them.",

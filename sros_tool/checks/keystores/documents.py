@@ -608,7 +608,7 @@ XML_DIFFERS = FindingKind(
     "governance.xml-differs",
     WARNING,
     "governance.xml differs from the signed governance.p7s",
-    "DDS loads governance.p7s. The readable copy was changed and never signed.",
+    "DDS loads governance.p7s. The readable copy was changed, but never signed again.",
     "rcl 9 (security.c).",
     f"{edit_remedy('KEYSTORE')}",
 )

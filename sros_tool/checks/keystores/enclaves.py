@@ -211,7 +211,7 @@ XML_DIFFERS = FindingKind(
     "enclave.xml-differs",
     WARNING,
     "permissions.xml differs from the signed permissions.p7s",
-    "DDS loads permissions.p7s. The readable copy was changed and never signed.",
+    "DDS loads permissions.p7s. The readable copy was changed, but never signed again.",
     "DDS-Security 1.1, 9.4.1.3; rcl 9 (security.c).",
     "Sign the intended permissions with `sros create_permission KEYSTORE ENCLAVE POLICY_FILE`.",
 )
