@@ -333,7 +333,8 @@ def _renaming_advice(closed: CloseState, policy: Policy) -> str:
     return (
         f"sros named {enumerated(several)} after one of several nodes; to choose another name, "
         f"change `path=` of the enclave (not `node=`) in {folder / 'policy.xml'}, and the name in "
-        f"{folder / 'requirements.toml'}, before the first process runs closed"
+        f"{folder / 'requirements.toml'}, before the first process runs closed; then revoke the "
+        f"earlier name: sros revoke {shlex.quote(str(folder / 'keystore'))} ENCLAVE"
     )
 
 

@@ -1918,7 +1918,8 @@ def test_an_enclave_that_gets_another_name_keeps_its_process(robot: Robot) -> No
     policy = robot.folder / "robot/policy.xml"
     named = "\nsros named /logger after one of several nodes; to choose another name, change `path="
     files = "` of the enclave (not `node=`) in robot/policy.xml, and the name in robot/requirements"
-    assert f"{named}{files}.toml, before the first process runs closed\n" in said.out
+    price = "then revoke the earlier name: sros revoke robot/keystore ENCLAVE\n"
+    assert f"{named}{files}.toml, before the first process runs closed; {price}" in said.out
     for file in (policy, robot.folder / "robot/requirements.toml"):
         file.write_text(file.read_text().replace('"/logger"', '"/mission"'))
     said = robot.close(status=1)
