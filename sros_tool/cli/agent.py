@@ -78,7 +78,8 @@ def agent() -> None:
 )  # fmt: skip
 @click.option(
     "--ca", "authorities", metavar="SHA256|FILE", multiple=True,
-    help="A permissions CA to trust, for a robot without any enclave yet. Can be repeated.",
+    help="A permissions CA to trust: its SHA-256, or its certificate; for a robot without any "
+    "enclave yet. Can be repeated.",
 )  # fmt: skip
 @click.option(
     "--tls-ca", metavar="FILE", type=PATH,
@@ -133,7 +134,7 @@ def _init(
     dry_run: bool,
     as_json: bool,
 ) -> None:
-    """Set up the agent of the security folder FOLDER, in FOLDER/.agent/agent.toml.
+    """Set up the agent of this robot: write its settings to FOLDER/.agent/agent.toml.
 
     FOLDER is where `sros import` or an Ansible play installs this robot's enclaves. The agent runs
     as the owner of FOLDER. Compare the printed SHA-256 of the root metadata with the SHA-256 that

@@ -210,7 +210,7 @@ _VENDORS = (*(vendor.value for vendor in TESTED), ZENOH)
 @click.option(
     "--watch",
     is_flag=True,
-    help="With `runtime`: keep running, and report when processes change.",
+    help="With `runtime`: keep running, and report changes of the findings on processes.",
 )
 @json_option
 @click.option("--sarif", "as_sarif", is_flag=True, help="The same as --format sarif.")

@@ -432,7 +432,10 @@ def _advice_without_security(robot: LocalRobot, closed: CloseState) -> str:
     """Return what to do if no process can start closed with the present RMW; "" if one can."""
     if closed.secured or not robot.rmws_without_security():
         return ""
-    return "sros doctor, to find an RMW that enforces security, and set it"
+    return (
+        "sros doctor, to find an RMW that enforces security; then set RMW_IMPLEMENTATION to this "
+        "RMW"
+    )
 
 
 def _show_undone(robot: LocalRobot, closed: CloseState) -> None:

@@ -182,8 +182,8 @@ def demo(
     rclpy, or Zenoh, which also needs a router. The node first says whether it is secured. In an
     enclave, this node needs only the right for its topic; the node names in the enclave's policy do
     not matter. A listener reads std_msgs/msg/String, and counts the messages of any other type that
-    the topic has; a talker reports if no node can read its type, and sends another type with
-    --type. Of the options, only --backend, --topic, --type and --for apply.
+    the topic has. A talker sends std_msgs/msg/String or the type of --type, and reports if no node
+    can read this type. Of the options, only --backend, --topic, --type and --for apply.
 
     Example:
       $ sros demo --topic /camera/image

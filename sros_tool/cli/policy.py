@@ -254,7 +254,7 @@ def diff_policy(
     or Zenoh configurations such as router.json5. Permissions and Zenoh rules are shown in ROS
     terms; the signature of permissions is verified if the permissions CA is next to them. "!" marks
     a right of B whose counterpart, such as the subscriber, only A has. If A or B covers only some
-    enclaves, as an export does, only these are compared. If a policy lacks Zenoh routers, and these
+    enclaves, as an export does, only these are compared. A policy may lack Zenoh routers: if they
     have only the rights that every node needs, a note names them in place of a difference. Lines
     that differ only in the robot of a fleet are shown as one. Two policies are also compared by the
     protection that they demand, two keystores by their governance.
@@ -265,13 +265,13 @@ def diff_policy(
     With --no-new-access, A and B can also be folders of policies, or policies at a git revision, as
     git:REVISION:PATH; the output calls A BASE, and B HEAD. The exit status is 0 only if, for every
     vendor, domain and name, B gives no enclave any access that A does not give. Also, B must not
-    assign a node to an enclave with more rights, or protect anything less. The exit status is 2 if
-    sros cannot decide this. sros assumes that a policy is signed with a governance that controls
-    all access. If A is a policy, and B is a keystore that protects less than the template
-    production, this counts as more access. If A is a keystore, and B is a policy, B never counts as
-    less protection. The last line says what is assumed and what is left out, such as dates. "!"
-    marks a DENY of A that B lacks, for names that B does not allow. If only a DENY is missing,
-    nobody gets access, so the exit status is 0, but `sros review` fails.
+    assign a node to an enclave with more rights, and must not protect anything less. The exit
+    status is 2 if sros cannot decide this. sros assumes that a policy is signed with a governance
+    that controls all access. If A is a policy, and B is a keystore that protects less than the
+    template production, this counts as more access. If A is a keystore, and B is a policy, B never
+    counts as less protection. The last line says what is assumed and what is left out, such as
+    dates. "!" marks a DENY of A that B lacks, for names that B does not allow. If only a DENY is
+    missing, nobody gets access, so the exit status is 0, but `sros review` fails.
 
     Example:
       $ sros diff_policy robot.xml keystore
@@ -513,9 +513,10 @@ class _SeveralObserved(SeveralValues):
     default="never",
     show_default=True,
     help="`difference`: exit with 1 if POLICY has rights to remove, wildcards to replace, or "
-    "rights that were used only in part; if it lacks an observed right; or if an enclave, or a "
-    "robot of it, is only in POLICY or only in OBSERVED. Nodes of an enclave count one by one if "
-    "OBSERVED has their profiles, but not with --fleet.",
+    "rights that were used only in part; if POLICY lacks an observed right; or if an enclave is "
+    "only in POLICY or only in OBSERVED. With --fleet, an enclave that was never observed for one "
+    "robot also counts. Without --fleet, sros also compares each node of an enclave, if OBSERVED "
+    "has profiles of the nodes.",
 )
 @force_option
 @dry_run_option

@@ -234,8 +234,9 @@ def review(
     are relative to the top of the repository.
 
     Both commits are read from git itself: nothing is checked out, and files of the work tree are
-    read only to report that they differ. No link in a commit is followed, and no program of the
-    repository or its configuration is run. The result names everything that was not reviewed.
+    read only to report that they differ from HEAD. No link in a commit is followed, and no program
+    of the repository or its configuration is run. The result names everything that was not
+    reviewed.
 
     Example:
       $ sros review --base refs/remotes/origin/main --policy robot/robot.xml

@@ -517,7 +517,7 @@ def units(
     dry_run: bool,
     as_json: bool,
 ) -> None:
-    """Write systemd units to FOLDER: nodes in ENCLAVE..., and timers (--job).
+    """Write systemd units to FOLDER: for nodes in ENCLAVE..., and for timers (--job).
 
     A node runs in its enclave or not at all, sees the keys of no other enclave, and gets no
     privilege of the system that a ROS node does not need. COMMAND is the node's program; the

@@ -100,7 +100,7 @@ def _focus_completions(
     "hosts",
     multiple=True,
     metavar="HOST=ENCLAVE",
-    help="Group ENCLAVE, and the enclaves below it, by the host they run on.",
+    help="Draw ENCLAVE, and the enclaves below it, in the group of HOST. Can be repeated.",
 )
 @fleets_option
 @click.option(

@@ -71,7 +71,7 @@ _FOUND_WORDS = {"create": "missing", "replace": "out of date", "remove": "no lon
     multiple=True,
     metavar="NAME",
     help=(
-        "Let only these topics and services pass between routers, such as '/fleet/*'; by default "
+        "Let only these topics and services, such as '/fleet/*', pass between routers; by default "
         "all names for which enclaves at both ends have rights. May be repeated; '' restores the "
         "default."
     ),
@@ -80,8 +80,8 @@ _FOUND_WORDS = {"create": "missing", "replace": "out of date", "remove": "no lon
     "--mode",
     type=click.Choice(["client", "peer"]),
     help=(
-        "client (default): sessions connect only to the router. peer: also to each other, on one "
-        "host."
+        "client (default): sessions connect only to the router. peer: sessions on one host also "
+        "connect to each other."
     ),
 )
 @click.option("--domain", metavar="IDS", help="ROS domains; by default the keystore's.")

@@ -274,7 +274,8 @@ def test_everything_is_prepared_and_nothing_is_closed(robot: Robot) -> None:
     assert 'Environment="ROS_SECURITY_ENCLAVE_OVERRIDE=/talker"\n' in drop_in.read_text()
     assert not robot.restarts and not [*(robot.folder / "systemd").iterdir()]
     assert ended.err.endswith(
-        "next: sros doctor, to find an RMW that enforces security, and set it\n"
+        "next: sros doctor, to find an RMW that enforces security; then set RMW_IMPLEMENTATION to "
+        "this RMW\n"
     )
     (ignored := robot.folder / "robot/.gitignore").write_text("mine\n")
     said = robot.close().err
