@@ -63,8 +63,8 @@ class DomainSet:
                 raise UsageError(
                     f"{text!r}{source and f' ({source})'} is neither a domain id nor a list of "
                     "domain ids",
-                    f"Domain ids are whole numbers from 0 to {MAX_DOMAIN}; "
-                    "above it, some DDS vendors refuse the documents.",
+                    f"Domain ids are whole numbers from 0 to {MAX_DOMAIN}; some DDS vendors refuse "
+                    "documents with larger numbers.",
                     "Write for example 0 or 0,7 or 10-19.",
                 )
             pairs.append((first, last))

@@ -419,16 +419,16 @@ def portability_problems(
                 overlap_test_of([t for r in allowed for t in _topics(getattr(r, other))]),
             )
             if blocked:
-                kept_from = "subscribing" if other == "subscribe" else "publishing"
+                kept_from = "subscribing to" if other == "subscribe" else "publishing on"
                 yield (
                     "portable.deny-blocks-topic",
                     f"denying to {direction} {_topics_text(blocked)} also keeps the enclave from "
-                    f"{kept_from} there",
+                    f"{kept_from} the same topics",
                 )
         sets = [t for r in grant.rules for c in (*r.publish, *r.subscribe) for t in c.topics]
         sets = sorted({topic for topic in sets if "[" in topic})
         if sets:
-            yield "portable.character-set", f"{_topics_text(sets)} uses a [set] of characters"
+            yield "portable.character-set", f"a [set] of characters is in {_topics_text(sets)}"
 
 
 def _topics(criteria: Iterable[Criteria]) -> tuple[str, ...]:

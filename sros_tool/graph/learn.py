@@ -524,12 +524,12 @@ def _needed_files(root: Path, part: str) -> dict[str, bytes]:
 
 _MOST_SHOWN = 5
 _NOTE_TEXTS = {
-    "ambiguous": "nodes with the same name run in several enclaves, and the graph does not show "
-    "which node runs in which enclave, so each of these enclaves gets the rights of all these "
-    "nodes. To tell them apart, start one node at a time under --watch: {}",
+    "ambiguous": "nodes with the same name ({}) run in several enclaves, and the graph does not "
+    "show which node runs in which enclave, so each of these enclaves gets the rights of all these "
+    "nodes. To tell them apart, start one node at a time under --watch",
     "changing-name": "nodes whose name changes with every start have a profile with a wildcard: {}",
     "half-service": "left out, because only the request or the reply of these services was "
-    "observed; observe again with a longer --spin-time: {}",
+    "observed: {}. Observe again with a longer --spin-time",
     "no-ros-name": "left out, because a policy cannot name topics that have no ROS name: {}",
     "odd-name": "left out, because these names are not valid in ROS; an attacker may be trying to "
     "get a wildcard into your policy: {}",
@@ -541,19 +541,20 @@ _NOTE_TEXTS = {
     "processes were started without an enclave, or ROS_SECURITY_ENCLAVE_OVERRIDE (as `sros run` "
     "and `sros env` set it) names an enclave that the graph does not show. --enclave-per-node "
     "gives each process an enclave of its own, with the name of its node",
-    "same-node": "several processes have the same node in the same enclave, so this enclave gets "
-    "the rights of all of them. Unless it is one process that was restarted, find out whether each "
-    "of these processes is yours, and give the nodes different names (-r __node:=NAME): {}",
-    "service-event": "service introspection is on: every subscriber of these topics can read the "
-    "requests; remove the topics from the policy if introspection is for debugging only: {}",
+    "same-node": "several processes have a node with the same name in the same enclave, so this "
+    "enclave gets the rights of all these processes: {}. Unless it is one process that was "
+    "restarted, find out whether each of these processes is yours, and give the nodes different "
+    "names (-r __node:=NAME)",
+    "service-event": "service introspection is on, and every subscriber of these topics can read "
+    "the requests: {}. If introspection is only for debugging, remove the topics from the policy",
     "sets-clock": "these nodes may set the clock of every node that uses simulated time; only a "
     "simulator or a player needs this: {}",
     "silent": "left out, because these nodes were announced but had no endpoint: {}",
     "stray": "left out, because the writers or readers of these topics belong to no ROS node: {}",
     "unknown-enclave": "left out, because the graph does not show in which enclaves these nodes "
-    "run: ROS_SECURITY_ENCLAVE_OVERRIDE names the enclave, and the observer's keystore has no "
-    "certificate of the enclave; observe with the keystore that has their enclaves (--keystore), "
-    "or start them with `--ros-args --enclave /its/name`: {}",
+    "run: {}. ROS_SECURITY_ENCLAVE_OVERRIDE names their enclaves, and the observer's keystore has "
+    "no certificates of these enclaves. Observe with the keystore that has them (--keystore), or "
+    "start the nodes with `--ros-args --enclave /its/name`",
     "tool": "left out, because these nodes are tools that observe the robot: {}",
 }
 
@@ -692,11 +693,10 @@ def _notes(
     if shared:
         yield Note(
             "graph.shared-enclave",
-            "several processes share an enclave, because of the names of their nodes; it gets the "
-            "rights of all of them. Unless it is one process that was restarted, "
-            "give the nodes different names (-r __node:=NAME), or start each process with "
-            "--ros-args --enclave: "
-            f"{first_subjects(shared)}",
+            "several processes share an enclave, because of the names of their nodes: "
+            f"{first_subjects(shared)}. Each enclave gets the rights of all its processes. Unless "
+            "it is one process that was restarted, give the nodes different names (-r "
+            "__node:=NAME), or start each process with --ros-args --enclave",
         )
     yield from name_notes(users, set(names.values()))
 
@@ -711,7 +711,7 @@ _HEADERS = {
      that were observed may be unwanted. -->
 """,
     RightsOrigin.LOG: """\
-<!-- Written by sros generate_policy: rights that were denied, by the lines of logs.
+<!-- Written by sros generate_policy: rights that were denied, as logs say.
      Review it before you enforce it: a process can print any line, also one that looks like a
      denial, to get a right that it should not have. -->
 """,

@@ -313,7 +313,8 @@ def _certificate_in(
         ):
             return _load_der(certificate)
     why = "It is a TRUSTED CERTIFICATE that is not trusted for this use."
-    raise PkiError(unreadable, why, "Write it with the label CERTIFICATE.")
+    remedy = "`openssl x509 -in FILE -out NEW` writes it without trust settings."
+    raise PkiError(unreadable, why, remedy)
 
 
 def _permits_use(trust_settings: bytes, settings_use: TrustSettingsUse) -> bool:
@@ -590,7 +591,10 @@ def other_issuer_text(certificate: x509.Certificate, authority: x509.Certificate
         return f"another CA named {name} (the certificate does not name the CA's key)"
     named, here = issuer.key_identifier.hex(), own.digest.hex() if own else "missing"
     if named == here:
-        return f"a CA named {name} by its key identifier, but signature or serial number differ"
+        return (
+            f"a CA that has the same name, {name}, and the same key identifier, but not the same "
+            "key or serial number"
+        )
     return f"another CA named {name} (key identifier {named}, here {here})"
 
 

@@ -436,7 +436,7 @@ def list_refusal(
     best = _best_list(chain, lists, moment)
     if best is None:
         name = subject_text(certificate.issuer)
-        text = f"the revocation list of {name} is missing, and OpenSSL has another CA's list"
+        text = f"the revocation list of {name} is missing, although there is a list of another CA"
         return ListRefusal(Obstacle.MISSING, None, text)
     crl, issuer, score = best
     name = subject_text(issuer.subject)

@@ -178,7 +178,8 @@ def check_key(content: bytes, label: str = "") -> None:
 
 
 def _unreadable_key_error(name: str, reason: str = "") -> PkiError:
-    why = f"It is not a PEM private key, or it is damaged{f': {reason}' if reason else ''}."
+    reason = reason or "it is not a PEM private key, or it is damaged"
+    why = f"{reason[:1].upper()}{reason[1:]}."
     return PkiError(f"the private key {name} cannot be read", why, "Restore it from a backup.")
 
 
@@ -190,7 +191,7 @@ def _key_block(data: bytes, name: str) -> bytes:
             if len(block.content) > _MAX_BYTES and block.label in _PRIVATE_KEY_LABELS:
                 raise PkiError(
                     f"the private key {name} is too large",
-                    f"It has more than {_MAX_BYTES // 1024} KiB; an RSA key of 4096 bits has 4.",
+                    f"It has more than {_MAX_BYTES // 1024} KiB; an RSA key of 4096 bits, 4 KiB.",
                     "Use an EC prime256v1 key, or an RSA key of 2048 bits.",
                 )
             if block.label in KEY_LABELS and not block.headers:
@@ -330,7 +331,8 @@ def few_rounds_clause(pem: bytes) -> str:
         except (ValueError, PkiError):
             continue  # `load_key` reports it
         if scrypt and math.prod(numbers[:3]) < _LEAST_SCRYPT_WORK:
-            return f"trying a passphrase takes scrypt with {', '.join(map(str, numbers[:3]))}"
+            work = ", ".join(map(str, numbers[:3]))
+            return f"trying a passphrase takes scrypt with N, r, p = {work}"
         if not scrypt and numbers and numbers[0] < _FEWEST_SAFE_ROUNDS:
             return f"trying a passphrase takes {numbers[0]} rounds"
     return ""
@@ -349,7 +351,7 @@ def _decrypted(pem: bytes, name: str, passphrase: str) -> PrivateKeyTypes:
     secret = _as_bytes(passphrase)
     with reading(
         f"the private key {name} cannot be decrypted",
-        "The passphrase is wrong.",
+        "The passphrase is wrong, or the file is damaged.",
         "Try again with the right passphrase.",
     ):
         return serialization.load_pem_private_key(pem, secret, unsafe_skip_rsa_key_validation=True)
@@ -361,7 +363,7 @@ def _as_bytes(passphrase: str) -> bytes:
     if len(secret) > LONGEST_PASSPHRASE:
         raise PkiError(
             "the passphrase is too long",
-            f"It has {len(secret)} bytes, and OpenSSL accepts {LONGEST_PASSPHRASE}.",
+            f"It has {len(secret)} bytes, and OpenSSL accepts at most {LONGEST_PASSPHRASE}.",
             "Choose a shorter one.",
         )
     return secret

@@ -424,7 +424,7 @@ def _split(message: bytes) -> tuple[bytes | None, bytes]:
         if (form := kind_of(message)) not in ("", SIGNED_MESSAGE):
             raise PkiError("it is not an S/MIME signed message", f"It is {form}.")
         raise PkiError(
-            "it has a line end or a zero byte, which programs read in different ways",
+            "it has a zero byte, or a line end that programs read in different ways",
             "The lines of a signed document end with CR and LF, or with LF.",
         )
     head, _, body = text.partition(b"\n\n")

@@ -288,7 +288,7 @@ def _open_key(parsed: TokenUri, secrets: Secrets, *, create: bool) -> TokenKey:
         raise PkiError(
             f"the key {parsed.object!r} on the token {parsed.token!r} is not an EC prime256v1 key",
             "Not every DDS vendor accepts other keys.",
-            "Name another object of the token.",
+            "Name an EC prime256v1 key of the token (object=LABEL).",
         )
     return TokenKey(private, loaded, parsed)
 
@@ -459,8 +459,8 @@ def parse_enclave_uri(uri: str, name: str) -> TokenUri:
     if kind != "private" or too_long or not all(map(str.isprintable, texts)):
         raise UsageError(
             "the PKCS#11 URI cannot name the key of an enclave",
-            f"The token name has at most {_LONGEST_TOKEN} bytes, the object name at most "
-            f"{_LONGEST_OBJECT}; neither has control characters. The type, if stated, is private.",
+            f"The token name may have at most {_LONGEST_TOKEN} bytes, the object name at most "
+            f"{_LONGEST_OBJECT}, and no control characters. A stated type has to be private.",
             "Write pkcs11:token=NAME;object=LABEL?pin-source=FILE.",
         )
     return parsed
@@ -544,7 +544,7 @@ def _attributes(parts: Sequence[str], known: Set[str]) -> dict[str, str]:
             shown = f" {name!r}" if name.replace("-", "").isalpha() else ""
             raise UsageError(
                 f"the attribute{shown} of a PKCS#11 URI is not accepted",
-                "It is unknown in RFC 7512, in the wrong part of the URI, or repeated.",
+                "sros does not support it here, or it is repeated or in the wrong part of the URI.",
                 "Write pkcs11:token=NAME;object=LABEL?module-path=FILE&pin-source=FILE.",
             )
         attributes[name] = unquote(value)

@@ -79,7 +79,7 @@ _SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*:")
 NAME_THE_FLEET = (
     "Name the fleet's file with --fleet FILE. If the verb has no --fleet, copy the policy, and "
     "write a robot's name in place of the placeholder. `merge_policy` does not change a policy "
-    "with placeholders: write placeholders in the other policy, too, and name both files."
+    "with placeholders: write placeholders in the other policy, too, and use both files unmerged."
 )
 """The remedy for reading a policy with placeholders without a fleet."""
 _MAX_INCLUDES = 10_000
@@ -231,7 +231,7 @@ class Includer:
         if self._includes > _MAX_INCLUDES or len(place.trail) >= _MAX_DEPTH:
             raise PolicyError(
                 f"{where}: there are too many includes, or they are nested too deeply",
-                f"At most {_MAX_INCLUDES} are read, at most {_MAX_DEPTH} within each other.",
+                f"At most {_MAX_INCLUDES} are read, and they may be nested {_MAX_DEPTH} deep.",
                 "Write the rights themselves in place of some includes.",
             )
         if element.get("parse", "xml") != "xml":
@@ -451,7 +451,7 @@ def refuse_fallbacks(policy: Policy) -> None:
     for source, file in policy.fallbacks:
         raise PolicyError(
             f"{source}: the fallback of the include is used, because '{file}' is absent",
-            "Decisions on this policy would be right only on machines that lack the file, too.",
+            "On a machine that has the file, decisions on this policy would be wrong.",
             "Add the file, or put the rights of the fallback in the place of the include.",
         )
 
@@ -1092,8 +1092,8 @@ class _EarlierReader(_Reader):
             names = ", ".join(dict.fromkeys(self._private[:3]))
             yield Note(
                 "convert.private-name",
-                f"{names}: since ROS 2 Eloquent a private name has a slash, which was added here. "
-                "ros2/sros2 of Eloquent joined the name to the name of the node without a slash.",
+                f"{names}: sros added the slash that a private name needs since ROS 2 Eloquent. "
+                "But ros2/sros2 of Eloquent joined the names of node and topic without a slash.",
             )
         for enclave in policy.enclaves:
             if not any(profile.groups for profile in enclave.all_profiles()):

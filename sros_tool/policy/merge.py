@@ -462,8 +462,8 @@ def merge_all(path: Path, policies: Iterable[Policy]) -> Merged:
     first_nodes = nodes_in_several_namespaces(first.enclaves)
     several = (
         f"{enclave} has the node {node} in {first_few([profile.ns for profile in profiles], 3)}: "
-        "each process in this enclave has the rights of all of them. Put the namespace into path=, "
-        "too, to give each instance an enclave of its own."
+        "each process in this enclave has the rights of the node in all these namespaces. Put the "
+        "namespace into path=, too, to give each instance an enclave of its own."
         for (enclave, node), profiles in nodes_in_several_namespaces(before.enclaves).items()
         if first_nodes.get((enclave, node), ()) != profiles
     )
@@ -492,7 +492,7 @@ def _shared_enclaves(before: Policy, policies: Iterable[Policy], after: Policy) 
         if nodes and come and asked.get(enclave, set()).isdisjoint(map(_name_of, nodes)):
             yield (
                 f"{enclave} has {_nodes_text(nodes)}, and now also {_nodes_text(come)}: each "
-                "process in this enclave has the rights of all of them. Unless they run in one "
+                "process in this enclave has the rights of all these nodes. Unless they run in one "
                 "process, give one of them another enclave, with --enclave or in its policy."
             )
 
@@ -541,7 +541,11 @@ def _check_protection(path: Path, merged: Policy, additions: Policy) -> None:
     for protection in stated_protections(additions.enclaves):
         old = present.get((protection.kind, protection.name))
         if old is None or old.level is not protection.level:
-            says = f'says protect="{old.word}" at {old.source}' if old else "does not state it"
+            says = (
+                f'says protect="{old.word}" at {old.source}'
+                if old
+                else "states no protection of it"
+            )
             raise PolicyError(
                 f'{protection.source}: {protection} has protect="{protection.word}", and '
                 f"'{path}' {says}",

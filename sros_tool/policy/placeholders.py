@@ -108,7 +108,9 @@ def check_path(path: Parts) -> None:
     path_placeholders = placeholders_of(path)
     if plural := next((part for part in path_placeholders if part.plural), None):
         singular = plural._replace(plural=False)
-        raise ValueError(f"{plural} names all robots, a path names one enclave: write {singular}.")
+        raise ValueError(
+            f"{plural} names all robots, but a path names one enclave: write {singular}."
+        )
     if len({part.group for part in path_placeholders}) > 1:
         raise ValueError("Its placeholders are of different groups.")
 
@@ -132,7 +134,7 @@ def check_name(name: Parts, path: Parts, *, several: bool) -> None:
                     f"{placeholder} stands for several names, but only one can be here."
                 )
         elif not of_path:
-            suggestion = f" For a name for each robot write {placeholder._replace(plural=True)}."
+            suggestion = f" For a name for each robot, write {placeholder._replace(plural=True)}."
             raise ValueError(
                 f"{placeholder} stands for one robot, but the enclave's path does not say which "
                 f"one.{suggestion if several else ''}"
@@ -141,8 +143,8 @@ def check_name(name: Parts, path: Parts, *, several: bool) -> None:
             only = str(placeholder._replace(value="robot"))
             raise ValueError(
                 f"{placeholder} stands for a robot of a group, and the path of this enclave is not "
-                f"for this group alone: leave out the group, or write another enclave for it, with "
-                f"{only} in its path."
+                "for this group alone: leave out the group, or write another enclave for the "
+                f"group, with {only} in its path."
             )
 
 

@@ -79,7 +79,9 @@ class Revision:
         sizes = self.repository.sizes(ids)
         if sum(sizes.get(tree_entry.id, 0) for _, tree_entry in files) > _MOST_POLICY_BYTES:
             raise DocumentError(
-                f"'{self}' has more than {_MOST_POLICY_BYTES} bytes", "", "Name a policy in it."
+                f"'{self}' has more than {_MOST_POLICY_BYTES} bytes",
+                "",
+                "Name a policy in the folder.",
             )
         contents = self.repository.contents(ids)
         policies = [
@@ -107,7 +109,7 @@ class Revision:
             raise MissingFileError(f"'{shown}' does not exist")
         if entry.mode not in FILES:
             raise DocumentError(
-                f"'{shown}' is {entry.kind}", "", "Name a file of the revision itself."
+                f"'{shown}' is {entry.kind}", "", "Name a regular file of the revision."
             )
         return self.repository.content(entry.id)
 
@@ -262,7 +264,7 @@ class CommitFiles:
         # Checked before reading, because many links together may be too large.
         for where, link in links.items():
             if not 0 < sizes.get(link.id, 1) <= _LONGEST_TARGET:
-                raise DocumentError(f"'{where}' is a link with an impossible target")
+                raise DocumentError(f"'{where}' is a link to a path that no file can have")
         places: dict[str, list[str]] = {}
         for where, tree_entry in plain.items():
             places.setdefault(tree_entry.id, []).append(where)
@@ -272,7 +274,7 @@ class CommitFiles:
         contents = self.repository.contents(link.id for link in links.values())
         for where, link in links.items():
             if b"\0" in contents[link.id]:
-                raise DocumentError(f"'{where}' is a link with an impossible target")
+                raise DocumentError(f"'{where}' is a link to a path that no file can have")
         top = self.folder / path
         with Folder(self.folder) as folder:
             _make_folders(folder, path)

@@ -61,6 +61,7 @@ from sros_tool.proof.worlds import (
     valid_topics,
 )
 from sros_tool.reach import OF_EVERY_NODE, QUESTIONS
+from sros_tool.wording import counted
 
 MOST_STEPS = 8_000_000
 """Maximum number of search steps for names that several wildcards match: about twenty seconds."""
@@ -909,12 +910,12 @@ def _why_never_fails(requirement: Requirement, world: World) -> str:
             if len(_matching_enclaves(enclaves, world.enclaves)) == count:
                 return "every enclave matches the list"
         case AtMost(most=most) if most >= count:
-            return f"there are only {count} enclaves"
+            return f"the whole system has {counted(count, 'enclave')}"
         case Widest() | NothingBut() if not any(restricted_enclaves(requirement, world.enclaves)):
             return "no enclave is left to restrict"
         case Widest(rights=rights):
             if all(any(covers(name, "/*") for name in names) for _, names in rights):
-                return "wildcards may match every name"
+                return "the requirement lets wildcards match every name"
         case Apart():
             through = _matching_enclaves(requirement.through, world.enclaves)
             sources = _matching_enclaves(requirement.sources, world.enclaves) - through

@@ -411,11 +411,9 @@ def decided_findings(
     findings += [_assumption_finding(*assumption) for assumption in decided.assumed]
     findings += [_not_crossing_finding(*blocked_use) for blocked_use in decided.blocked]
     if system.is_export:
-        text = "only the enclaves in this export were judged: others of its keystore may be missing"
+        text = "only the enclaves in this export were judged: its keystore may have other enclaves"
         if decided.unjudged:
-            text += (
-                f", such as {first_few(decided.unjudged, _MOST_SHOWN)}, which should have rights"
-            )
+            text += f", such as {first_few(decided.unjudged, _MOST_SHOWN)}, which must have rights"
         if away := sorted({name for world in system.worlds for name in world.away}):
             text += f"; left out on purpose, for other machines: {first_few(away, _MOST_SHOWN)}"
         findings.append(OF_EXPORT.found(system.file, text, system.file))
@@ -487,7 +485,7 @@ def _edit_text(violation: Violation) -> str:
             key, enclaves = "enclaves", [violation.steps[0].use.enclave, *violation.alike]
             enclaves += [steps[0].use.enclave for steps in violation.differing]
             if (number := sum(len(names) for _, names in requirement.rights)) > 1:
-                effect = f"; this allows all names of the requirement ({number})"
+                effect = f"; this allows all {number} names of the requirement"
         case Apart(through=listed, sources=sources):
             # The narrowest exception: the first enclaves that pass on what the source sends.
             key, enclaves = "through", [steps[violation.position].use.enclave, *violation.alike]
@@ -501,14 +499,14 @@ def _edit_text(violation: Violation) -> str:
         return ""
     space = requirement.namespace.rstrip("/")
     if not all(name.startswith(f"{space}/") for name in enclaves):
-        effect += "; an enclave with * at its beginning does not move with the namespace"
+        effect += "; an enclave that begins with * is the same in every namespace"
     written = {
         name.removeprefix(space) if name.startswith(f"{space}/") else f"*{name}"
         for name in enclaves
     }
     place, quoted = requirement.source, [f'"{name}"' for name in sorted(written)]
     return (
-        "Change the policy at the named lines; or, if this is wanted, add "
+        "Change the policy at the named lines; or, to allow this, add "
         f"{first_few(quoted, _MOST_SHOWN)} to `{key}` of the requirement at "
         f"{place.file}:{place.line}{effect}."
     )
@@ -559,7 +557,7 @@ def _clause(violation: Violation) -> str:
             if violation.missing:
                 return "does not exist"
             if violation.idle:
-                return "cannot start with its current files; `sros check` shows why"
+                return "cannot start with its current files (`sros check` shows why)"
             return f"may not {steps[0].action_text()}"
         case Protected(level=level):
             return f"its messages are not {_protected(level)}"

@@ -379,7 +379,7 @@ def compare_access(base: AccessSource, head: AccessSource) -> Growth:
     if unclear and not (added or lost or new_nodes):
         raise DocumentError(
             f"'{head.shown}' cannot be compared: {unclear[0]}",
-            "Apart from that, nothing is new.",
+            "In all other parts, no access is new, and no protection is lost.",
         )
     sides: tuple[_Edges | None, ...] = ({}, {})
     if added and not partial:
@@ -424,7 +424,7 @@ def _lost_protection(
 def _not_compared_clauses(base: AccessSource, head: AccessSource) -> Iterator[str]:
     """Yield clauses on parts of HEAD that could not be compared."""
     if fault := contradiction(head):
-        yield f"the protection of HEAD: {fault}"
+        yield f"HEAD contradicts itself: {fault}"
     yield from unknown_settings(base.zenoh_files, head.zenoh_files)
     if "zenoh" in (base.kind, head.kind):
         return
@@ -1451,7 +1451,7 @@ def _assumptions(base: AccessSource, head: AccessSource) -> Iterator[str]:
         if side.kind != "policy" or against.kind == "policy":
             continue
         if _domains_of_robots(side, against).keys() < side.permissions.keys():
-            whose = "its enclaves without a robot" if side.fleet else "it"
+            whose = f"the enclaves of {name} without a robot" if side.fleet else name
             yield f"{name} names no domains, so the domains of {other} count for {whose}"
         if against.zenoh is not None:
             yield f"{name} has the Zenoh settings that sros writes"
@@ -1485,4 +1485,4 @@ def _left_out_texts(base: AccessSource, head: AccessSource) -> Iterator[str]:
         if side.scope is not None and other.scope is None:
             yield f"enclaves that {name} does not have"
     if base.protections is not None and head.governance is None and head.kind != "policy":
-        yield "the protection of messages, of which HEAD says nothing"
+        yield "the protection of messages, which HEAD does not state"

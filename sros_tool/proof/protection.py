@@ -141,7 +141,7 @@ def less_protection(
     yield from _unrevoked_certificates(old, new)
     yield from _changed_certificates(old, new)
     if old.kind == new.kind == "keystore" and old.zenoh is not None and new.zenoh is None:
-        text = "nothing enforces any more what its Zenoh files enforced"
+        text = "nothing enforces any more what these files enforced"
         yield _looser("Zenoh files", "present", "missing", text)
     if old.routers and not {*new.routers} <= {*old.routers}:
         text = "anyone who poses as the router reads and changes everything that passes"
@@ -176,11 +176,12 @@ def _weaker_for_later_enclaves(
             known = old.fleet.robots.get(name)
             if known and known.domain is not None and known.domain != robot.domain:
                 domain = "all of the keystore" if robot.domain is None else str(robot.domain)
+                there = "all domains of the keystore" if robot.domain is None else "the new domain"
                 yield _looser(
                     f"later enclaves: domain of robot {name}",
                     str(known.domain),
                     domain,
-                    "permissions that are signed for it later are valid there",
+                    f"permissions that are signed later for this robot are valid in {there}",
                 )
 
 
@@ -193,7 +194,7 @@ def _changed_certificates(old: AccessSource, new: AccessSource) -> Iterator[Sett
         if new_one.name not in (before, old_one.name if old_one else enclave):
             key, text = (
                 f"certificate of {enclave}",
-                "anyone who has its key can act as that enclave",
+                f"anyone who has its key can act as {new_one.name}",
             )
             yield _looser(key, before, new_one.name, text)
 
@@ -220,10 +221,10 @@ def _unrevoked_certificates(old: AccessSource, new: AccessSource) -> Iterator[Se
         who = (
             f"{names[0]} again trusts" if len(names) == 1 else f"{len(names)} enclaves again trust"
         )
-        text = f"{who} anyone who has its key"
+        text = f"{who} anyone who has the key of this certificate"
         yield _looser(f"certificate {serial:x}", "revoked", "trusted", text)
     if (more := len(trusted) - _MOST_SERIALS) > 0:
-        text = "enclaves again trust anyone who has their keys"
+        text = "enclaves again trust anyone who has a key of these certificates"
         yield _looser(f"{more} more certificates", "revoked", "trusted", text)
 
 
@@ -307,7 +308,7 @@ def _dropped_statements(
                 f"protect {protection}",
                 protection.word,
                 less,
-                f"the policy no longer demands it of {protection.kind.removesuffix('s')} {name}",
+                f"the policy no longer demands this for {protection.kind.removesuffix('s')} {name}",
             )
 
 
@@ -401,7 +402,7 @@ def looser_router_rules(
     """
     if new.routers and not (states_routers(old) and states_routers(new)):
         for router in sorted({*old.passing} - {*new.routers}):
-            meaning = "its enclaves may now be at the same router as others"
+            meaning = "enclaves of this router may now be at the same router as other enclaves"
             yield _looser(f"router {router} of Zenoh", "present", "missing", meaning)
     routers: dict[tuple[str, str], list[str]] = defaultdict(list)
     for router in sorted(old.passing.keys() & new.passing.keys()):
@@ -417,7 +418,7 @@ def looser_router_rules(
             f"rules of router {router} for router {other}",
             "without",
             f"with {names[0]}",
-            f"{names[0]} may pass between them",
+            f"{names[0]} may pass between these routers",
         )
 
 

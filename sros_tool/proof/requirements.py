@@ -415,7 +415,7 @@ def _stated_tables(data: bytes, file: str) -> list[_Table]:
         if not plain or len(requirements) != len(lines):
             raise DocumentError(
                 f"{file}: {kind} is not written as tables",
-                "Every requirement needs a header line: findings state its number.",
+                "Every requirement needs a header line: findings state the number of this line.",
                 f"Write [[{kind}]] on a line of its own before every requirement, and not inside a "
                 "multi-line string.",
             )
@@ -497,7 +497,7 @@ class _Table:
                 raise self.error(
                     key,
                     f"{shortened(key)} is not a key of [[{self.kind}]]",
-                    (f"There are {', '.join(known_keys)}."),
+                    f"Its keys are {', '.join(known_keys)}.",
                 )
         texts = {key: self.text(key) if key in self.values else "" for key in _WORD_KEYS}
         robots = {"robot": self.robot, "of_robots": self.of_robots}
@@ -519,8 +519,6 @@ class _Table:
     def texts(self, key: str, *, least: int = 1) -> tuple[str, ...]:
         """Return the strings of a list value."""
         value = self.values.get(key)
-        if value is None:
-            raise self.error(key, f"{key} is missing in [[{self.kind}]]", "")
         if (
             not isinstance(value, list)
             or not least <= len(value) <= _MOST_TEXTS
@@ -611,6 +609,9 @@ class _Table:
         return replace(self, values=values)
 
     def error(self, key: str, problem: str, why: str, remedy: str = "") -> DocumentError:
+        """Return an error about a key, or about the whole table if ``key`` is ""."""
+        if key and key not in self.values:
+            problem = f"{key} is missing in [[{self.kind}]]"
         place = Source(self.source.file, self.lines.get(key, self.source.line))
         return DocumentError(f"{place}: {problem}", why, remedy)
 
@@ -685,7 +686,7 @@ def _group_members(
                 key,
                 f"{placeholder} stands for robots, but no fleet says which",
                 "",
-                "For a policy, name the fleet file with --fleet; a keystore of a fleet has one.",
+                "For a policy, name the fleet file with --fleet. A keystore needs a fleet itself.",
             )
         try:
             robots = fleet.members(placeholder.group)
@@ -803,7 +804,7 @@ def _at_most_from(table: _Table) -> AtMost:
         raise table.error(
             "enclaves",
             f"enclaves has {shortened(most)}, which is not a number",
-            "Write how many enclaves may use one name, from 1; for none there is [[nobody]].",
+            "Write how many enclaves may use one name, at least 1. If none may, write [[nobody]].",
         )
     return AtMost(**common, rights=table.rights(), most=most)
 

@@ -588,7 +588,7 @@ class _Review:
             if not folder:
                 raise self._missing_file_error(path)
             if not is_keystore(folder):
-                raise DocumentError(f"'{path}' is not a keystore", "It has no enclaves in it.")
+                raise DocumentError(f"'{path}' is not a keystore", "It has no enclaves.")
             return folder
 
         return (yield from _read_each("keystore", self.request.keystores, folder_at))
@@ -643,8 +643,9 @@ class _Review:
             before, after = (read_connections(e.folder / file) for e in (self.base, self.head))
             for where in sorted({*before, *after}, key=_variables_before_hosts):
                 if before.get(where) != (value := after.get(where)):
-                    text = "is gone, which" if value is None else f"is {value}, which"
-                    lines.append((f"{text} can change which keys Ansible delivers, and how", where))
+                    text = "is gone" if value is None else f"is {value}"
+                    effect = "this can change which keys Ansible delivers, and how"
+                    lines.append((f"{text}: {effect}", where))
         return (_FOUND, StepFindings(tuple(lines))) if lines else None
 
     def _converted_step(self) -> tuple[int, Content] | None:
@@ -751,7 +752,9 @@ class _Review:
             if clause := self._hidden_entry_clause(path, entry):
                 lines.append((f"changes and is not reviewed: it is {clause}", path))
         for path in self._paths_of(changed, _is_packed):
-            named.append(("changes and is an archive, or compressed: nothing looks into it", path))
+            named.append(
+                ("changes and is an archive, or compressed: the review does not look into it", path)
+            )
         gone = [(path, entry) for path, entry in earlier if not self._has(self.head, path)]
         for path in self._policies_among(gone, self.base, known=False):
             new = names.get(dict(gone)[path].id)

@@ -206,7 +206,7 @@ def load_side(path: Path, fleet: Fleet | None = None) -> AccessSource:
         if not source.sound or note.id in UNCERTAIN:
             raise DocumentError(
                 f"'{path}' cannot be compared: {note.text.rstrip('.')}",
-                "It is not certain which rights it gives.",
+                "The rights that it gives are not certain.",
                 f"`sros check {quote(str(path))}` shows what is wrong with it.",
             )
     if source.kind == "policy":
@@ -471,7 +471,7 @@ def _trusts(
             except SrosError as error:
                 raise DocumentError(
                     f"'{authority.parent}' cannot be compared: {error.what}",
-                    "It is not certain which certificates it refuses.",
+                    "It is not certain which certificates are refused there.",
                     error.remedy,
                 ) from error
     return trusts

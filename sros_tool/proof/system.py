@@ -561,7 +561,7 @@ def _zenoh_worlds(
             raise KeystoreError(
                 f"what Zenoh enforces in keystore '{root}' is not known: {note.text.rstrip('.')}",
                 "",
-                "Write its files again with `sros zenoh`, or name a DDS vendor with --vendor.",
+                "Write the Zenoh files again (`sros zenoh`), or name a DDS vendor with --vendor.",
             )
     enforcers = source.enforcers
     domains = (domain,) if domain is not None else domains_of(enforcers) or (0,)

@@ -76,7 +76,7 @@ from sros_tool.policy.rights import Right, policy_rights
 from sros_tool.proof.growth import AccessByVendors, Gain
 from sros_tool.proof.sources import AccessSource
 from sros_tool.proof.worlds import domains_of, zenoh_message
-from sros_tool.wording import first_few
+from sros_tool.wording import counted, first_few
 from sros_tool.zenoh.access import Enforcement, Remote
 from sros_tool.zenoh.releases import version_text
 
@@ -296,7 +296,7 @@ def _vulnerability_findings(
             if vulnerabilities
         )
         unclear = {advisory.id for advisory in known[1].unclear} if known[1] else set()
-        parts = [f"{len(old & new)} stay"] if old & new else []
+        parts = [counted(len(old & new), "stays", "stay")] if old & new else []
         for ids, status in (
             (old - new - unclear, "fixed"),
             (old & unclear, f"not known for {releases[1].latest}"),
@@ -514,7 +514,10 @@ def _expired_peers_notes(before: Shipped, after: Shipped) -> Iterator[Finding]:
     drops_before, drops_after = (shipped.vendor.traits.drops_expired for shipped in (before, after))
     if drops_before != drops_after:
         does = "lose each other" if drops_after else "keep communicating"
-        text = f"running processes {does} when the certificate of one of them expires"
+        text = (
+            f"with the new release, running processes {does} when the certificate of one of them "
+            "expires"
+        )
         yield EXPIRED_PEERS.found(f"{before.release} to {after.release}", text)
 
 

@@ -198,7 +198,9 @@ class Participant:
         """Return the samples of a built-in topic that lists discovered objects."""
         reader = self._library.api.dds_create_reader(self.handle, topic, None, None)
         if reader < 0:
-            raise self._dds_error(reader, "cannot read what was discovered")
+            raise self._dds_error(
+                reader, "cannot read the participants or endpoints that were discovered"
+            )
         try:
             return _take_samples(self._library, reader, 1000, copy)
         finally:
@@ -269,8 +271,8 @@ class Participant:
 
 
 _MORE_PARTICIPANTS = (
-    "Without multicast, Cyclone DDS has room for ten participants of a domain. Allow more, with "
-    "CYCLONEDDS_URI='<CycloneDDS><Domain><Discovery><MaxAutoParticipantIndex>100"
+    "Without multicast, Cyclone DDS has room for ten participants of a domain on each host. Allow "
+    "more, with CYCLONEDDS_URI='<CycloneDDS><Domain><Discovery><MaxAutoParticipantIndex>100"
     "</MaxAutoParticipantIndex></Discovery></Domain></CycloneDDS>', or add --backend rclpy to a "
     "node of `sros demo`."
 )

@@ -412,13 +412,13 @@ def replaced_notes(environment: Mapping[str, str], variables: Mapping[str, str])
             continue
         keys = [key.strip().strip("/") for key, _ in override_pairs(before)]
         shown = first_few([_shortened(key) for key in keys], _MOST_KEYS) or "nothing"
-        yield Note("zenoh.replaced", f"{OVERRIDE} was set for {shown}, and is replaced.")
+        yield Note("zenoh.replaced", f"{OVERRIDE} changed {shown}, and is replaced.")
         if any(key.partition("/")[0] == "access_control" for key in keys):
             yield Note(
                 "zenoh.access-control-override",
-                f"WARNING: the replaced {OVERRIDE} changed access_control, so that a process does "
-                "not enforce the rules of its file. Nodes that are started without sros still get "
-                f"it: find out what sets {OVERRIDE}, and remove it there.",
+                f"WARNING: the replaced {OVERRIDE} changed access_control: a process with this "
+                "value does not enforce the rules of its file. Nodes that are started without sros "
+                f"still get the value: find out what sets {OVERRIDE}, and remove it there.",
             )
 
 

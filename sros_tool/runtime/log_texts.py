@@ -111,6 +111,10 @@ _ALL_FAULTS = (
 _EXPLAIN_REMEDY = "`sros explain KEYSTORE ENCLAVE --log LOG` finds the cause in the enclave."
 _LOG_FILE_REMEDY = "If ROS_SECURITY_LOG_FILE names a file, run `sros explain --log FILE` with it."
 _EXPLAIN_OR_LOG_FILE = f"{_EXPLAIN_REMEDY} {_LOG_FILE_REMEDY}"
+_RESTORE_FILE = (
+    "`sros explain KEYSTORE ENCLAVE join` names the file and the command that restores it. For an "
+    "enclave on a robot, export it from its keystore again."
+)
 _RENEW_ENCLAVE = "Renew the enclave: `sros renew KEYSTORE ENCLAVE`."
 _SIGN_PERMISSIONS = "Sign the permissions again: `sros create_permission KEYSTORE ENCLAVE POLICY`."
 _SIGN_DOCUMENT = (
@@ -132,7 +136,7 @@ _WHY_NO_FOLDER = (
     "ROS_SECURITY_KEYSTORE or the enclave's name is wrong, or the user of the node cannot enter "
     "the folder"
 )
-_SHOW_MODES = "`namei -l {path}` shows who may enter."
+_SHOW_MODES = "`namei -l {path}` shows who may enter each folder."
 CHANGE_OWNER_REMEDY = (
     f"{_SHOW_MODES} Give the export to the user of the node: `sudo chown -R USER KEYSTORE`. If the "
     "folder was made after the node started, restart the node."
@@ -159,7 +163,8 @@ _RENEW_PARTICIPANT = (
 _OTHER_PERMISSIONS_CA = (
     "its permissions are not signed by a permissions CA that this process has loaded. This process "
     "was not restarted since stage 1 of a rotation (`sros rotate_ca`), or the peer was not "
-    "restarted since stage 2; or both have enclaves of different keystores, or a file was changed"
+    "restarted since stage 2; or the two processes have enclaves of different keystores, or the "
+    "peer's permissions.p7s was changed after it was signed"
 )
 _SAME_KEYSTORE = (
     "Give both sides enclaves of the same keystore; `sros inspect` shows the CA of an enclave."
@@ -172,8 +177,8 @@ _DENIED_ENDPOINT = (
 )
 _FIND_TOPIC = (
     "Look for an earlier line that names the topic, on standard output or in the file of "
-    "ROS_SECURITY_LOG_FILE. Or run the node without security, and `sros audit KEYSTORE`, which "
-    "names everything that the node would be denied."
+    "ROS_SECURITY_LOG_FILE. Or run the node without security: `sros audit KEYSTORE` then names "
+    "everything that the permissions would deny the node."
 )
 
 _ROS_TEXTS = (
@@ -182,7 +187,8 @@ _ROS_TEXTS = (
         r"|-DSECURITY=ON|does not have security support|security (?:is )?not supported"
         r"|compiled without security",
         "this DDS was built without DDS Security, so no secured node can start with it",
-        "Use the ROS 2 packages of the distribution; `sros doctor` shows which DDS enforces.",
+        "Use the ROS 2 packages of the distribution; `sros doctor` shows which DDS enforces "
+        "security.",
         refuses=RefusedObject.ALL_SECURITY,
     ),
     _log_text(
@@ -214,8 +220,7 @@ _ROS_TEXTS = (
     _log_text(
         "files-missing", _ROS, r"couldn't find all security files",
         "a file of the enclave is missing or a broken link; the message does not say which",
-        "`sros explain KEYSTORE ENCLAVE join` names the file and the command that restores it; on "
-        "a robot, export the enclave again.", _FILE_FAULTS,
+        _RESTORE_FILE, _FILE_FAULTS,
         refuses=RefusedObject.PARTICIPANT,
     ),
     _log_text(  # rmw_cyclonedds
@@ -223,8 +228,7 @@ _ROS_TEXTS = (
         "a file of the enclave is missing, a broken link, or closed to the user of this process; "
         "the message does not say which. With ROS_SECURITY_STRATEGY=Enforce, no node starts; with "
         "any other value, the node RUNS UNSECURED",
-        "`sros explain KEYSTORE ENCLAVE join` names the file and the command that restores it; on "
-        "a robot, export the enclave again.", _FILE_FAULTS,
+        _RESTORE_FILE, _FILE_FAULTS,
         refuses=RefusedObject.PARTICIPANT,
     ),
     _log_text(
@@ -261,8 +265,8 @@ _CYCLONE_PARTICIPANT_TEXTS = (
     _log_text(
         "peer-revoked", _CYCLONE, r"(?:Begin|Process) handshake (?:request |reply )?failed: "
         r"Certificate not valid: error: certificate revoked",
-        "a PEER was refused, not this process: its certificate is revoked. The line names the "
-        "subject of this certificate",
+        "a PEER was refused, not this process: the peer's certificate is revoked. The line names "
+        "the subject of this certificate",
         "If the certificate was replaced (`sros renew --revoke-old`), restart the processes of the "
         "peer's enclave, with its new files. If none of your processes still has the certificate, "
         "somebody tries to use it: the refusal is right.",
@@ -270,29 +274,30 @@ _CYCLONE_PARTICIPANT_TEXTS = (
     _log_text(
         "peer-expired", _CYCLONE, r"(?:Begin|Process) handshake (?:request |reply )?failed: "
         r"Certificate not valid: error: certificate (?P<reason>has expired|is not yet valid)",
-        "a PEER was refused, not this process: by the clock of this host, its certificate {reason}",
+        "a PEER was refused, not this process: by the clock of this host, the peer's certificate "
+        "{reason}",
         f"Compare the clocks of both hosts. {_RENEW_PARTICIPANT}",
     ),
     _log_text(
         "peer-refused", _CYCLONE, r"(?:Begin|Process) handshake (?:request |reply )?failed: "
         r"Certificate not valid: error: (?P<reason>[^;]+)",
-        "a PEER was refused, not this process: its certificate is not accepted ({reason}); if the "
-        "CAs differ, the peer logs the same message or nothing",
+        "a PEER was refused, not this process: the peer's certificate is not accepted ({reason}); "
+        "if the two have different CAs, the peer logs the same message or nothing",
         _SAME_KEYSTORE,
     ),
     _log_text(
         "peer-handshake", _CYCLONE, r"(?:Begin|Process) handshake (?:request |reply )?failed"
         r"|FSM: handshake (?:failed|timeout)|handshake \(lguid=\S+ rguid=\S+\) failed",
-        "a PEER failed to authenticate: most often the key.pem of the peer is not the key of its "
-        "cert.pem, which the peer's Cyclone DDS does not check; or the peer runs another DDS or "
-        "version",
+        "a PEER failed to authenticate: most often the peer's key.pem does not belong to its "
+        "cert.pem (Cyclone DDS does not check this when the peer starts); or the peer runs another "
+        "DDS, or another version",
         "Run `sros verify` or `sros inspect` on the enclave of every peer.", (Fault.KEY_MISMATCH,),
     ),
     _log_text(
         "peer-governance", _CYCLONE, r"security_attributes mismatch",
-        "a PEER was refused: its governance has other protection than the governance of this "
-        "process. The processes have enclaves of different keystores, or one process was started "
-        "before the governance changed",
+        "a PEER was refused: its governance demands other protection than the governance of "
+        "this process. The processes have enclaves of different keystores, or one process was "
+        "started before the governance changed",
         f"{_SAME_KEYSTORE} `sros inspect` also shows the governance. Export the enclaves again, "
         "and restart both processes.",
     ),
@@ -318,7 +323,7 @@ _CYCLONE_PARTICIPANT_TEXTS = (
     _log_text(
         "peer-refused", _CYCLONE,
         rf"{_CYCLONE_PARTICIPANT} permissions from plugin: (?P<reason>\w.+)",
-        "a PEER was refused, not this process: its permissions are not accepted ({reason})",
+        "a PEER was refused, not this process: the peer's permissions are not accepted ({reason})",
         _SAME_KEYSTORE,
     ),
 )  # fmt: skip
@@ -368,7 +373,8 @@ _CYCLONE_START_TEXTS = (
     _log_text(
         "crl-expired", _CYCLONE, r"Certificate not valid: error: CRL (?:has expired|is not yet)",
         "the CRL has expired or is not valid yet, so that every participant is refused",
-        "Sign the CRL again: `sros crl KEYSTORE --refresh`.",
+        "Check the clock of the host. If it is right, sign the CRL again: `sros crl KEYSTORE "
+        "--refresh`.",
         (Fault.CRL_EXPIRED, Fault.CRL_NOT_YET_VALID),
     ),
     _log_text(
@@ -385,7 +391,8 @@ _CYCLONE_START_TEXTS = (
     _log_text(
         "pem-unreadable", _CYCLONE, r"Failed to parse (?:certificate|private key)"
         r"|Certificate is invalid: ",
-        "a certificate or key.pem is not a PEM file (the message says certificate for all)",
+        "a certificate or key.pem is not a PEM file (for key.pem, the message may also say "
+        "certificate)",
         "Restore the file.", (Fault.CERTIFICATE_MALFORMED, *_KEY_FAULTS, *_FILE_FAULTS),
     ),
     _log_text(
@@ -463,7 +470,8 @@ _FAST_PARTICIPANT_TEXTS = (
     _log_text(
         "peer-version", _FAST, r"Remote participant PermissionsCA algorithm differs from local",
         "a PEER was refused: the peer runs another version of Fast DDS, or has a permissions CA "
-        "with another type of key", "Run one version of Fast DDS on all hosts of the robot.",
+        "with another type of key", "Run one version of Fast DDS on all hosts of the robot. "
+        f"If the versions are the same: {_SAME_KEYSTORE}",
     ),
     _log_text(
         "peer-permissions", _FAST,
@@ -497,7 +505,8 @@ _FAST_PARTICIPANT_TEXTS = (
     _log_text(
         "peer-refused", _FAST, r"Error validating remote permissions for"
         r"|Remote participant doesn't sent the signed permissions|Not receive remote permissions",
-        "a PEER was refused, not this process: its permissions did not arrive or were not accepted",
+        "a PEER was refused, not this process: the peer's permissions did not arrive or were not "
+        "accepted",
         _SAME_KEYSTORE,
     ),
     _log_text(
@@ -513,7 +522,8 @@ _FAST_PARTICIPANT_TEXTS = (
         "a publisher or subscription of a PEER was refused. If no other line gives the reason, "
         "the governance of the peer protects the topic differently: the processes have enclaves "
         "of different keystores, or one process was started before the governance changed",
-        "`sros check KEYSTORE OTHER`, with the keystore or export of the peer, names the topic. "
+        "`sros check KEYSTORE OTHER`, with the keystore or export of the peer as OTHER, names the "
+        "topic. "
         "Export the enclaves of both processes again, from the same keystore, and restart both "
         "processes.", vagueness=1,
     ),
@@ -524,15 +534,16 @@ _FAST_START_TEXTS = (
     _log_text(
         "identity", _FAST, r"SECURITY\s*Error\]\s*->\s*Function validate_local_identity"
         r"|PKIDH::validate_local_identity :\s*\Z",
-        "the identity is refused, and the message gives no reason: the certificate or its CA is "
-        "out of date, from another CA, damaged or revoked, or crl.pem is out of date or damaged",
+        "the identity is refused, and the message gives no reason. Either the certificate or its "
+        "CA is out of date, from another CA, damaged or revoked, or crl.pem is out of date or "
+        "damaged",
         _EXPLAIN_REMEDY,
         (*_CERTIFICATE_FAULTS, Fault.CERTIFICATE_MALFORMED, *_CA_FAULTS, *_CRL_FAULTS),
     ),
     _log_text(
         "ca", _FAST, r"Error '(?P<number>\d+)' verifying CA certificate"
-        r"(?: for \S.*?: (?P<reason>[a-z][\w ,()-]*?))?(?= \(\S+:\d+\)|\Z)",
-        "the first certificate of a CA's file is not accepted (OpenSSL's error {number}: {reason})",
+        r"(?: for \S.*?(?P<reason>: [a-z][\w ,()-]*?))?(?= \(\S+:\d+\)|\Z)",
+        "the first certificate in a CA file is not accepted (OpenSSL's error {number}{reason})",
         _EXPLAIN_REMEDY, (*_CA_FAULTS, Fault.CERTIFICATE_MALFORMED),
         refuses=RefusedObject.PARTICIPANT,
     ),
@@ -547,7 +558,7 @@ _FAST_START_TEXTS = (
         "token", _FAST, r"Error opening the private key \w+=|Error retrieving 'pkcs11' engine"
         r"|Error initializing the HSM provider library|Error setting the PIN in the 'pkcs11'",
         "the key is on a PKCS#11 token that Fast DDS cannot use: the token, OpenSSL's engine "
-        "(libengine-pkcs11-openssl), its module or the PIN is missing or wrong",
+        "(libengine-pkcs11-openssl), the token's PKCS#11 module or the PIN is missing or wrong",
         "`sros verify DIR --tokens` asks the token for the key.", (Fault.TOKEN_URI,),
         refuses=RefusedObject.PARTICIPANT,
     ),
@@ -628,7 +639,8 @@ _CONSEQUENCE_TEXTS = (
     _log_text(
         "plugin-unset", _FAST, r"Authentication plugin not configured. Security will be disabled",
         "the process RUNS UNSECURED: it has no enclave",
-        "Start the process with `sros run KEYSTORE ENCLAVE -- COMMAND`, secured or not at all.",
+        "Start the process with `sros run KEYSTORE ENCLAVE -- COMMAND`, which runs a process "
+        "secured or not at all.",
     ),
     _log_text(
         "participant", _FAST, r"Error while configuring security plugin"

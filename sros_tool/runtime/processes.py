@@ -1198,7 +1198,8 @@ def _loaded_enclave(
         return None
     name = environment.get(ENCLAVE) or enclave_argument(command)
     if not keystore.startswith("/") and not folder:
-        return ProcessEnclave(keystore, name, problem=f"{KEYSTORE} is a relative path")
+        why = f"{KEYSTORE} is a relative path, and the working directory is not known"
+        return ProcessEnclave(keystore, name, problem=why)
     top = keystore if keystore.startswith("/") else f"{folder}/{keystore}"
     place = f"{top}/enclaves/{name.strip('/')}"
     try:

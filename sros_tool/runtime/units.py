@@ -47,7 +47,7 @@ METRICS_FILE = "/var/lib/sros-metrics/sros.prom"
 FLEET_FILE = "/var/lib/sros-metrics/fleet.prom"
 
 _ORIGIN_COMMENT = (
-    "# Made by `sros units`; change it with `systemctl edit`, and this file stays as it is."
+    "# Made by `sros units`. Change it with `systemctl edit`, which leaves this file as it is."
 )
 _PLAIN_PATH = re.compile(r"(/(?!\.\.?(/|\Z))[A-Za-z0-9_.][A-Za-z0-9._+-]*)+\Z")
 _USER = re.compile(r"[A-Za-z_][A-Za-z0-9_-]{0,30}\Z")
@@ -152,11 +152,12 @@ def node_template(user: str) -> str:
     Without `node_settings`, which contain the command, the unit starts nothing for an enclave.
     """
     return f"""\
-# Runs a node in the enclave of its instance name, which sros@NAME.service.d/enclave.conf adds.
+# Runs a node. The instance name is the node's enclave; sros@NAME.service.d/enclave.conf has the
+# settings of the enclave, and the command.
 {_ORIGIN_COMMENT}
 [Unit]
 Description=ROS node in enclave %f
-# Certificates are not valid before their time, and DDS looks for network interfaces only once.
+# Before the clock is set, certificates are not valid. DDS looks for network interfaces only once.
 Wants=network-online.target time-sync.target
 After=network-online.target time-sync.target
 
@@ -216,7 +217,7 @@ def node_settings(
         _ORIGIN_COMMENT,
         "[Service]",
         *render_environment(variables, "systemd").splitlines(),
-        "# The node sees the keys of no other enclave, and of no CA.",
+        "# The node sees neither the keys of other enclaves nor the keys of CAs.",
         f"InaccessiblePaths=-{keystore}/private",
     ]
     if place != folder:

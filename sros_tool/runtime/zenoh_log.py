@@ -20,7 +20,7 @@ _SAME_KEYSTORE = (
     "Give both sides enclaves of the same keystore, and restart both after each stage of `sros "
     "rotate_ca KEYSTORE`; `sros inspect` shows the CA of an enclave."
 )
-_WRITE_AGAIN = "Let `sros zenoh KEYSTORE` write the file, and do not edit the file."
+_WRITE_AGAIN = "Let `sros zenoh KEYSTORE` write the configuration, and do not edit it."
 
 ZENOH_IDS = "zenoh-"
 """Prefix of the ids of Zenoh's log texts."""
@@ -42,7 +42,7 @@ _LISTENING_TEXTS = (
     _zenoh_text(
         "foreign-ca", r"zenoh_link\S*: received fatal alert: UnknownCA"
         r"|invalid peer certificate: UnknownIssuer",
-        "a PEER was refused, or refused this process: their certificates are of different CAs",
+        "a PEER was refused, or refused this process: the two certificates are of different CAs",
         _SAME_KEYSTORE,
     ),
     _zenoh_text(
@@ -81,7 +81,7 @@ _LISTENING_TEXTS = (
         "a PEER is connected, and may do nothing: no rule here has the name of its certificate",
         "`sros zenoh KEYSTORE --check` shows whether the files are up to date; restart the "
         "processes that it names. If the peer is the router, it runs in another enclave than the "
-        "keystore names.",
+        "router enclave of the keystore.",
     ),
     _zenoh_text(
         "no-subject-open", r"(?P<zid>[0-9a-f]{1,32}) did not match any configured ACL subject\. "

@@ -339,11 +339,13 @@ def _names_of(
 def _untranslatable_denial_error(
     right: str, denied: str, denying: Source, wide: str, allowing: Source, why: str
 ) -> PolicyError:
-    allows = f"line {allowing.line} of '{allowing.file}' allows" if allowing.line else "they allow"
+    allows = (
+        f"line {allowing.line} of '{allowing.file}' allows" if allowing.line else "the rights allow"
+    )
     return PolicyError(
         f"{denying}: DENY {right} {denied} cannot be expressed in Zenoh, because {allows} {wide}",
-        "In Zenoh, a query or a put with a wildcard bypasses a DENY inside a wildcard. So sros "
-        f"lists the names that remain allowed, and {why}.",
+        "In Zenoh, a query or a put with a wildcard bypasses a rule that denies only some of its "
+        f"names. So sros lists the names that remain allowed, but {why}.",
         f"List the names to {right} in place of {wide}.",
     )
 

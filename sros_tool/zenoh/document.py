@@ -206,11 +206,11 @@ def _override(root: _Section, path: str, value: str) -> None:
     inner = root.value
     try:
         if not last or len(parents) >= _MOST_PARTS:
-            raise Json5Error("no setting has that name", 0)
+            raise _no_setting_error(path)
         for part in parents:
             section = inner.setdefault(part, Json5Object(0))
             if not isinstance(section, Json5Object) or part == "endpoints":
-                raise Json5Error("no setting has that name", 0)
+                raise _no_setting_error(path)
             inner = section
         inner[last] = parse_json5(value)
         inner.lines[last] = 0
@@ -219,6 +219,10 @@ def _override(root: _Section, path: str, value: str) -> None:
             f"ZENOH_CONFIG_OVERRIDE sets {path[:80]!r} to a value that Zenoh refuses",
             f"In {value[:80]!r}: {error.problem}.",
         ) from error
+
+
+def _no_setting_error(path: str) -> DocumentError:
+    return DocumentError(f"ZENOH_CONFIG_OVERRIDE sets {path[:80]!r}, but Zenoh has no such setting")
 
 
 def _root(data: bytes, name: str, *, lines: bool) -> _Section:

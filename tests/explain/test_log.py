@@ -1354,7 +1354,7 @@ def test_a_folder_that_is_there_has_the_right_name(keystore: Path, tmp_path: Pat
         for begin, unsecured in (("rcl: ", False), ("", True)):
             log.write_text(f"{begin}SECURITY ERROR: directory '{place}' does not exist.\n")
             found = sros("explain", *words, "--log", log).out
-            assert f"`namei -l {place}` shows who may enter. " in found
+            assert f"`namei -l {place}` shows who may enter each folder. " in found
             gives = f"`sudo chown -R USER {export}`" in found
             assert gives is (place == exported), "nobody gets the CA keys"
             assert ("This keystore has the CA keys" in found) is not gives

@@ -121,7 +121,7 @@ def test_a_policy_without_placeholders_is_the_same() -> None:
         (enclave("/{robot}", "/x", node="{namespace}"), "not a valid node name"),
         (
             enclave("/{robot}", "{robot:carriers}/x"),
-            "write another enclave for it, with {robot:carriers} in",
+            "write another enclave for the group, with {robot:carriers} in",
         ),
         (enclave("/{robot}", "{robots}/{robots:carriers}"), "several groups"),
         (enclave("/{robot}", "/{robot}*"), "same part"),

@@ -68,11 +68,11 @@ def test_names(nodes: list[ObservedNode], enclaves: set[str]) -> None:
         ),
         (
             [unshown("/a"), unshown("/z", participant="p2", enclave="/a")],
-            ["graph.shared-enclave: --ros-args --enclave: /a (2 processes)"],
+            ["graph.shared-enclave: of their nodes: /a (2 processes)"],
         ),
         (
             [unshown("/launch_ros_1"), unshown("/launch_ros_2", participant="p2")],
-            ["graph.shared-enclave: --ros-args --enclave: /launch_ros (2 processes)"],
+            ["graph.shared-enclave: of their nodes: /launch_ros (2 processes)"],
         ),
         (
             [unshown("/camera"), unshown("/camera/driver", participant="p2")],

@@ -61,4 +61,4 @@ def test_a_secured_node_of_unknown_enclave_is_left_out_and_said() -> None:
     assert {each.enclave for each in learned.profiles} == {"/talker_listener/talker", "/named"}
     (note,) = learned.notes
     assert note.id == "graph.unknown-enclave"
-    assert note.text.endswith(": /other") and "--keystore" in note.text
+    assert ": /other. " in note.text and "--keystore" in note.text

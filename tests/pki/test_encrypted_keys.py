@@ -179,7 +179,9 @@ ROUNDS = {
     "pkcs8 -topk8 -iter 600000": "",
     "pkcs8 -topk8 -v1 PBE-SHA1-3DES": "trying a passphrase takes 2048 rounds",
     "pkcs8 -topk8 -scrypt": "",
-    "pkcs8 -topk8 -scrypt -scrypt_N 1024": "trying a passphrase takes scrypt with 1024, 8, 1",
+    "pkcs8 -topk8 -scrypt -scrypt_N 1024": (
+        "trying a passphrase takes scrypt with N, r, p = 1024, 8, 1"
+    ),
     "pkey -traditional -aes256": "trying a passphrase takes one round of MD5",
     "pkey": "",
 }

@@ -492,12 +492,20 @@ def test_settings_of_zenoh_are_compared(sound: Path, path: str, value: object, s
         (settings("unique_subject = true", "unique_subject = false"), 1, "fit every later"),
         (settings('validity = "1d"', 'validity = "2d"'), 0, "not covered: dates, "),
         (without_settings, 1, "later enclaves: permissions.default node_basics -> everything"),
-        (without_the_list, 1, "revoked -> trusted: /mux again trusts anyone who has its key"),
-        (an_earlier_list, 1, "revoked -> trusted: 3 enclaves again trust anyone who has its key"),
+        (
+            without_the_list,
+            1,
+            "revoked -> trusted: /mux again trusts anyone who has the key",
+        ),
+        (
+            an_earlier_list,
+            1,
+            "revoked -> trusted: 3 enclaves again trust anyone who has the key",
+        ),
         (
             an_earlier_list_for_later_enclaves,
             1,
-            "trusted: the keystore again trusts anyone who has its",
+            "trusted: the keystore again trusts anyone who has the key",
         ),
         (
             a_list_of_another_ca,
@@ -505,7 +513,7 @@ def test_settings_of_zenoh_are_compared(sound: Path, path: str, value: object, s
             "its revocation list makes DDS refuse every enclave: another CA signed it",
         ),
         (a_list_next_to_the_one_that_counts, 2, "several revocation lists of one CA"),
-        (a_list_that_does_not_begin_a_line, 1, "/mux again trusts anyone who has its key"),
+        (a_list_that_does_not_begin_a_line, 1, "/mux again trusts anyone who has the key"),
         (an_entry_that_undoes_another, 2, "has entries that vendors may ignore"),
         (a_damaged_list, 2, "mux' cannot be compared: the revocation list crl.pem cannot be read"),
         (without_the_files_of_zenoh, 1, "+ less protection: Zenoh files present -> missing"),

@@ -546,7 +546,10 @@ def test_what_is_no_part_of_a_policy_and_what_is_too_large(change: Change) -> No
     change.commit({"large.xml": None, **packed})
     said = change.review("--policy", "robot.xml").ok().out
     for name in packed:
-        assert f"'{name}' changes and is an archive, or compressed: nothing looks into" in said
+        assert (
+            f"'{name}' changes and is an archive, or compressed: the review does not look into"
+            in said
+        )
 
 
 def test_a_keystore_fits_on_a_disk(change: Change) -> None:
@@ -563,7 +566,7 @@ def test_a_keystore_fits_on_a_disk(change: Change) -> None:
     folders = (("40000", "long", long), ("40000", "many", many), ("40000", "odd", odd))
     top = _tree(change, *folders)
     commit = change.git("commit-tree", top, "-m", "x")
-    no_link = "impossible target"
+    no_link = "a link to a path that no file can have"
     for name, said in (("many", "has more than 1073741824"), ("odd", no_link), ("long", no_link)):
         with TemporaryDirectory() as folder:
             files = CommitFiles(Repository(change.folder), "HEAD", commit, Path(folder))
@@ -889,13 +892,13 @@ _HOSTS = """{"_meta": {"hostvars": {"r1": {"ansible_host": "10.0.0.1"}}},
                 "hosts.json",
                 _HOSTS,
                 _HOSTS.replace('"red"', '"red", "ansible_ssh_common_args": "-o ProxyCommand=evil"'),
-                "'all.vars.ansible_ssh_common_args' is -o ProxyCommand=evil, which can change",
+                "'all.vars.ansible_ssh_common_args' is -o ProxyCommand=evil: this can change",
             ),
             (
                 "hosts.json",
                 _HOSTS,
                 _HOSTS.replace('10.0.0.1"', '10.0.0.1", "sros_patterns": ["/*"]'),
-                "'_meta.hostvars.r1.sros_patterns' is ['/*'], which can change which",
+                "'_meta.hostvars.r1.sros_patterns' is ['/*']: this can change which",
             ),
         ],
         2,

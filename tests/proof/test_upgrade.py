@@ -273,7 +273,8 @@ def test_an_update_changes_what_an_expiry_does(
         present=find_distribution(before),
     ).findings  # fmt: skip
     texts = [finding.text for finding in found if finding.id == EXPIRED]
-    wanted = f"running processes {does} when the certificate of one of them expires"
+    wanted = f"with the new release, running processes {does} when the certificate of one of them "
+    wanted += "expires"
     assert texts == ([wanted] if does else [])
 
 

@@ -101,7 +101,7 @@ class Decision(NamedTuple):
 _REASONS = {
     "allow-rule": "an allow rule matches",
     "deny-rule": "a deny rule matches",
-    "partition": "the rule that decides does not name the partitions",
+    "partition": "the rule that decides does not name the partitions of the endpoint",
     "default": "no rule matches, so the default of the grant decides",
     "no-rule": "no rule allows the access, and the vendor ignores the default",
     "unrestricted": "the governance does not control this access",
@@ -110,7 +110,7 @@ _REASONS = {
     "peer-refuses-participant": "peers do not accept the participant on this domain",
     "no-grant": "no grant names the subject",
     "empty-subject": "a certificate with an empty subject crashes the process",
-    "blank-subject": "a grant whose subject has a part of blanks crashes the process",
+    "blank-subject": "a grant whose subject has a part that is only blanks crashes the process",
     "not-yet-valid": "the grant of the subject is not valid yet",
     "expired": "the grant of the subject has expired",
     "malformed": "the vendor does not accept a document",
