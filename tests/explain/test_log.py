@@ -50,7 +50,7 @@ CAUSES = {
     "crl garbage": ("crl.pem: it is not a revocation list",),
     "ca expired": ("identity_ca.cert.pem: it expired",),
     "key of another enclave": ("key.pem: it is not the key of cert.pem",),
-    "key garbage": ("key.pem: it is not a PEM private key",),
+    "key garbage": ("key.pem: it has no line '-----BEGIN PRIVATE KEY-----'",),
     "key encrypted": ("key.pem: ",),
     "governance tampered": ("governance.p7s: its signature does not match",),
     "permissions tampered": ("permissions.p7s: its signature does not match",),
