@@ -152,7 +152,7 @@ def test_a_merge_keeps_it_and_adds_it_with_new_names(tmp_path: Path) -> None:
     assert said(merged) == [*SAID[:2], *SAID[2:3], "/a topic /new sign", SAID[3]]
     same = merge_into(file, read(policy(enclave("/a", f"scan{ENCRYPT}", "/free"))))
     assert same.document.decode() == WRITTEN
-    for other, text in ((f"scan{SIGN}", "says protect=.encrypt"), (f"/free{SIGN}", "states no protection")):
+    for other, text in ((f"scan{SIGN}", "says protect=.encrypt"), (f"/free{SIGN}", "no protect")):
         with pytest.raises(PolicyError, match=text):
             merge_into(file, read(policy(enclave("/a", other))))
 
