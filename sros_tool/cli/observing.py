@@ -403,8 +403,8 @@ def generate_policy(
       copied common/node/logging.xml, common/node/types.xml, ... next to it
       $ sros generate_policy robot.xml --watch 10m
       watching for 600 s, or until Ctrl-C; then the policy is written
-      new: /talker (/talker_listener/talker)
-      new: /talker (/talker_listener/talker) publish /chatter
+      seen: /talker (/talker_listener/talker)
+      seen: /talker (/talker_listener/talker) publish /chatter
       ...
       $ sros generate_policy unsecured.xml --enclave-per-node
       wrote 'unsecured.xml': 2 enclaves, 2 nodes, 20 rights

@@ -601,14 +601,14 @@ class ReportedRights:
             name = f"{profile.ns.rstrip('/')}/{profile.node}"
             if place not in self._nodes:
                 self._nodes.add(place)
-                lines.append(f"new: {name} ({profile.enclave})")
+                lines.append(f"seen: {name} ({profile.enclave})")
             for right in sorted(profile.rights):
                 plain = NodeRight(
                     right.right, name_as_written(right.name, profile.ns, profile.node)
                 )
                 if plain not in self._ordinary and (*place, right) not in self._rights:
                     self._rights.add((*place, right))
-                    lines.append(f"new: {name} ({profile.enclave}) {right.right} {right.name}")
+                    lines.append(f"seen: {name} ({profile.enclave}) {right.right} {right.name}")
         return lines
 
 

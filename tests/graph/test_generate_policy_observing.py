@@ -141,7 +141,7 @@ def test_an_enclave_for_each_node_of_an_unsecured_robot(
 def test_a_watch_names_the_enclaves_that_it_gives(program: Program) -> None:
     words = ("robot.xml", "--watch", "1s", "--enclave-per-node")
     ended = program(graph(*UNSHOWN), *words).ok()
-    assert "new: /hall/listener (/hall/listener) subscribe /chatter" in ended.err
+    assert "seen: /hall/listener (/hall/listener) subscribe /chatter" in ended.err
 
 
 def test_a_log_names_enclaves_itself(program: Program, tmp_path: Path) -> None:
@@ -216,8 +216,8 @@ def test_a_watch_tells_what_is_new(program: Program) -> None:
     ended = program(graph(TALKER), "robot.xml", "--watch", "1s").ok()
     assert ended.err.splitlines()[:3] == [
         "watching for 1 s, or until Ctrl-C; then the policy is written",
-        "new: /talker (/talker)",
-        "new: /talker (/talker) publish /chatter",
+        "seen: /talker (/talker)",
+        "seen: /talker (/talker) publish /chatter",
     ]
 
 

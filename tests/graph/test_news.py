@@ -13,6 +13,9 @@ def test_each_new_thing_is_one_line(tmp_path: Path) -> None:
     news = ReportedRights(common_parts(tmp_path, policies_dir()))
     first = graph(node("/talker", "publish chatter", like="python"))
     second = graph(node("/talker", "publish chatter", "call /fib", like="c++"))
-    assert news.lines(first) == ["new: /talker (/robot)", "new: /talker (/robot) publish /chatter"]
+    assert news.lines(first) == [
+        "seen: /talker (/robot)",
+        "seen: /talker (/robot) publish /chatter",
+    ]
     assert news.lines(first) == []
-    assert news.lines(second) == ["new: /talker (/robot) call /fib"]
+    assert news.lines(second) == ["seen: /talker (/robot) call /fib"]

@@ -638,11 +638,11 @@ def test_a_robot_without_enclaves_is_learned_into_one_for_each_process(tmp_path:
 # ── over time ──────────────────────────────────────────────────────────────────────────────
 
 WATCHING = "watching until Ctrl-C; then the policy is written"
-PASSED_BY = "new: /passer_by (/passer_by) publish /hello"
+PASSED_BY = "seen: /passer_by (/passer_by) publish /hello"
 PASSER_BY = process(
     "/passer_by", node("passer_by", publish=["hello"]), visits=[WATCHING, PASSED_BY]
 )
-BEATS = "new: /steady (/steady) publish /beat"
+BEATS = "seen: /steady (/steady) publish /beat"
 STEADY = process("/steady", node("steady", publish=["beat"]))
 
 
@@ -668,11 +668,11 @@ def test_a_watch_keeps_who_came_and_went(tmp_path: Path) -> None:
     assert ("/passer_by", "publish", "/hello") in rights_of(tmp_path / "watched.xml")
     assert ("/steady", "publish", "/beat") in rights_of(tmp_path / "watched.xml")
     assert {each[0] for each in rights_of(tmp_path / "after.xml")} == {"/steady"}
-    news = [line for line in watched.err.splitlines() if line.startswith("new: ")]
+    news = [line for line in watched.err.splitlines() if line.startswith("seen: ")]
     assert sorted(news) == [
-        "new: /passer_by (/passer_by)",
+        "seen: /passer_by (/passer_by)",
         PASSED_BY,
-        "new: /steady (/steady)",
+        "seen: /steady (/steady)",
         BEATS,
     ]
 
