@@ -211,7 +211,9 @@ def _file_findings(
     if ends:
         expired = ", ".join(f"{document} at {iso(end)}" for document, end in ends.items())
         remedy = _EXPIRED_CA_REMEDY if ends.keys() & set(_AUTHORITIES.values()) else ""
-        yield PROCESS_EXPIRED.found(process.label, f"of {name} expired: {expired}", remedy=remedy)
+        yield PROCESS_EXPIRED.found(
+            process.label, f"in {name}, these have expired: {expired}", remedy=remedy
+        )
     yield from _local_time_findings(process, loaded, now, zone)
     if enclave.writable:
         yield PROCESS_REPLACEABLE.found(process.label, _plain_path(enclave.writable))

@@ -388,7 +388,7 @@ def _subject_findings(document: ConfigurationDocument) -> Iterator[Finding]:
         yield SELF_LIMITING.found(document.mode.value, text, document.name, open_to_all[0].line)
     else:
         for subject in open_to_all:
-            text = f"subject {subject.id} has {_described_subject(subject)}, and allow rules"
+            text = f"subject {subject.id} states {_described_subject(subject)}, and has allow rules"
             yield EVERYBODY.found(f"subject {subject.id}", text, document.name, subject.line)
     pairs = list(islice(_overlapping_subjects(access.subjects), _MOST_PAIRS + 1))
     if pairs:

@@ -71,8 +71,8 @@ def test_a_list_that_revokes_an_enclave_of_the_other_folder(keystore: Path, tmp_
     for paths in ((robot, laptop), (laptop, robot), (keystore, robot, laptop)):
         refusing = ", ".join(str(path) for path in paths if path != laptop)
         assert strangers(*paths) == [
-            f"nodes of {refusing} refuse nodes of {laptop} in /a: their revocation list revokes "
-            "the certificate",
+            f"nodes of {refusing} refuse nodes of {laptop} in /a: the revocation list of "
+            f"{refusing} revokes the certificate",
             f"nodes of {laptop} accept 1 certificate that the newer revocation list of {refusing} "
             "revokes",
         ]

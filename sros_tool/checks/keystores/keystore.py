@@ -379,10 +379,9 @@ def _with_cause_of_ros2(findings: Sequence[Finding], keystore: OpenedKeystore) -
         else "an enclave that the keystore never issued",
         f"{names_text(names)}: the ledger has neither the certificate nor the permissions; `ros2 "
         f"security create_enclave` leaves enclaves in this state. Found: {_kinds_text(chosen)}.",
-        f"If you made the enclave, state its rights with `{command}`, which also issues the "
-        "certificate again. If nobody of your team made it, somebody else has the CA key: revoke "
-        "the "
-        "enclave, and replace the CA (`sros rotate_ca`).",
+        f"If your team made an enclave, state its rights with `{command}`, which also issues its "
+        "certificate again. Otherwise, somebody else has the CA key: revoke the enclave, and "
+        "replace the CA (`sros rotate_ca`).",
     )
 
 

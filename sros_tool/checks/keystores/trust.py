@@ -264,7 +264,7 @@ def _revoked_findings(targets: Targets) -> Iterator[Finding]:
     for (shown, names), of_lists in revocations.items():
         text = (
             f"nodes of {names_text(list(of_lists))} refuse nodes of {shown} in "
-            f"{names_text(names)}: their revocation list revokes "
+            f"{names_text(names)}: the revocation list of {names_text(list(of_lists))} revokes "
             f"{'the certificate' if len(names) == 1 else 'the certificates'}"
         )
         yield PEERS_REVOKED.found(shown, text, shown)
