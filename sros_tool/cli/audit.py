@@ -105,7 +105,7 @@ def audit(
 
     Nothing is denied: DDS has no permissive mode, so sros observes the ROS graph and decides about
     every endpoint as the DDS vendor would. A node has the rights of the enclave that the graph
-    shows, or else of the enclave whose profiles name the node. By default, sros observes until the
+    shows for it, or else of the enclave whose profiles name it. By default, sros observes until the
     graph stops changing; --watch also sees endpoints that nodes create later. Several policies
     count as one. Without POLICY and KEYSTORE, the keystore of $ROS_SECURITY_KEYSTORE decides. For
     nodes on Zenoh, the files that `sros zenoh` wrote into KEYSTORE decide, unless --vendor is

@@ -255,9 +255,9 @@ def check(
 
     PATH is a policy, a folder of policies, a keystore or an enclave. sros detects the type, unless
     the word `policy` or `keystore` before the first PATH states it. `sros check keystore` checks
-    the folder `keystore` here; if there is none, the keystore of $ROS_SECURITY_KEYSTORE. Without
-    PATH, sros checks this keystore and the runtime: the environment and the processes of this
-    machine.
+    the folder `keystore` here; if there is none, the keystore of $ROS_SECURITY_KEYSTORE. Plain
+    `sros check` checks the keystore of $ROS_SECURITY_KEYSTORE and the runtime: the environment and
+    the processes of this machine.
 
     Example:
       $ sros check robot.xml keystore
@@ -1037,7 +1037,7 @@ def metrics(
     dry_run: bool,
     as_json: bool,
 ) -> None:
-    """Give Prometheus the expiry of all files of a keystore, and its number of findings.
+    """Give Prometheus the expiry of all files of a keystore, and the number of findings.
 
     KEYSTORE is a keystore, or an export on a robot. The text is for the textfile collector of
     node_exporter.

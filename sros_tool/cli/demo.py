@@ -89,14 +89,15 @@ def _complete_scenario(
 )
 @click.option(
     "--topic",
-    help="ROS topic of talkers and listeners, of std_msgs/msg/String; a listener also counts the "
-    "messages of other types.  [default: /chatter]",
+    help="ROS topic of talkers and listeners, with std_msgs/msg/String; a listener also counts "
+    "the messages of other types.  [default: /chatter]",
 )
 @click.option(
     "--type",
     "message_type",
     metavar="TYPE",
-    help="A talker on rclpy sends default messages of this type, such as geometry_msgs/msg/Twist.",
+    help="Type of the talker's messages, such as geometry_msgs/msg/Twist: their fields have "
+    "default values. Needs rclpy.",
 )
 @click.option(
     "--for",

@@ -233,8 +233,8 @@ def _refuse_ignored(mode: str) -> None:
     "logs",
     metavar="FILE",
     multiple=True,
-    help="Explain the lines of one DDS log, with a keystore, an enclave's folder or a policy; - is "
-    "standard input.",
+    help="Explain the lines of one log of ROS 2, DDS or Zenoh, with a keystore, an enclave's "
+    "folder or a policy; - is standard input.",
 )
 @json_option
 def explain(
@@ -258,7 +258,7 @@ def explain(
     logs: tuple[str, ...],
     as_json: bool,
 ) -> int:
-    r"""Show whether DDS or Zenoh lets an enclave do something, by which rule, and how to change it.
+    r"""Show whether DDS or Zenoh lets an enclave do something, why, and how to change this.
 
     call and serve are about services, execute is about actions. If the rights name an action NAME
     but no service NAME, call and serve are about the action; use --type to choose. KEYSTORE is a

@@ -489,7 +489,7 @@ def _publish(
     and again before the time that it prints, for example each hour. Archives of unchanged robots
     stay; archives of robots that were revoked or left the fleet are removed.
 
-    The keys that sign PUB are in KEYSTORE/private.  The root key only signs the list of the other
+    The keys that sign PUB are in KEYSTORE/private.  The root key signs only the list of the other
     keys.  Move the root key away from the keystore.  Name it with --root-key to replace a key, and
     once a year to renew the list of keys.
 

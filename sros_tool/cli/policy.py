@@ -259,7 +259,7 @@ def diff_policy(
     that differ only in the robot of a fleet are shown as one. Two policies are also compared by the
     protection that they demand, two keystores by their governance.
 
-    The exit status is 1 if they differ (notes name differences that are not in the rights),
+    The exit status is 1 if A and B differ (notes name differences that are not in the rights),
     or if DDS would refuse A or B.
 
     With --no-new-access, A and B can also be folders of policies, or policies at a git revision, as
@@ -680,7 +680,7 @@ def policies(
     as_json: bool,
     dry_run: bool,
 ) -> int:
-    """List the policies that ship with sros, each with its enclaves, or copy them.
+    """List the policies that ship with sros, each with its enclaves, or copy these policies.
 
     --copy adds missing files to an existing folder, and replaces nothing: if a file differs,
     nothing is copied.

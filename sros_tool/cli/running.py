@@ -193,7 +193,7 @@ def env(
     The strategy is Enforce: a process that cannot run in the enclave does not start. If the enclave
     cannot be used, sros prints variables that keep every node from starting. With rmw_zenoh_cpp,
     which ignores ROS_SECURITY_*, the variables also name the configuration that `sros zenoh` wrote,
-    and override Zenoh variables that are set.
+    and override Zenoh variables that are already set.
 
     A container gets the files of the enclave from an export in DIR (Compose), or from a Secret
     (Kubernetes). Without --image, merge the output with a definition that names an image.
