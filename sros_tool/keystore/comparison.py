@@ -315,7 +315,7 @@ def mismatch(old: Governance, new: Governance) -> Mismatch:
 def compare_settings(old: Template, new: Template, now: datetime) -> tuple[SettingChange, ...]:
     """Return the changes between two settings of a keystore.
 
-    Left out are changes in the protection of topics and in the names of CAs.
+    Changes in the protection of topics and in the names of CAs are left out.
     """
     return tuple(_settings_changes(old, new, now))
 

@@ -94,7 +94,7 @@ _MOST_NUMBER = 2**53 - 1  # the largest number that every JSON reader reads exac
 MOST_PROBLEMS, LONGEST_PROBLEM = 50, 1000
 """Maximum number of problems in a confirmation, and of characters in a problem."""
 MOST_REQUESTS = 500
-"""Maximum number of signing requests in a confirmation; the agent sends others in later ones."""
+"""Maximum number of signing requests in a confirmation; later confirmations have the others."""
 _LONGEST_REQUEST = 16 * 1024
 LONGEST_SEAL = 256 * 1024
 """Maximum number of characters of a release's seal in a confirmation: about 200 enclaves."""
@@ -229,7 +229,7 @@ KEY_NOT_HERE = "is not on this robot"
 OF_ANOTHER_KEY = "it does not belong to the enclave's key"
 """The agent's words if a release needs another key for an enclave than the robot has.
 
-The robot has no key, or the certificate is for another key.
+Either the robot has no key for the enclave, or the release's certificate is for another key.
 """
 
 

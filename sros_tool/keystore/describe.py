@@ -279,7 +279,7 @@ class RouterFacts(NamedTuple):
     enclaves: Sequence[str]
     """The enclaves whose sessions connect to the router, perhaps with wildcards."""
     crossing: Sequence[str]
-    """Names that may pass between this router and others; empty if those of the network apply."""
+    """Names that may pass between this router and others; empty if the network's names apply."""
 
 
 def router_facts(router: ZenohRouter) -> RouterFacts:
@@ -1106,7 +1106,7 @@ def history(keystore: OpenedKeystore, *, now: datetime) -> History:
 
 
 def _active_paths(keystore: OpenedKeystore) -> Iterator[str]:
-    """Yield the paths from which DDS loads certificates and signed documents, existing or not."""
+    """Yield where DDS loads certificates and signed documents from; some files may be missing."""
     authorities = sorted((keystore.root / PUBLIC).glob("*.cert.pem"))
     yield from (f"{PUBLIC}/{path.name}" for path in authorities)
     yield from (GOVERNANCE_P7S, CRL)

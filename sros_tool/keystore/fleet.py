@@ -93,11 +93,13 @@ def enclaves_of_several_distributions(keystore: OpenedKeystore) -> dict[tuple[st
     return enclaves
 
 
-def checked_fleet(keystore: OpenedKeystore, without_it: Callable[[], str] = str) -> Fleet | None:
+def checked_fleet(
+    keystore: OpenedKeystore, advice_without_fleet: Callable[[], str] = str
+) -> Fleet | None:
     """Return the fleet, or None, as `load_fleet` does, after checking that nobody edited its file.
 
-    Verbs that issue or send files by the fleet use this function.  ``without_it`` returns the
-    beginning of the error's remedy: sentences on how to go on without the fleet.
+    Verbs that issue or send files by the fleet use this function.  ``advice_without_fleet`` returns
+    the beginning of the error's remedy: sentences on how to go on without the fleet.
 
     Raises:
         KeystoreError: the fleet file is not the file that sros wrote last.
@@ -106,7 +108,7 @@ def checked_fleet(keystore: OpenedKeystore, without_it: Callable[[], str] = str)
         raise KeystoreError(
             f"'{keystore.root / FLEET}' {problem}",
             "It decides which enclaves belong to a robot, and which domains they may join.",
-            without_it() + fleet_edits_remedy(keystore.root, problem),
+            advice_without_fleet() + fleet_edits_remedy(keystore.root, problem),
         )
     return load_fleet(keystore)
 
@@ -265,12 +267,15 @@ class EnclaveDomains(NamedTuple):
 
 
 def with_routers_of_robots(
-    network: ZenohNetwork, before: Fleet | None, fleet: Fleet, gone_enclaves: Collection[str] = ()
+    network: ZenohNetwork,
+    before: Fleet | None,
+    fleet: Fleet,
+    revoked_enclaves: Collection[str] = (),
 ) -> ZenohNetwork:
     """Return a network with the routers of ``fleet`` instead of the routers of ``before``.
 
     ``before`` is the previous fleet. The addresses at which a router listens are kept. Routers
-    whose enclaves are in ``gone_enclaves`` are left out.
+    whose enclaves are in ``revoked_enclaves`` are left out.
     """
     from sros_tool.zenoh.configuration import ZenohRouter  # most fleets name no routers
 
@@ -279,7 +284,7 @@ def with_routers_of_robots(
         known.pop(name, None)
     listening = {router.name: router.listen for router in network.routers}
     for name, robot in _robots_by_router(fleet).items():
-        if name not in gone_enclaves:
+        if name not in revoked_enclaves:
             own = [enclave for enclave in enclaves_of(fleet, robot) if enclave != name]
             folder = fleet.routers.rpartition("/")[0]
             if has_placeholder(folder):

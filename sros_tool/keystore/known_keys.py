@@ -221,7 +221,7 @@ def unlisted_revocations(keystore: OpenedKeystore, now: datetime) -> Sequence[st
 
 
 def unknown_authorities(keystore: OpenedKeystore, role: str) -> Sequence[x509.Certificate]:
-    """Return the CAs in the file of a role that the keystore does not know.
+    """Return the CAs that the keystore does not know, out of those in a role's CA file.
 
     The result is empty if the ledger records no CA.
     """

@@ -21,7 +21,7 @@ from sros_tool.faults import ORIGINAL_KEYSTORE, remedy_in_original_keystore
 ENCLAVES, PUBLIC, PRIVATE = "enclaves", "public", "private"
 CLOSED_PROCESSES, CLOSED_POLICY = "processes.json", "policy.xml"
 CLOSED_OBSERVATION = "observed.json"
-"""Files that `sros close` writes next to its keystore."""
+"""With `CLOSED_PROCESSES` and `CLOSED_POLICY`, the files of `sros close` next to its keystore."""
 CLOSED_KEYSTORE = "keystore"
 """The keystore in a folder of `sros close`, until it is brought to another machine."""
 CLOSED_OBSERVER = "/sros_observer"

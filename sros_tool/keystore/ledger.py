@@ -94,7 +94,7 @@ SAME_KEY = "same key"
 FROM_BEFORE = "from before the ledger"
 """The ``reason`` of a CA that a rotation replaces, but that the ledger lacked.
 
-An example is a ledger from which earlier lines were lost.
+The ledger can lack it because earlier lines were lost.
 """
 RECORDED_LATE = (SAME_KEY, FROM_BEFORE)
 """The ``reason`` values of a CA certificate whose key may have issued what earlier lines record."""

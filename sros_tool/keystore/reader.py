@@ -720,7 +720,7 @@ class OpenedEnclave:
 class EnclaveIdentity(NamedTuple):
     """The certificate of an enclave, and the problems of certificate, key and identity CA.
 
-    That a keystore lacks a key which was generated on the robot and stays there is no problem.
+    A key that was generated on the robot and stays there does not count as missing in the keystore.
     """
 
     certificate: x509.Certificate | None
@@ -728,7 +728,7 @@ class EnclaveIdentity(NamedTuple):
 
 
 def _problems_in_keystore(problems: tuple[Problem, ...], key_on_robot: bool) -> tuple[Problem, ...]:
-    """Return the problems without a missing key that is on the robot."""
+    """Return the problems, except a missing key that is on the robot."""
     on_robot = (KEY_FILE, Fault.FILE_MISSING) if key_on_robot else None
     return tuple(problem for problem in problems if (problem.file, problem.fault) != on_robot)
 

@@ -603,7 +603,7 @@ def _discovery_notes(permissions: Permissions) -> Iterator[Note]:
 
 
 def _missing_discovery(grant: Grant) -> list[str]:
-    """Return "publish" and "subscribe" if the rules do not allow this for every node's topic."""
+    """Return which of "publish" and "subscribe" the rules do not allow on every node's topic."""
 
     def match(rules: Iterable[Rule], verb: str) -> bool:
         criteria = (criterion for rule in rules for _, criterion in rule.criteria_of((verb,)))
@@ -652,7 +652,7 @@ class DifferentEnclave(NamedTuple):
 
 
 class DifferentDomains(NamedTuple):
-    """The ROS domains of an enclave that differ between A and B."""
+    """An enclave whose ROS domains differ between A and B."""
 
     enclave: str
     """Name of the enclave."""

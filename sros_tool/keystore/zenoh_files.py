@@ -337,14 +337,14 @@ class ZenohDocuments:
 class ZenohChange:
     """The changes of a transaction on which the Zenoh configurations of a keystore depend.
 
-    ``issued`` are the new permissions of enclaves.  ``gone`` are the revoked enclaves, and
+    ``issued`` are the new permissions of enclaves.  ``revoked`` are the revoked enclaves, and
     ``replaced`` the enclaves whose earlier certificates are revoked.  ``recorded`` are the entries
-    that the transaction adds to the ledger.  ``stated`` are the policies of the enclaves;
-    errors name lines of them.
+    that the transaction adds to the ledger.  ``stated`` are the policies of the enclaves, whose
+    lines errors name.
     """
 
     issued: Mapping[str, SignedRights] = field(default_factory=dict)
-    gone: Collection[str] = ()
+    revoked: Collection[str] = ()
     replaced: Collection[str] = ()
     stated: Mapping[str, Enclave | None] = field(default_factory=dict)
     recorded: Sequence[Entry] = ()
@@ -379,13 +379,13 @@ def drifted_configurations(
     keystore: OpenedKeystore,
     wanted_documents: ZenohDocuments,
     authority: x509.Certificate,
-    gone_enclaves: Collection[str] = (),
+    revoked_enclaves: Collection[str] = (),
     reader: RenderedReader | None = None,
 ) -> tuple[DriftedConfiguration, ...]:
     """Return the configurations that differ from ``wanted_documents``, or lack a valid signature.
 
-    Configurations of enclaves in ``gone_enclaves`` do not count, nor do rules for unread enclaves.
-    ``reader`` may already have read the files.
+    Configurations of enclaves in ``revoked_enclaves`` do not count, nor do rules for unread
+    enclaves. ``reader`` may already have read the files.
     """
     reader = reader or RenderedReader()
 
@@ -406,7 +406,7 @@ def drifted_configurations(
 
     files = [file for _, part in map_slices(list(wanted_documents.files), compare) for file in part]
     stale = stale_files(keystore.root, wanted_documents.files, wanted_documents.existing)
-    files += (file for file in stale if file.enclave not in gone_enclaves)
+    files += (file for file in stale if file.enclave not in revoked_enclaves)
     return tuple(files)
 
 
@@ -496,7 +496,7 @@ def zenoh_documents(
     root = keystore.root
     of_network = _domains(network, domains, keystore)
     existing = keystore.names if existing is None else existing
-    names = sorted({*existing, *change.issued}.difference(change.gone))
+    names = sorted({*existing, *change.issued}.difference(change.revoked))
     for router in network.router_names():
         if router not in names:
             raise KeystoreError(
@@ -892,7 +892,7 @@ _DECIDING_MESSAGES = {
     "request": (Flow.INGRESS, Message.QUERY),
     "reply": (Flow.EGRESS, Message.QUERY),
 }
-"""Maps each right to its message, stated again on purpose, to find errors of the translation."""
+"""Maps each right to its message, as the translation does: two sources show an error in one."""
 _RIGHTS_BY_TOKEN_KIND = {
     "NN": "",
     "MP": "publish",

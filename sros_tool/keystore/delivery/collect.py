@@ -84,7 +84,7 @@ from sros_tool.values import DryRun, FileChange, FileChanges, NamedKeystore, Not
 from sros_tool.wording import counted, first_few
 
 _MOST_NAMES = 100_000
-"""Maximum number of names in an inbox among which names without a robot are searched."""
+"""Maximum number of names in an inbox that sros reads to find names of no robot."""
 _SHOWN = 5
 _FEW = 4
 """Number of certificates up to which a ledger without index is searched once per certificate."""
@@ -574,9 +574,9 @@ class _Verifier:
         )
 
     def _has_new_keys(self, robot: Robot, last: ReceivedConfirmation) -> bool:
-        """Return whether a robot got new keys after its last message, and the others are revoked.
+        """Return whether a robot got new keys after its last message, and its old keys are revoked.
 
-        Then no other computer can have a key of the robot from before, and still use it.
+        Then another computer that has an earlier key of the robot can no longer use it.
         """
         if restored_at(self._keystore):  # the ledger may lack a certificate
             return False
@@ -907,7 +907,7 @@ def _revoke_again(
     keyring: Keyring,
     dry_run: bool,
 ) -> tuple[str, list[Note], list[FileChange]]:
-    """Revoke what only lists of robots revoke, and refuse requests signed with such certificates.
+    """Revoke certificates that only lists of robots revoke; refuse requests signed with them.
 
     Returns the same as `_sign`.  Certificates that the ledger lacks are recorded.  If the lists
     cannot be signed, no request is signed.  But for lists of a CA service there is only a note,

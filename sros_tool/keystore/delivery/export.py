@@ -276,8 +276,8 @@ def exported_files(
 ) -> dict[str, bytes]:
     """Map the paths of the files to export to their content; ``keyless`` is as in `distribute`.
 
-    All files are of the same state of the keystore: not some enclaves with the revocation list of
-    before a revocation, and others with the new one.
+    All files are of the same state of the keystore: either all enclaves have the revocation list
+    from before a revocation, or all have the new list.
 
     Raises:
         KeystoreError: an enclave does not exist, or cannot run.

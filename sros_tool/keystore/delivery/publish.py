@@ -903,7 +903,7 @@ class _Publication:
         )
 
     def _has_later_releases(self, restored: bool) -> bool:
-        """Return whether the folder has later releases, an error unless ``restored``."""
+        """Return whether the folder has later releases; raise an error unless ``restored``."""
         if self.list.number >= (unused := self.keystore.ledger_file.next_number()):
             number = self.list.number
             why = f"It has release {number}, but the last number in the ledger is {unused - 1}."

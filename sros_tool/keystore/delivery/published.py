@@ -78,9 +78,10 @@ def check_positive_number(value: object, maximum: int = MOST_NUMBER) -> int:
 
 
 class Evaluated(NamedTuple):
-    """The time until which a robot's files, found without problems, need no new evaluation.
+    """The evaluation that found no problem in a robot's files, and the time for which it holds.
 
-    ``files`` is a digest of the files without revocation lists, and of the version of sros.
+    ``files`` is a digest of the files without revocation lists, and of the version of sros. From
+    ``since`` until ``until``, files with this digest need no new evaluation.
     """
 
     files: str

@@ -83,7 +83,7 @@ class LaterChange(NamedTuple):
     enclave: str
     """Name of the enclave; empty for the governance."""
     what: str
-    """The rights and domains; empty for other changes."""
+    """The rights and domains, or the lines of the governance; empty for other changes."""
 
 
 # ── whether the keystore is older than its robots ──────────────────────────────────────────
@@ -186,7 +186,8 @@ class LaterSeals:
     def explains(self, seal: str | None, certificate: x509.Certificate) -> bool:
         """Return whether a known restore explains that the ledger lacks a robot's certificate.
 
-        This is so if the robot's release, by its seal, and the certificate are from before it.
+        This is so if the robot's release, by its seal, and the certificate are from before the
+        restore.
         """
         with suppress(SrosError):
             if seal and iso(validity_of(certificate).not_before) <= self._restored:
@@ -363,8 +364,8 @@ def without_agreed_changes(
 
     Rights count as agreed to if publishing was refused only because of rights, and their enclave
     was then renewed by name.  Other commands that sign rights, such as a rotation, agree to none.
-    A governance counts as agreed to only if nothing shows the difference to the published
-    governance.
+    A governance counts as agreed to if publishing was refused, the governance was then signed
+    again, and it lacks no known line of the published governance.
     """
     releases = keystore.ledger_with("what", "release").entries
     last = max((entry.number for entry in releases if entry.what == "release"), default=0)

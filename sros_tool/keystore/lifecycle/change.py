@@ -436,7 +436,7 @@ class KeystoreChange:
         self,
         issued: Mapping[str, SignedRights],
         *,
-        gone_enclaves: frozenset[str] = frozenset(),
+        revoked_enclaves: frozenset[str] = frozenset(),
         replaced: Sequence[str] = (),
         stated: Mapping[str, Enclave | None] | None = None,
         created: Sequence[str] = (),
@@ -445,7 +445,7 @@ class KeystoreChange:
 
         Args:
             issued: the new permissions of enclaves.
-            gone_enclaves: the enclaves that are revoked.
+            revoked_enclaves: the enclaves that are revoked.
             replaced: the enclaves whose earlier certificates are revoked.
             stated: the policies of enclaves, for the lines that errors name.
             created: new enclaves, which have no running processes yet.
@@ -458,7 +458,7 @@ class KeystoreChange:
             return
         change = ZenohChange(
             issued,
-            gone=gone_enclaves,
+            revoked=revoked_enclaves,
             replaced=replaced,
             stated=stated or {},
             recorded=self.entries,
@@ -468,7 +468,7 @@ class KeystoreChange:
             *(self.keystore, self.template.zenoh, self.domains, authority, self.now, change),
             existing=existing,
         )
-        drifts = [*drifted_configurations(self.keystore, wanted, authority, gone_enclaves)]
+        drifts = [*drifted_configurations(self.keystore, wanted, authority, revoked_enclaves)]
         drifts = [drift for drift in drifts if drift.kind is not Drift.FOREIGN]
         for drift in drifts:
             if drift.kind is Drift.STALE:

@@ -845,7 +845,7 @@ def write_enclaves(
 
 @dataclass(frozen=True, slots=True)
 class _EnclaveOutcome:
-    """The outcome for an enclave; ``superseded`` is its old certificate if that must be revoked.
+    """The outcome for an enclave; ``superseded`` is the old certificate if it must be revoked.
 
     ``other_files`` is the reason why the certificate was replaced although the rights stay the
     same: other files of the enclave may still work.  It is "" for any other outcome.

@@ -107,7 +107,8 @@ class LostRecords:
 
         `restore_revocations` records the certificate if the ledger lacks it.  ``reason`` is
         `REPORTED` if no seal of the keystore shows that the certificate belongs to this keystore.
-        An ``explained`` certificate shows no new restore.
+        ``explained`` says that a known restore explains why the ledger lacks the certificate, so
+        that it shows no other restore.
         """
         try:
             name = check_enclave_name(common_name_of(certificate.subject))
@@ -215,10 +216,10 @@ def _entries_to_repeat(
     """Return the entries of the ``old`` list that the next list must repeat.
 
     These are the certificates that had not expired when the old list was issued.  By RFC 5280, 3.3,
-    an entry may be left out only after a list that was issued after the certificate's expiry has
-    had it.  An old list that was issued in the future, by a clock that was wrong, counts as issued
-    ``now``.  ``expiries`` maps serial numbers to expiries (ISO 8601, UTC); an entry without a known
-    expiry is always repeated.
+    an entry may be left out only if an earlier list that was issued after the certificate's expiry
+    has the entry.  An old list that was issued in the future, by a clock that was wrong, counts as
+    issued ``now``.  ``expiries`` maps serial numbers to expiries (ISO 8601, UTC); an entry without
+    a known expiry is always repeated.
     """
     if old is None:
         return []
@@ -447,8 +448,9 @@ class RevocationListSigner:
 
         ``revocations`` are the entries of new revocations.  The enclaves ``names`` get the lists,
         except the `recipients`, who already have them.  The numbers of the lists are at least
-        ``least``.  Each list has all serial numbers, because the ledger does not say which of two
-        CAs issued a certificate, and a serial number of the other CA does no harm.
+        ``least``.  ``incomplete`` accepts that the list of the old CA cannot be signed.  Each list
+        has all serial numbers, because the ledger does not say which of two CAs issued a
+        certificate, and a serial number of the other CA does no harm.
 
         Raises:
             KeystoreError: a revocation needs the key of the old CA, which is missing, and

@@ -135,7 +135,7 @@ def revoke(
         )
         change.remarks += lists.remarks
         _drop_routers(change, gone)
-        change.stage_zenoh({}, gone_enclaves=gone)
+        change.stage_zenoh({}, revoked_enclaves=gone)
         change.record()
         change.finish(command="revoke")
     return change.result(
@@ -179,9 +179,9 @@ def restore_revocations(
     The next list has a higher number than the lost lists.
 
     An enclave that was revoked is moved to ``revoked`` again, even if it was renewed since then.
-    An enclave stays if only an earlier certificate of it was replaced and revoked.  The key of this
-    certificate is revoked, too, unless a certificate that the ledger lacked has the same key.  If a
-    revoked key vouched for later keys, these keys are also revoked.
+    An enclave stays if only an earlier certificate of the enclave was replaced and revoked.  The
+    key of this certificate is revoked, too, unless a certificate that the ledger lacked has the
+    same key.  If a revoked key vouched for later keys, these keys are also revoked.
 
     Certificates that the ledger lacks are recorded, so that they can be revoked.  Certificates
     of a revoked enclave are revoked immediately.
@@ -281,7 +281,7 @@ def restore_revocations(
             change.entries += entries
         change.remarks += lists.remarks
         _drop_routers(change, gone)
-        change.stage_zenoh({}, gone_enclaves=gone)
+        change.stage_zenoh({}, revoked_enclaves=gone)
         change.record()
         change.finish(command="revoke", revoked_before=revoked)
     if unknown:

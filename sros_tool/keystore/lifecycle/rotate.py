@@ -385,8 +385,8 @@ def renew_identity_ca(
 
     Nothing else changes: on Cyclone DDS 0.10.2 and Fast DDS 2.9.1 (tested), the certificates that
     the CA issued have valid chains both to its old certificate and to its new one.  A permissions
-    CA cannot be renewed in this way, because DDS accepts documents only with the CA certificate
-    that they embed.
+    CA cannot be renewed in this way: signed documents contain its present certificate, and DDS
+    would refuse them with a new one.
 
     Raises:
         KeystoreError: the keystore has a single CA; a rotation is in progress; the CA is not
@@ -494,7 +494,7 @@ class _Rotator:
             self._refuse_deletion(stage)
             return stage
         if self._rotation.stage is RotationStage.NONE:
-            successors = self._begin_rotation(wanted, next_to=stage is RotationStage.DISTRIBUTE)
+            successors = self._begin_rotation(wanted, keep_keys=stage is RotationStage.DISTRIBUTE)
             if stage is RotationStage.DISTRIBUTE:
                 self._distribute(successors)
             else:
@@ -571,10 +571,10 @@ class _Rotator:
 
     # ── the stages ─────────────────────────────────────────────────────────────────────────
 
-    def _begin_rotation(self, wanted: _WantedAuthorities, *, next_to: bool) -> list[_Successor]:
+    def _begin_rotation(self, wanted: _WantedAuthorities, *, keep_keys: bool) -> list[_Successor]:
         for role in ROLES:
             strangers = unknown_authorities(self._keystore, role)
-            if strangers and not self._keystore.ledger_with("what", "ca").gaps and next_to:
+            if strangers and not self._keystore.ledger_with("what", "ca").gaps and keep_keys:
                 raise KeystoreError(
                     f"the file of the {role} CA has {authority_text(strangers[0])}, which the "
                     "keystore does not know",
@@ -582,7 +582,7 @@ class _Rotator:
                     f"Restore '{self._root}/{ca_certificate(role)}' from a backup; or, if all "
                     "processes may be restarted together, replace the CAs with --finish.",
                 )
-        successors = _make_successors(self._change, wanted, next_to=next_to)
+        successors = _make_successors(self._change, wanted, keep_keys=keep_keys)
         for successor in successors:
             if wanted.validity is None:
                 self._note_earlier_expiry(successor.old[0], successor.new.certificate)
@@ -922,12 +922,12 @@ class _WantedAuthorities:
 
 
 def _make_successors(
-    change: KeystoreChange, authorities: _WantedAuthorities, *, next_to: bool
+    change: KeystoreChange, authorities: _WantedAuthorities, *, keep_keys: bool
 ) -> list[_Successor]:
     """Create the wanted CAs, and stage their keys.
 
-    With ``next_to``, new keys in the keystore are written next to the present keys; otherwise, they
-    replace the present keys.
+    With ``keep_keys``, new keys in the keystore are written next to the present keys; otherwise,
+    they replace the present keys.
     """
     template, new_keys = change.template, authorities.new_keys
     files = change.keystore.authority_files
@@ -953,7 +953,7 @@ def _make_successors(
     for file, serves in files.items():
         if wanted & set(serves):
             _check_place(change, file, serves[0], new_keys)
-            at = f"{PRIVATE}/{'next_' if next_to else ''}{file}.key.pem"
+            at = f"{PRIVATE}/{'next_' if keep_keys else ''}{file}.key.pem"
             successors.append(_make_successor(change, file, serves, at, authorities, validity))
     return successors
 
