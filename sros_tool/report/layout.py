@@ -202,7 +202,7 @@ def scenes_of(
     """
     groups = {enclave.path: enclave.group for enclave in picture.enclaves}
     titles = sorted(set(groups.values()))
-    essential = _essential_edges(picture.edges)
+    essential = essential_edges(picture.edges)
     if len(groups) <= _MOST_ENCLAVES or len(titles) < 2 or len(titles) > len(groups) // 2:
         scenes = [
             _scene(
@@ -238,7 +238,7 @@ def scenes_of(
     return tuple(scenes)
 
 
-def _essential_edges(edges: Iterable[Edge]) -> list[Edge]:
+def essential_edges(edges: Iterable[Edge]) -> list[Edge]:
     """Return the edges without rights that every node needs.
 
     If an enclave may call a service by its exact name, the rights to serve this service stay.

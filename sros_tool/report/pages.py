@@ -25,7 +25,7 @@ from typing import Any
 from sros_tool.names import is_expression
 from sros_tool.policy.model import ALLOW
 from sros_tool.reach import OF_EVERY_NODE
-from sros_tool.report.layout import Scene
+from sros_tool.report.layout import Scene, essential_edges
 from sros_tool.report.picture import (
     Bundle,
     Picture,
@@ -132,7 +132,9 @@ def _page_data(picture: Picture, scenes: tuple[Scene, ...], drawn: Picture) -> d
     Names with equal rights are grouped into bundles, which take less space than an entry for each
     right.
     """
-    bundles = bundled_names(picture.names, picture.edges, separate_questions=True)
+    essential = frozenset(essential_edges(picture.edges))  # the page leaves out the same rights
+    edges = [replace(edge, common=edge not in essential) for edge in picture.edges]
+    bundles = bundled_names(picture.names, edges, separate_questions=True)
     return {
         "requirements": _requirements_json(picture.requirements),
         "headlines": picture.other_answers,

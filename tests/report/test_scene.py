@@ -11,6 +11,7 @@ from sros_tool.names import NODE_SERVICES
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import DENY
 from sros_tool.policy.rights import policy_rights
+from sros_tool.report import pages
 from sros_tool.report.compose import PictureSource, compose, overlay
 from sros_tool.report.layout import Scene, scenes_of, side_card
 from sros_tool.report.picture import Picture, SourceTitle
@@ -161,7 +162,8 @@ def test_a_service_of_every_node_that_an_enclave_may_call_by_name_is_drawn_whole
         "/tuner": group("services", "request", "/guardian/set_parameters"),
         "/look": group("services", "request", "/guardian/list_*"),
     }
-    scene = scenes_of(picture_of(tmp_path, enclaves))[0]
+    picture = picture_of(tmp_path, enclaves)
+    scene = (scenes := scenes_of(picture))[0]
     of = {card.members: card for card in scene.cards if card.kind}
     called, listed = of["/guardian/set_parameters",], of["/guardian/list_parameters",]
     assert {(link.source, link.target) for link in scene.links} == {
@@ -170,6 +172,8 @@ def test_a_service_of_every_node_that_an_enclave_may_call_by_name_is_drawn_whole
         ("s/look", listed.id),
     }
     assert (called.notes, listed.notes) == ((), ("served by /watchdog",))
+    ties = pages._page_data(picture, scenes, picture)["ties"]
+    assert {tie["common"] for tie in ties if tie["right"] == "reply"} == {True, False}
 
 
 def test_what_differs_is_never_folded_into_an_enclave(tmp_path: Path) -> None:
