@@ -356,7 +356,7 @@ def test_what_is_in_the_way_of_the_lock_is_named(kind: str, keystore: Path) -> N
         os.mkfifo(path)
     else:
         os.mknod(path, stat.S_IFSOCK | 0o600)
-    with pytest.raises(KeystoreError, match=r"is in the way.* remove it"):
+    with pytest.raises(KeystoreError, match=r"is in the way.* remove this file"):
         create_enclaves(keystore, ["/new"], now=NOW)
     path.rmdir() if kind == "folder" else path.unlink()
     assert snapshot(keystore) == before

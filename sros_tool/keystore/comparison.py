@@ -62,12 +62,12 @@ _PROPERTIES: dict[ProtectionKind, frozenset[str]] = {
 _LOSS_TEXTS = {
     "secrecy": "no longer encrypted",
     "integrity": "no longer signed",
-    "origin": "no longer proven to come from one writer",
+    "origin": "no longer proven to come from the writer that they name",
 }
 _GAIN_TEXTS = {
     "secrecy": "encrypted",
     "integrity": "signed",
-    "origin": "proven to come from one writer",
+    "origin": "proven to come from the writer that they name",
 }
 _ROS_WORDS = {
     "rtps_protection_kind": "whole messages",
@@ -123,7 +123,7 @@ def _governance_changes(old: Governance, new: Governance) -> Iterator[SettingCha
         (
             Effect.LOOSER,
             _remaining_domains(after, before),
-            "enclaves may also join domain {}, unless their permissions are for other domains only",
+            "enclaves may also join domain {}, unless their permissions are only for other domains",
         ),
         (
             Effect.TIGHTER,
@@ -340,7 +340,7 @@ def _settings_changes(old: Template, new: Template, now: datetime) -> Iterator[S
             yield SettingChange(effect, key, first, second, words[effect is Effect.TIGHTER])
     yield from _zenoh_changes(old.zenoh, new.zenoh)
     rotated = "applies to the CAs that `sros rotate_ca` makes"
-    listed = "applies to the next revocation list that is signed, also by `sros crl --refresh`"
+    listed = "applies to the next revocation list; `sros crl --refresh` signs one"
     for key, first, second, meaning in (
         (
             "authorities.validity",
@@ -392,7 +392,7 @@ def _zenoh_changes(old: ZenohNetwork | None, new: ZenohNetwork | None) -> Iterat
         ("endpoints", "sessions connect to these endpoints"),
         ("listen", "the router listens on these endpoints"),
         ("mode", "how sessions reach each other"),
-        ("domains", "the domains of the governance in which the network is used"),
+        ("domains", "the network is used in these domains of the governance"),
         ("routers", "further routers, each with the enclaves whose sessions connect to it"),
         ("crossing", "names that pass from one router to another"),
     ):
@@ -413,8 +413,8 @@ _CHOICE_EFFECTS = (
         "unique_subject",
         False,
         (
-            "earlier permissions fit every later certificate",
-            "earlier permissions do not fit a certificate that is issued again",
+            "earlier permissions also fit later certificates of the enclave",
+            "earlier permissions do not fit later certificates of the enclave",
         ),
     ),
     (

@@ -482,10 +482,10 @@ class ReceivedConfirmation:
         if alternated is None or self.time - alternated > timedelta(days=1):
             return ""
         return (
-            f"{_TWO_COMPUTERS} seem to send messages in turn: they reported an earlier start "
-            f"or release again, last at {iso(alternated)}. Perhaps a disk was copied or restored. "
-            "The files of the other computer are not known. Give the robot new keys, and revoke "
-            "the others (docs/howto/one_robot.md: Same name, new hardware)."
+            f"{_TWO_COMPUTERS} seem to send messages in turn: the messages went back to an earlier "
+            f"start or release, last at {iso(alternated)}. Perhaps a disk was copied or restored. "
+            "sros knows the files of only one of the two computers. Give the robot new keys, and "
+            "revoke the earlier keys (docs/howto/one_robot.md: Same name, new hardware)."
         )
 
     def clock_note(self) -> str:
@@ -654,7 +654,7 @@ def refusals(keystore: OpenedKeystore) -> dict[str, RefusedMessage]:
     except (SrosError, ValueError, TypeError, KeyError, AttributeError) as error:
         raise DocumentError(
             f"'{path}' is damaged",
-            "It lists the robots whose last message was refused, so it is not known what these "
+            "It lists the robots whose last message was refused, so sros does not know what these "
             "robots have.",
             "Remove it, and run `sros fleet collect`, which writes it again.",
         ) from error
@@ -732,7 +732,9 @@ def _confirmation_from(value: Any) -> Confirmation:
     if not isinstance(value, dict):
         raise _FormError("it is not a JSON object")
     if value.get("format") != _FORMAT or type(value["format"]) is not int:
-        raise _FormError(f"its format is not {_FORMAT}", "Use an sros of the same version.")
+        raise _FormError(
+            f"its format is not {_FORMAT}", "Use the same version of sros here and on the robot."
+        )
     if unknown := sorted(value.keys() - _REQUIRED_KEYS - _OPTIONAL_KEYS):
         raise _FormError(
             f"it has the unknown key {_shortened(unknown[0])}; if the robot has a later release of "
@@ -886,7 +888,7 @@ _AGENT_READERS: Mapping[str, Callable[[Any], Any]] = {
 def _dds_from(value: Any) -> RobotDds:
     if not isinstance(value, dict) or value.keys() != set(RobotDds._fields):
         raise _FormError('the keys of "dds" are not "libraries" and "unseen"')
-    why = "its number of unseen processes is not a number"
+    why = "its count of unseen processes is not a number"
     unseen = _number_from(value["unseen"], why, most=_MOST_UNSEEN)
     libraries = _list_from(value["libraries"], _MOST_LIBRARIES, "DDS libraries")
     return RobotDds(tuple(map(_library_from, libraries)), unseen)
@@ -894,10 +896,12 @@ def _dds_from(value: Any) -> RobotDds:
 
 def _library_from(value: Any) -> RobotLibrary:
     if not isinstance(value, dict) or value.keys() != set(RobotLibrary._fields):
-        raise _FormError('the keys of a library of its DDS are not "product", "version", ...')
+        raise _FormError(
+            'the keys of a DDS library are not "product", "version", "path" and "seen"'
+        )
     product, version, path, seen = (value[key] for key in RobotLibrary._fields)
     if product not in PRODUCTS:
-        raise _FormError(f"{_shortened(product)} is not a DDS that confirmations name")
+        raise _FormError(f"{_shortened(product)} is not the name of a DDS that sros knows")
     if not isinstance(version, str) or (version and not _LIBRARY_VERSION.match(version)):
         raise _FormError(f"{_shortened(version)} is not the version of a DDS")
     if not isinstance(path, str) or not _LIBRARY_PATH.match(path):

@@ -823,7 +823,7 @@ def _describe_signature(
     """Describe the signature of the signed document ``data`` at ``path``."""
     signed = files.signed(data)
     authority_file = authority or permissions_ca_for(path)
-    reason = "no permissions CA certificate is next to it; name one with --ca"
+    reason = "no certificate of a permissions CA is next to the document; name one with --ca"
     verified: bool | None = None
     if authority_file:
         certificates = load_certificates(

@@ -259,9 +259,9 @@ class EnclaveDomains(NamedTuple):
                 f"the robot {robot.name} is in domain {robot.domain}, but the keystore is for "
                 f"domain {self.keystore}",
                 "An enclave can communicate only in the domains that the governance names.",
-                f"Add it with `sros update_keystore KEYSTORE --domain "
-                f"{self.keystore},{robot.domain} --allow-looser`, or change it in the fleet "
-                "file.",
+                f"Add domain {robot.domain} with `sros update_keystore KEYSTORE --domain "
+                f"{self.keystore},{robot.domain} --allow-looser`, or give the robot another "
+                "domain in the fleet file.",
             )
         return DomainSet.of((robot.domain, robot.domain))
 
@@ -358,7 +358,7 @@ def _refuse_shared_enclaves(fleet: Fleet) -> None:
                     "perhaps from an earlier policy. An export for one of the robots would have "
                     "the "
                     "key of the other.",
-                    "Give the robot another name or namespace in the fleet file.",
+                    "Give one of the robots another name or namespace in the fleet file.",
                 )
             owners[name] = robot.name
 
@@ -411,11 +411,11 @@ def notes_on_lost_enclaves(keystore: OpenedKeystore, before: Fleet, after: Fleet
     for name, enclaves in left_enclaves.items():
         enclaves.update(enclave for enclave in earlier[name].below if not robot_of(after, enclave))
         why = "has other enclave paths now" if name in after.robots else "is no longer in the fleet"
-        stay = "stays" if len(enclaves) == 1 else "stay"
+        stay, them = ("stays", "it") if len(enclaves) == 1 else ("stay", "them")
         shown = first_few(sorted(enclaves), _MOST_SHOWN)
         yield Note(
             "fleet.left-enclaves",
-            f"the robot {name} {why}: {shown} {stay} valid. To revoke them, run `sros revoke "
+            f"the robot {name} {why}: {shown} {stay} valid. To revoke {them}, run `sros revoke "
             f"{quote(str(keystore.root))} {arguments_for(keystore, sorted(enclaves))}`.",
         )
 
@@ -423,7 +423,7 @@ def notes_on_lost_enclaves(keystore: OpenedKeystore, before: Fleet, after: Fleet
 def _lost_router_note(keystore: OpenedKeystore, robot: str, router: str) -> Note:
     text = (
         f"the robot {robot} has no Zenoh router any more: its enclave {router} stays valid. Stop "
-        "the router, and take its enclave back: `sros revoke "
+        "the router, and revoke its enclave: `sros revoke "
         f"{quote(str(keystore.root))} {router}`."
     )
     return Note("fleet.left-router", text)

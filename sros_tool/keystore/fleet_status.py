@@ -904,7 +904,7 @@ def _notes_on_clock(received: ReceivedConfirmation) -> Iterator[str]:
     if note := received.clock_note():
         yield note
     if received.confirmation.clock == RobotClock.BEHIND:
-        yield "its clock shows an earlier time than documents that it has verified"
+        yield "its clock shows an earlier time than documents that the robot has verified"
 
 
 class _KeystoreFile(NamedTuple):
@@ -1411,8 +1411,9 @@ def _robot_status(
     is_lost = state is State.REFUSED and refusal and refusal.why.startswith(NOT_IN_LEDGER)
     if (is_lost or (state is State.UNKNOWN and not is_ahead)) and records.is_restored:
         lost_note = (
-            "the keystore was restored, and lacks what it issued after the backup. If this is the "
-            f"robot: `sros distribute_key {quote(str(records.root))} --robot NAME FOLDER --force`"
+            "the keystore was restored, and lacks what it issued after the backup. If the "
+            "robot sent this: `sros distribute_key "
+            f"{quote(str(records.root))} --robot NAME FOLDER --force`"
         )
         compared_robot = compared_robot._replace(notes=(lost_note, *compared_robot.notes))
     problems = confirmed.problems if confirmed else None
@@ -1675,8 +1676,8 @@ def fleet_metrics(
         ),
         Metric(
             "sros_fleet_publication_altered",
-            "Number of published files that `sros fleet publish` found missing, changed or older "
-            "than published in the last day, and published again.",
+            "Number of published files that in the last day, `sros fleet publish` found missing, "
+            "changed or older than it had written them, and published again.",
             (Sample(len(status.publication.altered), place),) if status.publication else (),
         ),
         Metric(
@@ -1703,7 +1704,8 @@ def fleet_metrics(
         ),
         Metric(
             "sros_fleet_clock_ahead_seconds",
-            "How far the clock of a robot was ahead when its confirmation was received.",
+            "How many seconds the clock of a robot was ahead when its confirmation was received; "
+            "negative if the clock was behind.",
             per_robot(
                 lambda robot: (
                     int((robot.clock - robot.received).total_seconds())

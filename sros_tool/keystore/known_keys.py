@@ -520,7 +520,9 @@ class KnownKeys:
             if publish_first and may_have_later_releases(self._keystore):
                 folder = quote(read_published(self._keystore).folder)
                 publish = f"sros fleet publish {quote(str(self._keystore.root))} {folder}"
-                remedy = f"First run `{publish} --restored`, which takes this list over."
+                remedy = (
+                    f"First run `{publish} --restored`, which revokes again what this list revokes."
+                )
             raise KeystoreError(
                 f"the certificate of {holder} was revoked",
                 "A revocation list names it, and the ledger does not: the keystore may come from a "

@@ -304,7 +304,7 @@ def how_to_learn_one_process(robot: Path, domain: int = 0) -> str:
     """
     option = f" --domain {domain}" * bool(domain)
     return (
-        f"let it run open next to the closed robot, and run `sros generate_policy "
+        f"let the process run open next to the closed robot, and run `sros generate_policy "
         f"{quote(str(robot / CLOSED_POLICY))} --enclave-per-node{option}`; read the added "
         f"rights, run `sros close {quote(str(robot))}`, and restart the process as `sros close` "
         "says"
@@ -322,7 +322,7 @@ def how_to_add_domains(root: Path, domains: str) -> str:
     command = f"sros update_keystore {quote(str(keystore or 'KEYSTORE'))} --domain {domains}"
     if keystore == root:
         return f"add the domain with `{command} --allow-looser`"
-    where = "to its keystore" if keystore else "where its keystore is"
+    where = "to its keystore" if keystore else "on the machine of its keystore"
     text = f"add the domain {where}, with `{command} --allow-looser`, and export again"
     return remedy_in_closed_robot(root, text)
 
@@ -464,9 +464,7 @@ def enclave_names(root: Path, *, hidden: bool = False) -> tuple[str, ...]:
     """
     names, unread = search_enclaves(root, hidden=hidden)
     if unread:
-        raise _unreadable_folder_error(
-            root, unread, "Enclaves in it would be missing from the result."
-        )
+        raise _unreadable_folder_error(root, unread, "Enclaves would be missing from the result.")
     return names
 
 
@@ -479,9 +477,7 @@ def enclaves_below(root: Path, name: str) -> tuple[str, ...]:
     top, start = os.fspath(root / ENCLAVES), os.fspath(enclave_path(root, name))
     names, unread = _search(top, start)
     if unread:
-        raise _unreadable_folder_error(
-            root, unread, "Enclaves in it would be missing from the result."
-        )
+        raise _unreadable_folder_error(root, unread, "Enclaves would be missing from the result.")
     return tuple(enclave for enclave in names if enclave != name)
 
 
@@ -716,6 +712,6 @@ def locate_enclave(folder: Path) -> tuple[Path, str]:
         f"'{folder}' is not below a folder named {ENCLAVES}",
         "rcl finds an enclave by its path below that folder.",
         "Name the keystore, or the enclave's folder in it. If you have only this folder, "
-        f"move it to a place where rcl looks: `mkdir -p robot/{ENCLAVES} && cp -a "
+        f"copy it to a place where rcl looks: `mkdir -p robot/{ENCLAVES} && cp -a "
         f"{quote(str(absolute))} robot/{ENCLAVES}/ && sros check robot`.",
     )

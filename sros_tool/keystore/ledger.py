@@ -703,7 +703,7 @@ class LedgerFile:
             return file
         raise KeystoreError(
             f"{name}, a sealed part of the ledger of '{self.root}', is missing",
-            "The answer needs all lines of the ledger.",
+            "This command needs all lines of the ledger.",
             "Copy it back from your archive.",
         )
 
@@ -740,7 +740,7 @@ class LedgerFile:
         if fault := _head_fault(files.head, read.lines, read.signed, is_chained=read.chained):
             faults.append(fault)
         if files.later:
-            text = f"{files.later} is a later part of it, so an earlier ledger was put back"
+            text = f"{files.later} is a later part of the ledger, so an earlier ledger was put back"
             faults.append(_Fault(read.lines, text))
         recorded = [_Fault(entry.number, entry.reason) for entry in entries if entry.what == GAP]
         gaps = (at for at, entry in zip(numbers, entries, strict=True) if entry.what == GAP)
@@ -996,7 +996,7 @@ def _too_large_error(path: Path) -> KeystoreError:
         f"archive, and state all rights again with `sros generate_artifacts -k {quote(str(root))} "
         f"-p POLICY_FILE`. Then replace the CAs with `sros rotate_ca {quote(str(root))} --next`: "
         "files that the new ledger lacks are then no longer valid. If the ledger does not belong "
-        "to this keystore, restore it from a backup.",
+        "to this keystore, restore the right ledger from a backup.",
     )
 
 
@@ -1086,7 +1086,7 @@ def _head_fault(head: _Head | None, lines: int, signed: str, *, is_chained: bool
     ``signed`` is the digest of the line that the head states as the last one.
     """
     if not head:
-        text = f"{LEDGER_HEAD}, which signs its end, is missing"
+        text = f"{LEDGER_HEAD}, which signs the end of the ledger, is missing"
         return _Fault(lines, text) if is_chained else None
     if head.fault:
         return _Fault(lines, head.fault)

@@ -560,7 +560,7 @@ def check_domain(domains: DomainSet, domain: int | None, root: Path) -> None:
     if domain is None or domain in domains:
         return
     raise KeystoreError(
-        f"ROS_DOMAIN_ID is {domain}, but keystore '{root}' is for domain {domains} only",
+        f"ROS_DOMAIN_ID is {domain}, but keystore '{root}' is only for domain {domains}",
         "In any other domain, DDS refuses a node with this keystore.",
         f"Set ROS_DOMAIN_ID to {domains}, or {how_to_add_domains(root, f'{domains},{domain}')}.",
     )
@@ -950,7 +950,7 @@ class _EnclaveFiles:
                 f"but by {other_issuer_text(certificate, ca)}"
             )
             if refusal := self._chain_problem(certificate, authorities or b""):
-                text += f"; with all CAs of the file, {refusal}"
+                text += f"; also with all CAs of {IDENTITY_CA_FILE}, {refusal}"
             self._add(CERTIFICATE_FILE, text, Fault.CERTIFICATE_ISSUER)
         elif certificate and ca and authorities and not self._problems:
             self._check_chain(certificate, authorities)

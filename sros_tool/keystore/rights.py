@@ -408,8 +408,9 @@ def _zenoh_rights(path: Path, document: ConfigurationDocument) -> RightsSource:
         text = f"{path}: it puts a namespace before the keys; this answer ignores the namespace."
         notes.append(Note("rights.zenoh-namespace", text))
     if rules.left_out:
-        text = f"{path}: {len(rules.left_out)} key expressions are no ROS names, such as "
-        text += f"{rules.left_out[0][:80]}; this answer leaves them out."
+        number = counted(len(rules.left_out), "key expression")
+        text = f"{path}: this answer leaves out {number} without a ROS name, "
+        text += f"for example {rules.left_out[0][:80]}."
         notes.append(Note("rights.zenoh-no-name", text))
     return RightsSource(
         path,
@@ -462,7 +463,11 @@ def _keystore_rights(
         rights |= granted
         enclaves.update(scope)
         if foreign := sorted(set(scope) - {name}):
-            verdict = "which can use them, too" if name in scope else "and DDS refuses them"
+            verdict = (
+                "which can use these permissions, too"
+                if name in scope
+                else "and DDS refuses these permissions"
+            )
             text = f"{name}: its permissions are for {', '.join(foreign)}, {verdict}."
             reader.sound = False
             reader.notes.append(Note(FOREIGN_GRANT, text))
@@ -536,7 +541,7 @@ class _Reader:
             signed.verify(authority)
         except SrosError as error:
             self.sound = False
-            text = f"{label}: THE SIGNATURE DOES NOT VERIFY, and DDS refuses it: {error}"
+            text = f"{label}: THE SIGNATURE DOES NOT VERIFY, and DDS refuses the file: {error}"
             self.notes.append(Note("rights.bad-signature", text.rstrip(".") + "."))
 
     def _authority_for(self, file: Path) -> x509.Certificate | None:
@@ -595,7 +600,7 @@ def _discovery_notes(permissions: Permissions) -> Iterator[Note]:
     for name, grant in _first_grants(permissions).items():
         if lacking := _missing_discovery(grant):
             text = (
-                f"{name} may not {' and '.join(lacking)} {ROS_DISCOVERY_TOPIC}: its nodes do not "
+                f"{name} may not {' or '.join(lacking)} {ROS_DISCOVERY_TOPIC}: its nodes do not "
                 "start, or do not see the other nodes, or are not seen. Sign its permissions from "
                 "its policy."
             )
@@ -830,7 +835,7 @@ def without_enclaves_of_sros(source: RightsSource, other: RightsSource) -> Right
     if named := sorted(left_out & routers):
         number = counted(len(named), "Zenoh router")
         text = (
-            f"left out: {number} that the policy lacks, with only the rights that every node needs"
+            f"left out: {number}, not in the policy, and with no other rights than every node needs"
         )
         notes = (*notes, Note("rights.routers", f"{text}: {first_few(named, 5)}."))
     return replace(

@@ -296,8 +296,8 @@ def _enclaves_of_robots(
             if left := _enclaves_named_after(keystore, name):
                 raise KeystoreError(
                     f"the fleet in keystore '{root}' gives no enclave to a robot {name}",
-                    f"It has {_names_text(left)}: perhaps the robot left the fleet or a group, or "
-                    "the path is written without {robot}.",
+                    f"The keystore has {_names_text(left)}: perhaps the robot left the fleet or a "
+                    "group, or the path is written without {robot}.",
                     f"Name the enclaves themselves: {arguments_for(keystore, left)}.",
                 )
             fleet.robot(name)
@@ -382,16 +382,18 @@ def missing_enclave_error(
         return KeystoreError(
             missing,
             why,
-            f"If it is not a typo, write its rights into {policy}, and run `sros close {folder}`. "
-            f"To learn them, {how_to_learn_one_process(robot)}.",
+            f"If the name is right, write the enclave's rights into {policy}, and run `sros close "
+            f"{folder}`. To learn the rights, {how_to_learn_one_process(robot)}.",
         )
     if not keystore.is_original:
         where = f"`sros distribute_key KEYSTORE {quote(name)} {quote(str(root))}`"
-        return KeystoreError(missing, why, f"If it is not a typo, export it with {where}.")
+        return KeystoreError(
+            missing, why, f"If the name is right, export the enclave with {where}."
+        )
     if not may_create:
         return KeystoreError(missing, why, f"See `sros list_enclaves {quote(str(root))}`.")
     create = f"`sros create_enclave {quote(str(root))} {quote(name)}`"
-    return KeystoreError(missing, why, f"If it is not a typo, create it with {create}.")
+    return KeystoreError(missing, why, f"If the name is right, create the enclave with {create}.")
 
 
 _PERMISSION_TEXTS = {

@@ -174,8 +174,8 @@ def edit_notes(keystore: OpenedKeystore, governance: Governance) -> tuple[Note, 
     if not edits:
         return ()
     clauses = first_few(edits.clauses(), _MOST_SHOWN, "; ", "; and ")
-    text = f"{clauses}. Only files issued from now on may follow the edit, "
-    text += f"and the signed governance does not: {edit_remedy(keystore.root)}"
+    text = f"{clauses}. Files that are issued from now on may follow the edit; earlier files "
+    text += f"and the signed governance do not: {edit_remedy(keystore.root)}"
     return (Note("keystore.edited", text),)
 
 
@@ -234,7 +234,7 @@ def _difference_clauses(old: Template, new: Template) -> Iterator[str]:
     for key in dict.fromkeys((*before, *after)):
         old_value, new_value = before.get(key, "nothing"), after.get(key, "nothing")
         if old_value != new_value and key not in ("name", "description"):
-            yield f"{key} in {SETTINGS} is {new_value}, but {old_value} was written by sros"
+            yield f"{key} in {SETTINGS} is {new_value}, but sros wrote {old_value}"
 
 
 def _governance_edit(keystore: OpenedKeystore) -> str:

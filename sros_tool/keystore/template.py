@@ -286,7 +286,9 @@ def _read_zenoh(table: _Table) -> ZenohNetwork:
         except SrosError as error:
             raise _TemplateError(f"{table.path}.router: {error}".removesuffix(".")) from error
         if names.count(name) > 1:
-            raise _TemplateError(f"{table.path}.routers has {name}, which is {table.path}.router")
+            raise _TemplateError(
+                f"{table.path}.routers has {name}, which is also {table.path}.router"
+            )
     for router in (network, *network.routers):
         for key in ("endpoints", "listen"):
             for endpoint in getattr(router, key):
@@ -463,8 +465,8 @@ def _read_authority_name(table: _Table) -> str:
     name = table.text("name", "sros")
     if not 0 < len(name) <= _LONGEST_AUTHORITY_NAME or not name.isprintable():
         raise _TemplateError(
-            f"{table.path}.name is {name!r}, which is not 1 to {_LONGEST_AUTHORITY_NAME} printable "
-            "characters"
+            f"{table.path}.name is {name!r}, which does not have 1 to "
+            f"{_LONGEST_AUTHORITY_NAME} printable characters"
         )
     return name
 

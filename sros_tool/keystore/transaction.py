@@ -505,7 +505,7 @@ class Transaction:
         if link := link_of_stranger(self.root):
             raise KeystoreError(
                 f"'{link}' is a link of another user",
-                "Every user can create a link at this path, and it leads to "
+                "Every user can create a link at this path, and this link leads to "
                 f"'{os.path.realpath(link)}'.",
                 "Choose another folder, or name the folder itself.",
             )
@@ -1078,7 +1078,7 @@ class KeystoreLock:
         return KeystoreError(
             f"'{self._folder.path / LOCK}' is in the way",
             "It is not a file that sros made.",
-            "Find out who can write to the folder, and remove it.",
+            "Find out who can write to the folder, and remove this file.",
         )
 
     def _is_there(self, handle: int) -> bool:

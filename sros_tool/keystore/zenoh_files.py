@@ -224,7 +224,7 @@ def _read_configuration(
         signed = state.read_once.signed(message)
         if state.permissions_ca is None:
             text = (
-                "the permissions CA of the enclave is missing, so its signature cannot be verified"
+                "the permissions CA of the enclave is missing, so the signature cannot be verified"
             )
             return ZenohProblem(signed_file, text, ZenohFault.SIGNATURE)
         signed.verify(state.permissions_ca)
@@ -250,9 +250,7 @@ def _before_revocation_clause(configuration: Configuration, state: OpenedEnclave
         return ""  # another check reports this problem of the enclave
     if configuration.revoked >= _last_revocation(lists=(crl,)):
         return ""
-    return (
-        f"it is older than the last revocation in {CRL_FILE}, and may still give the revoked rights"
-    )
+    return f"it is older than the last revocation in {CRL_FILE}: revoked enclaves may keep rights"
 
 
 def _out_of_date_clause(
@@ -502,8 +500,8 @@ def zenoh_documents(
             raise KeystoreError(
                 f"keystore '{root}' has no enclave {router}, and the Zenoh router needs it",
                 "Its certificate shows to all others that the process is the router.",
-                f"Create it with `sros create_enclave {quote(str(root))} {router}`, name "
-                "another one with `sros zenoh --router NAME`, or end the network with `sros zenoh "
+                f"Create it with `sros create_enclave {quote(str(root))} {router}`, name another "
+                "enclave with `sros zenoh --router NAME`, or end the network with `sros zenoh "
                 f"{quote(str(root))} --off`.",
             )
         if change.stated.get(router):
@@ -609,8 +607,8 @@ def _rights_for_peers(
     except TooManyExpressions:
         raise PolicyError(
             f"the common rights of {name} and another enclave cannot be expressed in Zenoh",
-            "In peer mode each session has the rights that both ends have. Their wildcards combine "
-            "into too many key expressions.",
+            "In peer mode, each session has the rights that both enclaves have. The wildcards in "
+            "these rights combine into too many key expressions.",
             "Use fewer wildcards, or client mode: `sros zenoh --mode client`.",
         ) from None
     rendered.append(router)
@@ -674,7 +672,8 @@ def _domains(
     root = keystore.root
     if unserved := [domain for domain in network.domains if domain not in domains]:
         raise UsageError(
-            f"the Zenoh network has domain {unserved[0]}, and keystore '{root}' only {domains}",
+            f"the Zenoh network has domain {unserved[0]}, but keystore '{root}' is only for "
+            f"domain {domains}",
             "DDS and Zenoh would enforce different rights.",
             f"Name other domains with `sros zenoh --domain`, or add the domain with `sros "
             f"update_keystore {quote(str(root))} --domain {domains},{unserved[0]} --allow-looser`.",
@@ -1162,7 +1161,7 @@ def rights_in_domain(enclave: str, grant: Grant, domain: int) -> tuple[StatedRig
     if grant.default_allow:
         raise PolicyError(
             f"{source}: <default>ALLOW</default> cannot be expressed in Zenoh",
-            "It allows by default, which some DDS vendors follow and others ignore.",
+            "Some DDS vendors follow this default, and others ignore it.",
             _REMEDY_STATE_RIGHTS,
         )
     rules = [rule for rule in grant.rules if domain in rule.domains.closed()]
@@ -1353,8 +1352,8 @@ def _vendors_differ_error(
         f"{difference}, because the order of the rules matters",
         f"On DDS {next(iter(reasons))}, and rule {denying[0]} comes too late to deny it. On Zenoh, "
         "as in a policy, a deny rule wins wherever it stands.",
-        f"List the names to {verb} in a policy, without that deny rule, and sign it with `sros "
-        "create_permission`.",
+        f"In a policy, list the names to {verb}, without that deny rule, and sign the policy with "
+        "`sros create_permission`.",
     )
 
 

@@ -96,7 +96,10 @@ def _(bench: Bench) -> None:
     bench.adopt("identity", bench.new_authority(IS_CA, (NO_SIGNING, True)))
 
 
-@cause("enclave.certificate-issuer", "with all CAs of the file, the chain is longer than the")
+@cause(
+    "enclave.certificate-issuer",
+    "also with all CAs of identity_ca.cert.pem, the chain is longer than the",
+)
 def _(bench: Bench) -> None:
     root, key = bench.new_authority(ONLY_LEAVES, common_name="root")
     middle, below = bench.new_authority(IS_CA, issuer=(root.subject, key), common_name="middle")

@@ -739,7 +739,9 @@ def test_processes_that_started_after_the_watch(robot: Robot) -> None:
     robot.more = (late, replace(late, pid=8, command=("/opt/more", "--ros-args")))
     said = robot.close(status=1).out
     assert f"in its enclave: sros run {export} ENCLAVE -- COMMAND; stop processes that " in said
-    assert "`sros demo listener`; to give another process its own enclave, let it run" in said
+    assert (
+        "`sros demo listener`; to give another process its own enclave, let the process run" in said
+    )
     learn = "`sros generate_policy robot/policy.xml --enclave-per-node`; read the added rights"
     assert f"next to the closed robot, and run {learn}" in said
     assert "--undo" not in said, "no advice opens the robot"
@@ -1265,7 +1267,9 @@ def test_a_process_that_the_policy_lacks_keeps_its_command(robot: Robot) -> None
     robot.absent = {"/talker"}
     robot.close()
     lacking = sros("env", "robot/export", "/talker", cwd=robot.folder).err
-    assert "write its rights into robot/policy.xml, and run `sros close robot`." in lacking
+    assert (
+        "write the enclave's rights into robot/policy.xml, and run `sros close robot`." in lacking
+    )
     robot.nodes, robot.absent = (TALKER, LISTENER), set()
     said = robot.close("--for", "1s", status=1).out
     add = "sros merge_policy robot/policy.xml robot/seen.xml --in-place"

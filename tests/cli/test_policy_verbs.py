@@ -473,7 +473,11 @@ def test_a_job_fails_where_the_policy_and_what_was_observed_differ(folder: Path)
     [
         ({"one": "x", "two": "y x"}, 0, ""),
         ({"one": "x y"}, 1, "the node /two of enclave /n was never observed."),
-        ({"one": "x", "two": "y"}, 1, "two has rights that the node never used, or only in part:"),
+        (
+            {"one": "x", "two": "y"},
+            1,
+            "two has rights that the node never used, or used only in part:",
+        ),
         ({"one": "x y", "two": "x y"}, 1, "/one lacks rights that the node used: publish topic /y"),
         ({"one": "x", "two": "x y", "six": "x"}, 1, "/six lacks rights that the node used:"),
         ({"one": "x", "two": "x y", "t_*": "x"}, 1, "/t_* lacks rights that the node used:"),

@@ -86,10 +86,8 @@ def test_a_router_without_rights_of_its_own_does_not_differ_from_the_policy(fold
     assert "+ /router ALLOW publish" in sros(*compare, cwd=folder).out
     sros("zenoh", "ks", cwd=folder).ok()
     ended = sros(*compare, cwd=folder).ok()
-    left_out = (
-        "left out: 1 Zenoh router that the policy lacks, with only the rights that every node"
-    )
-    assert (ended.out, f"{left_out} needs: /router." in ended.err) == ("", True)
+    left_out = "left out: 1 Zenoh router, not in the policy, and with no other rights than every"
+    assert (ended.out, f"{left_out} node needs: /router." in ended.err) == ("", True)
     (folder / "known.xml").write_text(policy_text({"/a": "", "/b": "", "/router": ""}))
     known = sros("diff_policy", "known.xml", "ks", cwd=folder)
     assert "left out" not in known.err and "+ /router ALLOW publish topic /rosout" in known.out
@@ -213,7 +211,10 @@ def test_the_enclave_of_the_router_is_made_with_what_every_node_needs(folder: Pa
         (("ks", "--router", "way"), "zenoh.router"),
         (("ks", "--endpoint", "tcp/localhost:1"), "is not HOST:PORT"),
         (("ks", "--endpoint", "localhost:70000"), "is not HOST:PORT"),
-        (("ks", "--domain", "7"), "the Zenoh network has domain 7, and keystore 'ks' only 0"),
+        (
+            ("ks", "--domain", "7"),
+            "the Zenoh network has domain 7, but keystore 'ks' is only for domain 0",
+        ),
         (("ks", "--off", "--mode", "peer"), "--off takes no options of the network"),
         (("nothing",), "is not a valid keystore"),
         ((), "ROS_SECURITY_KEYSTORE"),

@@ -141,7 +141,7 @@ def test_the_fleet_file_alone_says_where_the_router_of_a_robot_is(
 ) -> None:
     refused = sros("zenoh", keystore, "--router", value)
     assert refused.status == 2
-    assert "names the router of r1" in refused.err
+    assert "sets the router of r1" in refused.err
     assert network(keystore).routers == (R1, R2)
     edited = (keystore / "sros.toml").read_text().replace("r1.local", "r9.local")
     (keystore / "sros.toml").write_text(edited)

@@ -164,7 +164,7 @@ def test_settings_are_read_as_they_were_written(keystore: Path) -> None:
         (("--router", "/r3/router="), "no further router /r3/router"),
         (("--router", "/r3/router=r3.local"), "HOST:PORT"),
         (("--router", "/router=r3.local:7447"), "enclaves that connect"),
-        (("--router", "/r1/router"), "which is zenoh.router"),
+        (("--router", "/r1/router"), "which is also zenoh.router"),
         (("--cross", "chatter"), "zenoh.crossing has 'chatter'"),
     ],
 )  # fmt: skip

@@ -48,7 +48,7 @@ def test_what_one_robot_used_stays_for_all(folder: Path) -> None:
     assert "publish topic {namespace}/unused" in ended.out
     assert "observed, and not allowed\n    publish topic /hall/r1/no\n" in ended.out
     assert (
-        "/{robot}/base was never observed for r2: rights that only these robots use are removed"
+        "/{robot}/base was never observed for r2: rights that only this robot uses are removed"
         in ended.err
     )
     assert "observed, but the policy lacks them: /stranger." in ended.err

@@ -262,7 +262,7 @@ def test_the_service_signs_the_revocation_list(site: Path) -> None:
     others = 4711  # of another site
     before = snapshot(site)
     for crl, words in (
-        (b"", rf"only this service signs .*\({serial:x}\), and give its list with --crl FILE"),
+        (b"", rf"only this service signs .*: {serial:x}. Give the list of the service with"),
         (listed(others), f"It does not revoke {serial:x}"),
         (listed(serial, key=OTHER), "did not sign it"),
         (listed(serial, days=-1), "not now"),
@@ -402,4 +402,4 @@ def test_a_later_list_of_the_service_that_a_robot_sends_stops_no_renewal(
     said = said_by(tmp_path / "r2", "r2", then, sequence=2, crl=listed(mine, number=8).decode())
     message.write_bytes(signed_message(tmp_path / "r2", "/r2/base", said))
     (note,) = collect(root, tmp_path / "inbox", now=then).notes
-    assert note.text.startswith("r1, r2 have a revocation list of the CA service")
+    assert note.text.startswith("r1, r2 have a revocation list, signed by the CA service")

@@ -49,7 +49,9 @@ def test_where_nobody_is_meant_the_error_says_who_is_there(tmp_path: Path) -> No
     text = str(
         missing_enclave_error(OpenedKeystore(tmp_path / "ks"), "/camera", [*THERE, "/x", "/y"])
     )
-    assert "/x and 1 more. If it is not a typo, create it with `sros create_enclave " in text
+    assert (
+        "/x and 1 more. If the name is right, create the enclave with `sros create_enclave " in text
+    )
 
 
 def test_a_namespace_is_not_taken_for_an_enclave_that_is_missing() -> None:
@@ -84,7 +86,7 @@ def test_a_topic_service_or_action_is_not_taken_for_an_enclave(tmp_path: Path) -
 
 def test_an_export_gets_it_from_its_keystore(tmp_path: Path) -> None:
     text = str(missing_enclave_error(OpenedKeystore(tmp_path), "/camera", THERE))
-    assert f"export it with `sros distribute_key KEYSTORE /camera {tmp_path}`." in text
+    assert f"export the enclave with `sros distribute_key KEYSTORE /camera {tmp_path}`." in text
 
 
 def test_a_name_that_could_not_be_made_is_told_so() -> None:

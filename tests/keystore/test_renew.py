@@ -520,7 +520,7 @@ def test_the_program(tmp_path: Path) -> None:
     every = sros("renew", root, "--all-expiring", "200d").ok().out
     assert every == "renewed enclave /a\nrenewed enclave /b\n"
     again = sros("renew", root, "--all-expiring", "9000d").ok().err
-    assert "the new files expire within 9000d again" in again
+    assert "the new files expire within 9000d, too" in again
     assert "the last of the replaced certificates works until" in (
         sros("renew", root, "/a", "/b").ok().err
     )

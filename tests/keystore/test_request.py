@@ -249,7 +249,7 @@ def test_a_request_for_an_existing_enclave_is_refused(
     steps = f"already exists.*`sros revoke .* {NAME}`.* --enclave.* -p POLICY_FILE.*--fleet"
     with pytest.raises(KeystoreError, match=steps):
         sign_request(home, thief.file.read_bytes(), now=NOW)
-    with pytest.raises(KeystoreError, match=r"already exists.*add --renew;"):
+    with pytest.raises(KeystoreError, match=r"already exists.*add --renew\."):
         sign_request(home, request_of(robot), now=NOW)
     base = create_request(tmp_path / "thief", "/base")
     with pytest.raises(

@@ -433,7 +433,7 @@ def test_keys_in_files_elsewhere(tmp_path: Path) -> None:
 def test_the_note_on_a_lost_old_key_names_where_it_belongs(separate: Path) -> None:
     key = separate / "private/identity_ca.key.pem"
     kept = key.rename(separate.parent / "kept.pem")
-    refused(lambda: rotate_ca(separate, now=NOW), separate, f"It is not at '{key}'")
+    refused(lambda: rotate_ca(separate, now=NOW), separate, f"The current key is not at '{key}'")
     kept.rename(key)
     rotate_ca(separate, now=NOW)
     key.rename(kept)
@@ -739,7 +739,7 @@ def test_without_the_old_key_revoking_waits_for_the_end(
     assert snapshot(separate) == before
     carried = lists_of(separate)[1]
     done = sros("revoke", separate, "/d", "--until-retired").ok()
-    assert "Fast DDS accepts the revoked certificates that it issued" in done.err
+    assert "Fast DDS accepts the revoked certificates that the CA issued" in done.err
     assert lists_of(separate)[1] == carried
     refreshed = sros("crl", separate, "--refresh").ok()
     assert "was not signed again" in refreshed.err

@@ -336,7 +336,9 @@ def test_what_an_earlier_ledger_lacks_is_not_forgotten(
             with pytest.raises(KeystoreError, match=f"{ledger_part(later)}' is a later part"):
                 create_enclaves(root, ["/d"], now=NOW)
         assert snapshot(root) == before
-        damaged = f"{ledger_part(later)} is a later part of it, so an earlier ledger was put back"
+        damaged = (
+            f"{ledger_part(later)} is a later part of the ledger, so an earlier ledger was put back"
+        )
         asking = (CHECK, ("verify",), ("inspect",), ("inspect", "--history"))
         for asked in asking:
             found = sros(*asked, root)

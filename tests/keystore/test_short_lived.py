@@ -144,4 +144,4 @@ def test_a_robot_with_a_name_of_people_is_noted(tmp_path: Path) -> None:
         said = sros(*words, cwd=tmp_path).ok().err
         note = "[fleet.short-lived]: the settings of the keystore make enclaves of operator short-"
         assert (note in said) == (name == "operator")
-        assert ("such as /operator/base" in said) == (name == "operator")
+        assert ("for example /operator/base" in said) == (name == "operator")

@@ -243,7 +243,7 @@ def test_rules_for_names(root: Path) -> None:
     camera = NamedValues("topic", "/camera/*", (("data", "NONE"), ("metadata", "SIGN")))
     target = with_values(present_settings(OpenedKeystore(root)).settings, rules=[camera])
     done = to(root, target)
-    assert "on topic /camera/*" in told(done)
+    assert "the processes that use topic /camera/*;" in told(done)
     expressions = [
         each.topic_expression
         for each in OpenedKeystore(root).governance.domain_access_rules[0].topic_access_rules

@@ -473,11 +473,13 @@ def _older_message_notes(inbox: Path, messages: Iterable[_ReceivedMessage]) -> I
     robots = [message.robot.name for message in messages if message.outcome == "older"]
     if robots:
         messages_text = "an older message" if len(robots) == 1 else "older messages"
-        lies, pronoun = ("lies", "it") if len(robots) == 1 else ("lie", "them")
+        lies, older = (
+            ("lies", "the older message") if len(robots) == 1 else ("lie", "the older messages")
+        )
         yield Note(
             "fleet.older-message",
             f"{messages_text} of {first_few(robots, _SHOWN)} {lies} in '{inbox}', although a "
-            f"newer message was already collected. sros ignores {pronoun}: delete {pronoun}.",
+            f"newer message was already collected. Delete {older}, which sros ignores.",
         )
 
 
@@ -676,7 +678,7 @@ class _Verifier:
                 "its certificate was revoked after this message was accepted",
             )
         if is_of_replaced_ca:
-            why = "its certificate is of an identity CA that was replaced: it missed the rotation"
+            why = "its identity CA was replaced: the robot missed the rotation of this CA"
             raise _OutdatedCertificateError(why, why)
         issued = self._issued(digest(signer))
         if issued is None:
@@ -848,18 +850,18 @@ class _Renewals:
             return (
                 "not_allowed",
                 'the keystore\'s copy of the fleet file does not say renewal = "allowed" for '
-                f"{robot.name}. If your file says it: `sros generate_artifacts -k "
+                f"{robot.name}. If your fleet file says it, run `sros generate_artifacts -k "
                 f"{quote(str(self._keystore.root))} -p POLICY_FILE --fleet FILE`",
             )
         if not same_key and message.enclave != name:
             raise _RefusedError(
-                f"it has a new key, so {name} itself has to sign the message, but "
+                f"the request has a new key, so {name} itself has to sign the message, but "
                 f"{message.enclave} signed it"
             )
         if not same_key and message.certificate.public_key() != present.public_key():
             raise _RefusedError(
-                f"it has a new key, so the current key of {name} has to sign the message, but an "
-                "earlier key signed it"
+                f"the request has a new key, so the current key of {name} has to sign the "
+                "message, but an earlier key signed it"
             )
         for certificate in (message.certificate, present):
             self._check_grace(robot, validity_of(certificate))
@@ -888,8 +890,8 @@ class _Renewals:
         if not robot.renewal_grace or overdue > parse_duration(robot.renewal_grace):
             grace = robot.renewal_grace or "none"
             raise _RefusedError(
-                f"its certificate expired {elapsed(overdue)} ago (renewal_grace of {robot.name}: "
-                f"{grace})"
+                f"its certificate expired {elapsed(overdue)} ago, which is more than the "
+                f"renewal_grace of {robot.name} ({grace})"
             )
 
     @cached_property
@@ -929,8 +931,8 @@ def _revoke_again(
     if keyring.ca_service(root, IDENTITY, OpenedKeystore(root).template):
         # The list is for all sites, and everybody can get it, so this does not delay other robots.
         text = (
-            f"{have} a revocation list of the CA service that the keystore lacks: import it "
-            f"with `sros crl {quote(str(root))} --refresh --crl FILE`"
+            f"{have} a revocation list, signed by the CA service, that the keystore lacks: import "
+            f"it with `sros crl {quote(str(root))} --refresh --crl FILE`"
         )
         notes = [Note("fleet.later-list", text)] if robots_with_lists else []
         if not is_later:
@@ -950,8 +952,8 @@ def _revoke_again(
             text = f"what messages of robots show cannot be recorded in the ledger: {error.what}"
             return "", [*notes, Note("fleet.certificates-restored", text)], []
         why = (
-            f"{have} a revocation list that the keystore signed but does not know, and it cannot "
-            f"sign another: {error.what}"
+            f"{have} a revocation list that the keystore signed but does not know, and no new list "
+            f"can be signed: {error.what}"
         )
         for request in requests:
             if request.request:

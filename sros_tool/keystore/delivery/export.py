@@ -223,7 +223,7 @@ def _other_enclave_notes(
             yield Note(
                 "export.not-in-keystore",
                 f"'{target}' also has enclave {name}, which keystore '{keystore.root}' does not "
-                "have; if it was revoked, remove it from the robot, too: "
+                "have; if the enclave was revoked, remove it from the robot, too: "
                 f"{_enclave_removal(target, [name], present)}",
             )
         elif owner and exported and owner.name not in exported:
@@ -231,11 +231,11 @@ def _other_enclave_notes(
     for robot, enclaves in of_others.items():
         yield Note(
             "export.of-another-robot",
-            f"'{target}' also has {first_few(enclaves, _MOST_SHOWN)} of robot {robot}: whoever has "
-            f"the folder can act as {robot}. If they are not meant to be there, remove them: "
-            f"`{_enclave_removal(target, enclaves, present)}`. If they were on another robot, give "
-            f"{robot} new keys: `sros renew {quote(str(keystore.root))} --robot {quote(robot)} "
-            "--new-key --revoke-old`.",
+            f"'{target}' also has {first_few(enclaves, _MOST_SHOWN)} of robot {robot}: whoever "
+            f"has the folder can act as {robot}. If files of {robot} are not meant to be there, "
+            f"remove them: `{_enclave_removal(target, enclaves, present)}`. If they were on "
+            f"another robot, give {robot} new keys: `sros renew {quote(str(keystore.root))} "
+            f"--robot {quote(robot)} --new-key --revoke-old`.",
         )
 
 
@@ -494,7 +494,7 @@ def _check_last_document(keystore: OpenedKeystore, name: str, path: Path, data: 
     sha256 = hashlib.sha256(data).hexdigest()
     if sha256 in signed and sha256 != signed[-1]:
         raise KeystoreError(
-            f"'{path}' is an earlier document than the last one that was signed",
+            f"'{path}' is older than the last signed {kind}",
             f"Somebody put it back, and robots would get the earlier {kind}.",
             f"Find out who put it back: `sros check {quote(str(keystore.root))}` says what to do.",
         )
@@ -655,7 +655,7 @@ def _write_archive(
             if _state_of(target) != before:
                 raise KeystoreError(
                     f"another process has just written '{target}'",
-                    "Its files may be newer. Nothing was changed.",
+                    "The archive may have newer files. Nothing was changed.",
                     "Run this command again.",
                 )
             put_in_place()
@@ -682,8 +682,9 @@ def _unpack_archive(target: Path) -> Mapping[str, bytes]:
     except DocumentError as error:
         raise KeystoreError(
             f"'{target}' cannot be compared with the new archive",
-            f"{error}. It may have a later CA or a newer revocation list. Nothing was changed.",
-            "Choose another name, or remove it first.",
+            "It may have a later CA or a newer revocation list, and it cannot be read: "
+            f"{str(error).rstrip('.')}. Nothing was changed.",
+            "Choose another name, or first remove this archive.",
         ) from error
 
 

@@ -460,7 +460,7 @@ class _RoleKeys:
         if first and (roles := [role for role in _ROLES if self._path(role).exists()]):
             raise KeystoreError(
                 f"'{self._root}' has the {roles[0]} key for publishing, but no {FLEET_ROOT}",
-                "This file says which keys robots trust.",
+                f"{FLEET_ROOT} says which keys robots trust.",
                 f"Restore {FLEET_ROOT} from a backup.",
             )
         self.rotated = () if first else tuple(role for role in _ROLES if role in rotate)
@@ -864,8 +864,8 @@ class _Publication:
             "fleet.revocations-not-shown",
             f"nothing in '{self._folder}' shows what was revoked, or which rights were taken away, "
             f"after {since}: a robot that was stolen after that gets releases, and is trusted. "
-            f"Unless you have done so, run `sros fleet collect {where} INBOX`, which revokes again "
-            "what messages of robots show. Revoke again what else was stolen (`sros revoke "
+            f"Run `sros fleet collect {where} INBOX` if you have not yet: it revokes again what "
+            "messages of robots show. Revoke again what else was stolen (`sros revoke "
             f"{where} --robot NAME`), and sign the present policy (`sros generate_artifacts`). "
             "Then publish again.",
         )
@@ -896,10 +896,10 @@ class _Publication:
         return KeystoreError(
             f"'{self._folder}' has nothing that the keystore '{self.keystore.root}' published",
             "The keystore has published before. If it was restored from a backup and the folder "
-            "was lost, too, robots that were revoked later would get releases again.",
+            "was lost, too, robots that were revoked after the backup would get releases again.",
             "Name the folder in which the keystore publishes. If that folder is lost, or this is "
             f"an additional folder, add --new-folder to {self._command}; if the keystore was "
-            "restored, first repeat its later revocations, and add --restored as well.",
+            "restored, first repeat the revocations after the backup, and add --restored as well.",
         )
 
     def _has_later_releases(self, restored: bool) -> bool:
@@ -948,8 +948,8 @@ class _Publication:
                 raise self._restored_error(
                     f"was published again without {first_few(removed, _MOST_NAMES)}, and the "
                     f"keystore '{self.keystore.root}' does not know this",
-                    f"repeat the revocations (`{revoke}`), remove robots that left the fleet from "
-                    "the fleet file, and publish again",
+                    f"repeat the revocations (`{revoke}`), remove from the fleet file the robots "
+                    "that left the fleet, and publish again",
                 )
 
     def _restored_error(self, evidence: str, remedy: str) -> KeystoreError:
@@ -988,8 +988,8 @@ class _Publication:
         raise KeystoreError(
             f"sros cannot read the last release of any robot in '{self._folder}'",
             f"{problem} Without a release, sros cannot tell which revocations the keystore lacks.",
-            "Copy a release there from a copy of the folder, or from the robot, whose agent "
-            "keeps it as FOLDER/.agent/release.tar.gz.",
+            "Copy a release there from a copy of the folder, or from a robot, whose agent "
+            "keeps its release as FOLDER/.agent/release.tar.gz.",
         )
 
     def _restore(self, forgotten_lists: LostRecords, keyring: Keyring) -> None:

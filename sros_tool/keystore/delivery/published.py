@@ -73,7 +73,7 @@ class PublishedRelease(NamedTuple):
 def check_positive_number(value: object, maximum: int = MOST_NUMBER) -> int:
     """Return ``value``; raise `ValueError` unless it is a number from 1 to ``maximum``."""
     if type(value) is not int or not 1 <= value <= maximum:
-        raise ValueError("a release number or version is no number, or is too high")
+        raise ValueError(f"a release number or version is not a number from 1 to {maximum}")
     return value
 
 

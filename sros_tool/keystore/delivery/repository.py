@@ -75,7 +75,7 @@ def load_signer(data: bytes, label: str) -> CryptoSigner:
     try:
         key = serialization.load_pem_private_key(data, None)
     except (ValueError, TypeError, UnsupportedAlgorithm) as error:
-        raise PkiError(f"{label} is not a private key without passphrase") from error
+        raise PkiError(f"{label} is not a private key, or has a passphrase") from error
     if not isinstance(key, Ed25519PrivateKey):
         raise PkiError(f"{label} is not an Ed25519 key", "", "Name the key that sros made.")
     return CryptoSigner(key)
@@ -89,8 +89,8 @@ def lost_key_remedy(*roles: str) -> str:
 
 
 _REMEDY_ROOT_KEY = (
-    "Name the right file with --root-key. If a rotation of this key was killed, the right file is "
-    "FILE.new, next to the earlier one."
+    "Name the right file with --root-key. If a rotation of this key was interrupted, the right "
+    "file is FILE.new, next to the earlier file."
 )
 
 
@@ -295,8 +295,8 @@ def _foreign_folder_error(folder: Path, why: str) -> KeystoreError:
         f"'{folder}' has metadata that this keystore did not write",
         f"{why[:1].upper()}{why[1:].removesuffix('.')}.",
         "Name another folder. If the keystore was restored from a backup, first follow "
-        "docs/howto/keystore_is_lost.md. If this keystore published to it before, and it is "
-        f"damaged, {_damaged_metadata_remedy(folder)}.",
+        "docs/howto/keystore_is_lost.md. If this keystore published to this folder before, and the "
+        f"metadata is damaged, {_damaged_metadata_remedy(folder)}.",
     )
 
 

@@ -139,18 +139,18 @@ def older_than_robots_error(
             f"'{keystore.root}' never published"
         )
         other = (
-            f" If the keystore was not restored, {claim.robot} has other files or lies: examine "
-            f"it, or revoke it with `sros revoke {where} --robot {claim.robot}`; then its word no "
-            "longer counts."
+            f" If the keystore was not restored, {claim.robot} has wrong files, or sends false "
+            f"messages: examine the robot, or run `sros revoke {where} --robot {claim.robot}`, so "
+            "that its messages no longer count."
         )
         doing = "Perhaps the keystore was restored from a backup, or is a copy: then, publishing"
     return KeystoreError(
         shown,
         f"{doing} would undo later changes, such as a revocation, or bring back rights that were "
         "taken away.",
-        f"Restore a later backup. If there is none, run `sros fleet collect {where} INBOX`, revoke "
-        f"again what was revoked, and run `sros fleet publish {where} {place} --restored`; "
-        f"docs/howto/keystore_is_lost.md has the other steps.{other}",
+        f"Restore a later backup. If there is none, run `sros fleet collect {where} INBOX`, "
+        f"revoke again what was revoked after the backup, and run `sros fleet publish {where} "
+        f"{place} --restored`; docs/howto/keystore_is_lost.md has the other steps.{other}",
     )
 
 
@@ -503,9 +503,9 @@ def check_authorities(keystore: OpenedKeystore, folder: Path, last: Release) -> 
     later_ones = " and ".join(authority_text(replaced[role]) for role in roles)
     options = " ".join(f"--{role}-ca FILE --{role}-key PLACE" for role in roles)
     by_hand = (
-        " Otherwise, also bring the files of each robot by hand (`sros distribute_key "
-        f"{where} --robot NAME FOLDER --force`), because robots accept releases only "
-        "of the CA that they trust."
+        " Otherwise, also bring each robot its files by hand (`sros distribute_key "
+        f"{where} --robot NAME FOLDER --force`), because robots accept only "
+        "releases that a CA sealed which they trust."
     ) * (PERMISSIONS in replaced)
     raise KeystoreError(
         f"{names} {'was' if len(roles) == 1 else 'were'} replaced after the backup of the "

@@ -260,8 +260,8 @@ def check_same_authority(
                 f"'{target}' contains enclaves {whose if replaced else 'of another keystore'}",
                 f"They trust {subject_text(present_authorities[0].subject)}, and could not "
                 "communicate with the new enclaves.",
-                "Export all enclaves of the folder together: with --robot NAME, or all of them by "
-                "name, with --keyless if their keys were made on the robot."
+                "Export all enclaves of the folder together: add --robot NAME, or name all of "
+                "them (with --keyless if their keys were made on the robot)."
                 if replaced
                 else "Choose another folder.",
             )
@@ -392,7 +392,7 @@ def check_answer(answer: RequestAnswer, key: PublicKey, *, now: datetime) -> Ope
     if weak := "; ".join(f"{file}: {text}" for file, text in weaknesses(state)):
         raise PkiError(
             f"the answer for enclave {answer.name} has weak cryptography",
-            f"{weak}. Whoever forges its signatures can issue any identity or any permissions.",
+            f"{weak}. Whoever forges such signatures can issue any identity or any permissions.",
             "Replace the CA with `sros rotate_ca`, and have the request signed again.",
         )
     return state
@@ -541,7 +541,7 @@ def _check_pinned(
     )
     remedy = "Ask for the SHA-256 that `sros sign_request` printed. Nothing was changed."
     if digest(identity_ca) in pinned:
-        why = "The pinned CA is its identity CA, which signs only the certificate."
+        why = "The pinned CA is the answer's identity CA, which signs only the certificate."
         remedy = "Pin the permissions CA, which signs the whole answer. Nothing was changed."
     raise KeystoreError(
         f"the answer for enclave {answer.name} is not signed by the pinned CA", why, remedy
@@ -609,7 +609,7 @@ def _check_newer(place: Path, answer: RequestAnswer, certificate: x509.Certifica
                 f"It trusts {authority_text(retired[0])}, which is older than a CA here: the "
                 "keystore may come from a backup. With a CA that was replaced, what was revoked "
                 "since would be trusted again.",
-                "If it comes from a backup, replace the CA again on the keystore machine: "
+                "If the keystore comes from a backup, replace its CA there again: "
                 "docs/howto/keystore_is_lost.md says how. If this CA is right, because `sros "
                 "rotate_ca --identity-ca` or --permissions-ca named it, add --force.",
             )
@@ -641,9 +641,9 @@ def _lost_revocation_notes(place: Path, answer: RequestAnswer) -> Iterator[Note]
             f"the earlier revocation list revokes {counted(len(lost), 'certificate')} that the new "
             f"list lacks, such as {min(lost):x}. This is right if these certificates have expired: "
             "`sros inspect KEYSTORE --history` shows when they expire. If a certificate has not "
-            "expired, or is not shown, the keystore comes from a backup: then take the list over "
-            "from another robot, with `sros crl KEYSTORE --refresh --crl FILE`, and have the "
-            "request signed again."
+            "expired, or is not shown, the keystore comes from a backup: then import the list of "
+            "another robot with `sros crl KEYSTORE --refresh --crl FILE`, and have the request "
+            "signed again."
         )
         yield Note("import.list-lacks", text)
 
@@ -664,9 +664,11 @@ def _check_number(path: Path, answer: RequestAnswer, remedy: str) -> bool:
     if not old or present == answer.seal:
         return bool(old)
     if not new:
-        why = f"It has no number, the installed answer has {old}: an earlier sros made this answer."
+        why = (
+            f"It has no number, and the installed one has {old}: an earlier sros made this answer."
+        )
     elif new < old:
-        why = f"It has the number {new}, the installed answer has {old}."
+        why = f"It has the number {new}, and the installed answer has {old}."
     elif new == old:
         why = f"Both answers have the number {old}, so the keystore's ledger was reset in between."
     else:

@@ -138,8 +138,8 @@ def check_rollback(
         raise KeystoreError(
             f"'{target / path}' has a later {role} CA than the keystore's",
             f"It trusts {authority_text(authority)}, and the keystore's CA is "
-            f"{_first_authority(files, path)}, an earlier CA: the robot would trust this CA again, "
-            "and certificates that were revoked since then. Nothing was changed.",
+            f"{_first_authority(files, path)}: the robot would trust the earlier CA again, and "
+            "certificates that were revoked since then. Nothing was changed.",
             "The keystore may come from a backup (docs/howto/keystore_is_lost.md says how to go "
             "on), or the files in the folder are of another keystore. If the keystore's CA is "
             f"right, first {_removal_of(target, later)}",
@@ -307,7 +307,7 @@ def _lost_revocations(
                     shown = (
                         f"revokes {counted(len(lacking), 'certificate')} that the keystore's "
                         "revocation list lacks",
-                        f"One of them, with the serial number {min(lacking):x}, may not have "
+                        f"The certificate with the serial number {min(lacking):x} may not have "
                         "expired",
                     )
                 else:
@@ -336,8 +336,8 @@ def check_own_keys(target: Path, files: Mapping[str, bytes]) -> None:
         if key and key != load_certificate(data, path).public_key():
             raise KeystoreError(
                 f"the certificate is not for the key in '{target / folder}'",
-                "No process would start with it. The keystore knows only an earlier key, perhaps "
-                "because it comes from a backup. Nothing was changed.",
+                "No process would start with it. Perhaps the keystore comes from a backup, and "
+                "knows only an earlier key. Nothing was changed.",
                 f"{_ANSWER_AGAIN} If the keystore's certificate is right, remove the key first.",
             )
 

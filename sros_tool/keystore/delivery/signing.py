@@ -553,7 +553,7 @@ def _check_requested_name(
         raise KeystoreError(
             f"enclave {name} already exists in keystore '{keystore.root}'",
             "The sender of the request would get the rights of this enclave.",
-            f"If that is intended, {intended}; otherwise create the request for another name.",
+            f"If that is intended, {intended}. Otherwise, create the request for another name.",
         )
     if renew and not exists:
         raise KeystoreError(
@@ -619,7 +619,7 @@ def _check_answer_usable(answer: RequestAnswer, request: SigningRequest, now: da
         raise KeystoreError(
             f"the robot would reject the answer for {answer.name}: {error.what}",
             error.why,
-            "Nothing was changed. Look for the fault with `sros inspect` of the keystore.",
+            "Nothing was changed. Run `sros inspect` on the keystore to find the fault.",
         ) from error
 
 

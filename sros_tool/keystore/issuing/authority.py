@@ -78,7 +78,7 @@ class Authority:
         if self.own_key is None:
             raise KeystoreError(
                 f"only the CA service can sign for {authority_text(self.certificate)}",
-                "The key is not here.",
+                "sros does not have the key of this CA.",
             )
         return self.own_key
 
@@ -236,7 +236,8 @@ def load_authority(
     if not keystore.has(ca_certificate(role)) and not keystore.has(ca_key(role)):
         raise KeystoreError(
             f"keystore '{root}' has no {role} CA",
-            "It may be an export for a robot, which has enclaves but no CA to create more.",
+            "Perhaps it is an export for a robot: an export has enclaves, but no CA to create "
+            "more.",
             "Use the keystore that it was exported from.",
         )
     certificate = keystore.ca_certificate(role)
@@ -329,7 +330,7 @@ def check_imported(
     if not own:
         raise PkiError(
             f"the certificate of the {role} CA does not fit its key",
-            f"The key belongs to no certificate in the file, which has {len(certificates)}.",
+            "The key belongs to no certificate in the file.",
             "Name the certificate and the key of the same CA.",
         )
     for weak in filter(None, map(weakness, certificates)):
@@ -347,8 +348,8 @@ def check_imported(
         raise PkiError(
             f"{subject_text(own[0].subject)} cannot be the {role} CA: no DDS vendor accepts it",
             f"{refusals_text(refusals)}.",
-            "Issue the CA's certificate again, self-signed with SHA-256, basicConstraints CA:TRUE "
-            "and keyUsage keyCertSign and digitalSignature.",
+            "Issue the CA's certificate again, self-signed, with SHA-256, basicConstraints "
+            "CA:TRUE, and keyUsage keyCertSign and digitalSignature.",
         )
     return ImportedAuthority(
         own[0], b"".join(map(pem, chain)), tuple(_refusal_notes(role, chain, refusals))
@@ -405,10 +406,11 @@ def _refusal_notes(
     elif role == PERMISSIONS and (fault := next(purpose_faults(chain), "")):
         yield Note(
             "portable.ca-purpose",
-            f"{fault}: Fast DDS 2.9.1 and Cyclone DDS 0.10.2 refuse all documents that it signs "
-            '("unsuitable certificate purpose"), and only Fast DDS 2.14 accepts them. Issue its '
-            "certificate again with keyUsage digitalSignature and without extendedKeyUsage, unless "
-            "all robots run Fast DDS 2.14.",
+            f"{fault}: Fast DDS 2.9.1 and Cyclone DDS 0.10.2 refuse all documents that the CA "
+            "signs "
+            '("unsuitable certificate purpose"), and only Fast DDS 2.14 accepts them. Issue '
+            "the CA's certificate again with keyUsage digitalSignature and without "
+            "extendedKeyUsage, unless all robots run Fast DDS 2.14.",
         )
     for certificate in chain:
         key, name = certificate.public_key(), subject_text(certificate.subject)

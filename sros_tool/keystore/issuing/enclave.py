@@ -488,7 +488,7 @@ def _early_expiry_note(
     return Note(
         "keystore.ends-with-ca",
         f"New {label} expire with their CA at {iso(end)}, {lost.days} days earlier than the "
-        f"keystore's settings choose. Rotate the CA with `sros rotate_ca {quote(str(root))} "
+        f"keystore's settings say. Rotate the CA with `sros rotate_ca {quote(str(root))} "
         "--next`.",
     )
 

@@ -242,8 +242,9 @@ class Keyring:
             raise KeystoreError(
                 error.what,
                 error.why,
-                f"The keystore '{root}' of user {owner} names this key. If the CA may sign for it, "
-                f"set SROS_{role.upper()}_KEY=file:{path}; otherwise find out who changed it.",
+                f"The keystore '{root}' of user {owner} names this key. If the CA may sign for "
+                f"this keystore, set SROS_{role.upper()}_KEY=file:{path}; otherwise, find out who "
+                "changed its settings.",
             ) from error
 
     def _is_from_user(self, role: str) -> bool:

@@ -37,6 +37,7 @@ from sros_tool.errors import KeystoreError
 from sros_tool.names import ROS_DISCOVERY_TOPIC, expand, is_expression
 from sros_tool.policy.model import ALLOW, Enclave
 from sros_tool.policy.patterns import common_name, matches, overlap
+from sros_tool.wording import counted
 
 _COMPARED_VENDORS = (Vendor.STANDARD, Vendor.FAST)
 """The vendors that must decide as the policy does.
@@ -158,7 +159,7 @@ def prove(policy: Enclave, permissions: Permissions, domains: DomainSet) -> None
             f"the permissions of {policy.path} would not match the policy",
             f"By the policy, {disagreements[0]}"
             + (
-                f" (and {len(disagreements) - 1} more differences)."
+                f" (and {counted(len(disagreements) - 1, 'more difference')})."
                 if len(disagreements) > 1
                 else "."
             ),

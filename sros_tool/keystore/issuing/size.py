@@ -218,7 +218,7 @@ def _node_notes(
             lacking = {right._replace(enclave=path) for right in use.not_allowed} - shown
             unused = {right._replace(enclave=path) for right in use.differing()} - shown - lacking
             for text, rights in (
-                ("has rights that the node never used, or only in part", unused),
+                ("has rights that the node never used, or used only in part", unused),
                 ("lacks rights that the node used", lacking),
             ):
                 if rights:
@@ -226,7 +226,7 @@ def _node_notes(
                     yield Note(
                         "minimize.node-differs",
                         f"the profile of the node {use.enclave} {text}: {names}. The comparison of "
-                        f"enclave {path} does not show it, because of its other nodes.",
+                        f"enclave {path} does not show this, because of the enclave's other nodes.",
                     )
 
 
@@ -234,7 +234,7 @@ def _robot_notes(unobserved: Mapping[str, Sequence[str]]) -> Iterator[Note]:
     for path, robots in unobserved.items():
         text = (
             f"{path} was never observed for {first_few(robots, _MOST_SHOWN)}: rights that only "
-            "these robots use are removed, too."
+            f"{'this robot uses' if len(robots) == 1 else 'these robots use'} are removed, too."
         )
         yield Note("minimize.robot-never-observed", text)
 

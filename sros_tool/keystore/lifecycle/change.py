@@ -350,9 +350,9 @@ class KeystoreChange:
         if names:
             yield Note(
                 "keystore.revocation-list-lacks",
-                f"the revocation list lacks certificates of {first_few(names, 5)}, which were "
-                "revoked: processes that start now accept them. Find out who put an earlier list "
-                f"back, and run `sros crl {quote(str(self.root))} --refresh`.",
+                f"the revocation list lacks revoked certificates of {first_few(names, 5)}: "
+                "processes that start now accept these certificates. Find out who put an earlier "
+                f"list back, and run `sros crl {quote(str(self.root))} --refresh`.",
             )
 
     def unrevoked_key(self, name: str, certificate: x509.Certificate) -> PublicKey:
@@ -363,7 +363,7 @@ class KeystoreChange:
         """
         public: PublicKey = certificate.public_key()  # type: ignore[assignment]
         where = f"{quote(str(self.root))} {name}"
-        remedy = f"Give it another key with `sros renew {where} --new-key --revoke-old`."
+        remedy = f"Give the enclave another key with `sros renew {where} --new-key --revoke-old`."
         self.known.refuse_revoked(public, f"enclave {name}", remedy, certificate)
         return public
 
@@ -383,7 +383,7 @@ class KeystoreChange:
         if revoke_old and self.identity.service:
             raise KeystoreError(
                 "a CA service does not revoke earlier certificates in the same step",
-                "It signs its revocation list only once the keystore has the new certificates.",
+                "It signs its revocation list only after the keystore has the new certificates.",
                 "Leave --revoke-old out, revoke the earlier certificates at the service, and give "
                 f"its list: `sros crl {quote(str(self.root))} --refresh --crl FILE`.",
             )
@@ -574,8 +574,8 @@ class KeystoreChange:
             raise KeystoreError(
                 f"the CA service issued a certificate for {equal[0].enclave} with a serial number "
                 "that another certificate has",
-                f"It is {equal[0].serial}; no revocation list could tell them apart. Nothing was "
-                "changed.",
+                f"It is {equal[0].serial}; no revocation list could tell the two certificates "
+                "apart. Nothing was changed.",
             )
         asked = window(self.now, self.template.certificate_validity)
         end = iso(
@@ -663,9 +663,9 @@ def _short_lived_notes(fleet: Fleet, template: Template) -> Iterator[Note]:
     if short_lived:
         text = (
             f"the settings of the keystore make enclaves of {first_few(tuple(short_lived), 3)} "
-            f"short-lived, such as {next(iter(short_lived.values()))}, and `sros renew "
-            "--all-expiring` leaves them out: give the robot another name or namespace, or change "
-            "`[[enclaves]]` in the settings."
+            f"short-lived (for example {next(iter(short_lived.values()))}), so `sros renew "
+            "--all-expiring` leaves them out: give such a robot another name or namespace, or "
+            "change `[[enclaves]]` in the settings."
         )
         yield Note("fleet.short-lived", text)
 
@@ -791,7 +791,7 @@ def _left_out_notes(left_out: Mapping[str, str]) -> Iterable[Note]:
         get, reason = ("gets", "Reason") if len(names) == 1 else ("get", "Reason for each enclave")
         yield Note(
             "zenoh.left-out",
-            f"{first_few(names, 5)} {get} no configuration for Zenoh, and may do nothing there. "
+            f"{first_few(names, 5)} {get} no configuration for Zenoh, and may do nothing on Zenoh. "
             f"{reason}: {why}.",
         )
 

@@ -403,11 +403,14 @@ def _revoked_before_notes(
         )
 
     if unasked := [name for name in revoked_before if name not in named]:
+        them = "it" if len(unasked) == 1 else "them"
         raise KeystoreError(
             f"a policy names {', '.join(unasked)}, revoked in keystore '{root}'",
-            "The policy would create it again, and `distribute_key --all` would export it.",
-            f"Remove it from the policy{' or its robot from the fleet file' if fleet else ''}; or, "
-            "to create it again with a new key and the rights of the policy, name it with -e: "
+            f"The policy would create {them} again, and `distribute_key --all` would export "
+            f"{them}.",
+            f"Remove {them} from the policy{' or the robot from the fleet file' if fleet else ''}; "
+            f"or, to create {them} again with a new key and the rights of the policy, name {them} "
+            "with -e: "
             f"{command(unasked)}.",
         )
     later = _certified_after_backup(change, missing) - {*revoked_before, *named}
@@ -442,8 +445,8 @@ def refuse_other_template(root: Path, template: Template) -> None:
         raise UsageError(
             f"keystore '{root}' already exists, with the template {present.name}",
             f"--template {template.name} would have no effect on it.",
-            f"Leave --template out, or first run `sros update_keystore {where} --template "
-            f"{quote(template.name)} --dry-run`, which shows what it changes, and then without "
+            f"Leave --template out, or run `sros update_keystore {where} --template "
+            f"{quote(template.name)} --dry-run`, which shows the changes, and run it again without "
             "--dry-run.",
         )
 
@@ -695,8 +698,8 @@ def _raise_protection(
         Note(
             "keystore.earlier-governance",
             "The signature of the former governance stays valid: anyone who can change the files "
-            "of a robot can put it back there, until the CA that signed it is replaced (`sros "
-            "rotate_ca --help`).",
+            "of a robot can put this governance back there, until the CA that signed it is "
+            "replaced (`sros rotate_ca --help`).",
         ),
         *_zenoh_notes(template),
     )
@@ -745,12 +748,12 @@ def _restart_text(mismatch: Mismatch, *, revoked: bool) -> str:
             "certificates of other processes. Until then, running processes communicate as before."
         )
     if mismatch:
-        which, effect, more = "all processes", "do not communicate", ""
+        which, effect, more = "all processes together", "do not communicate", ""
         if not mismatch.everything:
-            which, more = "the processes that use these names", f" {IF_EXPIRED}"
-            effect += f" on {', '.join(mismatch.names)}, but do on everything else"
+            which = f"together the processes that use {', '.join(mismatch.names)}"
+            effect, more = f"{effect} on these names, but do on all others", f" {IF_EXPIRED}"
         return (
-            f"Cyclone DDS and Fast DDS: restart {which} together; restarted and other processes "
+            f"Cyclone DDS and Fast DDS: restart {which}; restarted and other processes "
             f"{effect}. Until then, running processes communicate as before.{more}"
         )
     return f"All vendors: {ONE_BY_ONE} Until its restart, a process keeps its former files."
@@ -1006,8 +1009,9 @@ class _EnclaveMaker:
             return
         text = (
             f"enclave {name} had lost its {PERMISSIONS_FILE}: it now has the default permissions "
-            "of the keystore's template, and no longer the rights of its policy. To give it these "
-            f"again: `sros create_permission {quote(str(self._root))} {quote(name)} POLICY`."
+            "of the keystore's template, and no longer the rights of its policy. To give it the "
+            f"rights of its policy again: `sros create_permission {quote(str(self._root))} "
+            f"{quote(name)} POLICY`."
         )
         yield Note("keystore.rights-lost", text)
 
@@ -1137,7 +1141,7 @@ class _EnclaveMaker:
         return KeystoreError(
             f"the certificates of {len(windows)} enclaves are not valid now: "
             f"{first_few(list(windows), _MOST_SHOWN)}",
-            f"That of {name} {dates}",
+            f"The certificate of {name} {dates}",
             f"Renew them with {command}.",
         )
 

@@ -116,10 +116,8 @@ def renew(
         change.notes += (*writer.notes, *renewer.notes) if replaced else ()
         left = writer.expiry - change.now
         if replaced and expiring and expiring.remaining and left <= expiring.remaining:
-            text = f"the new files expire within {duration_text(expiring.remaining)} again, "
-            text += (
-                f"on {iso(writer.expiry)}, so that they are renewed each time: choose a shorter "
-            )
+            text = f"the new files expire within {duration_text(expiring.remaining)}, too "
+            text += f"(on {iso(writer.expiry)}), so each run renews them again: choose a shorter "
             change.notes.append(Note("renew.due-again", f"{text}time, or a longer validity."))
         with suppress(SrosError):  # the governance is not part of a renewal
             change.notes += change.edit_notes()

@@ -75,6 +75,7 @@ from sros_tool.pki.crl import (
     signed_by,
 )
 from sros_tool.validity import BACKDATE, Window, iso
+from sros_tool.wording import counted
 
 
 class LostRecords:
@@ -336,10 +337,10 @@ class RevocationListSigner:
         )
         if entries and (published := publish_command(self._root)):
             text = (
-                "give the list to a web server of robots that fetch, but only when `sros fleet "
-                f"status {quote(str(self._root))}` shows that they have fetched ({published}): "
-                "until "
-                "then, the server would refuse a robot whose certificates are all replaced"
+                f"publish ({published}), and wait until `sros fleet status "
+                f"{quote(str(self._root))}` shows that the robots have fetched. Only then give "
+                "the list to a web server of these robots: before, the server would refuse a "
+                "robot whose certificates are all replaced"
             )
             self.remarks.append(Note("crl.web-server", text))
         return entries
@@ -430,8 +431,8 @@ class RevocationListSigner:
         if crl is None or any(signed_by(crl.list, authority) for authority in trusted):
             return crl
         text = (
-            "No identity CA of this keystore signed its current revocation list, so its "
-            "entries do not count: find out who wrote it."
+            "No identity CA of this keystore signed its current revocation list, so the "
+            "entries of the list do not count: find out who wrote the list."
         )
         self.remarks.append(Note("crl.not-signed-here", text))
         return None
@@ -462,8 +463,9 @@ class RevocationListSigner:
         if lost := self._lost_revocations(expiries):
             new_entries = [*new_entries, *lost]
             text = (
-                f"The revocation list was not the last list that this keystore signed: {len(lost)} "
-                "revocations were restored."
+                "The revocation list was not the last list that this keystore signed: "
+                f"{counted(len(lost), 'revocation')} {'was' if len(lost) == 1 else 'were'} "
+                "restored."
             )
             self.remarks.append(Note("crl.put-back", text))
         signed = self._sign(self._authority, self.present, new_entries, expiries, least)
@@ -518,11 +520,9 @@ class RevocationListSigner:
             KeystoreError: the list is missing, is not signed by the identity CA, is not later than
                 the present list, is not valid now, or does not revoke all ``serials``.
         """
-        numbers = ", ".join(sorted(f"{serial:x}" for serial in serials)) or "nothing"
-        remedy = (
-            f"Revoke the certificates at the service ({numbers}), and give its list with --crl "
-            "FILE."
-        )
+        numbers = ", ".join(sorted(f"{serial:x}" for serial in serials))
+        revoke = f"Revoke these certificates at the service: {numbers}. " if numbers else ""
+        remedy = f"{revoke}Give the list of the service with --crl FILE."
         if not self._given:
             raise KeystoreError(
                 f"the identity CA of keystore '{self._root}' is a CA service, and only this "
@@ -660,19 +660,19 @@ class RevocationListSigner:
         if new_entries and not incomplete:
             raise KeystoreError(
                 f"the key of the old identity CA {name} is not available",
-                f"Until that CA is retired, Fast DDS accepts its certificates, so it also has to "
-                f"sign a revocation list: {error.what}.",
-                f"Restart all processes and run `sros rotate_ca {quote(str(self._root))} --to "
-                "retire` first; "
-                "or add --until-retired, and retire it soon.",
+                "Until that CA is retired, Fast DDS accepts its certificates, so the CA also has "
+                f"to sign a revocation list: {error.what}.",
+                f"First restart all processes and run `sros rotate_ca {quote(str(self._root))} "
+                "--to retire`; or add --until-retired, and retire the CA soon.",
             )
         text = f"The list of the old identity CA {name} was not signed again"
         if new_entries:
             text += (
-                "; until it is retired, Fast DDS accepts the revoked certificates that it issued"
+                "; until the CA is retired, Fast DDS accepts the revoked certificates that the CA "
+                "issued"
             )
         elif old:
-            text += f"; it expires at {iso(old.next_update)}, and Fast DDS then refuses "
+            text += f"; the list expires at {iso(old.next_update)}, and Fast DDS then refuses "
             text += "the enclaves of that CA"
         text += f": run `sros rotate_ca {quote(str(self._root))} --to retire`."
         self.remarks.append(Note("crl.old-ca-not-signed", text))
@@ -703,14 +703,14 @@ def another_ca_remedy(keystore: OpenedKeystore, purpose: str) -> str:
     words = ["sros rotate_ca", quote(str(keystore.root))]
     if read_rotation(keystore).stage is not RotationStage.NONE:
         return (
-            f"First retire the old CA: `{' '.join(words)} --finish`, restart all processes, and "
-            f"then {purpose}."
+            f"First retire the old CA with `{' '.join(words)} --finish`, restart all processes, "
+            f"and then {purpose}."
         )
     if len(keystore.authority_files) > 1:
         words.append("--identity")
     if not keystore.has(f"{PRIVATE}/{file}.key.pem"):
         words.append("--identity-key URI")
     return (
-        f"Replace the identity CA by a CA that may sign revocation lists: `{' '.join(words)} "
-        f"--finish`, restart all processes, and then {purpose}."
+        f"With `{' '.join(words)} --finish`, replace the identity CA by a CA that may sign "
+        f"revocation lists; restart all processes, and then {purpose}."
     )

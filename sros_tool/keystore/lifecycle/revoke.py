@@ -159,9 +159,9 @@ def _later_keys_notes(
         would = "would be" if change.dry_run else "are"
         yield Note(
             "revoke.later-keys",
-            f"the keystore was restored from a backup, and learned later keys of "
-            f"{first_few(sorted(names), _MOST_SHOWN)} only after that, such as keys of new "
-            f"hardware. They {would} revoked, too, and are not certified again: create new keys on "
+            f"the keystore was restored from a backup, and only then learned later keys of "
+            f"{first_few(sorted(names), _MOST_SHOWN)} (for example of new hardware). These keys "
+            f"{would} revoked, too, and are not certified again: create new keys on "
             "the robot. docs/howto/keystore_is_lost.md says how to revoke only the earlier keys.",
         )
 
@@ -399,18 +399,18 @@ def _reasons_of_revoked(change: KeystoreChange, unknown: Mapping[str, Entry]) ->
 
 def _unknown_note(change: KeystoreChange, unknown: Mapping[str, Entry]) -> Note:
     """Return a note on certificates that are recorded now, or would be without ``dry_run``."""
-    would = "would be" if change.dry_run else "are"
+    has = "would have" if change.dry_run else "has"
     text = (
-        f"the keystore issued {counted(len(unknown), 'certificate')} that its ledger lacks: it was "
-        f"restored from a backup, or is a copy. They {would} in the ledger again, so that `sros "
-        "revoke` revokes them"
+        f"the keystore issued {counted(len(unknown), 'certificate')} that its ledger lacks: the "
+        f"keystore was restored from a backup, or is a copy. The ledger {has} each certificate "
+        "again, so that `sros revoke` revokes it"
     )
     revoked = {entry.serial for entry in change.entries if entry.what == "revocation"}
     valid = sorted({entry.enclave for entry in unknown.values() if entry.serial not in revoked})
     if missing := [name for name in valid if not change.keystore.has_enclave(name)]:
         text += (
             f". The keystore lacks {first_few(missing, _MOST_SHOWN)}, whose certificates stay "
-            "valid. To keep such a robot, create its enclaves again with `sros "
+            "valid. To keep the robot of such an enclave, create its enclaves again with `sros "
             "generate_artifacts`, then give them new keys: `sros renew "
             f"{quote(str(change.root))} --robot NAME --new-key --revoke-old`. Otherwise create "
             "them again and revoke them, or replace the CA with `sros rotate_ca`"
@@ -493,8 +493,9 @@ def _drop_routers(change: KeystoreChange, revoked: Collection[str]) -> None:
         left = tuple(router for router in network.routers if router not in dropped)
         change.set_network(replace(network, routers=left))
         names = ", ".join(router.name for router in dropped)
+        is_or_are = "is no longer a router" if len(dropped) == 1 else "are no longer routers"
         text = (
-            f"{names} is no longer a router. The new files of the enclaves that connected there "
+            f"{names} {is_or_are}. The new files of the enclaves that connected there "
             "name another router."
         )
         change.notes.append(Note("zenoh.router-revoked", text))
@@ -508,8 +509,8 @@ def _router_error(change: KeystoreChange, router: str) -> KeystoreError:
         "Without a router, no node on Zenoh finds the other nodes; and every session trusts the "
         "router's key.",
         f"Move the router first: `sros zenoh {where} --router {other}`. Stop the router in "
-        f"{router}, start one in {other}, restart the processes that the verb names, and revoke "
-        f"{router} then.",
+        f"{router}, start one in {other}, restart the processes that `sros zenoh` names, "
+        f"and then revoke {router}.",
     )
 
 

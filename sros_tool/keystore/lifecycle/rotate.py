@@ -173,7 +173,7 @@ def rotate_ca(
         if existing and rotation.stage is not RotationStage.NONE:
             raise UsageError(
                 f"the keystore is at the stage {rotation.stage} of a rotation to another CA",
-                "A rotation to a CA that exists begins with its certificate.",
+                "The certificate of an existing CA can be given only at the start of a rotation.",
                 "End this rotation first, without the certificate.",
             )
         stage = RotationStage.RETIRE if finish else _target_stage(change.keystore, rotation, to)
@@ -251,11 +251,11 @@ def _no_robot_notes(keystore: OpenedKeystore, names: Iterable[str]) -> Iterator[
     fleet = load_fleet(keystore)
     without = [name for name in names if robot_of(fleet, name) is None] if fleet else []
     if without:
-        verb = "belongs" if len(without) == 1 else "belong"
+        verb, its = ("belongs", "its") if len(without) == 1 else ("belong", "their")
         yield Note(
             "keystore.of-no-robot",
             f"{first_few(without, _ENCLAVES_SHOWN)} {verb} to no robot, so it is unknown whether "
-            "their files are at this stage: check that before the next stage.",
+            f"{its} files are at this stage: check that before the next stage.",
         )
 
 
@@ -399,7 +399,7 @@ def renew_identity_ca(
             raise KeystoreError(
                 f"the CA of keystore '{root}' cannot be renewed with the same key",
                 "It is also the permissions CA: signed permissions contain its present "
-                "certificate, and DDS would refuse them with a new one.",
+                "certificate, and DDS would refuse them with a new certificate.",
                 "Rotate it without --same-key.",
             )
         if read_rotation(change.keystore).stage is not RotationStage.NONE:
@@ -447,7 +447,9 @@ def _renewed_by_service(
         raise UsageError(
             "only a CA service issues its own certificate",
             "",
-            "Leave --identity-ca out." if issued else "Give the new one with --identity-ca FILE.",
+            "Leave --identity-ca out."
+            if issued
+            else "Give its new certificate with --identity-ca FILE.",
         )
     renewed = check_imported(IDENTITY, issued, None, change.now)
     new = renewed.certificate
@@ -521,7 +523,7 @@ class _Rotator:
         if self._delete and stage is RotationStage.DISTRIBUTE:
             raise UsageError(
                 "the stage distribute deletes no key",
-                "The old CA still issues.",
+                "The old CA is still in use.",
                 "Add --delete-old-key to a later stage.",
             )
         if self._delete and self.kept_elsewhere:
@@ -945,7 +947,7 @@ def _make_successors(
         if wanted & set(serves) and not set(serves) <= wanted:
             raise UsageError(
                 f"the CA in '{PUBLIC}/{file}.cert.pem' is the identity CA and the permissions CA",
-                "It can only be replaced in both roles.",
+                "It can be replaced only in both roles.",
                 "Leave out --identity and --permissions.",
             )
     check_places(new_keys, replace(template, separate_authorities=len(files) > 1))
@@ -963,7 +965,7 @@ def _check_place(change: KeystoreChange, file: str, role: str, new_keys: Keyring
         raise KeystoreError(
             f"the key of the {role} CA is not in the keystore, so the key of the new CA should not "
             "be there either",
-            f"It is not at '{change.root}/{place}'."
+            f"The current key is not at '{change.root}/{place}'."
             if (place := change.keyring.place(role, change.template)) == ca_key(role)
             else f"The current key is at '{place}'.",
             f"Name a place for the new key with --{role}-key.",
@@ -1033,7 +1035,7 @@ def _make_successor(
                 raise KeystoreError(
                     older,
                     "Robots that fetch would take it for a CA that was replaced, and refuse it.",
-                    "Make a new CA: leave out its certificate.",
+                    "Leave out the certificate, so that sros makes a new CA.",
                 )
             text = (
                 f"{older}, so robots take it for a CA that was replaced: the first `sros import` "

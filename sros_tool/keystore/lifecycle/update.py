@@ -228,7 +228,7 @@ def _checked_target(
             )
     if not target.separate_authorities and len(keystore.authority_files) > 1:
         raise UsageError(
-            "a keystore with separate CAs cannot change back to one CA for both purposes",
+            "a keystore with separate CAs cannot change back to one CA for both roles",
             "With one CA, every enclave can sign its own permissions (Cyclone DDS 0.10.2, Fast DDS "
             "2.9.1).",
             "Add --set authorities.layout=separate to keep separate CAs, or create another "
@@ -630,7 +630,7 @@ class _Updater:
                 f"the permissions of enclave {name} are not for domain {before}",
                 "The change would give the enclave the same rights in the new domain as in domain "
                 f"{before}, but its permissions are for other domains.",
-                f"State them with `sros create_permission {quote(str(self._root))} {name} "
+                f"State the rights with `sros create_permission {quote(str(self._root))} {name} "
                 "POLICY_FILE`.",
             )
         rules = tuple(rule._replace(domains=after) for rule in grant.rules)
@@ -690,8 +690,8 @@ class _Updater:
             role = "" if shared else f" --{PERMISSIONS}"
             text = (
                 "The signature of the previous governance stays valid: anyone who can change the "
-                "files of a robot can put it back there, until the CA that signed it is "
-                f"replaced: {self._rotation_command(role)}."
+                "files of a robot can put this governance back there, until the CA that signed "
+                f"it is replaced: {self._rotation_command(role)}."
             )
             return [Note("keystore.earlier-governance", text)]
         return []
@@ -823,7 +823,7 @@ def _with_routers_of_robots(change: KeystoreChange, network: ZenohNetwork) -> Ze
         of_fleet = asked.get(router.name) not in (router, before.get(router.name))
         if of_fleet and (robot := robot_of_router(change.fleet, router.name)):
             raise UsageError(
-                f"the fleet of keystore '{change.root}' names the router of {robot.name}",
+                f"the fleet file of keystore '{change.root}' sets the router of {robot.name}",
                 f"The fleet file says {router}.",
                 f"Change `router` of {robot.name} in the fleet file, and run `sros "
                 "generate_artifacts --fleet`.",
