@@ -551,7 +551,7 @@ MIXED_VENDORS = FindingKind(
 PROCESS_PERMISSIVE = FindingKind(
     "runtime.process-permissive",
     WARNING,
-    "a process that runs without security if its enclave was missing at its start",
+    "a process that starts without security if its enclave is missing",
     "The ROS_SECURITY_STRATEGY of the process is not exactly `Enforce`: if its enclave, or a "
     "file of the enclave, is missing, the process starts unsecured.",
     "rcl 9 (rcl/src/rcl/security.c); tested with ROS 2 Jazzy.",

@@ -66,7 +66,7 @@ _UNSEEN_REMEDY = (
 ROBOTS_UNKNOWN = FindingKind(
     "runtime.robots-dds-unknown",
     NOTE,
-    "robots with DDS libraries that are not known",
+    "robots whose DDS libraries are not known",
     "sros cannot tell which known vulnerabilities these robots have.",
     "The last confirmations of the robots.",
     "If no library was reported or seen, confirm again with this version of sros (`sros fleet "

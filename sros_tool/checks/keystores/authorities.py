@@ -331,7 +331,7 @@ LEDGER_UNPROVEN = FindingKind(
 CLOCK_BEHIND = FindingKind(
     "keystore.clock-behind",
     WARNING,
-    "a check for a moment before the last change of the keystore",
+    "a check whose time is before the last change of the keystore",
     "If the clock of this machine is behind, expired files count as valid.",
     "sros: ledger.jsonl has the time of each change.",
     "Set the clock. If the clock is correct now, but was ahead at the last change, run `sros crl "
