@@ -737,7 +737,7 @@ _IDENTITY_ROWS: tuple[Row, ...] = (
             Identity(Undefended(forger.files_readable_for_all), "talker"),
             RowStatus.HEARD,
             "no DDS checks file modes: any user that can read the key can pose as the enclave",
-            defence_removed="the modes of files and folders",
+            defence_removed="restrictive modes of files and folders",
         ),
     ),
 )
@@ -807,7 +807,7 @@ _PERMISSIONS_ROWS: tuple[Row, ...] = (
             Identity(Undefended(forger.another_permissions_ca_trusted), "guest"),
             RowStatus.HEARD,
             "the listener trusts this CA, so it accepts the permissions",
-            defence_removed="the listener's permissions CA",
+            defence_removed="a listener that trusts only the keystore's permissions CA",
         ),
     ),
     *tries(
