@@ -344,7 +344,8 @@ def check(
             )
         chosen = selection.choose(map(_with_relative_paths, changed.findings))
         not_compared = changed.enclaves - changed.compared
-        upgraded = f"; {not_compared} already for {upgrade_to.title}" if not_compared else ""
+        are = counted(not_compared, "enclave is", "enclaves are")
+        upgraded = f"; {are} already for {upgrade_to.title}" if not_compared else ""
         echo(f"compared {counted(changed.compared, 'enclave')}{upgraded}", err=True)
         _PRINTERS[form](chosen, selection)
         return _status(chosen, fail_on)

@@ -278,8 +278,8 @@ def _show(robot: LocalRobot, closed: CloseState) -> None:
 
 def _process_line(process: ClosedProcess, closed: CloseState, policy: Policy) -> str:
     """Return the enclave of a process, how sros knows the process, and how it is restarted."""
-    restart = "by its launch, by hand" if process.launch else "by hand"
-    restart = "by Docker Compose, by hand" if process.container else restart
+    restart = "by hand, with its launch" if process.launch else "by hand"
+    restart = "by hand, with Docker Compose" if process.container else restart
     does = "restarts" if process.pid else "adds a drop-in to"
     restart = f"--apply {does} {process.unit}" if process.unit else restart
     runs = process.enclave in closed.secured

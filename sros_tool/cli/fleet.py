@@ -415,7 +415,7 @@ def _outcomes_text(numbers: Mapping[str, int], outcomes: Sequence[str], verb_for
     """Return the number of messages or requests with each outcome, in words."""
     present_outcomes = (outcome for outcome in outcomes if numbers.get(outcome))
     return ", ".join(
-        f"{numbers[name]} {verb_form}{_OUTCOME_WORDS.get(name, name.replace('_', ' '))}"
+        f"{numbers[name]} {_OUTCOME_WORDS.get(name) or verb_form + name.replace('_', ' ')}"
         for name in present_outcomes
     )
 

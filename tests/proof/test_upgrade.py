@@ -388,7 +388,7 @@ def test_a_robot_of_a_fleet_has_a_distribution_of_its_own(tmp_path: Path) -> Non
     assert stated_distributions(keystore, "/r1/base") == ("humble",)
     assert stated_distributions(keystore, "/r2/base") == ("jazzy",)
     compared = sros("check", root, "--upgrade-to", "jazzy", env={"ROS_DISTRO": None}).ok()
-    assert compared.err.splitlines()[0] == "compared 1 enclave; 1 already for Jazzy"
+    assert compared.err.splitlines()[0] == "compared 1 enclave; 1 enclave is already for Jazzy"
     fleet.write_text('[robots]\nr1 = { distribution = "Humble" }\n')
     with pytest.raises(DocumentError, match="It is not a ROS 2 distribution that sros knows"):
         read_fleet(fleet)
