@@ -788,7 +788,7 @@ def _denied_start_actions_sentence(lacking: Sequence[_NodeLackingRight]) -> str:
         if kinds[kind]
     ]
     return (
-        f"{names_text(nodes)} may not {', '.join(verbs)}. A node that is denied such an action "
+        f"{names_text(nodes)} may not {', '.join(verbs)}. A node that is denied this "
         "exits at its start."
     )
 

@@ -913,7 +913,7 @@ def test_a_thief_with_all_keys_who_counts_versions_up(publisher: Home, version: 
     thief = Thief(publisher, publisher.pub, *ROLES)
     thief.sign("timestamp", lambda _signed: None, version)
     before = snapshot(publisher.root)
-    with pytest.raises(KeystoreError, match="too high|not a number from 1 to"):
+    with pytest.raises(KeystoreError, match=r"too high|not a number from 1 to"):
         publisher.publish()
     assert snapshot(publisher.root) == before
     shutil.rmtree(publisher.pub)

@@ -201,7 +201,7 @@ def test_the_pin_reaches_the_node_of_its_token_and_no_other(root: Path, tmp_path
         assert (PIN in printed, "/m.so" in printed) == (False, True)
     words = ("env", root, "/arm", "--format", "kubernetes", "--target", "/etc/sros/keystore")
     told = sros(*words, "--image", "robot:1", env={**os.environ, **FAST}).ok().err
-    assert f"its PKCS #11 module, and its PIN in '{file}'" in told
+    assert f"the token's PKCS #11 module, and the PIN in '{file}'" in told
     file.write_text(f"{PIN}\n")
     assert "line break" in started(root, "/arm", tmp_path)[""]
     file.chmod(0o644)
