@@ -193,9 +193,10 @@ def parse_advisories(data: bytes, label: str) -> tuple[Advisory, ...]:
                 merged[key] = earlier.with_releases_of(advisory) if earlier else advisory
         return tuple(merged.values())
     except ValueError as error:
+        reason = str(error).partition("\n")[0][:_LONGEST_SUMMARY]
         raise DocumentError(
-            f"{label} has no advisories in the OSV format",
-            str(error).partition("\n")[0][:_LONGEST_SUMMARY],
+            f"{label} is not in the OSV format: {reason}",
+            "",
             "Give a JSON file with an OSV record, or with a list of them.",
         ) from error
 
@@ -285,7 +286,7 @@ def _ranges(affected: Mapping[str, Any], identity: str) -> Iterator[_Range]:
 def _numbers(version: object, identity: str) -> Version:
     numbers = _VERSION.fullmatch(version) if isinstance(version, str) else None
     if not numbers:
-        raise ValueError(f"{identity} names a release that is not three numbers")
+        raise ValueError(f"{identity} names a release that is not a number such as 2.14.5")
     return int(numbers[1]), int(numbers[2] or 0), int(numbers[3] or 0)
 
 

@@ -191,7 +191,8 @@ def _key_block(data: bytes, name: str) -> bytes:
             if len(block.content) > _MAX_BYTES and block.label in _PRIVATE_KEY_LABELS:
                 raise PkiError(
                     f"the private key {name} is too large",
-                    f"It has more than {_MAX_BYTES // 1024} KiB; an RSA key of 4096 bits, 4 KiB.",
+                    f"It has more than {_MAX_BYTES // 1024} KiB. "
+                    "An RSA key of 4096 bits has 4 KiB.",
                     "Use an EC prime256v1 key, or an RSA key of 2048 bits.",
                 )
             if block.label in KEY_LABELS and not block.headers:

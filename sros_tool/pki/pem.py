@@ -65,7 +65,7 @@ def blocks(data: bytes) -> Iterator[Block]:
         if begin:
             yield _read_block(begin[1], pieces)
         elif _BEGIN.match(line) and line[-1] > 0x7F:
-            raise PkiError("one of its '-----BEGIN' lines ends with a byte beyond ASCII")
+            raise PkiError("one of its '-----BEGIN' lines ends with a non-ASCII byte")
 
 
 def read_as_text(data: bytes) -> bytes:

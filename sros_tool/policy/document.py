@@ -237,7 +237,7 @@ class Includer:
         if element.get("parse", "xml") != "xml":
             raise PolicyError(
                 f"{where}: an include of plain text is not accepted",
-                "It would put any readable file into a signed document.",
+                "It could put any readable file into a signed document.",
                 "Include policy XML, without parse=.",
             )
         inside = [child for child in element if isinstance(child.tag, str)]

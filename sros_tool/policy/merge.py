@@ -614,7 +614,7 @@ class _Editor:
                     f"rights of the enclave {path} cannot be added to '{self._path}'",
                     f"The enclave is included from {included.source}."
                     if included
-                    else "Its <enclaves> are included from another file.",
+                    else "The <enclaves> of this file are included from another file.",
                     "Merge into the file that contains this part.",
                 )
             profiles = _NewElement(

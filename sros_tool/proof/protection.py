@@ -144,7 +144,7 @@ def less_protection(
         text = "nothing enforces any more what these files enforced"
         yield _looser("Zenoh files", "present", "missing", text)
     if old.routers and not {*new.routers} <= {*old.routers}:
-        text = "anyone who poses as the router reads and changes everything that passes"
+        text = "anyone who poses as the router can read and change everything that passes"
         before, after = (", ".join(side.routers) for side in (old, new))
         yield _looser("Zenoh router", before, after, text)
     if new.zenoh_files:

@@ -563,7 +563,7 @@ class _Table:
         if all(enclave.startswith(EXCEPT) for enclave in enclaves):
             raise self.error(
                 key,
-                f"{key} only excludes enclaves",
+                f"the list {key} names only excluded enclaves",
                 'Begin the list with "*", for all other enclaves.',
             )
         return tuple(map(self.enclave_below, enclaves))
@@ -686,7 +686,7 @@ def _group_members(
                 key,
                 f"{placeholder} stands for robots, but no fleet says which",
                 "",
-                "For a policy, name the fleet file with --fleet. A keystore needs a fleet itself.",
+                "For a policy, name the fleet file with --fleet. A keystore must have a fleet.",
             )
         try:
             robots = fleet.members(placeholder.group)

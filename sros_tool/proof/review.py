@@ -435,7 +435,7 @@ class _Review:
             refusal = DocumentError(
                 "both commits are the same, so that nothing would be compared",
                 "",
-                "Check out the commit of the change (GitHub's pull_request_target does not), or "
+                "Check out the commit of the change (on GitHub, pull_request_target does not), or "
                 "ask for no comparison: --base none.",
             )
             yield ReviewStep("files", "", _UNDECIDED, refusal)

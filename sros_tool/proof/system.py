@@ -355,7 +355,7 @@ _MOST_GOVERNANCES = 4
 _WHY_UNKNOWN = {
     FOREIGN_GRANT: "Permissions are not secret: whoever has the key of an enclave can use all "
     "permissions that have a grant for this enclave.",
-    RELAY: "A changed process can use what its peers allow.",
+    RELAY: "A process with a changed program can use whatever its peers allow.",
 }
 """Ids of notes → why the rights in a keystore are not known."""
 

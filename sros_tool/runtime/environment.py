@@ -380,7 +380,7 @@ def _text(path: Path) -> str:
         raise KeystoreError(
             f"the path {text!r} cannot be given to Zenoh",
             "Zenoh reads a path as UTF-8 text, and does not accept ';' and '?' in it.",
-            "Move the keystore to another path.",
+            "Move the keystore to a path without such characters.",
         )
     return json.dumps(text, ensure_ascii=False).translate(_LINE_ENDS)
 
@@ -527,11 +527,11 @@ def render_secret(enclave: str, files: Mapping[str, bytes]) -> str:
     size = sum(map(len, files.values()))
     if size > MAX_SECRET:
         raise KeystoreError(
-            f"the files of enclave {enclave} have {size} bytes, but a Secret has room for "
+            f"the files of enclave {enclave} have {size} bytes, but a Secret holds at most "
             f"{MAX_SECRET}",
             "Kubernetes refuses a larger Secret.",
-            "Give the enclave fewer rights, or bring its files to the node of the cluster: `sros "
-            "distribute_key`.",
+            "Give the enclave fewer rights, or bring its files to the node of the cluster where "
+            "it runs: `sros distribute_key`.",
         )
     return yaml_text(
         {

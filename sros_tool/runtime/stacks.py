@@ -70,8 +70,8 @@ _LOG = logging.getLogger(__name__)
 _PROBE_SECONDS = 60.0
 
 ROS_ADVICE = (
-    "The ROS 2 packages of Ubuntu (such as ros-jazzy-ros-base or ros-kilted-ros-base) have DDS "
-    "Security built in; the wheels on PyPI do not."
+    "Use the ROS 2 packages of Ubuntu (such as ros-jazzy-ros-base or ros-kilted-ros-base): they "
+    "have DDS Security built in, and the wheels on PyPI do not."
 )
 _ZENOH_ADVICE = (
     "It enforces the files that `sros zenoh KEYSTORE` writes, not those of DDS Security."

@@ -157,7 +157,8 @@ def node_template(user: str) -> str:
 {_ORIGIN_COMMENT}
 [Unit]
 Description=ROS node in enclave %f
-# Before the clock is set, certificates are not valid. DDS looks for network interfaces only once.
+# Before the clock is set, a certificate may seem not valid yet. DDS looks for network interfaces
+# only once.
 Wants=network-online.target time-sync.target
 After=network-online.target time-sync.target
 

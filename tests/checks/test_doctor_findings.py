@@ -62,7 +62,7 @@ BY = "DDS Security can be enforced here, by "
         (
             (RMW, CYCLONE),
             1,
-            "but NOT by ROS nodes: rmw_opendds does not enforce it. The ROS 2",
+            "but NOT by ROS nodes: rmw_opendds does not enforce it. Use the ROS 2",
             False,
         ),
         ((UNTRIED, CYCLONE), 1, "but NOT by ROS nodes: rmw_opendds could not be tried.", None),
@@ -83,7 +83,7 @@ def test_the_status_is_about_the_nodes_of_ros(
     ended = sros("doctor", env={})
     assert ended.status == status
     assert said in ended.out.partition("\n\n")[0]
-    assert ended.out.count("The ROS 2 packages of Ubuntu") <= 1
+    assert ended.out.count("ROS 2 packages of Ubuntu") <= 1
     assert json.loads(sros("doctor", "--json", env={}).out)["ros_enforces"] is ros
 
 

@@ -164,5 +164,5 @@ def test_releases_can_be_listed_beside_ranges_of_git() -> None:
 )
 def test_what_is_no_advisory_is_refused(data: bytes) -> None:
     assert parse_advisories(document(), "it")
-    with pytest.raises(DocumentError, match="it has no advisories in the OSV format"):
+    with pytest.raises(DocumentError, match="it is not in the OSV format"):
         parse_advisories(data, "it")

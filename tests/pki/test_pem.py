@@ -35,7 +35,7 @@ BEGIN = b"-----BEGIN CERTIFICATE-----\n"
         (FIRST[:-30], "The block CERTIFICATE in it is cut short"),
         (FIRST.replace(b"END C", b"END X"), "does not end with '-----END CERTIFICATE-----'"),
         (FIRST.replace(BEGIN, BEGIN + b"?"), "is not valid base64"),
-        (FIRST.replace(BEGIN, BEGIN.replace(b"-\n", b"-\xc2\xa0\n")), "a byte beyond ASCII"),
+        (FIRST.replace(BEGIN, BEGIN.replace(b"-\n", b"-\xc2\xa0\n")), "a non-ASCII byte"),
         (FIRST.replace(BEGIN, BEGIN + b"\0"), "in it has a zero byte"),
     ],
 )

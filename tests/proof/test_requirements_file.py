@@ -161,7 +161,7 @@ WRONG = {
     '[[protected]]\ntopics = ["/x"]': "r.toml:1: level is missing in [[protected]]",
     '[[protected]]\ntopics = ["/x"]\nlevel = "SIGN"': "r.toml:3: level has 'SIGN'",
     '[[protected]]\ntopics = ["/x"]\nlevel = []': "r.toml:3: level has []",
-    '[[only]]\npublish = ["/x"]\nenclaves = ["!/x"]': "r.toml:3: enclaves only excludes enclaves",
+    '[[only]]\npublish = ["/x"]\nenclaves = ["!/x"]': "names only excluded enclaves",
     '[[only]]\npublish = ["/x"]\nenclaves = ["!x"]': "r.toml:3: '!x' is not an enclave",
     "[[not_both]]\nfirst = 1": "r.toml:2: first has 1, which does not state rights",
     '[[not_both]]\nfirst = { publish = ["/x"] }': "r.toml:1: second is missing in [[not_both]]",

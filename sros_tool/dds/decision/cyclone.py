@@ -330,7 +330,9 @@ def _read_number(node: _Node) -> int:
     # Cyclone DDS truncates the number to 32 bits before it checks the range.
     number = (number + 2**31) % 2**32 - 2**31
     if not 0 <= number <= MAX_DOMAIN:
-        raise UnreadableError(f"<{node.tag}> holds {number}, which is not from 0 to {MAX_DOMAIN}")
+        raise UnreadableError(
+            f"<{node.tag}> holds {number}, which is not between 0 and {MAX_DOMAIN}"
+        )
     return number
 
 
