@@ -131,8 +131,8 @@ OTHER_DISTRIBUTION = FindingKind(
     "runtime.other-distribution",
     WARNING,
     "ROS_DISTRO is none of the distributions that the keystore is for",
-    "`sros check` decided by the rules of the DDS that the keystore's distributions ship. Another "
-    "distribution can allow or deny other accesses, without any message.",
+    "`sros check` decides by the rules of the DDS that the keystore's distributions ship. "
+    "Another distribution can allow or deny other accesses, without any message.",
     "sros: `distributions` in the settings of a keystore, `distribution` in its fleet file.",
     "Source one of these distributions. Or check your distribution (`sros check KEYSTORE` with "
     "`--upgrade-to`), and then name it: for the keystore, with `sros update_keystore KEYSTORE "

@@ -160,8 +160,8 @@ WRONG_KIND = FindingKind(
     "policy.wrong-kind",
     WARNING,
     "a name of another kind, such as a service in a rule for topics",
-    "Every ROS 2 node has a topic of this name, not a service, or the other way around, so the "
-    "rule has no effect.",
+    "Every ROS 2 node has a topic of this name and no service, or a service and no topic. So "
+    "the rule has no effect.",
     "ROS 2 Jazzy (rclcpp 28, rclpy 7); ROS 2 design, Actions.",
     "Move the name to the group of its kind: <topics> or <services>.",
 )
@@ -928,7 +928,8 @@ NOT_ON_ZENOH = FindingKind(
     "policy.not-on-zenoh",
     ERROR,
     "a policy that Zenoh rules cannot express",
-    "`sros zenoh` refuses a keystore with such permissions. This is checked with --vendor zenoh.",
+    "`sros zenoh` refuses a keystore with such permissions. sros checks this only with --vendor "
+    "zenoh.",
     "zenoh.io, Access Control; sros (docs/zenoh.md).",
     "List names in place of wildcards.",
 )

@@ -20,10 +20,11 @@ VACUOUS = FindingKind(
     "The named part protects nothing: perhaps a name is misspelled or was changed, or the "
     "exceptions cover every enclave.",
     "The requirements file.",
-    "Correct the name or its kind (service or action), here or in the policy, or name fewer "
-    "exceptions. (Was a topic, node or enclave renamed? If by `merge_policy --remap`, check with "
-    "the same --remap.) For a name that is to stay unused, write [[nobody]]. For enclaves that "
-    "come and go, such as laptops, write who may ([[only]]), not who may not.",
+    "Correct the name or its kind (service or action), in the requirement or in the policy, or "
+    "name fewer exceptions. (Was a topic, node or enclave renamed? If by `merge_policy "
+    "--remap`, check with the same --remap.) For a name that is to stay unused, write "
+    "[[nobody]]. For enclaves that come and go, such as laptops, write who may ([[only]]), not "
+    "who may not.",
 )
 UNKNOWN_ENCLAVE = FindingKind(
     "requirement.unknown-enclave",
@@ -32,7 +33,7 @@ UNKNOWN_ENCLAVE = FindingKind(
     "The exception has no effect. Perhaps the enclave is only on other robots, or its name is "
     "misspelled.",
     "The requirements file.",
-    "Compare the name with those of the robot's enclaves; ignore this finding if only other "
+    "Compare the name with the names of the robot's enclaves; ignore this finding if only other "
     "robots, or robots of a package's users, have the enclave.",
     prominent=True,
 )

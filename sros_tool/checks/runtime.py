@@ -54,8 +54,8 @@ RMW_INSECURE = FindingKind(
     "runtime.rmw-without-security",
     ERROR,
     "an RMW that does not enforce DDS Security",
-    "The RMW was built without security, or sros does not know that it enforces the files of an "
-    "enclave. Nodes fail, or run unsecured.",
+    "The RMW was built without security, or sros does not know whether it enforces security. "
+    "Nodes fail, or run unsecured.",
     "Found by a test (`sros doctor`), or by the name of the RMW.",
     "Use an RMW that enforces security according to `sros doctor`.",
 )

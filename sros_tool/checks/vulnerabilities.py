@@ -70,8 +70,8 @@ ROBOTS_UNKNOWN = FindingKind(
     "sros cannot tell which known vulnerabilities these robots have.",
     "The last confirmations of the robots.",
     "If no library was reported or seen, confirm again with this version of sros (`sros fleet "
-    "report` on the robot), while the nodes run. If sros could not examine some processes: "
-    f"{_UNSEEN_REMEDY}",
+    "report` on the robot), while the nodes run. If sros could not examine some processes, "
+    f"{_UNSEEN_REMEDY[:1].lower()}{_UNSEEN_REMEDY[1:]}",
     prominent=True,
 )
 NOTES_ON_LIBRARIES = (PACKAGE_VULNERABILITIES, VERSION_UNKNOWN, ROBOTS_UNKNOWN)

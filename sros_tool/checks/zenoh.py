@@ -195,7 +195,8 @@ EXPIRED_STAYS = FindingKind(
     "zenoh.expired-stays",
     WARNING,
     "a connection outlives its certificate",
-    "A process keeps its connection after its certificate has expired, for as long as it runs.",
+    "After the certificate of a process has expired, its connections stay open until the "
+    "process ends.",
     _TESTED_SOURCE,
     'Write "close_link_on_expiration": true in transport/link/tls.',
 )

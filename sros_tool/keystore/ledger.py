@@ -66,9 +66,10 @@ if TYPE_CHECKING:
 
 GAP = "gap"
 LEDGER_REMEDY = (
-    "Restore ledger.jsonl and ledger.p7s from the same backup. Without one, state all rights again "
-    "with `sros generate_artifacts -k KEYSTORE -p POLICY_FILE`, and replace the CAs with `sros "
-    "rotate_ca KEYSTORE --next`, so that files that the ledger lacks are no longer valid."
+    "Restore ledger.jsonl and ledger.p7s from the same backup. Without a backup, state all "
+    "rights again with `sros generate_artifacts -k KEYSTORE -p POLICY_FILE`, and replace the "
+    "CAs with `sros rotate_ca KEYSTORE --next`, so that files that the ledger lacks are no "
+    "longer valid."
 )
 """What to do about a ledger with missing or changed lines."""
 SEALED = "sealed"

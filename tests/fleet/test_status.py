@@ -881,7 +881,9 @@ def test_a_damaged_ledger_is_not_blamed_on_the_fleet_file(field: Field) -> None:
     ledger = field.root / "ledger.jsonl"
     lines = ledger.read_text().splitlines(keepends=True)
     ledger.write_text("".join([*lines[:5], *lines[6:]]))
-    restore = "Restore ledger.jsonl and ledger.p7s from the same backup. Without one, state all"
+    restore = (
+        "Restore ledger.jsonl and ledger.p7s from the same backup. Without a backup, state all"
+    )
     told = field.run("fleet", "status", "ks", status=1).out
     assert f"the ledger has lines that are missing or were changed. {restore}" in told
     assert restore in field.run("renew", "ks", "--robot", "r1", status=2).err

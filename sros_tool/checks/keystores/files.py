@@ -175,11 +175,12 @@ CA_KEY_ON_ROBOT = FindingKind(
     "An attacker on the robot can create any enclave, with any rights.",
     "ROS 2 design, ROS 2 Security Enclaves; NIST SP 800-57 part 1, 6 (protection of keys).",
     "Make sure that the keystore that made the export has the key, and remove the key here. If "
-    "others had access, replace the CA in that keystore (`sros rotate_ca`).",
+    "others had access to the key, replace the CA in that keystore (`sros rotate_ca`).",
 )
 _ON_A_ROBOT = (
-    "On a robot, replace the folder by an export (`sros distribute_key KEYSTORE ENCLAVE TARGET`); "
-    "if others had access, run `sros rotate_ca`."
+    "On a robot, replace the folder by an export (`sros distribute_key KEYSTORE ENCLAVE "
+    "TARGET`); if others had access to the folder, replace the CA on the keystore machine "
+    "(`sros rotate_ca`)."
 )
 _COPY_WITHOUT_LINKS_REMEDY = (
     "On the keystore machine, keep the CA keys, and copy the keystore again with its links (`cp "

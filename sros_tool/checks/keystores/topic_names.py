@@ -31,8 +31,8 @@ NOT_FOR_ROS = FindingKind(
     "permissions.not-for-ros",
     NOTE,
     "permissions without any ROS 2 name",
-    "No ROS 2 node can run in this enclave: a node needs ros_discovery_info, and the DDS names "
-    "of ROS topics begin with rt/, and the DDS names of services with rq/ and rr/.",
+    "No ROS 2 node can run in this enclave: a node needs ros_discovery_info, and DDS names that "
+    "begin with rt/ (topics) or with rq/ and rr/ (services).",
     _MAPPING_SOURCE,
     "Nothing to do if a program uses DDS without ROS. Otherwise give the enclave a policy: `sros "
     "create_permission KEYSTORE ENCLAVE POLICY_FILE`.",
