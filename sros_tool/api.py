@@ -758,7 +758,7 @@ def explain_access(
     context = asking.context(asked.enclave.joined_domains)
     if vendor == ZENOH:
         return _access_on_zenoh(asked, question, context, kind)
-    signed = asked.enclave.as_here if action == "join" else asked.enclave
+    signed = asked.enclave.on_this_machine if action == "join" else asked.enclave
     evaluator = Evaluator(Vendor(vendor), signed, context)
     question, _ = question_meant(evaluator, asked, question, kind)
     answer = explain(evaluator, question)

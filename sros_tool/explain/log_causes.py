@@ -637,7 +637,7 @@ class Examiner:
         names_other_file = KEY_FILE not in hit.fields.get("path", KEY_FILE)
         if names_other_file or Fault.FILE_MISSING not in hit.meaning.faults:
             return
-        if enclave.key_elsewhere and not enclave.as_here.key_elsewhere:
+        if enclave.key_elsewhere and not enclave.on_this_machine.key_elsewhere:
             yield (
                 f"{KEY_FILE}: missing, as in a copy without keys; on the robot, this is the fault",
                 remedy(Fault.FILE_MISSING, self._root, enclave.name, KEY_FILE),

@@ -202,7 +202,7 @@ def explain_on_dds(
     vendor, why = chosen_vendor
     enclave = asked_enclave.enclave
     if question.word == "join":
-        enclave = enclave.as_here
+        enclave = enclave.on_this_machine
     evaluator = Evaluator(vendor, enclave, context)
     question, taken = question_meant(evaluator, asked_enclave, question, kind)
     answer = explain(evaluator, question)

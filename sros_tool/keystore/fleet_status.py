@@ -1262,12 +1262,12 @@ class _KeystoreRecords:
         names.update(self._unrecorded[robot.name].below)
         return tuple(sorted(name for name in names if not self._keystore.has_enclave(name)))
 
-    def short_lived(self, first: Mapping[str, _Expiring]) -> tuple[str, ...]:
-        """Return the short-lived enclaves of the files in ``first``.
+    def short_lived(self, first_expiring: Mapping[str, _Expiring]) -> tuple[str, ...]:
+        """Return the short-lived enclaves of the files in ``first_expiring``.
 
-        ``first`` maps a kind of file to the robot's file that expires first.
+        ``first_expiring`` maps a kind of file to the robot's file that expires first.
         """
-        names = {file.enclave for file in first.values() if file.enclave}
+        names = {file.enclave for file in first_expiring.values() if file.enclave}
         template = self._keystore.template
         return tuple(sorted(name for name in names if template.longest_validity(name) is not None))
 

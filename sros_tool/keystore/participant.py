@@ -124,7 +124,7 @@ class LoadedEnclave(NamedTuple):
         return tuple(_file_expiries(self.state, self.folder)) if self.state and self.folder else ()
 
     @property
-    def as_here(self) -> LoadedEnclave:
+    def on_this_machine(self) -> LoadedEnclave:
         """The enclave as a process on this machine loads it: a key elsewhere counts as missing."""
         return self._replace(key_elsewhere=self.state.key_on_robot) if self.state else self
 

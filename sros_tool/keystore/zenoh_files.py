@@ -10,7 +10,7 @@ an earlier rule are subtracted from later rules.  The result is compared with th
 vendor.  If two vendors differ, or if the order of the rules cannot be expressed, the permissions
 are refused.
 
-One difference between vendors is left out: on Cyclone DDS 0.10, a denial of one direction also
+One difference between vendors is accepted: on Cyclone DDS 0.10, a denial of one direction also
 keeps an enclave from the other direction of the topic (``portable.deny-blocks-topic``).
 """
 

@@ -112,11 +112,11 @@ class ExportSelection:
 
 
 def select_enclaves_to_export(
-    keystore: OpenedKeystore, names: Iterable[str], given: Collection[str], *, keyless: bool
+    keystore: OpenedKeystore, names: Iterable[str], named: Collection[str], *, keyless: bool
 ) -> ExportSelection:
     """Return the enclaves to export, and the enclaves left out because their keys are on robots.
 
-    With ``keyless``, no enclave is left out. Enclaves that are ``given`` by name are never left
+    With ``keyless``, no enclave is left out. Enclaves in ``named`` (given by name) are never left
     out, so that `distribute` refuses them.
 
     Raises:
@@ -126,7 +126,7 @@ def select_enclaves_to_export(
     chosen: list[str] = []
     left_out: list[str] = []
     for name in dict.fromkeys(names):
-        only_matches = name not in given and not keyless
+        only_matches = name not in named and not keyless
         at_robot = only_matches and key_on_robot(keystore.folder(name))
         (left_out if at_robot else chosen).append(name)
     if not chosen:

@@ -410,7 +410,7 @@ class KeystoreChange:
             template=self.template,
             keyring=self.keyring,
             now=self.now,
-            given_list=self.crl,
+            list_of_service=self.crl,
         )
 
     def revoke_superseded(
@@ -612,7 +612,7 @@ class KeystoreChange:
                 keystore=self.keystore,
                 allowed=self._allowed,
                 revoked_before=revoked_before,
-                remedy=lambda: self._another_ca(command) if command else "",
+                remedy=lambda: self._another_ca_remedy(command) if command else "",
             )
         self._note_unknown_authorities()
         self.transaction.commit()
@@ -632,7 +632,7 @@ class KeystoreChange:
             )
             self.notes.append(Note("keystore.unknown-authority", text))
 
-    def _another_ca(self, command: str) -> str:
+    def _another_ca_remedy(self, command: str) -> str:
         from sros_tool.keystore.lifecycle.revocation_list import another_ca_remedy
 
         return another_ca_remedy(self.keystore, command)

@@ -234,9 +234,9 @@ class RevocationListSigner:
     """Signer of the revocation lists of all trusted identity CAs, within a transaction.
 
     ``present`` is the list before the change; None if there is no list, or no trusted identity CA
-    signed it.  ``given`` is the list (PEM) that a CA service signed, if the keystore has a CA
-    service.  ``remarks`` are notes on lists that could not be signed or used, and on certificates
-    that may be missing from the ledger.
+    signed it.  ``list_of_service`` is the list (PEM) that a CA service signed, if the keystore has
+    a CA service.  ``remarks`` are notes on lists that could not be signed or used, and on
+    certificates that may be missing from the ledger.
     """
 
     def __init__(
@@ -248,15 +248,15 @@ class RevocationListSigner:
         template: Template,
         keyring: Keyring,
         now: datetime,
-        given_list: bytes = b"",
+        list_of_service: bytes = b"",
     ) -> None:
-        if given_list and not authority.service:
+        if list_of_service and not authority.service:
             raise UsageError(
                 "the keystore signs its revocation list itself",
                 "--crl is only for a keystore whose identity CA is a CA service.",
                 "Leave --crl out.",
             )
-        self._given = given_list
+        self._given_list = list_of_service
         self._transaction = transaction
         self._keystore = keystore
         self._root = keystore.root
@@ -523,14 +523,14 @@ class RevocationListSigner:
         numbers = ", ".join(sorted(f"{serial:x}" for serial in serials))
         revoke = f"Revoke these certificates at the service: {numbers}. " if numbers else ""
         remedy = f"{revoke}Give the list of the service with --crl FILE."
-        if not self._given:
+        if not self._given_list:
             raise KeystoreError(
                 f"the identity CA of keystore '{self._root}' is a CA service, and only this "
                 "service signs revocation lists",
                 "Nothing was changed.",
                 remedy,
             )
-        crl = load_crl(self._given, "of the CA service")
+        crl = load_crl(self._given_list, "of the CA service")
         if not signed_by(crl.list, authority.certificate):
             fault = f"{authority_text(authority.certificate)} did not sign it"
         elif not crl.this_update <= self._now < crl.next_update:
@@ -603,33 +603,33 @@ class RevocationListSigner:
         )
         if not replaced or not file:
             return None
-        coming = rotation.stage is RotationStage.DISTRIBUTE
+        is_new_ca = rotation.stage is RotationStage.DISTRIBUTE
         certificates = self._keystore.certificates_of(file)
-        sha256 = replaced.new if coming else replaced.old
+        sha256 = replaced.new if is_new_ca else replaced.old
         (other,) = [candidate for candidate in certificates if digest(candidate) == sha256]
-        if coming and are_crls_confusable(certificates[0], other):
+        if is_new_ca and are_crls_confusable(certificates[0], other):
             return None  # then all processes have to be restarted together anyway
         old = self._list_if_authentic(self._keystore.embedded_list(file))
         try:
-            authority = self._open(other, replaced, is_coming=coming)
+            authority = self._open(other, replaced, is_new_ca=is_new_ca)
         except KeystoreError as error:
             # The new CA has not issued anything yet; the next stage of the rotation signs its list.
-            if not coming:
+            if not is_new_ca:
                 self._note_unsigned_list(other, error, new_entries, old, incomplete=incomplete)
             return None
         # In the next stage, this list replaces the present one, so its number must be higher.
-        if coming:
+        if is_new_ca:
             least = max(least, (self.present.number if self.present else 0) + 2)
-        signed = self._sign(authority, old, () if coming else new_entries, expiries, least)
+        signed = self._sign(authority, old, () if is_new_ca else new_entries, expiries, least)
         bundle = b"".join(map(pem, certificates)) + signed.document
         roles = self._keystore.authority_files[file]
         write_bundle(self._transaction, file, roles, bundle, names)
         return signed
 
     def _open(
-        self, certificate: x509.Certificate, replaced: Replacement, *, is_coming: bool
+        self, certificate: x509.Certificate, replaced: Replacement, *, is_new_ca: bool
     ) -> Authority:
-        place = replaced.key if is_coming else replaced.old_key_place(certificate)
+        place = replaced.key if is_new_ca else replaced.old_key_place(certificate)
         # The environment variables name places for the key of the issuing CA, not of this one.
         keyring = replace(self._keyring, places={})
         key = keyring.open(self._keystore, IDENTITY, replace(self._template, identity_key=place))
