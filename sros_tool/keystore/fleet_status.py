@@ -1676,8 +1676,8 @@ def fleet_metrics(
         ),
         Metric(
             "sros_fleet_publication_altered",
-            "Number of published files that in the last day, `sros fleet publish` found missing, "
-            "changed or older than it had written them, and published again.",
+            "Number of published files that `sros fleet publish` replaced in the last day, because "
+            "they were missing, changed or older than the last publication.",
             (Sample(len(status.publication.altered), place),) if status.publication else (),
         ),
         Metric(

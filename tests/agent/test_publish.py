@@ -1528,7 +1528,7 @@ def test_what_a_restored_keystore_cannot_know_is_not_published_in_silence(
         with pytest.raises(KeystoreError, match="the governance was changed") as refused:
             publisher.publish(restored=True, dry_run=dry_run)
     assert "rtps_protection_kind SIGN" in refused.value.what
-    lacking = "The keystore lacks /r5/base, which robots have. If a robot made their keys, sign its"
+    lacking = "lacks /r5/base, which robots have. If a robot made the key of such an enclave, sign"
     before, _, after = refused.value.remedy.partition(lacking)
     assert "sign_request" in after and "generate_artifacts" in after and "Sign" not in before
     assert "/r2/base: not known, because the archive of the last release of r2" in str(

@@ -652,7 +652,7 @@ def test_an_enclave_that_the_keystore_lost_is_named(keystore: Path, tmp_path: Pa
     sros("revoke", keystore, "/a").ok()
     ended = sros("distribute_key", keystore, "--all", robot, "--force").ok()
     assert f"'{robot}' also has enclave /a" in ended.err
-    subprocess.run(["sh", "-c", re.findall(r"rm -r .*", ended.err)[0]], check=True)
+    subprocess.run(["sh", "-c", re.findall(r"rm -r [^`]*", ended.err)[0]], check=True)
     assert not (robot / "enclaves/a").exists()
     again = sros("distribute_key", keystore, "--all", robot, "--force", "--json").ok()
     assert json.loads(again.out)["notes"] == []

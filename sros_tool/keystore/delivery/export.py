@@ -223,8 +223,8 @@ def _other_enclave_notes(
             yield Note(
                 "export.not-in-keystore",
                 f"'{target}' also has enclave {name}, which keystore '{keystore.root}' does not "
-                "have; if the enclave was revoked, remove it from the robot, too: "
-                f"{_enclave_removal(target, [name], present)}",
+                "have. If the enclave was revoked, remove it from "
+                f"the robot, and from this folder: `{_enclave_removal(target, [name], present)}`.",
             )
         elif owner and exported and owner.name not in exported:
             of_others[owner.name].append(name)

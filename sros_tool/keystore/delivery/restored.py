@@ -467,9 +467,9 @@ def _missing_step(root: str, missing: Sequence[str]) -> str:
     Signing the policy would make new keys for them; releases do not show who made the present keys.
     """
     return (
-        f"The keystore lacks {first_few(missing, _NAMED)}, which robots have. If a robot made "
-        "their keys, sign its requests again before you sign the policy, with `sros sign_request "
-        f"{root} REQUEST --no-answer -p POLICY_FILE --fleet FLEET_FILE`."
+        f"The keystore lacks {first_few(missing, _NAMED)}, which robots have. If a robot made the "
+        "key of such an enclave, sign its request again before you sign the policy, with `sros "
+        f"sign_request {root} REQUEST --no-answer -p POLICY_FILE --fleet FLEET_FILE`."
     )
 
 
@@ -504,8 +504,8 @@ def check_authorities(keystore: OpenedKeystore, folder: Path, last: Release) -> 
     options = " ".join(f"--{role}-ca FILE --{role}-key PLACE" for role in roles)
     by_hand = (
         " Otherwise, also bring each robot its files by hand (`sros distribute_key "
-        f"{where} --robot NAME FOLDER --force`), because robots accept only "
-        "releases that a CA sealed which they trust."
+        f"{where} --robot NAME FOLDER --force`), because a robot accepts a "
+        "release only if it trusts the CA that sealed the release."
     ) * (PERMISSIONS in replaced)
     raise KeystoreError(
         f"{names} {'was' if len(roles) == 1 else 'were'} replaced after the backup of the "
