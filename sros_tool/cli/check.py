@@ -727,8 +727,8 @@ def _needs_renewal(root: Path, text: str, moment: datetime, form: str) -> int:
     if form == "json":
         print_json(expiring_enclaves(expiring))
     else:
-        lines = [describe_lifetime(enclave, moment) for enclave in expiring.due]
-        lines += [f"{enclave.name}  unknown: {enclave.error}" for enclave in expiring.unreadable]
+        due = [describe_lifetime(enclave, moment) for enclave in expiring.due]
+        unknown = [f"{enclave.name}  unknown: {enclave.error}" for enclave in expiring.unreadable]
         none_due = {0: "no enclave needs", 1: "the only enclave does not need"}.get(
             expiring.lasting, f"none of {expiring.lasting} enclaves needs"
         )
@@ -738,11 +738,12 @@ def _needs_renewal(root: Path, text: str, moment: datetime, form: str) -> int:
         left_out = expiring.short_lived_text()
         left_out = f"not counted: {left_out}" if left_out else ""
         if form == "markdown":
-            echo_lines(renewal_markdown(lines, "; ".join(filter(None, (none_due, left_out))), text))
+            if_none = "; ".join(filter(None, (none_due, left_out)))
+            echo_lines(renewal_markdown(due, unknown, if_none, text))
         else:
-            for line in first_lines(lines):
+            for line in first_lines([*due, *unknown]):
                 echo(line)
-            for remark in filter(None, ("" if lines else none_due, left_out)):
+            for remark in filter(None, ("" if due or unknown else none_due, left_out)):
                 echo(remark, err=True)
     notes = tuple(keystore.ledger_file.clock_notes(moment))
     print_notes(notes)
@@ -750,15 +751,22 @@ def _needs_renewal(root: Path, text: str, moment: datetime, form: str) -> int:
     return NOT_DONE if is_unknown else 1 if expiring.due else 0
 
 
-def renewal_markdown(lines: Sequence[str], text_if_none: str, text: str) -> str:
-    """Return the enclaves to renew soon as Markdown, or a sentence that there are none."""
+def renewal_markdown(
+    due: Sequence[str], unknown: Sequence[str], text_if_none: str, threshold: str
+) -> str:
+    """Return the enclaves to renew soon as Markdown, or a sentence that there are none.
+
+    ``due`` and ``unknown`` are lines on enclaves to renew and on enclaves that cannot be read.
+    """
     from sros_tool.markdown import bounded_list, code, plain
 
-    if not lines:
+    if not (due or unknown):
         return f"### Certificates: {plain(text_if_none)}\n"
-    count = "1 enclave needs" if len(lines) == 1 else f"{len(lines)} enclaves need"
-    listed = bounded_list(map(code, lines), 4000, "which `sros check --needs-renewal` shows")
-    return f"### Certificates: {count} to be renewed {plain(f'({text})')}\n\n{listed}\n"
+    need = f"{counted(len(due), 'enclave')} {'needs' if len(due) == 1 else 'need'} to be renewed"
+    unread = f", {len(unknown)} cannot be read" if unknown else ""
+    shown_by = "which `sros check --needs-renewal` shows"
+    listed = bounded_list(map(code, (*due, *unknown)), 4000, shown_by)
+    return f"### Certificates: {need} {plain(f'({threshold})')}{unread}\n\n{listed}\n"
 
 
 def _print_markdown(chosen_findings: ChosenFindings, fleet: Fleet | None) -> None:

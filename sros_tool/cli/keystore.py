@@ -784,9 +784,7 @@ def update_keystore(
     from sros_tool.keystore.settings import present_settings
     from sros_tool.keystore.template import load_template, with_values
 
-    if sum((template_name is not None, take_edits, discard_edits)) > 1 and not (
-        template_name and discard_edits
-    ):
+    if take_edits and (template_name is not None or discard_edits):
         raise UsageError("--take-edits excludes --template and --discard-edits")
     chosen = (template_name, values, rules, dropped, domain, take_edits, discard_edits)
     if trust_records:

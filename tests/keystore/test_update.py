@@ -822,6 +822,7 @@ def test_the_options(root: Path) -> None:
         ("--domain", "x"),
         ("--template", "production", "--take-edits"),
         ("--take-edits", "--discard-edits"),
+        ("--template", "production", "--take-edits", "--discard-edits"),
         ("--take-edits", "--next"),
     ],
 )
