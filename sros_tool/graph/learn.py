@@ -526,7 +526,7 @@ _MOST_SHOWN = 5
 _NOTE_TEXTS = {
     "ambiguous": "nodes with the same name ({}) run in several enclaves, and the graph does not "
     "show which node runs in which enclave, so each of these enclaves gets the rights of all these "
-    "nodes. To tell them apart, start one node at a time under --watch",
+    "nodes. To tell them apart, start one node at a time while this command runs with --watch",
     "changing-name": "nodes whose name changes with every start have a profile with a wildcard: {}",
     "half-service": "left out, because only the request or the reply of these services was "
     "observed: {}. Observe again with a longer --spin-time",
@@ -542,7 +542,7 @@ _NOTE_TEXTS = {
     "and `sros env` set it) names an enclave that the graph does not show. --enclave-per-node "
     "gives each process an enclave of its own, with the name of its node",
     "same-node": "several processes have a node with the same name in the same enclave, so this "
-    "enclave gets the rights of all these processes: {}. Unless it is one process that was "
+    "enclave gets the rights of all these processes: {}. Unless they are one process that was "
     "restarted, find out whether each of these processes is yours, and give the nodes different "
     "names (-r __node:=NAME)",
     "service-event": "service introspection is on, and every subscriber of these topics can read "
@@ -695,7 +695,7 @@ def _notes(
             "graph.shared-enclave",
             "several processes share an enclave, because of the names of their nodes: "
             f"{first_subjects(shared)}. Each enclave gets the rights of all its processes. Unless "
-            "it is one process that was restarted, give the nodes different names (-r "
+            "they are one process that was restarted, give the nodes different names (-r "
             "__node:=NAME), or start each process with --ros-args --enclave",
         )
     yield from name_notes(users, set(names.values()))

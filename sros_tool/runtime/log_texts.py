@@ -118,8 +118,9 @@ _RESTORE_FILE = (
 _RENEW_ENCLAVE = "Renew the enclave: `sros renew KEYSTORE ENCLAVE`."
 _SIGN_PERMISSIONS = "Sign the permissions again: `sros create_permission KEYSTORE ENCLAVE POLICY`."
 _SIGN_DOCUMENT = (
-    f"`sros explain KEYSTORE ENCLAVE --log LOG` names the document. {_SIGN_PERMISSIONS} "
-    "Restore governance.p7s from a backup: every enclave depends on this file."
+    "`sros explain KEYSTORE ENCLAVE --log LOG` names the document. Sign permissions.p7s again: "
+    "`sros create_permission KEYSTORE ENCLAVE POLICY`. But restore governance.p7s from a backup: "
+    "every enclave depends on this file."
 )
 _MAKE_READABLE = (
     "Allow the user of the node to read the file, and to enter the folders above the file: `ls -lL "
@@ -350,7 +351,8 @@ _CYCLONE_START_TEXTS = (
         "certificate-expired", _CYCLONE, r"Certificate not valid: error: certificate has expired",
         "the certificate of the enclave or of its identity CA has expired; the message "
         "does not say which",
-        _RENEW_ENCLAVE, (Fault.CERTIFICATE_EXPIRED, Fault.CA_EXPIRED),
+        f"{_RENEW_ENCLAVE} If the CA has expired, first replace it: `sros rotate_ca KEYSTORE "
+        "--finish`.", (Fault.CERTIFICATE_EXPIRED, Fault.CA_EXPIRED),
     ),
     _log_text(
         "certificate-not-yet-valid", _CYCLONE, r"Certificate not valid: error: certificate is not "
@@ -564,7 +566,8 @@ _FAST_START_TEXTS = (
     ),
     _log_text(
         "key-unreadable", _FAST, r"Error obtaining private key",
-        "key.pem is encrypted, damaged or empty", "Store the key as PEM without a passphrase.",
+        "key.pem is encrypted, damaged or empty", "Store the key as PEM without a passphrase. If it is "
+        "damaged, give the enclave a new key: `sros renew KEYSTORE ENCLAVE --new-key`.",
         (*_KEY_FAULTS, *_FILE_FAULTS),
         refuses=RefusedObject.PARTICIPANT,
     ),

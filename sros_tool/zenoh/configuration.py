@@ -510,7 +510,7 @@ def check_network(network: ZenohNetwork) -> None:
             f"the router cannot listen at {' and '.join(sorted(hosts))}",
             "Without --listen the router listens at each endpoint, and does not start if one of "
             "them is on another host.",
-            f"Say where it listens, such as `--listen [::]:{min(connect)[1]}`.",
+            f"Name where it listens, for example with `--listen [::]:{min(connect)[1]}`.",
         )
     if not listen:
         return
@@ -525,7 +525,7 @@ def check_network(network: ZenohNetwork) -> None:
         raise UsageError(
             f"the router listens only on its own host, but sessions connect to {far[0]}",
             "Another host cannot reach a router that listens at localhost.",
-            f"Let it listen for other hosts, such as `--listen [::]:{min(listen)[1]}`.",
+            f"Let it listen for other hosts, for example with `--listen [::]:{min(listen)[1]}`.",
         )
 
 

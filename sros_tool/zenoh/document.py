@@ -237,7 +237,7 @@ def _root(data: bytes, name: str, *, lines: bool) -> _Section:
     except UnicodeDecodeError as error:
         raise _json5_error_class(name)(
             f"the Zenoh configuration '{name}' is not UTF-8",
-            f"The byte at {error.start} does not belong to UTF-8 text.",
+            f"The byte at position {error.start} is not valid in UTF-8.",
         ) from error
     except Json5Error as error:
         raise _json5_error_class(name)(
@@ -275,7 +275,7 @@ def _parse_yaml(text: str, name: str) -> object:
         language = "TOML" if _has_ending(name, _TOML_ENDINGS) else "YAML"
         raise UnreadConfigurationError(
             f"the Zenoh configuration '{name}' is in a language that sros does not read",
-            f"Zenoh reads it as {language}, by the ending of its name.",
+            f"Zenoh reads it as {language}, because of the ending of its name.",
             "Write it as JSON5 into a file whose name ends with .json5.",
         )
     return value
