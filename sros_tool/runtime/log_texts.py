@@ -566,8 +566,9 @@ _FAST_START_TEXTS = (
     ),
     _log_text(
         "key-unreadable", _FAST, r"Error obtaining private key",
-        "key.pem is encrypted, damaged or empty", "Store the key as PEM without a passphrase. If it is "
-        "damaged, give the enclave a new key: `sros renew KEYSTORE ENCLAVE --new-key`.",
+        "key.pem is encrypted, damaged or empty",
+        "Store the key as PEM without a passphrase. If it is damaged, give the enclave a "
+        "new key: `sros renew KEYSTORE ENCLAVE --new-key`.",
         (*_KEY_FAULTS, *_FILE_FAULTS),
         refuses=RefusedObject.PARTICIPANT,
     ),
