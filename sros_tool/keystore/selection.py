@@ -45,7 +45,7 @@ from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.names import check_enclave_name
 from sros_tool.validity import iso
 from sros_tool.values import NamedKeystore, shows
-from sros_tool.wording import counted, first_few
+from sros_tool.wording import first_few
 
 
 @shows(optional=("robots",))
@@ -342,8 +342,8 @@ def missing_enclave_error(
     if below := [existing for existing in names if name and existing.startswith(f"{name}/")]:
         return KeystoreError(
             missing,
-            f"It is the namespace of {counted(len(below), 'enclave')}, such as {below[0]}.",
-            f"Name one of them; a verb that takes several also has --match '{name}/*'.",
+            f"It is the namespace of {first_few(below, _MOST_SHOWN)}.",
+            f"Name an enclave; verbs that take several enclaves also have --match '{name}/*'.",
         )
     uses = _enclaves_using(keystore, name, names)
     if of_node := uses.pop("node"):

@@ -101,7 +101,7 @@ DIAMONDS = {f"g{i}": {"children": [f"g{i + 1}", f"h{i + 1}"]} for i in range(30)
         ("h.yml", "all: {hosts: {r-1: }}", "sros_robot: r7"),
         ("h.yml", "all: {hosts: {'<r7/>': }}", "sros_robot: r7"),
         ("h.yml", "all: {hosts: {r1: {sros_robot: 7}}}", "not a text"),
-        ("h.yml", "all: {hosts: {r1: , a: {sros_robot: r1}}}", "both the robot r1"),
+        ("h.yml", "all: {hosts: {r1: , a: {sros_robot: r1}}}", "the same robot name r1"),
         ("h.yml", "all: {hosts: {localhost: }}", "means something else"),
         ("h.yml", "all: {hosts: {h: {sros_robot: all}}}", "means something else"),
         ("h.yml", "arm: {hosts: {arm: }}", "'arm' is a robot and a group"),
