@@ -816,8 +816,7 @@ _PERMISSIONS_ROWS: tuple[Row, ...] = (
             "permissions signed by the enclave itself",
             Identity(forger.permissions_signed_by_itself, "guest"),
             RowStatus.NOT_LET_IN,
-            "the enclave's certificate is not from the permissions CA, so it cannot sign"
-            " permissions",
+            "DDS accepts only signers whose certificate is from the permissions CA",
             Variant(
                 (Condition.EXACT_SIGNER,),
                 RowStatus.NOT_LET_IN,
