@@ -441,7 +441,9 @@ def refuse_lost_changes(
             _LOG.info("right that was taken away after the backup: %s", text)
         short = [textwrap.shorten(text, _LONGEST, placeholder=" ...") for text in texts[:_NAMED]]
         more = "; -v shows more" if short != texts else ""
-        what.append(f"rights of {shown(rights)} were taken away ({'; '.join(short)}{more})")
+        perhaps = ", or may have been" * any(": not known, because" in text for _, text in taken)
+        why = f"{'; '.join(short)}{more}"
+        what.append(f"rights of {shown(rights)} were taken away{perhaps} ({why})")
         steps.append("Sign the present policy again, with `sros generate_artifacts`.")
         if not (certificates or keys or names["governance"]):
             steps.append(f"If the enclaves are to have these rights, run {renew(rights)}.")
