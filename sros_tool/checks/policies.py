@@ -829,9 +829,9 @@ def _missing_common_part_cause(lacking: Sequence[_NodeLackingRight]) -> Cause:
     if any(_is_any_node(node) for node in nodes):
         remedy = f"{_NAME_NODE_FIRST_REMEDY} {remedy}"
     return Cause(
-        f"{counted(len(nodes), 'node')} lack rights that every node needs"
+        f"{counted(len(nodes), 'node')} lack rights that nodes need"
         if plural
-        else "a node lacks rights that every node needs",
+        else "a node lacks rights that nodes need",
         _denied_start_actions_sentence(lacking),
         remedy,
         len(lacking),

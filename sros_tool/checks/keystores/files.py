@@ -179,7 +179,7 @@ CA_KEY_ON_ROBOT = FindingKind(
 )
 _ON_A_ROBOT = (
     "On a robot, replace the folder by an export (`sros distribute_key KEYSTORE ENCLAVE "
-    "TARGET`); if others had access to it, run `sros rotate_ca`."
+    "TARGET`); if others could read it, run `sros rotate_ca`."
 )
 _COPY_WITHOUT_LINKS_REMEDY = (
     "On the keystore machine, keep the CA keys, and copy the keystore again with its links (`cp "
