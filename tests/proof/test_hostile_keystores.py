@@ -489,7 +489,7 @@ def test_settings_of_zenoh_are_compared(sound: Path, path: str, value: object, s
             1,
             "later enclaves: protection.rtps SIGN -> NONE: whole messages: no longer",
         ),
-        (settings("unique_subject = true", "unique_subject = false"), 1, "fit every later"),
+        (settings("unique_subject = true", "unique_subject = false"), 1, "fit later certificates"),
         (settings('validity = "1d"', 'validity = "2d"'), 0, "not covered: dates, "),
         (without_settings, 1, "later enclaves: permissions.default node_basics -> everything"),
         (
