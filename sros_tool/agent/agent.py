@@ -190,7 +190,12 @@ class Round(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Machine:
-    """The inputs of a round: time, time zone, and functions that read and change the machine."""
+    """The inputs of a round: time, time zone, and functions that read and change the machine.
+
+    ``look`` returns the running processes, ``clock`` whether a time service set the clock, and
+    ``boot`` an id of the start of the machine; ``fetch`` fetches a release, and ``systemd``
+    restarts units (None: the usual ones).
+    """
 
     now: datetime
     zone: tzinfo
@@ -256,8 +261,8 @@ class _Round:
         if clock is not RobotClock.BEHIND and installation.made:
             clock = self._clock_next_to_release(installation.made) or clock
         self._note_unreleased_enclaves()
-        self._note_repaired(now)
-        self._note_removed()
+        self._note_repaired_files(now)
+        self._note_removed_enclaves()
         names = self._enclaves()
         opened = open_installed(self._folder, names, now=now)
         if clock is not RobotClock.BEHIND:  # with a wrong clock, valid files look unusable
@@ -531,7 +536,7 @@ class _Round:
                     "everything that the release lacks."
                 )
 
-    def _note_repaired(self, now: datetime) -> None:
+    def _note_repaired_files(self, now: datetime) -> None:
         """Report for a day the files that differed from the release and were replaced."""
         recent = {
             path: at
@@ -549,7 +554,7 @@ class _Round:
                 f"{first_few(paths, 3)}. Find out who or what changes files on this robot."
             )
 
-    def _note_removed(self) -> None:
+    def _note_removed_enclaves(self) -> None:
         """Report the removed enclaves whose keys somebody may have copied.
 
         This ends when their certificates are revoked or have expired, or a release has them.
@@ -586,7 +591,7 @@ class _Round:
             )
 
     def _copied_key(self, path: str) -> CopiedKey:
-        """Return the key at ``path`` with the present certificate of its enclave."""
+        """Return the key at ``path``, noted now, with the present certificate of its enclave."""
         serial, expires = "", None
         with suppress(SrosError, OSError):
             certificate = read_certificate(self._folder / _certificate_path(enclave_of(path)))
@@ -916,7 +921,7 @@ class _Round:
             self._folder,
             self._settings.robot,
             now=now,
-            unreadable=self._unreadable,
+            unreadable=self._note_unreadable_enclave,
         )
         restart, crl_restart = (
             tuple(sorted({*names, *processes.elsewhere}))
@@ -1019,7 +1024,7 @@ class _Round:
             return None
         return text
 
-    def _unreadable(self, name: str, error: Exception) -> None:
+    def _note_unreadable_enclave(self, name: str, error: Exception) -> None:
         text = self._write_error_text(error) if isinstance(error, OSError) else str(error)
         self._problems.append(f"the confirmation leaves out {name}: {text}")
 

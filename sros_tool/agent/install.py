@@ -103,7 +103,7 @@ class Installation(NamedTuple):
 class _Change:
     """The changes of an enclave's files: new contents by path, and paths to remove.
 
-    ``seen`` has the files (None: there is none) with which the new ones were compared.
+    ``seen`` has the files with which the new files were compared, by path; None for a missing file.
     """
 
     write: dict[str, bytes] = field(default_factory=dict)
@@ -469,7 +469,10 @@ def _present_key(folder: Folder, name: str, files: Mapping[str, bytes]) -> Publi
 
 
 def _files_seen(folder: Folder, name: str) -> dict[str, bytes | None]:
-    """Return the files of an enclave that show how new it is; those that cannot be read as None."""
+    """Return the files that show how new an enclave is, by path; None for a file without content.
+
+    Such a file is missing, or cannot be read.
+    """
     seen: dict[str, bytes | None] = {}
     for file in _DATED_FILES:
         path = f"{enclave_folder(name)}/{file}"

@@ -100,7 +100,8 @@ def look_at_processes(
 
     ``look`` reads the processes of the machine. ``replaced`` maps enclaves to the time when their
     files were replaced, and ``list_replaced`` to the time when their trust files (CAs and
-    revocation list) were replaced. Both times are by the clock of ``now``. They are used in
+    revocation list) were replaced. ``list_since`` maps enclaves to the time since when their trust
+    files have been the same. All times are by the clock of ``now``. The first two are used in
     addition to the modification times of the files, because the clock may have been set since the
     files were written.
     """
@@ -296,7 +297,7 @@ class Systemd:
     def __init__(self, command: Sequence[str]) -> None:
         self._command = command
 
-    def active(self) -> frozenset[str]:
+    def active_units(self) -> frozenset[str]:
         """Return the names of the active units that `sros units` writes for nodes.
 
         Raises:
@@ -408,7 +409,7 @@ def restart_units(
         if allowed.returncode:
             return Restarts()
     try:
-        active = systemd.active()
+        active = systemd.active_units()
     except UnavailableError as error:
         active = frozenset()
         problems.append(str(error))

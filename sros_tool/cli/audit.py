@@ -201,7 +201,7 @@ def audit(
             "there is nothing to audit: no node was observed",
             why_no_node_was_observed(environment, snapshot.seconds, rmw, enclave),
         )
-    ended = audits.notes_on_ended(snapshot.gone)
+    ended = audits.notes_on_ended_nodes(snapshot.gone)
     by_vendor = (audits.BY_VENDOR_ON_ZENOH,) if on_zenoh and not enclaves.zenoh else ()
     audited = replace(audited, notes=(*audited.notes, *ended, *by_vendor))
     existed = patch is not None and patch.exists()
@@ -292,7 +292,7 @@ def _advice_to_add_by_hand(sources: Sequence[Path], fleet: Fleet, audited: Audit
     if policy.policy() == stated:
         return ""
     missing = dict.fromkeys(profile.enclave for profile in audited.missing.profiles)
-    of = dict.fromkeys(policy.stated(name)[0] for name in missing if name in policy)
+    of = dict.fromkeys(policy.stated_enclave(name)[0] for name in missing if name in policy)
     places = [f"{enclave.source} ({enclave.path})" for enclave in of] or [str(sources[0])]
     return f"add its rights by hand, with placeholders, at {', '.join(places)}"
 

@@ -159,7 +159,7 @@ def print_files(root: Path, words: str, paths: Sequence[str]) -> None:
 
 def _change_lines(root: Path, paths: Sequence[str]) -> Iterator[str]:
     """Yield the paths of files; paths that differ only in the robot of a fleet share a line."""
-    from sros_tool.fleet.robots import folded
+    from sros_tool.fleet.robots import folded_lines
     from sros_tool.keystore.fleet import load_fleet
     from sros_tool.keystore.reader import OpenedKeystore
 
@@ -167,7 +167,7 @@ def _change_lines(root: Path, paths: Sequence[str]) -> Iterator[str]:
     with suppress(SrosError):  # a new keystore and an export have no fleet
         fleet = load_fleet(OpenedKeystore(root))
     lines = ((f"/{path.partition('/')[2].rpartition('/')[0]}", path) for path in paths)
-    yield from folded(fleet, lines)
+    yield from folded_lines(fleet, lines)
 
 
 def print_closed_and_adopted(
@@ -204,7 +204,7 @@ def rights_lines(
     root: Path, replaced_rights: Sequence[ReplacedRights], *, dry_run: bool
 ) -> Iterator[str]:
     """Yield a line for each lost or gained right; the robots of a fleet share a line."""
-    from sros_tool.fleet.robots import folded
+    from sros_tool.fleet.robots import folded_lines
     from sros_tool.keystore.fleet import fleet_before_change
     from sros_tool.keystore.reader import OpenedKeystore
 
@@ -218,7 +218,7 @@ def rights_lines(
     for (verb, text), names in together.items():
         word = f"would {verb}" if dry_run else verb if len(names) > 1 else f"{verb}s"
         lines.append((names[0], f"{shown_names(names)} {word}: {text}"))
-    yield from folded(fleet, lines)
+    yield from folded_lines(fleet, lines)
 
 
 def shown_names(names: Sequence[str]) -> str:

@@ -242,7 +242,7 @@ def _show(robot: LocalRobot, closed: CloseState) -> None:
         echo(f"  not observed before: {process_text}; if it does not belong to the robot, stop it")
     for name in closed.new:
         why = "has ended" if name in closed.observed.ended else "new"
-        start = closed.observed.command_of_new(robot.export.absolute(), name)
+        start = closed.observed.command_of_new_process(robot.export.absolute(), name)
         echo(f"  {name}: {why}, start it with: {start}")
     if naming := _renaming_advice(closed, policy):
         echo(naming)

@@ -270,14 +270,14 @@ def fleet_policies(
     With ``robots``, only the enclaves of these robots are kept; each of these robots has to have
     one.
     """
-    from sros_tool.fleet.expansion import FleetPolicy, check_choice
+    from sros_tool.fleet.expansion import FleetPolicy, check_chosen_robots
     from sros_tool.fleet.fleet_file import read_fleet
     from sros_tool.policy.document import read_policy
 
     fleet = read_fleet(fleet_file)
     policies = [FleetPolicy(read_policy(file, placeholders=True), fleet, robots) for file in files]
     if robots:
-        check_choice(policies, fleet, robots)
+        check_chosen_robots(policies, fleet, robots)
     return policies
 
 

@@ -360,7 +360,7 @@ def explain(
             explanation = explain_on_zenoh(asked, question, why_zenoh, context, kind=kind)
         lines = _zenoh_lines(explanation)
     else:
-        from sros_tool.explain.vendors import Compared, explain_on_dds
+        from sros_tool.explain.vendors import ComparedDecisions, explain_on_dds
 
         if not (vendor or distro):
             distro = _stated_distribution(asked.enclave.keystore, asked.enclave.name)
@@ -368,7 +368,11 @@ def explain(
             _note_unknown_distribution()
         chosen = chosen_vendor(None if vendor == ZENOH else vendor, distro, os.environ)
         compared = (
-            Compared.VENDORS if all_vendors else Compared.DISTRIBUTIONS if all_distros else None
+            ComparedDecisions.VENDORS
+            if all_vendors
+            else ComparedDecisions.DISTRIBUTIONS
+            if all_distros
+            else None
         )
         explanation = explain_on_dds(asked, question, chosen, context, kind=kind, compared=compared)
         lines = _vendor_lines(explanation)
@@ -457,11 +461,11 @@ def _open_enclave(
     keystore: OpenedKeystore | None, name: str, policy: Path | None, asking: AskingContext
 ) -> AskedEnclave:
     """Open an enclave of a keystore, in a folder, or of a policy without a keystore."""
-    from sros_tool.explain.asking import is_enclave, open_to_ask
+    from sros_tool.explain.asking import is_enclave, open_asked_enclave
 
     if keystore is None and not policy and not is_enclave(Path(name)):
         keystore = _keystore_of_environment()
-    return open_to_ask(keystore, name, policy, asking)
+    return open_asked_enclave(keystore, name, policy, asking)
 
 
 def _keystore_of_environment() -> OpenedKeystore:
@@ -777,8 +781,8 @@ def _zenoh_lines(explanation: ZenohExplanation) -> Iterator[str]:
         yield _labeled_row("from", f"{_place_text(line.source)}: {line.stated}")
     if explanation.wants_rights:
         yield from _to_do_lines(stated)
-    if explanation.written:
-        yield _labeled_row("remedy", explanation.written)
+    if explanation.files_remedy:
+        yield _labeled_row("remedy", explanation.files_remedy)
 
 
 def _link_lines(answer: ZenohAnswer) -> Iterator[str]:
@@ -975,7 +979,7 @@ def _who_lines(
     operation only in some domains, its line names these domains.  ``asked_in`` says where the
     enclaves are: " in this export", or "".
     """
-    from sros_tool.fleet.robots import folded
+    from sros_tool.fleet.robots import folded_lines
 
     able = [outcome for outcome in answer.outcomes if outcome.allowed]
     in_part = [outcome for outcome in answer.outcomes if outcome.in_part]
@@ -999,7 +1003,7 @@ def _who_lines(
     stopped = [outcome for outcome in answer.outcomes if outcome.stopped]
     for outcome in stopped[:_MOST_SHOWN]:
         lines.append((outcome.enclave, f"  cannot start: {outcome.enclave}  {outcome.stopped}"))
-    yield from folded(fleet, lines)
+    yield from folded_lines(fleet, lines)
     if more := stopped[_MOST_SHOWN:]:
         yield f"  cannot start: {counted(len(more), 'more enclave')}"
     count = counted(len(answer.outcomes), "enclave")
@@ -1073,7 +1077,7 @@ def _followed_lines(followed: FollowedReach) -> Iterator[str]:
 
     The enclaves of a fleet are grouped by robot.
     """
-    from sros_tool.fleet.robots import folded
+    from sros_tool.fleet.robots import folded_lines
     from sros_tool.reach import path_text
 
     reach = followed.reach
@@ -1085,7 +1089,7 @@ def _followed_lines(followed: FollowedReach) -> Iterator[str]:
         yield f"{reach.enclave} {clause} {counted(len(paths), 'enclave')}{where}"
         in_order = sorted(paths.items(), key=lambda item: (len(item[1]), item[0]))
         lines = ((name, f"  {path_text(path)}") for name, path in in_order)
-        yield from folded(followed.fleet, lines)
+        yield from folded_lines(followed.fleet, lines)
 
 
 # ── --log ──────────────────────────────────────────────────────────────────────────────────

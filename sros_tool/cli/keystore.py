@@ -163,7 +163,7 @@ def create_permission(
     left_out = [
         name
         for name in for_fleet or ()
-        if for_fleet and (robot := for_fleet.stated(name)[1])
+        if for_fleet and (robot := for_fleet.stated_enclave(name)[1])
         if robot.name in robots and name not in chosen
     ]
     if left_out:

@@ -395,7 +395,7 @@ def enclave_lines(difference: SourcesDifference, fleet: Fleet | None) -> list[st
     Such an enclave is on one side only and has no rights there, has other ROS domains on the other
     side, or has unclear permissions.  Equal lines of robots are merged.
     """
-    from sros_tool.fleet.robots import folded
+    from sros_tool.fleet.robots import folded_lines
 
     sides = [
         [(pair.enclave, f"- {pair.enclave} in domain {pair.a}") for pair in difference.domains],
@@ -411,7 +411,7 @@ def enclave_lines(difference: SourcesDifference, fleet: Fleet | None) -> list[st
     ]
     unclear = "may be allowed or denied something else, as the notes say"
     sides.append([(name, f"? {name} {unclear}") for name in difference.unclear])
-    return [text for lines in sides for text in folded(fleet, lines)]
+    return [text for lines in sides for text in folded_lines(fleet, lines)]
 
 
 def unanswered_lines(difference: SourcesDifference, fleet: Fleet | None) -> Iterator[str]:
@@ -419,13 +419,13 @@ def unanswered_lines(difference: SourcesDifference, fleet: Fleet | None) -> Iter
 
     Lines that differ only in the robot are merged.
     """
-    from sros_tool.fleet.robots import folded
+    from sros_tool.fleet.robots import folded_lines
     from sros_tool.policy.rights import lost_counterpart_text
 
     lines = [
         (right.enclave, f"! {lost_counterpart_text(right)}") for right in difference.unanswered
     ]
-    yield from folded(fleet, lines)
+    yield from folded_lines(fleet, lines)
 
 
 def protection_lines(protections: Iterable[tuple[str, StatedProtection]]) -> list[str]:
@@ -446,7 +446,7 @@ def _difference_lines(
 
     ``first`` and ``second`` are the fleets of the two sides, ``sides`` their names.
     """
-    from sros_tool.fleet.robots import folded
+    from sros_tool.fleet.robots import folded_lines
 
     lines: list[tuple[str, str, str]] = []
     for sign, right in difference.lines():
@@ -459,7 +459,9 @@ def _difference_lines(
     return [
         text
         for side, fleet in fleets
-        for text in folded(fleet, [(name, text) for sign, name, text in lines if sign == side])
+        for text in folded_lines(
+            fleet, [(name, text) for sign, name, text in lines if sign == side]
+        )
     ]
 
 
@@ -913,9 +915,9 @@ def added_lines(base: AccessSource, head: AccessSource, growth: Growth) -> list[
 
 def _new_node_lines(head: AccessSource, nodes: Iterable[NewNode]) -> Iterator[str]:
     """Yield a line for each node that gets more rights in another enclave; robots share lines."""
-    from sros_tool.fleet.robots import folded
+    from sros_tool.fleet.robots import folded_lines
 
-    return folded(head.fleet, ((node.enclave, f"+ {_new_node_text(node)}") for node in nodes))
+    return folded_lines(head.fleet, ((node.enclave, f"+ {_new_node_text(node)}") for node in nodes))
 
 
 def _new_node_text(new: NewNode) -> str:
@@ -927,10 +929,10 @@ def _new_node_text(new: NewNode) -> str:
 
 def _renamed_lines(renamed: Mapping[str, str], fleet: Fleet | None) -> Iterator[str]:
     """Yield a line for each renamed enclave; equal lines of several robots are merged."""
-    from sros_tool.fleet.robots import folded
+    from sros_tool.fleet.robots import folded_lines
 
     lines = ((new, f"~ {_renamed_text(old, new)}") for old, new in sorted(renamed.items()))
-    return folded(fleet, lines)
+    return folded_lines(fleet, lines)
 
 
 def _renamed_text(old: str, new: str) -> str:
@@ -951,10 +953,10 @@ def _removed_lines(base: AccessSource, head: AccessSource, growth: Growth) -> li
 def _folded_gains(
     side: AccessSource, sign: str, gains: Iterable[Gain], growth: Growth
 ) -> list[str]:
-    from sros_tool.fleet.robots import folded
+    from sros_tool.fleet.robots import folded_lines
 
     lines = [(gain.enclaves[0], f"{sign} {_gain_text(sign, gain, growth)}") for gain in gains]
-    return list(folded(side.fleet, lines))
+    return list(folded_lines(side.fleet, lines))
 
 
 def _gain_text(sign: str, gain: Gain, growth: Growth) -> str:
@@ -984,7 +986,7 @@ def _gain_text(sign: str, gain: Gain, growth: Growth) -> str:
 
 
 def _reach_lines(head: AccessSource, reach: Sequence[NewReach]) -> list[str]:
-    from sros_tool.fleet.robots import folded
+    from sros_tool.fleet.robots import folded_lines
     from sros_tool.reach import path_text
 
     reached = [
@@ -994,7 +996,7 @@ def _reach_lines(head: AccessSource, reach: Sequence[NewReach]) -> list[str]:
         )
         for new_reach in reach
     ]
-    lines = list(folded(head.fleet, reached))
+    lines = list(folded_lines(head.fleet, reached))
     more = len(lines) - _MOST_NEW_LINES
     if more > 0:
         lines[_MOST_NEW_LINES:] = [
@@ -1005,13 +1007,13 @@ def _reach_lines(head: AccessSource, reach: Sequence[NewReach]) -> list[str]:
 
 def dropped_lines(head: AccessSource, dropped: Iterable[DroppedDenial]) -> list[str]:
     """Return a line for each DENY that is dropped or narrowed; lines of robots are merged."""
-    from sros_tool.fleet.robots import folded
+    from sros_tool.fleet.robots import folded_lines
 
     lines = (
         (denial.denial.enclave, f"! {denial.denial.enclave} {_dropped_text(denial)}")
         for denial in dropped
     )
-    return list(folded(head.fleet, lines))
+    return list(folded_lines(head.fleet, lines))
 
 
 def _dropped_text(dropped: DroppedDenial) -> str:

@@ -638,7 +638,7 @@ def _finding_line(finding: Finding) -> str:
 
 def _lines_of_changed_form(change: RightsChange) -> Iterator[str]:
     """Yield a line for each name that became absolute, or relative to its node's namespace."""
-    from sros_tool.fleet.robots import folded
+    from sros_tool.fleet.robots import folded_lines
     from sros_tool.policy.model import ALLOW
 
     made_absolute = "begins with / now, so that the namespace of its node does not apply"
@@ -649,7 +649,7 @@ def _lines_of_changed_form(change: RightsChange) -> Iterator[str]:
             denied = "" if right.qualifier is ALLOW else "DENY "
             text = f"~ {right.enclave} {denied}{right.describe()} {made}  ({source})"
             lines.append((right.enclave, text))
-        yield from folded(change.after.fleet, lines)
+        yield from folded_lines(change.after.fleet, lines)
 
 
 def _verdict(result: Review) -> str:

@@ -116,14 +116,14 @@ def undo(robot: LocalRobot, *, dry_run: bool) -> CloseState:
     policy = _readable_policy(robot)
     state = current_state(robot, policy)._replace(dry_run=dry_run, changes=changes)
     remaining = _RemainingProcesses(
-        RunningRobot(robot), observed.within(policy) if policy else observed
+        RunningRobot(robot), observed.limited_to(policy) if policy else observed
     )
     remaining.say_how_to_start()
     problems = [
         *remaining.commands_to_open(),
-        *(() if dry_run else remaining.secured_units()),
+        *(() if dry_run else remaining.secured_processes_of_units()),
         *(() if dry_run else _processes_not_open(running, started)),
-        *remaining.further_secured(),
+        *remaining.further_secured_processes(),
         *remaining.unknown_processes(),
     ]
     runs = any(process.pid or process.alike for process in state.observed.processes)
@@ -199,7 +199,7 @@ class _RemainingProcesses:
         for command, names in started_by.items():
             yield f"restart {enumerated([*names])} open: {command}"
 
-    def secured_units(self) -> Iterator[str]:
+    def secured_processes_of_units(self) -> Iterator[str]:
         """Yield the processes of units that run in enclaves though their units were restarted."""
         for process in self._observed.processes:
             if process.unit and process.enclave in self._secured:
@@ -236,7 +236,7 @@ class _RemainingProcesses:
             command = process.open_command(self._robot.domain)
             self._robot.shell.say(f"{process.enclave} {state}{start} open{under}: {command}")
 
-    def further_secured(self) -> Iterator[str]:
+    def further_secured_processes(self) -> Iterator[str]:
         """Yield a text for each process in an enclave that is not an observed process of it."""
         known = {process.enclave for process in self._observed.processes}
         for enclave in sorted(self._secured.keys() - known):

@@ -175,9 +175,10 @@ def ended_processes(
 ) -> list[ClosedProcess]:
     """Return the processes that ended while sros watched, with the nodes that they ran.
 
-    If an enclave had several commands, its processes are left out, because one of them may be
-    another program that took the node's name.  ``observed`` are the processes that still run; their
-    units are taken to have started none of the ended processes.
+    ``ran`` are the ended processes, with their origins. If an enclave had several commands, its
+    processes are left out, because one of them may be another program that took the node's
+    name.  ``observed`` are the processes that still run; their units are taken to have started none
+    of the ended processes.
     """
     origins = {process.pid: origin for process, origin in ran}
     units_in_use = observed.units

@@ -538,7 +538,7 @@ def _start_of_unknown_process(running: RunningRobot, state: CloseState) -> str:
     observed, export = state.observed, running.robot.export.absolute()
     if not (idle := sorted(state.stopped)):
         return ""
-    start = observed.command_of_new(export, "ENCLAVE")
+    start = observed.command_of_new_process(export, "ENCLAVE")
     if len(observed.unknown) == len(idle) == 1:
         for process in running.open_processes:
             known = secured_process(process, idle[0])
@@ -551,7 +551,7 @@ def _start_of_unknown_process(running: RunningRobot, state: CloseState) -> str:
 
 def _shared_program_problems(robot: LocalRobot) -> Iterator[str]:
     """Yield a text for each program whose processes would all run in one enclave."""
-    observed = robot.processes.within(read_policy(robot.policy))
+    observed = robot.processes.limited_to(read_policy(robot.policy))
     by_program: dict[tuple[str, ...], list[ClosedProcess]] = {}
     for process in observed.processes:
         names = sorted({process.enclave, *process.shares})

@@ -358,7 +358,7 @@ class ObservedProcesses(NamedTuple):
             brought=brought,
         )
 
-    def within(self, policy: Policy) -> ObservedProcesses:
+    def limited_to(self, policy: Policy) -> ObservedProcesses:
         """Return a copy without enclaves that the policy does not have any more."""
         names = {ROUTER, *(enclave.path for enclave in policy.enclaves)}
         return self._replace(
@@ -385,13 +385,13 @@ class ObservedProcesses(NamedTuple):
         }
         return sorted(nodes.difference(enclave.path for enclave in policy.enclaves))
 
-    def command_of_new(self, export: Path, enclave: str) -> str:
-        """Return the shell command for a process in an enclave without an observed process."""
+    def command_of_new_process(self, export: Path, enclave: str) -> str:
+        """Return a shell command that starts a new process, written as COMMAND, in an enclave."""
         rmw = next((process.rmw for process in self.processes if process.rmw), "")
         return f"{shlex.join(run_words(export, enclave, rmw))} COMMAND"
 
-    def started_in(self, process: ClosedProcess) -> str:
-        """Return the enclave in which the command of a process is started.
+    def start_enclave(self, process: ClosedProcess) -> str:
+        """Return the enclave in which the command of a process has to be started.
 
         This enclave differs from the enclave of the process if the program itself chooses the
         enclave in which its process runs.
@@ -414,7 +414,7 @@ class ObservedProcesses(NamedTuple):
         commands: dict[str, list[ClosedProcess]] = {}
         for process in sorted(self.processes, key=lambda process: process.enclave != ROUTER):
             if not process.unit:
-                started = process._replace(enclave=self.started_in(process))
+                started = process._replace(enclave=self.start_enclave(process))
                 command = started.secured_command(folder, launches.get(tuple(process.launch), ""))
                 commands.setdefault(command, []).append(process)
         return commands

@@ -485,7 +485,7 @@ def _why_missing(running: RunningRobot, missing: Sequence[str], observed: Observ
     if may_end := [name for name in absent if name not in {*has_start, *robot.without}]:
         options = ", ".join(f"--without {name}" for name in may_end)
         advice += f". For a process that does not always run, add its option: {options}"
-    if absent and (in_other_domains := running.in_other_domains()):
+    if absent and (in_other_domains := running.other_domains_text()):
         advice += f". Also {in_other_domains}"
     for why in dict.fromkeys(why for processes in outdated.values() for _, why in processes):
         pids = {

@@ -89,6 +89,8 @@ class Shell(NamedTuple):
 class LocalRobot:
     """The robot of this machine, with the folder into which it is closed.
 
+    ``without``, ``elsewhere``, ``here`` and ``brought`` are the enclaves that these options name.
+
     Raises:
         SrosError: other users can change the files in the folder, which say what systemd starts; or
             a file in the folder is broken.

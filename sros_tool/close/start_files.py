@@ -42,8 +42,8 @@ def write_start_files(robot: LocalRobot, state: CloseState) -> list[FileChange]:
     }
     for process in observed.processes:
         if process.unit:
-            variables = environments[observed.started_in(process)]
-            files[f"units/{process.unit}.d/{DROP_IN}"] = _drop_in(robot, process, variables)
+            variables = environments[observed.start_enclave(process)]
+            files[f"units/{process.unit}.d/{DROP_IN}"] = _drop_in_text(robot, process, variables)
     files[robot.commands_file.name] = _commands_text(robot, state)
     files[COMPOSE_FILE] = _compose_text(robot, observed, environments)
     changes = unit_changes(robot.start, files, force=True)
@@ -66,7 +66,7 @@ def _remove_environments(robot: LocalRobot, kept: Collection[str]) -> list[FileC
     return [FileChange("remove", str(path)) for path in unneeded]
 
 
-def _drop_in(robot: LocalRobot, process: ClosedProcess, variables: Mapping[str, str]) -> str:
+def _drop_in_text(robot: LocalRobot, process: ClosedProcess, variables: Mapping[str, str]) -> str:
     """Return the drop-in of the unit that starts a process."""
     text = render_environment(variables, "systemd")
     if process.lacks_enclave_argument:
@@ -84,7 +84,7 @@ def _compose_text(
     services = []
     for process in observed.processes:
         files = str(robot.export.absolute() / "enclaves" / process.enclave.strip("/"))
-        variables = environments[observed.started_in(process)]
+        variables = environments[observed.start_enclave(process)]
         container = Container(process.enclave, object_name(process.enclave), variables, files)
         services += render_container(container, COMPOSE).splitlines()[1:]
     heading = (
@@ -115,14 +115,14 @@ def _commands_text(robot: LocalRobot, state: CloseState) -> str:
         lines = [f"# Stop each of these processes, and start it {place}", together]
     if not state.secured:
         lines = [*map(_warning_of_rmw, robot.rmws_without_security()), *lines]
-    lines = [*lines, *_commands(due, folder, state.denied_remappings)] if due else []
+    lines = [*lines, *_command_lines(due, folder, state.denied_remappings)] if due else []
     for name in state.new:
-        start = state.observed.command_of_new(robot.export.absolute(), name)
+        start = state.observed.command_of_new_process(robot.export.absolute(), name)
         why = "has ended" if name in state.observed.ended else "is new"
         lines += ["", f"# {name} {why}: COMMAND is what starts it", start]
     if rest:
         lines += ["", "# These processes run closed, with the current files."]
-    lines += _commands(rest, folder, state.denied_remappings)
+    lines += _command_lines(rest, folder, state.denied_remappings)
     lines += _commands_elsewhere(state.observed.moved)
     if shutil.which("ros2", path=robot.shell.environment.get("PATH")):
         launch = shlex.join(launch_words(folder, ("ros2", "launch"), ("PACKAGE", "FILE")))
@@ -135,7 +135,7 @@ def _warning_of_rmw(rmw: str) -> str:
     return f"# NOT YET: {no_security_text(rmw)}. First find an RMW that enforces it: sros doctor"
 
 
-def _commands(
+def _command_lines(
     by_hand: Mapping[str, Sequence[ClosedProcess]],
     folder: Path,
     denied_remappings: Mapping[str, Sequence[str]],

@@ -228,7 +228,7 @@ class RunningRobot:
             if count[name, fitting] > (len(fitting) if known else 1):
                 yield each
 
-    def with_other_files(self, observed: ObservedProcesses) -> Sequence[str]:
+    def enclaves_with_other_files(self, observed: ObservedProcesses) -> Sequence[str]:
         """Return the enclaves whose process runs secured, but with no files of the export."""
         own = {process.pid for process, _ in self.secured}
         others = [
@@ -270,7 +270,7 @@ class RunningRobot:
         ]
         return observed._replace(processes=[*as_started, *later])
 
-    def in_other_domains(self) -> str:
+    def other_domains_text(self) -> str:
         """Return the processes of other ROS domains, with the commands that close them, or ""."""
         robot, domains = self.robot, dict[str, list[str]]()
         for process in self.processes.processes:
@@ -502,7 +502,7 @@ def current_state(robot: LocalRobot, policy: Policy | None) -> CloseState:
     if robot.observed:
         observed = running.with_later_processes(robot.observed)
         observed = observed.with_current_pids(running.processes, robot.export)
-    observed = observed.within(policy) if policy else observed
+    observed = observed.limited_to(policy) if policy else observed
     absent = {
         process.enclave for process in observed.processes if process.is_absent(running.processes)
     }
@@ -536,7 +536,7 @@ def current_state(robot: LocalRobot, policy: Policy | None) -> CloseState:
         observed=observed,
         steps=(),
         secured=secured,
-        other_files=running.with_other_files(observed),
+        other_files=running.enclaves_with_other_files(observed),
         outdated={name: processes[-1][1] for name, processes in outdated.items()},
         outdated_pids={
             name: [*dict.fromkeys(process.program[0] for process, _ in processes)]
@@ -550,10 +550,10 @@ def current_state(robot: LocalRobot, policy: Policy | None) -> CloseState:
             name: changed for name, changed in changed_at.items() if name not in brought
         },
         brought=brought,
-        expired_elsewhere=(expired := _expired(robot, changed_at)),
+        expired_elsewhere=(expired := _expired_enclaves(robot, changed_at)),
         earlier_elsewhere=_earlier_files_until(robot, expired),
         valid_until=(until := _valid_until(robot)),
-        expires_soon=_expiring(robot) if until else (),
+        expires_soon=_expiring_enclaves(robot) if until else (),
         denied=(),
         newly_denied=(),
         denied_remappings={},
@@ -581,13 +581,13 @@ def _expiries(robot: LocalRobot, root: Path, names: Iterable[str]) -> Mapping[st
     }
 
 
-def _expired(robot: LocalRobot, names: Iterable[str]) -> Mapping[str, datetime]:
+def _expired_enclaves(robot: LocalRobot, names: Iterable[str]) -> Mapping[str, datetime]:
     """Map the named enclaves of the keystore that have expired to their expiry."""
     now, expiries = robot.shell.now(), _expiries(robot, robot.keystore, names)
     return {name: expiry for name, expiry in expiries.items() if expiry and expiry < now}
 
 
-def _expiring(robot: LocalRobot) -> Sequence[str]:
+def _expiring_enclaves(robot: LocalRobot) -> Sequence[str]:
     """Return the enclaves of the export that expire soon, as `sros renew` decides."""
     lifetimes, _ = survey(OpenedKeystore(robot.export))
     now = robot.shell.now()
@@ -595,7 +595,7 @@ def _expiring(robot: LocalRobot) -> Sequence[str]:
 
 
 def _earlier_files_until(robot: LocalRobot, names: Collection[str]) -> Mapping[str, datetime]:
-    """Map those of the named enclaves whose earlier files still work to the moment they expire."""
+    """Map each named enclave with earlier files that still work to the expiry of these files."""
     if not names:
         return {}
     issued, now = IssuedEarlier(OpenedKeystore(robot.keystore), names), robot.shell.now()

@@ -94,7 +94,7 @@ def watch(robot: LocalRobot, words: Sequence[str]) -> list[str]:
         status, document, _ = robot.shell.run(words, True)
     running = RunningRobot(robot)
     if status:
-        others = running.in_other_domains()
+        others = running.other_domains_text()
         raise UnavailableError(
             f"there is no robot to close: no node was observed in domain {robot.domain}",
             f"{others}." if others else "",
@@ -117,7 +117,7 @@ def watch(robot: LocalRobot, words: Sequence[str]) -> list[str]:
             "at the end, or could not be read in time; when the whole robot runs, watch again: "
             f"{robot.close_command} --for 5m"
         )
-    if others := running.in_other_domains():
+    if others := running.other_domains_text():
         robot.shell.say(others)
     if os.path.lexists(robot.observed_policy):  # a file of an earlier watch
         remove_file(robot.observed_policy)

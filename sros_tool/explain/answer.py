@@ -128,8 +128,8 @@ class Question(NamedTuple):
         )
         return (*published, *read)
 
-    def allowed(self, enclave: str) -> Right:
-        """Return the right of an enclave that allows the access."""
+    def needed_right(self, enclave: str) -> Right:
+        """Return the right that an enclave needs for the access."""
         return Right(enclave, ALLOW, self.right, self.name)
 
     def __str__(self) -> str:
@@ -181,7 +181,7 @@ def ask(word: str, name: str = "", kind: str | None = None) -> Question:
 _WORDS_FOR_ACTIONS = {"call": "call", "serve": "execute"}
 
 
-def about_action(question: Question, rights: Iterable[Right]) -> Question | None:
+def question_about_action(question: Question, rights: Iterable[Right]) -> Question | None:
     """Return the question about an action with the same name, if rights show such an action.
 
     "call" and "serve" are for services and actions, whose names look the same.  Returns None if
@@ -765,7 +765,7 @@ class Evaluator:
         return next((r for r in rules if self.context.domain in r.domains.closed()), None)
 
     def _first_expiry(self) -> tuple[str, datetime | None]:
-        """Return the file of the enclave that expires first, and its expiry."""
+        """Return the enclave's file that expires first, and its expiry; or ("", None)."""
         expiries = list(self.enclave.expiries())
         access, permissions = self.access, self._participant.permissions
         if permissions and access:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import parse_permissions
 from sros_tool.errors import KeystoreError, Note, PolicyError, SrosError
-from sros_tool.explain.answer import Evaluator, Question, about_action, ask
+from sros_tool.explain.answer import Evaluator, Question, ask, question_about_action
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     PERMISSIONS_FILE,
@@ -156,7 +156,7 @@ def is_enclave(folder: Path) -> bool:
     return any((folder / name).exists() for name in (CERTIFICATE_FILE, PERMISSIONS_FILE))
 
 
-def open_to_ask(
+def open_asked_enclave(
     keystore: OpenedKeystore | None, name: str, policy_file: Path | None, asking: AskingContext
 ) -> AskedEnclave:
     """Return an enclave to ask about: of a keystore, in a folder ``name``, or only of a policy.
@@ -317,7 +317,7 @@ def _action_meant(
     rights = set(grant_rights(evaluator.enclave.name, answer.grant)) if answer.grant else set()
     if not answer.allowed:
         rights.update(read_other_rights())
-    return about_action(question, rights)
+    return question_about_action(question, rights)
 
 
 def notes_on_question_about_action(question: Question, action: Question) -> tuple[Note, ...]:
@@ -372,7 +372,7 @@ def question_meant(
 
 
 @shows("enclave", "question", "domain", "at", "time_zone")
-class Asked(NamedTuple):
+class AskedQuestion(NamedTuple):
     """The question, with its enclave, domain and time."""
 
     enclave: str

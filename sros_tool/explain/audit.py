@@ -131,8 +131,9 @@ def _matches_node_name(node: str, name: str) -> bool:
 
 @dataclass(frozen=True)
 class AuditedEnclaves:
-    """The enclaves of a policy or keystore (``what``); ``load`` loads an enclave by its name.
+    """The enclaves of a policy or keystore; ``load`` loads an enclave by its name.
 
+    ``what`` is "policy" or "keystore".
     With ``zenoh``, the Zenoh files of ``keystore`` decide, and not the permissions.
     """
 
@@ -456,7 +457,7 @@ def audit(observation: Observation, enclaves: AuditedEnclaves, observer: str = "
     if without_enclave:
         for node in enclave_per_node(make_observation(without_enclave)).observation.nodes:
             judged.append(node)
-            denied += _without_enclave(node, enclaves.what)
+            denied += _rights_without_enclave(node, enclaves.what)
     if divided:
         notes.append(
             Note(
@@ -537,7 +538,7 @@ def _unjudged_notes(observation: Observation) -> list[tuple[Note, str]]:
     ]
 
 
-def notes_on_ended(nodes: Iterable[str]) -> tuple[Note, ...]:
+def notes_on_ended_nodes(nodes: Iterable[str]) -> tuple[Note, ...]:
     """Return a note on nodes, by full name, that ended while the graph was observed."""
     note = _note("ended", _ENDED_TEXT, (n for n in nodes if not is_tool_name(_base_name(n))))
     return (note,) if note else ()
@@ -673,7 +674,7 @@ def _endpoints(right: str, name: str) -> tuple[Endpoint, ...]:
     )
 
 
-def _without_enclave(node: ObservedNode, source: str) -> Iterator[DeniedRight]:
+def _rights_without_enclave(node: ObservedNode, source: str) -> Iterator[DeniedRight]:
     reason = f"the {source} has no enclave for this node"
     for enclave in node.enclaves:
         for right, needed in _rights_of(node, enclave):

@@ -76,19 +76,19 @@ def note_on_earlier_permissions(
         text = (
             f"the rights in earlier permissions of {names} are not known here: they were signed "
             "from an earlier policy. Whoever kept these permissions and the key has the rights "
-            f"until {max(unknown.values())}. {_end_of_rights(keystore, unknown)}"
+            f"until {max(unknown.values())}. {_remedy_to_end_rights(keystore, unknown)}"
         )
         yield Note("explain.earlier-permissions", text)
     if same:
         names = first_few(sorted(same), _MOST_NAMED)
         text = (
             f"the present files of {names} do not work, but whoever kept earlier files may still "
-            f"do it until {max(same.values())}. {_end_of_rights(keystore, same)}"
+            f"do it until {max(same.values())}. {_remedy_to_end_rights(keystore, same)}"
         )
         yield Note("explain.earlier-permissions", text)
 
 
-def _end_of_rights(keystore: OpenedKeystore, names: Collection[str]) -> str:
+def _remedy_to_end_rights(keystore: OpenedKeystore, names: Collection[str]) -> str:
     listed = " ".join(quote(name) for name in sorted(names))
     which = listed if len(names) <= _MOST_NAMED else "ENCLAVE..."
     return f"To end this, run `sros renew {quote(str(keystore.root))} {which} --revoke-old`."
@@ -135,7 +135,7 @@ def note_on_revoked_enclaves(
             return
         if gaps := keystore.ledger_with("what", "revocation").gaps:
             yield _note_on_unknown_answer(keystore, kind, f"{LEDGER}: {first_few(gaps, 1)}")
-        revoked = tuple(_revoked_with_right(keystore, question, vendor, asking))
+        revoked = tuple(_revoked_enclaves_with_right(keystore, question, vendor, asking))
         removed = removed_enclaves(keystore, asking.at)
     except SrosError as error:
         yield _note_on_unknown_answer(keystore, kind, error.what, error.remedy)
@@ -189,7 +189,7 @@ class _RevokedEnclave(NamedTuple):
     until: str
 
 
-def _revoked_with_right(
+def _revoked_enclaves_with_right(
     keystore: OpenedKeystore, question: Question, vendor: Vendor | None, asking: AskingContext
 ) -> Iterator[_RevokedEnclave]:
     """Yield the enclaves whose revoked certificates may have a right."""

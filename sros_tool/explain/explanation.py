@@ -229,7 +229,10 @@ def _is_rotating(keystore: Path) -> bool:
 
 
 def _is_latest(keystore: Path, enclave: str) -> bool:
-    """Return whether an enclave has the permissions that the ledger records as signed last."""
+    """Return whether an enclave has the permissions that the ledger records as signed last.
+
+    True if this is not known.
+    """
     from sros_tool.keystore.reader import OpenedKeystore
 
     try:
@@ -425,7 +428,7 @@ def remapping_clause(name: str, meant: str) -> str:
 
 
 def meaning_of_other_kind(right: Right, named: Iterable[Right]) -> str:
-    """Return a clause if ``named`` has a service as an action, or the reverse; otherwise ""."""
+    """Return a clause if ``named`` has a service as an action, or an action as a service; or ""."""
     for other in named:
         if other.name == right.name and {other.kind, right.kind} == {"services", "actions"}:
             kind = "an action" if other.kind == "actions" else "a service"

@@ -206,11 +206,13 @@ def explain_log(
     findings = [
         finding
         for hits in grouped_hits(lines, reported)
-        if (finding := examiner.message(hits)) is not None
+        if (finding := examiner.message_finding(hits)) is not None
     ]
     lacking = examiner.missing_namespaces(denied)
     findings += [
-        examiner.denial(denial, naming[denial], lacking.get((denial.process, denial.enclave), ""))
+        examiner.denial_finding(
+            denial, naming[denial], lacking.get((denial.process, denial.enclave), "")
+        )
         for denial in denied
     ]
     own_enclave = find("")

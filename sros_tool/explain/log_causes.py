@@ -136,7 +136,7 @@ class Examiner:
         return frozenset(os.path.realpath(line["folder"]) for line in named)
 
     def _as_started(self, enclave: LoadedEnclave | None) -> LoadedEnclave | None:
-        """Return an enclave as the process started in it.
+        """Return the enclave; a missing key counts if a process of the log started in its folder.
 
         A folder without any keys may be a copy of the robot's folder.  If the log names this very
         folder, it is no copy, and the missing key counts.
@@ -158,7 +158,7 @@ class Examiner:
             return RAN_OPEN
         return UNNOTICED_FAULT if problems else None
 
-    def message(self, hits: list[LogHit]) -> LogFinding | None:
+    def message_finding(self, hits: list[LogHit]) -> LogFinding | None:
         """Return the finding for a group of equal messages; None if they show no problem."""
         named = self._as_started(self._find(hits[0].enclave))
         meaning = self._meaning(hits[0], named)
@@ -203,7 +203,7 @@ class Examiner:
         remedies = list(dict.fromkeys(remedy for _, remedy in causes if remedy))
         remedies += [remedy_of] * (meaning in STARTS)
         remedy = self._with_names(meaning.remedy_without_fault, enclave, first)
-        nothing_found = f"{remedy} {_nothing_found(enclave)}".lstrip()
+        nothing_found = f"{remedy} {_nothing_found_text(enclave)}".lstrip()
         return replace(
             plain,
             enclave=enclave.name,
@@ -268,7 +268,7 @@ class Examiner:
             hit.fields["participant"] for hit in hits if hit.fields.get("participant")
         )
         names = (
-            [self._keystore.peer(peer) for peer in islice(shown, _MAX_PEERS)]
+            [self._keystore.enclave_of_peer(peer) for peer in islice(shown, _MAX_PEERS)]
             if self._keystore
             else []
         )
@@ -329,7 +329,9 @@ class Examiner:
         )
         return then.allowed and not now.allowed
 
-    def denial(self, denial: Denial, named: list[tuple[int, str]], ns: str = "") -> LogFinding:
+    def denial_finding(
+        self, denial: Denial, named: list[tuple[int, str]], ns: str = ""
+    ) -> LogFinding:
         """Return the finding for a denied topic; ``named`` are the lines that name the topic.
 
         ``ns`` is the namespace that is missing in all names of the process, or "".
@@ -356,7 +358,7 @@ class Examiner:
             denial.process,
             denial.enclave,
             f"{who} may not {right} {denied}: {by}",
-            self._how_to_ask(denial, name),
+            self._commands_to_ask(denial, name),
         )
         if enclave is None:
             return finding
@@ -398,7 +400,7 @@ class Examiner:
             other, better = self._other_node_cause(denial, answer)
             if not other:
                 other, better = self._similar_name_cause(denial, name, enclave, finding.remedy)
-            asked = [question.allowed(enclave.name) for question in _questions_to_ask(denial)]
+            asked = [question.needed_right(enclave.name) for question in _questions_to_ask(denial)]
             if likely := self._policy.likely_namespace(asked[0]) if self._policy and asked else "":
                 other = [f"in the namespace {likely}, the policy allows it"]
                 better = (
@@ -487,7 +489,7 @@ class Examiner:
             return [], ""
         (question,) = questions
         asked = self._answer(enclave, denial.vendor, question)
-        denied = question.allowed(enclave.name)
+        denied = question.needed_right(enclave.name)
         if other := meaning_of_other_kind(denied, named_rights(asked)):
             return [f"{other}, but {name} is {with_article(question.type)}"], ""
         is_used = self._keystore.has_other_side(denied) if self._keystore else None
@@ -532,7 +534,7 @@ class Examiner:
                 f"Otherwise, {remedy}"
             )
         if is_used is False and self._keystore:
-            place = self._keystore.place
+            place = self._keystore.kind
             return [f"no enclave of the {place} may {PEER_RIGHT[denied.right]} {name}"], (
                 f"{remedy} Or, if another name is meant, the node lacks a remapping, or has a "
                 "wrong one: compare its start command with the command in the robot's launch files "
@@ -550,7 +552,7 @@ class Examiner:
                 return right.name
         return ""
 
-    def _how_to_ask(self, denial: Denial, name: str) -> str:
+    def _commands_to_ask(self, denial: Denial, name: str) -> str:
         """Return the commands that show which rights a policy lacks for a denied topic."""
         root, enclave = self._root or "KEYSTORE", denial.enclave or "ENCLAVE"
         asked, advice = self._policy.file if self._policy else root, ""
@@ -620,8 +622,10 @@ class Examiner:
     def _causes(
         self, enclave: LoadedEnclave, answer: Answer, faults: tuple[Fault, ...]
     ) -> Iterator[tuple[str, str]]:
-        """Yield faults in ``faults`` with remedies; if there are none, all faults of the
-        enclave.
+        """Yield the enclave's faults that are in ``faults``, with remedies.
+
+        If there are none, yield all faults of the enclave; without any fault, the reason of a
+        denial.
         """
         fitting = [problem for problem in answer.problems if problem.fault in faults]
         for problem in fitting or answer.problems:
@@ -802,7 +806,7 @@ def _listed_nodes(nodes: Sequence[str]) -> str:
     return f"the node{'s' * (len(nodes) > 1)} {', '.join(nodes)}"
 
 
-def _nothing_found(enclave: LoadedEnclave) -> str:
+def _nothing_found_text(enclave: LoadedEnclave) -> str:
     return (
         f"Enclave {enclave.name} now has no fault that would explain the message: "
         "check the files on the robot itself, its clock and its time zone."

@@ -35,8 +35,8 @@ class SearchedKeystore:
     def __init__(self, keystore: OpenedKeystore) -> None:
         self._keystore = keystore
 
-    def peer(self, guid: str) -> str:
-        """Return the enclave of a participant by its GUID, as a vendor prints it, or ""."""
+    def enclave_of_peer(self, guid: str) -> str:
+        """Return the enclave of the participant with a GUID, as a vendor prints the GUID, or ""."""
         identity = guid.replace(".", "")
         if ":" in guid:
             identity = "".join(word.zfill(8) for word in guid.split(":"))
@@ -103,8 +103,8 @@ class SearchedKeystore:
         return None
 
     @property
-    def place(self) -> str:
-        """A word for the source of the enclaves: keystore or export."""
+    def kind(self) -> str:
+        """The kind of the source: "keystore", or "export" if enclaves may be missing."""
         is_whole = self._rights is not None and self._rights.scope is None
         return "keystore" if is_whole else "export"
 

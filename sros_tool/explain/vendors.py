@@ -24,8 +24,8 @@ from sros_tool.explain.answer import (
     text_of_parts,
 )
 from sros_tool.explain.asking import (
-    Asked,
     AskedEnclave,
+    AskedQuestion,
     AskingContext,
     ZenohInBrief,
     domains_decided_alike,
@@ -83,7 +83,7 @@ class ZenohNextToDds(NamedTuple):
 class VendorExplanation(NamedTuple):
     """The decision of one DDS vendor."""
 
-    asked: Asked
+    asked: AskedQuestion
     answer: Answer
     vendor_why: str
     """Reason for the choice of this vendor."""
@@ -150,7 +150,7 @@ class Comparison(NamedTuple):
     ``allowed`` is the decision of the chosen vendor.
     """
 
-    asked: Asked
+    asked: AskedQuestion
     vendors: Sequence[Answer] | None
     """The decision of each vendor; present only with ``--all-vendors``."""
     distributions: Sequence[DistributionAnswer] | None
@@ -178,8 +178,8 @@ class Comparison(NamedTuple):
 DdsExplanation = VendorExplanation | Comparison
 
 
-class Compared(Enum):
-    """The decisions to compare: of all vendors, or of all distributions."""
+class ComparedDecisions(Enum):
+    """Whose decisions are compared: those of all vendors, or of all distributions."""
 
     VENDORS = auto()
     DISTRIBUTIONS = auto()
@@ -192,7 +192,7 @@ def explain_on_dds(
     context: JoinContext,
     *,
     kind: str | None = None,
-    compared: Compared | None = None,
+    compared: ComparedDecisions | None = None,
 ) -> DdsExplanation:
     """Return the decision of the chosen vendor, or of all vendors or distributions.
 
@@ -226,12 +226,12 @@ def explain_on_dds(
         *_earlier_permissions_notes(answer, context),
         *_note_on_anybody([_access_without_identity(evaluator, question)], refuse),
     )
-    asked = Asked(enclave.name, question, context)
-    if compared is Compared.VENDORS:
+    asked = AskedQuestion(enclave.name, question, context)
+    if compared is ComparedDecisions.VENDORS:
         evaluators = {v: Evaluator(v, enclave, context) for v in Vendor if v is not vendor}
         answers = [answer if v is vendor else explain(evaluators[v], question) for v in Vendor]
         return Comparison(asked, answers, None, beside, answer.allowed, notes)
-    if compared is Compared.DISTRIBUTIONS:
+    if compared is ComparedDecisions.DISTRIBUTIONS:
         deciding = {v for distribution in SUPPORTED for v in distribution.vendors}
         by_vendor = {v: Evaluator(v, enclave, context).answer(question) for v in deciding}
         by_distribution = [

@@ -13,7 +13,7 @@ from sros_tool.dds.decision.vendors import CYCLONE_DDS, TESTED
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import Governance
 from sros_tool.errors import KeystoreError, Note, SrosError
-from sros_tool.explain.answer import Question, about_action, ask
+from sros_tool.explain.answer import Question, ask, question_about_action
 from sros_tool.explain.asking import notes_on_question_about_action
 from sros_tool.faults import REFUSE_STRANGERS
 from sros_tool.fleet.robots import Fleet
@@ -148,7 +148,7 @@ def answer_for_all(decider: Decider, question: Question, kind: str | None) -> An
     unclear = all(outcome.wildcard for outcome in outcomes if outcome.allowed)
     if not kind and unclear and question.type == "service":
         rights = decider.rights_naming(question.name)
-        if action := about_action(question, rights):
+        if action := question_about_action(question, rights):
             taken = notes_on_question_about_action(question, action)
             question, outcomes = action, decider.outcomes(action)
     return AnswerForAll(question, outcomes, (*taken, *decider.notes(question, outcomes)))

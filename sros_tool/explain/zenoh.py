@@ -30,8 +30,8 @@ from sros_tool.explain.answer import (
     text_of_parts,
 )
 from sros_tool.explain.asking import (
-    Asked,
     AskedEnclave,
+    AskedQuestion,
     AskingContext,
     ZenohInBrief,
     note_on_action,
@@ -1003,7 +1003,7 @@ class ZenohExplanation(NamedTuple):
     ``stated`` is the decision by the signed permissions, from which these files are made.
     """
 
-    asked: Asked
+    asked: AskedQuestion
     vendor_why: str
     """Reason for the choice of Zenoh."""
     answer: ZenohAnswer
@@ -1050,10 +1050,10 @@ class ZenohExplanation(NamedTuple):
     @property
     def remedy(self) -> str:
         """What to do if no change of the policy helps, or null."""
-        return self.written or (self.stated.remedy if self.wants_rights else "")
+        return self.files_remedy or (self.stated.remedy if self.wants_rights else "")
 
     @property
-    def written(self) -> str:
+    def files_remedy(self) -> str:
         """What to do if the Zenoh files do not match the permissions, or ""."""
         if self.answer.of_router:
             return "" if self.allowed else "Give the node an enclave of its own."
@@ -1122,7 +1122,7 @@ def explain_on_zenoh(
         *(() if answer.allowed else note_on_action(question, kind, decide)),
         *(() if joins else note_on_lacking_keys(keystore)),
     )
-    asked = Asked(enclave.name, question, context)
+    asked = AskedQuestion(enclave.name, question, context)
     return ZenohExplanation(asked, why, answer, outdated, by_permissions, keystore, notes)
 
 

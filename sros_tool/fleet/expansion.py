@@ -97,16 +97,19 @@ class FleetPolicy(Mapping[str, Enclave]):
     def __len__(self) -> int:
         return len(self._of)
 
-    def stated(self, path: str) -> tuple[Enclave, Robot | None]:
-        """Return the enclave, with placeholders, that a path comes from, and the path's robot."""
+    def stated_enclave(self, path: str) -> tuple[Enclave, Robot | None]:
+        """Return the policy's enclave, with placeholders, for a path, and the robot of the path.
+
+        The robot is None for a path that the policy states without a placeholder.
+        """
         return self._of[path]
 
-    def without_robot(self) -> list[str]:
+    def paths_without_robot(self) -> list[str]:
         """Return the paths that the policy states without a placeholder."""
         return [e.path for e in self._policy.enclaves if not has_placeholder(e.path)]
 
     def policy(self) -> Policy:
-        """Return the policy with all enclaves expanded; raise `PolicyError` without an enclave."""
+        """Return the policy with all enclaves expanded; raise `PolicyError` if there are none."""
         if not self._of:
             raise PolicyError(f"'{self._policy.file}': the policy has no enclave for this fleet")
         return replace(self._policy, enclaves=tuple(self.values()))
@@ -193,7 +196,10 @@ class FleetPolicy(Mapping[str, Enclave]):
         return replace(group, names=tuple(names), lines=tuple(lines))
 
     def _filled_names(self, name: str, written: str, source: Source) -> tuple[str, ...]:
-        """Return the different names that a name expands to: one name, or one for each robot."""
+        """Return the different names that a name expands to: one name, or one for each robot.
+
+        ``written`` is the name as the policy states it, before a robot was filled in.
+        """
         if not has_placeholder(name):
             if name != written and (problem := _name_problem(name)):
                 raise _invalid_name_error(name, problem, source)
@@ -202,12 +208,12 @@ class FleetPolicy(Mapping[str, Enclave]):
         names = self._names.get(key)
         if names is None:
             parts = parts_of(name)
-            names = tuple(dict.fromkeys(self._robots_for_name(parts, source)))
+            names = tuple(dict.fromkeys(self._names_for_robots(parts, source)))
             if name == written:  # without a placeholder, a name is the same for all robots
                 self._names[key] = names
         return names
 
-    def _robots_for_name(self, parts: Parts, source: Source) -> Iterator[str]:
+    def _names_for_robots(self, parts: Parts, source: Source) -> Iterator[str]:
         for robot in self._group_members(placeholders_of(parts)[0].group, source):
             name = "".join(map(str, fill(parts, robot.name, robot.namespace, plural=True)))
             if problem := _name_problem(name):
@@ -215,14 +221,16 @@ class FleetPolicy(Mapping[str, Enclave]):
             yield name
 
 
-def check_choice(policies: Sequence[FleetPolicy], fleet: Fleet, robots: Collection[str]) -> None:
+def check_chosen_robots(
+    policies: Sequence[FleetPolicy], fleet: Fleet, robots: Collection[str]
+) -> None:
     """Raise `PolicyError` if the policies lack a chosen robot, or some of its enclaves.
 
     ``policies`` are all policies of the fleet, expanded only for the chosen ``robots``.
     """
-    owners = {policy.stated(path)[1] for policy in policies for path in policy}
+    owners = {policy.stated_enclave(path)[1] for policy in policies for path in policy}
     patterns = [pattern for policy in policies for pattern in policy.patterns]
-    written = [path for policy in policies for path in policy.without_robot()]
+    written = [path for policy in policies for path in policy.paths_without_robot()]
     lost = unrecorded_enclaves(fleet.with_enclaves(patterns), written, robots)
     for name, (below, naming) in lost.items():
         has_enclave = fleet.robots[name] in owners
@@ -347,9 +355,11 @@ def unobserved_robots(policy: FleetPolicy, observed: Iterable[Right]) -> dict[st
     """
     observed_rights = _rights_by_enclave(observed)
     missing: dict[str, list[str]] = defaultdict(list)
-    stated_enclaves = {policy.stated(path)[0].path for path in observed_rights if path in policy}
+    stated_enclaves = {
+        policy.stated_enclave(path)[0].path for path in observed_rights if path in policy
+    }
     for path in policy:
-        enclave, robot = policy.stated(path)
+        enclave, robot = policy.stated_enclave(path)
         if robot and enclave.path in stated_enclaves and path not in observed_rights:
             missing[enclave.path].append(robot.name)
     return missing
@@ -365,7 +375,7 @@ def check_narrowed(policy: FleetPolicy, result: MinimizedPolicy, observed: Itera
     observed_rights = _rights_by_enclave(observed)
     replaced = {use.enclave for use in result.uses if use.wildcards}
     for path in policy:
-        if path not in observed_rights and policy.stated(path)[0].path not in replaced:
+        if path not in observed_rights and policy.stated_enclave(path)[0].path not in replaced:
             continue
         allowed, narrowed = (policy_rights(Policy((side[path],))) for side in (policy, after))
         before, now = Rules(allowed), Rules(narrowed)
@@ -400,13 +410,13 @@ def _rights_as_stated(policy: FleetPolicy, path: str, observed: Iterable[Right])
 
     A right to an action is yielded as rights to its parts.
     """
-    enclave, robot = policy.stated(path)
+    enclave, robot = policy.stated_enclave(path)
     policy[path]  # raises an error if there are too many names
     rights = policy_rights(with_absolute_names(Policy((enclave,))))
     stated = [right for right in rights if right.qualifier is ALLOW]
     exact: dict[tuple[str, str], list[Right]] = defaultdict(list)
     for right in stated:
-        for name in _names(policy, right.name, robot):
+        for name in _expanded_names(policy, right.name, robot):
             for part, own_part in zip(parts(right), parts(right._replace(name=name)), strict=True):
                 exact[own_part.right, own_part.name].append(part)
     rules = Rules(stated)
@@ -431,10 +441,11 @@ def _rights_as_stated(policy: FleetPolicy, path: str, observed: Iterable[Right])
         yield from same or [right._replace(enclave=enclave.path)]
 
 
-def _names(policy: FleetPolicy, name: str, robot: Robot | None) -> Iterable[str]:
-    """Return a robot's names for a name with placeholders.
+def _expanded_names(policy: FleetPolicy, name: str, robot: Robot | None) -> Iterable[str]:
+    """Return the names that a name with placeholders stands for, for one robot.
 
-    The name has the form of `with_absolute_names`.
+    The name has the form of `with_absolute_names`. ``robot`` None stands for an enclave of no
+    robot.
     """
     if not has_placeholder(name):
         return (name,)

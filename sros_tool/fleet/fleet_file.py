@@ -31,7 +31,7 @@ from sros_tool.fleet.robots import (
     pattern_problem,
     renewal_problem,
     robot_of,
-    router_of,
+    router_enclave_of,
     router_problem,
     size_problem,
     user_problem,
@@ -87,10 +87,10 @@ def read_fleet(path: Path) -> Fleet:
         ) from error
 
 
-def read_connections(path: Path) -> dict[str, str]:
-    """Return an inventory's settings of how Ansible connects to its hosts; {} for a TOML file.
+def read_connection_settings(path: Path) -> dict[str, str]:
+    """Return an inventory's settings for the connections to its hosts; {} for a TOML file.
 
-    The values are texts, by the path of their keys in the inventory.
+    The result maps the path of a key, such as ``all.vars.ansible_user``, to the value as text.
 
     Raises:
         SrosError: as `read_fleet`.
@@ -144,7 +144,7 @@ class _Reader:
         read = [self._read_robot(name, values, groups) for name, values in robots.items()]
         fleet = Fleet.of(read, groups, enclaves, routers)
         for robot in read:
-            if robot.router and robot_of(fleet, router_of(fleet, robot)) != robot:
+            if robot.router and robot_of(fleet, router_enclave_of(fleet, robot)) != robot:
                 text = f"{routers} is not a path of the enclaves of {robot.name}."
                 raise self._invalid_value_error("routers", routers, text)
         if ambiguous := sorted(fleet.robots.keys() & fleet.groups.keys()):
@@ -192,7 +192,11 @@ class _Reader:
     def _read_values(
         self, values: Mapping[str, Any], places: Mapping[str, str], name: str = ""
     ) -> dict[str, Any]:
-        """Return settings after a check; ``name`` is filled into the settings of a group."""
+        """Return the settings ``values`` after a check.
+
+        ``places`` maps each key to the place that errors name. The robot's ``name`` is filled into
+        the settings of a group; "" leaves placeholders as they are.
+        """
         checked: dict[str, Any] = {}
         for key, value in values.items():
             if key == "domain":

@@ -60,7 +60,7 @@ class Robot(NamedTuple):
     host name or IP address, ``user`` the account there ("": the default of ssh).  ``groups`` are
     sorted.  ``router`` is the address (``HOST:PORT``) at which sessions and other routers connect
     to its Zenoh router, or "" if it has none; ``crossing`` are the names that may pass between that
-    router and others, if not all may.  ``distribution`` is its ROS 2 distribution ("": the
+    router and others (empty: all names).  ``distribution`` is its ROS 2 distribution ("": the
     distributions of the keystore).  ``renewal`` is `RENEWAL_ALLOWED` if `sros fleet collect` may
     sign its requests for renewal; ``renewal_grace`` is a duration, such as ``30d``, for which a
     certificate is still accepted with such a request after its expiry ("": none).
@@ -264,12 +264,12 @@ def group_of(parts: Parts) -> str:
 
 
 def path_for(parts: Parts, robot: Robot) -> str:
-    """Return the path of a robot's enclave."""
+    """Return the path of the enclave that a robot has by the path pattern ``parts``."""
     return "".join(map(str, fill(parts, robot.name, robot.namespace)))
 
 
-def router_of(fleet: Fleet, robot: Robot) -> str:
-    """Return the path of the enclave for a robot's Zenoh router, whether or not it has one."""
+def router_enclave_of(fleet: Fleet, robot: Robot) -> str:
+    """Return the path for the enclave of a robot's Zenoh router, even if there is no router."""
     return path_for(parts_of(fleet.routers), robot)
 
 
@@ -336,7 +336,7 @@ def former_robot_of(fleet: Fleet, enclave: str) -> str:
     return ""
 
 
-class Unrecorded(NamedTuple):
+class UnrecordedEnclaves(NamedTuple):
     """Enclaves whose path has a robot's name, but matches no path pattern of the fleet.
 
     ``below`` are in a folder of this robot only, such as ``/r3``; ``naming`` have the robot's name
@@ -349,8 +349,8 @@ class Unrecorded(NamedTuple):
 
 def unrecorded_enclaves(
     fleet: Fleet, names: Iterable[str], robots: Collection[str]
-) -> dict[str, Unrecorded]:
-    """Map each robot to the enclaves, out of ``names``, that are `Unrecorded` for it."""
+) -> dict[str, UnrecordedEnclaves]:
+    """Map each robot to the enclaves, out of ``names``, that are `UnrecordedEnclaves` for it."""
     folders = _robots_by_folder(fleet)
     below: dict[str, list[str]] = {robot: [] for robot in robots}
     naming: dict[str, list[str]] = {robot: [] for robot in robots}
@@ -365,7 +365,7 @@ def unrecorded_enclaves(
         for robot in named & below.keys():
             (below if owners == {robot} else naming)[robot].append(name)
     return {
-        robot: Unrecorded(tuple(sorted(below[robot])), tuple(sorted(naming[robot])))
+        robot: UnrecordedEnclaves(tuple(sorted(below[robot])), tuple(sorted(naming[robot])))
         for robot in robots
     }
 
@@ -470,7 +470,7 @@ _MOST_SHOWN = 20  # maximum number of robots that a line names; --json has all
 _MOST_TARGETS = 5  # if more pairs of robots share a text, they become one line
 
 
-def folded(fleet: Fleet | None, lines: Iterable[tuple[str, str]]) -> Iterator[str]:
+def folded_lines(fleet: Fleet | None, lines: Iterable[tuple[str, str]]) -> Iterator[str]:
     """Yield lines about enclaves; lines that differ only in the robot become one line.
 
     That line has placeholders for the robot's name and namespace, and lists the robots at its end.
@@ -538,7 +538,10 @@ def grouped_by_robot(
 
 
 class _Folding(NamedTuple):
-    """A text with a placeholder for any robot, any robot but ``own``, or any pair of robots."""
+    """A text with a placeholder for any robot but ``own`` ("": for any robot).
+
+    With ``pairs``, the text has placeholders for any pair of robots.
+    """
 
     text: str
     own: str = ""
@@ -570,7 +573,7 @@ def _foldings(fleet: Fleet, enclave: str, text: str) -> list[tuple[_Folding, str
 
 
 def named_robots(fleet: Fleet, enclave: str, text: str) -> tuple[Robot, ...]:
-    """Return the robot of an enclave, if it has one, and the robots whose names a text has."""
+    """Return the robot of an enclave, if any, and the robots that ``enclave`` or ``text`` names."""
     owner = robot_of(fleet, enclave)
     words = dict.fromkeys(re.findall(r"\w+", f"{enclave} {text}", re.A))
     named = (fleet.robots[word] for word in words if word in fleet.robots)
@@ -610,7 +613,7 @@ def _whole_name_expression(value: str) -> re.Pattern[str]:
 
 
 def _two_sets(pairs: Sequence[str]) -> tuple[list[str], list[str]] | None:
-    """Return two sets of robots if ``pairs`` are each robot of one with each of the other."""
+    """Return two lists of robots if ``pairs`` pair each robot of one with each of the other."""
     names = [pair.split(" and ") for pair in pairs]
     first, second = ([*dict.fromkeys(pair[place] for pair in names)] for place in (0, 1))
     is_whole = len(set(pairs)) == len(first) * len(second) and min(len(first), len(second)) > 1

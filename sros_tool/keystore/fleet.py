@@ -22,7 +22,7 @@ from sros_tool.fleet.robots import (
     Robot,
     enclaves_of,
     robot_of,
-    router_of,
+    router_enclave_of,
     size_problem,
     unrecorded_enclaves,
 )
@@ -303,7 +303,9 @@ def robot_of_router(fleet: Fleet | None, name: str) -> Robot | None:
 
 def _robots_by_router(fleet: Fleet) -> dict[str, Robot]:
     """Map the enclave of each robot's Zenoh router to the robot."""
-    return {router_of(fleet, robot): robot for robot in fleet.robots.values() if robot.router}
+    return {
+        router_enclave_of(fleet, robot): robot for robot in fleet.robots.values() if robot.router
+    }
 
 
 # ── writing ────────────────────────────────────────────────────────────────────────────────
@@ -399,7 +401,7 @@ def notes_on_lost_enclaves(keystore: OpenedKeystore, before: Fleet, after: Fleet
         same_robot = after.robots.get(robot.name)
         kept = set(enclaves_of(after, same_robot) if same_robot else ())
         if same_robot and robot.router and not same_robot.router:
-            router = router_of(before, robot)
+            router = router_enclave_of(before, robot)
             kept.add(router)
             if keystore.has_enclave(router):
                 yield _lost_router_note(keystore, robot.name, router)

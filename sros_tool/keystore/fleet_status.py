@@ -25,7 +25,7 @@ from sros_tool.errors import SrosError
 from sros_tool.fleet.robots import (
     Fleet,
     Robot,
-    Unrecorded,
+    UnrecordedEnclaves,
     enclaves_of,
     robot_of,
     unrecorded_enclaves,
@@ -255,7 +255,7 @@ class RobotStatus:
     """Revoked enclaves of the robot that are no longer in the keystore, whether or not the robot
     confirmed their files.
     """
-    others: Unrecorded
+    others: UnrecordedEnclaves
     received: datetime | None
     """When the last confirmation was received, in UTC, by the clock of the keystore's machine; or
     null.
@@ -1359,7 +1359,7 @@ def _robot_status(
     compared_robot: _ComparedRobot,
     records: _KeystoreRecords,
     stages: _Stages,
-    unrecorded: Unrecorded,
+    unrecorded: UnrecordedEnclaves,
 ) -> RobotStatus:
     different = tuple(records.file(compared_robot.robot, file) for file in compared_robot.different)
     revoked = records.revoked(compared_robot.robot)

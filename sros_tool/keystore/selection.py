@@ -19,7 +19,7 @@ from typing import NamedTuple
 from sros_tool.errors import InvalidNameError, KeystoreError, Note, SrosError
 from sros_tool.fleet.robots import (
     Fleet,
-    Unrecorded,
+    UnrecordedEnclaves,
     enclaves_of,
     folders_of_robots,
     robot_of,
@@ -125,7 +125,7 @@ def select_to_revoke(
         # The verb reports what is wrong with a name.
         return tuple(names), tuple(_revoked_notes(revoked))
     chosen = dict.fromkeys(select_enclaves(keystore, names, patterns))
-    unrecorded: dict[str, Unrecorded] = {}
+    unrecorded: dict[str, UnrecordedEnclaves] = {}
     by_name = partial(_revocation_by_name, keystore, robots)
     if fleet := checked_fleet(keystore, by_name) if robots else None:
         possible = _possible_enclaves(keystore, fleet, robots)
@@ -266,7 +266,7 @@ def _enclaves_of_robots(
     keystore: OpenedKeystore,
     robots: Sequence[str],
     checked: bool,
-    unrecorded: Mapping[str, Unrecorded],
+    unrecorded: Mapping[str, UnrecordedEnclaves],
 ) -> list[str]:
     if not robots:
         return []

@@ -293,7 +293,7 @@ class CommitFiles:
                 )
         return top
 
-    def written(self, path: str) -> bytes:
+    def written_content(self, path: str) -> bytes:
         """Return the content of a file that was written, without asking git again."""
         return (self.folder / path).read_bytes()
 
@@ -305,7 +305,7 @@ class CommitFiles:
                 content = None
                 with suppress(SrosError, OSError):
                     content = folder.read(path)
-                if content != self.written(path):
+                if content != self.written_content(path):
                     paths.append(path)
         return paths
 
@@ -518,7 +518,10 @@ def includes_files(content: bytes) -> bool:
 
 
 def files_including(parts: Iterable[str], files: Mapping[str, bytes]) -> set[str]:
-    """Return the files that include one of ``parts``, directly or through other files."""
+    """Return the paths of files that include one of ``parts``, directly or through other files.
+
+    ``files`` maps paths to contents.
+    """
     includes = {
         path: {target for target, _ in _includes(path, data)} for path, data in files.items()
     }
@@ -529,7 +532,10 @@ def files_including(parts: Iterable[str], files: Mapping[str, bytes]) -> set[str
 
 
 def _includes(path: str, content: bytes | None) -> Iterator[tuple[str, str]]:
-    """Yield file and xpointer of the includes in a file, without fallbacks."""
+    """Yield the included file and the xpointer of each include in a file.
+
+    Includes in fallbacks and in metadata are left out. An unreadable file has no includes.
+    """
     try:
         root = parse(content, "the file", instructions=True) if content is not None else None
     except DocumentError:
@@ -542,8 +548,11 @@ def _includes(path: str, content: bytes | None) -> Iterator[tuple[str, str]]:
             yield target, element.get("xpointer", "")
 
 
-def same_root(first_content: bytes, second_content: bytes) -> bool:
-    """Return whether the root elements of two files have the same name and attributes."""
+def have_same_root(first_content: bytes, second_content: bytes) -> bool:
+    """Return whether the root elements of two files have the same name and attributes.
+
+    False if a file cannot be read as XML.
+    """
     try:
         first, second = (parse(content, "the file") for content in (first_content, second_content))
     except DocumentError:

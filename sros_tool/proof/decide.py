@@ -345,7 +345,7 @@ def _uses_of_rights(
         for met in world.side(part.writes).users_of_topics(topics, limit):
             if met.enclave in left_out:
                 continue
-            if topic := world.use(met, topics, limit):
+            if topic := world.example_of_use(met, topics, limit):
                 uses[met.enclave].append(_use(met.enclave, right, part, topics, topic))
     return uses
 
@@ -461,11 +461,11 @@ def _witness_against_at_most(
             for part, met in holders.get(ANYBODY, ()):
                 # Any number of processes without an identity may exist, so a single use breaks the
                 # requirement.
-                if topic := world.use(met, part.topics(expression), limit):
+                if topic := world.example_of_use(met, part.topics(expression), limit):
                     return Witness((_use(ANYBODY, right, part, part.topics(expression), topic),))
             if len(holders) <= most:
                 continue
-            name = _shared_by(world, holders.values(), most + 1, expression, limit)
+            name = _shared_name(world, holders.values(), most + 1, expression, limit)
             if name is None:
                 continue
             uses = [
@@ -488,7 +488,7 @@ def _uses_of(
             yield Use(enclave, right, name, topic, part.writes)
 
 
-def _shared_by(
+def _shared_name(
     world: World,
     holders_by_part: Collection[Sequence[tuple[_TopicOfRight, TopicUser]]],
     count: int,
@@ -546,7 +546,7 @@ def _witness_against_widest(
             side, all_topics = world.side(part.writes), part.topics("*")
             within = NameSet.union(part.topics(name).every() for name in names)
             for enclave in enclaves:
-                own_topics = side.of[enclave]
+                own_topics = side.topics_of[enclave]
                 around = own_topics.superset()
                 if around is not None and not around.automata:
                     continue
@@ -564,7 +564,7 @@ _READ_BY_EVERY_NODE = NameSet((ROS_DISCOVERY_TOPIC, "rt/parameter_events"))
 def _witness_against_nothing_but(
     requirement: NothingBut, world: World, limit: SearchLimit
 ) -> Witness | None:
-    """Return a witness with the shortest name for which an enclave has another right.
+    """Return a witness with the shortest name to which an enclave has a right that is not listed.
 
     The result is None if the requirement holds.
     """
@@ -579,7 +579,7 @@ def _witness_against_nothing_but(
             for name in names
         )
         for enclave in enclaves:
-            unexpected = world.side(writes).of[enclave] - allowed - ordinary
+            unexpected = world.side(writes).topics_of[enclave] - allowed - ordinary
             if topic := world.any_example(unexpected, limit):
                 right, name = right_to_use(topic, writes=writes)
                 uses[enclave].append(Use(enclave, right, name, topic, writes))
@@ -936,7 +936,7 @@ def _is_used_by_anybody(
     for part in right_parts:
         met = world.side(part.writes).users_of_topics(part.topics(name), limit)
         if any(meeting.stated for meeting in met) or any(
-            world.use(meeting, part.topics(name), limit) for meeting in met
+            world.example_of_use(meeting, part.topics(name), limit) for meeting in met
         ):
             return True
     return False
@@ -1018,7 +1018,7 @@ def _may_learn(world: World, enclave: str, excluded: Container[str]) -> bool:
 
     True may be wrong, but False is certain, and saves a search of the whole robot.
     """
-    around = world.side(False).of.get(enclave, NameSet()).superset()
+    around = world.side(False).topics_of.get(enclave, NameSet()).superset()
     if around is None or around.automata:
         return True
     return any(

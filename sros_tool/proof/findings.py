@@ -85,7 +85,7 @@ class Step:
 
     def action_text(self) -> str:
         """Return text such as ``publish /cmd_vel``, with the wildcard that allows it."""
-        right, kind, name, by = self.drawn()
+        right, kind, name, by = self.stated_form()
         shown = f"action {name}" if kind == "actions" else name
         text = f"{right or ('write' if self.use.writes else 'read')} {shown}"
         is_denied = self.place and self.place.right.qualifier is DENY
@@ -94,7 +94,7 @@ class Step:
             f"{text} with the permissions of {self.permissions_of}" if self.permissions_of else text
         )
 
-    def drawn(self) -> tuple[str, str, str, str]:
+    def stated_form(self) -> tuple[str, str, str, str]:
         """Return right, kind and name as a policy states them, and the wildcard that allows them.
 
         A part of an action is shown as the policy states it: as a right to the action, or to the
@@ -165,16 +165,19 @@ def _are_alike(uses: Sequence[Use], witness: Witness) -> bool:
 
 
 @dataclass(frozen=True, slots=True)
-class Decided:
-    """The decisions on all requirements: broken requirements, and reasons why parts cannot fail.
+class Decisions:
+    """The decisions on all requirements.
 
-    ``assumed`` are requirements that hold only with the assumed protection of the default template,
-    with a name whose protection the policy does not state.  ``blocked`` are requirements that hold,
-    with a use that does not pass between Zenoh routers. ``unnamed`` are requirements that hold,
-    with their names that no right states.  ``unjudged`` are enclaves that have to have rights, but
-    that an export lacks.  ``holding_alone`` are requirements with relative names that only further
-    enclaves could break, with the reasons.  ``absent`` are requirements with exceptions for
-    enclaves that do not exist, as clauses; ``misspelled`` those with a similar name that exists.
+    ``violations`` are the broken requirements. ``vacuous`` are requirements of which a part, or the
+    whole, cannot fail, with the reasons.  ``assumed`` are requirements that hold only with the
+    assumed protection of the default template, with a name whose protection the policy does not
+    state.  ``blocked`` are requirements that hold, with a use that does not pass between Zenoh
+    routers. ``unnamed`` are requirements that hold, with their names that no right
+    states.  ``unjudged`` are enclaves that have to have rights, but that an export
+    lacks.  ``holding_alone`` are requirements with relative names that only further enclaves could
+    break, with the reasons.  ``absent`` are requirements with exceptions for enclaves that do not
+    exist, with clauses on these exceptions. ``misspelled`` are the same, if an enclave with a
+    similar name exists.
     """
 
     violations: tuple[Violation, ...]
@@ -188,7 +191,7 @@ class Decided:
     misspelled: tuple[tuple[Requirement, tuple[str, ...]], ...] = ()
 
 
-def decide_all(requirements: Sequence[Requirement], system: System) -> Decided:
+def decide_all(requirements: Sequence[Requirement], system: System) -> Decisions:
     """Return the decisions on requirements in all worlds.
 
     Raises:
@@ -248,7 +251,7 @@ def decide_all(requirements: Sequence[Requirement], system: System) -> Decided:
         blocked += [(requirement, verdict.blocked) for _, verdict in verdicts if verdict.blocked][
             :1
         ]
-    return Decided(
+    return Decisions(
         violations=tuple(violations),
         vacuous=tuple(vacuous),
         assumed=tuple(assumed),
@@ -391,23 +394,29 @@ def _with_parent_namespaces(namespace: str) -> Iterator[str]:
 
 
 def decided_findings(
-    decided: Decided, system: System, before: Iterable[Right] = ()
+    decided: Decisions, system: System, before: Iterable[Right] = ()
 ) -> list[Finding]:
     """Return the findings of decisions: broken requirements first, in order."""
     findings = [_violation_finding(violation) for violation in decided.violations]
     findings += [
         _part_finding(VACUOUS, requirement, why, _namespace_remedy(requirement, system.rights))
-        for requirement, why in _once(decided.vacuous)
+        for requirement, why in _without_namespace_repeats(decided.vacuous)
     ]
     for kind, decisions in (
         (MISSPELLED_ENCLAVE, decided.misspelled),
         (UNKNOWN_ENCLAVE, decided.absent),
         (HOLDS_ALONE, decided.holding_alone),
     ):
-        findings += [_part_finding(kind, requirement, why) for requirement, why in _once(decisions)]
+        findings += [
+            _part_finding(kind, requirement, why)
+            for requirement, why in _without_namespace_repeats(decisions)
+        ]
     if decided.unnamed:
         allowed = [right for right in before if right.qualifier is ALLOW]
-        findings += [_unnamed_finding(*unnamed, allowed) for unnamed in _once(decided.unnamed)]
+        findings += [
+            _unnamed_finding(*unnamed, allowed)
+            for unnamed in _without_namespace_repeats(decided.unnamed)
+        ]
     findings += [_assumption_finding(*assumption) for assumption in decided.assumed]
     findings += [_not_crossing_finding(*blocked_use) for blocked_use in decided.blocked]
     if system.is_export:
@@ -424,7 +433,7 @@ def decided_findings(
     return findings
 
 
-def _once(
+def _without_namespace_repeats(
     decided: Iterable[tuple[Requirement, tuple[str, ...]]],
 ) -> Iterable[tuple[Requirement, tuple[str, ...]]]:
     """Return requirements with reasons, without those that differ only in their namespace."""
@@ -465,7 +474,7 @@ def _violation_finding(violation: Violation) -> Finding:
     ]
     place = requirement.source
     related.append(
-        RelatedPlace(f"required: {_with_title(requirement)}", place.file, place.line or None)
+        RelatedPlace(f"required: {_titled_demand(requirement)}", place.file, place.line or None)
     )
     return VIOLATED.found(
         _subject(violation),
@@ -512,7 +521,7 @@ def _edit_text(violation: Violation) -> str:
     )
 
 
-def _with_title(requirement: Requirement) -> str:
+def _titled_demand(requirement: Requirement) -> str:
     name = f"{requirement.name}: " if requirement.name else ""
     return f"{name}{demand(requirement)}"
 
@@ -526,7 +535,7 @@ def short_text(violation: Violation) -> str:
         case AtMost():
             text = _clause(violation)
         case Protected(level=level):
-            text = f"messages of {_subject(violation)} are not {_protected(level)}"
+            text = f"messages of {_subject(violation)} are not {_protection_word(level)}"
         case _:
             text = f"{_subject(violation)} {_clause(violation)}"
     more = 0 if violation.position else len(violation.witness.others)
@@ -538,7 +547,7 @@ def _violation_clause(violation: Violation) -> str:
     """Return a clause that states a violation, without the subject of the finding."""
     match violation.requirement:
         case Apart():
-            text = f"{_clause(violation)}: {_chain(violation.steps)}"
+            text = f"{_clause(violation)}: {_chain_text(violation.steps)}"
             how = "through" if violation.position else "from"
             names = violation.alike
             return f"{text} (also {how} {_listed_names(names)})" if names else text
@@ -560,7 +569,7 @@ def _clause(violation: Violation) -> str:
                 return "cannot start with its current files (`sros check` shows why)"
             return f"may not {steps[0].action_text()}"
         case Protected(level=level):
-            return f"its messages are not {_protected(level)}"
+            return f"its messages are not {_protection_word(level)}"
         case AtMost():
             return _joined_steps(steps)
         case NotBoth():
@@ -569,11 +578,11 @@ def _clause(violation: Violation) -> str:
             return f"may {steps[0].action_text()}"
 
 
-def _protected(level: Level) -> str:
+def _protection_word(level: Level) -> str:
     return "encrypted" if level is Level.ENCRYPT else "signed"
 
 
-def _chain(steps: Sequence[Step]) -> str:
+def _chain_text(steps: Sequence[Step]) -> str:
     """Return a chain of steps as text, such as ``/a -publish /x-> /b -publish /y-> /c``."""
     hops = zip(steps[::2], steps[1::2], strict=True)
     return " ".join(

@@ -457,7 +457,8 @@ def _permissions_fit(vendor: Vendor, side: AccessSource, name: str, subject: str
 class _Access:
     """The access of an enclave in one world and domain.
 
-    ``topics`` are the allowed topics; ``decide`` decides on a single topic.
+    ``topics`` are the allowed topics; ``decide`` decides on a single topic. ``joins`` says whether
+    a process of the enclave may join the domain.
     """
 
     topics: Mapping[AccessVerb, NameSet]
@@ -476,7 +477,11 @@ _FittingOthers = Callable[[AccessSource, str], tuple[str, ...]]
 
 @dataclass(frozen=True, slots=True)
 class _World:
-    """A DDS vendor, or Zenoh, with the domains in which access is compared."""
+    """A DDS vendor, or Zenoh, with the domains in which access is compared.
+
+    ``style`` is the way in which the vendor matches wildcards. ``longest`` is the length in bytes
+    of the longest topic name (None: no limit).
+    """
 
     title: str
     style: Style
@@ -717,7 +722,7 @@ def _each_gain(
     scope: Collection[str] | None,
     limit: SearchLimit,
 ) -> Iterator[Gain]:
-    stated = _Stated(old, new)
+    stated = _StatedRights(old, new)
     names = set(new.permissions) | {right.enclave for right in new.rights}
     names.update(*(enforcer.names() for enforcer in new.enforcers))
     for enclave in sorted(names if scope is None else names.intersection(scope)):
@@ -749,7 +754,7 @@ class _PlaceOfEnclave:
 
 
 def _added_gains(
-    stated_rights: _Stated,
+    stated_rights: _StatedRights,
     place: _PlaceOfEnclave,
     topics: Mapping[AccessVerb, NameSet],
     sides: tuple[_Access, _Access],
@@ -773,7 +778,7 @@ class AccessByVendors:
     """
 
     def __init__(self, source: AccessSource) -> None:
-        self._stated = _Stated(source, source)
+        self._stated = _StatedRights(source, source)
 
     def gained_topics(
         self,
@@ -870,7 +875,7 @@ class _Denials:
         return None if at is None else self._rights[at]
 
 
-class _Stated:
+class _StatedRights:
     """An index of both sides' stated rights: it finds the right that gives an added access."""
 
     def __init__(self, old: AccessSource, new: AccessSource) -> None:

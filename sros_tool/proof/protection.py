@@ -113,7 +113,7 @@ def contradiction(side: AccessSource) -> str:
     return ""
 
 
-def _looser(key: str, before: str, after: str, meaning: str) -> SettingChange:
+def _looser_change(key: str, before: str, after: str, meaning: str) -> SettingChange:
     return SettingChange(Effect.LOOSER, key, before, after, meaning)
 
 
@@ -130,7 +130,7 @@ def less_protection(
         yield from _looser_governance(least, _payload_governance(new.governance), limit)
     if old.authorities is not None and new.authorities is not None:
         for role, fingerprint in sorted(new.authorities - old.authorities):
-            yield _looser(
+            yield _looser_change(
                 f"{role} CA {fingerprint[:16]}...",
                 "unknown",
                 "trusted",
@@ -142,11 +142,11 @@ def less_protection(
     yield from _changed_certificates(old, new)
     if old.kind == new.kind == "keystore" and old.zenoh is not None and new.zenoh is None:
         text = "nothing enforces any more what these files enforced"
-        yield _looser("Zenoh files", "present", "missing", text)
+        yield _looser_change("Zenoh files", "present", "missing", text)
     if old.routers and not {*new.routers} <= {*old.routers}:
         text = "anyone who poses as the router can read and change everything that passes"
         before, after = (", ".join(side.routers) for side in (old, new))
-        yield _looser("Zenoh router", before, after, text)
+        yield _looser_change("Zenoh router", before, after, text)
     if new.zenoh_files:
         yield from looser_settings(old.zenoh_files, new.zenoh_files)
     if old.protections and new.protections is not None:
@@ -177,7 +177,7 @@ def _weaker_for_later_enclaves(
             if known and known.domain is not None and known.domain != robot.domain:
                 domain = "all of the keystore" if robot.domain is None else str(robot.domain)
                 there = "all domains of the keystore" if robot.domain is None else "the new domain"
-                yield _looser(
+                yield _looser_change(
                     f"later enclaves: domain of robot {name}",
                     str(known.domain),
                     domain,
@@ -196,7 +196,7 @@ def _changed_certificates(old: AccessSource, new: AccessSource) -> Iterator[Sett
                 f"certificate of {enclave}",
                 f"anyone who has its key can act as {new_one.name}",
             )
-            yield _looser(key, before, new_one.name, text)
+            yield _looser_change(key, before, new_one.name, text)
 
 
 def _unrevoked_certificates(old: AccessSource, new: AccessSource) -> Iterator[SettingChange]:
@@ -222,10 +222,10 @@ def _unrevoked_certificates(old: AccessSource, new: AccessSource) -> Iterator[Se
             f"{names[0]} again trusts" if len(names) == 1 else f"{len(names)} enclaves again trust"
         )
         text = f"{who} anyone who has the key of this certificate"
-        yield _looser(f"certificate {serial:x}", "revoked", "trusted", text)
+        yield _looser_change(f"certificate {serial:x}", "revoked", "trusted", text)
     if (more := len(trusted) - _MOST_SERIALS) > 0:
         text = "enclaves again trust anyone who has a key of these certificates"
-        yield _looser(f"{more} more certificates", "revoked", "trusted", text)
+        yield _looser_change(f"{more} more certificates", "revoked", "trusted", text)
 
 
 _MOST_SERIALS = 20
@@ -304,7 +304,7 @@ def _dropped_statements(
                 if name in _set_of_names(_names_of_kind(later, protection.kind))
                 else "nothing"
             )
-            yield _looser(
+            yield _looser_change(
                 f"protect {protection}",
                 protection.word,
                 less,
@@ -351,7 +351,7 @@ def added_crossing(
     if after is None:
         if new.later is not None and new.zenoh_files:
             meaning = "what passes between routers is not known"
-            yield _looser("Zenoh settings", "limit crossing", "missing", meaning)
+            yield _looser_change("Zenoh settings", "limit crossing", "missing", meaning)
         return
     kept = {*before.router_names()} & {*after.router_names()}
     for router in sorted(kept):
@@ -360,7 +360,7 @@ def added_crossing(
             name := _newly_passing_name(old_crossing, new_crossing, limit)
         ):
             meaning = f"{name} may pass between this router and others"
-            yield _looser(
+            yield _looser_change(
                 f"crossing of router {router}", _text(old_crossing), _text(new_crossing), meaning
             )
     yield from _moved_enclaves(before, after, {*new.permissions, *new.certified, *kept}, limit)
@@ -384,7 +384,7 @@ def _moved_enclaves(
                 _crossing_of_both(before, old_router, old_place), has, limit
             ):
                 crossing = _text(_crossing_of_both(before, old_router, old_place))
-                yield _looser(
+                yield _looser_change(
                     f"router of {enclave}",
                     f"{old_router}, which passes on {crossing}",
                     new_router,
@@ -403,7 +403,7 @@ def looser_router_rules(
     if new.routers and not (states_routers(old) and states_routers(new)):
         for router in sorted({*old.passing} - {*new.routers}):
             meaning = "enclaves of this router may now be at the same router as other enclaves"
-            yield _looser(f"router {router} of Zenoh", "present", "missing", meaning)
+            yield _looser_change(f"router {router} of Zenoh", "present", "missing", meaning)
     routers: dict[tuple[str, str], list[str]] = defaultdict(list)
     for router in sorted(old.passing.keys() & new.passing.keys()):
         had = old.passing[router]
@@ -414,7 +414,7 @@ def looser_router_rules(
             if name := _newly_passing_name(((right.name,), tuple(known)), ((right.name,),), limit):
                 routers[router, right.enclave].append(name)
     for (router, other), names in routers.items():
-        yield _looser(
+        yield _looser_change(
             f"rules of router {router} for router {other}",
             "without",
             f"with {names[0]}",

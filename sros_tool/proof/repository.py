@@ -255,7 +255,7 @@ class Repository:
         if (merge := name.removesuffix(_FIRST_PARENT)) != name:
             if remote:
                 self.fetch_missing(merge, remote)
-            name = self.merged_into(merge)
+            name = self.first_parent(merge)
         if remote and not name.startswith("refs/") and len(name) in (40, 64):
             self.fetch_missing(name, remote)
         return self.exact_commit(name, "--base")
@@ -264,7 +264,7 @@ class Repository:
         """Return the full id of the commit to review: ``HEAD``, a full id or a full reference."""
         return self.commit(name) if name == "HEAD" else self.exact_commit(name, "--head")
 
-    def merged_into(self, merge: str) -> str:
+    def first_parent(self, merge: str) -> str:
         """Return the id of a merge commit's first parent: the target branch before the merge.
 
         Raises:

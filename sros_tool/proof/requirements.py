@@ -83,9 +83,11 @@ class RobotNames(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Requirement:
-    """Base class of requirements, with the place of the table in the file, name and reason (or "").
+    """Base class of requirements.
 
-    ``robot`` is the robot whose values replaced the placeholders, or "". ``namespace`` is the
+    ``source`` is the place of the requirement's table in the file; ``name`` and ``why`` are its
+    name and its reason, or "".  ``robot`` is the robot whose values replaced the placeholders, or
+    "". ``of_robots`` are the lists that replaced placeholders for all robots. ``namespace`` is the
     namespace for which the file was read; ``is_relative`` says whether a name moves with it.
     ``elsewhere`` is the requirement in any other namespace; None if the file was read for a
     namespace.
@@ -488,8 +490,10 @@ class _Table:
     def common_arguments(self, *keys: str) -> dict[str, Any]:
         """Return the arguments that all requirements have.
 
+        ``keys`` are the keys that only this kind of requirement has.
+
         Raises:
-            DocumentError: a key of the table is not in ``keys``.
+            DocumentError: the table has an unknown key.
         """
         known_keys = (*keys, *_WORD_KEYS)
         for key in self.values:

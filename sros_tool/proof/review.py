@@ -41,7 +41,7 @@ from sros_tool.errors import DocumentError, SrosError
 from sros_tool.faults import Fault
 from sros_tool.files import policies_dir
 from sros_tool.fleet.expansion import FleetPolicy, fleet_with_enclaves, read_policy_for
-from sros_tool.fleet.fleet_file import read_connections, read_fleet
+from sros_tool.fleet.fleet_file import read_connection_settings, read_fleet
 from sros_tool.fleet.robots import Fleet, Robot
 from sros_tool.folders import Folder
 from sros_tool.keystore.expiry import ExpiryCheck, Threshold, due_enclaves
@@ -90,11 +90,11 @@ from sros_tool.proof.commit_files import (
     converting_patterns,
     files_including,
     files_used_whole,
+    have_same_root,
     includes_files,
     is_whole_policy,
     may_be_policy,
     may_match,
-    same_root,
 )
 from sros_tool.proof.decide import restricted_enclaves
 from sros_tool.proof.findings import (
@@ -175,7 +175,8 @@ class ReviewRequest:
     fail.  With ``allow_dropped_requirements``, requirements that HEAD drops or weakens do not make
     the review fail. The review fails if an enclave expires within ``renew_within``.  ``left_out``
     are files and folders of policies that are not reviewed.  ``template`` is the keystore template
-    whose protection the policies get: a path, the name of a shipped template, or "".
+    whose protection the policies get: a path, the name of a shipped template, or "".  ``at`` is the
+    time of the review, and ``zone`` the time zone of the robots.
     """
 
     repository: Repository
@@ -456,7 +457,7 @@ class _Review:
         if head_fleet:
             self.robots[named] = fleet_with_enclaves(head_fleet, of_head)
         yield from self._step_result(
-            "policy", named, findings, only_with_result=bool(of_head), complete=complete
+            "policy", named, findings, is_wanted=bool(of_head), complete=complete
         )
         keystores = yield from self._keystores(self.head)
         for path, keystore in keystores.items():
@@ -480,14 +481,14 @@ class _Review:
                 "new-access",
                 named,
                 lambda: self._access(of_base, base_fleet, before, after, moving),
-                only_with_result=bool(asked.policies),
+                is_wanted=bool(asked.policies),
                 complete=complete,
             )
             yield from self._step_result(
                 "rights",
                 named,
                 partial(self._rights, before, after, moving),
-                only_with_result=bool(of_base),
+                is_wanted=bool(of_base),
             )
         for path, keystore in keystores.items():
             earlier_keystore = base_keystores.get(path)
@@ -512,15 +513,15 @@ class _Review:
         subject: str,
         decide: Callable[[], tuple[int, Content] | None],
         *,
-        only_with_result: bool = True,
+        is_wanted: bool = True,
         complete: bool = True,
         can_be_allowed: bool = True,
     ) -> Iterator[ReviewStep]:
-        """Run ``decide`` and yield a step with its result or its error.
+        """Run ``decide`` and yield a step with its result or its error, if the step ``is_wanted``.
 
         Without ``complete`` (a file could not be read), no step says that nothing was found.
         """
-        if not only_with_result:
+        if not is_wanted:
             return
         try:
             decided = decide()
@@ -640,7 +641,9 @@ class _Review:
                 lines.append((f"gets the keys of {enclave}, which {had} had before", robot.name))
         if base[1] and self.base:
             file = self.request.fleet
-            before, after = (read_connections(e.folder / file) for e in (self.base, self.head))
+            before, after = (
+                read_connection_settings(e.folder / file) for e in (self.base, self.head)
+            )
             for where in sorted({*before, *after}, key=_variables_before_hosts):
                 if before.get(where) != (value := after.get(where)):
                     text = "is gone" if value is None else f"is {value}"
@@ -741,7 +744,7 @@ class _Review:
             place = f"{ENCLAVES} --leave-out {PUBLIC}" if is_top else quote(path)
             text = f"is a keystore that changes and is not reviewed: {review}, or leave it out with"
             lines.append((f"{text} --leave-out {place}", path))
-        for path in self._used_in_part(changed, reviewed, fleet):
+        for path in self._policies_used_in_part(changed, reviewed, fleet):
             lines.append(("changes and is used only in part: the rest is not reviewed", path))
         for path in self._unreviewed_policies_including(changed):
             lines.append(("is not reviewed, and includes a file that changes", path))
@@ -762,7 +765,7 @@ class _Review:
         facts = StepFindings(tuple(lines), tuple(named))
         return (_FOUND if lines else _OK, facts) if facts.lines else None
 
-    def _used_in_part(
+    def _policies_used_in_part(
         self,
         changed: Iterable[tuple[str, TreeEntry]],
         reviewed: Sequence[Path],
@@ -771,7 +774,7 @@ class _Review:
         """Yield changed policies that reviewed policies or keystores include only in part."""
         named = {str(path.relative_to(self.head.folder)) for path in reviewed}
         known = {
-            path: self.head.written(path)
+            path: self.head.written_content(path)
             for path, _ in changed
             if path in self.head.files and path not in named
         }
@@ -797,7 +800,7 @@ class _Review:
         """Yield changed files that the reviewed policies include only in part."""
         files = self.head.files
         whole = files_used_whole(
-            named, lambda path: self.head.written(path) if path in files else None
+            named, lambda path: self.head.written_content(path) if path in files else None
         )
         for path, data in parts.items():
             with suppress(SrosError):
@@ -805,7 +808,7 @@ class _Review:
                     continue
                 before = self.base.entry(path) if self.base else None
                 earlier = self.request.repository.content(before.id) if before else data
-                if path in whole and same_root(earlier, data):
+                if path in whole and have_same_root(earlier, data):
                     continue
             yield path
 
@@ -820,7 +823,7 @@ class _Review:
             path
             for path, entry in changed
             if (
-                may_be_policy(self.head.written(path))
+                may_be_policy(self.head.written_content(path))
                 if path in files
                 else entry.mode in FILES and not _is_below(path, self.request.left_out)
             )
@@ -1088,15 +1091,17 @@ class _Review:
             yield from self._step_result(
                 "requirements",
                 subject,
-                partial(self._decided, files.values(), wanted, system, rights, elsewhere),
-                only_with_result=bool(read),
+                partial(
+                    self._decided_requirements, files.values(), wanted, system, rights, elsewhere
+                ),
+                is_wanted=bool(read),
                 complete=len(read) == len(paths)
                 and (subject in keystores or self.has_all_policies),
             )
             required_before = [*chain.from_iterable(earlier.values())]
             decide = partial(self._dropped_step, required_before, wanted, system, sources)
             yield from self._step_result(
-                "requirements-before", subject, decide, only_with_result=len(read) == len(files)
+                "requirements-before", subject, decide, is_wanted=len(read) == len(files)
             )
 
     def _read(
@@ -1110,7 +1115,7 @@ class _Review:
 
         return (yield from _read_each("requirements", files, requirements_at))
 
-    def _decided(
+    def _decided_requirements(
         self,
         files: Iterable[Path],
         requirements: Sequence[Requirement],
@@ -1291,7 +1296,7 @@ class _Review:
             return _FOUND, StepFindings(new)
 
         yield from self._step_result("keystore", path, findings)
-        yield from self._step_result("signed", path, signed, only_with_result=bool(stated))
+        yield from self._step_result("signed", path, signed, is_wanted=bool(stated))
         if self.base:
             yield from self._step_result("new-access", path, access)
         yield from self._step_result("expiry", path, lambda: self._expiry(before or folder, folder))
@@ -1322,7 +1327,7 @@ def _robots_by_enclave(files: Iterable[Path], fleet: Fleet | None) -> dict[str, 
     if fleet is None:
         return {enclave.path: None for file in files for enclave in read_policy(file).enclaves}
     policies = (FleetPolicy(read_policy(file, placeholders=True), fleet) for file in files)
-    return {path: policy.stated(path)[1] for policy in policies for path in policy}
+    return {path: policy.stated_enclave(path)[1] for policy in policies for path in policy}
 
 
 _FILES_OF_ENCLAVES = (*REQUIRED_FILES, *OPTIONAL_FILES, *ZENOH_FILES)

@@ -189,7 +189,10 @@ ALL_DOMAINS = DomainSet.of((0, MAX_DOMAIN))
 
 
 def load_side(path: Path, fleet: Fleet | None = None) -> AccessSource:
-    """Read one side of a comparison: also a folder of policies, or ``git:REVISION:PATH``.
+    """Read one side of a comparison.
+
+    ``path`` is a file or folder that `load_rights` reads, a folder of policies, or
+    ``git:REVISION:PATH``.
 
     Raises:
         SrosError: the side cannot be read, DDS would refuse a part of it, or a part cannot be
@@ -519,7 +522,7 @@ _Read = tuple[Policy, Fleet | None]
 
 
 def _read(path: Path, fleet: Fleet | None, policy_files: PolicyFiles | None = None) -> _Read:
-    """Return the policy in a file, and the fleet with the enclaves of the policy."""
+    """Return the policy in a file, and the fleet with its enclaves (None without a fleet)."""
     if fleet is None:
         return read_policy(path, policy_files=policy_files), None
     expanded = FleetPolicy(read_policy(path, placeholders=True, policy_files=policy_files), fleet)
@@ -552,7 +555,7 @@ def _access_of_policies(shown: str, policies: list[_Read]) -> AccessSource:
 
 
 def load_policies(files: Iterable[Path], shown: str, fleet: Fleet | None = None) -> AccessSource:
-    """Return the joint access by the policies of one robot, or of one fleet.
+    """Return the joint access by the policies of one robot or fleet; texts name it ``shown``.
 
     Raises:
         SrosError: a policy cannot be read, or two policies have the same enclave.

@@ -73,7 +73,7 @@ def suggest(
     """
     requirements: list[Requirement] = []
     limit = SearchLimit(MOST_STEPS)
-    all_worlds, stated = Worlds(worlds), _Stated(rights)
+    all_worlds, stated = Worlds(worlds), _StatedRights(rights)
     most = _MAX_CANDIDATES * min(len(fleet.robots) if fleet else 1, _MAX_ROBOTS)
     for requirement in islice(_candidates(stated, worlds), most):
         verdicts = all_worlds.decide(requirement, limit)
@@ -87,7 +87,7 @@ def suggest(
     return Suggestions(requirements, [_comment_on_unmet(each) for each in missing])
 
 
-def _unreserved_moves(stated: _Stated, proposed: Iterable[Requirement]) -> Iterator[Only]:
+def _unreserved_moves(stated: _StatedRights, proposed: Iterable[Requirement]) -> Iterator[Only]:
     """Yield a requirement for each name that moves a robot, and that ``proposed`` does not reserve.
 
     These requirements do not hold, or were not decided.
@@ -128,7 +128,7 @@ def _joined_requirement(requirement: Requirement, other: Requirement) -> Require
     return None
 
 
-class _Stated:
+class _StatedRights:
     """The enclaves that state each right to a name, and the wildcards of each right."""
 
     def __init__(self, rights: Iterable[Right]) -> None:
@@ -186,7 +186,7 @@ class _Stated:
         }
 
 
-def _candidates(stated_rights: _Stated, worlds: Sequence[World]) -> Iterator[Requirement]:
+def _candidates(stated_rights: _StatedRights, worlds: Sequence[World]) -> Iterator[Requirement]:
     for right in _SENDING_RIGHTS:
         yield from _few_holders(stated_rights, right)
     yield from _changing_services(stated_rights)
@@ -203,7 +203,7 @@ def _candidates(stated_rights: _Stated, worlds: Sequence[World]) -> Iterator[Req
         )
 
 
-def _few_holders(stated_rights: _Stated, right: str) -> Iterator[Only]:
+def _few_holders(stated_rights: _StatedRights, right: str) -> Iterator[Only]:
     """Yield a requirement for each group of up to three enclaves that are the only users of names.
 
     Services that only read get their own requirement, so that an exception for them does not allow
@@ -226,7 +226,7 @@ def _few_holders(stated_rights: _Stated, right: str) -> Iterator[Only]:
         yield Only(source=_NOWHERE, rights=((right, tuple(names_held)),), enclaves=enclaves)
 
 
-def _changing_services(stated_rights: _Stated) -> Iterator[Only | Nobody]:
+def _changing_services(stated_rights: _StatedRights) -> Iterator[Only | Nobody]:
     """Yield requirements on services that change nodes, and that nobody may call on some nodes.
 
     The enclaves that may call such a service of another node are exceptions.
@@ -398,14 +398,14 @@ _HEADING = """\
 
 
 def render_requirements(
-    requirements: Iterable[Requirement], of: str, comments: Iterable[str] = ()
+    requirements: Iterable[Requirement], source_name: str, comments: Iterable[str] = ()
 ) -> str:
     """Return requirements as TOML, with their demands as comments, and ``comments`` at the end.
 
-    ``of`` names the source at the top.  `sros_tool.proof.requirements.parse_requirements` returns
-    equal requirements, with other places.
+    ``source_name`` is written at the top.  `sros_tool.proof.requirements.parse_requirements`
+    returns equal requirements, with other places.
     """
-    lines = [_HEADING.format(of=json.dumps(of))]
+    lines = [_HEADING.format(of=json.dumps(source_name))]
     for requirement in requirements:
         lines += [f"# {demand(requirement)}", f"[[{requirement.KIND}]]"]
         lines += [f"{key} = {_toml(value)}" for key, value in _values(requirement)]

@@ -72,7 +72,7 @@ from sros_tool.proof.worlds import (
     names_of_expression,
     ros_access,
     topics_of,
-    zenoh_message,
+    zenoh_messages,
 )
 from sros_tool.translate import permissions_for, protected_topics
 from sros_tool.translate_zenoh.rights import remote_rights, stated_rights
@@ -216,7 +216,7 @@ def _planned_zenoh(
     rules = {remote.common_name: AccessControl((remote,)) for remote in control.remotes}
 
     def confirm(enclave: str, writes: bool, topic: str) -> bool:
-        messages = zenoh_message(topic, domain, writes=writes)
+        messages = zenoh_messages(topic, domain, writes=writes)
         own_rules = rules.get(enclave)
         return (
             own_rules is not None

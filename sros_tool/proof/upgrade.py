@@ -75,7 +75,7 @@ from sros_tool.policy.model import ALLOW, Policy, stated_protections
 from sros_tool.policy.rights import Right, policy_rights
 from sros_tool.proof.growth import AccessByVendors, Gain
 from sros_tool.proof.sources import AccessSource
-from sros_tool.proof.worlds import domains_of, zenoh_message
+from sros_tool.proof.worlds import domains_of, zenoh_messages
 from sros_tool.wording import counted, first_few
 from sros_tool.zenoh.access import Enforcement, Remote
 from sros_tool.zenoh.releases import version_text
@@ -256,8 +256,8 @@ def _upgrade_findings(
         if distribution.assumption:
             yield NOT_MEASURED.found(f"ROS 2 {distribution.title}", distribution.assumption)
     for old, new in _products(before, after, vendor):
-        yield from _untested_notes(old, new)
-        yield from _expired_peers_notes(old, new)
+        yield from _untested_findings(old, new)
+        yield from _expired_peers_findings(old, new)
         for change in changes(files, old, new):
             kind = _KINDS[change.kind]
             yield kind.found(change.enclave, change.text, change.file, remedy=change.remedy)
@@ -360,7 +360,11 @@ _KINDS: Mapping[str, FindingKind] = {
 
 
 class DecisionChange(NamedTuple):
-    """A decision on an enclave that differs between two ROS 2 distributions."""
+    """A decision on an enclave that differs between two ROS 2 distributions.
+
+    ``kind`` says which decision differs, as a key of `_KINDS`. ``file`` is the path of the file on
+    which the decision depends.
+    """
 
     kind: str
     enclave: str
@@ -387,7 +391,7 @@ def changes(files: DecidedFiles, before: Shipped, after: Shipped) -> Iterator[De
             context = JoinContext(number, files.at.now, files.at.zone)
             where = f"on domain {number}, " if len(numbers) > 1 else ""
             sides = [
-                _Decided(
+                _ReleaseDecision(
                     shipped, files, name, context, fitting_others[shipped.vendor].get(name, ())
                 )
                 for shipped in (before, after)
@@ -397,7 +401,7 @@ def changes(files: DecidedFiles, before: Shipped, after: Shipped) -> Iterator[De
                 break
 
 
-class _Decided:
+class _ReleaseDecision:
     """The decision of one release of DDS on an enclave: causes of a refusal, and access.
 
     The access includes access by permissions of other enclaves (``fitting_others``) that fit the
@@ -439,17 +443,17 @@ class _Decided:
 def _changes_of_enclave(
     files: DecidedFiles,
     name: str,
-    sides: Sequence[_Decided],
+    sides: Sequence[_ReleaseDecision],
     domain: int,
     where: str,
     by_vendors: AccessByVendors,
 ) -> Iterator[DecisionChange]:
     old, new = sides
     if new.causes and (not old.causes or (new.crashes and not old.crashes)):
-        text = f"{where}{_verdict(new)}; {_verdict(old)}"
-        yield _refusal(_LOSES, files, name, new.causes[0], text)
+        text = f"{where}{_verdict_text(new)}; {_verdict_text(old)}"
+        yield _refusal_change(_LOSES, files, name, new.causes[0], text)
     elif old.causes and not new.causes:
-        text = f"{where}{_verdict(old)}; {_verdict(new)}"
+        text = f"{where}{_verdict_text(old)}; {_verdict_text(new)}"
         yield DecisionChange(_JOINS, name, text, files.place(name, old.causes[0].file))
     if old.causes or new.causes:
         return
@@ -482,12 +486,12 @@ def _gain_text(gain: Gain) -> str:
     return gain.right._replace(name=gain.name).describe()
 
 
-def _verdict(side: _Decided) -> str:
+def _verdict_text(side: _ReleaseDecision) -> str:
     clauses = [refusal_clause(cause, [side.shipped.title]) for cause in side.causes]
     return "; ".join(clauses) or f"{side.shipped.title} accepts it"
 
 
-def _refusal(
+def _refusal_change(
     kind: str, files: DecidedFiles, name: str, cause: RefusalCause, text: str
 ) -> DecisionChange:
     remedy = ""
@@ -498,7 +502,7 @@ def _refusal(
     return DecisionChange(kind, name, text, files.place(name, cause.file), remedy)
 
 
-def _untested_notes(before: Shipped, after: Shipped) -> Iterator[Finding]:
+def _untested_findings(before: Shipped, after: Shipped) -> Iterator[Finding]:
     for shipped in dict.fromkeys((before, after)):
         if not shipped.tested:
             same_vendor = before.vendor is after.vendor
@@ -509,8 +513,8 @@ def _untested_notes(before: Shipped, after: Shipped) -> Iterator[Finding]:
             yield NOT_MEASURED.found(f"ROS 2 {shipped.distribution.title}", text)
 
 
-def _expired_peers_notes(before: Shipped, after: Shipped) -> Iterator[Finding]:
-    """Yield a note if only one of two releases separates running processes at an expiry."""
+def _expired_peers_findings(before: Shipped, after: Shipped) -> Iterator[Finding]:
+    """Yield a finding if only one of two releases separates running processes at an expiry."""
     drops_before, drops_after = (shipped.vendor.traits.drops_expired for shipped in (before, after))
     if drops_before != drops_after:
         does = "lose each other" if drops_after else "keep communicating"
@@ -585,7 +589,7 @@ def _drops_below_name(
     messages = [
         message
         for topic in right.topics.publish
-        for message in zenoh_message(topic, domain, writes=True)
+        for message in zenoh_messages(topic, domain, writes=True)
     ]
     return bool(messages) and any(
         enforcer.decide(remote, flow, message, key).allowed

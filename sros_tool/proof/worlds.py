@@ -112,8 +112,8 @@ ROS_TOPICS = NameSet.union(
 class TopicUser:
     """An enclave that may use some of the topics in question.
 
-    The rights of the enclave name the ``stated`` topics; with ``wild``, wildcards may match further
-    topics.
+    ``names`` are all topics that it may use. The rights of the enclave name the ``stated`` topics;
+    with ``wild``, wildcards may match further topics.
     """
 
     enclave: str
@@ -130,14 +130,14 @@ def shortest(names: Iterable[str]) -> str | None:
 class Side:
     """An index of the topics that enclaves may write, or an index of the topics they may read."""
 
-    def __init__(self, of: Mapping[str, NameSet]) -> None:
-        self.of = of
+    def __init__(self, topics_of: Mapping[str, NameSet]) -> None:
+        self.topics_of = topics_of
         self.exact: dict[str, list[str]] = defaultdict(list)
         self._wild: dict[Automaton, list[str]] = defaultdict(list)
         self._any: list[str] = []
         self._found: dict[str, Sequence[str]] = {}
         self._users_by_automaton: dict[Automaton, frozenset[str]] = {}
-        for enclave, names in of.items():
+        for enclave, names in topics_of.items():
             around = names.superset()
             if around is None:
                 self._any.append(enclave)
@@ -158,7 +158,7 @@ class Side:
         stated: dict[str, list[str]] = {}
         for topic in self.topics_matching(topics.expression, limit):
             for enclave in self.exact[topic]:
-                if topic in self.of[enclave]:
+                if topic in self.topics_of[enclave]:
                     stated.setdefault(enclave, []).append(topic)
         own_automaton = _automaton_of_wildcards(topics.expression)
         if own_automaton is None:
@@ -174,7 +174,9 @@ class Side:
             self._any
         )
         return [
-            TopicUser(enclave, self.of[enclave], tuple(stated.get(enclave, ())), enclave in wild)
+            TopicUser(
+                enclave, self.topics_of[enclave], tuple(stated.get(enclave, ())), enclave in wild
+            )
             for enclave in sorted(wild.union(stated))
         ]
 
@@ -209,7 +211,7 @@ class Side:
         An enclave may be listed wrongly.
         """
         if automata is None:
-            return sorted(self.of)
+            return sorted(self.topics_of)
         enclaves = set(self._any)
         for own_automaton in automata:
             if own_automaton not in self._users_by_automaton:
@@ -236,7 +238,7 @@ class Side:
         for automaton, enclaves in self._wild.items():
             if not users.issuperset(enclaves) and automaton.matches(topic):
                 users.update(enclaves)
-        return sorted(user for user in users if topic in self.of[user])
+        return sorted(user for user in users if topic in self.topics_of[user])
 
 
 def _indexes_starting_with(ordered: list[str], begin: str) -> range:
@@ -275,7 +277,7 @@ Confirm = Callable[[str, bool, str], bool]
 """Function (enclave, writes, topic): whether the world's engine allows writing (or reading)."""
 
 
-class Written(NamedTuple):
+class WrittenTopics(NamedTuple):
     """The topics that an enclave may write; ``exact`` are the topics stated without wildcards.
 
     ``around`` is the result of `NameSet.superset` for the exact topics.
@@ -347,7 +349,7 @@ class World:
         self._readers_of: dict[str, list[str]] = {}
         self._writers_of: dict[str, list[str]] = {}
         self._shared: dict[tuple[str, str], str | None] = {}
-        self._written: dict[str, Written] = {}
+        self._written: dict[str, WrittenTopics] = {}
         self._stated_names: dict[tuple[str, str], frozenset[str]] = {}
 
     def _with_fitting(self, name: str, access: Mapping[str, TopicAccess]) -> TopicAccess:
@@ -452,7 +454,9 @@ class World:
             )
         return self._stated_names[begin, end]
 
-    def use(self, topic_user: TopicUser, topics: Topics, limit: SearchLimit) -> str | None:
+    def example_of_use(
+        self, topic_user: TopicUser, topics: Topics, limit: SearchLimit
+    ) -> str | None:
         """Return the best example of ``topics`` that an enclave may use, or None."""
         if topic_user.wild:
             return self.example(topic_user.names, topics, limit)
@@ -481,16 +485,16 @@ class World:
         """Return the router that an enclave connects to; "" in a network with a single router."""
         return self.crossing.router_of.get(enclave, "") if self.crossing else ""
 
-    def written_by(self, enclave: str, excluded_names: NameSet) -> Written:
+    def written_by(self, enclave: str, excluded_names: NameSet) -> WrittenTopics:
         """Return topics that an enclave may write, without ``excluded_names``.
 
         All calls must have the same ``excluded_names``, because results are cached.
         """
         if enclave not in self._written:
-            names = self.side(True).of.get(enclave, NameSet()) - excluded_names
+            names = self.side(True).topics_of.get(enclave, NameSet()) - excluded_names
             around = names.superset()
             exact = tuple(topic for topic in around.exact if topic in names) if around else ()
-            self._written[enclave] = Written(names, around, exact)
+            self._written[enclave] = WrittenTopics(names, around, exact)
         return self._written[enclave]
 
     def shared_topic(
@@ -501,7 +505,7 @@ class World:
         ``written`` has to depend on the writer only.
         """
         if (writer, reader) not in self._shared:
-            shared = written & self._readers.of.get(reader, NameSet())
+            shared = written & self._readers.topics_of.get(reader, NameSet())
             crossing = self.topics_between(writer, reader)
             shared = shared if crossing is None else shared & crossing
             valid = (shared & names for names in _VALID_TOPICS)
@@ -608,7 +612,7 @@ def any_allows(
     enforcers: Iterable[Enforcement], enclave: str, domain: int, topic: str, *, writes: bool
 ) -> bool:
     """Return whether any of the enforcers lets an enclave write or read a topic."""
-    messages = zenoh_message(topic, domain, writes=writes)
+    messages = zenoh_messages(topic, domain, writes=writes)
     remote = Remote(enclave)
     return bool(messages) and any(
         all(enforcer.decide(remote, *message).allowed for message in messages)
@@ -681,7 +685,7 @@ def _topics(key: str, domain: int, begin: str) -> NameSet:
     return NameSet(exact, (automaton.surrounded(begin, end) for automaton in inner))
 
 
-def zenoh_message(topic: str, domain: int, *, writes: bool) -> list[tuple[Flow, Message, str]]:
+def zenoh_messages(topic: str, domain: int, *, writes: bool) -> list[tuple[Flow, Message, str]]:
     """Return flow, message and key of the messages by which a process writes or reads a topic.
 
     A topic without a ROS name has no messages.

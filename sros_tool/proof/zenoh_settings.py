@@ -22,7 +22,10 @@ from sros_tool.zenoh.document import ConfigurationDocument, parse_configuration
 
 @dataclass(frozen=True, slots=True)
 class SignedConfiguration:
-    """A Zenoh configuration; the state ``signature`` is "holds", "missing" or "broken"."""
+    """A Zenoh configuration with the state of its signature.
+
+    ``signature`` is "holds", "missing", "broken", or "not verified" without a permissions CA.
+    """
 
     document: ConfigurationDocument
     signature: str

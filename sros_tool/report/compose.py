@@ -107,7 +107,7 @@ class PictureSource:
         """Whether the system may have enclaves that are not in the source."""
         return self.is_export or self.origin.kind in ("enclave", "permissions")
 
-    def titled(self, title: str) -> PictureSource:
+    def with_title(self, title: str) -> PictureSource:
         """Return a copy with another title."""
         return replace(self, origin=self.origin._replace(title=title))
 

@@ -38,8 +38,8 @@ from sros_tool.report.layout import (
     enclave_notes,
     links_of,
     names_card,
-    placed,
     side_card,
+    with_positions,
 )
 from sros_tool.report.picture import (
     Bundle,
@@ -472,7 +472,7 @@ def flow_scene(picture: Picture, hops: int = HOPS, *, with_places: bool = True) 
         heads=tuple(draft.heads(cards)),
         shown=len(names),
     )
-    return placed(scene, draft.columns) if with_places else scene
+    return with_positions(scene, draft.columns) if with_places else scene
 
 
 class _Stage(NamedTuple):
@@ -497,14 +497,14 @@ class _Draft:
         self._first = 2 if self._further[0] else 0
         self.columns = self._column_of(True, 1) + 2 * self._right + 1
         self.columns += 2 if self._further[1] else 0
-        self._nodes = self._folded()
+        self._nodes = self._card_ids()
         self._stages = [self._stage(stage) for stage in range(1 - self._right, self._left)]
 
     def _column_of(self, is_before_focus: bool, hop: int) -> int:
         middle = self._first + 2 * self._left - 1
         return middle + (1 - 2 * hop if is_before_focus else 2 * hop - 1)
 
-    def _folded(self) -> Mapping[tuple[bool, str], str]:
+    def _card_ids(self) -> Mapping[tuple[bool, str], str]:
         """Map pairs (whether before the focus, enclave) to the id of the card with the enclave."""
         nodes = {}
         for before, side in ((True, self._flow.before), (False, self._flow.after)):

@@ -61,7 +61,11 @@ _Part = tuple[int, tuple[int, ...]]
 
 
 class Folding(NamedTuple):
-    """A picture in which equal units are drawn once, and the real names behind the labels."""
+    """A picture in which equal units are drawn once, and the real names behind the labels.
+
+    ``enclaves`` maps drawn paths to the real paths; ``names`` maps a kind and a drawn name to the
+    real names.
+    """
 
     picture: Picture
     equal: tuple[EqualUnits, ...]
@@ -116,11 +120,11 @@ class Folding(NamedTuple):
 
 
 class DrawnUnit(NamedTuple):
-    """A robot, namespace or enclave that can be equal to other units of its ``family``.
+    """A robot, namespace or enclave (``what``) that can be equal to other units of its family.
 
-    ``values`` are the words that stand for the unit in names: its name, and its namespace if that
-    differs. ``group`` are the groups and the domain of a robot: only robots with the same groups
-    and domain are expected to be alike.
+    ``family`` is the number of the family.      ``values`` are the words that stand for the unit in
+    names: its name, and its namespace if that differs. ``group`` are the groups and the domain of a
+    robot: only robots with the same groups and domain are expected to be alike.
     """
 
     name: str
@@ -178,10 +182,10 @@ class UnitText:
 class UnitNames:
     """The names of units in texts, and the unit of each enclave.
 
-    ``of`` maps enclaves to the numbers of their units.  An enclave belongs to the unit whose name
-    is in the enclave's path, even outside of the unit's namespace.  If the path has the names of
-    several units, the enclave belongs to no unit. A unit can be folded only if the paths of all its
-    enclaves have the unit's name.
+    ``unit_of`` maps enclaves to the numbers of their units.  An enclave belongs to the unit whose
+    name is in the enclave's path, even outside of the unit's namespace.  If the path has the names
+    of several units, the enclave belongs to no unit. A unit can be folded only if the paths of all
+    its enclaves have the unit's name.
     """
 
     def __init__(self, units: Sequence[DrawnUnit], paths: Iterable[str]) -> None:
@@ -196,21 +200,21 @@ class UnitNames:
                 if number[value] == 1 and n not in dropped
             }
             self._texts: dict[str, UnitText] = {}
-            self.of: dict[str, int] = {
+            self.unit_of: dict[str, int] = {
                 path: n
                 for n, unit in enumerate(units)
                 if n not in dropped
                 for path in unit.enclaves
             }
-            unnamed = {n for path, n in self.of.items() if n not in self.text(path).units}
+            unnamed = {n for path, n in self.unit_of.items() if n not in self.text(path).units}
             if not unnamed:
                 break
             dropped |= unnamed
         for path in paths:
-            if path not in self.of:
+            if path not in self.unit_of:
                 named_units = set(self.text(path).units)
                 if len(named_units) == 1:
-                    self.of[path] = named_units.pop()
+                    self.unit_of[path] = named_units.pop()
 
     def text(self, text: str) -> UnitText:
         """Return a text split at the names of units: whole words, or parts between underscores."""
@@ -263,13 +267,13 @@ class _Draft:
         self._units = units_of(paths, robots)
         self._names_of = {(name.kind, name.name): name for name in picture.names}
         names = UnitNames(self._units, paths)
-        self._of, self._text = names.of, names.text
+        self._unit_of, self._text = names.unit_of, names.text
         self._unread = {units.like: units.members for units in picture.unread}
         self._domains_of = {enclave.path: enclave.domains for enclave in picture.enclaves}
 
     def folding(self) -> Folding:
         """Return the folding; its picture is unchanged if nothing can be folded."""
-        if self._of and not self._has_marks():
+        if self._unit_of and not self._has_marks():
             self._kinds: dict[object, int] = {}
             self._common_kinds: set[int] = set()
             self._seen = tuple(self._parts_with_unit_names())
@@ -299,7 +303,7 @@ class _Draft:
 
     def _path_split_at_own_unit(self, enclave: str) -> UnitText:
         """Return the path of an enclave, split only at the name of the enclave's own unit."""
-        return self._text(enclave).with_only_unit(self._of.get(enclave), self._word)
+        return self._text(enclave).with_only_unit(self._unit_of.get(enclave), self._word)
 
     def _parts_with_unit_names(self) -> Iterator[tuple[int, tuple[int, ...], Edge | str]]:
         """Yield each enclave and drawn right whose texts have names of units.
@@ -314,7 +318,7 @@ class _Draft:
         targets = {(focus.kind, focus.name) for focus in self._picture.focus}
         owners = {e.path: self._path_split_at_own_unit(e.path) for e in self._picture.enclaves}
         for enclave in self._picture.enclaves:
-            if enclave.path in self._of:
+            if enclave.path in self._unit_of:
                 owner, group = owners[enclave.path], self._text(enclave.group)
                 drawn = (
                     *(owner.form, group.form, enclave.observed, enclave.domains),
@@ -422,11 +426,11 @@ class _Draft:
         return 2 * len(own & others) >= max(len(own), len(others))
 
     def _named_by(self, families: Container[int]) -> Counter[int]:
-        """Map each unit to the number of other units of its family with rights to its names."""
+        """Map each unit of ``families`` to how many other units of its family have rights to it."""
         pairs = {
             (unit, owner)
             for _kind, units, part in self._seen
-            if isinstance(part, Edge) and (owner := self._of.get(part.enclave)) is not None
+            if isinstance(part, Edge) and (owner := self._unit_of.get(part.enclave)) is not None
             for unit in units
             if unit != owner
             and self._units[unit].family == self._units[owner].family
@@ -450,7 +454,7 @@ class _Draft:
             edges=edges,
             focus=tuple(map(self._focus, self._picture.focus)),
         )
-        shown_domains = {self._domains(unit) for unit in self._of.values()} - {""}
+        shown_domains = {self._domains(unit) for unit in self._unit_of.values()} - {""}
         units = sorted(
             EqualUnits(
                 self._label(members[0]),
@@ -489,7 +493,7 @@ class _Draft:
 
     def _path(self, enclave: str) -> str:
         """Return the path that is drawn for an enclave, with labels for units."""
-        text, unit = self._path_split_at_own_unit(enclave), self._of.get(enclave)
+        text, unit = self._path_split_at_own_unit(enclave), self._unit_of.get(enclave)
         path = text.fill(self._label)
         if unit in self._inside and path not in self._enclaves:
             self._enclaves[path] = tuple(self._per_unit(text, self._inside[unit]))
@@ -507,7 +511,7 @@ class _Draft:
         """Yield the rights to draw: rights of drawn units, and of enclaves without a unit."""
         count_text = self._other_units_text()
         for edge in self._picture.edges:
-            unit = self._of.get(edge.enclave)
+            unit = self._unit_of.get(edge.enclave)
             if unit is not None and not self._is_drawn(unit):
                 continue
             name = self._text(edge.name)
@@ -534,7 +538,7 @@ class _Draft:
         """Return a function that returns the number of other units for a right, as text."""
         units_by_key: dict[object, set[int]] = defaultdict(set)
         families: dict[int, list[int]] = defaultdict(list)
-        for n in sorted(set(self._of.values()), key=self._unit_name_order):
+        for n in sorted(set(self._unit_of.values()), key=self._unit_name_order):
             families[self._units[n].family].append(n)
 
         def key(edge: Edge, unit: int, other_unit: int) -> object:
@@ -548,7 +552,7 @@ class _Draft:
             )
 
         for edge in self._picture.edges:
-            unit = self._of.get(edge.enclave)
+            unit = self._unit_of.get(edge.enclave)
             if unit is not None and self._is_drawn(unit):
                 for other_unit in self._text(edge.name).units:
                     if self._is_counted(unit, other_unit):
@@ -590,7 +594,7 @@ class _Draft:
     def _folded_enclaves(self, differing_parts: Set[Edge | str]) -> Iterator[PicturedEnclave]:
         differing = {part if isinstance(part, str) else part.enclave for part in differing_parts}
         for enclave in self._picture.enclaves:
-            unit = self._of.get(enclave.path)
+            unit = self._unit_of.get(enclave.path)
             if unit is None:
                 yield enclave
             elif self._is_drawn(unit):
@@ -630,7 +634,7 @@ class _Draft:
                 usual_of.setdefault((self._units[n].family, self._units[n].group), members[0])
         near = {
             n: usual
-            for n in set(self._of.values()) - self._units_in_focus()
+            for n in set(self._unit_of.values()) - self._units_in_focus()
             if (usual := usual_of.get((self._units[n].family, self._units[n].group))) is not None
             and self._is_drawn(n)
             and self._inside.get(n) != self._inside[usual]
@@ -649,8 +653,8 @@ class _Draft:
                 more = [part for key, part in own_parts.items() if key not in near_parts]
                 fewer = [part for key, part in near_parts.items() if key not in own_parts]
                 differing_parts.update(more)
-                only = dict.fromkeys(self._in_words(more, n))
-                missing = dict.fromkeys(self._in_words(fewer, n, near[n]))
+                only = dict.fromkeys(self._texts_of_parts(more, n))
+                missing = dict.fromkeys(self._texts_of_parts(fewer, n, near[n]))
                 # An enclave that both units have differs in something else, such as a fault.
                 has = tuple(text for text in only if text not in missing)
                 lacks = tuple(text for text in missing if text not in only)
@@ -665,7 +669,7 @@ class _Draft:
         names = (focus.name for focus in self._picture.focus)
         return {unit for name in names for unit in self._text(name).units}
 
-    def _in_words(
+    def _texts_of_parts(
         self, drawn: Sequence[Edge | str], unit: int, replaced: int | None = None
     ) -> Iterator[str]:
         """Yield enclaves and rights in words, with the name of ``unit`` instead of ``replaced``."""

@@ -201,7 +201,7 @@ def _summary(picture: Picture, scene: Scene) -> str:
 
 
 def _lines(text: str, width: int) -> list[str]:
-    """Split a sentence into lines that fit into a picture of this width."""
+    """Split a sentence into lines that fit into a picture of this width, in pixels."""
     return wrap(text, max(20, (width - 28) // 7), break_on_hyphens=False)
 
 

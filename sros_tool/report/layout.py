@@ -92,7 +92,7 @@ class Head(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scene:
-    """Cards and the links between them.
+    """Cards and the links between them; all lengths and positions are in pixels.
 
     ``shown`` is the number of names that are drawn, or counted on the card of the only enclave with
     rights to them. ``hidden`` is the number of names that are left out, because all rights to these
@@ -116,11 +116,12 @@ class Scene:
 class Card:
     """A rectangle with text: an enclave, a group of enclaves, or a bundle of names.
 
-    ``column`` counts from 0, names are in odd columns; an enclave that sends and listens has a card
-    on both sides.  A card in the focus of the picture is ``chosen``.  ``lines`` is the text,
-    ``notes`` smaller text below.  ``members`` are all enclaves or names of the card.  Only cards of
-    names have ``kind``, ``level``, ``lacks`` and ``tags``: the letters of onlookers, which are
-    nodes with rights to many of the names.  Only cards of enclaves have ``group``.
+    ``role`` is "enclave", "group" or "names".  ``column`` counts from 0, names are in odd columns;
+    an enclave that sends and listens has a card on both sides.  A card in the focus of the picture
+    is ``chosen``.  ``lines`` is the text, ``notes`` smaller text below.  ``members`` are all
+    enclaves or names of the card.  Only cards of names have ``kind``, ``level``, ``lacks`` and
+    ``tags``: the letters of onlookers, which are nodes with rights to many of the names.  Only
+    cards of enclaves have ``group``.
     """
 
     id: str
@@ -272,7 +273,7 @@ def _scene(
         everybody[edge.kind, edge.name].add(owner(edge.enclave))
     draft = _Draft(picture, edges, owner, members, everybody)
     scene = draft.scene(name, title)
-    scene = placed(scene, 3) if with_places else scene
+    scene = with_positions(scene, 3) if with_places else scene
     shown = _count_real_names({(edge.kind, edge.name) for edge in edges}, drawn_as or {})
     hidden = (
         _count_real_names({(name.kind, name.name) for name in picture.names}, drawn_as or {})
@@ -593,21 +594,23 @@ def links_of(cards: Mapping[str, Card], ties: Iterable[LinkedTie]) -> list[Link]
     ]
 
 
-def placed(scene: Scene, columns: int) -> Scene:
-    """Return a scene with the positions of all cards, links and frames."""
+def with_positions(scene: Scene, columns: int) -> Scene:
+    """Return a scene with the positions of all cards, links and frames, in ``columns`` columns."""
     lines = sorted({(link.source, link.target) for link in scene.links})
     tips = Counter(link.target for link in scene.links)
-    cards = _stacked_cards([_with_room_for(tips[c.id], c) for c in scene.cards], lines, columns)
+    cards = _stacked_cards(
+        [_with_room_for_tips(tips[c.id], c) for c in scene.cards], lines, columns
+    )
     return replace(
         scene,
         height=max((card.y + card.height for card in cards.values()), default=0) + MARGIN,
         cards=tuple(cards.values()),
-        links=_linked_cards(cards, scene.links),
+        links=_links_with_ends(cards, scene.links),
         frames=tuple(_frames_of(cards.values())),
     )
 
 
-def _with_room_for(tips: int, card: Card) -> Card:
+def _with_room_for_tips(tips: int, card: Card) -> Card:
     """Return the card, high enough for this number of arrowheads below each other."""
     needed = 2 * PAD + _TIP * (min(tips, _MOST_TIPS) - 1)
     return replace(card, height=max(card.height, needed))
@@ -633,7 +636,7 @@ def _stacked_cards(
     }
 
 
-def _linked_cards(cards: Mapping[str, Card], links: Sequence[Link]) -> tuple[Link, ...]:
+def _links_with_ends(cards: Mapping[str, Card], links: Sequence[Link]) -> tuple[Link, ...]:
     """Return the links with their ends spread along the edges of the cards."""
     ports: dict[tuple[str, bool], list[tuple[float, int]]] = defaultdict(list)
     for number, link in enumerate(links):
@@ -776,7 +779,10 @@ def _crossings(columns: Sequence[Sequence[ColumnItem]], lines: Sequence[tuple[st
 
 
 def _inversions(ends: Sequence[int], size: int) -> int:
-    """Return the number of inverted pairs, computed with a Fenwick tree."""
+    """Return how many pairs of ``ends`` are in decreasing order, computed with a Fenwick tree.
+
+    All ``ends`` are less than ``size``.
+    """
     tree = [0] * (size + 1)
     crossings = 0
     for count, end in enumerate(ends):

@@ -157,9 +157,7 @@ def _page_data(picture: Picture, scenes: tuple[Scene, ...], drawn: Picture) -> d
 def _requirements_json(requirements: Requirements | None) -> dict[str, Any] | None:
     """Return the number of requirements that hold, and the violations of all others.
 
-    The result is None without requirements.
-
-    Findings have further details.
+    The result is None without requirements. The page's findings have further details.
     """
     return requirements and {
         "hold": requirements.hold,

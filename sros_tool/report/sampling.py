@@ -33,7 +33,10 @@ _UNIT_MARKS = "\x01\x02"
 
 
 class SampledKeystore(NamedTuple):
-    """The enclaves of a keystore to read in full, and the units of all other enclaves."""
+    """The enclaves of a keystore to read in full, and the units of all other enclaves.
+
+    ``unread`` are these units, and ``left_out`` their numbers in ``names``.
+    """
 
     keystore: OpenedKeystore
     enclaves: tuple[str, ...]
@@ -41,7 +44,7 @@ class SampledKeystore(NamedTuple):
     names: UnitNames = UnitNames((), ())
     left_out: frozenset[int] = frozenset()
 
-    def rights(self, rights: Collection[Right]) -> frozenset[Right]:
+    def without_unread_units(self, rights: Collection[Right]) -> frozenset[Right]:
         """Return the rights, except rights to names of units that are not read."""
         if not self.left_out:
             return frozenset(rights)
@@ -72,7 +75,7 @@ def sample_of(
     if any(_is_ambiguous(word, names.words) for word in names.words):
         return whole_keystore
     enclaves: dict[int, list[str]] = defaultdict(list)
-    for path, number in names.of.items():
+    for path, number in names.unit_of.items():
         enclaves[number].append(path)
     equal_units: dict[object, list[int]] = defaultdict(list)
     for n in sorted(enclaves, key=lambda n: name_order(units[n].name)):
@@ -85,7 +88,7 @@ def sample_of(
         if len(further) > 1 and _named_units(keystore, enclaves[first], names) <= {first}
         for n in (first, *further)
     }
-    other_paths = [path for path in paths if names.of.get(path) not in few]
+    other_paths = [path for path in paths if names.unit_of.get(path) not in few]
     if len(other_paths) > _MAX_READ_IN_FULL:
         return whole_keystore
     named: dict[int, set[Right]] = defaultdict(set)
@@ -105,7 +108,7 @@ def sample_of(
             number = sum(len(enclaves[n]) for n in unread_units)
             unread.append(UnreadUnits(units[first].what, members, number, units[first].name))
             left_out |= {*unread_units}
-    chosen = tuple(path for path in paths if names.of.get(path) not in left_out)
+    chosen = tuple(path for path in paths if names.unit_of.get(path) not in left_out)
     return SampledKeystore(keystore, chosen, tuple(unread), names, frozenset(left_out))
 
 

@@ -135,7 +135,7 @@ def draw(request: PictureRequest) -> tuple[Picture, Folding]:
         )
     titles = _titles([*sources, *request.observed])
     read = [
-        _read(path, fleet, request, title).titled(title)
+        _read(path, fleet, request, title).with_title(title)
         for path, fleet, title in zip(sources, fleets, titles, strict=False)
     ]
     observed = [read_source(path, now=request.now) for path in request.observed]
@@ -154,7 +154,7 @@ def draw(request: PictureRequest) -> tuple[Picture, Folding]:
     places = {enclave: robot.name for enclave, robot in robots.items()}
     hosts = places | _hosts(request.hosts)
     if observed:
-        observation = union(list(map(PictureSource.titled, observed, titles[len(read) :])))
+        observation = union(list(map(PictureSource.with_title, observed, titles[len(read) :])))
         enclave_of = enclaves_of_nodes(observation.nodes, read[0].nodes)
         read.append(observation.moved_to_homes(enclave_of))
     picture = _compared_picture(read, hosts, use=bool(request.observed))
@@ -423,7 +423,7 @@ def _with_requirements(
             _finding_text(finding, finding.subject),
             short_text(violation),
             tuple(
-                PicturedUse(step.use.enclave, *step.drawn())
+                PicturedUse(step.use.enclave, *step.stated_form())
                 for step in violation.steps
                 # What an enclave may not do, but must, is no right that could be drawn.
                 if step.place and step.use.right and not isinstance(violation.requirement, Must)
@@ -487,14 +487,14 @@ def read_source(
     """
     data = read_bytes(path, "file") if path.is_file() else b""
     if data.lstrip()[:1] == b"{" and not is_zenoh(data, path):
-        return _observation(path)
+        return _read_observation(path)
     if sample is None and path.is_dir() and is_keystore(path):
         keystore = OpenedKeystore(path)
         sample = SampledKeystore(keystore, keystore.names)
     if sample:
         read = load_rights(sample.keystore, only_enclaves=sample.enclaves)
         notes = (*read.notes, *notes_on_hidden_enclaves(path))
-        read = replace(read, rights=sample.rights(read.rights), notes=notes)
+        read = replace(read, rights=sample.without_unread_units(read.rights), notes=notes)
     else:
         read = load_rights(path, fleet)
     findings = tuple(PicturedFinding(note.id, "warning", note.text) for note in read.notes)
@@ -566,7 +566,7 @@ def _printable(name: str) -> str:
     )
 
 
-def _observation(path: Path) -> PictureSource:
+def _read_observation(path: Path) -> PictureSource:
     try:
         observed = observation_from_json(parse_json(read_bytes(path, "file")))
     except (ValueError, KeyError, TypeError, AttributeError) as error:

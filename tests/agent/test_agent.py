@@ -187,7 +187,7 @@ class FakeSystemd(Systemd):
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
 
-    def active(self) -> frozenset[str]:
+    def active_units(self) -> frozenset[str]:
         return frozenset({"sros@r1-b.service"})
 
     def restart(self, unit: str) -> None:

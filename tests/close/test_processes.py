@@ -169,7 +169,9 @@ def test_commands_name_the_rmw_and_on_zenoh_the_enclave() -> None:
     in_domain = "cd /opt && env ROS_DOMAIN_ID=7 RMW_IMPLEMENTATION=rmw_zenoh_cpp python3 talk"
     assert talker.open_command(7) == in_domain
     observed = ObservedProcesses(7, [talker])
-    assert observed.command_of_new(Path("export"), "/horn") == f"{run.format('/horn')} COMMAND"
+    assert (
+        observed.command_of_new_process(Path("export"), "/horn") == f"{run.format('/horn')} COMMAND"
+    )
 
 
 def test_commands_name_the_path_of_sros_where_a_shell_does_not_find_it(

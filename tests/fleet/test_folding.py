@@ -11,7 +11,7 @@ import pytest
 from sros_tool.checks.formats import folded_findings
 from sros_tool.checks.requirements import VIOLATED
 from sros_tool.cli.changed import print_plan
-from sros_tool.fleet.robots import Fleet, Robot, folded
+from sros_tool.fleet.robots import Fleet, Robot, folded_lines
 from sros_tool.keystore import transaction
 from tests.proof.test_review import Change
 from tests.support.harness import copy_of, policy_text, publish, sros, subscribe
@@ -34,49 +34,51 @@ def lines(text: str, *robots: str) -> list[tuple[str, str]]:
 
 def test_what_differs_only_in_the_robot_is_one_line() -> None:
     text = "- /{robot}/base ALLOW publish topic {namespace}/odom"
-    assert list(folded(FLEET, lines(text, "r1", "r10", "r2"))) == [
+    assert list(folded_lines(FLEET, lines(text, "r1", "r10", "r2"))) == [
         f"{text}  (3 robots: r1, r10, r2)"
     ]
-    assert list(folded(FLEET, lines(text, "r1", "r10"))) == [f"{text}  (the 2 robots of carriers)"]
+    assert list(folded_lines(FLEET, lines(text, "r1", "r10"))) == [
+        f"{text}  (the 2 robots of carriers)"
+    ]
     every = "/{robot}/base"
-    assert list(folded(FLEET, lines(every, *FLEET.robots))) == [f"{every}  (all 4 robots)"]
+    assert list(folded_lines(FLEET, lines(every, *FLEET.robots))) == [f"{every}  (all 4 robots)"]
 
 
 def test_what_differs_stands_out_and_one_robot_stays_as_it_is() -> None:
     found = [*lines("/{robot}/base may", "r1", "r10"), *lines("/{robot}/base may not", "r2"),
              ("/d", "/d may")]  # fmt: skip
-    assert list(folded(FLEET, found)) == [
+    assert list(folded_lines(FLEET, found)) == [
         "/{robot}/base may  (the 2 robots of carriers)", "/r2/base may not", "/d may",
     ]  # fmt: skip
-    assert list(folded(None, found)) == [text for _, text in found]
+    assert list(folded_lines(None, found)) == [text for _, text in found]
 
 
 def test_the_name_of_another_robot_is_no_placeholder() -> None:
     found = [("/r1/base", "/r1/base to /r10/x r1_x"), ("/r10/base", "/r10/base to /r10/x r1_x")]
-    assert list(folded(FLEET, found)) == [text for _, text in found]
+    assert list(folded_lines(FLEET, found)) == [text for _, text in found]
 
 
 def test_an_enclave_of_no_robot_has_the_only_robot_that_its_line_names() -> None:
     one = [("/d", f"/d may publish {names}/go") for names in ("/hall/r1", "/hall/r10", "/r2")]
-    assert list(folded(FLEET, one)) == [
+    assert list(folded_lines(FLEET, one)) == [
         "/d may publish {namespace}/go  (3 robots: r1, r10, r2)",
     ]
     several = [("/d", f"/d may move {names}") for names in ("/r1 to /r2", "/r2 to /r1")]
-    assert list(folded(FLEET, several)) == [text for _, text in several]
+    assert list(folded_lines(FLEET, several)) == [text for _, text in several]
 
 
 def test_an_enclave_of_a_robot_is_folded_by_the_only_other_robot_of_its_lines() -> None:
     one = [("/x/base", f"/x/base may publish {names}/go") for names in ("/hall/r1", "/hall/r10")]
-    assert list(folded(FLEET, one)) == [
+    assert list(folded_lines(FLEET, one)) == [
         "/x/base may publish /hall/{other}/go  (the 2 robots of carriers)"
     ]
     every = [*one, ("/x/base", "/x/base may publish /r2/go"), ("/x/base", "/x/base may join")]
-    assert list(folded(FLEET, every)) == [
+    assert list(folded_lines(FLEET, every)) == [
         "/x/base may publish /hall/{other}/go  (the 2 robots of carriers)",
         "/x/base may publish /r2/go", "/x/base may join",
     ]  # fmt: skip
     both = [*one, ("/r2/base", "/r2/base may publish /hall/r1/go")]
-    assert list(folded(FLEET, both)) == [
+    assert list(folded_lines(FLEET, both)) == [
         "/{robot}/base may publish /hall/r1/go  (2 robots: x, r2)",
         "/x/base may publish /hall/r10/go",
     ]
@@ -89,7 +91,7 @@ def test_many_lines_that_differ_in_two_robots_are_one() -> None:
 
     def told(pairs: list[tuple[str, str]]) -> list[str]:
         lines = ((f"/{one}/base", f"/{one}/base publish /{other}/go") for one, other in pairs)
-        return list(folded(fleet, lines))
+        return list(folded_lines(fleet, lines))
 
     text = "/{robot}/base publish /{other}/go  "
     assert told(every) == [f"{text}(all 8 robots, each with every other)"]
@@ -111,7 +113,9 @@ def test_pairs_are_said_to_be_all_only_if_they_are_all() -> None:
     fleet = Fleet.of(robots, enclaves=["/{robot}/x"])
 
     def told(pairs: list[tuple[str, str]]) -> list[str]:
-        return list(folded(fleet, [(f"/{one}/x", f"/{one}/x to /{two}/y") for one, two in pairs]))
+        return list(
+            folded_lines(fleet, [(f"/{one}/x", f"/{one}/x to /{two}/y") for one, two in pairs])
+        )
 
     each_other = told([*permutations(sources, 2)])
     (line,) = each_other

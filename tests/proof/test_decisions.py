@@ -16,7 +16,7 @@ from sros_tool.keystore.template import load_template
 from sros_tool.policy.document import read_policy
 from sros_tool.proof import decide as decisions
 from sros_tool.proof.findings import (
-    Decided,
+    Decisions,
     decide_all,
     decided_findings,
     requirement_findings,
@@ -44,7 +44,7 @@ def robot(rights: Mapping[str, str]) -> System:
     return policy_system(policy, Circumstances(NOW))
 
 
-def decided(rights: Mapping[str, str], required: str) -> Decided:
+def decided(rights: Mapping[str, str], required: str) -> Decisions:
     return decide_all(parse_requirements(required.encode(), "r.toml"), robot(rights))
 
 

@@ -25,7 +25,7 @@ from cryptography import x509
 from sros_tool.dds.governance import parse_governance, render_governance
 from sros_tool.dds.permissions import parse_permissions
 from sros_tool.errors import KeystoreError, Note, SrosError
-from sros_tool.fleet.robots import folded
+from sros_tool.fleet.robots import folded_lines
 from sros_tool.keystore.delivery.published import read_published
 from sros_tool.keystore.delivery.release import Release, sealed_robot
 from sros_tool.keystore.delivery.rollback import retired_authorities
@@ -436,7 +436,7 @@ def refuse_lost_changes(
         taken = [
             (e.enclave, f"{e.enclave}: {e.what}") for e in changes if e.change == "rights_taken"
         ]
-        texts = [" ".join(text.split()) for text in folded(recorded_fleet(keystore), taken)]
+        texts = [" ".join(text.split()) for text in folded_lines(recorded_fleet(keystore), taken)]
         for text in texts:
             _LOG.info("right that was taken away after the backup: %s", text)
         short = [textwrap.shorten(text, _LONGEST, placeholder=" ...") for text in texts[:_NAMED]]
@@ -535,7 +535,7 @@ def other_changes_notes(keystore: OpenedKeystore, changes: Sequence[LaterChange]
         if change.change in texts
     ]
     if lines:
-        shown = first_few([*folded(recorded_fleet(keystore), lines)], _SHOWN)
+        shown = first_few([*folded_lines(recorded_fleet(keystore), lines)], _SHOWN)
         missing = [change.enclave for change in changes if change.change == "missing"]
         first = f"{_missing_step(quote(str(keystore.root)), missing)} " if missing else ""
         yield Note(

@@ -206,7 +206,7 @@ def _stated_rights(
     expanded = policy.policy() if isinstance(policy, FleetPolicy) else policy
     stated = {name: _StatedRights(stated_enclave(expanded, name)) for name in names}
     if isinstance(policy, FleetPolicy):
-        paths = {name: policy.stated(name)[0].path for name in names}
+        paths = {name: policy.stated_enclave(name)[0].path for name in names}
         stated = {
             name: of_enclave._replace(path=paths[name] if has_placeholder(paths[name]) else "")
             for name, of_enclave in stated.items()

@@ -19,7 +19,7 @@ from cryptography import x509
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import Grant
 from sros_tool.errors import Note, SrosError
-from sros_tool.fleet.robots import Fleet, folded
+from sros_tool.fleet.robots import Fleet, folded_lines
 from sros_tool.keystore.delivery.published import may_have_later_releases
 from sros_tool.keystore.known_keys import IssuedEarlier, restored_at
 from sros_tool.keystore.layout import PERMISSIONS_FILE
@@ -93,7 +93,9 @@ class ReplacedRights:
         return self._text(self.gained, self.gained_domains, fleet)
 
     def _text(self, rights: Sequence[Right], domains: str, fleet: Fleet | None) -> str:
-        described = folded(fleet, ((self.enclave, text) for text in _described_rights(rights)))
+        described = folded_lines(
+            fleet, ((self.enclave, text) for text in _described_rights(rights))
+        )
         texts = (
             first_few(list(described), _RIGHTS_SHOWN),
             f"domain {domains}" if domains else "",
