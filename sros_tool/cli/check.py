@@ -471,7 +471,9 @@ def _one_path(family: str, paths: tuple[Path, ...], option: str) -> Path:
         if not path.is_dir() or is_keystore(path):
             return path
     raise UsageError(
-        f"{option} takes one policy file or keystore", "", "Run the command once for each of these."
+        f"{option} takes one policy file or keystore",
+        "",
+        "Name only one, and run the command once for each.",
     )
 
 

@@ -265,8 +265,8 @@ def _show(robot: LocalRobot, closed: CloseState) -> None:
         )
     for name, rules in closed.denied_remappings.items():
         echo(
-            f"the start command of {name} gives a name that the policy denies, by the remapping "
-            f"{enumerated(rules)}: change it before you start the process"
+            f"the start command of {name} remaps to a name that the policy denies "
+            f"({enumerated(rules)}): change the remapping before you start the process"
         )
     if stays := len(closed.denied) - len(closed.newly_denied):
         rights = counted(stays, "right")

@@ -64,8 +64,8 @@ if TYPE_CHECKING:
     metavar="[NODE:]FROM:=TO",
     multiple=True,
     help="Remap a name of OTHER, as `--ros-args -r` does for a node; also __node:=NAME, __ns:=NS. "
-    "Applies after --namespace.  Requirements need the same rules (`sros check --remap`), but "
-    "cannot follow __ns.  Can be repeated.",
+    "Applies after --namespace.  Give the same rules to `sros check --remap` for requirements; it "
+    "takes no __ns, so use --namespace for that in both commands.  Can be repeated.",
 )
 @click.option(
     "--enclave",

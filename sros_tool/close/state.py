@@ -397,8 +397,9 @@ class CloseState(NamedTuple):
     """
     not_observed: Sequence[str]
     """Processes that run in enclaves of the robot but were not observed there, and further
-    processes with an observed command, as "process 123 (talker) in /talker". If such a process
-    runs in place of an observed process, the text adds that it was started with another command.
+    processes with an observed command, as "process 123 (talker) in /talker". The text of a
+    process that runs in place of the observed process of its enclave ends with "(by another
+    command than the observed process)".
     """
     new: Sequence[str]
     """The enclaves of the policy in which no process was observed, and none runs now."""

@@ -209,7 +209,7 @@ def _advisories_of(record: Mapping[str, Any]) -> Iterator[Advisory]:
         or not _ADVISORY_ID.fullmatch(identity)
     ):
         raise ValueError("an advisory has no id such as CVE-2025-62599")
-    is_withdrawn = bool(_text(record.get("withdrawn") or ""))
+    is_withdrawn = bool(_text(record.get("withdrawn") or "", "withdrawn"))
     aliases = _list(record.get("aliases", []), "aliases")
     cve = (name for name in aliases if isinstance(name, str) and re.fullmatch(_CVE, name))
     database_data = _object(record.get("database_specific", {}))
@@ -224,7 +224,7 @@ def _advisories_of(record: Mapping[str, Any]) -> Iterator[Advisory]:
         unread: list[str] = []
         for part in () if is_withdrawn else parts:
             new_ranges = list(_ranges(part, identity))
-            listed = list(map(_text, _list(part.get("versions", []), "versions")))
+            listed = _texts(part.get("versions", []), "versions")
             numbers = {text: version_numbers(text) for text in listed}
             new_versions = set(filter(None, numbers.values()))
             if not new_ranges and not new_versions:
@@ -235,12 +235,12 @@ def _advisories_of(record: Mapping[str, Any]) -> Iterator[Advisory]:
         yield Advisory(
             name,
             product,
-            _text(record.get("summary", "")),
-            tuple(map(_text, _list(database_data.get("needs", []), "needs"))),
-            _text(database_data.get("gives", "unclear")),
+            _text(record.get("summary", ""), "summary"),
+            tuple(_texts(database_data.get("needs", []), "needs")),
+            _text(database_data.get("gives", "unclear"), "gives"),
             tuple(ranges),
             frozenset(versions),
-            tuple(map(_text, _list(database_data.get("unclear_lines", []), "unclear_lines"))),
+            tuple(_texts(database_data.get("unclear_lines", []), "unclear_lines")),
             tuple(unread),
         )
 
@@ -302,9 +302,13 @@ def _list(value: object, name: str) -> list[Any]:
     return value
 
 
-def _text(value: object) -> str:
+def _texts(value: object, name: str) -> list[str]:
+    return [_text(text, f"an entry of {name}") for text in _list(value, name)]
+
+
+def _text(value: object, name: str) -> str:
     if not isinstance(value, str):
-        raise ValueError("a text is not a string")
+        raise ValueError(f"{name} is not a string")
     return value[:_LONGEST_SUMMARY]
 
 

@@ -101,7 +101,7 @@ def parse_json(text: str) -> Any:
     except (ValueError, RecursionError):
         raise Json5Error("it is not JSON", 1) from None
     if _is_deep(value):
-        raise Json5Error(f"more than {_MAX_DEPTH} levels", 1)
+        raise Json5Error(f"objects and lists are nested more than {_MAX_DEPTH} levels deep", 1)
     return value
 
 
@@ -162,7 +162,9 @@ class _Reader:
 
     def _value(self, depth: int) -> Any:
         if not depth:
-            raise Json5Error(f"more than {_MAX_DEPTH} levels", self._now.line)
+            raise Json5Error(
+                f"objects and lists are nested more than {_MAX_DEPTH} levels deep", self._now.line
+            )
         token = self._take()
         if token.text == "{":
             return self._object(token.line, depth)

@@ -291,10 +291,8 @@ def test_a_policy_that_was_changed_stays_and_is_followed(robot: Robot) -> None:
     policy.write_text(policy.read_text().replace("chatter", "old/chatter", 1))
     changed = policy.read_text()
     ended = robot.close()
-    denied = (
-        "start command of /listener gives a name that the policy denies, by the remapping words"
-    )
-    assert f"{denied}:=chatter: change it before you start the process\n" in ended.out
+    denied = "start command of /listener remaps to a name that the policy denies (words:=chatter)"
+    assert f"{denied}: change the remapping before you start the process\n" in ended.out
     commands = (robot.folder / "robot/start/commands.txt").read_text()
     change = "First change its remapping words:=chatter: the policy denies this name.\ncd /opt && "
     assert f"\n# /listener\n# {change}" in commands and commands.count("First change") == 1

@@ -36,7 +36,7 @@ REFUSED = {
     "/* open": "unexpected",
     "{a:1,'a':2}": "'a' is named twice",
     '"\\ud800"': "half a character",
-    "[" * 101 + "]" * 101: "more than 100 levels",
+    "[" * 101 + "]" * 101: "nested more than 100 levels deep",
 }
 
 

@@ -248,7 +248,8 @@ class Condition(StrEnum):
     CYCLONE = "Cyclone DDS 0.10"
     FAST = "Fast DDS"
     EXACT_SIGNER = (
-        "signers must be in the file of the permissions CA (Fast DDS since 2.10, Cyclone DDS 11)"
+        "the certificate of a signer must be in the file of the permissions CA (Fast DDS with the "
+        "fix of CVE-2023-24010, Cyclone DDS 11)"
     )
 
 
