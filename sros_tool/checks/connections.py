@@ -125,19 +125,21 @@ def with_time_to_connect(processes: Iterable[Process], now: datetime) -> Iterato
 def connection_findings(missing: Sequence[tuple[Process, Process]]) -> Iterator[Finding]:
     """Yield findings about secured processes that trust the same CA, and are not connected."""
     for process, peers in restarts(missing):
-        names = first_few([_named(peer) for peer in peers], _MOST_NAMES)
+        names = first_few([_process_name(peer) for peer in peers], _MOST_NAMES)
         text = f"it has not connected to {names}: they do not hear each other"
-        yield PROCESS_NOT_CONNECTED.found(_named(process), text, remedy=_remedy(process, peers))
+        yield PROCESS_NOT_CONNECTED.found(
+            _process_name(process), text, remedy=_remedy(process, peers)
+        )
 
 
 def missing_text(missing: Sequence[tuple[Process, Process]]) -> str:
     """Return text on pairs of processes that do not hear each other, with the remedy."""
-    first, second = map(_named, missing[0])
+    first, second = map(_process_name, missing[0])
     more = f" and {counted(len(missing) - 1, 'other pair')}" if missing[1:] else ""
     to_restart = [*restarts(missing)]
     remedy = next(filter(None, (_remedy(process, peers) for process, peers in to_restart)), "")
     if not remedy:
-        names = enumerated([_named(process) for process, _ in to_restart])
+        names = enumerated([_process_name(process) for process, _ in to_restart])
         remedy = f"restart {names}{', one after the other' * (len(to_restart) > 1)}, and ask again"
     return f"{first} and {second}{more} do not hear each other; {remedy[0].lower()}{remedy[1:]}"
 
@@ -147,5 +149,5 @@ def _remedy(process: Process, peers: Iterable[Process]) -> str:
     return _REMEDY_FOR_USERS if {peer.user for peer in peers} != {process.user} else ""
 
 
-def _named(process: Process) -> str:
+def _process_name(process: Process) -> str:
     return f"{process.label}{f' in {plain(process.enclave.name)}' if process.enclave else ''}"

@@ -411,33 +411,39 @@ _NEEDED_TLS_FILES = {
 }
 
 
-def secured_by(environment: Mapping[str, str], folder: Path) -> Iterator[str]:
-    """Yield clauses on settings that secure nodes which start with an environment in a folder."""
+def security_clauses(environment: Mapping[str, str], folder: Path) -> Iterator[str]:
+    """Yield clauses on settings in ``environment`` that secure nodes.
+
+    ``folder`` is the working directory of the nodes.
+    """
     if environment.get(ENABLE) == "true":
         yield f"{ENABLE} is set"
     if is_zenoh(environment):
-        yield from _secured_by_zenoh(environment, folder)
+        yield from _zenoh_security_clauses(environment, folder)
         return
     value = environment.get("CYCLONEDDS_URI", "")
     inline = value.lstrip().startswith("<") and "$" not in value
     for part in [value] if inline else filter(None, value.split(",")):
         path = folder / part.strip().removeprefix("file://")
-        yield from _security_in_configuration(
+        yield from _configuration_security_clauses(
             _CYCLONE_SECURITY, "CYCLONEDDS_URI", part.encode() if inline else path
         )
     for name in (*_PROFILE_VARIABLES, "FASTDDS_ENVIRONMENT_FILE"):
         if text := environment.get(name, ""):
             sought = _PROFILE_SECURITY if name in _PROFILE_VARIABLES else _NAMES_PROFILES
-            yield from _security_in_configuration(sought, name, folder / text)
+            yield from _configuration_security_clauses(sought, name, folder / text)
     for path in map(folder.joinpath, _DEFAULT_PROFILES):
         if path.exists():
-            yield from _security_in_configuration(
+            yield from _configuration_security_clauses(
                 _PROFILE_SECURITY, f"'{path.name}' in this folder", path
             )
 
 
-def _secured_by_zenoh(environment: Mapping[str, str], folder: Path) -> Iterator[str]:
-    """Yield a clause if variables give rmw_zenoh certificates, rules or a password, or may do."""
+def _zenoh_security_clauses(environment: Mapping[str, str], folder: Path) -> Iterator[str]:
+    """Yield a clause if variables give rmw_zenoh certificates, rules or a password.
+
+    Also yield a clause if the configuration that they name cannot be read.
+    """
     uri, override = environment.get(SESSION_URI, ""), environment.get(OVERRIDE, "")
     named = " with ".join(name for name in (SESSION_URI, OVERRIDE) if environment.get(name))
     try:
@@ -455,7 +461,9 @@ def _secured_by_zenoh(environment: Mapping[str, str], folder: Path) -> Iterator[
         yield f"{named} has security"
 
 
-def _security_in_configuration(sought_text: bytes, name: str, place: bytes | Path) -> Iterator[str]:
+def _configuration_security_clauses(
+    sought_text: bytes, name: str, place: bytes | Path
+) -> Iterator[str]:
     """Yield a clause if a configuration contains ``sought_text``, a pattern, or cannot be read.
 
     ``name`` names the configuration in the clause; ``place`` is its content, or its path.

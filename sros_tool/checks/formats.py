@@ -303,7 +303,11 @@ _FILE_KINDS_TEXT = "certificate, permissions, governance, crl, identity_ca or pe
 
 
 class Expiry(NamedTuple):
-    """The moment when a file expires; ``enclave`` is "" for a file that all enclaves share."""
+    """The moment when a file expires.
+
+    ``kind`` is the kind of file in metrics, such as "certificate"; ``enclave`` is "" for a file
+    that all enclaves share.
+    """
 
     kind: str
     enclave: str

@@ -106,7 +106,7 @@ class FindingKind(NamedTuple):
         accepted: str = "",
         related: tuple[RelatedPlace, ...] = (),
     ) -> Finding:
-        """Return a finding of this kind."""
+        """Return a finding of this kind; the arguments are the fields of `Finding`."""
         return Finding(self, subject, text, file, line or None, remedy, accepted, related)
 
 
@@ -236,7 +236,7 @@ _MODULES = (
 """The modules of checks, in the order in which their kinds are listed."""
 
 
-def _declared(module: ModuleType) -> Iterator[FindingKind]:
+def _kinds_in(module: ModuleType) -> Iterator[FindingKind]:
     """Yield the kinds that a module defines, as constants or as values of dictionaries."""
     for value in vars(module).values():
         for part in value.values() if isinstance(value, dict) else (value,):
@@ -252,7 +252,7 @@ def all_kinds() -> Mapping[str, FindingKind]:
         *dict.fromkeys(
             kind
             for module in modules
-            for kind in sorted(_declared(module), key=lambda kind: kind.id)
+            for kind in sorted(_kinds_in(module), key=lambda kind: kind.id)
         )
     )
 

@@ -233,7 +233,7 @@ def _changed_text(process: Process, files: str) -> str:
 
 def why_order_is_unknown(process: Process) -> str:
     """Return why times of files do not show changes since the start of a process; "" if they do."""
-    advanced = process.clock_advanced
+    advanced = process.clock_advance
     return (
         f"the clock was set forward by {elapsed(advanced)} while the process ran"
         if advanced

@@ -3,7 +3,7 @@
 `program` lists the verbs; the modules of the verbs, by what they are about:
 
 - keystores: `keystore`, `inspect`, `life`, `zenoh`
-- robots: `deployment`, `fleet`
+- robots: `deployment`, `fleet`, `agent`
 - processes: `running`, `close`, `demo`
 - policies: `policy`, `review`, `view`
 - robots that run: `observing`, `audit`

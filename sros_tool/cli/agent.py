@@ -21,7 +21,7 @@ from sros_tool.cli.common import (
     local_zone,
     now,
     print_json,
-    read_named,
+    read_file_or_stdin,
     secrets,
 )
 from sros_tool.cli.program import VerbGroup
@@ -194,7 +194,7 @@ def _init(
     settings_from(parse_toml(render_settings(settings).decode()), "these options")
     if tls_ca and not tls_ca.is_file():
         raise UsageError(f"'{tls_ca}' is not a file")
-    root = read_named(root_file, "root metadata", max_bytes=_MOST_ROOT_BYTES)
+    root = read_file_or_stdin(root_file, "root metadata", max_bytes=_MOST_ROOT_BYTES)
     path = agent_folder(folder) / SETTINGS_FILE
     existed = path.exists()
     if existed and not force:

@@ -29,7 +29,7 @@ from sros_tool.cli.common import (
     verb,
 )
 from sros_tool.cli.observing import (
-    Watching,
+    WatchingVerb,
     check_duration,
     observe,
     observer_environment,
@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from sros_tool.graph.observation import Observation
 
 
-@verb("audit", cls=Watching)
+@verb("audit", cls=WatchingVerb)
 @click.argument("sources", metavar="[POLICY...|KEYSTORE]", type=PATH, nargs=-1)
 @observing_options("Run the observer in this enclave, if the robot is already secured.")
 @click.option(

@@ -291,7 +291,7 @@ def check(
         at = _circumstances(domain, moment, ())
         if form == "sarif":
             raise UsageError("--needs-renewal has no SARIF output", "", "Use --json.")
-        return _needs_renewal(root, needs_renewal, at.now, form)
+        return _show_renewals(root, needs_renewal, at.now, form)
     lowest = Severity[severity.upper()]
     if _is_option_given("fail_on") and fail_on != "never":  # a hidden finding fails no check
         lowest = min(lowest, Severity[fail_on.upper()])
@@ -714,7 +714,7 @@ def _relative_file(file: str) -> str:
     return str(relative_path(Path(file))) if file else ""
 
 
-def _needs_renewal(root: Path, text: str, moment: datetime, form: str) -> int:
+def _show_renewals(root: Path, text: str, moment: datetime, form: str) -> int:
     from sros_tool.keystore.expiry import (
         describe_lifetime,
         due_enclaves,

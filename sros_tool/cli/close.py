@@ -384,7 +384,7 @@ def _show_end(
         answer = f"the robot is not proved closed; next: {accept}{next_command}"
     elif apply:
         for command, processes in closed.pending_by_hand.items():
-            stop = _started_together(processes)
+            stop = _shared_start_text(processes)
             echo(f"stop {stop}, and start again with:" if stop else "start again with:")
             echo(f"  {command}")
             if advice := processes[0].launch_advice(robot.folder.absolute()):
@@ -462,7 +462,7 @@ def _state_text(closed: CloseState, *, apply: bool) -> str:
     if not closed.secured:
         not_closed = "nothing was closed" if apply else "nothing is closed yet"
         return "no process of the robot runs" if closed.stopped >= {*closed.pending} else not_closed
-    words = {name: _how_it_runs(closed, name) for name in closed.pending}
+    words = {name: _run_state_text(closed, name) for name in closed.pending}
     exceptions = ", ".join(
         f"{enumerated([name for name in words if words[name] == word])} ({word})"
         for word in dict.fromkeys(words.values())
@@ -472,7 +472,7 @@ def _state_text(closed: CloseState, *, apply: bool) -> str:
     return f"the processes run in their enclaves{', except for ' * bool(words)}{exceptions}"
 
 
-def _how_it_runs(closed: CloseState, enclave: str) -> str:
+def _run_state_text(closed: CloseState, enclave: str) -> str:
     """Return how the process of an enclave runs, if not as it should."""
     if enclave in closed.secured:
         return _NOT_CURRENT
@@ -529,7 +529,7 @@ def _validity_lines(closed: CloseState) -> list[str]:
     return [f"the files are valid until {iso(closed.valid_until)}; {advice}"]
 
 
-def _started_together(processes: Sequence[ClosedProcess]) -> str:
+def _shared_start_text(processes: Sequence[ClosedProcess]) -> str:
     """Return what one command stops and starts together: a process, a launch, or the containers.
 
     Returns "" if no process runs any more.

@@ -115,7 +115,7 @@ def dry_run_option(function: Decorated) -> Decorated:
     )(function)
 
 
-class _MeasuredVendors(click.Choice):  # type: ignore[type-arg]  # generic from click 8.2 on
+class _TestedVendors(click.Choice):  # type: ignore[type-arg]  # generic from click 8.2 on
     """An option type: tested DDS vendors and products, imported only when the option is used."""
 
     def __init__(self) -> None:
@@ -144,7 +144,7 @@ def allow_refusal_option(function: Decorated) -> Decorated:
     return click.option(
         "--allow-refusal",
         multiple=True,
-        type=_MeasuredVendors(),
+        type=_TestedVendors(),
         metavar="VENDOR",
         callback=_as_vendors,
         help="Make the change even if this DDS vendor (fastdds-2.6, ...; all-fastdds for all of "
@@ -301,7 +301,7 @@ def enclave_filter_options(help_begin: str = "Only") -> Callable[[Decorated], De
     return add
 
 
-def several_enclaves(function: Decorated) -> Decorated:
+def several_enclaves_options(function: Decorated) -> Decorated:
     """Add ``--all``, ``--match PATTERN`` and ``--robot NAME`` to a verb for several enclaves.
 
     ``--all`` is the pattern ``*``.
@@ -326,7 +326,7 @@ def several_enclaves(function: Decorated) -> Decorated:
 
 
 def check_chosen(names: Sequence[str], patterns: Sequence[str], robots: Sequence[str]) -> None:
-    """Raise `UsageError` if the arguments and the options of `several_enclaves` name no enclave."""
+    """Raise `UsageError` if neither arguments nor `several_enclaves_options` name an enclave."""
     if not (names or patterns or robots):
         raise UsageError(
             "no enclave is named",
@@ -341,7 +341,7 @@ def chosen_enclaves(
     patterns: Sequence[str],
     robots: Sequence[str],
 ) -> tuple[str, ...]:
-    """Return the enclaves that the arguments and the options of `several_enclaves` name.
+    """Return the enclaves that the arguments and the options of `several_enclaves_options` name.
 
     Raises:
         UsageError: no enclave is named.
@@ -930,7 +930,7 @@ def _first_line(path: Path) -> str:
 # ── files and pipes that the user names ─────────────────────────────────────────────────────
 
 
-def read_named(path: Path, kind: str, *, max_bytes: int = 16 * 1024 * 1024) -> bytes:
+def read_file_or_stdin(path: Path, kind: str, *, max_bytes: int = 16 * 1024 * 1024) -> bytes:
     """Return the bytes of a file, or of standard input for "-"; errors call the file ``kind``.
 
     At most one byte more than ``max_bytes`` (16 MiB) is read from standard input.

@@ -36,10 +36,10 @@ from sros_tool.cli.common import (
     print_json,
     print_notes,
     progress,
-    read_named,
+    read_file_or_stdin,
     root_and_file,
     secrets,
-    several_enclaves,
+    several_enclaves_options,
     split_root,
     verb,
 )
@@ -64,7 +64,7 @@ _STREAM = Path("-")
 
 @verb("distribute_key")
 @keystore_arguments("[KEYSTORE] [ENCLAVE...] TARGET")
-@several_enclaves
+@several_enclaves_options
 @click.option("--force", is_flag=True, help="Replace files in TARGET that differ.")
 @click.option(
     "--keyless",
@@ -447,7 +447,7 @@ def sign_request(
     existed = output is not None and output.exists()
     signed = work(
         root,
-        read_named(request, "signing request"),
+        read_file_or_stdin(request, "signing request"),
         policy=_policy(policy_file, fleet_file),
         only_enclaves=only,
         refuse_revoked=refuse_revoked,
@@ -557,7 +557,7 @@ def import_verb(
     from sros_tool.keystore.delivery.robot import import_answer, read_pinned_cas, shown_import
 
     pinned = read_pinned_cas(pin) if pin is not None else frozenset[str]()
-    data = read_named(answer, "answer")
+    data = read_file_or_stdin(answer, "answer")
     done = import_answer(
         folder,
         data,

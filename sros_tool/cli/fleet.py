@@ -39,7 +39,7 @@ from sros_tool.cli.common import (
     print_json,
     print_notes,
     progress,
-    read_named,
+    read_file_or_stdin,
     robot_option,
     root_and_file,
     save,
@@ -229,7 +229,7 @@ def _confirm(arguments: tuple[str, ...], robot: str, dry_run: bool, as_json: boo
     keystore = OpenedKeystore(root)
     recorded_fleet(keystore).robot(robot)
     shown_file = "standard input" if str(file) == "-" else f"'{file}'"
-    data = read_named(file, "confirmation", max_bytes=MAX_BYTES)
+    data = read_file_or_stdin(file, "confirmation", max_bytes=MAX_BYTES)
     received = receive(data, robot, shown_file, now=now())
     path = confirmation_file(robot)
     changes = file_change(root / path, existed=(root / path).exists())
@@ -1014,7 +1014,7 @@ _OFTEN_BY_PROBLEM = ("look into it", "check its server", "check whether it is on
 
 
 class _Group(NamedTuple):
-    """Robots that share a row of the status."""
+    """Robots that share a row of the status; ``what`` is the summary of their differences."""
 
     robots: Sequence[RobotStatus]
     state: str

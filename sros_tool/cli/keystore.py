@@ -42,7 +42,7 @@ from sros_tool.cli.common import (
     progress,
     robot_option,
     ros_domain,
-    several_enclaves,
+    several_enclaves_options,
     split_root,
     verb,
 )
@@ -102,7 +102,7 @@ _revoke_old_option = click.option(
 
 @verb("create_permission")
 @keystore_arguments("[KEYSTORE] [ENCLAVE...] POLICY_FILE")
-@several_enclaves
+@several_enclaves_options
 @fleet_option("The robots that the placeholders of the policy stand for.")
 @_revoke_old_option
 @allow_refusal_option

@@ -32,7 +32,7 @@ from sros_tool.cli.common import (
     now,
     print_json,
     progress,
-    several_enclaves,
+    several_enclaves_options,
     split_root,
     try_passphrase,
     verb,
@@ -60,7 +60,7 @@ _crl_option = click.option(
 
 @verb("renew")
 @keystore_arguments("[KEYSTORE] [ENCLAVE...]", required=False)
-@several_enclaves
+@several_enclaves_options
 @click.option(
     "--all-expiring",
     metavar="DURATION|PERCENT|soon",
@@ -198,7 +198,7 @@ def _complete_reason(
 
 @verb("revoke")
 @keystore_arguments("[KEYSTORE] [ENCLAVE...]", required=False)
-@several_enclaves
+@several_enclaves_options
 @click.option(
     "--reason",
     default="unspecified",

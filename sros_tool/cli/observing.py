@@ -46,7 +46,7 @@ _FOREVER = "until Ctrl-C"
 _DURATION = re.compile(r"\d+[smhdwy]\Z", re.ASCII)
 
 
-class Watching(Verb):
+class WatchingVerb(Verb):
     """A command whose ``--watch`` needs no value."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
@@ -280,7 +280,7 @@ def why_no_node_was_observed(
     environment: Mapping[str, str], seconds: float, rmw: str, enclave: str | None
 ) -> str:
     """Return the likely reasons why no node was observed, and a remedy."""
-    from sros_tool.checks.environment import secured_by
+    from sros_tool.checks.environment import security_clauses
     from sros_tool.runtime.variables import DOMAIN, KEYSTORE
 
     merged = {**os.environ, **environment}
@@ -290,7 +290,7 @@ def why_no_node_was_observed(
             f"The observer ran secured, in enclave {enclave}: the observer does not see nodes that "
             "are unsecured, have a certificate of another CA, or use another DDS."
         )
-    if secured := [*secured_by(merged, Path.cwd())]:
+    if secured := [*security_clauses(merged, Path.cwd())]:
         return looked + (
             f"The observer does not see open nodes, because {' and '.join(secured)} in this shell: "
             "unset the variable to observe an open robot, or give --keystore and --enclave to "
@@ -315,7 +315,7 @@ _NO_NODES = "No nodes detected in the ROS graph. No policy file was generated."
 """The message of ros2/sros2; scripts look for it."""
 
 
-class _ObservingCommand(Watching):
+class _ObservingCommand(WatchingVerb):
     """A command whose ``--watch`` needs no value, and whose ``--from-log`` takes several values."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:

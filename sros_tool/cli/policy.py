@@ -488,11 +488,11 @@ def folded_differences(
 _MOST_SHOWN = 5
 
 
-class _SeveralObserved(SeveralValues):
+class _MinimizeVerb(SeveralValues):
     several = ("--observed",)
 
 
-@verb("minimize_policy", cls=_SeveralObserved)
+@verb("minimize_policy", cls=_MinimizeVerb)
 @click.argument("policy", type=PATH)
 @click.option(
     "--observed",

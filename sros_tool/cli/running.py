@@ -33,7 +33,7 @@ from sros_tool.cli.common import (
     print_json,
     print_notes,
     progress,
-    several_enclaves,
+    several_enclaves_options,
     split_root,
     verb,
 )
@@ -58,7 +58,7 @@ if TYPE_CHECKING:
     from sros_tool.enclave_environment import EnclaveEnvironment
 
 _COMMAND_KEY = "sros.command"
-"""The key in ``ctx.meta`` for the words that a `_WithCommand` gets after ``--``."""
+"""The key in ``ctx.meta`` for the words that a `_VerbWithCommand` gets after ``--``."""
 _FAST_DDS_PIN = "FASTDDS_PKCS11_PIN"
 """The variable from which Fast DDS takes the PIN of a token (Pkcs11Provider.cpp)."""
 _NO_PIN = (
@@ -107,17 +107,17 @@ class _FailingClosed(Verb):
         """Parse the arguments."""
         if more.get("resilient_parsing"):  # completion
             return super().make_context(info_name, args, parent, **more)
-        with _refusal_printed(_form_of(args), "--json" in args):
+        with _print_refusal_on_failure(_form_of(args), "--json" in args):
             return super().make_context(info_name, args, parent, **more)
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run the verb."""
-        with _refusal_printed(ctx.params["form"], ctx.params["as_json"]):
+        with _print_refusal_on_failure(ctx.params["form"], ctx.params["as_json"]):
             return super().invoke(ctx)
 
 
 @contextmanager
-def _refusal_printed(form: str, as_json: bool) -> Iterator[None]:
+def _print_refusal_on_failure(form: str, as_json: bool) -> Iterator[None]:
     """Print output that keeps nodes from starting if an error or a signal ends the context."""
     try:
         yield
@@ -272,7 +272,7 @@ def _refuse_open_output() -> None:
             )
 
 
-class _WithCommand(Verb):
+class _VerbWithCommand(Verb):
     """A verb with a command as argument, whose options it does not parse.
 
     The command is all words after ``--``; without it, if ``needs_no_dashes``, parsing of options
@@ -292,7 +292,7 @@ class _WithCommand(Verb):
         return super().parse_args(ctx, own_arguments)
 
 
-@verb("run", cls=_WithCommand)
+@verb("run", cls=_VerbWithCommand)
 @keystore_arguments("[KEYSTORE] ENCLAVE -- COMMAND...", required=False, type=click.UNPROCESSED)
 @click.option(
     "--policy",
@@ -426,13 +426,13 @@ def completion(shell: str) -> None:
 _NODE_USER = "ros"
 
 
-class _WithCommandAfterDashes(_WithCommand):
+class _VerbWithCommandAfterDashes(_VerbWithCommand):
     needs_no_dashes = False
 
 
-@verb("units", cls=_WithCommandAfterDashes)
+@verb("units", cls=_VerbWithCommandAfterDashes)
 @keystore_arguments("[KEYSTORE] [ENCLAVE...] FOLDER [-- COMMAND...]")
-@several_enclaves
+@several_enclaves_options
 @click.option(
     "--job",
     "jobs",

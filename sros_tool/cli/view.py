@@ -50,7 +50,7 @@ _WITH_FINDINGS = ("html", "json")
 _ENDINGS = {".htm": "html", ".mmd": "mermaid", ".gv": "dot", ".md": "markdown"}
 
 
-class _SeveralObserved(SeveralValues):
+class _ViewVerb(SeveralValues):
     several = ("--observed", "--focus")
 
 
@@ -69,7 +69,7 @@ def _focus_completions(
     return [*completions(sorted(names), incomplete)]
 
 
-@verb("view", cls=_SeveralObserved)
+@verb("view", cls=_ViewVerb)
 @click.argument("sources", metavar="SOURCE...", type=PATH, nargs=-1, required=True)
 @click.option(
     "--format",

@@ -26,7 +26,7 @@ from sros_tool.runtime.processes import (
     Process,
     ProcessOrigin,
     RunningProcesses,
-    launch_verb,
+    launch_word_index,
     process_origin,
     program_of,
     without_launch_files,
@@ -210,7 +210,7 @@ class ClosedProcess(NamedTuple):
             return f"docker compose -f compose.yaml -f {overlay} up -d"
         words = (_sros_word(), *self.command[1:]) if self.is_demo else self.command
         variables = {RMW: self.rmw} if self.rmw else {}
-        if verb := launch_verb(self.launch):
+        if verb := launch_word_index(self.launch):
             words = launch_words(folder, self.launch[: verb + 1], self.launch[verb + 1 :])
         elif self.launch:
             words = self.launch
@@ -229,7 +229,7 @@ class ClosedProcess(NamedTuple):
 
         Returns "" for a process that `ros2 launch` or no launch starts.
         """
-        if not self.launch or self.container or launch_verb(self.launch):
+        if not self.launch or self.container or launch_word_index(self.launch):
             return ""
         given = f"keystore={str(folder / 'export')!r}, policy={str(folder / 'policy.xml')!r}"
         return visible(

@@ -12,7 +12,7 @@ from datetime import datetime, tzinfo
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from sros_tool.checks.environment import secured_by
+from sros_tool.checks.environment import security_clauses
 from sros_tool.close.processes import ROUTER, ObservedProcesses, read_processes
 from sros_tool.enclave_environment import loadable_environment
 from sros_tool.errors import SrosError, UnavailableError, UsageError
@@ -77,7 +77,7 @@ class Shell(NamedTuple):
 
     def check_open(self) -> None:
         """Raise `UsageError` if an observer that this shell starts might run secured."""
-        if secured := [*secured_by(self.environment, Path.cwd())]:
+        if secured := [*security_clauses(self.environment, Path.cwd())]:
             raise UsageError(
                 f"{' and '.join(secured)}, so this shell does not see an open robot",
                 "sros looks for open nodes with an observer that is open itself.",

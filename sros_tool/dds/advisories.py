@@ -44,7 +44,10 @@ Version = tuple[int, int, int]
 
 
 class _Range(NamedTuple):
-    """The releases from ``introduced`` up to ``end`` (None: no end)."""
+    """The releases from ``introduced`` up to ``end`` (None: all later releases).
+
+    ``inclusive`` says whether ``end`` itself is in the range.
+    """
 
     introduced: Version
     end: Version | None
@@ -80,7 +83,7 @@ class Advisory(NamedTuple):
         return version in self.versions or any(part.has(version) for part in self.ranges)
 
     def fixed_in(self, version: Version) -> str:
-        """Return the first release of the same major version with the fix; "" without a fix."""
+        """Return the first fixed release of the same major version; "" if there is none."""
         ends = {None if part.inclusive else part.end for part in self.ranges if part.has(version)}
         last = max((end for end in ends if end), default=None)
         if last is None or None in ends or last[0] != version[0] or self.affects(last):

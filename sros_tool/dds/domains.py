@@ -138,9 +138,9 @@ class DomainSet:
 
     @classmethod
     def partition(cls, sets: Iterable[DomainSet]) -> tuple[DomainSet, ...]:
-        """Return groups of domains that belong to the same ``sets``, which must be closed.
+        """Return groups of domains that belong to the same ``sets`` (results of `closed`).
 
-        So a set contains either all domains of a group or no domain of it.
+        So each set contains either all domains of a group or none of them.
         """
         ranges: dict[tuple[bool, ...], list[tuple[int, int]]] = {}
         known = tuple(dict.fromkeys(sets))

@@ -131,7 +131,7 @@ class DomainRule:
     topic_access_rules: tuple[TopicRule, ...]
 
 
-def _declared(rule: type[DomainRule | TopicRule]) -> tuple[Attribute, ...]:
+def _declared_attributes(rule: type[DomainRule | TopicRule]) -> tuple[Attribute, ...]:
     return tuple(
         Attribute(
             attribute_field.name,
@@ -144,7 +144,7 @@ def _declared(rule: type[DomainRule | TopicRule]) -> tuple[Attribute, ...]:
 
 
 _ATTRIBUTES: dict[type, tuple[Attribute, ...]] = {
-    rule: _declared(rule) for rule in (DomainRule, TopicRule)
+    rule: _declared_attributes(rule) for rule in (DomainRule, TopicRule)
 }
 
 
@@ -154,7 +154,10 @@ def attributes(rule: type[DomainRule | TopicRule]) -> tuple[Attribute, ...]:
 
 
 def attribute_values(rule_class: type[DomainRule | TopicRule], *, protect: bool) -> dict[str, Any]:
-    """Map the names of a rule's attributes to portable values that protect, or to open values."""
+    """Map the names of a rule's attributes to values.
+
+    With ``protect``, these are the portable values; otherwise, the open values.
+    """
     return {
         attribute.name: attribute.portable if protect else attribute.open
         for attribute in attributes(rule_class)

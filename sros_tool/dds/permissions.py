@@ -42,7 +42,7 @@ TOPIC_LINE_BYTES = len("            <topic></topic>\r\n")
 class Criteria(NamedTuple):
     """The topics and partitions of a ``<publish>`` or ``<subscribe>`` in a rule.
 
-    Without partitions, the default partition is meant.
+    Without partitions, the default partition is meant.  ``data_tags`` are pairs of name and value.
     """
 
     topics: tuple[str, ...]
@@ -59,10 +59,13 @@ class Rule(NamedTuple):
     subscribe: tuple[Criteria, ...] = ()
     relay: tuple[Criteria, ...] = ()
     order: tuple[str, ...] = ()
-    """The directions of the rule's criteria in document order; () for publish first."""
+    """The direction of each of the rule's criteria, in document order.
+
+    If empty, the order is publish, subscribe, relay.
+    """
 
     def criteria_of(self, directions: Sequence[str]) -> Iterator[tuple[str, Criteria]]:
-        """Yield pairs of direction and criteria of ``directions``, in document order."""
+        """Yield the criteria for ``directions`` in document order, each after its direction."""
         criteria = {each: iter(getattr(self, each)) for each in directions}
         order = self.order or [each for each in directions for _ in getattr(self, each)]
         for direction in order:
@@ -71,7 +74,10 @@ class Rule(NamedTuple):
 
 
 class Grant(NamedTuple):
-    """The rights and the validity of a subject; dates have the form in the document."""
+    """The rights and the validity of a subject; dates are written as in the document.
+
+    ``default_allow`` says whether access is allowed if no rule matches.
+    """
 
     name: str
     subject: str
@@ -376,7 +382,7 @@ OverlapTest = Callable[[str], bool]
 """A function that returns whether an expression and some other expressions share a name."""
 
 
-def _overlap_by_text(names: Sequence[str]) -> OverlapTest:
+def _textual_overlap_test(names: Sequence[str]) -> OverlapTest:
     """Return a function that returns whether an expression and any of ``names`` match.
 
     The match is textual: one of the two, as a pattern, has to match the text of the other.
@@ -389,7 +395,7 @@ def _overlap_by_text(names: Sequence[str]) -> OverlapTest:
 def portability_problems(
     permissions: Permissions,
     signed_bytes: int,
-    overlap_test_of: Callable[[Sequence[str]], OverlapTest] = _overlap_by_text,
+    overlap_test_of: Callable[[Sequence[str]], OverlapTest] = _textual_overlap_test,
 ) -> Iterator[tuple[str, str]]:
     """Yield id and clause for each part of a document that vendors read differently.
 

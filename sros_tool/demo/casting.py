@@ -558,10 +558,10 @@ def enclave_grant(root: Path, enclave: str) -> Grant | None:
 
 def allows(grant: Grant, direction: str, topic: str) -> bool:
     """Return whether a grant allows ``direction`` (publish or subscribe) on a DDS topic."""
-    return bool(_allowing(grant, direction, topic))
+    return bool(_allowing_expression(grant, direction, topic))
 
 
-def _allowing(grant: Grant, direction: str, topic: str) -> str:
+def _allowing_expression(grant: Grant, direction: str, topic: str) -> str:
     """Return the expression by which a grant allows ``direction`` on a DDS topic; "" if denied.
 
     As with the vendors, the first rule that names the topic decides; of several matching
@@ -590,8 +590,8 @@ def _expressions_of(grant: Grant, right: str, name: str) -> tuple[str, ...]:
     """Return the expressions that allow a right on a ROS name, for each DDS topic ("": denied)."""
     topics = dds_names(right, name)
     return (
-        *(_allowing(grant, "publish", topic) for topic in topics.publish),
-        *(_allowing(grant, "subscribe", topic) for topic in topics.subscribe),
+        *(_allowing_expression(grant, "publish", topic) for topic in topics.publish),
+        *(_allowing_expression(grant, "subscribe", topic) for topic in topics.subscribe),
     )
 
 

@@ -47,7 +47,7 @@ class CycloneNode:
         self._readers.append((reader, hear))
 
     def types(self, name: str, *, of_publishers: bool) -> Sequence[str]:
-        """Return the ROS types of a topic's discovered publishers, or else of its subscriptions."""
+        """Return the ROS types of a topic's discovered publishers, or of its subscriptions."""
         participant, topic = self._participant, self.wire_name(name)
         endpoints = participant.publications() if of_publishers else participant.subscriptions()
         return [ros_type(endpoint.type_name) for endpoint in endpoints if endpoint.topic == topic]
@@ -76,7 +76,10 @@ class CycloneNode:
         self._readers.append((reader, reply))
 
     def client(self, name: str) -> Call:
-        """Return a function that sends a request to a service, and passes replies to ``hear``."""
+        """Return a function that sends a request to a service.
+
+        Its arguments are the request and the function that gets the replies.
+        """
         (requests,), (replies,) = dds_names("request", name)
         reader, writer = self._participant.reader(replies), self._participant.writer(requests)
         waiting: list[Hear] = []

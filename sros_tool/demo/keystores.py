@@ -105,7 +105,7 @@ class KeystoreSet:
             )
         return secured_environment(root, name, domain) | dict(identity.variables)
 
-    def announced(self, party: Party) -> str:
+    def announced_enclave(self, party: Party) -> str:
         """Return the enclave that a party announces to others, or ""."""
         if party.announced:
             return self.enclave(Identity(OWN, party.announced))

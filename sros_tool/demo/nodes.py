@@ -175,7 +175,7 @@ class Node(Protocol):
         """Subscribe to a topic; ``hear`` is called with every text received."""
 
     def types(self, name: str, *, of_publishers: bool) -> Sequence[str]:
-        """Return the types of a topic's discovered publishers, or else of its subscriptions."""
+        """Return the ROS types of a topic's discovered publishers, or of its subscriptions."""
 
     def count(self, name: str, kind: str, on_count: Callable[[int], None]) -> str:
         """Count messages of a type other than string; return why that is impossible, or "".
@@ -187,7 +187,10 @@ class Node(Protocol):
         """Offer a service; ``answer`` is called with a request and returns the reply."""
 
     def client(self, name: str) -> Call:
-        """Return a function that sends a request to a service, and passes replies to ``hear``."""
+        """Return a function that sends a request to a service.
+
+        Its arguments are the request and the function that gets the replies.
+        """
 
     def watch(self) -> None:
         """Start to discover publishers."""
@@ -236,12 +239,12 @@ class NodeRole:
         count = partial(node.count, options.topic) if of_publishers else None
         return OtherTypes(options, self._events, types, count)
 
-    def sent(self, text: str) -> None:
+    def report_sent(self, text: str) -> None:
         """Report a message that was sent."""
         self._sent += 1
         self._events.report(EventKind.SENT, text)
 
-    def heard(self, text: str) -> None:
+    def report_heard(self, text: str) -> None:
         """Report a message that was received."""
         self._events.report(EventKind.HEARD, text)
 
@@ -325,14 +328,14 @@ class _Talker(NodeRole):
     def act(self) -> None:
         text = f"{self._options.text}: {self._sent + 1}"
         self._publish(text)
-        self.sent(text)
+        self.report_sent(text)
 
 
 class _Listener(NodeRole):
     """A listener that reports every message."""
 
     def prepare(self) -> None:
-        self._node.subscribe(self._options.topic, self.heard)
+        self._node.subscribe(self._options.topic, self.report_heard)
         self._others = self._other_types(of_publishers=True)
 
     def step(self) -> None:
@@ -350,7 +353,7 @@ class _Relay(_Talker):
 
     def prepare(self) -> None:
         super().prepare()
-        self._node.subscribe(self._options.topic, self.heard)
+        self._node.subscribe(self._options.topic, self.report_heard)
 
 
 class _Observer(NodeRole):
@@ -373,14 +376,14 @@ class _Server(NodeRole):
         self._node.serve(self._options.service, self._answer)
 
     def _answer(self, request: str) -> str:
-        self.heard(request)
+        self.report_heard(request)
         question = request.rpartition(": ")[2]
         try:
             first, second = map(int, question.split(" + "))
         except ValueError:
             return "no such sum"
         answer = f"{self._options.text}: {question} = {first + second}"
-        self.sent(answer)
+        self.report_sent(answer)
         return answer
 
 
@@ -395,10 +398,10 @@ class _Client(NodeRole):
 
         def check(answer: str) -> None:
             if answer.endswith(f": {first} + {second} = {first + second}"):
-                self.heard(answer)
+                self.report_heard(answer)
 
         request = f"{self._options.text}: {first} + {second}"
-        self.sent(request)
+        self.report_sent(request)
         self._call(request, check)
 
 
@@ -414,7 +417,7 @@ class _ActionServer(NodeRole):
         self._node.serve(f"{action}/cancel_goal", lambda _request: "refused")
 
     def _accept(self, request: str) -> str:
-        self.heard(request)
+        self.report_heard(request)
         goal = request.rpartition(": ")[2]
         for length in range(2, FIBONACCI_ORDER + 1):
             self._feedback(f"{goal} {fibonacci(length)}")
@@ -423,7 +426,7 @@ class _ActionServer(NodeRole):
 
     def _result(self, _request: str) -> str:
         answer = f"{self._options.text}: {fibonacci(FIBONACCI_ORDER)}"
-        self.sent(answer)
+        self.report_sent(answer)
         return answer
 
 
@@ -444,7 +447,7 @@ class _ActionClient(NodeRole):
     def act(self) -> None:
         goal = f"goal {self._sent + 1} of {os.getpid()}"
         request = f"{self._options.text}: {goal}"
-        self.sent(request)
+        self.report_sent(request)
         self._call_goal(
             request, lambda reply: self._accepted.append(goal) if reply == "accepted" else None
         )
@@ -462,7 +465,7 @@ class _ActionClient(NodeRole):
 
     def _check(self, answer: str) -> None:
         if answer.endswith(f": {fibonacci(FIBONACCI_ORDER)}"):
-            self.heard(answer)
+            self.report_heard(answer)
 
 
 class _Composed(NodeRole):

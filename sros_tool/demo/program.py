@@ -69,15 +69,15 @@ from sros_tool.demo.scenarios.model import (
     Scenario,
     Wire,
     check_topic,
-    joined,
-    together,
+    merged_row,
+    merged_scenario,
 )
 from sros_tool.demo.wire import (
     Injection,
     Wiretap,
     bound_ports,
     mapped_segments,
-    shared_memory,
+    segments_with_text,
     with_changed_bit,
 )
 from sros_tool.errors import UnavailableError, UsageError
@@ -117,8 +117,9 @@ _HOST = "host"
 class Limits:
     """Time limits in seconds: for the start, for the observation of a row, and for all rows.
 
-    ``wave`` is for one group of parallel rows, so that many rows get more time than ``total``.  All
-    limits except ``window`` exist only to detect hanging processes, also on slow machines.
+    An observation without a result after ``window`` goes on for up to ``longest_window``.  ``wave``
+    is for one group of parallel rows, so that many rows get more time than ``total``.  All limits
+    except ``window`` exist only to detect hanging processes, also on slow machines.
     """
 
     start: float = 60.0
@@ -179,12 +180,12 @@ def run_demo(options: DemoOptions, now: datetime, progress: Progress) -> DemoRes
     topic = check_topic((user.topic if user else DEFAULT_TOPIC) if topic is None else topic)
     scenarios = _with_chosen_rows(options)
     isolation = _isolation(options.network)
-    groups = [joined(scenarios)] if zenoh else list(scenarios)
+    groups = [merged_scenario(scenarios)] if zenoh else list(scenarios)
     domains = [_domains(scenario, options, user, isolation) for scenario in groups]
     started = time.monotonic()
     results: list[ScenarioResult] = []
     names: dict[str, None] = {}
-    with _ended_by_signals(), _demo_folder(options.keep) as folder:
+    with _clean_up_after_signals(), _demo_folder(options.keep) as folder:
         if zenoh is None:
             progress("looking for a DDS that enforces security")
         backend = zenoh or find_backend(options.backend, folder, topic, now)
@@ -448,7 +449,7 @@ def _demo_folder(keep: Path | None) -> Iterator[Path]:
 
 
 @contextmanager
-def _ended_by_signals() -> Iterator[None]:
+def _clean_up_after_signals() -> Iterator[None]:
     """Clean up after SIGTERM and SIGHUP as after Ctrl-C: the folder has private keys."""
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -580,7 +581,7 @@ class _Runner:
         if tried:
             async with self._slots:
                 for patience in _PATIENCE if self._plan.backend.on_zenoh else _PATIENCE[:1]:
-                    played = await self._play(group[0], together(tried), patience)
+                    played = await self._play(group[0], merged_row(tried), patience)
                     observed = (judge_row(replace(played, row=row)).observed for row in tried)
                     if RowStatus.UNDECIDED not in observed:
                         break
@@ -614,7 +615,7 @@ class _Runner:
         folder.mkdir(parents=True)
         expiry = None
         if row.short_lived:
-            identity, lifetime = row.talking.identity, patience.lifetime
+            identity, lifetime = row.first_talker.identity, patience.lifetime
             seconds = plan.keystores.issue_short_lived(identity, lifetime, self._elapsed())
             expiry = time.monotonic() + seconds
         processes: dict[str, _PartyProcess] = {}
@@ -644,7 +645,7 @@ class _Runner:
                 segments = frozenset().union(
                     *(process.segments() for process in processes.values())
                 )
-                memory = shared_memory(texts, segments)
+                memory = segments_with_text(texts, segments)
             ports = frozenset[int]().union(*(process.ports() for process in processes.values()))
             wire = tap.count(ports) if tap and row.wire else {}
             injected = None
@@ -722,7 +723,9 @@ class _Runner:
         )
         environment |= plan.keystores.environment(party.identity, domain)
         if backend.on_zenoh:
-            command = backend.zenoh_command(party.role, options, plan.keystores.announced(party))
+            command = backend.zenoh_command(
+                party.role, options, plan.keystores.announced_enclave(party)
+            )
         else:
             names = plan.keystores.node_names(party)
             command = backend.command(party.role, options, names, secured=secured)
@@ -771,7 +774,7 @@ class _Runner:
                     break
                 if silence and now >= max(shortest, enough_at + _AFTER_ENOUGH):
                     break
-            if now >= longest or any(process.ended for process in needed):
+            if now >= longest or any(process.ended_by_itself for process in needed):
                 break
             await asyncio.sleep(_POLL_SECONDS)
         await asyncio.sleep(_GRACE_SECONDS)
@@ -842,7 +845,7 @@ async def _end_softly(processes: Collection[_PartyProcess]) -> None:
     for process in processes:
         process.ask_to_end()
     latest = time.monotonic() + _SECONDS_TO_END
-    while time.monotonic() < latest and not all(process.gone for process in processes):
+    while time.monotonic() < latest and not all(process.has_exited for process in processes):
         await asyncio.sleep(_POLL_SECONDS)
 
 
@@ -951,7 +954,7 @@ class _PartyProcess:
         self.name = name
         self.topic = topic
         self.text = text
-        self._through = dds_library
+        self._library = dds_library
         self._log = folder / f"{stem}.log"
         report = folder / f"{stem}.jsonl"
         self._reader = EventReader(report)
@@ -994,7 +997,7 @@ class _PartyProcess:
         return self._own_status is None and any(event.kind is EventKind.READY for event in events)
 
     @property
-    def ended(self) -> bool:
+    def ended_by_itself(self) -> bool:
         """Whether the process has ended by itself."""
         self.look()
         return self._own_status is not None
@@ -1013,7 +1016,7 @@ class _PartyProcess:
         return dds_of(self._process.pid)
 
     def ask_to_end(self) -> None:
-        """Send SIGTERM; an end after that does not count as `ended`."""
+        """Send SIGTERM; an end after that does not count as `ended_by_itself`."""
         self.look()
         self._asked = True
         with suppress(ProcessLookupError):
@@ -1026,7 +1029,7 @@ class _PartyProcess:
             self._process.send_signal(signal.SIGSTOP)
 
     @property
-    def gone(self) -> bool:
+    def has_exited(self) -> bool:
         """Whether the process has ended, for any reason."""
         return self._process.poll() is not None
 
@@ -1043,7 +1046,7 @@ class _PartyProcess:
         return PartyRecord(
             text=self.text,
             topic=self.topic,
-            through=self._through,
+            library=self._library,
             events=(*self._events, *late),
             output=plain_text(self._log.read_text(encoding="utf-8", errors="replace")),
             status=self._own_status,

@@ -47,14 +47,14 @@ from sros_tool.wording import counted, first_few
 class PartyRecord:
     """The record of a process that has ended.
 
-    ``text`` marks the messages of a talker; ``topic`` is the ROS topic of the process; ``through``
-    is the name of its library; ``output`` is its output; ``status`` is its exit status (negative
-    for a signal) if the process ended by itself.
+    ``text`` marks the messages of a talker; ``topic`` is the ROS topic of the process; ``library``
+    names the library that the node in the process uses; ``output`` is what the process printed;
+    ``status`` is its exit status (negative for a signal) if the process ended by itself.
     """
 
     text: str = ""
     topic: str = ""
-    through: str = ""
+    library: str = ""
     events: tuple[Event, ...] = ()
     output: str = ""
     status: int | None = None
@@ -65,7 +65,8 @@ class RowRecord:
     """The record of a row that has ended.
 
     ``window`` is the start and end of the observation (seconds of CLOCK_MONOTONIC), or None if a
-    party was not ready in time.  ``injected`` counts packets that were sent again or changed;
+    party was not ready in time.  ``wire`` maps parties to counts of captured packets.  ``injected``
+    counts packets that were sent again or changed;
     ``skipped`` is the reason why the row was not run, or "".  ``expiry`` is the time at which the
     certificate of a short-lived talker expires (CLOCK_MONOTONIC, s); ``memory`` maps each party to
     the number of shared memory segments that contain its text.  If ``applies`` is False, the
@@ -405,7 +406,7 @@ def _judge_view(case: _ClaimRecords) -> _ClaimFinding:
         return _undecided(f"{claim.subject} made no count during the observation")
     most = max(event.publishers.get(topic, 0) for event in looks)
     counted = f"{most} {'servers' if serves else 'publishers'} on {topic}"
-    return case.result(most > 0, f"{observer.through} counts {counted} in {len(looks)} polls")
+    return case.result(most > 0, f"{observer.library} counts {counted} in {len(looks)} polls")
 
 
 def _judge_loss(case: _ClaimRecords) -> _ClaimFinding:
@@ -421,7 +422,7 @@ def _judge_loss(case: _ClaimRecords) -> _ClaimFinding:
     if not inside:
         return _undecided(f"{claim.subject} made no count during the observation")
     left = inside[-1].publishers.get(topic, 0)
-    detail = f"{case.subject.through} counts {most} publishers on {topic}, and {left} after "
+    detail = f"{case.subject.library} counts {most} publishers on {topic}, and {left} after "
     return case.result(not left, f"{detail}{claim.talker} tried to remove the node")
 
 

@@ -188,8 +188,11 @@ def mapped_segments(process: int) -> frozenset[Path]:
     return frozenset(Path(name[0]) for name in names if name and name[0].startswith(_SHARED_MEMORY))
 
 
-def shared_memory(texts: Mapping[str, str], segments: Collection[Path]) -> dict[str, int]:
-    """Map each party to the number of shared memory segments that contain its text."""
+def segments_with_text(texts: Mapping[str, str], segments: Collection[Path]) -> dict[str, int]:
+    """Map each party to the number of shared memory segments that contain the party's text.
+
+    ``texts`` maps parties to their texts ("": none).
+    """
     return {
         name: sum(_contains_text(path, text) for path in segments) if text else 0
         for name, text in texts.items()

@@ -131,7 +131,7 @@ class _ZenohNode:
         self._keep(self._session.declare_subscriber(key, lambda it: hear(_text_of(it.payload))))
 
     def types(self, name: str, *, of_publishers: bool) -> Sequence[str]:
-        """Return the ROS types of a topic's publishers in the graph, or else subscriptions."""
+        """Return the ROS types of a topic's publishers in the graph, or of its subscriptions."""
         return [ros_type(kind) for kind, _ in self._types(name, "MP" if of_publishers else "MS")]
 
     def _types(self, name: str, kind: str) -> list[tuple[str, str]]:
@@ -165,9 +165,10 @@ class _ZenohNode:
         self._keep(self._session.declare_queryable(key, reply, complete=True))
 
     def client(self, name: str) -> Call:
-        """Return a function that sends a request to a service, and passes every reply to ``hear``.
+        """Return a function that sends a request to a service.
 
-        ``name`` may have Zenoh wildcards.
+        Its arguments are the request and the function that gets every reply.  ``name`` may have
+        Zenoh wildcards.
         """
         kind = _type_of_topic(name, _SERVICE_TYPE)
         gid = _GID if "*" in name else self._announce("SC", name, kind)
@@ -306,7 +307,7 @@ class _Eraser(NodeRole):
 
     def act(self) -> None:
         if self._zenoh_node.erase("talker"):
-            self.sent(f"erased {self._sent + 1}")
+            self.report_sent(f"erased {self._sent + 1}")
 
 
 _FLOODER, _ERASER = "flooder", "eraser"

@@ -221,7 +221,7 @@ def load_certificate(
 ) -> x509.Certificate:
     """Return the first certificate of a PEM file; ``name`` names the file in errors.
 
-    Without ``trusted``, blocks ``TRUSTED CERTIFICATE`` are ignored, as Cyclone DDS does.
+    Without ``trusted``, blocks ``TRUSTED CERTIFICATE`` are ignored, as by Cyclone DDS.
 
     Raises:
         PkiError: sros or OpenSSL cannot read the certificate, or its trust settings forbid its use

@@ -108,7 +108,10 @@ def chain_fault(
 
 
 class _Chain:
-    """A certificate chain from `build_chain`, which can be verified with different checks."""
+    """A certificate chain from `build_chain`, which can be verified with different checks.
+
+    ``missing`` says why the chain ends before a trusted CA; "" if it does not.
+    """
 
     def __init__(
         self, certificates: list[x509.Certificate], missing: str, moment: datetime
@@ -171,7 +174,7 @@ def build_chain(
     other_certificates: Sequence[x509.Certificate],
     moment: datetime,
 ) -> tuple[list[x509.Certificate], str]:
-    """Return the chain from ``start`` to a trusted CA, and "" or why the chain ends before one.
+    """Return the chain from ``start`` to a trusted CA, and why the chain ends before, or "".
 
     As in OpenSSL (build_chain), the first certificate with a fitting name and fitting identifiers
     is the issuer, even if the signature was made by another key.
@@ -320,6 +323,7 @@ class _CaStatus(Flag):
     OLD = auto()
     """A certificate without basicConstraints: accepted as a root CA, but not by strict checks."""
     NETSCAPE = auto()
+    """A certificate that is a CA certificate only because of its nsCertType."""
 
 
 @lru_cache(maxsize=64)

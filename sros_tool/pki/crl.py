@@ -65,7 +65,8 @@ class Revoked(NamedTuple):
 class RevocationList(NamedTuple):
     """A revocation list whose signature is not verified yet.
 
-    ``revoked`` leaves out entries with the reason removeFromCRL, because they revoke nothing.
+    ``list`` is the list as `cryptography` reads it.  ``revoked`` leaves out entries with the reason
+    removeFromCRL, because they revoke nothing.
     """
 
     number: int
@@ -415,6 +416,10 @@ class ListRefusal(NamedTuple):
 
 class _ListScore(NamedTuple):
     """How well a list fits a certificate; scores compare field by field, in this order.
+
+    ``only_known``: OpenSSL knows all critical extensions of the list.  ``in_scope``: the list is
+    for this certificate.  ``current``: the list is valid now.  ``from_issuer``: the certificate in
+    the chain that issued the checked certificate also issued the list.
 
     Source: OpenSSL 3, x509_vfy.c (get_crl_score).
     """

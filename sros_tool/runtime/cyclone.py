@@ -261,7 +261,7 @@ class Participant:
         from sros_tool.runtime.vendor_log import participant_refusal
 
         messages = self._library.log.messages()
-        reason = ". ".join([_describe_return(self._library, code), *messages[-3:]])
+        reason = ". ".join([_return_code_text(self._library, code), *messages[-3:]])
         refused = code == _NOT_ALLOWED_BY_SECURITY or (
             secured and bool(participant_refusal("\n".join(messages)))
         )
@@ -294,7 +294,7 @@ class Writer:
         sample = StringSample(text.encode())
         code = self._library.api.dds_write(self.handle, ctypes.byref(sample))
         if code < 0:
-            raise DdsError("cannot write", _describe_return(self._library, code))
+            raise DdsError("cannot write", _return_code_text(self._library, code))
 
 
 class Reader:
@@ -314,7 +314,7 @@ class Reader:
             waitset = api.dds_create_waitset(self._participant)
             if condition < 0 or waitset < 0:
                 raise DdsError(
-                    "cannot wait", _describe_return(self._library, min(condition, waitset))
+                    "cannot wait", _return_code_text(self._library, min(condition, waitset))
                 )
             api.dds_waitset_attach(waitset, condition, 0)
             self._waitset = waitset
@@ -384,7 +384,7 @@ def _take_samples(
     infos = (SampleInfo * limit)()
     count = library.api.dds_take(handle, samples, infos, limit, limit)
     if count < 0:
-        raise DdsError("cannot read", _describe_return(library, count))
+        raise DdsError("cannot read", _return_code_text(library, count))
     try:
         return [
             copy(address)
@@ -477,7 +477,7 @@ def _memory_file() -> int:
     return file
 
 
-def _describe_return(library: CycloneLibrary, code: int) -> str:
+def _return_code_text(library: CycloneLibrary, code: int) -> str:
     """Return the name of a (negative) return code, as the library gives it."""
     return str(library.api.dds_strretcode(code).decode("ascii", "replace"))
 

@@ -129,7 +129,7 @@ class Process:
     """A running process that uses ROS 2, DDS or Zenoh.
 
     ``started`` is the earliest moment at which the process can have loaded its files, by the clock
-    of that moment; ``clock_advanced`` is the time by which the clock was set forward since then,
+    of that moment; ``clock_advance`` is the time by which the clock was set forward since then,
     which makes ``started`` too early by a minute or more. ``libraries`` are the names of mapped
     libraries of ROS 2, DDS and Zenoh, such as "libddsc", and ``dds`` the DDS libraries with their
     versions.
@@ -155,7 +155,7 @@ class Process:
     dds: tuple[MappedLibrary, ...] = ()
     forked_by: tuple[int, tuple[str, ...]] = (0, ())
     own_pid: int = 0
-    clock_advanced: timedelta = timedelta()
+    clock_advance: timedelta = timedelta()
     own_ports: frozenset[MemoryPort] = frozenset()
     mapped_ports: frozenset[MemoryPort] = frozenset()
 
@@ -350,7 +350,13 @@ def program_of(command: tuple[str, ...]) -> str:
 
 
 class _Stat(NamedTuple):
-    """The numbers in /proc/PID/stat; ``identity`` changes with the program."""
+    """Values in /proc/PID/stat.
+
+    ``parent`` is the id of the parent process, ``ticks`` the start of the process in clock ticks
+    after the start of the machine, and ``size`` the size of the virtual memory in bytes.
+    ``identity`` changes when the process runs another program.  ``is_idle`` is true for a process
+    that has ended and for a part of the kernel.
+    """
 
     parent: int
     ticks: int
@@ -449,15 +455,15 @@ class ProcessTable:
                 started = (
                     begin + timedelta(seconds=stat.ticks / self._ticks) + _SHORTEST_LOADING_TIME
                 )
-                advanced = _clock_advanced(folder, started)
+                advanced = _clock_advance(folder, started)
                 if advanced:
                     advanced = max(advanced, longest_advance())
                     started -= advanced + _LONGEST_TIME_TO_FIRST_LOOK
                 if before and before.process and before.stat.identity == stat.identity:
                     # Kept from the last look, because the clock may have been set since.
-                    started, advanced = before.process.started, before.process.clock_advanced
+                    started, advanced = before.process.started, before.process.clock_advance
                 process = _examine(pid, folder, command, started)
-                process = process and replace(process, clock_advanced=advanced)
+                process = process and replace(process, clock_advance=advanced)
                 unseen = None
             except (PermissionError, _TooLongError) as error:
                 why = error.strerror or "the operating system refuses it"
@@ -480,7 +486,7 @@ class ProcessTable:
         for pid in filter(str.isdigit, os.listdir(self._proc)):
             with suppress(OSError), self._opened(int(pid)) as folder:
                 started = begin + timedelta(seconds=_stat(folder).ticks / self._ticks)
-                longest = max(longest, _clock_advanced(folder, started))
+                longest = max(longest, _clock_advance(folder, started))
         return longest
 
     def _with_files(self, process: Process, folder: int) -> Process:
@@ -696,8 +702,8 @@ class ProcessOrigin(NamedTuple):
 
     ``unit`` is the systemd system service, ``folder`` the working directory, ``launch`` the command
     of the launch that started the process (or that is the process): ``ros2 launch``, or a Python
-    program that runs a launch description.  ``container`` is the id of its Docker or Podman
-    container.
+    program that runs a launch description.  ``container`` is the id of the Docker or Podman
+    container in which the process runs.
     """
 
     unit: str = ""
@@ -720,7 +726,7 @@ def process_origin(pid: int, proc: Path = Path("/proc")) -> ProcessOrigin:
             handle = os.open(proc / str(pid), os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
             try:
                 command, parent = tuple(_words(handle, "cmdline")), _stat(handle).parent
-                is_launch = launch_verb(command) or _runs_launch(handle, pid, command, child)
+                is_launch = launch_word_index(command) or _runs_launch(handle, pid, command, child)
             finally:
                 os.close(handle)
             if is_launch:
@@ -758,7 +764,7 @@ def without_launch_files(command: Sequence[str]) -> tuple[str, ...]:
 _LAUNCH_FILE = re.compile(r"(/launch_params_)[a-z0-9_]{8}\b")
 
 
-def launch_verb(command: Sequence[str]) -> int:
+def launch_word_index(command: Sequence[str]) -> int:
     """Return the index of the word ``launch`` in a command of ``ros2 launch``, else 0."""
     for index in (1, 2):
         if [*command[index : index + 1]] == ["launch"] and Path(command[index - 1]).name == "ros2":
@@ -869,7 +875,7 @@ _STARTED_BY, _STARTED_AS = 11, 12
 """AT_UID and AT_EUID in /proc/PID/auxv (getauxval(3)): real and effective user id at the start."""
 
 
-def _clock_advanced(folder: int, started: datetime) -> timedelta:
+def _clock_advance(folder: int, started: datetime) -> timedelta:
     """Return by how much the clock was set forward since somebody first looked at a process.
 
     ``started`` is the start of the process by the present clock. The kernel gives /proc/PID the
@@ -974,9 +980,10 @@ class LoadedFile:
 
 @dataclass(frozen=True, slots=True)
 class ProcessEnclave:
-    """The enclave that a process names, and the current state of its files.
+    """The enclave that a process names, and the current state of the enclave's files.
 
-    ``keystore`` is the path that the process names.  ``moved`` maps folders of the keystore whose
+    ``keystore`` is the path that the process names.  ``is_there`` says that the enclave's folder
+    exists.  ``moved`` maps folders of the keystore whose
     last change was a move or a new mode, without added or removed files, to the time of that
     change.  ``writable`` is a clause on a folder that users other than the keystore's owner can
     change. ``here`` is the path of the keystore for sros; None if this path is another folder for

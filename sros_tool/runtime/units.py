@@ -75,7 +75,7 @@ SystemCallErrorNumber=EPERM
 
 
 class Job(StrEnum):
-    """Regular work on a keystore, which a timer starts."""
+    """Work for a keystore or a robot: a guard that always runs, and jobs that timers start."""
 
     RENEW = "renew"
     CHECK = "check"

@@ -210,6 +210,9 @@ class DroppedMessage(NamedTuple):
 
     ``line`` counts from 1; ``name`` is the common name of the remote process, "" if the log does
     not show a name; ``message`` is Zenoh's name for the message, such as "Declare Subscriber".
+    ``process`` is the label of the enforcing process in the log, ``zid`` the Zenoh id of the remote
+    process, and ``key`` the key expression.  ``ingress`` says that the enforcing process received
+    the message; otherwise, it was to send the message.
     """
 
     line: int

@@ -15,7 +15,7 @@ from zoneinfo import ZoneInfo
 import pytest
 
 from sros_tool.checks import processes, runtime
-from sros_tool.checks.environment import secured_by
+from sros_tool.checks.environment import security_clauses
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingFilter
 from sros_tool.checks.processes import may_lack_list
 from sros_tool.checks.runtime import RuntimeState
@@ -266,7 +266,7 @@ def test_what_keeps_the_enclave_from_loading_is_found_too(sound_one: RuntimeStat
 def test_a_process_whose_start_the_clock_does_not_tell(
     sound_one: RuntimeState, bench: Bench
 ) -> None:
-    set_forward = {"started": datetime(2000, 1, 1, tzinfo=UTC), "clock_advanced": 25 * DAY / 24}
+    set_forward = {"started": datetime(2000, 1, 1, tzinfo=UTC), "clock_advance": 25 * DAY / 24}
     (found,) = runtime_findings(changed(0, **set_forward)(sound_one, bench))
     assert found.id == "runtime.process-outdated"
     assert found.text.startswith(
@@ -549,9 +549,11 @@ def test_what_secures_the_nodes_of_a_shell(
         ("password", '{transport: {auth: {usrpwd: {user: "me"}}}}'),
     ):
         (tmp_path / name).write_text(text)
-    found = [*secured_by(variables, tmp_path)]
+    found = [*security_clauses(variables, tmp_path)]
     assert len(found) == bool(said)
     assert all(clause.startswith(said) for clause in found)
     (tmp_path / "DEFAULT_FASTRTPS_PROFILES.xml").symlink_to("secured")
     at_last = "'DEFAULT_FASTRTPS_PROFILES.xml' in this folder has security"
-    assert (at_last in secured_by(variables, tmp_path)) != (ON_ZENOH.items() <= variables.items())
+    assert (at_last in security_clauses(variables, tmp_path)) != (
+        ON_ZENOH.items() <= variables.items()
+    )

@@ -43,7 +43,7 @@ from sros_tool.runtime.processes import (
     ProcessTable,
     RunningProcesses,
     UnseenProcess,
-    launch_verb,
+    launch_word_index,
     process_origin,
     user_text,
     with_files,
@@ -878,7 +878,7 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     robot.more = (replace(talker, started=datetime.now(UTC) + timedelta(days=1)),)
     assert ": restart them" not in robot.close().out
     long_ago = talker.started - timedelta(days=400)
-    robot.more = (replace(talker, started=long_ago, clock_advanced=timedelta(days=2)),)
+    robot.more = (replace(talker, started=long_ago, clock_advance=timedelta(days=2)),)
     said = robot.close("--proof", status=1).out
     assert "its enclave: the clock was set forward by 2 d while the process ran, and " in said
     assert " may have changed after the start of the processes of /talker (process 4711); " in said
@@ -2006,8 +2006,8 @@ def test_a_process_that_was_launched_is_launched_secured(tmp_path: Path, robot: 
     made_up(tmp_path, 9, "/opt/talker", parent=8)
     origin = ProcessOrigin("", "/opt", LAUNCH)
     assert process_origin(9, tmp_path) == process_origin(7, tmp_path) == origin
-    assert launch_verb(("ros2", "launch")) == 1
-    assert not any(map(launch_verb, [("ros2", "run", "launch"), ("launch",), ()]))
+    assert launch_word_index(("ros2", "launch")) == 1
+    assert not any(map(launch_word_index, [("ros2", "run", "launch"), ("launch",), ()]))
 
     robot.launch = LAUNCH
     assert "has no name= in its launch file, and would not start" in robot.close(status=1).out

@@ -20,9 +20,16 @@ from sros_tool.demo.result import (
     judge_row,
 )
 from sros_tool.demo.scenarios import choose_scenarios
-from sros_tool.demo.scenarios.model import Relation, Role, Row, RowStatus, joined, together
+from sros_tool.demo.scenarios.model import (
+    Relation,
+    Role,
+    Row,
+    RowStatus,
+    merged_row,
+    merged_scenario,
+)
 from sros_tool.demo.scenarios.on_zenoh import ATTACKS, ZENOH_SCENARIOS
-from sros_tool.demo.wire import PacketCounter, mapped_segments, shared_memory
+from sros_tool.demo.wire import PacketCounter, mapped_segments, segments_with_text
 from sros_tool.errors import UnavailableError, UsageError
 from sros_tool.runtime.events import Event, EventKind, ProcessStage
 from tests.support.harness import sros
@@ -89,13 +96,13 @@ def test_an_attacker_in_another_enclave_obeys_no_rules_of_its_own() -> None:
 
 
 def test_rows_of_one_world_share_their_processes() -> None:
-    rows = joined(ZENOH_SCENARIOS).rows
+    rows = merged_scenario(ZENOH_SCENARIOS).rows
     groups = [[rows[index] for index in group] for group in program.groups_of_rows(rows)]
     assert sorted(row.name for group in groups for row in group) == sorted(ROWS)
     for group in groups:
-        world = together(group)
+        world = merged_row(group)
         assert len({party.name for party in world.parties}) == len(world.parties)
-    processes = sum(len(together(group).parties) for group in groups)
+    processes = sum(len(merged_row(group).parties) for group in groups)
     assert processes < 0.6 * sum(len(row.parties) for row in rows)
 
 
@@ -103,7 +110,7 @@ def test_a_world_cannot_have_two_parties_of_one_name() -> None:
     row = ROWS["talker to listener, directly"]
     other = replace(row.party("talker"), topic="/other")
     with pytest.raises(ValueError, match="two parties 'talker'"):
-        together([row, replace(row, parties=(other,))])
+        merged_row([row, replace(row, parties=(other,))])
 
 
 def test_scenarios_are_chosen_by_name() -> None:
@@ -237,7 +244,7 @@ def test_text_in_shared_memory_is_found(tmp_path: Path) -> None:
     (tmp_path / "other").write_bytes(b"somebody's")
     segments = [*tmp_path.iterdir(), tmp_path / "gone"]
     texts = {"talker": "the talker", "listener": ""}
-    assert shared_memory(texts, segments) == {"talker": 1, "listener": 0}
+    assert segments_with_text(texts, segments) == {"talker": 1, "listener": 0}
 
 
 def test_the_segments_of_a_process_are_those_that_it_maps() -> None:

@@ -301,16 +301,16 @@ def test_a_clock_that_was_set_forward_makes_no_process_newer_than_it_is(proc: Pr
     first_look = datetime.fromtimestamp(proc.add(7, *ROS, start="0").stat().st_ctime, UTC)
     begin = first_look + timedelta(seconds=time.clock_gettime(time.CLOCK_BOOTTIME))
     (first,) = table.look(begin - timedelta(seconds=1)).processes
-    assert first.clock_advanced == timedelta()
+    assert first.clock_advance == timedelta()
     later = begin + timedelta(hours=1)
     assert table.look(later).processes == (first,)
     (process,) = ProcessTable(proc.path).look(later).processes
-    assert timedelta(minutes=59) < process.clock_advanced < timedelta(minutes=61)
+    assert timedelta(minutes=59) < process.clock_advance < timedelta(minutes=61)
     assert first_look - timedelta(minutes=2) < process.started < first_look
     # Another process started five minutes later, and somebody looked at it at the same moment.
     proc.add(8, "sh", start=f"{300 * os.sysconf('SC_CLK_TCK')}")
     (process,) = ProcessTable(proc.path).look(later).processes
-    assert timedelta(minutes=64) < process.clock_advanced < timedelta(minutes=66)
+    assert timedelta(minutes=64) < process.clock_advance < timedelta(minutes=66)
     assert first_look - timedelta(minutes=7) < process.started < first_look - timedelta(minutes=5)
 
 
@@ -318,14 +318,14 @@ def test_a_look_asks_once_how_far_the_clock_was_set(
     proc: Proc, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """On a robot without a battery for its clock, all processes are older than the clock shows."""
-    clock_advanced = Mock(wraps=processes._clock_advanced)
-    monkeypatch.setattr(processes, "_clock_advanced", clock_advanced)
+    clock_advance = Mock(wraps=processes._clock_advance)
+    monkeypatch.setattr(processes, "_clock_advance", clock_advance)
     for pid in range(2, 12):
         proc.add(pid, *ROS, start="0")
     boot = datetime.now(UTC) + timedelta(seconds=time.clock_gettime(time.CLOCK_BOOTTIME))
     found = ProcessTable(proc.path).look(boot + timedelta(hours=1)).processes
-    assert len(found) == 10 and all(process.clock_advanced for process in found)
-    assert clock_advanced.call_count == 2 * len(found)
+    assert len(found) == 10 and all(process.clock_advance for process in found)
+    assert clock_advance.call_count == 2 * len(found)
 
 
 @pytest.mark.parametrize(

@@ -319,7 +319,7 @@ class InstalledEnclave(NamedTuple):
 def open_installed(
     folder: Path, names: Iterable[str], *, now: datetime
 ) -> dict[str, InstalledEnclave]:
-    """Return the enclaves of ``names`` in the security folder ``folder`` that can be opened."""
+    """Map those of ``names`` that can be opened in the security folder ``folder`` to enclaves."""
     opened, files = {}, FilesReadOnce()
     for name in names:
         place = enclave_path(folder, name)
@@ -337,7 +337,7 @@ def unusable_sentences(enclaves: Mapping[str, InstalledEnclave]) -> Iterator[str
             yield f"{name} {COULD_NOT_START}: {enclave.problem}."
 
 
-def _on_robot(folder: Path, now: datetime) -> CheckedKeystore:
+def _keystore_on_robot(folder: Path, now: datetime) -> CheckedKeystore:
     return CheckedKeystore(OpenedKeystore(folder), Circumstances(now, on_robot=True))
 
 
@@ -345,7 +345,7 @@ def exposed_sentences(folder: Path, now: datetime) -> Iterator[str]:
     """Yield sentences on files that others can read or change, as `sros verify` finds them."""
     paths: dict[tuple[str, str, str], list[str]] = {}
     try:
-        for finding in check_files(_on_robot(folder, now)):
+        for finding in check_files(_keystore_on_robot(folder, now)):
             if finding.severity >= ERROR:
                 path = os.path.relpath(finding.file, folder)
                 to_do = _CLOSE_KEY if finding.kind is KEY_READABLE else ""
@@ -360,7 +360,7 @@ def exposed_keys(folder: Path, now: datetime) -> frozenset[str]:
     """Return the paths, in ``folder``, of private keys that others can read, as far as known."""
     keys = set()
     with suppress(SrosError, OSError):
-        for finding in check_files(_on_robot(folder, now)):
+        for finding in check_files(_keystore_on_robot(folder, now)):
             if finding.kind is KEY_READABLE:
                 keys.add(os.path.relpath(finding.file, folder))
     return frozenset(keys)

@@ -150,7 +150,10 @@ def _authority_findings(
 def key_findings(
     certificate: x509.Certificate, subject: str, file: str, *, owner_clause: str = "it has"
 ) -> Iterator[Finding]:
-    """Yield findings about a certificate's key or signature that a vendor refuses."""
+    """Yield findings about a certificate's key or signature that a vendor refuses.
+
+    ``owner_clause`` begins the texts of the findings.
+    """
     key = certificate.public_key()
     fits = (isinstance(key, ec.EllipticCurvePublicKey) and key.curve.name == "secp256r1") or (
         isinstance(key, rsa.RSAPublicKey) and key.key_size == 2048
@@ -403,7 +406,7 @@ _SHOWN, _MOST_LEFT = 5, 20
 """
 
 
-def _left_enclave_findings(keystore: CheckedKeystore, fleet: Fleet) -> Iterator[Finding]:
+def _former_robot_findings(keystore: CheckedKeystore, fleet: Fleet) -> Iterator[Finding]:
     from sros_tool.fleet.robots import former_robot_of
 
     robots: dict[str, list[str]] = {}
@@ -457,7 +460,7 @@ def _settings_and_ledger_findings(keystore: CheckedKeystore) -> Iterator[Finding
         clause = f"{FLEET} {keystore.fleet_edited}"
         yield FLEET_EDITED.found("fleet", clause, keystore.shown(FLEET))
     if keystore.fleet:
-        yield from _left_enclave_findings(keystore, keystore.fleet)
+        yield from _former_robot_findings(keystore, keystore.fleet)
     for clause in edits.unsigned:
         yield NOT_AS_SETTINGS.found("settings", clause, file)
     file = keystore.shown(LEDGER)

@@ -94,7 +94,8 @@ def keystore_findings(
 ) -> list[Finding]:
     """Return all findings in a keystore, or in some of its enclaves.
 
-    With ``only_enclaves``, only these enclaves are checked, and not the keystore itself.
+    ``at`` has the moment and the other conditions of the check.  With ``only_enclaves``, only these
+    enclaves are checked, and not the keystore itself.
 
     Raises:
         KeystoreError: the path of ``opened`` is not a keystore.

@@ -92,7 +92,8 @@ class Circumstances:
 class CheckedKeystore:
     """A keystore, or an export for a robot, as checks read it.
 
-    A file that exists and cannot be read counts as missing, and is listed in ``unread``.
+    ``at`` has the moment and the other conditions of the check.  A file that exists and cannot be
+    read counts as missing, and is listed in ``unread``.
     """
 
     opened: OpenedKeystore

@@ -120,7 +120,10 @@ class _Party:
         self.signer: x509.Certificate | None = None
 
     def accepts(self, other: _Party, role: int) -> bool:
-        """Return whether a node of this enclave accepts the other enclave's CA in this role."""
+        """Return whether a node of this enclave accepts the other enclave's CA.
+
+        ``role`` is the index in `ROLES` of the CA's role.
+        """
         shown = (other.certificate, other.signer)[role]
         return shown is not None and any(
             shown == authority or issued_by(shown, authority) for authority in self.trusted[role]
@@ -378,7 +381,7 @@ class _TargetGovernance:
         return tuple(documents)
 
     @cached_property
-    def first(self) -> tuple[DomainSet, ...]:
+    def first_domains(self) -> tuple[DomainSet, ...]:
         """The domains of the first enclave."""
         return self._domains(self._enclaves[:1])
 
@@ -398,13 +401,15 @@ class _TargetGovernance:
             domain_sets[domains] = None
         return tuple(domain_sets)
 
-    def joined(self) -> Iterator[int]:
-        """Yield the domains that an enclave may join."""
+    def joined_by_any(self) -> Iterator[int]:
+        """Yield the domains that at least one enclave may join."""
         return chain.from_iterable(self.domains)
 
     def overlaps(self, other: _TargetGovernance) -> bool:
         """Return whether enclaves of both targets may join a common domain; True if not known."""
-        return _domains_meet(self.first, other.first) or _domains_meet(self.domains, other.domains)
+        return _domains_meet(self.first_domains, other.first_domains) or _domains_meet(
+            self.domains, other.domains
+        )
 
 
 def _domains_meet(domain_sets: Sequence[DomainSet], other_sets: Sequence[DomainSet]) -> bool:
@@ -415,6 +420,7 @@ def _domains_meet(domain_sets: Sequence[DomainSet], other_sets: Sequence[DomainS
 class _Incompatibility(NamedTuple):
     """The reason that two targets do not communicate.
 
+    ``names`` are the names that cannot be used between the targets; () for all names.
     ``differences`` are settings with both values; () if only the domains differ.
     """
 
@@ -450,7 +456,7 @@ def _incompatible_governance_findings(
         )
         if incompatibility.kind is PEERS_DOMAINS:
             own_domains, domains = (
-                DomainSet.of(*((d, d) for name in names for d in governed[name].joined()))
+                DomainSet.of(*((d, d) for name in names for d in governed[name].joined_by_any()))
                 for names in (alike_names, incompatible_names)
             )
             why = f"the first side is for domain {own_domains}, the second for domain {domains}"

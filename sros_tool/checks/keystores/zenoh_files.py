@@ -130,7 +130,7 @@ def check_own_zenoh(enclave: CheckedEnclave) -> Iterator[Finding]:
         return
     if not any(os.path.lexists(enclave.folder / file) for file in ZENOH_FILES):
         if ZENOH in enclave.keystore.at.vendors:
-            yield _found(MISSING, enclave, f"{SESSION_FILE} is missing", SESSION_FILE)
+            yield _zenoh_finding(MISSING, enclave, f"{SESSION_FILE} is missing", SESSION_FILE)
         return
     from sros_tool.keystore.zenoh_files import open_zenoh  # most keystores have no Zenoh files
 
@@ -145,10 +145,10 @@ def _configuration_findings(
     for problem in opened_zenoh.problems:
         if kind := _KINDS.get(problem.fault.value):
             text = problem.text if problem.text != "missing" else f"{problem.file} is missing"
-            yield _found(kind, enclave, text, problem.file)
+            yield _zenoh_finding(kind, enclave, text, problem.file)
 
 
-def _found(kind: FindingKind, enclave: CheckedEnclave, text: str, file: str) -> Finding:
+def _zenoh_finding(kind: FindingKind, enclave: CheckedEnclave, text: str, file: str) -> Finding:
     remedy = kind.remedy
     if not enclave.keystore.is_original:
         remedy = f"In the {ORIGINAL_KEYSTORE}: run `sros zenoh KEYSTORE`."

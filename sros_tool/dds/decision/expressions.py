@@ -272,7 +272,8 @@ class ExpressionIndex:
 
     An expression without wildcards is found by the whole name, another expression by the text
     before its first wildcard.  So a search in thousands of expressions takes little longer than one
-    comparison.
+    comparison.  With ``both_ways``, a name with wildcards also finds expressions that match the
+    name as an expression.
     """
 
     def __init__(self, style: Style, texts: Iterable[str], *, both_ways: bool = False) -> None:

@@ -106,8 +106,8 @@ def _same_parts(granted_subject: str, certified_subject: str) -> bool:
 def _trimmed(text: bytes, start: int, end: int) -> bytes:
     """Return ``text[start:end]`` with blanks at both ends removed as by Fast DDS 2.9.1.
 
-    Removal on one side stops before only one byte is left; in a shorter part, removal continues
-    after the end of the part.
+    Blanks are removed on each side until two bytes are left.  In a part of less than two bytes,
+    removal continues beyond the part.
     """
     last = end - 1
     try:
@@ -205,7 +205,7 @@ def _plain_subject(text: str) -> str:
 _SEPARATORS = re.compile(r"[,/|]")
 
 
-def _has_granted_parts(
+def _grant_has_all_parts(
     granted_subject: str, certified_subject: str, *, normalize: Callable[[str], str] = str
 ) -> bool:
     parts = [normalize(part) for part in _SEPARATORS.split(granted_subject) if part]
@@ -240,8 +240,8 @@ _COMPARE: dict[Subjects, Callable[[str, str], bool]] = {
     Subjects.EXACT: _same_attributes,
     Subjects.WHOLE_ATTRIBUTES: _same_parts,
     Subjects.ANY_ORDER: _same_in_any_order,
-    Subjects.SUBSET: _has_granted_parts,
-    Subjects.TRIMMED_SUBSET: partial(_has_granted_parts, normalize=_without_blanks),
+    Subjects.SUBSET: _grant_has_all_parts,
+    Subjects.TRIMMED_SUBSET: partial(_grant_has_all_parts, normalize=_without_blanks),
 }
 
 

@@ -442,12 +442,12 @@ def joined_titles(titles: Iterable[str]) -> list[str]:
         named = releases.setdefault(vendor.traits.product if vendor else title, [])
         named += [vendor] if vendor else []
     return [
-        product if set(named) == _measured(product) else f"{product} {_releases_text(named)}"
+        product if set(named) == _tested_releases(product) else f"{product} {_releases_text(named)}"
         for product, named in releases.items()
     ]
 
 
-def _measured(product: str) -> set[Vendor]:
+def _tested_releases(product: str) -> set[Vendor]:
     return {vendor for vendor in TESTED if vendor.traits.product == product}
 
 

@@ -258,7 +258,8 @@ class Variant:
     """The expected status of a row if all ``conditions`` are true.
 
     ``open_because`` is the reason why an attack succeeds under these conditions ("": the attack
-    fails). ``remedy`` is what a user can do.  ``instead`` is a row to run instead, for a vendor
+    fails). ``remedy`` is what a user can do.  ``mechanism`` replaces the reason for the expected
+    status ("": the reason of the row).  ``instead`` is a row to run instead, for a vendor
     that implements the defense differently.
     """
 
@@ -328,7 +329,7 @@ class Row:
         return self.party(self.claims[0].subject).topic
 
     @property
-    def talking(self) -> Party:
+    def first_talker(self) -> Party:
         """The talker of the first claim."""
         return self.party(self.claims[0].talker)
 
@@ -354,7 +355,7 @@ class Row:
         return self
 
 
-def together(rows: Sequence[Row]) -> Row:
+def merged_row(rows: Sequence[Row]) -> Row:
     """Merge rows that share processes into one row with all parties, claims and controls.
 
     Raises:
@@ -394,7 +395,7 @@ class Scenario:
     any_keystore: bool = False
 
 
-def joined(scenarios: Sequence[Scenario]) -> Scenario:
+def merged_scenario(scenarios: Sequence[Scenario]) -> Scenario:
     """Merge scenarios with the same enclaves and policy into one scenario with all rows.
 
     Raises:
@@ -435,7 +436,7 @@ def known_open(row: Row, because: str, remedy: str) -> Row:
 
 
 def tries(attack: str, *rows: Row) -> tuple[Row, ...]:
-    """Return rows as attempts of one attack, including replacement rows for vendors."""
+    """Return the rows, marked as attempts of the attack; also marks the rows that replace them."""
     return tuple(
         replace(
             row,

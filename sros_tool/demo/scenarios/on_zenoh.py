@@ -554,7 +554,9 @@ _ENTRIES: tuple[tuple[Party, str, RowStatus, RowStatus], ...] = (
 )
 
 
-def _past_the_router(party: Party, attack: str, denied: RowStatus, done: RowStatus) -> list[Row]:
+def _rows_past_the_router(
+    party: Party, attack: str, denied: RowStatus, done: RowStatus
+) -> list[Row]:
     return [
         _trespass_row(
             attack,
@@ -577,7 +579,9 @@ def _past_the_router(party: Party, attack: str, denied: RowStatus, done: RowStat
     ]
 
 
-def _through_the_router(party: Party, attack: str, denied: RowStatus, done: RowStatus) -> list[Row]:
+def _rows_through_the_router(
+    party: Party, attack: str, denied: RowStatus, done: RowStatus
+) -> list[Row]:
     return [
         _trespass_row(
             attack,
@@ -604,8 +608,8 @@ def _trespass_rows() -> tuple[Row, ...]:
     """Return the trespass rows: with and without a router in between, and without the defense."""
     rows: list[Row] = []
     for way, rows_of in (
-        ("past the router", _past_the_router),
-        ("through the router", _through_the_router),
+        ("past the router", _rows_past_the_router),
+        ("through the router", _rows_through_the_router),
     ):
         for party, act, denied, done in _ENTRIES:
             attack = f"another enclave {act} {way}"
@@ -690,7 +694,7 @@ _ROUTER_ROWS = tuple(
 # ── the router of another host ─────────────────────────────────────────────────────────────
 
 
-def _far_router(keystore: KeystoreChoice) -> tuple[Party, Party]:
+def _far_and_near_router(keystore: KeystoreChoice) -> tuple[Party, Party]:
     """Return two routers; listener and admin connect to the far router, which starts first."""
     far = Identity(keystore, zenoh_forger.FAR_ROUTER)
     return Party("far router", Role.ROUTER, far), replace(_router(keystore), turn=1)
@@ -699,7 +703,7 @@ def _far_router(keystore: KeystoreChoice) -> tuple[Party, Party]:
 def _far_pair(keystore: KeystoreChoice) -> tuple[Party, ...]:
     """Return two routers, a talker and a listener."""
     talker, listener = talker_and_listener(keystore)
-    return (*_far_router(keystore), replace(talker, turn=2), replace(listener, turn=2))
+    return (*_far_and_near_router(keystore), replace(talker, turn=2), replace(listener, turn=2))
 
 
 _NEAR = replace(
