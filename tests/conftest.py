@@ -147,7 +147,7 @@ def pytest_runtest_teardown(item: pytest.Item) -> Iterator[None]:
 @pytest.fixture(scope="session", autouse=True)
 def decrypt_each_key_once() -> Iterator[None]:
     """A passphrase is slow to try, and most tests use copies of the same encrypted keys."""
-    decrypt = keys._decrypted
+    decrypt = keys._decrypted_key
     known: dict[tuple[bytes, str], PrivateKeyTypes] = {}
 
     def decrypted(pem: bytes, name: str, passphrase: str) -> PrivateKeyTypes:
@@ -156,7 +156,7 @@ def decrypt_each_key_once() -> Iterator[None]:
         return known[pem, passphrase]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(keys, "_decrypted", decrypted)
+        patch.setattr(keys, "_decrypted_key", decrypted)
         patch.setattr(keys, "_P", 1)  # of five, so that making an encrypted key is no slower either
         yield
 

@@ -194,7 +194,7 @@ def _file_findings(
     loaded = _loaded_files(enclave, changed, process, ledgers)
     if revoked := loaded.revoked:
         yield PROCESS_REVOKED.found(process.label, f"the certificate of {name} was {revoked}")
-    elif not enclave.is_there or len(enclave.lacking) == len(_required_files(enclave)):
+    elif not enclave.is_there or len(enclave.missing_files) == len(_required_files(enclave)):
         if not _why_unsecured(process):
             text = f"{name} in '{plain(enclave.keystore, _LONGEST_PATH)}' has no files"
             unknown = f"; {loaded.unknown}" if loaded.unknown else ""
@@ -261,7 +261,7 @@ def newer_files(process: Process, enclave: ProcessEnclave) -> Iterator[str]:
         for file in files
         if file.changed and file.changed > process.started and file.name not in _KEY_FILES
     ]
-    gone = [name for name in enclave.lacking if any(name == file.name for file in files)]
+    gone = [name for name in enclave.missing_files if any(name == file.name for file in files)]
     yield from (_plain_path(file) for file in newer)
     yield from (f"{file} (removed)" for file in gone)
     if not newer and not gone:
@@ -391,10 +391,10 @@ class _Ledgers:
 
     def entries(self, enclave: ProcessEnclave, user: int) -> tuple[Sequence[Entry], str]:
         """Return an enclave's entries, and a clause that says why they cannot be read, or ""."""
-        if enclave.here is None:
+        if enclave.local_keystore is None:
             return (), "its keystore is not at this path here"
         try:
-            size = (enclave.here / LEDGER).stat().st_size
+            size = (enclave.local_keystore / LEDGER).stat().st_size
         except OSError:
             return (), "its keystore has no ledger"
         if size > _MOST_LEDGER:
@@ -405,7 +405,9 @@ class _Ledgers:
             return (), f"sros reads at most {most} MiB of ledgers for the processes of a user"
         self._read[user] += size
         try:
-            entries = OpenedKeystore(enclave.here).ledger_with("enclave", enclave.name).entries
+            entries = (
+                OpenedKeystore(enclave.local_keystore).ledger_with("enclave", enclave.name).entries
+            )
         except SrosError as error:
             return (), f"the ledger of its keystore cannot be read: {error.what}"
         return [entry for entry in entries if entry.enclave == enclave.name], ""
@@ -483,11 +485,11 @@ def _why_unsecured(process: Process) -> str:
     if enclave is None:
         return f"{KEYSTORE} is not set"
     moments = [moment for moment in enclave.moved.values() if moment > process.started]
-    if enclave.is_there and not enclave.lacking:
+    if enclave.is_there and not enclave.missing_files:
         return ""
     if moments:  # its files may have been complete at its start
         return ""
-    fault = f"has no {', '.join(enclave.lacking)}" if enclave.is_there else "is not there"
+    fault = f"has no {', '.join(enclave.missing_files)}" if enclave.is_there else "is not there"
     keystore = plain(enclave.keystore, _LONGEST_PATH)
     return f"{plain(enclave.name, _LONGEST_PATH)} in '{keystore}' {fault}"
 

@@ -104,7 +104,9 @@ def _clock_findings(state: RuntimeState) -> Iterator[Finding]:
     """Yield a finding if a keystore of this shell, or of a process, is newer than the clock."""
     clock = state.clock or state.now
     enclaves = (process.enclave for process in state.running.processes)
-    used = (str(enclave.here) for enclave in enclaves if enclave and enclave.here)
+    used = (
+        str(enclave.local_keystore) for enclave in enclaves if enclave and enclave.local_keystore
+    )
     for root in dict.fromkeys((state.environment.get(KEYSTORE, ""), *used)):
         if not root or not Path(root).is_dir():
             continue

@@ -212,7 +212,7 @@ def _keystore_lines(keystore: DescribedKeystore) -> Iterator[str]:
     if isinstance(keystore.governance, UnreadableFile):
         yield f"  governance: {keystore.governance.error}"
     elif keystore.governance:
-        yield from _indented(_domain_rule_lines(keystore.governance))
+        yield from _indented_lines(_domain_rule_lines(keystore.governance))
     if network := keystore.zenoh:
         yield (
             f"  Zenoh in {network.mode} mode: router {network.router} at "
@@ -290,7 +290,7 @@ def _enclave_lines(enclave: DescribedEnclave) -> Iterator[str]:
     if facts.token:
         yield f"  {_token_place_text(facts.token)}"
     for grant in facts.permissions or ():
-        yield from _indented(_grant_lines(grant))
+        yield from _indented_lines(_grant_lines(grant))
     if zenoh := enclave.zenoh:
         yield f"  Zenoh: {', '.join(file.file for file in zenoh.files) or 'NOT USABLE'}"
         for problem in zenoh.problems:
@@ -300,10 +300,10 @@ def _enclave_lines(enclave: DescribedEnclave) -> Iterator[str]:
 def _certificate_file_lines(certificates: DescribedCertificates) -> Iterator[str]:
     file = certificates.file
     yield f"{'CA certificate' if file.first.is_ca else 'certificate'} {certificates.path}"
-    yield from _indented(_certificate_lines(file.first))
+    yield from _indented_lines(_certificate_lines(file.first))
     for further in file.further or ():
         yield "next to it, in the same file"
-        yield from _indented(_certificate_lines(further))
+        yield from _indented_lines(_certificate_lines(further))
     if file.crl:
         yield _list_text(file.crl)
 
@@ -349,20 +349,20 @@ def _token_lines(described_token: DescribedKeyOnToken) -> Iterator[str]:
 
 def _permissions_lines(permissions: DescribedPermissions) -> Iterator[str]:
     yield f"permissions {permissions.path}"
-    yield from _indented(_signature_lines(permissions.signature))
+    yield from _indented_lines(_signature_lines(permissions.signature))
     for grant in permissions.grants:
-        yield from _indented(_grant_lines(grant))
+        yield from _indented_lines(_grant_lines(grant))
 
 
 def _governance_lines(governance: DescribedGovernance) -> Iterator[str]:
     yield f"governance {governance.path}"
-    yield from _indented(_signature_lines(governance.signature))
-    yield from _indented(_domain_rule_lines(governance))
+    yield from _indented_lines(_signature_lines(governance.signature))
+    yield from _indented_lines(_domain_rule_lines(governance))
 
 
 def _configuration_lines(described_configuration: DescribedConfiguration) -> Iterator[str]:
     yield f"Zenoh configuration {described_configuration.path}"
-    yield from _indented(_signature_lines(described_configuration.signature))
+    yield from _indented_lines(_signature_lines(described_configuration.signature))
     for problem in described_configuration.problems:
         yield f"  {problem}"
     if not described_configuration.made_by_sros:
@@ -385,13 +385,13 @@ def _configuration_lines(described_configuration: DescribedConfiguration) -> Ite
     if described_configuration.domains:
         yield f"  domain {', '.join(map(str, described_configuration.domains))}"
     for remote in described_configuration.rights:
-        yield from _indented(_remote_lines(remote))
+        yield from _indented_lines(_remote_lines(remote))
 
 
 def _remote_lines(remote: RemoteFacts) -> Iterator[str]:
     if remote.own_rights_by_router:
         yield f"through the router {remote.enclave} this enclave may"
-        yield from _indented(_right_lines(remote.may))
+        yield from _indented_lines(_right_lines(remote.may))
         return
     counts = [
         f"{right} {counted(len(names), kind.removesuffix('s'))}"
@@ -428,7 +428,7 @@ def _grant_lines(grant: GrantFacts) -> Iterator[str]:
     for rule in grant.rules:
         where = f" in partitions {', '.join(rule.partitions)}" if rule.partitions else ""
         yield f"  {rule.qualifier} in domain {rule.domains}{where}"
-        yield from _indented(_indented(_right_lines(rule.rights)))
+        yield from _indented_lines(_indented_lines(_right_lines(rule.rights)))
     yield f"  everything else: {grant.default}"
 
 
@@ -456,7 +456,7 @@ def _domain_rule_lines(governance: DescribedGovernance) -> Iterator[str]:
             )
 
 
-def _indented(lines: Iterable[str]) -> Iterator[str]:
+def _indented_lines(lines: Iterable[str]) -> Iterator[str]:
     return (_INDENT + line for line in lines)
 
 

@@ -201,7 +201,7 @@ def view(
             "",
             "`sros diff_policy A B --format markdown` compares two.",
         )
-    if written in ("html", "svg") and not (output or show or dry_run) and _on_terminal():
+    if written in ("html", "svg") and not (output or show or dry_run) and _is_on_terminal():
         raise UsageError(
             "a page or picture would be written to this terminal",
             "",
@@ -259,7 +259,7 @@ def view(
         click.launch(output.absolute().as_uri())
 
 
-def _on_terminal() -> bool:
+def _is_on_terminal() -> bool:
     return sys.stdout is not None and sys.stdout.isatty()
 
 

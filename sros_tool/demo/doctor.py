@@ -122,7 +122,9 @@ def diagnosis_text(diagnosis: Diagnosis) -> str:
         identity = f"{stack.dds} {stack.version}".strip() if stack.present else ""
         lines.append(f"{stack.name:<{width}}  {_answer(stack):<19}  {identity}".rstrip())
         is_concluded = stack.advice in diagnosis.conclusion
-        lines += _indented([stack.evidence, stack.where, "" if is_concluded else stack.advice])
+        lines += _indented_lines(
+            [stack.evidence, stack.where, "" if is_concluded else stack.advice]
+        )
     return "\n".join(lines)
 
 
@@ -134,7 +136,7 @@ def _answer(stack: Stack) -> str:
     return "enforces security" if stack.enforces else "does not enforce"
 
 
-def _indented(texts: Sequence[str]) -> list[str]:
+def _indented_lines(texts: Sequence[str]) -> list[str]:
     return [f"    {text}" for text in texts if text]
 
 

@@ -625,8 +625,8 @@ class _Runner:
         network = RowNetwork(own=self._plan.own_networks)
         try:
             with network.in_network():
-                if row.tapped:
-                    tap = self._listen_in(index, row)
+                if row.is_captured:
+                    tap = self._start_wiretap(index, row)
                     if tap.problem:
                         return RowRecord(row, domain, skipped=tap.problem)
             for turn in sorted({party.turn for party in row.parties}):
@@ -678,13 +678,13 @@ class _Runner:
     async def _wait_until_settled(self, processes: Collection[_PartyProcess]) -> bool:
         """Wait until all processes are settled; return False if that takes too long."""
         deadline = min(time.monotonic() + self._plan.limits.start, self._end)
-        while not all(process.settled for process in processes):
+        while not all(process.is_settled for process in processes):
             if time.monotonic() > deadline:
                 return False
             await asyncio.sleep(_POLL_SECONDS)
         return True
 
-    def _listen_in(self, index: int, row: Row) -> Wiretap:
+    def _start_wiretap(self, index: int, row: Row) -> Wiretap:
         texts = {party.name: self._text(index, party) for party in row.parties}
         topic = self._plan.backend.wire_name(self._plan.topic, self._plan.domains[index])
         return Wiretap(texts, topic, replayed=bool(row.replay or row.impersonate))
@@ -717,7 +717,7 @@ class _Runner:
         backend = plan.backend
         environment |= backend.environment(
             party.role,
-            wire=row.tapped,
+            wire=row.is_captured,
             denied=denied,
             secured=secured,
         )
@@ -749,7 +749,7 @@ class _Runner:
             now = time.monotonic()
             return now, now
         needed = [processes[party.name] for party in row.parties if _is_needed(party, row)]
-        if not all(process.running for process in needed):
+        if not all(process.is_running for process in needed):
             return None
         if row.meanwhile is not None:
             self._plan.keystores.change(row.party(row.claims[0].subject).identity, row.meanwhile)
@@ -798,7 +798,7 @@ class _Runner:
 def _is_hopeless(claim: Claim, row: Row, processes: Mapping[str, _PartyProcess]) -> bool:
     """Return whether a claim can no longer hold, because its intruder was refused or has ended."""
     names = [name for name in (claim.subject, claim.talker) if name and row.party(name).intruder]
-    return not all(processes[name].running for name in names)
+    return not all(processes[name].is_running for name in names)
 
 
 def _awaits_silence(claim: Claim, row: Row, processes: Mapping[str, _PartyProcess]) -> bool:
@@ -806,7 +806,7 @@ def _awaits_silence(claim: Claim, row: Row, processes: Mapping[str, _PartyProces
     if claim.holds or claim.relation in (Relation.HEARS_AGAIN, Relation.BELIEVES):
         return False
     names = [name for name in (claim.subject, claim.talker) if name and row.party(name).intruder]
-    return claim.denied not in DENIALS or all(processes[name].running for name in names)
+    return claim.denied not in DENIALS or all(processes[name].is_running for name in names)
 
 
 def groups_of_rows(rows: Sequence[Row]) -> list[list[int]]:
@@ -983,7 +983,7 @@ class _PartyProcess:
         return self._events
 
     @property
-    def settled(self) -> bool:
+    def is_settled(self) -> bool:
         """Whether the process is ready, was refused, or has failed or ended."""
         events = self.look()
         return self._own_status is not None or any(
@@ -991,7 +991,7 @@ class _PartyProcess:
         )
 
     @property
-    def running(self) -> bool:
+    def is_running(self) -> bool:
         """Whether the process was ready and has not ended by itself."""
         events = self.look()
         return self._own_status is None and any(event.kind is EventKind.READY for event in events)

@@ -170,7 +170,7 @@ class _ClaimFinding(NamedTuple):
     detail: str
 
 
-def _undecided(why: str) -> _ClaimFinding:
+def _undecided_finding(why: str) -> _ClaimFinding:
     return _ClaimFinding(RowStatus.UNDECIDED, why)
 
 
@@ -215,7 +215,7 @@ def _observe_row(record: RowRecord) -> _ClaimFinding:
     for claim, finding in controls:
         if finding.status is not claim.expected:
             claim_text = f"{claim.subject} {claim.relation} {claim.talker}".strip()
-            return _undecided(
+            return _undecided_finding(
                 f"the control failed ({claim_text}: {finding.status}, {finding.detail})"
             )
     details = [finding.detail for _, finding in claims]
@@ -254,7 +254,7 @@ class _ClaimRecords:
             e for e in party.events if e.kind is EventKind.SENT and _is_in_window(e, self.record)
         ]
 
-    def heard(self) -> list[Event]:
+    def messages_heard(self) -> list[Event]:
         """Return the talker's messages that the subject heard, at any time."""
         return _messages_heard(self.talker, self.subject)
 
@@ -273,7 +273,7 @@ def _judge_claim(claim: Claim, record: RowRecord) -> _ClaimFinding:
     if claim.relation is Relation.STARTS:
         return _ClaimFinding(RowStatus.STARTED, f"{claim.subject} started")
     if record.window is None:
-        return _undecided("not all processes were ready in time")
+        return _undecided_finding("not all processes were ready in time")
     return _JUDGES[claim.relation](_ClaimRecords(claim, record))
 
 
@@ -286,8 +286,8 @@ def _judge_hearing(case: _ClaimRecords) -> _ClaimFinding:
     claim, record = case.claim, case.record
     sent = {event.text for event in case.messages_sent(case.talker)}
     if not sent:
-        return _undecided(f"{claim.talker} sent nothing during the observation")
-    heard = case.heard()
+        return _undecided_finding(f"{claim.talker} sent nothing during the observation")
+    heard = case.messages_heard()
     if record.row.meanwhile is not None:  # messages before the change prove nothing
         heard = [event for event in heard if _is_in_window(event, record)]
     arrived = len(sent & {event.text for event in heard})
@@ -298,8 +298,8 @@ def _judge_hearing(case: _ClaimRecords) -> _ClaimFinding:
 def _judge_answers(case: _ClaimRecords) -> _ClaimFinding:
     claim, asked = case.claim, case.messages_sent(case.subject)
     if not asked:
-        return _undecided(f"{claim.subject} sent no request during the observation")
-    answers = case.heard()
+        return _undecided_finding(f"{claim.subject} sent no request during the observation")
+    answers = case.messages_heard()
     within = sum(_is_in_window(event, case.record) for event in answers)
     right = f"{min(within, len(asked))} right answers from the {claim.talker}"
     return case.result(bool(answers), f"{claim.subject} asked {len(asked)} times and got {right}")
@@ -309,8 +309,8 @@ def _judge_execution(case: _ClaimRecords) -> _ClaimFinding:
     """Judge a call by the requests that the server executed, because a reply may be lost."""
     claim, asked = case.claim, case.messages_sent(case.talker)
     if not asked:
-        return _undecided(f"{claim.talker} sent no request during the observation")
-    reached = case.heard()
+        return _undecided_finding(f"{claim.talker} sent no request during the observation")
+    reached = case.messages_heard()
     number = f"{min(len(reached), len(asked))} of {len(asked)} requests of the {claim.talker}"
     return case.result(bool(reached), f"{claim.subject} executed {number}")
 
@@ -320,13 +320,13 @@ _SECONDS_IN_TRANSIT = 1.0
 
 
 def _judge_expiry(case: _ClaimRecords) -> _ClaimFinding:
-    claim, expiry, heard = case.claim, case.record.expiry, case.heard()
+    claim, expiry, heard = case.claim, case.record.expiry, case.messages_heard()
     if expiry is None or not any(event.time < expiry for event in heard):
-        return _undecided(f"{claim.talker} was not heard before its certificate expired")
+        return _undecided_finding(f"{claim.talker} was not heard before its certificate expired")
     after = expiry + _SECONDS_IN_TRANSIT
     sent = [e for e in case.talker.events if e.kind is EventKind.SENT and e.time > after]
     if not sent:
-        return _undecided(f"{claim.talker} sent nothing after its certificate had expired")
+        return _undecided_finding(f"{claim.talker} sent nothing after its certificate had expired")
     late = [event for event in heard if event.time > after]
     before = f"{len(heard) - len(late)} messages of the {claim.talker} until its certificate"
     return case.result(
@@ -348,7 +348,7 @@ def _with_evidence(finding: _ClaimFinding, claim: Claim, record: RowRecord) -> _
     lines = ((name, line) for name, output in outputs for line in output.splitlines())
     logged = next(((name, line) for name, line in lines if claim.evidence in line), None)
     if logged is None:
-        return _undecided(f"{finding.detail}, but no process logged {claim.evidence!r}")
+        return _undecided_finding(f"{finding.detail}, but no process logged {claim.evidence!r}")
     name, line = logged
     return _ClaimFinding(finding.status, f"{finding.detail}; {name}: {_message_of(line)}")
 
@@ -362,8 +362,8 @@ def _message_of(line: str) -> str:
 def _judge_replay(case: _ClaimRecords) -> _ClaimFinding:
     claim, injected = case.claim, case.record.injected
     if injected is None or not injected.packets:
-        return _undecided("no packets of the talker were captured to send again")
-    repeated = sum(event.time >= injected.time for event in case.heard())
+        return _undecided_finding("no packets of the talker were captured to send again")
+    repeated = sum(event.time >= injected.time for event in case.messages_heard())
     return case.result(
         repeated > 0,
         f"{claim.subject} heard {repeated} messages when {injected.packets} packets of the "
@@ -374,7 +374,7 @@ def _judge_replay(case: _ClaimRecords) -> _ClaimFinding:
 def _judge_forgery(case: _ClaimRecords) -> _ClaimFinding:
     claim, talker, injected = case.claim, case.talker, case.record.injected
     if injected is None or not injected.packets:
-        return _undecided("no packet of the talker could be changed")
+        return _undecided_finding("no packet of the talker could be changed")
     sent = {event.text for event in talker.events if event.kind is EventKind.SENT}
     sent.add(f"{talker.text}: {len(sent) + 1}")  # perhaps sent, but suspended before its report
     believed = sum(
@@ -398,12 +398,12 @@ def _judge_view(case: _ClaimRecords) -> _ClaimFinding:
     serves = case.record.row.party(claim.talker).role is Role.SERVER
     # A server only has to exist; no client has to call it.
     if not serves and not case.messages_sent(case.talker):
-        return _undecided(f"{claim.talker} sent nothing during the observation")
+        return _undecided_finding(f"{claim.talker} sent nothing during the observation")
     looks = [
         e for e in observer.events if e.kind is EventKind.SEEN and _is_in_window(e, case.record)
     ]
     if not looks:
-        return _undecided(f"{claim.subject} made no count during the observation")
+        return _undecided_finding(f"{claim.subject} made no count during the observation")
     most = max(event.publishers.get(topic, 0) for event in looks)
     counted = f"{most} {'servers' if serves else 'publishers'} on {topic}"
     return case.result(most > 0, f"{observer.library} counts {counted} in {len(looks)} polls")
@@ -412,15 +412,15 @@ def _judge_view(case: _ClaimRecords) -> _ClaimFinding:
 def _judge_loss(case: _ClaimRecords) -> _ClaimFinding:
     claim, topic = case.claim, case.talker.topic
     if not any(event.kind is EventKind.SENT for event in case.talker.events):
-        return _undecided(f"{claim.talker} found no node to remove")
+        return _undecided_finding(f"{claim.talker} found no node to remove")
     looks = [event for event in case.subject.events if event.kind is EventKind.SEEN]
     most = max((event.publishers.get(topic, 0) for event in looks), default=0)
     if not most:
-        return _undecided(f"{claim.subject} never saw a publisher on {topic}")
+        return _undecided_finding(f"{claim.subject} never saw a publisher on {topic}")
     # Only inside the window, because the talker ends after it.
     inside = [event for event in looks if _is_in_window(event, case.record)]
     if not inside:
-        return _undecided(f"{claim.subject} made no count during the observation")
+        return _undecided_finding(f"{claim.subject} made no count during the observation")
     left = inside[-1].publishers.get(topic, 0)
     detail = f"{case.subject.library} counts {most} publishers on {topic}, and {left} after "
     return case.result(not left, f"{detail}{claim.talker} tried to remove the node")
@@ -433,11 +433,11 @@ def _judge_wire(case: _ClaimRecords) -> _ClaimFinding:
         return case.result(segments > 0, f"{segments} segments of shared memory show the text")
     count = record.wire.get(claim.subject)
     if count is None:
-        return _undecided("no packets were captured")
+        return _undecided_finding("no packets were captured")
     if claim.wire is not Wire.TEXT:
         shown = count.topics if claim.wire is Wire.TOPIC else count.certificates
         if not shown and not count.protected:
-            return _undecided("no packets of the row were captured")
+            return _undecided_finding("no packets of the row were captured")
         packet_kind = f"the {claim.wire}" if claim.wire is Wire.TOPIC else f"a {claim.wire}"
         return case.result(shown > 0, f"{shown} packets show {packet_kind}")
     if count.plain:
@@ -445,7 +445,7 @@ def _judge_wire(case: _ClaimRecords) -> _ClaimFinding:
     sent = len(case.messages_sent(case.subject))
     # Missing text proves something only if the messages were in the captured packets.
     if count.protected * 2 < max(2, sent):
-        return _undecided(
+        return _undecided_finding(
             f"only {count.protected} encrypted packets were captured for {sent} messages"
         )
     return case.result(False, f"0 packets show the text, {count.protected} are encrypted")

@@ -54,7 +54,7 @@ SUPERSEDED = x509.ReasonFlags.superseded.value
 """The reason for revoking a certificate that was renewed, although its key may still be in use."""
 
 
-class Revoked(NamedTuple):
+class RevocationEntry(NamedTuple):
     """An entry of a revocation list; ``reason`` is one of `REASONS`."""
 
     serial: int
@@ -72,7 +72,7 @@ class RevocationList(NamedTuple):
     number: int
     this_update: datetime
     next_update: datetime
-    revoked: tuple[Revoked, ...]
+    revoked: tuple[RevocationEntry, ...]
     list: x509.CertificateRevocationList
 
     def expires_soon_from(self) -> datetime:
@@ -88,7 +88,7 @@ class RevocationList(NamedTuple):
 def sign_crl(
     issuer: x509.Certificate,
     key: PrivateKey,
-    revoked: Iterable[Revoked],
+    revoked: Iterable[RevocationEntry],
     *,
     number: int,
     this_update: datetime,
@@ -157,12 +157,12 @@ def _fields_of(crl: x509.CertificateRevocationList, name: str) -> RevocationList
     expiry = next_update(crl)
     if expiry is None:
         raise PkiError(f"the revocation list {name} does not say when it expires", "", _RESTORE)
-    return RevocationList(list_number(crl), last_update(crl), expiry, _revoked_in(crl), crl)
+    return RevocationList(list_number(crl), last_update(crl), expiry, _entries_of(crl), crl)
 
 
-def _revoked_in(crl: x509.CertificateRevocationList) -> tuple[Revoked, ...]:
+def _entries_of(crl: x509.CertificateRevocationList) -> tuple[RevocationEntry, ...]:
     """Return the entries of a list; entries with the reason removeFromCRL are left out."""
-    return tuple(entry for entry in map(_revoked, crl) if entry.reason in REASONS)
+    return tuple(entry for entry in map(_revocation_entry, crl) if entry.reason in REASONS)
 
 
 def last_update(crl: x509.CertificateRevocationList) -> datetime:
@@ -229,7 +229,7 @@ def _read_in_full(crl: x509.CertificateRevocationList) -> x509.CertificateRevoca
     subject_text(crl.issuer)
     _ = last_update(crl), next_update(crl), crl.signature_hash_algorithm, list_number(crl)
     for entry in crl:
-        _revoked(entry)
+        _revocation_entry(entry)
     return crl
 
 
@@ -270,7 +270,7 @@ def lists_as_revoked(crl: x509.CertificateRevocationList, serial: int) -> bool:
         )
     else:
         entry = crl.get_revoked_certificate_by_serial_number(serial)
-    return entry is not None and _revoked(entry).reason in REASONS
+    return entry is not None and _revocation_entry(entry).reason in REASONS
 
 
 _READ_IF_CRITICAL = (
@@ -359,7 +359,7 @@ def newest_revocations(signer: bytes, *files: bytes) -> Revocations:
     newest = max(lists, key=list_number, default=None)
     if newest is None:  # a list without entries is falsy
         return Revocations()
-    return Revocations(list_number(newest), frozenset(e.serial for e in _revoked_in(newest)))
+    return Revocations(list_number(newest), frozenset(e.serial for e in _entries_of(newest)))
 
 
 def list_number(crl: x509.CertificateRevocationList) -> int:
@@ -370,12 +370,12 @@ def list_number(crl: x509.CertificateRevocationList) -> int:
         return 0
 
 
-def _revoked(entry: x509.RevokedCertificate) -> Revoked:
+def _revocation_entry(entry: x509.RevokedCertificate) -> RevocationEntry:
     try:
         reason = entry.extensions.get_extension_for_class(x509.CRLReason).value.reason.value
     except x509.ExtensionNotFound:
         reason = "unspecified"
-    return Revoked(entry.serial_number, tolerant.date(entry, "revocation_date"), reason)
+    return RevocationEntry(entry.serial_number, tolerant.date(entry, "revocation_date"), reason)
 
 
 # ── verification with lists (x509_vfy.c) ───────────────────────────────────────────────────

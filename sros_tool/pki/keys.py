@@ -141,7 +141,7 @@ def load_any_key(
                 "Decrypt it with `openssl pkey -in KEY -out KEY.plain`.",
             )
         _check_derivation(pem, name)
-        key = _decrypted(pem, name, passphrase())
+        key = _decrypted_key(pem, name, passphrase())
     else:
         try:
             key = serialization.load_pem_private_key(pem, None, unsafe_skip_rsa_key_validation=True)
@@ -348,7 +348,7 @@ def _integers(data: bytes, depth: int = 3) -> Iterator[int]:
             yield from _integers(value.content, depth - 1)
 
 
-def _decrypted(pem: bytes, name: str, passphrase: str) -> PrivateKeyTypes:
+def _decrypted_key(pem: bytes, name: str, passphrase: str) -> PrivateKeyTypes:
     secret = _as_bytes(passphrase)
     with reading(
         f"the private key {name} cannot be decrypted",

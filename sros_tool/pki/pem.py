@@ -52,7 +52,7 @@ def blocks(data: bytes) -> Iterator[Block]:
     """
     if single := _SINGLE_BLOCK.fullmatch(data):
         label = single[1].decode("ascii")
-        yield Block(label, b"", _decoded(single[2], label))
+        yield Block(label, b"", _decoded_content(single[2], label))
         return
     pieces = iter(_LINE_PIECE.findall(data))
     start = True  # OpenSSL drops a byte order mark at the start of the file and after each block
@@ -124,10 +124,12 @@ def _read_block(label: bytes, pieces: Iterator[bytes]) -> Block:
     if len(parts) == 1 and any(b":" in part for part in parts[0]):
         parts.append([])  # the block has headers only
     headers = b"\n".join(parts.pop(0)) if len(parts) == 2 else b""
-    return Block(label.decode("utf-8", "replace"), headers, _decoded(b"\n".join(parts[0]), name))
+    return Block(
+        label.decode("utf-8", "replace"), headers, _decoded_content(b"\n".join(parts[0]), name)
+    )
 
 
-def _decoded(encoded: bytes, name: str) -> bytes:
+def _decoded_content(encoded: bytes, name: str) -> bytes:
     text = encoded.partition(b"-")[0].translate(None, _IGNORED_IN_BASE64)
     if not text:
         raise PkiError(f"the block {name} in it is empty")

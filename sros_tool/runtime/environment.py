@@ -408,10 +408,10 @@ def replaced_notes(environment: Mapping[str, str], variables: Mapping[str, str])
         if not before or before == variables.get(name):
             continue
         if name != OVERRIDE:
-            yield Note("zenoh.replaced", f"{name} was {_shortened(before)}, and is replaced.")
+            yield Note("zenoh.replaced", f"{name} was {_shortened_text(before)}, and is replaced.")
             continue
         keys = [key.strip().strip("/") for key, _ in override_pairs(before)]
-        shown = first_few([_shortened(key) for key in keys], _MOST_KEYS) or "nothing"
+        shown = first_few([_shortened_text(key) for key in keys], _MOST_KEYS) or "nothing"
         yield Note("zenoh.replaced", f"{OVERRIDE} changed {shown}, and is replaced.")
         if any(key.partition("/")[0] == "access_control" for key in keys):
             yield Note(
@@ -422,7 +422,7 @@ def replaced_notes(environment: Mapping[str, str], variables: Mapping[str, str])
             )
 
 
-def _shortened(text: str) -> str:
+def _shortened_text(text: str) -> str:
     shown = text if len(text) <= _MOST_CHARACTERS else f"{text[:_MOST_CHARACTERS]}..."
     return repr(shown)
 

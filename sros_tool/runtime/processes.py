@@ -982,13 +982,13 @@ class LoadedFile:
 class ProcessEnclave:
     """The enclave that a process names, and the current state of the enclave's files.
 
-    ``keystore`` is the path that the process names.  ``is_there`` says that the enclave's folder
-    exists.  ``moved`` maps folders of the keystore whose
-    last change was a move or a new mode, without added or removed files, to the time of that
-    change.  ``writable`` is a clause on a folder that users other than the keystore's owner can
-    change. ``here`` is the path of the keystore for sros; None if this path is another folder for
-    sros. ``folders`` are the device and inode of the keystore and of the enclave, as far as these
-    exist.  ``problem`` is a clause on why the enclave could not be examined.
+    ``keystore`` is the path that the process names, and ``local_keystore`` the path by which sros
+    reaches this keystore; None if sros sees another folder, or none, at ``keystore``.  ``is_there``
+    says that the enclave's folder exists.  ``moved`` maps folders of the keystore whose last change
+    was a move or a new mode, without added or removed files, to the time of that change.
+    ``writable`` is a clause on a folder that users other than the keystore's owner can change.
+    ``folders`` are the device and inode of the keystore and of the enclave, as far as these exist.
+    ``problem`` is a clause on why the enclave could not be examined.
     """
 
     keystore: str
@@ -997,7 +997,7 @@ class ProcessEnclave:
     is_there: bool = False
     moved: Mapping[str, datetime] = field(default_factory=dict)
     writable: str = ""
-    here: Path | None = None
+    local_keystore: Path | None = None
     folders: tuple[tuple[int, int], ...] = ()
     problem: str = ""
 
@@ -1022,7 +1022,7 @@ class ProcessEnclave:
         return lost and os.path.abspath(self.keystore) == os.path.abspath(keystore)  # noqa: PTH100
 
     @property
-    def lacking(self) -> tuple[str, ...]:
+    def missing_files(self) -> tuple[str, ...]:
         """The names of the required files that are missing."""
         present_files = {file.name for file in self.files if file.changed or file.problem}
         present_files |= {_KEY} if _KEY_ON_TOKEN in present_files else set()
@@ -1218,7 +1218,9 @@ def _loaded_enclave(
         folders = root.folders(place)
     except OSError as error:
         there = (folder_of_keystore,)
-        return ProcessEnclave(keystore, name, here=here, folders=there, problem=_reason(error))
+        return ProcessEnclave(
+            keystore, name, local_keystore=here, folders=there, problem=_reason(error)
+        )
     own_folders = [above[-1], *folders[len(above) - 1 :]]
     return ProcessEnclave(
         keystore,
@@ -1234,7 +1236,7 @@ def _loaded_enclave(
             if state.st_mtime_ns < state.st_ctime_ns
         },
         writable=_writable_folder_clause(own_folders, user),
-        here=here,
+        local_keystore=here,
         folders=(folder_of_keystore, _identity(folders)),
     )
 

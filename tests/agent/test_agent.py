@@ -160,7 +160,7 @@ class Robot:
         states = [path.stat() for path in (here, seen) if path.exists()]
         folders = tuple((state.st_dev, state.st_ino) for state in states)
         enclave = ProcessEnclave(
-            str(here), name, files, is_there=is_there, here=here, folders=folders
+            str(here), name, files, is_there=is_there, local_keystore=here, folders=folders
         )
         started, user = self.started[name], self.user
         return Process(1, ("node",), environment, started, user=user, enclave=enclave)
@@ -1083,11 +1083,14 @@ def test_a_process_from_another_folder_never_has_the_present_files(
         process.enclave,
         keystore=str(copy),
         name="r1/a/",
-        here=copy,
+        local_keystore=copy,
         folders=((state.st_dev, state.st_ino),),
     )
     r1.settings = replace(r1.settings, restart=True, units=(Unit("a.service", ("/r1/a",)),))
-    for enclave in (found, replace(found, keystore=str(r1.folder), here=None)):  # in a container
+    for enclave in (
+        found,
+        replace(found, keystore=str(r1.folder), local_keystore=None),
+    ):  # in a container
         running = RunningProcesses((process, replace(process, enclave=enclave)))
         r1.running = lambda now, seen=running: seen  # type: ignore[method-assign, misc]
         done = r1.round()

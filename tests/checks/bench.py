@@ -17,7 +17,7 @@ from cryptography.x509.oid import NameOID
 
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import load_certificate, pem, validity_of
-from sros_tool.pki.crl import Revoked, last_update, next_update, sign_crl
+from sros_tool.pki.crl import RevocationEntry, last_update, next_update, sign_crl
 from sros_tool.pki.keys import PrivateKey, generate_key, key_pem, load_key
 
 SECRET = "open, sesame"
@@ -161,7 +161,7 @@ class Bench:
         data = sign_crl(
             ca,
             key,
-            [Revoked(serial, self.now - DAY) for serial in serials],
+            [RevocationEntry(serial, self.now - DAY) for serial in serials],
             number=1,
             this_update=begin or self.now - DAY,
             next_update=end or self.now + 1000 * DAY,

@@ -285,7 +285,7 @@ def test_the_ledgers_of_all_processes_of_a_user_are_bounded(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Any user can start a thousand processes that name a large ledger, and hide no one else's."""
-    enclave = ProcessEnclave(str(bench.root), "/base", here=bench.root)
+    enclave = ProcessEnclave(str(bench.root), "/base", local_keystore=bench.root)
     size = (bench.root / "ledger.jsonl").stat().st_size
     monkeypatch.setattr(processes, "_MOST_LEDGERS", 2 * size + 1)
     ledgers = processes._Ledgers()

@@ -15,7 +15,7 @@ import pytest
 from sros_tool.keystore import zenoh_files
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.pki import smime
-from sros_tool.pki.crl import Revoked, sign_crl
+from sros_tool.pki.crl import RevocationEntry, sign_crl
 from sros_tool.pki.keys import load_key
 from sros_tool.policy.rights import NodeName
 from sros_tool.translate_zenoh.rights import StatedRight, remote_of
@@ -321,7 +321,7 @@ def test_a_revocation_that_is_in_the_list_alone_counts(folder: Path) -> None:
     authority = OpenedKeystore(home).ca_certificate("identity")
     key = load_key((home / "private/identity_ca.key.pem").read_bytes(), "key")
     now = datetime.now(UTC)
-    more = (Revoked(99, now + timedelta(minutes=1)),)
+    more = (RevocationEntry(99, now + timedelta(minutes=1)),)
     list_file = (home / "public/identity_ca.crl.pem").resolve()
     list_file.write_bytes(
         sign_crl(authority, key, more, number=9, this_update=now, next_update=now + timedelta(9))

@@ -16,7 +16,7 @@ from sros_tool.keystore.lifecycle.create import create_keystore, generate_artifa
 from sros_tool.keystore.template import load_template
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import Issuer, common_name, issue_ca, load_certificate, pem
-from sros_tool.pki.crl import Revoked, sign_crl
+from sros_tool.pki.crl import RevocationEntry, sign_crl
 from sros_tool.pki.keys import PrivateKey, generate_key, key_pem, load_key
 from sros_tool.policy.document import read_policy
 from sros_tool.validity import Window, iso
@@ -96,7 +96,7 @@ class Enclave:
         made = sign_crl(
             certificate,
             key,
-            [Revoked(serial, self.now - DAY) for serial in revoked],
+            [RevocationEntry(serial, self.now - DAY) for serial in revoked],
             number=1,
             this_update=self.now + begin,
             next_update=self.now + end,

@@ -59,7 +59,7 @@ from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.reader import OpenedKeystore, read_certificate
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import Issuer, key_digest, make_request, validity_of
-from sros_tool.pki.crl import SUPERSEDED, Revoked, load_crl, sign_crl
+from sros_tool.pki.crl import SUPERSEDED, RevocationEntry, load_crl, sign_crl
 from sros_tool.pki.keys import PrivateKey, generate_key, load_key
 from sros_tool.validity import BACKDATE, iso, parse_iso
 from tests.dds.signer_rows import signed_by
@@ -739,7 +739,7 @@ def test_a_key_that_a_revoked_key_vouched_for(home: Home, revoked: int, is_repla
     assert home.of("r1", DUE).requests[0].outcome == "renewed"
     later, new = DUE + timedelta(days=2), home.certificate("/r1/base")
     key = load_key((home.root / "private/identity_ca.key.pem").read_bytes(), "the CA's key")
-    entry = Revoked(old.serial_number, DUE + timedelta(days=revoked), SUPERSEDED)
+    entry = RevocationEntry(old.serial_number, DUE + timedelta(days=revoked), SUPERSEDED)
     crl = sign_crl(authority, key, [entry], number=99, this_update=DUE, next_update=LATE)
     home.send("r2", later, crl=crl.decode())
     texts = {note.id: note.text for note in home.collect(later).notes}

@@ -37,7 +37,7 @@ from sros_tool.pki.certificates import (
     pem,
     validity_of,
 )
-from sros_tool.pki.crl import Revoked, sign_crl
+from sros_tool.pki.crl import RevocationEntry, sign_crl
 from sros_tool.pki.keys import generate_key, key_pem
 from sros_tool.validity import Window, parse_iso
 from tests.support.harness import certificate, copy_of, policy_text, publish, snapshot, sros
@@ -252,7 +252,7 @@ def test_the_keystore_of_another_user_does_not_name_the_service(site: Path) -> N
 
 
 def listed(*serials: int, number: int = 1, key: Any = CA_KEY, days: float = 30) -> bytes:
-    revoked = [Revoked(serial, now()) for serial in serials]
+    revoked = [RevocationEntry(serial, now()) for serial in serials]
     end = now() + days * DAY
     return sign_crl(CA, key, revoked, number=number, this_update=now() - 2 * DAY, next_update=end)
 

@@ -13,7 +13,14 @@ from cryptography.x509.oid import NameOID
 
 from sros_tool.errors import PkiError
 from sros_tool.pki.certificates import Issuer, authority_identifier, common_name, issue_ca, pem
-from sros_tool.pki.crl import Revoked, lists_as_revoked, load_crl, read_list, refusal_of, sign_crl
+from sros_tool.pki.crl import (
+    RevocationEntry,
+    lists_as_revoked,
+    load_crl,
+    read_list,
+    refusal_of,
+    sign_crl,
+)
 from sros_tool.pki.keys import PrivateKey, generate_key
 from sros_tool.validity import Window
 from tests.integration.forged_signatures import Node
@@ -154,16 +161,18 @@ def test_a_serial_number_that_no_list_holds_is_refused(serial: int) -> None:
     key, window = generate_key(), Window(NOW - DAY, NOW + DAY)
     ca = issue_ca(key, common_name("CA"), window)
     times = {"this_update": NOW - DAY, "next_update": NOW + DAY}
-    assert load_crl(sign_crl(ca, key, [Revoked((1 << 159) - 1, NOW)], number=1, **times), "")
+    assert load_crl(
+        sign_crl(ca, key, [RevocationEntry((1 << 159) - 1, NOW)], number=1, **times), ""
+    )
     with pytest.raises(PkiError, match=f"the serial number {serial:x} cannot be put"):
-        sign_crl(ca, key, [Revoked(serial, NOW)], number=1, **times)
+        sign_crl(ca, key, [RevocationEntry(serial, NOW)], number=1, **times)
 
 
 def test_a_list_whose_serial_numbers_are_no_numbers_is_refused(tmp_path: Path) -> None:
     key, window = generate_key(), Window(NOW - DAY, NOW + DAY)
     ca = issue_ca(key, common_name("CA"), window)
     times = {"this_update": NOW - DAY, "next_update": NOW + DAY}
-    made = load_crl(sign_crl(ca, key, [Revoked(5, NOW)], number=1, **times), "").list
+    made = load_crl(sign_crl(ca, key, [RevocationEntry(5, NOW)], number=1, **times), "").list
     (changed,) = Node.read(made.public_bytes(serialization.Encoding.DER))
     entries = next(each for each in changed.children[0].children[::-1] if each.tag == 0x30)
     entries.children[0].children[0].tag = 0x0A  # ENUMERATED

@@ -382,14 +382,16 @@ def check_authorities(keystore: CheckedKeystore) -> Iterator[Finding]:
     """Yield findings about the certificates and keys of the CAs, and the revocation list."""
     for part in keystore.unread:
         why = f"{part.error.what}. {part.error.why}".strip()
-        yield UNREADABLE.found(part.path, why, keystore.shown(part.path), remedy=part.error.remedy)
+        yield UNREADABLE.found(
+            part.path, why, keystore.shown_path(part.path), remedy=part.error.remedy
+        )
     unread = {part.path for part in keystore.unread}
     if keystore.is_original:
         for role in (IDENTITY, PERMISSIONS):
             path = ca_certificate(role)
             if role not in keystore.authorities and path not in unread:
                 text = f"there is no certificate of the {role} CA"
-                yield CA_MISSING.found(f"{role} CA", text, keystore.shown(path))
+                yield CA_MISSING.found(f"{role} CA", text, keystore.shown_path(path))
     yield from _settings_and_ledger_findings(keystore)
     seen: set[bytes] = set()
     for role, chain in keystore.authorities.items():
@@ -415,10 +417,10 @@ def _former_robot_findings(keystore: CheckedKeystore, fleet: Fleet) -> Iterator[
             robots.setdefault(robot, []).append(name)
     for robot, names in list(robots.items())[:_MOST_LEFT]:
         clause = f"{robot}: {first_few(names, _SHOWN)}"
-        yield LEFT_ENCLAVES.found("fleet", clause, keystore.shown(FLEET))
+        yield LEFT_ENCLAVES.found("fleet", clause, keystore.shown_path(FLEET))
     if (more_robots := len(robots) - _MOST_LEFT) > 0:
         clause = f"enclaves of {counted(more_robots, 'more robot')}"
-        yield LEFT_ENCLAVES.found("fleet", clause, keystore.shown(FLEET))
+        yield LEFT_ENCLAVES.found("fleet", clause, keystore.shown_path(FLEET))
 
 
 _NEXT_CA = "Make a new keystore with the certificate of the next CA of the CA service."
@@ -453,17 +455,17 @@ def _settings_and_ledger_findings(keystore: CheckedKeystore) -> Iterator[Finding
     if settings and not ledger:
         yield LEDGER_MISSING.found("ledger", f"there is no {LEDGER}", str(keystore.root))
         return
-    edits, file = keystore.edits, keystore.shown(SETTINGS)
+    edits, file = keystore.edits, keystore.shown_path(SETTINGS)
     if edits.settings:
         yield SETTINGS_EDITED.found("settings", "; ".join(edits.settings), file)
     if keystore.fleet_edited and not is_of_damaged_ledger(keystore.fleet_edited):
         clause = f"{FLEET} {keystore.fleet_edited}"
-        yield FLEET_EDITED.found("fleet", clause, keystore.shown(FLEET))
+        yield FLEET_EDITED.found("fleet", clause, keystore.shown_path(FLEET))
     if keystore.fleet:
         yield from _former_robot_findings(keystore, keystore.fleet)
     for clause in edits.unsigned:
         yield NOT_AS_SETTINGS.found("settings", clause, file)
-    file = keystore.shown(LEDGER)
+    file = keystore.shown_path(LEDGER)
     with suppress(SrosError):  # a ledger that cannot be read is unread
         if behind := keystore.opened.ledger_file.clock_behind(keystore.at.now):
             yield CLOCK_BEHIND.found("clock", behind, file)
@@ -485,7 +487,7 @@ def _authority(
     keystore: CheckedKeystore, role: str, chain: tuple[x509.Certificate, ...]
 ) -> Iterator[Finding]:
     certificate = chain[0]
-    file, subject = keystore.shown(ca_certificate(role)), f"{role} CA"
+    file, subject = keystore.shown_path(ca_certificate(role)), f"{role} CA"
     name, validity = authority_text(certificate), validity_of(certificate)
     begin, end = iso(validity.not_before), iso(validity.not_after)
     remedy = _NEXT_CA if role == IDENTITY and _has_ca_service(keystore) else ""
@@ -517,7 +519,7 @@ def _ca_key_findings(
             yield from key_mode_findings(keystore, str(path), path.stat().st_mode)
         try:
             pem = keystore.opened.read(path, "key")
-            key = load_key(pem, f"'{path}'", _locked)
+            key = load_key(pem, f"'{path}'", _refuse_passphrase)
         except _LockedError:
             yield from _weak_derivation_findings(subject, path, pem)
         except SrosError as error:
@@ -541,7 +543,7 @@ class _LockedError(Exception):
     """A CA key has a passphrase, so it cannot be checked."""
 
 
-def _locked() -> str:
+def _refuse_passphrase() -> str:
     raise _LockedError
 
 
@@ -549,7 +551,10 @@ def _shared_ca_findings(keystore: CheckedKeystore) -> Iterator[Finding]:
     certificates = [chain[0] for chain in keystore.authorities.values()]
     if len(certificates) == 2:
         yield from shared_ca_findings(
-            keystore, certificates[0], certificates[1], keystore.shown(ca_certificate(IDENTITY))
+            keystore,
+            certificates[0],
+            certificates[1],
+            keystore.shown_path(ca_certificate(IDENTITY)),
         )
 
 
@@ -587,7 +592,7 @@ def _separation_remedy(keystore: CheckedKeystore) -> str:
 
 
 def _revocation_list_findings(keystore: CheckedKeystore) -> Iterator[Finding]:
-    crl, file = keystore.crl, keystore.shown(CRL)
+    crl, file = keystore.crl, keystore.shown_path(CRL)
     if keystore.is_original:
         with suppress(SrosError):  # a ledger or list that cannot be read is unread
             if names := unlisted_revocations(keystore.opened, keystore.at.now):

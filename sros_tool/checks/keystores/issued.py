@@ -367,7 +367,7 @@ def _trust_findings(
             strangers = unknown_authorities(keystore.opened, role)
         for authority in strangers:
             text = f"{authority_text(authority)} is not in the ledger"
-            path = keystore.shown(ca_certificate(role))
+            path = keystore.shown_path(ca_certificate(role))
             yield UNKNOWN_AUTHORITY.found(f"{role} CA", text, path)
     for index, (role, file) in enumerate(zip(ROLES, _AUTHORITY_FILES, strict=True)):
         everyone = [summary for summary in summaries if summary.trusted[index]]
@@ -446,7 +446,7 @@ def _ledger_findings(
     with suppress(SrosError):  # a ledger that cannot be read is unread
         for name, expiry in sorted(removed_enclaves(keystore.opened, keystore.at.now).items()):
             text = f"the ledger has a certificate that is valid until {expiry}"
-            yield REMOVED.found(name, text, keystore.shown(LEDGER))
+            yield REMOVED.found(name, text, keystore.shown_path(LEDGER))
     for summary in summaries:
         place = f"{keystore.root}/{enclave_folder(summary.name)}"
         if f"{summary.serial:x}" in revoked:

@@ -272,7 +272,7 @@ def _governance_findings(
     with suppress(SrosError):  # `sros create_enclave` reports the error
         document = keystore.opened.files.signed(keystore.governance).document
         governance = parse_governance(document, GOVERNANCE_P7S)
-        file = keystore.shown(GOVERNANCE_P7S)
+        file = keystore.shown_path(GOVERNANCE_P7S)
         yield from governance_findings(keystore, governance, file, vendors)
 
 

@@ -224,7 +224,7 @@ class CheckedKeystore:
                 return f"template {name}"
         return "" if kind.severity is ERROR else "keystore whose CA signed it"
 
-    def shown(self, path: str | Path) -> str:
+    def shown_path(self, path: str | Path) -> str:
         """Return the path of a file below the root in the form that findings show."""
         return os.path.join(self.root, path)
 

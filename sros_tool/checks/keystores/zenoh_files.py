@@ -174,7 +174,7 @@ def check_network(
     try:
         drift = zenoh_drift(keystore.opened, network, domains, authorities[0], keystore.at.now)
     except SrosError as error:
-        yield CANNOT_BE_MADE.found("zenoh", str(error), keystore.shown(SETTINGS))
+        yield CANNOT_BE_MADE.found("zenoh", str(error), keystore.shown_path(SETTINGS))
         return
     for file in drift.files:
         if only_enclaves is None or file.enclave in only_enclaves:
@@ -201,7 +201,7 @@ def _drift_findings(keystore: CheckedKeystore, drifted: DriftedConfiguration) ->
     """Yield a finding for each difference between a configuration and the keystore."""
     from sros_tool.keystore.zenoh_files import Drift, open_zenoh
 
-    file = keystore.shown(drifted.path)
+    file = keystore.shown_path(drifted.path)
     if drifted.kind is Drift.STALE:
         yield LEFT_OVER.found(
             drifted.enclave, "the keystore has no such file for the enclave", file

@@ -790,7 +790,7 @@ class Access:
         """Return the decision if the governance forbids all endpoints of ``topic``, or None."""
         rule = self._governed.topic_rule(topic)
         if rule is None:
-            return self._without_topic_rule(topic)
+            return self._no_topic_rule_decision(topic)
         if self._traits.crashes_on_empty_texts and not rule.topic_expression.strip():
             text = "a topic rule of the governance is empty, which crashes the process"
             return self._answer(Outcome.CRASHES, "empty-topic", text)
@@ -819,7 +819,7 @@ class Access:
             NameSet.first(
                 (names, each is basis) for (names, _), each in zip(rules, bases, strict=True)
             )
-            & self._allowed_in(verb, basis)
+            & self._allowed_topics(verb, basis)
             for basis in dict.fromkeys(bases)
             if basis is not _DecisionBasis.NOTHING
         )
@@ -862,7 +862,7 @@ class Access:
             else _DecisionBasis.RULES
         )
 
-    def _allowed_in(self, verb: AccessVerb, basis: _DecisionBasis) -> NameSet:
+    def _allowed_topics(self, verb: AccessVerb, basis: _DecisionBasis) -> NameSet:
         if basis is _DecisionBasis.EVERYTHING:
             return _every_topic()
         allowed = self._granted.topics(verb)
@@ -998,7 +998,7 @@ class Access:
             and rule.data_protection_kind is ProtectionKind.NONE
         )
 
-    def _without_topic_rule(self, topic: str) -> Decision:
+    def _no_topic_rule_decision(self, topic: str) -> Decision:
         if self._governed.rule is None:
             text = f"the governance does not list domain {self._governed.domain}"
             return self._answer(Outcome.DENIED, "domain-not-in-governance", text)

@@ -311,7 +311,7 @@ class Row:
     unaccepted: bool = False
 
     @property
-    def tapped(self) -> bool:
+    def is_captured(self) -> bool:
         """Whether the row's packets are captured."""
         return bool(self.wire or self.replay or self.impersonate)
 
@@ -577,13 +577,13 @@ def composed_policy(topic: str) -> Policy:
 def _with_topic(enclave: Enclave, topic: str | None, before: str = _POLICY_TOPIC) -> Enclave:
     """Return the enclave with ``topic`` in place of ``before`` (None: remove ``before``)."""
 
-    def of_group(group: Group) -> Group | None:
+    def changed_group(group: Group) -> Group | None:
         if group.kind != "topics" or before not in group.names:
             return group
         return None if topic is None else replace(group, names=(topic,))
 
-    def of_profile(profile: Profile) -> Profile:
-        groups = (of_group(group) for group in profile.groups)
+    def changed_profile(profile: Profile) -> Profile:
+        groups = (changed_group(group) for group in profile.groups)
         return replace(profile, groups=tuple(group for group in groups if group is not None))
 
-    return enclave.with_profiles(of_profile)
+    return enclave.with_profiles(changed_profile)

@@ -70,7 +70,7 @@ def _edit_talker(copy: KeystoreCopy, change: _Change) -> None:
     _edit(copy.folder("talker") / SESSION_FILE, change)
 
 
-def _without_rules(document: _Document) -> None:
+def _remove_rules(document: _Document) -> None:
     document.pop("access_control", None)
 
 
@@ -89,7 +89,7 @@ def through_the_router(copy: KeystoreCopy) -> None:
 
 def rules_at_the_router_only(copy: KeystoreCopy) -> None:
     """Take the rules out of all sessions, which connect to each other directly."""
-    _edit_all(copy, _without_rules, router=False)
+    _edit_all(copy, _remove_rules, router=False)
 
 
 def sessions_that_limit_themselves(copy: KeystoreCopy) -> None:
@@ -97,7 +97,7 @@ def sessions_that_limit_themselves(copy: KeystoreCopy) -> None:
     through_the_router(copy)
     for name, path in _files(copy).items():
         _edit(
-            path, _without_rules if name == copy.router else _give_rights_to_everybody(copy.router)
+            path, _remove_rules if name == copy.router else _give_rights_to_everybody(copy.router)
         )
 
 
@@ -124,7 +124,7 @@ def subject_for_everybody(copy: KeystoreCopy) -> None:
 def another_router(copy: KeystoreCopy) -> None:
     """Let the guest listen in place of the router."""
     router = json.loads((enclave_path(copy.root, copy.router) / ROUTER_FILE).read_bytes())
-    _without_rules(router)
+    _remove_rules(router)
     (copy.folder("guest") / SESSION_FILE).write_text(json.dumps(router), encoding="utf-8")
 
 
@@ -170,7 +170,7 @@ def another_far_router(copy: KeystoreCopy) -> None:
     """Let the guest play the router of the second host."""
     far_router(copy)
     file = enclave_path(copy.root, FAR_ROUTER) / ROUTER_FILE
-    _edit(file, _without_rules)
+    _edit(file, _remove_rules)
     (copy.folder("guest") / SESSION_FILE).write_bytes(file.read_bytes())
 
 
@@ -185,7 +185,7 @@ def talkative_router(copy: KeystoreCopy) -> None:
     through_the_router(copy)
     folder = enclave_path(copy.root, copy.router)
     router = json.loads((folder / ROUTER_FILE).read_bytes())
-    _without_rules(router)
+    _remove_rules(router)
     (folder / ROUTER_FILE).write_text(json.dumps(router), encoding="utf-8")
 
 
@@ -252,12 +252,12 @@ def tokens_of_any_enclave(copy: KeystoreCopy) -> None:
 def tokens_of_any_name(copy: KeystoreCopy) -> None:
     """Let every enclave announce any node and any name, but only under the enclave's own name."""
 
-    def of_enclave(key: str) -> str:
+    def widened_key(key: str) -> str:
         chunks = key.split("/")
         enclave = chunks[6] if len(chunks) > 6 else ""  # else a key that all may see
         return f"@ros2_lv/{copy.domain}/*/*/*/*/{enclave}/**" if enclave else key
 
-    _widen_tokens(copy, of_enclave)
+    _widen_tokens(copy, widened_key)
 
 
 def tokens_of_any_name_through_the_router(copy: KeystoreCopy) -> None:
@@ -390,7 +390,7 @@ def links_in_the_clear(copy: KeystoreCopy) -> None:
     """Let everybody speak TCP, without access control."""
 
     def change(document: _Document) -> None:
-        _without_rules(document)
+        _remove_rules(document)
         del document["transport"]["link"]
         for side in ("listen", "connect"):
             endpoints = document[side]["endpoints"]

@@ -67,8 +67,8 @@ from sros_tool.pki.certificates import (
 from sros_tool.pki.crl import (
     REASONS,
     SUPERSEDED,
+    RevocationEntry,
     RevocationList,
-    Revoked,
     load_crl,
     load_crls,
     sign_crl,
@@ -188,7 +188,7 @@ class SignedList:
 
 def sign_list(
     authority: Authority,
-    revoked: Iterable[Revoked],
+    revoked: Iterable[RevocationEntry],
     *,
     number: int,
     template: Template,
@@ -213,7 +213,7 @@ def sign_list(
 
 def _entries_to_repeat(
     old: RevocationList | None, expiries: Mapping[int, str], now: datetime
-) -> list[Revoked]:
+) -> list[RevocationEntry]:
     """Return the entries of the ``old`` list that the next list must repeat.
 
     These are the certificates that had not expired when the old list was issued.  By RFC 5280, 3.3,
@@ -458,7 +458,9 @@ class RevocationListSigner:
                 ``incomplete`` is not set.
         """
         date = self._now.replace(microsecond=0)
-        new_entries = [Revoked(int(entry.serial, 16), date, entry.reason) for entry in revocations]
+        new_entries = [
+            RevocationEntry(int(entry.serial, 16), date, entry.reason) for entry in revocations
+        ]
         expiries = known_expiries(self._keystore, revoked_serials(self._keystore))
         if lost := self._lost_revocations(expiries):
             new_entries = [*new_entries, *lost]
@@ -487,7 +489,7 @@ class RevocationListSigner:
         self,
         authority: Authority,
         old: RevocationList | None,
-        new_entries: Sequence[Revoked],
+        new_entries: Sequence[RevocationEntry],
         expiries: Mapping[int, str],
         least: int,
     ) -> SignedList:
@@ -550,7 +552,7 @@ class RevocationListSigner:
             remedy,
         )
 
-    def _lost_revocations(self, expiries: Mapping[int, str]) -> list[Revoked]:
+    def _lost_revocations(self, expiries: Mapping[int, str]) -> list[RevocationEntry]:
         """Return the unexpired revocations in the ledger that the present list lacks.
 
         If the present list is not the last list in the ledger, all these revocations are returned.
@@ -572,7 +574,7 @@ class RevocationListSigner:
         missed = {entry.serial for entry in revoked_issues(keystore, on_a_list)}
         moment = iso(self._now)
         return [
-            Revoked(serial, self._now.replace(microsecond=0), reason)
+            RevocationEntry(serial, self._now.replace(microsecond=0), reason)
             for entry in entries[:count]
             if entry.what == "revocation" and entry.serial
             if (serial := int(entry.serial, 16)) not in listed
@@ -585,7 +587,7 @@ class RevocationListSigner:
 
     def _sign_list_of_second_ca(
         self,
-        new_entries: Sequence[Revoked],
+        new_entries: Sequence[RevocationEntry],
         names: Sequence[str],
         expiries: Mapping[int, str],
         *,
@@ -646,7 +648,7 @@ class RevocationListSigner:
         self,
         old_ca: x509.Certificate,
         error: KeystoreError,
-        new_entries: Sequence[Revoked],
+        new_entries: Sequence[RevocationEntry],
         old: RevocationList | None,
         *,
         incomplete: bool,
