@@ -259,7 +259,7 @@ class _Round:
         self._state = replace(self._state, readable_keys=tuple(exposed.values())[:_MOST_COPIED])
         installation, fetched = self._fetch_and_install(certain)
         if clock is not RobotClock.BEHIND and installation.made:
-            clock = self._clock_next_to_release(installation.made) or clock
+            clock = self._clock_compared_with_release(installation.made) or clock
         self._note_unreleased_enclaves()
         self._note_repaired_files(now)
         self._note_removed_enclaves()
@@ -356,8 +356,8 @@ class _Round:
             return RobotClock.BEHIND
         return self._machine.clock()
 
-    def _clock_next_to_release(self, made: datetime) -> RobotClock | None:
-        """Return ``BEHIND``, and report it, if a release is from the future; otherwise None."""
+    def _clock_compared_with_release(self, made: datetime) -> RobotClock | None:
+        """Return and report ``BEHIND`` if a release was ``made`` after the clock; else None."""
         now = self._machine.now
         if made <= now + _CLOCK_TOLERANCE:
             return None
@@ -700,8 +700,9 @@ class _Round:
     def _time_to_be_valid_at(self, release: Release, certain_time: datetime) -> datetime:
         """Return the time at which a release has to be valid.
 
-        This is the time of the clock. If documents prove that the clock is behind, it is the time
-        at which the keystore made the release.
+        This is ``certain_time``: the time of the clock, or a later time that verified documents
+        prove to be past. If the clock is behind, it is at least the time at which the keystore made
+        the release.
         """
         made = (
             release_time(release) if self._machine.now < certain_time - _CLOCK_TOLERANCE else None
@@ -780,8 +781,9 @@ class _Round:
     def _digests(self, names: Iterable[str]) -> dict[str, str]:
         """Map each enclave to two digests: of its files without the key, and of its trust files.
 
-        The trust files decide which other enclaves the enclave accepts. Of a revocation list, only
-        the revoked certificates count: a list that was only signed again makes no restart due.
+        Both are in one text, with a space between them. The trust files decide which other enclaves
+        the enclave accepts. Of a revocation list, only the revoked certificates count: a list that
+        was only signed again makes no restart due.
         """
         with Folder(self._folder) as opened:
             return {
@@ -912,7 +914,7 @@ class _Round:
         clock: RobotClock,
         asked: Renewals,
     ) -> bool:
-        """Send the message; return whether it arrived."""
+        """Send the message with the confirmation and the requests; return whether it arrived."""
         now = self._machine.now.replace(microsecond=0)
         sequence = self._state.next_sequence(now)
         self._state = replace(self._state, sequence=sequence)
@@ -967,7 +969,7 @@ class _Round:
         return self._replaced_list() if self._is_in_step else self._revocation_lists(names)
 
     def _seal_to_send(self) -> str | None:
-        """Return the seal of the installed release; None without a seal, or for a seal too long."""
+        """Return the seal of the installed release; None if there is no seal, or it is too long."""
         with suppress(SrosError, ValueError):
             seal = read_seal(self._folder).decode("ascii")
             return seal if 0 < len(seal) <= LONGEST_SEAL else None
@@ -993,7 +995,7 @@ class _Round:
             self._try_part(lambda: replace_file(path, text.encode()))
 
     def _drop_replaced_list(self, names: Iterable[str]) -> None:
-        """Remove the kept revocation list if the current list revokes the same certificates."""
+        """Remove the kept revocation list if the current list revokes all of its certificates."""
         kept, present = self._replaced_list(), self._revocation_lists(names)
         if kept and present and _revoked_serials(kept) <= _revoked_serials(present):
             with suppress(OSError):
@@ -1120,7 +1122,10 @@ def _moments_of(names: Collection[str], moments: Mapping[str, float]) -> dict[st
 
 
 def _boot_digest(robot: str, boot: str) -> str | None:
-    """Return a SHA-256 that hides the random id of the machine's start; None without an id."""
+    """Return a digest of ``boot``, the random id of the machine's start; None without an id.
+
+    The digest, a SHA-256 with the robot's name, hides the id.
+    """
     return hashlib.sha256(f"{robot} {boot}".encode()).hexdigest() if boot else None
 
 
@@ -1269,7 +1274,8 @@ _NEW_KEY_AFTER = 0.6
 def _is_renewal_due(keystore: OpenedKeystore, name: str, now: datetime, *, new_key: bool) -> bool:
     """Return whether the robot asks for the renewal of an enclave.
 
-    A file is written only when it changes, so its modification time is when the robot got the
+    It asks when a third of the time from the arrival of the certificate to its expiry is left. A
+    file is written only when it changes, so its modification time is when the robot got the
     certificate.  With ``new_key``, the expiry of the permissions counts, too: otherwise, when the
     permissions are due, the keystore machine would renew the certificate with the present key.
 

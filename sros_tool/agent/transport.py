@@ -31,7 +31,7 @@ _BLOCK_BYTES = 1 << 16
 
 
 class FolderTransport(FetcherInterface):
-    """Reads the files of a publishing folder on this machine, such as on a USB stick."""
+    """A TUF fetcher for a publishing folder on this machine, such as on a USB stick."""
 
     base = "folder:"
     connection = nullcontext()
@@ -62,7 +62,7 @@ class FolderTransport(FetcherInterface):
 
 
 class HttpTransport(FetcherInterface):
-    """Gets the files of a publishing folder from a web server, over one connection.
+    """A TUF fetcher for a publishing folder on a web server, over one connection.
 
     The ``connection`` has to be entered, and is cut off after some minutes.
     """

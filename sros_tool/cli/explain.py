@@ -1104,7 +1104,7 @@ def _show_log(
     as_json: bool,
 ) -> int:
     """Print explanations of a DDS log, or of standard input for "-"; return 1 if there are any."""
-    from sros_tool.explain.log import explain_log_of
+    from sros_tool.explain.log import explain_log_file
     from sros_tool.runtime.rmw import RMW
 
     if len(other_arguments) > 1:
@@ -1113,7 +1113,7 @@ def _show_log(
             raise UsageError(f"'{named}' does not exist", "", "Name a keystore, or a policy.")
         raise UsageError("--log takes at most a keystore and an enclave")
     text = read_log(log)
-    explained = explain_log_of(
+    explained = explain_log_file(
         log, text, keystore, "".join(other_arguments), asking, policy, os.environ.get(RMW, "")
     )
     status = 1 if explained.findings or explained.secured is False else 0

@@ -78,7 +78,8 @@ def _write_drop_ins(
 ) -> list[FileChange]:
     """Write the drop-ins of the units, print their paths, and return the changes.
 
-    Raises `SrosError`.
+    Raises:
+        SrosError: a unit has the drop-in of another folder, or a file cannot be used.
     """
     paths = [f"{unit}.d/{DROP_IN}" for unit in sorted(observed.units)]
     files = {path: read_bytes(robot.start / "units" / path, "unit").decode() for path in paths}
@@ -134,7 +135,7 @@ def undo(robot: LocalRobot, *, dry_run: bool) -> CloseState:
 
 
 def _processes_not_open(running: RunningRobot, started: Sequence[ClosedProcess]) -> Iterator[str]:
-    """Yield the processes of restarted units that run neither open nor in their enclaves."""
+    """Yield a text for each process of a restarted unit that runs neither open nor secured."""
     secured = {enclave.name for _, enclave in running.secured_everywhere}
     since = running.robot.shell.now() - _STABLE_FOR
     for process in started:
@@ -200,7 +201,7 @@ class _RemainingProcesses:
             yield f"restart {enumerated([*names])} open: {command}"
 
     def secured_processes_of_units(self) -> Iterator[str]:
-        """Yield the processes of units that run in enclaves though their units were restarted."""
+        """Yield a text for each process that still runs secured after a restart of its unit."""
         for process in self._observed.processes:
             if process.unit and process.enclave in self._secured:
                 yield (
@@ -237,7 +238,7 @@ class _RemainingProcesses:
             self._robot.shell.say(f"{process.enclave} {state}{start} open{under}: {command}")
 
     def further_secured_processes(self) -> Iterator[str]:
-        """Yield a text for each process in an enclave that is not an observed process of it."""
+        """Yield a text for each process in an enclave that was not observed for this enclave."""
         known = {process.enclave for process in self._observed.processes}
         for enclave in sorted(self._secured.keys() - known):
             process = self._secured[enclave]
@@ -260,7 +261,7 @@ class _RemainingProcesses:
         return f"end {process.label}, which runs as {user}, not as the owner of the enclave's files"
 
     def unknown_processes(self) -> Iterator[str]:
-        """Yield processes that may run secured, although this folder did not start them."""
+        """Yield a text for each process that may run secured, but not from this folder."""
         running = self._running
         pids = {process.pid for process, _ in running.secured_everywhere}
         for process in running.in_domain:
@@ -323,10 +324,13 @@ def _restart_units(
     changed: bool = False,
     dry_run: bool,
 ) -> None:
-    """Restart ``units``, after systemd has read its units again.  Raises `SrosError`.
+    """Restart ``units``, after systemd has read its units again.
 
     Units whose processes ended by themselves are restarted only if they run. With ``changed``,
     systemd reads its units again even if no unit is restarted.
+
+    Raises:
+        SrosError: systemctl cannot be run, or fails.
     """
     idle = {process.unit for process in observed.processes if not (process.pid or process.alike)}
     verbs = {"restart": units - idle, "try-restart": units & idle}

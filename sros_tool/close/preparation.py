@@ -438,7 +438,7 @@ def _keystore_problems(robot: LocalRobot) -> Iterator[str]:
 
 
 def _user_problems(robot: LocalRobot, observed: ObservedProcesses) -> Iterator[str]:
-    """Yield the users of processes who cannot read their enclaves."""
+    """Yield a text for each user whose processes cannot read their enclaves."""
     owner, export = robot.export.stat().st_uid, robot.export.absolute()
     for user in sorted({process.user for process in observed.processes}):
         if user == SEVERAL_USERS:
@@ -458,7 +458,7 @@ def _user_problems(robot: LocalRobot, observed: ObservedProcesses) -> Iterator[s
 
 
 def _launch_problems(robot: LocalRobot, observed: ObservedProcesses) -> Iterator[str]:
-    """Yield the processes that their launch would not start in their enclaves."""
+    """Yield a text for each process that its launch would not start in its enclave."""
     for process in observed.processes:
         command = process.command
         by_launch = process.launch or process.container
@@ -478,7 +478,7 @@ def _launch_problems(robot: LocalRobot, observed: ObservedProcesses) -> Iterator
 
 
 def _unknown_process_problems(running: RunningRobot, state: CloseState) -> Iterator[str]:
-    """Yield the processes without known nodes, and the nodes without a known process."""
+    """Yield texts on processes without known nodes, and on nodes without a known process."""
     robot, observed = running.robot, state.observed
     close = robot.close_command
     silent = "nobody would hear them any more (--partial accepts this)"

@@ -443,7 +443,7 @@ def _process_findings(running: RunningRobot) -> list[Finding]:
 
 
 def _unexpected_processes(running: RunningRobot) -> Iterator[str]:
-    """Yield processes in enclaves of other folders, and open processes in other domains."""
+    """Yield texts on processes in enclaves of other folders, and open ones in other domains."""
     known_pids = {process.pid for process, _ in running.secured}
     in_domain = running.in_domain
     for process in in_domain:

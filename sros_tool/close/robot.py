@@ -257,7 +257,7 @@ class LocalRobot:
             )
 
     def changed_at(self, enclave: str) -> datetime | None:
-        """Return when files of an enclave in the keystore, or linked files, changed last."""
+        """Return when an enclave's files in the keystore last changed; None without files."""
         folder = enclave_path(self.keystore, enclave)
         times = [file.stat().st_mtime for file in folder.glob("*") if file.is_file()]
         return time_of_file(max(times)) if times else None

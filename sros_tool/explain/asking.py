@@ -133,7 +133,7 @@ def rights_naming(keystore: OpenedKeystore, name: str) -> Iterator[Right]:
 
 
 def _may_contain_topic(document: bytes, name: str) -> bool:
-    """Return whether a document can contain a topic of a ROS name, including escaped characters."""
+    """Return whether the text of a document has a DDS topic that may belong to a ROS name."""
     text = name.encode()
     return text in document and (
         b"rt" + text in document or b"rq" + text in document or b"rr" + text in document

@@ -57,7 +57,7 @@ _MOST_FOLDERS = 5
 """Maximum number of folders that a note names."""
 
 
-def explain_log_of(
+def explain_log_file(
     log: str,
     text: str,
     keystore: OpenedKeystore | None,

@@ -319,7 +319,7 @@ class Examiner:
         return missing
 
     def _is_allowed_in(self, ns: str, denial: Denial, enclave: LoadedEnclave) -> bool:
-        """Return whether a denied topic would be allowed if its name had a namespace before it."""
+        """Return whether a denied topic is allowed only with the namespace ``ns`` before it."""
         if not denial.direction or denial.topic[2:3] != "/":
             return False
         moved = replace(denial, topic=f"{denial.topic[:2]}{ns}{denial.topic[2:]}")
@@ -415,7 +415,7 @@ class Examiner:
         return replace(finding, found=tuple(facts), checked=True, remedy=remedy)
 
     def _remedy_in_a_namespace(self, denial: Denial, name: str, remedy: str) -> str:
-        """Return a remedy that asks for the namespace, if only the policy of a package is known."""
+        """Return ``remedy``; for a package's policy, after a remedy for a missing namespace."""
         if not self._policy or denial.folder or denial.by_rule:
             return remedy
         space = self._policy.possible_namespace(name, denial.enclave)
@@ -435,7 +435,7 @@ class Examiner:
         return f" to {path}, which is {enclave.name} in namespace {space}" if space else ""
 
     def _other_folder_cause(self, denial: Denial, enclave: LoadedEnclave) -> tuple[list[str], str]:
-        """Return cause and remedy if the process loaded its files from another folder."""
+        """Return causes and a remedy if the process loaded files from another folder; or [], ""."""
         folder, loaded = Path(denial.folder), None
         with suppress(SrosError, OSError):  # the path comes from the log, so it may be anything
             if folder.is_absolute() and enclave.folder and not folder.samefile(enclave.folder):
@@ -452,7 +452,7 @@ class Examiner:
         )
 
     def _other_node_cause(self, denial: Denial, answer: Answer) -> tuple[list[str], str]:
-        """Return causes and a remedy if the permissions are for a node with another name."""
+        """Return causes and a remedy if the permissions are for another node's name; or [], ""."""
         node, nodes = node_denied_own_service(denial), _served_names(answer)
         if node and not any(covers(own_node, node) for own_node in nodes):
             enclaves: tuple[str, ...] = ()
@@ -483,7 +483,7 @@ class Examiner:
     def _similar_name_cause(
         self, denial: Denial, name: str, enclave: LoadedEnclave, remedy: str
     ) -> tuple[list[str], str]:
-        """Return causes and a remedy if the enclave has rights to similarly spelled names."""
+        """Return causes and a remedy if the enclave has rights to similar names; or [], ""."""
         questions = _questions_to_ask(denial)
         if len(questions) != 1 or denial.by_rule:
             return [], ""
@@ -545,7 +545,7 @@ class Examiner:
         return [], f"{remedy}{renamed or new_name}"
 
     def _misspelled_in_policy(self, denied: Right, named: Iterable[Right]) -> str:
-        """Return a name like the denied one that only the enclave may use, not its peers, or ""."""
+        """Return an allowed name that is like the denied one, and that no peer may use; or ""."""
         for right in named:
             is_alike = right.right == denied.right and is_spelled_alike(denied.name, right.name)
             if is_alike and self._keystore and self._keystore.has_other_side(right) is False:

@@ -56,7 +56,7 @@ class SearchedKeystore:
 
         Returns None if permissions cannot be read, so that this is not known, or if an enclave has
         the right only by a wildcard. In an export, the enclave with the right may be missing (see
-        `place`).
+        `kind`).
         """
         exact, expressions = self._allowed_names[PEER_RIGHT[right.right]]
         if right.name in exact:

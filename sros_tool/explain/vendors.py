@@ -645,7 +645,7 @@ def _note_on_anybody(opened_parts: Iterable[AccessWithoutIdentity], remedy: str)
 
 
 class VendorOfPolicy(NamedTuple):
-    """The decisions of a vendor on the enclaves of a policy, by the permissions to be signed.
+    """The decisions of a vendor on the enclaves of a policy, as if the policy were signed.
 
     With ``patterns``, only enclaves that match a pattern are decided on.
     """
@@ -784,7 +784,11 @@ class VendorOfKeystore(NamedTuple):
         )
 
     def notes(self, question: Question, outcomes: Sequence[VendorOutcome]) -> Iterator[Note]:
-        """Yield notes on enclaves that an export lacks, and on other holders of the right."""
+        """Yield notes on enclaves that may be left out, and on others that may have the right.
+
+        These are processes without an identity, and enclaves with earlier permissions or revoked
+        certificates.
+        """
         # As in `outcomes`.
         from sros_tool.explain.earlier import note_on_earlier_permissions, note_on_revoked_enclaves
         from sros_tool.explain.who import notes_on_enclaves_left_out

@@ -155,7 +155,7 @@ def answer_for_all(decider: Decider, question: Question, kind: str | None) -> An
 
 
 def note_on_callable_action(decider: Decider, question: Question) -> Note | None:
-    """Return a note, or None, that enclaves may call an action with the name of the service."""
+    """Return a note if enclaves may call an action with the name of the service; else None."""
     if (question.word, question.type) == ("call", "service"):
         action = ask("call", question.name, "action")
         outcomes = decider.outcomes(action)

@@ -124,7 +124,7 @@ class ZenohFile(NamedTuple):
 
 
 @shows("enclave", "problem", null_if_empty=("problem",))
-class Reached(NamedTuple):
+class ReachableEnclave(NamedTuple):
     """An enclave that has the right at the other end, such as to subscribe to a published topic."""
 
     enclave: str
@@ -179,7 +179,7 @@ class ZenohAnswer:
     outcome: _OutcomeWord
     text: str
     checks: tuple[Check, ...] = ()
-    reached: tuple[Reached, ...] = ()
+    reached: tuple[ReachableEnclave, ...] = ()
     """The enclaves with the matching right, such as the right to subscribe to a published topic.
     """
     wildcards: tuple[DecidingWildcard, ...] = ()
@@ -597,7 +597,7 @@ class ZenohEvaluator:
         process that has the router's key.
         """
         wanted = self._rights(answer.enclave, answer.question)
-        believing: list[Reached] = []
+        believing: list[ReachableEnclave] = []
         for name in self.names if wanted else ():
             if name == process.name:
                 continue
@@ -610,7 +610,7 @@ class ZenohEvaluator:
                 unrestricted = _unrestricted_process(process.name, Mode.ROUTER)
                 deliveries = self._direct_deliveries(unrestricted, other.process, wanted)
             if all(delivery.arrives for delivery in deliveries):
-                believing.append(Reached(name, deliveries, other.problem if other else ""))
+                believing.append(ReachableEnclave(name, deliveries, other.problem if other else ""))
                 if brief:
                     break
         if not believing:
@@ -719,7 +719,7 @@ class ZenohEvaluator:
 
     def _reached_enclaves(
         self, zenoh_file: ZenohFile, wanted_rights: Sequence[Right]
-    ) -> Iterator[Reached]:
+    ) -> Iterator[ReachableEnclave]:
         """Yield the enclaves whose rules let them exchange the messages of ``wanted_rights``.
 
         The other end is the process of ``zenoh_file``.
@@ -743,7 +743,7 @@ class ZenohEvaluator:
                     zenoh_file.process, other.process, wanted_rights
                 )
             if all(delivery.arrives for delivery in deliveries):
-                yield Reached(name, deliveries, other.problem)
+                yield ReachableEnclave(name, deliveries, other.problem)
 
     def _deliveries_between(
         self,
@@ -762,7 +762,7 @@ class ZenohEvaluator:
         process: ZenohProcess,
         wanted_rights: Sequence[Right],
         checks: Sequence[Check],
-        reached_enclaves: Sequence[Reached],
+        reached_enclaves: Sequence[ReachableEnclave],
     ) -> Iterator[DecidingWildcard]:
         """Yield the deciding wildcards, with the enclaves that a message on the wildcard reaches.
 

@@ -255,7 +255,7 @@ def read_policy_for(path: Path, fleet: Fleet | None) -> Policy:
     """Return the policy in a file; with a fleet, its placeholders are filled in.
 
     Raises:
-        PolicyError: (or another `DocumentError`) as `read_policy` and `FleetPolicy` raise it.
+        DocumentError: as `read_policy` and `FleetPolicy` raise it.
     """
     if fleet is None:
         return read_policy(path)

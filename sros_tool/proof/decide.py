@@ -286,7 +286,7 @@ def _sufficient_parts(right: str) -> tuple[_TopicOfRight, ...]:
 
 
 def _topics_of_rights(rights: RightNames) -> Iterator[tuple[str, _TopicOfRight, Topics]]:
-    """Yield pairs of a right and one of its DDS topics, for some rights."""
+    """Yield each right, each of its sufficient DDS topics, and that topic for each name."""
     for right, names in rights:
         for name in names:
             for part in _sufficient_parts(right):
@@ -490,21 +490,22 @@ def _uses_of(
 
 def _shared_name(
     world: World,
-    holders_by_part: Collection[Sequence[tuple[_TopicOfRight, TopicUser]]],
+    parts_by_holder: Collection[Sequence[tuple[_TopicOfRight, TopicUser]]],
     count: int,
     expression: str,
     limit: SearchLimit,
 ) -> str | None:
     """Return a name matching an expression that at least ``count`` holders may use, or None.
 
-    A name that an enclave states is preferred to a name that only wildcards match.
+    ``parts_by_holder`` has, for each holder, the parts of the right that it may use. A name that an
+    enclave states is preferred to a name that only wildcards match.
     """
     # Name → number of holders that state it, all without wildcards.
     exactly: Counter[str] = Counter()
     stated: set[str] = set()
     wild: list[NameSet] = []
     longest = world.longest
-    for parts in holders_by_part:
+    for parts in parts_by_holder:
         names = {part.topics(expression).ros_name(t) for part, met in parts for t in met.stated}
         stated |= names
         longest = min(longest, *(world.longest - part.added_bytes for part, _ in parts))

@@ -877,7 +877,10 @@ class _Review:
     def _policies_among(
         self, entries: Iterable[tuple[str, TreeEntry]], side: CommitFiles, *, known: bool = True
     ) -> list[str]:
-        """Return the paths of entries that may be policies, or parts of policies."""
+        """Return the paths of entries that may be policies, or parts of policies.
+
+        With ``known``, files that were already written for ``side`` are left out.
+        """
         unknown = ((path, entry) for path, entry in entries if not (known and path in side.files))
         return self._paths_of(unknown, may_be_policy)
 

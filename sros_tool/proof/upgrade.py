@@ -374,7 +374,9 @@ class DecisionChange(NamedTuple):
 
 
 def changes(files: DecidedFiles, before: Shipped, after: Shipped) -> Iterator[DecisionChange]:
-    """Yield the decisions that differ between two releases, in the first domain with a difference.
+    """Yield the decisions that differ between two releases.
+
+    For each enclave, these are the decisions in the first domain with a difference.
 
     Raises:
         DocumentError: there are too many wildcards to decide.
@@ -528,7 +530,7 @@ def _expired_peers_findings(before: Shipped, after: Shipped) -> Iterator[Finding
 def _node_start_findings(
     files: DecidedFiles, before: Distribution, after: Distribution
 ) -> Iterator[Finding]:
-    """Yield a finding for enclaves in which nodes start on only one of two distributions."""
+    """Yield a finding for each enclave in which nodes start on ``before``, but not on ``after``."""
     if has_type_descriptions(before.name) or files.keystore is None:
         return
     for name, enclave in files.loaded_enclaves():

@@ -128,7 +128,7 @@ def shortest(names: Iterable[str]) -> str | None:
 
 
 class Side:
-    """An index of the topics that enclaves may write, or an index of the topics they may read."""
+    """An index of the topics that enclaves may write, or of the topics that they may read."""
 
     def __init__(self, topics_of: Mapping[str, NameSet]) -> None:
         self.topics_of = topics_of
@@ -433,8 +433,9 @@ class World:
         )
 
     def any_example(self, names: NameSet, limit: SearchLimit) -> str | None:
-        """Return a topic of a set, or None; stated topics and topics that nodes can have come
-        first.
+        """Return a topic in ``names``, or None if it is empty.
+
+        Stated topics, and topics that nodes can have, come first.
         """
         sets = (names, *(names & name_set for name_set in _VALID_TOPICS))
         stated = (next(name_set.stated(), None) for name_set in sets)

@@ -402,7 +402,7 @@ def _marked_rights(
         first: drawn rights of the first source.
         second: drawn rights of the second source.
         allowed_by: for a right of both sources, show the wildcards of the first source only.
-            Without it, wildcards are shown if the right is by wildcards in both sources.
+            Without it, wildcards are shown if only wildcards give the right in both sources.
     """
     sides = [{_identity(edge): edge for edge in side} for side in (first, second)]
     edges = []

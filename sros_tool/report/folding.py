@@ -122,7 +122,7 @@ class Folding(NamedTuple):
 class DrawnUnit(NamedTuple):
     """A robot, namespace or enclave (``what``) that can be equal to other units of its family.
 
-    ``family`` is the number of the family.      ``values`` are the words that stand for the unit in
+    ``family`` is the number of the family.  ``values`` are the words that stand for the unit in
     names: its name, and its namespace if that differs. ``group`` are the groups and the domain of a
     robot: only robots with the same groups and domain are expected to be alike.
     """
@@ -426,7 +426,10 @@ class _Draft:
         return 2 * len(own & others) >= max(len(own), len(others))
 
     def _named_by(self, families: Container[int]) -> Counter[int]:
-        """Map each unit of ``families`` to how many other units of its family have rights to it."""
+        """Map each unit to how many other units of its family have rights to its names.
+
+        Only units of ``families`` are counted.
+        """
         pairs = {
             (unit, owner)
             for _kind, units, part in self._seen

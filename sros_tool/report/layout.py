@@ -492,8 +492,8 @@ def side_card(
 ) -> Card:
     """Return the card of an enclave, or of several enclaves, without x, y and width.
 
-    ``card`` is the id of the card, ``label`` names the enclave or enclaves, and ``group`` is its
-    group.
+    ``card`` is the id of the card, and ``label`` names the enclave or enclaves. ``group`` is the
+    group of a single enclave; "" for several enclaves.
     """
     lines = _wrapped_name(label, _SIDE_LETTERS)
     notes = [line for note in notes for line in wrap(note, _NOTE_LETTERS, break_on_hyphens=False)]

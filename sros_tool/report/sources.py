@@ -203,8 +203,9 @@ def _compared_picture(
 ) -> Picture:
     """Return the picture of one source, or the comparison of two sources.
 
-    The comparison is "use" if the second source was observed, "change" for two sources of the same
-    kind, "worlds" if a source is for Zenoh, and else "drift" (of a keystore from its policy).
+    The comparison is "use" with ``use``, or if the second source was observed; "change" for two
+    sources of the same kind, "worlds" if a source is for Zenoh, and else "drift" (of a keystore
+    from its policy).
     """
     if len(sources_read) == 1:
         return compose(sources_read[0], hosts)
@@ -453,7 +454,7 @@ def _file_name(path: str) -> str:
 def _pictured_finding(
     finding: Finding, enclaves: Container[str], shown: Callable[[str], str] = _file_name
 ) -> PicturedFinding:
-    """Return a finding for the picture; its text names the subject, unless this is an enclave.
+    """Return a finding for the picture; its text names the subject, unless it is in ``enclaves``.
 
     ``shown`` returns the name of a file.
     """

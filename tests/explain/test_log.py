@@ -15,7 +15,7 @@ import pytest
 
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.explain import asking
-from sros_tool.explain.log import explain_log, explain_log_of
+from sros_tool.explain.log import explain_log, explain_log_file
 from sros_tool.explain.log_causes import LogFinding
 from sros_tool.files import policies_dir
 from sros_tool.keystore.ledger import Ledger, LedgerFile
@@ -1273,7 +1273,7 @@ def test_a_log_with_many_enclaves_does_not_put_the_whole_policy_into_each_namesp
 
     monkeypatch.setattr("sros_tool.policy.model.below_namespace", below)
     at = asking.AskingContext(datetime.now(UTC), UTC)
-    explained_log = explain_log_of("robot.log", log.read_text(), None, "", at, policy)
+    explained_log = explain_log_file("robot.log", log.read_text(), None, "", at, policy)
     assert explained_log.findings[0].checked and {*placed} == {"/", "/e7"}
 
 
