@@ -154,7 +154,7 @@ def create_permission(
     result = create(
         root,
         chosen,
-        policy,
+        for_fleet or policy,
         domain=ros_domain(),
         revoke_old=revoke_old,
         keep_same=not given,

@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from shlex import quote
+from types import MappingProxyType
 from typing import TYPE_CHECKING, NamedTuple
 
 from sros_tool.dds.domains import DomainSet
@@ -236,10 +237,15 @@ def deliver_first_sentence(root: Path) -> str:
 
 
 class EnclaveDomains(NamedTuple):
-    """The ROS domains of enclaves: the domain of their robot, or all domains of the keystore."""
+    """The ROS domains of enclaves: the domain of their robot, or all domains of the keystore.
+
+    ``fleet`` is the keystore's fleet.  ``stated_robots`` maps enclaves to their robots in the fleet
+    file of a command that does not record this file as the keystore's fleet.
+    """
 
     keystore: DomainSet
     fleet: Fleet | None = None
+    stated_robots: Mapping[str, Robot] = MappingProxyType({})
 
     def robots(self) -> Collection[Robot]:
         """Return the robots of the fleet."""
@@ -249,9 +255,16 @@ class EnclaveDomains(NamedTuple):
         """Return the ROS domains for which an enclave gets permissions.
 
         Raises:
-            KeystoreError: the enclave's robot is in a domain that the keystore does not have.
+            KeystoreError: the enclave's robot is in a domain that the keystore does not have, or
+                the fleet file of the command and the keystore's fleet have it in different domains.
         """
+        stated = self.stated_robots.get(enclave)
         robot = robot_of(self.fleet, enclave) if self.fleet else None
+        if self.fleet and stated and robot is None:
+            robot = self.fleet.robots.get(stated.name)
+        if robot and stated and robot.domain != stated.domain:
+            raise _moved_robot_error(robot, stated)
+        robot = robot or stated
         if robot is None or robot.domain is None:
             return self.keystore
         if robot.domain not in self.keystore:
@@ -264,6 +277,22 @@ class EnclaveDomains(NamedTuple):
                 "domain in the fleet file.",
             )
         return DomainSet.of((robot.domain, robot.domain))
+
+
+def _moved_robot_error(recorded: Robot, stated: Robot) -> KeystoreError:
+    """Return the error for a robot that the command's fleet file has in another domain."""
+
+    def place(robot: Robot) -> str:
+        return "all domains" if robot.domain is None else f"domain {robot.domain}"
+
+    return KeystoreError(
+        f"the fleet file has the robot {stated.name} in {place(stated)}, but the keystore's fleet "
+        f"has it in {place(recorded)}",
+        "This command would not move the robot's other enclaves, so they could no longer "
+        "communicate with this one.",
+        f"Sign for the recorded domain, with `--fleet KEYSTORE/{FLEET}`. Then move all enclaves of "
+        "the robot with `sros generate_artifacts -k KEYSTORE -p POLICY_FILE --fleet FLEET_FILE`.",
+    )
 
 
 def with_routers_of_robots(

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import pytest
 
-from tests.support.harness import policy_text, publish, sros, subscribe
+from tests.support.harness import policy_text, publish, snapshot, sros, subscribe
 
 FLEET = """
 [groups]
@@ -215,3 +216,54 @@ def test_a_name_that_nobody_has_leads_to_that_of_the_robot(halls: Path) -> None:
     for words in (("/nothing",), ("/plan", "--robot", "p01"), ("/x/plan", "--robot", "p01")):
         ended = sros(*asked, *words, cwd=halls)
         assert ended.status == 1 and "perhaps" not in ended.err, ended
+
+
+MOVED = FLEET.replace('"pickers", "north"', '"pickers", "south"')
+NEW = POLICY.replace("/{robot:pickers}/eye", "/{robot:pickers}/new")
+"""A policy whose robots are known to the keystore, but not with this enclave path."""
+
+
+@pytest.mark.parametrize("recorded", [False, True])
+@pytest.mark.parametrize("name", ["/p01/wheels", "/p01/new"])
+@pytest.mark.parametrize("verb", ["sign_request", "create_permission"])
+def test_permissions_are_for_the_domain_in_the_fleet_file(
+    tmp_path: Path, verb: str, name: str, *, recorded: bool
+) -> None:
+    """The domain does not depend on whether the keystore records the robot already."""
+    files = {"f.toml": FLEET, "moved.toml": MOVED, "new.xml": NEW, "p.xml": POLICY}
+    for file, text in files.items():
+        (tmp_path / file).write_text(text)
+    words: tuple[str, ...] = ("--domain", "10,20")
+    sros("create_keystore", "ks", *words, cwd=tmp_path).ok()
+    if recorded:
+        words = ("-k", "ks", "-p", "p.xml", "--fleet", "f.toml", "--robot", "p01")
+        sros("generate_artifacts", *words, cwd=tmp_path).ok()
+    if verb == "sign_request":
+        sros("create_request", name, "robot", cwd=tmp_path).ok()
+        if recorded and name == "/p01/wheels":
+            sros("revoke", "ks", name, cwd=tmp_path).ok()
+        request = f"robot/enclaves{name}/request.pem"
+        words = ("ks", request, "--enclave", name, "-p", "new.xml", "-o", "answer.tgz")
+    else:
+        if not (recorded and name == "/p01/wheels"):
+            sros("create_enclave", "ks", name, cwd=tmp_path).ok()
+        words = ("ks", name, "new.xml")
+    before = snapshot(tmp_path / "ks")
+    if recorded:
+        refused = sros(verb, *words, "--fleet", "moved.toml", cwd=tmp_path)
+        said = "has the robot p01 in domain 20, but the keystore's fleet has it in domain 10"
+        assert (refused.status, said in refused.err) == (2, True), refused
+        assert snapshot(tmp_path / "ks") == before
+    fleet = "ks/fleet.toml" if recorded else "f.toml"
+    sros(verb, *words, "--fleet", fleet, cwd=tmp_path).ok()
+    permissions = tmp_path / f"ks/enclaves{name}/permissions.xml"
+    assert re.findall("<domains>(.*?)</domains>", re.sub(r"\s", "", permissions.read_text())) == [
+        "<id>10</id>"
+    ]
+    # Nothing is lost when the fleet is recorded, and check knows the robot from the fleet file.
+    words = ("--fleet", "f.toml", "--json")
+    checked = json.loads(sros("check", "ks", "--policy", "new.xml", *words, cwd=tmp_path).out)
+    assert "enclave.permissions-domains" not in {each["id"] for each in checked["findings"]}
+    if name == "/p01/wheels" or not recorded:
+        made = sros("generate_artifacts", "-k", "ks", "-p", "new.xml", *words, cwd=tmp_path)
+        assert "loses" not in made.ok().err and '"domain 20"' not in made.out

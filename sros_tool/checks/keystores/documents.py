@@ -32,6 +32,7 @@ from sros_tool.dds.governance import DomainRule, Governance, ProtectionKind, Top
 from sros_tool.dds.permissions import Criteria, Grant, Rule, portability_problems
 from sros_tool.errors import SrosError
 from sros_tool.faults import REFUSE_STRANGERS
+from sros_tool.fleet.robots import robot_of
 from sros_tool.keystore.fleet import EnclaveDomains
 from sros_tool.keystore.layout import GOVERNANCE_FILE, GOVERNANCE_XML
 from sros_tool.keystore.settings import edit_remedy
@@ -206,7 +207,8 @@ DOMAINS = FindingKind(
     "In a domain that only one of the two documents names, no node of the enclave can communicate.",
     "DDS-Security 1.1, 9.4.1.2 and 9.4.1.3; tested.",
     "Sign both for the same domains: `sros create_permission` uses the domains of the governance, "
-    "or the robot's domain in the fleet file.",
+    "or the robot's domain in the fleet file. If the keystore's fleet lacks the robot, first run "
+    "`sros generate_artifacts -k KEYSTORE -p POLICY_FILE --fleet FLEET_FILE`.",
 )
 FEWER_DOMAINS = FindingKind(
     "enclave.fewer-domains",
@@ -455,7 +457,9 @@ def _domain_findings(enclave: CheckedEnclave, grant: Grant, file: str) -> Iterat
     if grant.default_allow and not allowed.ranges:
         return  # by default, permissions are for every domain
     with suppress(SrosError):
-        wanted = EnclaveDomains(governed, enclave.keystore.fleet).of(enclave.name)
+        recorded, stated = enclave.keystore.fleet, enclave.keystore.at.fleet
+        known = recorded is not None and robot_of(recorded, enclave.name) is not None
+        wanted = EnclaveDomains(governed, recorded if known else stated).of(enclave.name)
     if allowed == wanted:
         return
     text = f"the permissions are for domain {str(allowed) or 'none'}, but "

@@ -18,7 +18,7 @@ from sros_tool.dds.permissions import name_notes
 from sros_tool.errors import DocumentError, KeystoreError, Note, PkiError, SrosError
 from sros_tool.files import staged_file
 from sros_tool.fleet.expansion import FleetPolicy
-from sros_tool.fleet.robots import robot_of
+from sros_tool.fleet.robots import Robot, robot_of
 from sros_tool.folders import Folder
 from sros_tool.keystore.delivery.archive import pack
 from sros_tool.keystore.delivery.robot import RequestAnswer, check_answer, seal
@@ -83,7 +83,6 @@ from sros_tool.pki.certificates import (
 from sros_tool.pki.certificates import subject_text as text_of
 from sros_tool.pki.keys import holds_private_key, load_key
 from sros_tool.policy.model import Enclave, Policy, stated_protections
-from sros_tool.policy.placeholders import has_placeholder
 from sros_tool.validity import iso
 from sros_tool.values import DryRun, FileChange, FileChanges, NamedKeystore, Notes, Words, shows
 from sros_tool.wording import first_few
@@ -123,7 +122,7 @@ def sign_request(
     The keystore gets all files of the enclave except the key.  The rights come from ``policy``;
     without a policy, from the current permissions if ``renew`` is set, otherwise from the
     keystore's template.  If ``policy`` is for a fleet, the enclave's path with placeholders is
-    recorded in the keystore's fleet.
+    recorded in the keystore's fleet, and the permissions are for the domain of the enclave's robot.
 
     Args:
         root: the keystore.
@@ -143,7 +142,8 @@ def sign_request(
             the enclave was revoked and ``only_enclaves`` does not name it; the request is for
             another enclave than ``only_enclaves``; the key was revoked or belongs to another
             enclave; ``answer`` exists; the keystore cannot issue; no vendor would accept the
-            enclave, or a vendor that accepts it today would no longer do so.
+            enclave, or a vendor that accepts it today would no longer do so; the fleet of the
+            policy and the keystore's fleet have the enclave's robot in different domains.
     """
     if data.count(_REQUEST_END) > 1:
         raise DocumentError(
@@ -187,10 +187,12 @@ class _StatedRights(NamedTuple):
     """The rights that a policy states for an enclave; None if the policy states none.
 
     ``path`` is the enclave's path in the policy if it has placeholders of a fleet, or else "".
+    ``robot`` is the enclave's robot in the policy's fleet; None if the path has no placeholders.
     """
 
     enclave: Enclave | None = None
     path: str = ""
+    robot: Robot | None = None
 
 
 def _stated_rights(
@@ -206,11 +208,10 @@ def _stated_rights(
     expanded = policy.policy() if isinstance(policy, FleetPolicy) else policy
     stated = {name: _StatedRights(stated_enclave(expanded, name)) for name in names}
     if isinstance(policy, FleetPolicy):
-        paths = {name: policy.stated_enclave(name)[0].path for name in names}
-        stated = {
-            name: of_enclave._replace(path=paths[name] if has_placeholder(paths[name]) else "")
-            for name, of_enclave in stated.items()
-        }
+        for name in names:
+            enclave, robot = policy.stated_enclave(name)
+            if robot:
+                stated[name] = stated[name]._replace(path=enclave.path, robot=robot)
     return stated
 
 
@@ -363,7 +364,8 @@ class _RequestCertifier:
         change.check_domain(domain)
         self._stated_rights = stated
         self._record_paths()
-        self._domains = EnclaveDomains(change.domains, change.fleet)
+        robots = {name: rights.robot for name, rights in stated.items() if rights.robot}
+        self._domains = EnclaveDomains(change.domains, change.fleet, robots)
         self._writer = change.writer()
         self._certified: dict[str, Enclave | None] = {}
         self._new: list[str] = []

@@ -25,7 +25,7 @@ from sros_tool.dds.governance import Governance, parse_governance, render_govern
 from sros_tool.dds.permissions import name_notes, parse_permissions
 from sros_tool.errors import KeystoreError, Note, PolicyError, SrosError, UsageError, check_meaning
 from sros_tool.fleet.expansion import FleetPolicy
-from sros_tool.fleet.robots import Fleet
+from sros_tool.fleet.robots import Fleet, Robot
 from sros_tool.keystore.comparison import Mismatch, compare_governance, mismatch
 from sros_tool.keystore.delivery.published import may_have_later_releases
 from sros_tool.keystore.expiry import IF_EXPIRED, ONE_BY_ONE
@@ -231,7 +231,7 @@ def create_enclaves(
 def create_permission(
     root: Path,
     names: Sequence[str],
-    policy: Policy,
+    policy: Policy | FleetPolicy,
     *,
     domain: int | None = None,
     revoke_old: bool = False,
@@ -243,7 +243,12 @@ def create_permission(
     Whoever kept the replaced permissions can use them until they expire, unless ``revoke_old`` is
     set: then the enclaves get new certificates for the same keys, and all earlier certificates are
     revoked.  With ``keep_same``, permissions that state the same rights are kept, as by
-    `generate_artifacts`.
+    `generate_artifacts`.  If ``policy`` is for a fleet, the permissions are for the domains of the
+    enclaves' robots.
+
+    Raises:
+        KeystoreError: an enclave does not exist; the fleet of the policy and the keystore's fleet
+            have a robot in different domains.
     """
     for name in names:
         check_enclave_name(name)
@@ -253,10 +258,25 @@ def create_permission(
         for name in names:
             if name not in existing:
                 raise missing_enclave_error(change.keystore, name, existing)
-        stated = {enclave.path: enclave for enclave in policy.enclaves}
+        stated: Mapping[str, Enclave]
+        robots: dict[str, Robot] = {}
+        if isinstance(policy, FleetPolicy):
+            stated = policy
+            for name in names:
+                if name in policy and (robot := policy.stated_enclave(name)[1]):
+                    robots[name] = robot
+            policy = policy.policy()
+        else:
+            stated = {enclave.path: enclave for enclave in policy.enclaves}
         wanted = {name: stated.get(name) or stated_enclave(policy, name) for name in names}
         _prepare_change(change, domain, protections=stated_protections(wanted.values()))
-        rights = write_enclaves(change, wanted, revoke_old=revoke_old, keep_same=keep_same)
+        rights = write_enclaves(
+            change,
+            wanted,
+            revoke_old=revoke_old,
+            keep_same=keep_same,
+            stated_robots=robots,
+        )
     return creation(change, rights)
 
 
@@ -787,6 +807,7 @@ def write_enclaves(
     revoke_old: bool = False,
     keep_same: bool = False,
     places: Mapping[str, TokenUri] = MappingProxyType({}),
+    stated_robots: Mapping[str, Robot] = MappingProxyType({}),
     progress: Progress | None = None,
 ) -> tuple[ReplacedRights, ...]:
     """Create or complete enclaves, sign the permissions by their policies, and commit the change.
@@ -799,6 +820,7 @@ def write_enclaves(
         revoke_old: also replace and revoke the certificates of enclaves that get other permissions.
         keep_same: keep permissions that already state the rights of a policy.
         places: maps enclaves to the places of new keys on tokens; other new keys are in files.
+        stated_robots: as in `EnclaveDomains`.
         progress: called with the name of each enclave that is done.
 
     Returns: The rights that enclaves gain and lose with their new permissions.
@@ -808,7 +830,13 @@ def write_enclaves(
         wanted_enclaves = ChainMap(dict.fromkeys(sorted(routers)), wanted_enclaves)  # type: ignore[arg-type]
     writer = change.writer(keys_on_token=bool(places), revoke_old=revoke_old)
     maker = _EnclaveMaker(
-        change, writer, places, wanted_enclaves, revoke_old=revoke_old, keep_same=keep_same
+        change,
+        writer,
+        places,
+        wanted_enclaves,
+        EnclaveDomains(change.domains, change.fleet, stated_robots),
+        revoke_old=revoke_old,
+        keep_same=keep_same,
     )
     done = writer.for_each(
         list(wanted_enclaves), lambda name: maker.make(name, wanted_enclaves[name]), progress
@@ -878,6 +906,7 @@ class _EnclaveMaker:
         writer: EnclaveWriter,
         places: Mapping[str, TokenUri],
         names: Iterable[str],
+        domains: EnclaveDomains,
         *,
         revoke_old: bool,
         keep_same: bool,
@@ -887,7 +916,7 @@ class _EnclaveMaker:
         self._writer = writer
         self._names = names
         self._tokens: EnclaveTokens = change.tokens(places)
-        self._domains = EnclaveDomains(change.domains, change.fleet)
+        self._domains = domains
         self._revoke_old = revoke_old
         self._keep_same = keep_same
 
