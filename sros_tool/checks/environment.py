@@ -442,7 +442,7 @@ def security_clauses(environment: Mapping[str, str], folder: Path) -> Iterator[s
 def _zenoh_security_clauses(environment: Mapping[str, str], folder: Path) -> Iterator[str]:
     """Yield a clause if variables give rmw_zenoh certificates, rules or a password.
 
-    Also yield a clause if the configuration that they name cannot be read.
+    Also yield a clause if the configuration that the variables name cannot be read.
     """
     uri, override = environment.get(SESSION_URI, ""), environment.get(OVERRIDE, "")
     named = " with ".join(name for name in (SESSION_URI, OVERRIDE) if environment.get(name))

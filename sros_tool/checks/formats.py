@@ -52,11 +52,12 @@ _MergeKeys = Mapping[str, tuple[Hashable, Hashable]]
 def folded_findings(
     groups: Iterable[tuple[Finding, ...]], fleet: Fleet | None
 ) -> Iterator[tuple[tuple[Finding, ...], str]]:
-    """Merge single findings that differ only in one robot or one enclave.
+    """Merge findings that differ only in one robot or one enclave.
 
-    Yields the first finding of each group, with a text that names the robots or enclaves of the
-    other findings ("" if there are none).  Findings that share a cause, or that have a line or
-    related places, stay as they are.
+    Each group in ``groups`` has the findings with one cause; only groups of one finding are merged.
+    Yields the first group of each merge, with a text that names the robots or enclaves of the other
+    groups ("" if there are none).  Findings that have a line or related places are merged only by
+    robot.
     """
     similar_groups: dict[Hashable, list[tuple[tuple[Finding, ...], str]]] = {}
     for group, other_robots in _merge_robots(groups, fleet):

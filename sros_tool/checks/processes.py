@@ -275,7 +275,7 @@ def may_lack_list(
     """Return whether a process may have loaded another revocation list, or other CAs.
 
     The process has loaded the present list and CAs if, since its start, no file of the enclave
-    changed but its certificate, permissions and governance. ``same_revocations`` says that all
+    changed except its certificate, permissions and governance. ``same_revocations`` says that all
     lists since the start of the process revoke the same certificates, so that a changed list does
     not matter.
     """
@@ -382,8 +382,8 @@ def _revocation_clause(enclave: ProcessEnclave, entries: Sequence[Entry], serial
 class _Ledgers:
     """The ledgers of the keystores that processes name, as far as they are read.
 
-    Any user can start processes that name a ledger of his own, so the bytes of all ledgers of a
-    user's processes are limited.
+    Any user can start processes that name a ledger of their own.  So sros limits the total size of
+    the ledgers that it reads for the processes of one user.
     """
 
     def __init__(self) -> None:

@@ -97,7 +97,7 @@ def robot_findings(
     advisories: Sequence[Advisory] | None = None,
     names_as_text: Callable[[Sequence[str]], str] = names_text,
 ) -> Iterator[Finding]:
-    """Yield a finding for each DDS library of robots, and one on robots whose DDS is not known.
+    """Yield a finding for each DDS library of robots, and a finding on robots with unknown DDS.
 
     ``robots`` maps names of robots to the DDS that they reported, or to None.  ``names_as_text``
     returns names of robots as a text.

@@ -547,7 +547,8 @@ def _circumstances(
 ) -> Circumstances:
     """Return the moment, domain, policies and fleet that the options name.
 
-    Without --fleet, policies are read for the fleet of the keystore, if only one is checked.
+    Without --fleet, policies are read for the fleet of the keystore, if only one keystore is
+    checked.
     """
     from sros_tool.checks.keystores.opened import Circumstances
     from sros_tool.cli.common import local_zone

@@ -62,7 +62,7 @@ KEYSTORE_VARIABLE = "ROS_SECURITY_KEYSTORE"
 
 
 class _NamedPath(click.Path):
-    """A path type that rejects "": it is an unset shell variable, not the working directory."""
+    """A path type that rejects "", which mostly comes from an unset shell variable."""
 
     def __init__(self) -> None:
         super().__init__(path_type=Path)

@@ -168,6 +168,6 @@ class DomainSet:
         return 0 if 0 in self else next(iter(self))
 
     def only(self) -> int | None:
-        """Return the only domain of the set, or None if it has several."""
+        """Return the only domain of the set; None if the set has no domain, or several."""
         domains = list(self)
         return domains[0] if len(domains) == 1 else None

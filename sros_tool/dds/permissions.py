@@ -65,7 +65,7 @@ class Rule(NamedTuple):
     """
 
     def criteria_of(self, directions: Sequence[str]) -> Iterator[tuple[str, Criteria]]:
-        """Yield the criteria for ``directions`` in document order, each after its direction."""
+        """Yield pairs of direction and criteria in document order, only for ``directions``."""
         criteria = {each: iter(getattr(self, each)) for each in directions}
         order = self.order or [each for each in directions for _ in getattr(self, each)]
         for direction in order:

@@ -101,7 +101,7 @@ class UserKeystore(NamedTuple):
     ``rows`` are for the enclaves with the widest permissions, and for enclaves with faulty or
     revoked files. ``enclaves`` is the number of all enclaves, ``elsewhere`` the number of enclaves
     whose key is not in the keystore.  ``not_tried`` lists tests that a proof needs and that cannot
-    run. ``secrets`` returns the passphrases of its CA keys.
+    run. ``secrets`` returns the passphrases of the CA keys.
     """
 
     root: Path

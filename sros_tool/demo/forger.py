@@ -367,7 +367,7 @@ def permissions_and_governance_signed_by_itself(copy: KeystoreCopy) -> None:
 
 
 def enclave_among_the_signers(copy: KeystoreCopy) -> None:
-    """Sign permissions with the guest's key; make guest and listener trust its certificate."""
+    """Sign permissions with the guest's key; guest and listener trust the guest's certificate."""
     permissions_signed_by_itself(copy)
     trusted = copy.read("guest", PERMISSIONS_CA_FILE) + pem(copy.certificate("guest"))
     for part in ("guest", "listener"):

@@ -796,7 +796,7 @@ class _Runner:
 
 
 def _is_hopeless(claim: Claim, row: Row, processes: Mapping[str, _PartyProcess]) -> bool:
-    """Return whether a claim can no longer hold, because its intruder was refused or has ended."""
+    """Return whether a claim can no longer hold, because an intruder was refused or has ended."""
     names = [name for name in (claim.subject, claim.talker) if name and row.party(name).intruder]
     return not all(processes[name].is_running for name in names)
 

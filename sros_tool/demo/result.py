@@ -938,7 +938,7 @@ def _attack_lines(
 
 
 def _result_without_defense(row: RowResult) -> str:
-    """Return the result without the defense, such as ``heard with the right key``."""
+    """Return the result of a row without a defense, such as ``heard with the right key``."""
     if row.defence_removed.startswith("the wrong "):
         # Here, the defense that was removed is a fault of the attacker's own files.
         return f"{row.observed} with the right {row.defence_removed.removeprefix('the wrong ')}"

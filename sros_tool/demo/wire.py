@@ -244,7 +244,7 @@ def packets_of(packets: Sequence[_CapturedPacket], ports: Collection[int]) -> li
 
 
 def with_changed_bit(packet: bytes, later: int, place: int, places: int) -> bytes | None:
-    """Return a copy of an RTPS packet with one bit changed, or None if it has no content.
+    """Return a copy of an RTPS packet with one bit changed; None if the packet has no content.
 
     The bit is in the middle of part ``place`` (from 0), if the content is divided into ``places``
     equal parts.
@@ -349,7 +349,7 @@ class Wiretap:
 
 
 class WireCount(NamedTuple):
-    """The numbers of packets that contain a talker's text, and of its row's protected packets.
+    """The number of packets with a talker's text, and of protected packets in the talker's row.
 
     ``topics`` and ``certificates`` count the packets of the row that show the topic name, and a
     certificate.

@@ -78,8 +78,8 @@ class TokenKey(ec.EllipticCurvePrivateKey):
     """A private key on a token, of the curve prime256v1.
 
     `cryptography` signs certificates, documents and revocation lists with this key as with any
-    other.  ``place`` names the key.  ``private`` is None for a key that is only planned, which
-    cannot sign.
+    other.  ``place`` names the key.  ``private`` is None for a key that is only planned; such a
+    key cannot sign.
     """
 
     def __init__(self, private: Any, public: ec.EllipticCurvePublicKey, place: TokenUri) -> None:
@@ -94,7 +94,7 @@ class TokenKey(ec.EllipticCurvePrivateKey):
 
     @property
     def never_left(self) -> bool:
-        """Whether the token states that the key was made there and cannot be exported."""
+        """Whether the token states that the key was made on the token and cannot be exported."""
         if self._private is None:
             return True  # a planned key, perhaps without the package for tokens
         from pkcs11 import Attribute, PKCS11Error

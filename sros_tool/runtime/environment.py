@@ -89,8 +89,8 @@ def without_own_libraries(environment: Mapping[str, str]) -> dict[str, str]:
     """Return an environment for a command that may use another ROS than the Python of sros.
 
     The PyPI wheels of ROS start a Python again with their libraries in LD_LIBRARY_PATH, and mark
-    this in the environment; a node of another ROS would load them, without DDS Security.  A Python
-    of the same wheels adds the libraries again.
+    this in the environment; a node of another ROS would load these libraries, without DDS Security.
+    A Python of the same wheels adds the libraries again.
     """
     kept = dict(environment)
     if kept.pop("_ROS_WHEELS_BOOTSTRAP_COMPLETE", None):

@@ -319,7 +319,7 @@ class InstalledEnclave(NamedTuple):
 def open_installed(
     folder: Path, names: Iterable[str], *, now: datetime
 ) -> dict[str, InstalledEnclave]:
-    """Map those of ``names`` that can be opened in the security folder ``folder`` to enclaves."""
+    """Map ``names`` to the enclaves in a security folder; unreadable enclaves are left out."""
     opened, files = {}, FilesReadOnce()
     for name in names:
         place = enclave_path(folder, name)

@@ -128,9 +128,9 @@ WEAK = FindingKind(
 def _authority_findings(
     role: str, chain: tuple[x509.Certificate, ...], moment: datetime, subject: str, file: str
 ) -> Iterator[Finding]:
-    """Yield findings about properties of a CA for which vendors refuse it.
+    """Yield findings about properties of a CA because of which vendors refuse the CA.
 
-    ``chain`` are the certificates in the file of the CA, its own certificate first.
+    ``chain`` are the certificates in the file of the CA, the CA's own certificate first.
     """
     certificate = chain[0]
     name = authority_text(certificate)
@@ -507,7 +507,7 @@ def _authority(
 def _ca_key_findings(
     keystore: CheckedKeystore, role: str, certificate: x509.Certificate
 ) -> Iterator[Finding]:
-    """Yield findings about the key that signs as a CA, and about copies of it in the keystore."""
+    """Yield findings about the key that signs as a CA, and about its copies in the keystore."""
     inside, subject = keystore.root / ca_key(role), f"{role} CA key"
     place = (keystore.settings.key_place(role) if keystore.settings else "") or ca_key(role)
     is_file = not (is_token_uri(place) or is_ca_service(place))

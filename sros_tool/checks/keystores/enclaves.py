@@ -306,9 +306,10 @@ def _token_findings(enclave: CheckedEnclave, place: TokenUri) -> Iterator[Findin
 
 
 def grant_of(enclave: CheckedEnclave) -> Grant | None:
-    """Return the grant that DDS reads for the enclave; None if its validity is empty or unreadable.
+    """Return the grant that DDS reads for the enclave.
 
-    Its dates may have a form that only some vendors read.
+    The result is None if there is no grant, or if the grant's validity is empty or cannot be read.
+    The grant's dates may have a form that only some vendors read.
     """
     grant = enclave.state.grant
     with suppress(ValueError):

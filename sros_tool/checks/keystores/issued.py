@@ -358,7 +358,7 @@ def _trust_findings(
 ) -> Iterator[Finding]:
     """Yield findings about unknown CAs, and about enclaves that share no CA with the keystore.
 
-    In an export, an enclave is compared with the CAs that most of its enclaves trust.  During a
+    In an export, an enclave is compared with the CAs that most enclaves there trust.  During a
     rotation, an enclave trusts the old and the new CA, so one common CA is enough.
     """
     for role in keystore.authorities:

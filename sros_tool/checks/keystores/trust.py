@@ -144,9 +144,9 @@ def findings_between(
 ) -> Iterator[Finding]:
     """Yield findings about keystores and exports whose nodes do not communicate with each other.
 
-    Other checks report unreadable files, and files that are not valid ``now``. So they also report
-    two enclaves whose files are never valid at the same time: at any moment, the files of one of
-    them are not valid.
+    Other checks report unreadable files, and files that are not valid ``now``.  If the files of two
+    enclaves are never valid at the same time, other checks report at least one of the two enclaves
+    at any moment.
 
     Args:
         targets: the keystores and exports, as the user named them.

@@ -981,9 +981,10 @@ class Access:
 
         Peers check only the direction of the refused participant: read access for its readers,
         write access for its writers.  If the other direction is access-controlled, the refused
-        participant itself checks the rights of its peers, which it knows only after the handshake.
-        So the refused participant matches endpoints that either side opens later (Cyclone DDS
-        0.10.2, `q_omg_security_check_remote_writer_permissions` and `.._reader_permissions`).
+        participant itself checks the rights of its peers; it knows these rights only after the
+        handshake.  So the refused participant matches endpoints that either side opens later
+        (Cyclone DDS 0.10.2, `q_omg_security_check_remote_writer_permissions` and
+        `.._reader_permissions`).
         """
         domain = self._governed.rule
         return (

@@ -179,7 +179,8 @@ UNSECURED = Identity()
 class Party:
     """One process of a row.
 
-    ``topic`` is the ROS name of its topic, service or action ("": the topic of the demo).
+    ``topic`` is the ROS name of the topic, service or action that the process uses ("": the topic
+    of the demo).
     ``other_topic`` puts a talker on a topic that nobody else uses.  If an ``intruder`` is refused,
     the row goes on.  A party of a later ``turn`` starts when all parties of earlier turns are
     ready. ``announced`` is the enclave that the party names to others ("": its own), as a part or a
@@ -201,9 +202,10 @@ class Party:
 class Claim:
     """A claim that ``relation`` holds, or does not hold, between ``subject`` and ``talker``.
 
-    ``holds`` is whether the claim is that the relation holds.  If a denial is expected, ``denied``
-    is the status in `DENIALS` that must have caused it (None: any).  ``evidence`` is a text that a
-    party of the row must have logged about a process that was refused ("": none).
+    With ``holds`` False, the claim is that the relation does not hold; ``denied`` is then the
+    status in `DENIALS` that must be the reason (None: any reason).  ``evidence`` is a text that a
+    party of the row must have logged about a process that was refused ("": none).  ``wire`` is the
+    text to look for if the relation is about packets or shared memory.
     """
 
     relation: Relation
@@ -436,7 +438,7 @@ def known_open(row: Row, because: str, remedy: str) -> Row:
 
 
 def tries(attack: str, *rows: Row) -> tuple[Row, ...]:
-    """Return the rows, marked as attempts of the attack; also marks the rows that replace them."""
+    """Return the rows as attempts of ``attack``, and so also the rows that replace them."""
     return tuple(
         replace(
             row,
@@ -522,8 +524,8 @@ def talking_policy(topic: str) -> Policy:
 def attacked_policy(topic: str) -> Policy:
     """Return a policy with talker, listener, a service, a guest and an admin.
 
-    The guest may use neither the topic nor the service.  The admin may publish the topic, and its
-    enclave name contains the guest's.
+    The guest may use neither the topic nor the service.  The admin may publish the topic.  The
+    name of the admin's enclave contains the name of the guest's enclave.
     """
     talking = talking_policy(topic)
     talker = next(

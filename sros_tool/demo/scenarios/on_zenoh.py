@@ -1033,7 +1033,7 @@ _EARLIER_ROWS = (
         ),
         _earlier_file_row(
             "session file of an earlier policy, sessions that limit themselves",
-            zenoh_forger.earlier_session_file_of_one_that_limits_itself,
+            zenoh_forger.earlier_self_limiting_session_file,
             RowStatus.HEARD,
             "rules that other processes enforce",
         ),

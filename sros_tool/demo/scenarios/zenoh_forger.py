@@ -285,7 +285,7 @@ def earlier_session_file(copy: KeystoreCopy) -> None:
     path.write_bytes(_session_file_of_earlier_policy(copy))
 
 
-def earlier_session_file_of_one_that_limits_itself(copy: KeystoreCopy) -> None:
+def earlier_self_limiting_session_file(copy: KeystoreCopy) -> None:
     """Restore the guest's earlier file; each session enforces only its own rights."""
     earlier = json.loads(_session_file_of_earlier_policy(copy))
     sessions_that_limit_themselves(copy)
@@ -436,7 +436,7 @@ def allow_shared_memory(copy: KeystoreCopy) -> None:
 
 
 def revoked_talker(copy: KeystoreCopy) -> None:
-    """Revoke the talker; a thief has a copy of its enclave."""
+    """Revoke the talker; a thief has a copy of the talker's enclave."""
     _keep_stolen(copy, _revoke_talker(copy))
 
 
