@@ -246,6 +246,7 @@ REPLACED_FILES = "changed or missing here, and replaced: "
 READABLE_KEYS = ", others could read "
 REMOVED_ENCLAVES = "The agent removed enclaves, "
 _OPEN_KEYS = ("private key that others can read", "private key others can read")
+_ALTERNATED_SHOWN = timedelta(days=1)
 _TWO_COMPUTERS = "Two computers with the keys of this robot"
 _COPIED_KEYS = (READABLE_KEYS, REMOVED_ENCLAVES, *_OPEN_KEYS, _TWO_COMPUTERS)
 """Words on private keys that somebody may have copied."""
@@ -476,16 +477,23 @@ class ReceivedConfirmation:
     time: datetime
     message: LastMessage | None = None
 
-    def two_computers_sentence(self) -> str:
-        """Return a sentence if messages of the last day came from two computers, or ""."""
+    def two_computers_sentence(self, *, was_restored: bool) -> str:
+        """Return a sentence if messages of the last day came from two computers, or "".
+
+        With ``was_restored``, the keystore was restored from a backup: its ledger may lack earlier
+        keys of the robot, so new keys do not end the problem (`collect`).
+        """
         alternated = self.message.alternated if self.message else None
-        if alternated is None or self.time - alternated > timedelta(days=1):
+        if alternated is None or self.time - alternated > _ALTERNATED_SHOWN:
             return ""
         return (
             f"{_TWO_COMPUTERS} seem to send messages in turn: the messages went back to an earlier "
             f"start or release, last at {iso(alternated)}. Perhaps a disk was copied or restored. "
             "sros knows the files of only one of the two computers. Give the robot new keys, and "
             "revoke the earlier keys (docs/howto/one_robot.md: Same name, new hardware)."
+        ) + was_restored * (
+            " Because the keystore was restored from a backup, this problem stays after that until "
+            f"a message comes after {iso(alternated + _ALTERNATED_SHOWN)}."
         )
 
     def clock_note(self) -> str:

@@ -1111,7 +1111,12 @@ class _KeystoreRecords:
     @cached_property
     def is_restored(self) -> bool:
         """Whether the keystore was restored, and has published with ``--restored`` since."""
-        return bool(restored_at(self._keystore)) and not self.age_clause
+        return self.was_restored and not self.age_clause
+
+    @property
+    def was_restored(self) -> bool:
+        """Whether the keystore was restored, so that its ledger may lack certificates."""
+        return bool(restored_at(self._keystore))
 
     def is_ahead(self, confirmed: Confirmation) -> bool:
         """Return whether a robot reports a release from after the keystore's backup."""
@@ -1418,7 +1423,7 @@ def _robot_status(
         compared_robot = compared_robot._replace(notes=(lost_note, *compared_robot.notes))
     problems = confirmed.problems if confirmed else None
     if (
-        two_computers := received.two_computers_sentence()
+        two_computers := received.two_computers_sentence(was_restored=records.was_restored)
         if received and compared_robot.enclaves
         else ""
     ):
