@@ -1285,7 +1285,7 @@ def _is_renewal_due(keystore: OpenedKeystore, name: str, now: datetime, *, new_k
     if new_key:
         with suppress(SrosError):  # what is wrong with permissions is reported elsewhere
             lifetime = read_credentials(keystore, name).lifetime()
-            return lifetime.due(Threshold(elapsed=_NEW_KEY_AFTER), now)
+            return lifetime.is_due(Threshold(elapsed=_NEW_KEY_AFTER), now)
     file = keystore.folder(name) / CERTIFICATE_FILE
     validity, here_since = validity_of(read_certificate(file)), time_of_file(file.stat().st_mtime)
     left = 1 - _NEW_KEY_AFTER if new_key else 1 / 3

@@ -22,7 +22,7 @@ from sros_tool.files import remove_file, replace_file
 from sros_tool.fleet.robots import name_problem
 from sros_tool.folders import Folder
 from sros_tool.keystore.confirmation import EXPIRED_METADATA, OLDER_THAN_SEEN
-from sros_tool.keystore.delivery.archive import OF_ONE_ROBOT
+from sros_tool.keystore.delivery.archive import LIMITS_OF_ONE_ROBOT
 from sros_tool.keystore.delivery.release import (
     Release,
     check_tuf,
@@ -213,7 +213,7 @@ def _transport(
             "",
             "Write it as in https://HOST/fleet, or as the path of a folder.",
         )
-    return FolderTransport(Path(source), max_bytes=OF_ONE_ROBOT.packed)
+    return FolderTransport(Path(source), max_bytes=LIMITS_OF_ONE_ROBOT.packed)
 
 
 def _updater(state: Path, transport: HttpTransport | FolderTransport, now: datetime) -> Updater:
@@ -251,7 +251,8 @@ def _remove_unreadable(state: Path) -> None:
         with suppress(OSError):
             state_of_file = path.stat()
             is_file = (
-                stat.S_ISREG(state_of_file.st_mode) and state_of_file.st_size <= OF_ONE_ROBOT.packed
+                stat.S_ISREG(state_of_file.st_mode)
+                and state_of_file.st_size <= LIMITS_OF_ONE_ROBOT.packed
             )
             if not (is_file or stat.S_ISDIR(state_of_file.st_mode)):
                 remove_file(path)
@@ -270,11 +271,11 @@ def _release_number(target: TargetFile | None, source: str, robot: str) -> int:
             "The robot is not in the fleet, or all its enclaves were revoked.",
             "On the keystore machine, run `sros fleet status KEYSTORE`.",
         )
-    if target.length > OF_ONE_ROBOT.packed:
+    if target.length > LIMITS_OF_ONE_ROBOT.packed:
         raise FetchError(
             FetchProblem.TOO_LARGE,
             f"the release of {robot} is too large: {target.length} bytes",
-            f"The limit is {OF_ONE_ROBOT.packed} bytes.",
+            f"The limit is {LIMITS_OF_ONE_ROBOT.packed} bytes.",
         )
     number = target.custom.get("number") if isinstance(target.custom, dict) else None
     if not isinstance(number, int) or number < 1:
@@ -288,7 +289,7 @@ def _release_number(target: TargetFile | None, source: str, robot: str) -> int:
 def _read_archive(path: Path, robot: str, number: int) -> Release:
     """Return the release in the verified archive at ``path``; it must be a release of ``robot``."""
     try:
-        release = read_release(read_bytes(path, "release", max_bytes=OF_ONE_ROBOT.packed))
+        release = read_release(read_bytes(path, "release", max_bytes=LIMITS_OF_ONE_ROBOT.packed))
     except SrosError as error:
         raise FetchError(FetchProblem.NOT_SIGNED, error.what, error.why, error.remedy) from error
     if release.robot != robot:

@@ -33,7 +33,7 @@ from sros_tool.keystore.delivery.release import (
     Release,
     seal_problem,
 )
-from sros_tool.keystore.delivery.robot import evaluate_delivered
+from sros_tool.keystore.delivery.robot import evaluate_delivered_files
 from sros_tool.keystore.delivery.rollback import older_list, retired_authorities
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
@@ -367,7 +367,7 @@ def _enclave_change(
     certified = load_certificates(files.get(CERTIFICATE_FILE, b""), CERTIFICATE_FILE)[0]
     takes_new = new_key is not None and new_key.public_key() == certified.public_key()
     key = new_key.public_key() if new_key and takes_new else _present_key(folder, name, files)
-    state, problems = evaluate_delivered(name, files, key, now=now)
+    state, problems = evaluate_delivered_files(name, files, key, now=now)
     problems += _weakness_clauses(state)
     if problems:
         raise KeystoreError("its new files cannot be used", "; ".join(problems))

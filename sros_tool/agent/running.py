@@ -25,11 +25,11 @@ from sros_tool.checks.processes import (
 )
 from sros_tool.errors import UnavailableError
 from sros_tool.keystore.confirmation import (
+    LibraryUse,
     RobotClock,
     RobotDds,
     RobotLibrary,
     RunningFiles,
-    Seen,
     is_enclave_below_root,
 )
 from sros_tool.keystore.layout import KEY_FILE, enclave_path
@@ -256,9 +256,9 @@ def enclaves_to_restart(
 def _robot_dds(running: RunningProcesses) -> RobotDds:
     """Return the DDS libraries that processes have loaded, or that are installed."""
     loaded = [library for process in running.processes for library in process.dds]
-    place_by_library = dict.fromkeys(installed_dds(), Seen.INSTALLED)
+    place_by_library = dict.fromkeys(installed_dds(), LibraryUse.INSTALLED)
     place_by_library |= dict.fromkeys(
-        (library._replace(replaced=False) for library in loaded), Seen.PROCESS
+        (library._replace(replaced=False) for library in loaded), LibraryUse.PROCESS
     )
     libraries = dict.fromkeys(
         RobotLibrary(library.product, library.version, plain(library.path, _LONGEST_PATH), how)

@@ -12,7 +12,7 @@ from sros_tool.dds.advisories import (
     shipped_advisories,
     version_numbers,
 )
-from sros_tool.keystore.confirmation import RobotDds, RobotLibrary, Seen
+from sros_tool.keystore.confirmation import LibraryUse, RobotDds, RobotLibrary
 from sros_tool.names import DISTRIBUTIONS
 from sros_tool.prometheus import Metric, Sample
 from sros_tool.runtime.processes import MappedLibrary, RunningProcesses, plain
@@ -102,7 +102,7 @@ def robot_findings(
     ``robots`` maps names of robots to the DDS that they reported, or to None.  ``names_as_text``
     returns names of robots as a text.
     """
-    seen: dict[MappedLibrary, dict[Seen, list[str]]] = {}
+    seen: dict[MappedLibrary, dict[LibraryUse, list[str]]] = {}
     lacking: dict[str, list[str]] = {}
     for robot, dds in robots.items():
         if dds is None:
@@ -116,7 +116,9 @@ def robot_findings(
         if dds.unseen:
             lacking.setdefault(_UNSEEN_TEXT, []).append(robot)
     by = {
-        library: [f"{_SEEN_TEXTS[how]} {names_as_text(where[how])}" for how in Seen if how in where]
+        library: [
+            f"{_SEEN_TEXTS[how]} {names_as_text(where[how])}" for how in LibraryUse if how in where
+        ]
         for library, where in seen.items()
     }
     yield from _library_findings(by, advisories)
@@ -128,8 +130,8 @@ def robot_findings(
 
 _UNSEEN_TEXT = "some processes of {} could not be examined"
 _SEEN_TEXTS = {
-    Seen.PROCESS: "loaded by processes of",
-    Seen.INSTALLED: "installed, but not loaded, on",
+    LibraryUse.PROCESS: "loaded by processes of",
+    LibraryUse.INSTALLED: "installed, but not loaded, on",
 }
 
 

@@ -218,7 +218,7 @@ def _confirm(arguments: tuple[str, ...], robot: str, dry_run: bool, as_json: boo
         KeptConfirmation,
         locked_confirmations,
         receive,
-        refuse_older,
+        refuse_older_confirmation,
         store_confirmation,
     )
     from sros_tool.keystore.fleet import recorded_fleet
@@ -234,7 +234,7 @@ def _confirm(arguments: tuple[str, ...], robot: str, dry_run: bool, as_json: boo
     path = confirmation_file(robot)
     changes = file_change(root / path, existed=(root / path).exists())
     with nullcontext() if dry_run else locked_confirmations(root):
-        refuse_older(keystore, received)
+        refuse_older_confirmation(keystore, received)
         if not dry_run:
             store_confirmation(keystore, received)
     confirmation = received.confirmation

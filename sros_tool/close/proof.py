@@ -219,7 +219,7 @@ def _expired_enclaves(robot: LocalRobot, root: Path) -> list[str]:
     """Return the enclaves below ``root`` whose certificate or permissions have expired."""
     lifetimes, _ = survey(OpenedKeystore(root)) if root.exists() else ((), ())
     now = robot.shell.now()
-    return [lifetime.name for lifetime in lifetimes if lifetime.expires() < now]
+    return [lifetime.name for lifetime in lifetimes if lifetime.first_expiry() < now]
 
 
 def _expired_text(robot: LocalRobot, expired: Sequence[str]) -> str:

@@ -20,7 +20,7 @@ from sros_tool.close.processes import (
 )
 from sros_tool.close.robot import MOST_NAMES, OBSERVER, LocalRobot, check_enclaves
 from sros_tool.keystore.expiry import Threshold, survey
-from sros_tool.keystore.known_keys import IssuedEarlier
+from sros_tool.keystore.known_keys import IssuedCredentials
 from sros_tool.keystore.layout import (
     CRL_FILE,
     KEY_FILE,
@@ -592,13 +592,13 @@ def _expiring_enclaves(robot: LocalRobot) -> Sequence[str]:
     """Return the enclaves of the export that expire soon, as `sros renew` decides."""
     lifetimes, _ = survey(OpenedKeystore(robot.export))
     now = robot.shell.now()
-    return [lifetime.name for lifetime in lifetimes if lifetime.due(Threshold(), now)]
+    return [lifetime.name for lifetime in lifetimes if lifetime.is_due(Threshold(), now)]
 
 
 def _earlier_files_until(robot: LocalRobot, names: Collection[str]) -> Mapping[str, datetime]:
     """Map each named enclave with earlier files that still work to the expiry of these files."""
     if not names:
         return {}
-    issued, now = IssuedEarlier(OpenedKeystore(robot.keystore), names), robot.shell.now()
+    issued, now = IssuedCredentials(OpenedKeystore(robot.keystore), names), robot.shell.now()
     moments = {name: issued.permissions_until(name) for name in names}
     return {name: until for name, until in moments.items() if until and until > now}

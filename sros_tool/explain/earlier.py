@@ -16,7 +16,7 @@ from sros_tool.dds.permissions import parse_permissions
 from sros_tool.errors import Note, SrosError
 from sros_tool.explain.answer import Evaluator, Question, acting_parts
 from sros_tool.explain.asking import AskingContext, domains_decided_alike
-from sros_tool.keystore.known_keys import IssuedEarlier, removed_enclaves, revoked_issues
+from sros_tool.keystore.known_keys import IssuedCredentials, removed_enclaves, revoked_entries
 from sros_tool.keystore.layout import LEDGER, PERMISSIONS_FILE, REVOKED, ROUTER_FILE
 from sros_tool.keystore.ledger import Entry
 from sros_tool.keystore.participant import LoadedEnclave
@@ -51,7 +51,7 @@ def note_on_earlier_permissions(
     unknown: dict[str, str] = {}
     same: dict[str, str] = {}
     try:
-        issued = IssuedEarlier(keystore, denied)
+        issued = IssuedCredentials(keystore, denied)
     except SrosError as error:
         yield _note_on_unknown_answer(
             keystore, "explain.earlier-permissions", error.what, error.remedy
@@ -195,7 +195,7 @@ def _revoked_enclaves_with_right(
     """Yield the enclaves whose revoked certificates may have a right."""
     permissions: defaultdict[str, list[Entry]] = defaultdict(list)
     certificates: defaultdict[str, list[Entry]] = defaultdict(list)
-    for entry in revoked_issues(keystore):
+    for entry in revoked_entries(keystore):
         if entry.what == "permissions":
             permissions[entry.enclave].append(entry)
         elif entry.not_after > iso(asking.at):

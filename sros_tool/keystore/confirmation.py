@@ -116,8 +116,8 @@ _CERTIFICATE_PEM = re.compile(
 )
 
 
-class Seen(StrEnum):
-    """Where a robot saw a DDS library."""
+class LibraryUse(StrEnum):
+    """Whether processes of a robot use a DDS library."""
 
     PROCESS = "process"
     """At least one running process has loaded the library."""
@@ -134,7 +134,7 @@ class RobotLibrary(NamedTuple):
     """Version of the DDS as three numbers; empty if the file name does not show the version."""
     path: str
     """Path of the library on the robot."""
-    seen: Seen
+    seen: LibraryUse
     """Whether a running process has loaded the library, or it is only installed."""
 
 
@@ -316,9 +316,10 @@ def make_confirmation(
     error; the confirmation leaves this enclave out.  Without ``unreadable``, the error is raised.
 
     Raises:
-        DocumentError: ``robot`` is not a robot's name. KeystoreError: ``root`` is not a keystore,
-        or a file in ``root`` is a link that leads out of ``root``. OSError: a file cannot be read;
-        a confirmation without this file would be false.
+        DocumentError: ``robot`` is not a robot's name.
+        KeystoreError: ``root`` is not a keystore, or a file in ``root`` is a link that leads out of
+            ``root``.
+        OSError: a file cannot be read; a confirmation without this file would be false.
     """
     if problem := name_problem(robot):
         raise DocumentError(f"{robot!r} is not the name of a robot", problem)
@@ -451,7 +452,9 @@ class LastMessage(NamedTuple):
     with an earlier release.
     """
 
-    def successor(self, boot: str | None, now: datetime) -> tuple[tuple[str, ...], datetime | None]:
+    def next_boots(
+        self, boot: str | None, now: datetime
+    ) -> tuple[tuple[str, ...], datetime | None]:
         """Return ``boots`` and ``alternated`` for the next record, after a message from ``boot``.
 
         ``boot`` is the digest of a start of the computer.  A computer never returns to an earlier
@@ -549,7 +552,7 @@ def receive(data: bytes, robot: str, label: str, *, now: datetime) -> ReceivedCo
     return ReceivedConfirmation(confirmation, now.replace(microsecond=0))
 
 
-def refuse_older(keystore: OpenedKeystore, received: ReceivedConfirmation) -> None:
+def refuse_older_confirmation(keystore: OpenedKeystore, received: ReceivedConfirmation) -> None:
     """Raise `DocumentError` if a confirmation was made before the last one of its robot.
 
     If the robot's clock was ahead, the last confirmation counts as made when it was received.
@@ -627,6 +630,8 @@ def store_refusals(
     now: datetime,
 ) -> None:
     """Write the reasons for refused messages, by robot, if they differ from ``previous``.
+
+    ``refused`` maps robots to the reasons, as clauses.
 
     The caller must hold `locked_confirmations`.
     """
@@ -914,9 +919,9 @@ def _library_from(value: Any) -> RobotLibrary:
         raise _FormError(f"{_shortened(version)} is not the version of a DDS")
     if not isinstance(path, str) or not _LIBRARY_PATH.match(path):
         raise _FormError(f"{_shortened(path)} is not the path of a library")
-    if seen not in tuple(Seen):
+    if seen not in tuple(LibraryUse):
         raise _FormError(f"{_shortened(seen)} does not say where a library was seen")
-    return RobotLibrary(product, version, path, Seen(seen))
+    return RobotLibrary(product, version, path, LibraryUse(seen))
 
 
 def _file_entries(value: Mapping[str, Any], key: str) -> Iterator[tuple[str, Any]]:

@@ -193,7 +193,7 @@ class GrantFacts(NamedTuple):
     name: str
     """Name of the grant."""
     subject: str
-    """The certificate subject for which the grant is."""
+    """Subject of the certificates to which the grant gives rights."""
     not_before: str
     """Start of the validity, as written in the document."""
     not_after: str
@@ -716,7 +716,7 @@ def _describe_network(network: ZenohNetwork) -> NetworkFacts:
 
 def _describe_zenoh(folder: Path, now: datetime) -> ZenohFiles | None:
     """Describe the Zenoh configurations of an enclave, with their problems; None without any."""
-    opened = _opened_at(folder, now)
+    opened = _open_zenoh_in(folder, now)
     if opened is None or not opened.files:
         return None
     modes = {file: configuration.mode for file, configuration in opened.configurations.items()}
@@ -966,7 +966,7 @@ def _describe_remote_rights(configuration: Configuration) -> list[RemoteFacts]:
     return remotes
 
 
-def _opened_at(folder: Path, now: datetime) -> OpenedZenoh | None:
+def _open_zenoh_in(folder: Path, now: datetime) -> OpenedZenoh | None:
     """Return the Zenoh configurations in ``folder``; None if it is not an enclave's folder."""
     if not all((folder / file).exists() for file in (CERTIFICATE_FILE, PERMISSIONS_FILE)):
         return None
@@ -983,7 +983,7 @@ def _content_problems(path: Path, now: datetime) -> list[str]:
     """
     reported = {ZenohFault.OTHER_DOCUMENT} if path.name in ZENOH_SIGNED else set()
     names = [pair for pair in ZENOH_SIGNED.items() if path.name in pair]
-    opened = _opened_at(path.absolute().parent, now) if names else None
+    opened = _open_zenoh_in(path.absolute().parent, now) if names else None
     return [
         str(problem)
         for problem in (opened.problems if opened else ())
@@ -1006,7 +1006,9 @@ class HistoryStatus(StrEnum):
     CURRENT = "current"
     """The certificate or document is in the keystore, and has not expired."""
     SUPERSEDED = "superseded"
-    """The keystore has a later one, but DDS still accepts this one (not revoked, not expired)."""
+    """The keystore has a later file instead, but DDS still accepts this one: it is not revoked and
+    has not expired.
+    """
     REPLACED = "replaced"
     """Earlier settings of the keystore; DDS does not read them."""
     REVOKED = "revoked"

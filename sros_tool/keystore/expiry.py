@@ -65,14 +65,14 @@ class Lifetime(NamedTuple):
     A CA service may date certificates differently from sros, which back-dates them.
     """
 
-    def expires(self) -> datetime:
+    def first_expiry(self) -> datetime:
         """Return the earlier expiry of certificate and permissions."""
         return min(self.certificate.not_after, self.permissions.not_after)
 
-    def due(self, threshold: Threshold, now: datetime) -> bool:
+    def is_due(self, threshold: Threshold, now: datetime) -> bool:
         """Return whether the enclave is due for renewal at ``now``."""
         if threshold.remaining is not None:
-            return self.expires() - now <= threshold.remaining
+            return self.first_expiry() - now <= threshold.remaining
         if threshold.elapsed is None:
             validities = self.certificate, self.permissions
             return any(validity.expires_soon_from() < now for validity in validities)
@@ -177,7 +177,10 @@ def parse_threshold(text: str) -> Threshold:
 
 
 def survey(keystore: OpenedKeystore) -> tuple[tuple[Lifetime, ...], tuple[UnreadableEnclave, ...]]:
-    """Return the lifetimes of the readable enclaves, and the unreadable enclaves, on all cores."""
+    """Return the lifetimes of the readable enclaves, and the unreadable enclaves.
+
+    All cores read the files of enclaves at the same time.
+    """
     keystore.check()
 
     def read(name: str) -> Lifetime | UnreadableEnclave:
@@ -206,7 +209,7 @@ class ExpiryCheck(NamedTuple):
     moment: datetime
 
     def short_lived_text(self) -> str:
-        """Return a clause that names short-lived enclaves and their expiry; "" without any."""
+        """Return a clause that names short-lived enclaves, with their expiry; "" without any."""
         shown = [describe_lifetime(lifetime, self.moment) for lifetime in self.short_lived]
         enclaves = counted(len(shown), "short-lived enclave")
         return f"{enclaves} (renewed only by name): {first_few(shown, 3)}" if shown else ""
@@ -223,7 +226,7 @@ def due_enclaves(
     }
     short_lived = tuple(lifetime for lifetime in lifetimes if is_short[lifetime.name])
     lasting = [lifetime for lifetime in lifetimes if not is_short[lifetime.name]]
-    due = tuple(lifetime for lifetime in lasting if lifetime.due(threshold, moment))
+    due = tuple(lifetime for lifetime in lasting if lifetime.is_due(threshold, moment))
     return ExpiryCheck(due, unreadable, len(lasting), short_lived, moment)
 
 
@@ -288,8 +291,8 @@ def describe_lifetime(lifetime: Lifetime, now: datetime) -> str:
         if lifetime.certificate.not_after <= lifetime.permissions.not_after
         else "permissions"
     )
-    word = "expired" if lifetime.expires() < now else "until"
-    return f"{lifetime.name}  {first} {word} {iso(lifetime.expires())}"
+    word = "expired" if lifetime.first_expiry() < now else "until"
+    return f"{lifetime.name}  {first} {word} {iso(lifetime.first_expiry())}"
 
 
 def _elapsed_fraction(validity: Window, now: datetime, made_at: datetime | None) -> float:

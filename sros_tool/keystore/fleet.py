@@ -251,7 +251,7 @@ class EnclaveDomains(NamedTuple):
         """Return the robots of the fleet."""
         return self.fleet.robots.values() if self.fleet else ()
 
-    def of(self, enclave: str) -> DomainSet:
+    def domains_of(self, enclave: str) -> DomainSet:
         """Return the ROS domains for which an enclave gets permissions.
 
         Raises:
@@ -317,8 +317,8 @@ def with_routers_of_robots(
             own = [enclave for enclave in enclaves_of(fleet, robot) if enclave != name]
             folder = fleet.routers.rpartition("/")[0]
             if has_placeholder(folder):
-                beside = f"{name.rpartition('/')[0]}/"
-                own = [f"{beside}*", *(e for e in own if not e.startswith(beside))]
+                siblings = f"{name.rpartition('/')[0]}/"
+                own = [f"{siblings}*", *(e for e in own if not e.startswith(siblings))]
             known[name] = ZenohRouter(
                 name, (robot.router,), listening.get(name, ()), tuple(own), robot.crossing
             )
@@ -411,10 +411,10 @@ def refuse_stale_domains(
     for name in keystore.names:
         if name in stated or robot_of(fleet, name) is None:
             continue
-        if before.of(name) != (domains := after.of(name)):
+        if before.domains_of(name) != (domains := after.domains_of(name)):
             raise KeystoreError(
                 f"according to the fleet file, enclave {name} belongs to domain {domains}, but it "
-                f"would keep its permissions for domain {before.of(name)}",
+                f"would keep its permissions for domain {before.domains_of(name)}",
                 "No policy of this command states its rights, so it gets no new permissions.",
                 "Name the policies of all enclaves whose robots change their domain.",
             )

@@ -345,7 +345,7 @@ class RobotStatus:
         return self.others.naming
 
     @property
-    def settled(self) -> bool:
+    def is_settled(self) -> bool:
         """Whether there is nothing to do: the files are current and the agent reports no problem.
 
         A robot without enclaves is settled, too.  A revoked robot is settled once its enclaves are
@@ -357,9 +357,9 @@ class RobotStatus:
 
     @property
     def mended(self) -> bool:
-        """Whether the robot is `settled` except for problems that its agent has mended."""
+        """Whether the robot is `is_settled` except for problems that its agent has mended."""
         is_over = self.state is State.CURRENT and all(map(is_mended, self.problems or ()))
-        return self.settled or is_over
+        return self.is_settled or is_over
 
     @property
     def problem_clauses(self) -> list[str]:
@@ -385,12 +385,12 @@ class RobotStatus:
         """Return whether a web server with the current CA and list refuses the robot at ``now``."""
         return self.locked_out_from is not None and self.locked_out_from <= now
 
-    def offline(self) -> RobotStatus:
+    def as_offline(self) -> RobotStatus:
         """Return a copy with `State.OFFLINE` or worse, for a robot that was silent for too long."""
         state = max(self.state, State.OFFLINE, key=_RANK_OF_STATE.__getitem__)
         return replace(self.without_list(), state=state)
 
-    def expired(self, now: datetime) -> RobotStatus:
+    def with_expired_state(self, now: datetime) -> RobotStatus:
         """Return a copy for the time ``now``: `State.EXPIRED` or worse if a file has expired."""
         if not self.enclaves or all(end > now for end in self.expiry.values()):
             return self
@@ -507,7 +507,7 @@ class PublishedMetadata:
         """Whether the metadata has not expired, and no file is known to be missing or refused."""
         return bool(self.accepted and not self.lacks)
 
-    def at(self, now: datetime) -> PublishedMetadata:
+    def as_seen_at(self, now: datetime) -> PublishedMetadata:
         """Return this publication as robots see it at the time ``now``."""
         accepted = now < self.expires if self.expires else None
         altered = altered_lately(self.altered, now)
@@ -647,7 +647,7 @@ class FleetStatus:
             and (mended or not publication.altered)
         )
         in_doubt = self.overdue or self.older or self.clock or self.edited
-        robots = (robot.mended if mended else robot.settled for robot in self.robots)
+        robots = (robot.mended if mended else robot.is_settled for robot in self.robots)
         return in_order and not in_doubt and all(robots)
 
     def with_overdue(self, now: datetime, max_age: timedelta | None = None) -> FleetStatus:
@@ -670,13 +670,15 @@ class FleetStatus:
 
         def status(robot: RobotStatus) -> RobotStatus:
             if robot.robot not in overdue:
-                return robot.expired(now)
+                return robot.with_expired_state(now)
             if robot.is_behind and robot.received and now - robot.received <= limit:
-                return robot.without_list().expired(now)  # it says itself that its clock is wrong
-            return robot.offline()
+                return robot.without_list().with_expired_state(
+                    now
+                )  # it says itself that its clock is wrong
+            return robot.as_offline()
 
         robots = map(status, self.robots)
-        publication = self.publication and self.publication.at(now)
+        publication = self.publication and self.publication.as_seen_at(now)
         is_accepted = publication is None or publication.is_in_order
         to_do = tuple(robot.with_to_do(now, is_accepted=is_accepted) for robot in robots)
         received = max((robot.received for robot in self.robots if robot.received), default=None)
@@ -713,7 +715,7 @@ def fleet_status(keystore: OpenedKeystore, names: Sequence[str] = ()) -> FleetSt
     is_any_revoked = records.is_any_listed() or (may_trust_replaced and records.is_any_revoked)
     return FleetStatus(
         keystore.root,
-        stages.of_keystore,
+        stages.stage_of_keystore,
         statuses,
         unassigned,
         older=older,
@@ -732,7 +734,7 @@ def fleet_status(keystore: OpenedKeystore, names: Sequence[str] = ()) -> FleetSt
 def _unseen_clause(missing: str | None) -> str:
     """Return why the publishing folder cannot be examined, or "".
 
-    ``missing`` is the result of `Published.first_missing`.
+    ``missing`` is the result of `PublicationRecord.first_missing`.
     """
     if missing is None:
         return "is not on this machine, or cannot be read"
@@ -908,6 +910,8 @@ def _notes_on_clock(received: ReceivedConfirmation) -> Iterator[str]:
 
 
 class _KeystoreFile(NamedTuple):
+    """The SHA-256 of a file in the keystore, and of each certificate (DER) in the file."""
+
     sha256: str
     certificates: tuple[str, ...]
 
@@ -970,8 +974,11 @@ class _KeystoreFiles:
 # ── origin of different files ──────────────────────────────────────────────────────────────
 
 
-class _Expiring(NamedTuple):
-    """The validity of a file on a robot, and its enclave; "" if the file is the keystore's own."""
+class _FileValidity(NamedTuple):
+    """The validity of a file on a robot, and the enclave of the file.
+
+    ``enclave`` is "" for a file that all enclaves share, such as the revocation list.
+    """
 
     enclave: str
     window: Window
@@ -1060,7 +1067,7 @@ class _KeystoreRecords:
         self._unrecorded = unrecorded_enclaves(fleet, self._revoked, robots)
 
     def _add_listed(self) -> None:
-        """Add revocations that are only on a revocation list, such as one copied from a robot."""
+        """Add revocations that only a revocation list has, such as a list copied from a robot."""
         reason_by_serial = {
             f"{entry.serial:x}": entry.reason
             for crl in self._keystore.revocation_lists
@@ -1234,7 +1241,7 @@ class _KeystoreRecords:
 
     @property
     def is_any_revoked(self) -> bool:
-        """Whether a certificate was revoked, even one of a replaced CA, whose list may be gone."""
+        """Whether any certificate was revoked; the lists of replaced CAs may be gone, but count."""
         return bool(self._revoked_serials)
 
     def is_any_listed(self) -> bool:
@@ -1259,7 +1266,7 @@ class _KeystoreRecords:
                 return parse_iso(max(expiries[serial] for serial in serials))
         return None
 
-    def revoked(self, robot: Robot) -> tuple[str, ...]:
+    def revoked_enclaves(self, robot: Robot) -> tuple[str, ...]:
         """Return a robot's revoked enclaves that are no longer in the keystore."""
         if not self._revoked:
             return ()
@@ -1267,7 +1274,7 @@ class _KeystoreRecords:
         names.update(self._unrecorded[robot.name].below)
         return tuple(sorted(name for name in names if not self._keystore.has_enclave(name)))
 
-    def short_lived(self, first_expiring: Mapping[str, _Expiring]) -> tuple[str, ...]:
+    def short_lived(self, first_expiring: Mapping[str, _FileValidity]) -> tuple[str, ...]:
         """Return the short-lived enclaves of the files in ``first_expiring``.
 
         ``first_expiring`` maps a kind of file to the robot's file that expires first.
@@ -1276,9 +1283,9 @@ class _KeystoreRecords:
         template = self._keystore.template
         return tuple(sorted(name for name in names if template.longest_validity(name) is not None))
 
-    def first_expiring(self, compared_robot: _ComparedRobot) -> dict[str, _Expiring]:
+    def first_expiring(self, compared_robot: _ComparedRobot) -> dict[str, _FileValidity]:
         """Map each kind of file to the robot's file that expires first, by the ledger."""
-        first: dict[str, _Expiring] = {}
+        first: dict[str, _FileValidity] = {}
         for kind, digests in compared_robot.expiring.items():
             entries = (self._issued.get(digest) for digest in digests)
             files = [
@@ -1289,7 +1296,7 @@ class _KeystoreRecords:
             if files:
                 entry = min(files, key=lambda file: file.not_after)
                 window = Window(parse_iso(entry.not_before), parse_iso(entry.not_after))
-                first[kind] = _Expiring(entry.enclave, window)
+                first[kind] = _FileValidity(entry.enclave, window)
         return first
 
     def file(self, robot: Robot, difference: _Difference) -> ConfirmedFile:
@@ -1367,7 +1374,7 @@ def _robot_status(
     unrecorded: UnrecordedEnclaves,
 ) -> RobotStatus:
     different = tuple(records.file(compared_robot.robot, file) for file in compared_robot.different)
-    revoked = records.revoked(compared_robot.robot)
+    revoked = records.revoked_enclaves(compared_robot.robot)
     counts: dict[str, Counter[State]] = {}
     for kind, number in compared_robot.current.items():
         counts.setdefault(kind, Counter())[State.CURRENT] = number
@@ -1456,7 +1463,7 @@ def _robot_status(
         fetches,
         confirmed.release if confirmed else None,
         records.published.get(compared_robot.robot.name),
-        stages.of(compared_robot),
+        stages.stage_of(compared_robot),
         {kind: counts[kind] for kind in (*_KINDS_BY_FILE.values(), _ZENOH_KIND) if kind in counts},
         different,
         restart,
@@ -1507,7 +1514,7 @@ class _Stages:
     def __init__(self, keystore: OpenedKeystore) -> None:
         rotation = read_rotation(keystore)
         is_complete = rotation.stage is RotationStage.NONE
-        self.of_keystore = self.COMPLETE if is_complete else rotation.stage.value
+        self.stage_of_keystore = self.COMPLETE if is_complete else rotation.stage.value
         replaced_roles = {
             role
             for replacement in rotation.replacements
@@ -1524,7 +1531,7 @@ class _Stages:
             new = [replaced.new for replaced in rotation.replacements if replaced.file == file]
             for kind in (f"{role}_ca" for role in roles):
                 self._new[kind] = new[0] if new else certificates[0]
-                self._of_kind[kind] = certificates, self.of_keystore if new else self.COMPLETE
+                self._of_kind[kind] = certificates, self.stage_of_keystore if new else self.COMPLETE
 
     @property
     def sealing_ca(self) -> str:
@@ -1553,7 +1560,7 @@ class _Stages:
             )
         )
 
-    def of(self, compared_robot: _ComparedRobot) -> str:
+    def stage_of(self, compared_robot: _ComparedRobot) -> str:
         """Return the stage of a robot's least advanced CA file; "" without a confirmed CA file."""
         stages = {
             self._stage(kind, certificates)

@@ -59,7 +59,7 @@ def other_enclave(keystore: OpenedKeystore, name: str, certificate: x509.Certifi
 
 
 def revoked_serials(keystore: OpenedKeystore) -> frozenset[int]:
-    """Return the serial numbers of all revoked certificates, also of replaced certificates."""
+    """Return the serial numbers of all revoked certificates, including replaced certificates."""
     entries = keystore.ledger_with("what", "revocation").entries
     recorded = {int(entry.serial, 16) for entry in entries if entry.what == "revocation"}
     listed = {entry.serial for crl in keystore.revocation_lists for entry in crl.revoked}
@@ -108,7 +108,7 @@ def certificates_of_revoked(
 def restored_at(keystore: OpenedKeystore) -> str:
     """Return when a keystore was last restored, if it still trusts an identity CA of that time.
 
-    Returns "" otherwise.
+    The time is in ISO 8601 (UTC).  Returns "" otherwise.
     """
     entries = _entries_since_trusted_ca(keystore, keystore.ledger_with("what", RESTORED).entries)
     return next((entry.time for entry in reversed(entries) if entry.what == RESTORED), "")
@@ -119,8 +119,8 @@ def subjects_since_restore(keystore: OpenedKeystore, ledger: Ledger) -> frozense
 
     The ledger may lack certificates and permissions that were issued after the backup, but none of
     them has one of these subjects.  A restore no longer matters once both CAs have been replaced.
-    Subjects that only messages or published releases showed (`KnownKeys.shown_after_restore`) are
-    left out.
+    Subjects that only messages or published releases showed are left out
+    (`KnownKeys.certificates_shown_after_restore`).
     """
     entries = ledger.entries
     trusted = max(
@@ -162,12 +162,12 @@ def _entries_since_trusted_ca(
     return entries[min(places, default=0) :]
 
 
-def revoked_issues(keystore: OpenedKeystore, listed: Collection[str] = ()) -> Iterator[Entry]:
+def revoked_entries(keystore: OpenedKeystore, listed: Collection[str] = ()) -> Iterator[Entry]:
     """Yield the ledger entries of revoked certificates, and of the permissions of their enclaves.
 
-    Certificates of CAs that are no longer trusted are left out, and certificates whose serial
-    number is in ``listed``.  The entry of a certificate records its issue or, if the ledger lacks
-    the issue, its revocation.
+    Two kinds of certificates are left out: certificates of CAs that are no longer trusted, and
+    certificates whose serial number (hexadecimal) is in ``listed``.  The entry of a certificate
+    records its issue or, if the ledger lacks the issue, its revocation.
     """
     serials = {f"{serial:x}" for serial in revoked_serials(keystore)}.difference(listed)
     recorded = keystore.ledger_file.with_values("serial", serials).entries if serials else ()
@@ -187,7 +187,8 @@ def revoked_issues(keystore: OpenedKeystore, listed: Collection[str] = ()) -> It
 def removed_enclaves(keystore: OpenedKeystore, now: datetime) -> Mapping[str, str]:
     """Map enclaves that were removed from a keystore, but not revoked, to their files' expiry.
 
-    Until the files expire, whoever has them can use them, because the keystore trusts their CA.
+    The expiry is in ISO 8601 (UTC).  Until the files expire, whoever has them can use
+    them, because the keystore trusts their CA.
     """
     recorded = keystore.ledger_file.recorded_enclaves()
     if recorded is None:
@@ -214,14 +215,14 @@ def unlisted_revocations(keystore: OpenedKeystore, now: datetime) -> Sequence[st
     def read() -> Sequence[str]:
         lists = keystore.revocation_lists
         listed = {f"{entry.serial:x}" for crl in lists for entry in crl.revoked}
-        revoked = revoked_issues(keystore, listed)
+        revoked = revoked_entries(keystore, listed)
         return sorted({e.enclave for e in revoked if e.serial and e.not_after > iso(now)})
 
     return keystore.once(("unlisted", now), read)
 
 
 def unknown_authorities(keystore: OpenedKeystore, role: str) -> Sequence[x509.Certificate]:
-    """Return the CAs that the keystore does not know, out of those in a role's CA file.
+    """Return the CAs in the CA file of a role that the keystore does not know.
 
     The result is empty if the ledger records no CA.
     """
@@ -232,10 +233,10 @@ def unknown_authorities(keystore: OpenedKeystore, role: str) -> Sequence[x509.Ce
 
 
 def known_authorities(keystore: OpenedKeystore, role: str) -> frozenset[str] | None:
-    """Return the SHA-256 of the certificates in a CA file that the keystore knows.
+    """Return the SHA-256 of the known certificates in the CA file of a role.
 
-    These are the CAs in the ledger, and the CAs that issued their certificates.  The result is None
-    if the ledger has no CA.
+    The known ones are the CAs in the ledger, and the CAs that issued their certificates.  The
+    result is None if the ledger has no CA.
     """
     return keystore.once(("known", role), lambda: _known_authorities(keystore, role))
 
@@ -272,7 +273,7 @@ def _may_be_issued_by_trusted_ca(keystore: OpenedKeystore, entry: Entry) -> bool
     return True
 
 
-class IssuedEarlier:
+class IssuedCredentials:
     """The certificates and permissions of enclaves in the ledger, without revoked certificates.
 
     Permissions work with a certificate for their subject, until the permissions or the certificate
@@ -311,30 +312,33 @@ class IssuedEarlier:
         last = max((until for _, until in self.permissions(name)), default="")
         return parse_iso(last) if last else None
 
-    def certificates_until(self, replaced: Entry, signed_for: str | None) -> datetime:
-        """Return when ``replaced`` and all earlier certificates of its enclave stop working.
+    def certificates_until(self, replaced_certificate: Entry, new_subject: str | None) -> datetime:
+        """Return when a replaced certificate and all earlier ones of its enclave stop working.
 
         A certificate works until it expires, or until the last permissions for its subject in the
         ledger expire, if that is earlier.  In three cases, only the expiry of the certificate
         counts:
 
-        - its subject is ``signed_for``, the subject of the enclave's new certificate;
+        - its subject is ``new_subject``, the subject of the enclave's new certificate;
         - its subject has no unique part, because Cyclone DDS finds such a subject in other
           subjects;
-        - ``signed_for`` is None, which says that certificates need no permissions.
+        - ``new_subject`` is None, which says that certificates need no permissions.
         """
         last: defaultdict[str, str] = defaultdict(str)
-        for entry in self._permissions[replaced.enclave]:
+        for entry in self._permissions[replaced_certificate.enclave]:
             last[entry.subject] = max(last[entry.subject], entry.not_after)
-        certificates = self._certificates[replaced.enclave].items()
+        certificates = self._certificates[replaced_certificate.enclave].items()
         return parse_iso(
             max(
                 min(expiry, last[subject])
                 if last[subject]
-                and signed_for not in (None, subject)
+                and new_subject not in (None, subject)
                 and _UNIQUE_PART.search(subject)
                 else expiry
-                for subject, expiry in [*certificates, (replaced.subject, replaced.not_after)]
+                for subject, expiry in [
+                    *certificates,
+                    (replaced_certificate.subject, replaced_certificate.not_after),
+                ]
             )
         )
 
@@ -404,7 +408,7 @@ class KnownKeys:
         listed = {entry.serial for crl in self._keystore.revocation_lists for entry in crl.revoked}
         return (later_revoked_serials(self._keystore) | listed) - recorded
 
-    def revoked_before(self, names: Collection[str]) -> set[str]:
+    def enclaves_revoked_before(self, names: Collection[str]) -> set[str]:
         """Return the enclaves in ``names`` whose last certificate was revoked, not just renewed.
 
         For a certificate whose revocation is not in the ledger, a revocation list decides.  If the
@@ -430,7 +434,7 @@ class KnownKeys:
                         enclaves.add(common_name_of(certificate.subject))
         return enclaves.intersection(names)
 
-    def shown_after_restore(self, names: Collection[str]) -> Sequence[Entry]:
+    def certificates_shown_after_restore(self, names: Collection[str]) -> Sequence[Entry]:
         """Return the ledger entries of certificates that the keystore issued after its last backup.
 
         Messages of robots or published releases showed them to the restored keystore.
@@ -457,12 +461,12 @@ class KnownKeys:
     def revoked_enclaves(self) -> list[str]:
         """Return the revoked enclaves that the keystore no longer has, sorted by name."""
         names = {entry.enclave for entry in self._revocations if entry.enclave}
-        return sorted(self.revoked_before(names.difference(self._keystore.names)))
+        return sorted(self.enclaves_revoked_before(names.difference(self._keystore.names)))
 
     def revoked_before_notes(self, names: Iterable[str]) -> Iterator[Note]:
         """Yield a note for each new enclave in ``names`` that was revoked before."""
         names = tuple(names)
-        revoked = self.revoked_before(names) if names else ()
+        revoked = self.enclaves_revoked_before(names) if names else ()
         for name in names:
             if name in revoked:
                 yield Note(
@@ -488,7 +492,7 @@ class KnownKeys:
         """Return whether the key with the digest ``key`` was revoked."""
         return key in self._revoked_keys
 
-    def refuse_revoked(
+    def refuse_revoked_key(
         self,
         key: PublicKey,
         holder: str,
@@ -539,7 +543,7 @@ class KnownKeys:
                 remedy,
             )
 
-    def shared_notes(self, names: Sequence[str]) -> Iterator[Note]:
+    def shared_key_notes(self, names: Sequence[str]) -> Iterator[Note]:
         """Yield a note for each enclave in ``names`` that shares its key with other enclaves."""
         if not names:
             return

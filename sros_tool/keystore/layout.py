@@ -232,7 +232,7 @@ def is_keystore(root: Path) -> bool:
         )
     except PermissionError as error:
         raise _unreadable_folder_error(
-            root, [UnreadPath.of(error)], "Its enclaves cannot be listed."
+            root, [UnreadPath.from_error(error)], "Its enclaves cannot be listed."
         ) from error
 
 
@@ -357,7 +357,7 @@ class UnreadPath(NamedTuple):
     why: str
 
     @classmethod
-    def of(cls, error: OSError) -> UnreadPath:
+    def from_error(cls, error: OSError) -> UnreadPath:
         """Return the path that the operating system did not let sros read, with the reason."""
         return cls(os.fsdecode(error.filename), error.strerror or str(error))
 
@@ -425,7 +425,7 @@ def _walk_folders(
                 entries = list(listing)
         except OSError as error:
             if error.errno not in (errno.ENOENT, errno.ENOTDIR):
-                unread.append(UnreadPath.of(error))
+                unread.append(UnreadPath.from_error(error))
             continue
         for entry in entries:
             name = entry.name
@@ -554,7 +554,7 @@ def revoked_certificates(root: Path, known: Container[str] = ()) -> tuple[Path, 
         return ()
     except OSError as error:
         effect = "Revoked certificates would be left out."
-        raise _unreadable_folder_error(root, [UnreadPath.of(error)], effect) from error
+        raise _unreadable_folder_error(root, [UnreadPath.from_error(error)], effect) from error
     files = (folder / name / CERTIFICATE_FILE for name in places if name not in known)
     return tuple(name for name in files if os.path.lexists(name))
 
@@ -565,7 +565,7 @@ def _unread_path(path: str) -> Iterator[UnreadPath]:
         os.close(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC))
     except OSError as error:
         if error.errno not in (errno.ENOENT, errno.ELOOP, errno.ENOTDIR):
-            yield UnreadPath.of(error)
+            yield UnreadPath.from_error(error)
 
 
 def _unreadable_folder_error(

@@ -338,7 +338,8 @@ class LedgerFile:
 
     ``authorities`` returns the certificates of the CAs that the keystore trusts.  A ledger of more
     than 16 MiB is read again for each question.  ``follow_link`` is False in the process that has
-    locked the keystore.  ``read`` is the function that reads the head the first time.
+    locked the keystore.  ``read_content`` reads the head the first
+    time.
     """
 
     def __init__(
@@ -388,7 +389,7 @@ class LedgerFile:
         Raises:
             KeystoreError: the file cannot be read at all.
         """
-        index = self._opened().ledger_index
+        index = self._opened_files().ledger_index
         many = index is None or len(values) * _LINES_PER_LOOKUP > index.state.lines
         if index is None or (many and self.is_complete):
             return self.ledger()
@@ -397,7 +398,7 @@ class LedgerFile:
 
     def next_number(self) -> int:
         """Return the number for a new answer, as `Ledger.next_number` does."""
-        if index := self._opened().ledger_index:
+        if index := self._opened_files().ledger_index:
             state = index.state
             return max(state.lines, state.number) + 1
         return self.ledger().next_number()
@@ -409,32 +410,34 @@ class LedgerFile:
         not included.
         """
         if self._recorded is None:
-            names = self.recorded_with()
+            names = self.recorded_enclaves_with()
             self._recorded = None if names is None else sorted(names)
         return self._recorded
 
-    def recorded_with(self, *parts: str) -> Collection[str] | None:
+    def recorded_enclaves_with(self, *parts: str) -> Collection[str] | None:
         """Return the `recorded_enclaves` with one of ``parts`` in their names, unsorted.
 
         The result is None without an index.
         """
-        index = self._opened().ledger_index
+        index = self._opened_files().ledger_index
         try:
             return index.names(parts) if index else None
         except IndexDamagedError:
-            return self.recorded_with(*parts) if self._remove_damaged_index() else None
+            return self.recorded_enclaves_with(*parts) if self._remove_damaged_index() else None
 
     @property
     def is_indexed(self) -> bool:
         """Whether there is an index, so that a few entries are found quickly."""
-        return self._opened().ledger_index is not None
+        return self._opened_files().ledger_index is not None
 
     @property
     def is_complete(self) -> bool:
         """Whether no sealed part is missing, so that all lines can be read."""
-        return all((self.root / ledger_part(n)).exists() for n in range(1, self._opened().part))
+        return all(
+            (self.root / ledger_part(n)).exists() for n in range(1, self._opened_files().part)
+        )
 
-    def _opened(self) -> _OpenedFiles:
+    def _opened_files(self) -> _OpenedFiles:
         if self._files is None:
             self._files = self._read()
         return self._files
@@ -443,20 +446,20 @@ class LedgerFile:
         """Return a reading with the values needed for adding lines; ``ledger`` may lack entries."""
         return self._readings.get(_IN_EVERY_LINE) or self._reading(_IN_NO_LINE, ())
 
-    def index_with(self, new: int, reading: _Reading) -> IndexUpdate | None:
-        """Return the update of the index for ``new`` additional lines; None if there is no index.
+    def index_update(self, new_lines: int, reading: _Reading) -> IndexUpdate | None:
+        """Return the update of the index for so many new lines; None if there is no index.
 
         ``reading`` comes from `reading_for_append`.  A ledger with a fault gets no index, because
         only reading all lines shows which entries are certain.
         """
-        if reading.ledger.lines + new < _INDEX_FROM_LINES or not reading.sound:
+        if reading.ledger.lines + new_lines < _INDEX_FROM_LINES or not reading.sound:
             return None
         from sros_tool.keystore.ledger_index import IndexUpdate
 
-        if index := self._opened().ledger_index:
+        if index := self._opened_files().ledger_index:
             return IndexUpdate(self.root, index)
         with self._open() or io.BytesIO() as file:
-            made, is_sound = self._new_index(file, self._opened().head)
+            made, is_sound = self._new_index(file, self._opened_files().head)
             return made if is_sound else None
 
     def last_part(self) -> tuple[int, int]:
@@ -465,19 +468,19 @@ class LedgerFile:
         Raises:
             KeystoreError: there is a later part, so an earlier ledger was put back.
         """
-        files = self._opened()
+        files = self._opened_files()
         if files.later:
             raise self._later_part_error(files.later)
         return files.part, files.state.st_size if files.state else 0
 
-    def clock_behind(self, now: datetime) -> str:
-        """Return how far the clock is behind the last entries, as a clause; "" if it is not."""
+    def clock_clause(self, now: datetime) -> str:
+        """Return how far the clock is behind the last entries, as a clause, or ""."""
         return clock_behind_clause(now, self.last_time(), "the last entry of the ledger")
 
     def clock_notes(self, now: datetime) -> Iterator[Note]:
         """Yield a note if the clock is behind the ledger, so that expired files may seem valid."""
         with suppress(SrosError):  # `sros check` reports a ledger that cannot be read
-            if behind := self.clock_behind(now):
+            if behind := self.clock_clause(now):
                 text = f"{behind}: expired files may count as valid. Set the clock."
                 yield Note("keystore.clock", text)
 
@@ -490,7 +493,7 @@ class LedgerFile:
         which were written while the clock was ahead.
         """
         times = []
-        for line in reversed(self._opened().last_lines):
+        for line in reversed(self._opened_files().last_lines):
             if entry := _parse_line(line):
                 with suppress(ValueError):
                     times.append(parse_iso(entry.time))
@@ -566,7 +569,7 @@ class LedgerFile:
             return _OpenedFiles(head, None, b"", later=self._file_with_later_lines(0))
         with file:
             state = os.fstat(file.fileno())
-            before = _sealed_before(file)
+            before = _entry_of_part_before(file)
             part = before.number + 1 if before else 1
             start = max(0, state.st_size - _LAST_LINES_BYTES)
             last = tuple(os.pread(file.fileno(), _LAST_LINES_BYTES, start).split(b"\n"))[
@@ -678,11 +681,11 @@ class LedgerFile:
         Raises:
             KeystoreError: a sealed part is missing, or is not as it was sealed.
         """
-        before = _sealed_before(last_part)
+        before = _entry_of_part_before(last_part)
         parts = [before] if before else []
         while parts and parts[-1].number > 1:
             with self._part(parts[-1]) as file:
-                before = _sealed_before(file)
+                before = _entry_of_part_before(file)
             if before is None or before.number != parts[-1].number - 1:
                 raise self._not_as_sealed_error(parts[-1])
             parts.append(before)
@@ -698,7 +701,7 @@ class LedgerFile:
         yield from _lines_in(last_part)
 
     def _part(self, sealed: Entry) -> BinaryIO:
-        """Return a sealed part, open for reading."""
+        """Return the sealed part that the entry ``sealed`` records, open for reading."""
         name = ledger_part(sealed.number)
         if file := self._open(name):
             return file
@@ -803,8 +806,8 @@ class LedgerFile:
     def _file_with_later_lines(self, part: int, last: os.stat_result | None = None) -> str:
         """Return the name of a file that has lines after the last known part; "" if there is none.
 
-        ``part`` is the number of the last known part.  ``last`` is its file, which can also have
-        another name, or be a copy.
+        ``part`` is the number of the last known part.  ``last`` is the state of this part's file,
+        which can also have another name, or be a copy.
         """
         if not self.root.exists():
             return ""
@@ -838,7 +841,7 @@ def _lines_in(file: BinaryIO) -> Iterator[bytes]:
     return iter(lambda: file.readline(_LONGEST_LINE), b"")
 
 
-def _sealed_before(file: BinaryIO) -> Entry | None:
+def _entry_of_part_before(file: BinaryIO) -> Entry | None:
     """Return the first entry in ``file`` if it records the sealed part before, or None."""
     line = file.readline(_LONGEST_LINE)
     file.seek(0)
@@ -901,7 +904,7 @@ def _read_lines(
     """Return the lines of a ledger; None if there are too many.
 
     At most ``maximum`` lines and ``most_bytes`` bytes are read.  ``stated`` is the number of lines
-    that the head states; ``needed_text`` is as in `LedgerFile`.
+    that the head states; ``needed_text`` is as in `LedgerFile._reading`.
     """
     entries: list[Entry] = []
     numbers = array("Q")
@@ -1130,7 +1133,7 @@ def append(
     gaps = [Entry(iso(now), GAP, reason=e.text, number=e.line) for e in present.unrecorded]
     index = None
     if not transaction.dry_run:
-        index = file.index_with(len(gaps) + len(entries), present)
+        index = file.index_update(len(gaps) + len(entries), present)
     links = _NewLines(chain(gaps, entries), present.previous, index)
     number, size = file.last_part()
     seals = index is not None and size + _USUAL_LINE_BYTES * len(entries) >= _SEAL_FROM_BYTES

@@ -153,11 +153,11 @@ class LedgerIndex:
         self._connection: sqlite3.Connection | None = None
 
     @classmethod
-    def open(cls, root: Path, lines: int, last: str, stated: str) -> Self | None:
+    def open(cls, root: Path, lines: int, last: str, stated_root: str) -> Self | None:
         """Return the index of the keystore ``root``; None if the head states another index.
 
-        The head states the number of ``lines``, the digest of the ``last`` line and the root of the
-        index.
+        The head states the number of ``lines``, the digest of the ``last`` line, and the index's
+        ``stated_root``.
         """
         path = root / LEDGER_INDEX
         try:
@@ -171,7 +171,7 @@ class LedgerIndex:
         if not row or [type(value) for value in row] != _STATE_TYPES:
             return None
         state, digests = IndexState(*row[:-1]), row[-1]
-        if (state.lines, state.last) != (lines, last) or state.root(digests) != stated:
+        if (state.lines, state.last) != (lines, last) or state.root(digests) != stated_root:
             return None
         return cls(path, state, digests)
 

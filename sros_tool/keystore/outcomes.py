@@ -91,7 +91,7 @@ def enclave_result(
         with suppress(SrosError):  # an existing enclave that is broken was not changed
             issued = read_credentials(keystore, name)
             number, sha256 = issued.certificate.serial_number, digest(issued.certificate)
-            until = issued.lifetime().expires()
+            until = issued.lifetime().first_expiry()
             return EnclaveResult(name, outcome, folder, f"{number:x}", sha256, until)
     return EnclaveResult(name, outcome, folder, None, None, None)
 

@@ -204,7 +204,7 @@ def _possible_enclaves(
     such a folder.
     """
     folders = folders_of_robots(fleet, robots)
-    recorded = keystore.ledger_file.recorded_with(*robots, *folders)
+    recorded = keystore.ledger_file.recorded_enclaves_with(*robots, *folders)
     if recorded is None:
         return keystore.names
     possible = set(recorded)

@@ -944,7 +944,7 @@ def test_a_forged_timestamp_is_refused_without_unpacking_everything(
     monkeypatch.setattr(published, "read_release", read.append)
     publication = fleet_status(OpenedKeystore(publisher.root)).publication
     assert publication and "metadata that this keystore did not write" in publication.refused
-    assert not publication.at(publisher.now).is_in_order and not read
+    assert not publication.as_seen_at(publisher.now).is_in_order and not read
     ended = sros("fleet", "status", "ks", cwd=publisher.folder)
     assert "the published files do not verify" in ended.out and ended.status == 1
     with pytest.raises(KeystoreError, match="more than 0 MiB, unpacked, of archives"):
@@ -1590,7 +1590,7 @@ def test_a_clock_that_was_set_back(publisher: Home) -> None:
         change.entries.append(Entry(iso(wrong), "x"))
         change.record()
         change.finish()
-    assert "h 59 min behind" in OpenedKeystore(publisher.root).ledger_file.clock_behind(wrong)
+    assert "h 59 min behind" in OpenedKeystore(publisher.root).ledger_file.clock_clause(wrong)
     status = fleet_status(OpenedKeystore(publisher.root))
     assert not status.with_overdue(publisher.now + timedelta(days=30, minutes=30)).clock
     behind = status.with_overdue(publisher.now)
@@ -1599,9 +1599,9 @@ def test_a_clock_that_was_set_back(publisher: Home) -> None:
         change.entries.append(Entry(iso(wrong), "crl"))
         change.record()
         change.finish()
-    assert not OpenedKeystore(publisher.root).ledger_file.clock_behind(wrong)
+    assert not OpenedKeystore(publisher.root).ledger_file.clock_clause(wrong)
     (publisher.root / "ledger.jsonl").write_text("damaged")
-    assert not OpenedKeystore(publisher.root).ledger_file.clock_behind(publisher.now)
+    assert not OpenedKeystore(publisher.root).ledger_file.clock_clause(publisher.now)
 
 
 def test_keystore_and_folder_in_one_another(publisher: Home) -> None:

@@ -387,7 +387,7 @@ def test_two_computers_that_are_alike_are_seen_by_their_starts(home: Home) -> No
         (r1,) = status.robots
         assert any("Two computers" in text for text in r1.problems or ()) == is_seen, boot
         assert (status.unconfirmed == ("r1",)) == is_seen, "no stage of a rotation"
-        assert not (is_seen and r1.settled)
+        assert not (is_seen and r1.is_settled)
     later = NOW + timedelta(days=2)
     home.send("r1", later, boot=second)
     home.collect(later)
@@ -956,14 +956,16 @@ def test_renewals_are_signed_in_one_change(home: Home) -> None:
 def test_the_ledger_tells_when_a_life_began(home: Home) -> None:
     """Also of a certificate of another CA, whose validity began when it was made."""
     keystore = OpenedKeystore(home.root)
-    made = [*collecting._Renewals(keystore, recorded_fleet(keystore), NOW)._issued("/r1/base")]
+    renewals = collecting._Renewals(keystore, recorded_fleet(keystore), NOW)
+    made = [*renewals._issued_validities("/r1/base")]
     for validity, when in made:
         assert when and when == validity.not_before + BACKDATE
     assert len(made) == 2
     forgetful = home.root / "ledger.jsonl"
     forgetful.write_text("")
     keystore = OpenedKeystore(home.root)
-    made = [*collecting._Renewals(keystore, recorded_fleet(keystore), NOW)._issued("/r1/base")]
+    renewals = collecting._Renewals(keystore, recorded_fleet(keystore), NOW)
+    made = [*renewals._issued_validities("/r1/base")]
     assert [when for _, when in made] == [None, None]
 
 

@@ -37,11 +37,11 @@ from sros_tool.keystore.confirmation import (
     MESSAGE_FILE,
     READABLE_KEYS,
     REPLACED_FILES,
+    LibraryUse,
     RobotClock,
     RobotDds,
     RobotLibrary,
     RunningFiles,
-    Seen,
     parse_confirmation,
     problem_rank,
 )
@@ -66,7 +66,7 @@ ROBOTS = ("r1", "r2", "r3")
 NO_NODE = ("--exclude", "enclave.node-cannot-start")
 POLICY = policy_text({"/{robot}/base": publish("/{robot}/x"), "/dispatcher": publish("/y")})
 SOUND_DDS = RobotDds(
-    (RobotLibrary(LIBRARY["product"], LIBRARY["version"], LIBRARY["path"], Seen.PROCESS),), 0
+    (RobotLibrary(LIBRARY["product"], LIBRARY["version"], LIBRARY["path"], LibraryUse.PROCESS),), 0
 )
 SHARED = ("governance", "identity_ca", "permissions_ca")
 

@@ -29,7 +29,7 @@ from sros_tool.keystore.confirmation import (
 from sros_tool.keystore.delivery.robot import import_answer
 from sros_tool.keystore.describe import describe, history
 from sros_tool.keystore.fleet_status import fleet_metrics, fleet_status
-from sros_tool.keystore.issuing.authority import check_imported
+from sros_tool.keystore.issuing.authority import check_imported_ca
 from sros_tool.keystore.ledger import certificate_entry
 from sros_tool.keystore.lifecycle.rotation import read_rotation, rotation_status
 from sros_tool.keystore.participant import JoinContext
@@ -136,7 +136,7 @@ def _certificate(data: bytes, place: Place) -> None:
 
 
 def _imported(data: bytes, place: Place) -> None:
-    check_imported("identity", data, place.corpus.key, NOW)
+    check_imported_ca("identity", data, place.corpus.key, NOW)
 
 
 def _request(data: bytes, place: Place) -> None:

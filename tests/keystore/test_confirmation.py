@@ -20,9 +20,9 @@ from sros_tool.keystore.confirmation import (
     MAX_BYTES,
     MOST_PROBLEMS,
     MOST_REQUESTS,
+    LibraryUse,
     RobotDds,
     RobotLibrary,
-    Seen,
     make_confirmation,
     parse_confirmation,
     render_confirmation,
@@ -50,7 +50,7 @@ def test_a_confirmation_names_all_files_but_keys(export: Path) -> None:
     (export / "enclaves/r7/base/notes.txt").write_text("mine")
     (export / "enclaves/my-backup").mkdir(exist_ok=True)
     (export / "enclaves/my-backup/key.pem").write_text("not an enclave")
-    dds = RobotDds((RobotLibrary("Fast DDS", "", "/libfastdds.so", Seen.INSTALLED),) * 102, 3)
+    dds = RobotDds((RobotLibrary("Fast DDS", "", "/libfastdds.so", LibraryUse.INSTALLED),) * 102, 3)
     made = replace(make_confirmation(export, "r7", now=NOW), dds=shortened_dds(dds))
     assert made.dds == RobotDds(dds.libraries[:100], 5), "what it does not name counts as unseen"
     wanted = {

@@ -76,7 +76,7 @@ def test_stated_expressions_allow_what_the_policy_allows(policy: Policy) -> None
             if topic.startswith("rt/") and len(topic) > 3:
                 for verb in ("publish", "subscribe"):
                     allowed = rules.allow(enclave.path, verb, topic[2:])
-                    assert stated.allow(verb, topic) == allowed, (verb, topic)
+                    assert stated.allows(verb, topic) == allowed, (verb, topic)
 
 
 @given(policies())

@@ -18,7 +18,7 @@ import pytest
 
 from sros_tool.dds.decision.vendors import TESTED, Vendor, joined_titles
 from sros_tool.errors import KeystoreError
-from sros_tool.keystore.issuing.acceptance import refusals, refuse_stopping
+from sros_tool.keystore.issuing.acceptance import refusals, refuse_stopping_nodes
 from sros_tool.keystore.layout import CRL, enclave_path, list_enclaves
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
 from sros_tool.keystore.lifecycle.revoke import revoke
@@ -273,12 +273,12 @@ def test_what_is_staged_is_evaluated(
     with Transaction(root, dry_run=dry_run) as transaction:
         stage(transaction, other)
         if not stopped:
-            assert refuse_stopping(transaction, now()) == ()
+            assert refuse_stopping_nodes(transaction, now()) == ()
             return
         with pytest.raises(KeystoreError) as refusal:
-            refuse_stopping(transaction, now())
+            refuse_stopping_nodes(transaction, now())
         assert f"start in {stopped} of" in refusal.value.what
-        (note, *_) = refuse_stopping(transaction, now(), allowed=TESTED)
+        (note, *_) = refuse_stopping_nodes(transaction, now(), allowed=TESTED)
         assert note.text.startswith(f"{TESTED[0].title} refuses {stopped} from now on")
 
 
@@ -291,7 +291,7 @@ def test_an_enclave_that_was_broken_before_hides_no_other_one(sound: Path, tmp_p
     with Transaction(root) as transaction:
         _break_governance(transaction, other)
         with pytest.raises(KeystoreError, match="start in /a, /b, /b/c of"):
-            refuse_stopping(transaction, now())
+            refuse_stopping_nodes(transaction, now())
 
 
 def test_a_revoked_enclave_that_is_put_back_keeps_nobody_from_signing_a_list(
@@ -310,7 +310,7 @@ def test_a_revoked_enclave_that_is_put_back_keeps_nobody_from_signing_a_list(
     with Transaction(root, dry_run=True) as transaction:
         _break_list(transaction, other)
         with pytest.raises(KeystoreError, match=r"start in /b, /b/c of"):
-            refuse_stopping(transaction, now())
+            refuse_stopping_nodes(transaction, now())
     ended = sros("crl", root, "--refresh").ok()
     assert "note [keystore.revoked-put-back]: the folder of /a is in the keystore" in ended.err
     assert (enclave_path(root, "/b") / "crl.pem").read_bytes() == (root / CRL).read_bytes()
@@ -340,9 +340,9 @@ def test_a_dry_run_says_what_it_did_not_keep(
     with Transaction(root, dry_run=True) as transaction:
         _break_governance(transaction, other)
         with pytest.raises(KeystoreError):
-            refuse_stopping(transaction, now())
+            refuse_stopping_nodes(transaction, now())
     monkeypatch.setattr("sros_tool.keystore.transaction._MOST_KEPT", 100)
     with Transaction(root, dry_run=True) as transaction:
         _break_governance(transaction, other)
-        (note,) = refuse_stopping(transaction, now())
+        (note,) = refuse_stopping_nodes(transaction, now())
         assert note.text.startswith("sros did not check enclaves/governance.p7s against the ")

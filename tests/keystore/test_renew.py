@@ -214,7 +214,7 @@ def test_what_check_says_expires_soon_is_what_soon_renews(
         found = keystore_findings(OpenedKeystore(root), Circumstances(now))
         assert any(finding.id == "enclave.ends-soon" for finding in found) is due
         for each in (life, life._replace(certificate=longer), life._replace(permissions=longer)):
-            assert each.due(parse_threshold("soon"), now) is due
+            assert each.is_due(parse_threshold("soon"), now) is due
 
 
 @pytest.mark.parametrize("text", ["", "%", "101%", "-1%", "6.5%", "30", "d", "0d", "٣%", "1e1%"])
@@ -239,7 +239,7 @@ def test_what_is_no_threshold(text: str) -> None:
 def test_due(threshold: str, day: int, due: bool, tmp_path: Path) -> None:
     root = made(tmp_path / "ks", "/a")
     (life,), _ = survey(OpenedKeystore(root))
-    assert life.due(parse_threshold(threshold), NOW + timedelta(days=day)) is due
+    assert life.is_due(parse_threshold(threshold), NOW + timedelta(days=day)) is due
 
 
 @pytest.mark.parametrize("hours", [1, 6, 24, 72])
@@ -248,9 +248,9 @@ def test_a_short_life_is_not_over_as_it_begins(hours: int, tmp_path: Path) -> No
     short = timedelta(hours=hours)
     root = made(tmp_path / "ks", "/a", certificate_validity=short, permissions_validity=short)
     (life,), _ = survey(OpenedKeystore(root))
-    assert not life.due(parse_threshold("66%"), NOW)
-    assert not life.due(parse_threshold("66%"), NOW + 0.6 * short)
-    assert life.due(parse_threshold("66%"), NOW + 0.7 * short)
+    assert not life.is_due(parse_threshold("66%"), NOW)
+    assert not life.is_due(parse_threshold("66%"), NOW + 0.6 * short)
+    assert life.is_due(parse_threshold("66%"), NOW + 0.7 * short)
 
 
 def test_the_life_of_a_certificate_of_another_ca_begins_when_it_came(tmp_path: Path) -> None:
@@ -259,16 +259,16 @@ def test_the_life_of_a_certificate_of_another_ca_begins_when_it_came(tmp_path: P
     file, hour = root / "enclaves/a/cert.pem", timedelta(hours=1)
     (life,), _ = survey(OpenedKeystore(root))
     short = life._replace(certificate=Window(NOW, NOW + 30 * hour))
-    assert not short.due(parse_threshold("66%"), NOW + 20 * hour)
+    assert not short.is_due(parse_threshold("66%"), NOW + 20 * hour)
     os.utime(file, (NOW.timestamp(), NOW.timestamp()))
     (life,), _ = survey(OpenedKeystore(root))
     short = life._replace(certificate=short.certificate)
-    assert not short.due(parse_threshold("66%"), NOW + 19 * hour)
-    assert short.due(parse_threshold("66%"), NOW + 20 * hour)
+    assert not short.is_due(parse_threshold("66%"), NOW + 19 * hour)
+    assert short.is_due(parse_threshold("66%"), NOW + 20 * hour)
     for strange in (-1e12, 1e12):
         os.utime(file, (strange, strange))
         (life,), _ = survey(OpenedKeystore(root))
-        assert not life._replace(certificate=short.certificate).due(
+        assert not life._replace(certificate=short.certificate).is_due(
             parse_threshold("66%"), NOW + 20 * hour
         )
 

@@ -26,7 +26,7 @@ from sros_tool.keystore.issuing.keyring import Keyring
 from sros_tool.keystore.known_keys import (
     _entries_since_trusted_ca,
     removed_enclaves,
-    revoked_issues,
+    revoked_entries,
     unknown_authorities,
     unlisted_revocations,
 )
@@ -554,14 +554,14 @@ def test_a_revoked_certificate_of_a_ca_that_is_gone_is_not_of_a_trusted_one(
 ) -> None:
     """Also if all happens in one second, so that the times in the ledger do not tell."""
     revoke(separate, ["/b"], now=NOW)
-    (certificate,) = (e for e in revoked_issues(OpenedKeystore(separate)) if e.serial)
+    (certificate,) = (e for e in revoked_entries(OpenedKeystore(separate)) if e.serial)
     assert (certificate.what, certificate.enclave) == ("certificate", "/b")
     rotate_ca(separate, finish=True, now=NOW)
-    assert not [e for e in revoked_issues(OpenedKeystore(separate)) if e.serial]
+    assert not [e for e in revoked_entries(OpenedKeystore(separate)) if e.serial]
     shutil.rmtree(separate / "revoked")
-    assert not [e for e in revoked_issues(OpenedKeystore(separate)) if e.serial]
+    assert not [e for e in revoked_entries(OpenedKeystore(separate)) if e.serial]
     revoke(separate, ["/a"], now=NOW)
-    assert {e.enclave for e in revoked_issues(OpenedKeystore(separate)) if e.serial} == {"/a"}
+    assert {e.enclave for e in revoked_entries(OpenedKeystore(separate)) if e.serial} == {"/a"}
 
 
 def test_the_renewal_of_a_ca_brings_no_removed_enclave_of_an_earlier_ca_back(

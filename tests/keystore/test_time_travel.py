@@ -363,7 +363,7 @@ def test_without_renewal_the_checks_of_years_would_fail(tmp_path: Path) -> None:
         assert bool(early.problems(["/a"], now)) == bool(expected), days
         assert sorted({problem.file for problem in found}) == expected, days
         (life,), _ = survey(OpenedKeystore(root))
-        assert life.due(Threshold(remaining=timedelta(0)), now) == (days > 270)
+        assert life.is_due(Threshold(remaining=timedelta(0)), now) == (days > 270)
     late = BEGIN + timedelta(days=400)
     with pytest.raises(AssertionError):
         check_history(root, late)

@@ -221,14 +221,14 @@ def test_permissions_that_expire_soon_are_signed_again(
     late = NOW + length * 0.7
     assert state(folder, late).changed == NAMES
     assert (
-        read_credentials(OpenedKeystore(folder / "ks"), "/a").lifetime().expires()
+        read_credentials(OpenedKeystore(folder / "ks"), "/a").lifetime().first_expiry()
         > validity.not_after
     )
     assert state(folder, late).kept == NAMES
     # A longer validity would not make them last longer than their certificate.
     end = read_credentials(OpenedKeystore(folder / "ks"), "/a").lifetime().certificate.not_after
     assert state(folder, end - 20 * DAY).changed == NAMES
-    assert read_credentials(OpenedKeystore(folder / "ks"), "/a").lifetime().expires() == end
+    assert read_credentials(OpenedKeystore(folder / "ks"), "/a").lifetime().first_expiry() == end
     assert state(folder, end - DAY).kept == NAMES
     with pytest.raises(KeystoreError, match="3 enclaves are not valid now: /a, /b, /c") as late_for:
         state(folder, end + DAY)
@@ -251,7 +251,8 @@ def test_a_chosen_validity_takes_effect(folder: Path) -> None:
     settings.write_text(f"{before}[permissions]{after}")
     assert state(folder).changed == NAMES
     assert (
-        read_credentials(OpenedKeystore(folder / "ks"), "/a").lifetime().expires() == NOW + 30 * DAY
+        read_credentials(OpenedKeystore(folder / "ks"), "/a").lifetime().first_expiry()
+        == NOW + 30 * DAY
     )
     assert state(folder, NOW + DAY).kept == NAMES
 

@@ -467,7 +467,7 @@ def _settings_and_ledger_findings(keystore: CheckedKeystore) -> Iterator[Finding
         yield NOT_AS_SETTINGS.found("settings", clause, file)
     file = keystore.shown_path(LEDGER)
     with suppress(SrosError):  # a ledger that cannot be read is unread
-        if behind := keystore.opened.ledger_file.clock_behind(keystore.at.now):
+        if behind := keystore.opened.ledger_file.clock_clause(keystore.at.now):
             yield CLOCK_BEHIND.found("clock", behind, file)
         yield from _restore_findings(keystore, file)
     for gap in keystore.ledger.gaps:

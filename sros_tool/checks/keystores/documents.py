@@ -459,7 +459,7 @@ def _domain_findings(enclave: CheckedEnclave, grant: Grant, file: str) -> Iterat
     with suppress(SrosError):
         recorded, stated = enclave.keystore.fleet, enclave.keystore.at.fleet
         known = recorded is not None and robot_of(recorded, enclave.name) is not None
-        wanted = EnclaveDomains(governed, recorded if known else stated).of(enclave.name)
+        wanted = EnclaveDomains(governed, recorded if known else stated).domains_of(enclave.name)
     if allowed == wanted:
         return
     text = f"the permissions are for domain {str(allowed) or 'none'}, but "

@@ -375,7 +375,7 @@ def _real_path_in_mounted_secret(key: str) -> str:
 
 def _unread_path_finding(error: OSError, root: str) -> Finding:
     path = os.fsdecode(error.filename)
-    remedy = UnreadPath.of(error).remedy(Path(root))
+    remedy = UnreadPath.from_error(error).remedy(Path(root))
     return UNREADABLE.found(path, str(error.strerror), path, remedy=remedy)
 
 

@@ -32,7 +32,7 @@ def refuse_archive_name(folder: Path, remedy: str) -> None:
 
 
 class ArchiveLimits(NamedTuple):
-    """Maximum size in bytes of an archive, packed and unpacked, and its number of entries."""
+    """Maximum size in bytes of an archive, packed and unpacked, and maximum number of entries."""
 
     packed: int
     unpacked: int
@@ -40,13 +40,13 @@ class ArchiveLimits(NamedTuple):
 
 
 _EXTENSION_HEADERS = (tarfile.XHDTYPE, tarfile.GNUTYPE_LONGNAME)
-"""The types of headers that say more about the next entry."""
+"""Types of headers with further fields of the entry that follows, such as a long path."""
 _MOST_HEADER = 1024
-"""Maximum size in bytes of such a header, which has room for a path."""
+"""Maximum size in bytes of a header with further fields: enough for a path."""
 _SPARSE_KEY = b"GNU.sparse."
-"""Begins the fields of a sparse file in the header of its entry."""
+"""Prefix of the fields that the header of a sparse file has."""
 _LIMITS_OF_ONE_ENCLAVE = ArchiveLimits(16 * 1024 * 1024, MAX_UNPACKED, 200)
-OF_ONE_ROBOT = ArchiveLimits(64 * 1024 * 1024, 256 * 1024 * 1024, 20_000)
+LIMITS_OF_ONE_ROBOT = ArchiveLimits(64 * 1024 * 1024, 256 * 1024 * 1024, 20_000)
 """The limits of an archive with all enclaves of a robot."""
 _GZIP_WINDOW_BITS = 16 + zlib.MAX_WBITS
 

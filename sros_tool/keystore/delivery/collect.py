@@ -63,7 +63,7 @@ from sros_tool.keystore.lifecycle.revocation_list import LostRecords
 from sros_tool.keystore.lifecycle.revoke import (
     REVOKED_AGAIN,
     restore_revocations,
-    restored_note,
+    restored_list_note,
 )
 from sros_tool.keystore.outcomes import changes_below
 from sros_tool.keystore.reader import OpenedKeystore
@@ -84,9 +84,9 @@ from sros_tool.values import DryRun, FileChange, FileChanges, NamedKeystore, Not
 from sros_tool.wording import counted, first_few
 
 _MOST_NAMES = 100_000
-"""Maximum number of names in an inbox that sros reads to find names of no robot."""
+"""Maximum number of names that sros reads in an inbox to find folders that belong to no robot."""
 _SHOWN = 5
-_FEW = 4
+_MOST_SEARCHES = 4
 """Number of certificates up to which a ledger without index is searched once per certificate."""
 
 
@@ -162,7 +162,7 @@ class CollectedInbox(NamedTuple):
     inbox: Path
     """The folder with the messages, as given by the user."""
     robots: Sequence[CollectedMessage]
-    """The robots of the fleet, sorted by name."""
+    """The outcome for each robot of the fleet, sorted by name."""
     not_signed: str
     """Why the CAs could not sign requests, as a clause; the exit status is then 2. Empty if no CA
     failed.
@@ -216,7 +216,8 @@ def collect(
     Raises:
         KeystoreError: the keystore has no fleet, or cannot be read; another process collects
             messages, too.
-        DocumentError: ``restored`` names no robot of the fleet; the inbox is not a folder.
+        DocumentError: ``restored`` has a name that no robot of the fleet has; the inbox is not a
+            folder.
     """
     recorded_fleet(OpenedKeystore(root))
     with nullcontext() if dry_run else locked_confirmations(root):
@@ -235,7 +236,7 @@ def collect(
         taken: list[_ReceivedMessage] = []
         for message in _read_inbox(inbox, fleet, verifier):
             if message.verified:
-                message.requests = renewals.judge(message.robot, message.verified)
+                message.requests = renewals.decide(message.robot, message.verified)
                 message.crl = message.verified.confirmation.crl
                 message.seal = message.verified.confirmation.seal
             if message.crl and forgotten.add(message.crl.encode()):
@@ -311,8 +312,11 @@ def _refusals(
 # ── reading the inbox ──────────────────────────────────────────────────────────────────────
 
 
-class _Verified(NamedTuple):
-    """A message whose signature, certificate and robot were verified."""
+class _VerifiedMessage(NamedTuple):
+    """A message whose signature, certificate and robot were verified.
+
+    ``enclave`` is the enclave whose key signed the message with ``certificate``.
+    """
 
     confirmation: Confirmation
     enclave: str
@@ -328,7 +332,7 @@ class _ReceivedMessage:
     why: str = ""
     enclave: str = ""
     sequence: int | None = None
-    verified: _Verified | None = None
+    verified: _VerifiedMessage | None = None
     received: ReceivedConfirmation | None = None
     crl: str | None = None
     """The revocation list in the message; it counts only if a CA of the keystore signed it."""
@@ -405,7 +409,11 @@ def _read_inbox(inbox: Path, fleet: Fleet, verifier: _Verifier) -> Iterator[_Rec
             try:
                 file = _read_message(folder, robot.name)
                 if not is_revoked:
-                    yield verifier.take(robot, file) if file else _ReceivedMessage(robot, "missing")
+                    yield (
+                        verifier.verify_message(robot, file)
+                        if file
+                        else _ReceivedMessage(robot, "missing")
+                    )
                     continue
                 taken = _ReceivedMessage(robot, "revoked")
             except _RefusedError as refusal:
@@ -419,7 +427,10 @@ def _read_inbox(inbox: Path, fleet: Fleet, verifier: _Verifier) -> Iterator[_Rec
 
 
 def _keep_parts_signed_by_cas(received: _ReceivedMessage, message: bytes) -> None:
-    """Keep the parts of a refused message that CAs signed: revocation list and seal."""
+    """Store the parts of a refused message that a CA may have signed: revocation list and seal.
+
+    The certificate of the message's signer is stored, too.  Nothing is verified here.
+    """
     with suppress(SrosError):
         signed = smime.parse_new(message)
         received.signer_certificate = signed.signer()
@@ -499,7 +510,7 @@ class _Verifier:
         self._searched = 0
         self._authorities = keystore.authority(IDENTITY)
 
-    def take(self, robot: Robot, file: _File) -> _ReceivedMessage:
+    def verify_message(self, robot: Robot, file: _File) -> _ReceivedMessage:
         """Return a robot's message after verifying it, with the confirmation to keep.
 
         Raises:
@@ -551,10 +562,10 @@ class _Verifier:
         before_it = (last.confirmation.release if last else None) or 0
         went_back = installed is not None and installed < before_it and not is_restored
         boot = verified.confirmation.boot
-        boots, alternated = (before or message).successor(boot, arrived)
+        boots, alternated = (before or message).next_boots(boot, arrived)
         if last and (alternated or went_back) and self._has_new_keys(robot, last):
             went_back = False
-            boots, alternated = message.successor(boot, arrived)
+            boots, alternated = message.next_boots(boot, arrived)
         # A new agent begins without a release, and a robot can only claim unpublished releases.
         if went_back and installed and self._is_published(before_it):
             alternated = arrived
@@ -612,7 +623,7 @@ class _Verifier:
         earliest = last.time if last else file.written
         return min(max(file.written, earliest), self._now).replace(microsecond=0)
 
-    def _verify(self, robot: Robot, data: bytes) -> _Verified:
+    def _verify(self, robot: Robot, data: bytes) -> _VerifiedMessage:
         try:
             signed = smime.parse_new(data)
             signer = signed.signer()
@@ -632,7 +643,7 @@ class _Verifier:
             raise _RefusedError(f"it is the confirmation of another robot, {confirmation.robot}")
         if confirmation.sequence is None:
             raise _RefusedError("it has no sequence number, although `sros agent` writes one")
-        return _Verified(confirmation, enclave, signer)
+        return _VerifiedMessage(confirmation, enclave, signer)
 
     def was_revoked(self, robot: Robot) -> bool:
         """Return whether all enclaves of a robot were revoked."""
@@ -680,7 +691,7 @@ class _Verifier:
         if is_of_replaced_ca:
             why = "its identity CA was replaced: the robot missed the rotation of this CA"
             raise _OutdatedCertificateError(why, why)
-        issued = self._issued(digest(signer))
+        issued = self._issue_entry(digest(signer))
         if issued is None:
             raise _RefusedError(
                 f"{NOT_IN_LEDGER}, though the keystore's identity CA issued it: the keystore may "
@@ -700,12 +711,12 @@ class _Verifier:
     def _was_of_replaced_ca(self, robot: Robot, signer: x509.Certificate) -> bool:
         """Return whether a replaced CA issued the certificate to an enclave of the robot.
 
-        Its digest must be in the ledger.  So a copy of the replaced CA's key is not enough to make
-        such a certificate.
+        The certificate's digest must be in the ledger.  So nobody can make such a certificate with
+        only a copy of the replaced CA's key.
         """
         if any(issued_by(signer, authority) for authority in self._authorities):
             return False
-        issued = self._issued(digest(signer))
+        issued = self._issue_entry(digest(signer))
         return bool(issued and robot_of(self._fleet, issued.enclave) == robot)
 
     def _has_key_of(self, enclave: str, signer: x509.Certificate) -> bool:
@@ -718,9 +729,9 @@ class _Verifier:
             return present.public_key() == signer.public_key()
         return False
 
-    def _issued(self, sha256: str) -> Entry | None:
+    def _issue_entry(self, sha256: str) -> Entry | None:
         """Return the ledger's entry for a certificate (SHA-256 of the DER), or None."""
-        if self._searched < _FEW or self._keystore.ledger_file.is_indexed:
+        if self._searched < _MOST_SEARCHES or self._keystore.ledger_file.is_indexed:
             self._searched += 1
             entries: Sequence[Entry] = self._keystore.ledger_with("sha256", sha256).entries
         else:
@@ -760,7 +771,10 @@ def _proves_issue(entry: Entry, sha256: str) -> bool:
 
 @dataclass(slots=True)
 class _DecidedRequest:
-    """A request for renewal and the decision on it; ``request`` is None if it is not signed."""
+    """A request for renewal and the decision on it.
+
+    ``request`` is the request to sign; None if the decision is not to sign.
+    """
 
     result: CollectedRequest
     request: SigningRequest | None = None
@@ -770,7 +784,7 @@ class _DecidedRequest:
     """Whether the request has another key than the enclave's current certificate."""
 
     def set_outcome(self, outcome: str, why: str = "") -> None:
-        """Set the outcome of a request that is not signed."""
+        """Decide that the request is not signed; ``why`` is the reason as a clause."""
         self.result = self.result._replace(outcome=outcome, why=why)
         self.request = None
 
@@ -783,8 +797,8 @@ class _Renewals:
         self._fleet = fleet
         self._now = now
 
-    def judge(self, robot: Robot, message: _Verified) -> list[_DecidedRequest]:
-        """Return the requests of a message, each with the decision on it."""
+    def decide(self, robot: Robot, message: _VerifiedMessage) -> list[_DecidedRequest]:
+        """Return the requests of a verified message with the decisions on them."""
         judged: list[_DecidedRequest] = []
         names: set[str] = set()
         for text in message.confirmation.requests or ():
@@ -812,7 +826,7 @@ class _Renewals:
         return judged
 
     def _decide_request(
-        self, robot: Robot, message: _Verified, request: SigningRequest
+        self, robot: Robot, message: _VerifiedMessage, request: SigningRequest
     ) -> tuple[str, str]:
         """Return the outcome of a request, and the reason; "renewed" means that it may be signed.
 
@@ -842,7 +856,7 @@ class _Renewals:
         # be wrong.
         due = min(
             validity.not_after - validity.lifetime(made) / 2
-            for validity, made in self._issued(name)
+            for validity, made in self._issued_validities(name)
         )
         if self._now < due:
             return "not_due", f"it can be renewed from {iso(due)}"
@@ -867,7 +881,7 @@ class _Renewals:
             self._check_grace(robot, validity_of(certificate))
         return "renewed", ""
 
-    def _issued(self, name: str) -> Iterator[tuple[Window, datetime | None]]:
+    def _issued_validities(self, name: str) -> Iterator[tuple[Window, datetime | None]]:
         """Yield the validities of an enclave's certificate and permissions, with their issue times.
 
         The time is None for files that the ledger does not have, such as files of ros2/sros2.
@@ -909,11 +923,12 @@ def _revoke_again(
     keyring: Keyring,
     dry_run: bool,
 ) -> tuple[str, list[Note], list[FileChange]]:
-    """Revoke certificates that only lists of robots revoke; refuse requests signed with them.
+    """Revoke certificates that only the revocation lists of robots revoke.
 
-    Returns the same as `_sign`.  Certificates that the ledger lacks are recorded.  If the lists
-    cannot be signed, no request is signed.  But for lists of a CA service there is only a note,
-    because only this service signs its lists and knows its certificates.
+    Requests for which such a certificate vouches are refused.  ``robots_with_lists`` are the robots
+    whose lists revoke more than the keystore's.  Certificates that the ledger lacks are recorded.
+    If the keystore cannot sign its next list, no request is signed.  For a CA service, there is
+    only a note, because only the service signs its lists and knows its certificates.
     """
     is_later = bool(forgotten_lists.later_number)
     unknown = forgotten_lists.unknown_certificates(OpenedKeystore(root))
@@ -959,7 +974,7 @@ def _revoke_again(
             if request.request:
                 request.set_outcome("not_signed", why)
         return why, [], []
-    notes += [restored_note(restored, have)] if robots_with_lists else []
+    notes += [restored_list_note(restored, have)] if robots_with_lists else []
     return "", [*notes, *restored.notes], [*changes_below(root, restored.changes)]
 
 
@@ -992,8 +1007,8 @@ def _defer_requests(
 
     The key that vouches for a new key may have been revoked after the backup.  If the keystore must
     not publish before ``--restored``, all requests are refused, because a new certificate comes
-    with the rights of the backup.  ``is_restored`` and ``is_older`` say whether messages of this
-    run show lost revocations or later releases.
+    with the rights of the backup.  ``is_restored`` says that messages of
+    this run show lost revocations; ``is_older``, that they show later releases.
     """
     requests = [request for message in messages for request in message.requests if request.request]
     if not requests:

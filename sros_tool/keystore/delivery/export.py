@@ -22,7 +22,7 @@ from sros_tool.fleet.robots import robot_of
 from sros_tool.folders import Folder
 from sros_tool.keystore.confirmation import enclave_of
 from sros_tool.keystore.delivery.archive import (
-    OF_ONE_ROBOT,
+    LIMITS_OF_ONE_ROBOT,
     SUFFIXES,
     file_mode,
     pack,
@@ -34,7 +34,7 @@ from sros_tool.keystore.delivery.rollback import (
     ROLES_OF_FILES,
     check_own_keys,
     check_rollback,
-    trusted_in,
+    trust_files_in,
 )
 from sros_tool.keystore.fleet import load_fleet, unrecorded_notes
 from sros_tool.keystore.known_keys import (
@@ -170,7 +170,7 @@ def distribute(
 
 
 def included_keys_notes(keystore: OpenedKeystore, names: Iterable[str]) -> Iterator[Note]:
-    """Yield a note on enclaves that an export with ``--keyless`` has with their private keys."""
+    """Yield a note on enclaves whose private keys are in an export despite ``--keyless``."""
     keys = [name for name in names if (keystore.folder(name) / KEY_FILE).exists()]
     if keys:
         their = "its private key" if len(keys) == 1 else "their private keys"
@@ -183,7 +183,7 @@ def included_keys_notes(keystore: OpenedKeystore, names: Iterable[str]) -> Itera
 
 
 def _token_notes(files: Mapping[str, bytes]) -> Iterator[Note]:
-    """Yield notes on keys on tokens."""
+    """Yield a note for each enclave whose key is on a token, and so is not in ``files``."""
     for path in files:
         folder, _, file = path.rpartition("/")
         if file == KEY_URI_FILE:
@@ -224,7 +224,7 @@ def _other_enclave_notes(
                 "export.not-in-keystore",
                 f"'{target}' also has enclave {name}, which keystore '{keystore.root}' does not "
                 "have. If the enclave was revoked, remove it from "
-                f"the robot, and from this folder: `{_enclave_removal(target, [name], present)}`.",
+                f"the robot, and from this folder: `{_removal_command(target, [name], present)}`.",
             )
         elif owner and exported and owner.name not in exported:
             of_others[owner.name].append(name)
@@ -233,13 +233,13 @@ def _other_enclave_notes(
             "export.of-another-robot",
             f"'{target}' also has {first_few(enclaves, _MOST_SHOWN)} of robot {robot}: whoever "
             f"has the folder can act as {robot}. If files of {robot} are not meant to be there, "
-            f"remove them: `{_enclave_removal(target, enclaves, present)}`. If they were on "
+            f"remove them: `{_removal_command(target, enclaves, present)}`. If they were on "
             f"another robot, give {robot} new keys: `sros renew {quote(str(keystore.root))} "
             f"--robot {quote(robot)} --new-key --revoke-old`.",
         )
 
 
-def _enclave_removal(target: Path, names: Sequence[str], present: Sequence[str]) -> str:
+def _removal_command(target: Path, names: Sequence[str], present: Sequence[str]) -> str:
     """Return the command that removes enclaves from a folder, but not enclaves nested in them."""
     nested = any(
         other.startswith(f"{name}/") for name in names for other in {*present}.difference(names)
@@ -559,7 +559,7 @@ def _write_folder(
     with Transaction(target, new_keystore=True, dry_run=dry_run) as transaction:
         check_same_authority(target, files, earlier=_recorded_authorities(keystore))
         _check_robot(keystore, target, files)
-        check_rollback(keystore, target, trusted_in(target, files), files, now)
+        check_rollback(keystore, target, trust_files_in(target, files), files, now)
         check_own_keys(target, files)
         stale = _stale_paths(target, files)
         different = {
@@ -589,7 +589,7 @@ def _recorded_authorities(keystore: OpenedKeystore) -> frozenset[str]:
 
 
 def _check_robot(keystore: OpenedKeystore, target: Path, files: Mapping[str, bytes]) -> None:
-    """Raise `KeystoreError` if the agent in ``target`` belongs to another robot than an enclave."""
+    """Raise `KeystoreError` if an exported enclave belongs to another robot than ``target``."""
     settings = target / AGENT / "agent.toml"
     if not settings.is_file() or not (fleet := load_fleet(keystore)):
         return
@@ -678,7 +678,9 @@ def _unpack_archive(target: Path) -> Mapping[str, bytes]:
             list.
     """
     try:
-        return unpack(read_bytes(target, "archive", max_bytes=OF_ONE_ROBOT.packed), OF_ONE_ROBOT)
+        return unpack(
+            read_bytes(target, "archive", max_bytes=LIMITS_OF_ONE_ROBOT.packed), LIMITS_OF_ONE_ROBOT
+        )
     except DocumentError as error:
         raise KeystoreError(
             f"'{target}' cannot be compared with the new archive",

@@ -35,8 +35,8 @@ from sros_tool.keystore.delivery.published import (
     BEGIN_AGAIN,
     MOST_NUMBER,
     TIMESTAMP_PATH,
-    Evaluated,
     MetadataExpiry,
+    PassedEvaluation,
     PublishedRelease,
     PublishedRobot,
     altered_lately,
@@ -91,7 +91,7 @@ from sros_tool.keystore.lifecycle.revocation_list import LostRecords
 from sros_tool.keystore.lifecycle.revoke import (
     REPLACED_AFTER_BACKUP,
     restore_revocations,
-    restored_note,
+    restored_list_note,
 )
 from sros_tool.keystore.outcomes import changes_below
 from sros_tool.keystore.reader import OpenedKeystore
@@ -182,11 +182,11 @@ class PublishedFleet(NamedTuple):
     root_sha256: str
     """SHA-256 of the root metadata, in hexadecimal."""
     refused_by: Sequence[str]
-    """Robots that refuse their release, because their last message shows that they do not trust
-    the permissions CA that sealed it: you have to bring their files to them by hand.
+    """Robots that refuse their release: by their last message, they do not trust the permissions
+    CA that sealed it.  Bring their files to them by hand.
     """
     later: Sequence[LaterChange]
-    """With ``--restored``: changes from after the backup that the keystore lacks."""
+    """With ``--restored``: changes made after the backup, which the keystore lacks."""
     altered: Sequence[str]
     """Archives (``robots/NAME.tar.gz``) and ``metadata/timestamp.json``, if this run found these
     files missing, changed, or older than the keystore had published. This run published these files
@@ -247,7 +247,7 @@ def publish(
     checked_fleet(keystore)
     refuse_archive_name(folder, "Releases are published in a folder: name one, such as pub.")
     _check_apart(root, folder)
-    if behind := keystore.ledger_file.clock_behind(now):
+    if behind := keystore.ledger_file.clock_clause(now):
         raise KeystoreError(
             behind,
             "Robots would refuse what is published now, or get it with wrong dates.",
@@ -300,7 +300,7 @@ def publish(
         return run.result(keys)
 
 
-def _later_in_folder(keystore: OpenedKeystore) -> str:
+def _newer_folder_clause(keystore: OpenedKeystore) -> str:
     """Return a clause with evidence that the publishing folder is newer than the keystore, or "".
 
     The result is also "" if this cannot be determined here.  Only metadata that the keystore's own
@@ -364,7 +364,7 @@ def age_clause(keystore: OpenedKeystore) -> str:
     """
     if restores_after_last_release(keystore):
         return "robots have files that it signed but does not know"
-    return _later_in_folder(keystore)
+    return _newer_folder_clause(keystore)
 
 
 def unpublished_restore_clause(keystore: OpenedKeystore) -> str:
@@ -375,7 +375,7 @@ def unpublished_restore_clause(keystore: OpenedKeystore) -> str:
     """
     if has_unpublished_restore(keystore):
         return "robots have releases that it sealed but does not know"
-    return _later_in_folder(keystore)
+    return _newer_folder_clause(keystore)
 
 
 def older_keystore_notes(keystore: OpenedKeystore) -> Iterator[Note]:
@@ -441,7 +441,7 @@ class _RoleKeys:
             remove_file(spare)
 
     def _is_root_key(self, path: Path) -> bool | None:
-        """Return whether a file has the root key that robots trust; None if no key is in it."""
+        """Return whether a file has the root key that robots trust; None without a readable key."""
         from sros_tool.keystore.delivery.repository import load_signer
 
         try:
@@ -513,7 +513,11 @@ class _RoleKeys:
         return signers
 
     def _sign_root(self, expires: datetime, *, new: bool, is_required: bool) -> None:
-        """Add a version of the root, if its key is here; ``new`` also makes a new root key."""
+        """Add a version of the root metadata, if the root key is here.
+
+        ``new`` also makes a new root key.  If ``is_required`` is set, a missing root key is an
+        error.
+        """
         from sros_tool.keystore.delivery.repository import load_signer, new_key
 
         path = self._root_file
@@ -583,9 +587,10 @@ class _ChangedRobot(NamedTuple):
 class _ReleaseOutcome(NamedTuple):
     """The outcome of publishing a robot's release.
 
-    ``why`` says why the release was refused; otherwise it is empty.  ``published`` is the release
-    that the robot has now.  It is None if the robot has none, because its first or only archive is
-    missing.
+    ``published`` is the release that the robot has now.  It is None if the robot has none: its
+    first release was refused, or the archive of its earlier release is missing.  ``why`` says why
+    the release was refused; otherwise it is empty.  ``not_valid`` is a clause on what in a new
+    release is not valid now, or "".
     """
 
     robot: str
@@ -596,11 +601,15 @@ class _ReleaseOutcome(NamedTuple):
 
 
 class _RobotFiles(NamedTuple):
-    """The files of a robot's release, sorted by path, and the result of their evaluation."""
+    """The files of a robot's release, sorted by path, and the result of their evaluation.
+
+    ``not_valid`` is a clause on what is not valid now, or "".  ``evaluated`` is None if the files
+    have to be evaluated again before the next release.
+    """
 
     files: Mapping[str, bytes]
     not_valid: str
-    evaluated: Evaluated | None
+    evaluated: PassedEvaluation | None
 
 
 class _Evaluator:
@@ -616,7 +625,7 @@ class _Evaluator:
         self._now = now
         self._lists: dict[object, bool] = {}
 
-    def files(self, enclaves: Sequence[str], before: Evaluated | None) -> _RobotFiles:
+    def files(self, enclaves: Sequence[str], before: PassedEvaluation | None) -> _RobotFiles:
         """Return the files of a robot with the given enclaves, evaluated.
 
         ``before`` is the evaluation of its last release.
@@ -633,9 +642,11 @@ class _Evaluator:
                 return _RobotFiles(files, "", before)
         released = {name: released_enclave(self._keystore, name, self._now) for name in enclaves}
         files = _sorted_by_path(enclave.files for enclave in released.values())
-        not_valid = (f"{name}: {of.not_valid}" for name, of in released.items() if of.not_valid)
+        not_valid = (
+            f"{n}: {enclave.not_valid}" for n, enclave in released.items() if enclave.not_valid
+        )
         until = min(enclave.until for enclave in released.values())
-        evaluated = Evaluated(_digest_except_revocation_lists(files), self._now, until)
+        evaluated = PassedEvaluation(_digest_except_revocation_lists(files), self._now, until)
         return _RobotFiles(files, "; ".join(not_valid), evaluated if until > self._now else None)
 
     def _is_list_good(self, name: str, files: Mapping[str, bytes]) -> bool:
@@ -717,9 +728,9 @@ class _Publication:
             if unknown := self._unknown_releases():
                 raise self._unknown_error(unknown) from error
             raise
-        self._there = self._present.releases()
+        self._present_releases = self._present.releases()
         self._composed: NewMetadata | None = None
-        self._made: list[_ReleaseOutcome] = []
+        self._outcomes: list[_ReleaseOutcome] = []
         self._removed: list[str] = []
         self._damaged: set[str] = set()
         self._altered: Sequence[str] = ()
@@ -789,7 +800,9 @@ class _Publication:
             if is_later or unknown:
                 unknown = [self._latest_release()] if is_later else unknown
                 check_authorities(self.keystore, self._folder, unknown[-1])
-                for path, content in chain.from_iterable(of.files.items() for of in unknown):
+                for path, content in chain.from_iterable(
+                    release.files.items() for release in unknown
+                ):
                     if path.endswith(_ENDS_OF_LIST_PATHS):
                         forgotten.add(content)
             else:
@@ -812,7 +825,7 @@ class _Publication:
         return is_recorded or self._claim_of_later_release() is not None
 
     def _claim_of_later_release(self) -> RobotClaim | None:
-        """Return what a robot says about a release that the keystore never published, if any."""
+        """Return a robot's claim to have a release that the keystore never published, or None."""
         entries = self.keystore.ledger_with("what", "release").entries
         last = max((entry.number for entry in entries if entry.what == "release"), default=0)
         fleet = recorded_fleet(self.keystore)
@@ -844,7 +857,7 @@ class _Publication:
 
         Once the keystore records another folder, the later releases would no longer be noticed.
         """
-        if evidence := _later_in_folder(self.keystore):
+        if evidence := _newer_folder_clause(self.keystore):
             where = f"{quote(str(self.keystore.root))} {quote(self._earlier_folder)}"
             raise KeystoreError(
                 evidence,
@@ -871,7 +884,7 @@ class _Publication:
         )
 
     def _unseen_root_note(self) -> Note:
-        """Return a note on replaced keys of publishing, which an empty folder does not show."""
+        """Return a note that keys of publishing may have been replaced without a trace here."""
         version = self.roots.last.version
         return Note(
             "fleet.root-not-seen",
@@ -903,7 +916,12 @@ class _Publication:
         )
 
     def _has_later_releases(self, restored: bool) -> bool:
-        """Return whether the folder has later releases; raise an error unless ``restored``."""
+        """Return whether the folder has later releases than the keystore knows.
+
+        Raises:
+            KeystoreError: it has, and ``restored`` is false.
+            DocumentError: the list of published releases has numbers that were never given.
+        """
         if self.list.number >= (unused := self.keystore.ledger_file.next_number()):
             number = self.list.number
             why = f"It has release {number}, but the last number in the ledger is {unused - 1}."
@@ -920,7 +938,7 @@ class _Publication:
             known = self.list.robots
             robots = [
                 robot
-                for robot, release in self._there.items()
+                for robot, release in self._present_releases.items()
                 if robot not in known or release.number > known[robot].release.number
             ]
             raise self._restored_error(
@@ -942,7 +960,7 @@ class _Publication:
         known, present = self.list.versions, self._present.versions()
         if any(present.get(name, 0) > known[name] for name in known.keys() - RENEWED_ALONE):
             fleet = recorded_fleet(self.keystore)
-            gone = sorted(self.list.robots.keys() - self._there.keys())
+            gone = sorted(self.list.robots.keys() - self._present_releases.keys())
             if removed := [robot for robot in gone if self._enclaves(fleet, robot)]:
                 revoke = f"sros revoke {quote(str(self.keystore.root))} --robot {removed[0]}"
                 raise self._restored_error(
@@ -963,15 +981,18 @@ class _Publication:
     @property
     def _highest_number(self) -> int:
         """The highest number of a release in the folder; 0 without a release."""
-        return max((release.number for release in self._there.values()), default=0)
+        return max((release.number for release in self._present_releases.values()), default=0)
 
     def _latest_release(self) -> Release:
         """Return a release with the highest number; it has the last CAs and revocation list.
 
-        Robots without such a release may have been refused since, and still have earlier files.
+        Releases with lower numbers may have earlier files, if later releases of their robots were
+        refused.
         """
         problem = ""
-        last = (robot for robot in self._there.items() if robot[1].number == self._number)
+        last = (
+            robot for robot in self._present_releases.items() if robot[1].number == self._number
+        )
         for robot, present_release in last:
             try:
                 if not (data := self._read(robot, present_release)):
@@ -1017,7 +1038,7 @@ class _Publication:
         self._revoked = frozenset(revocation.names("revoked"))
         if forgotten_lists.lists:
             whence = f"the last release in '{self._folder}' has"
-            self.notes.append(restored_note(revocation, whence))
+            self.notes.append(restored_list_note(revocation, whence))
         notes = [note for note in revocation.notes if note.id != REPLACED_AFTER_BACKUP]
         self.notes += notes
         if (forgotten_lists.lists or notes) and not self._dry_run:
@@ -1046,7 +1067,7 @@ class _Publication:
         """
         releases = sorted(self._sealed_releases(), key=lambda release: release.number)
         last: dict[str, Release | None] = {release.robot: release for release in releases}
-        for robot, published in self._there.items():
+        for robot, published in self._present_releases.items():
             sealed = last.get(robot)
             if sealed is None or sealed.number < published.number:
                 last[robot] = None
@@ -1154,7 +1175,9 @@ class _Publication:
     def _sealed_releases(self) -> Iterator[Release]:
         """Yield the releases in all archives that a permissions CA of the keystore sealed."""
         authorities = self.keystore.authority(PERMISSIONS)
-        yield from (each for each in self._releases() if not seal_problem(each, authorities))
+        yield from (
+            release for release in self._releases() if not seal_problem(release, authorities)
+        )
 
     def _releases(self) -> Iterator[Release]:
         """Yield the releases in all archives, whichever CA sealed them."""
@@ -1180,13 +1203,13 @@ class _Publication:
             has_files = before is not None and self._has_files_of(robot, before.release)
             if not before or before.files != state or not has_files:
                 changed_robots.append(_ChangedRobot(robot, names, state))
-            if before and not has_files and self._there.get(robot) == before.release:
+            if before and not has_files and self._present_releases.get(robot) == before.release:
                 self._damaged.add(robot)
-        known = self.list.robots.keys() | self._there.keys()
+        known = self.list.robots.keys() | self._present_releases.keys()
         gone = (known if among is None else looked_at) - wanted
         for name in gone:
             self.list.robots.pop(name, None)
-        self._removed = sorted({*self._removed, *(gone & self._there.keys())})
+        self._removed = sorted({*self._removed, *(gone & self._present_releases.keys())})
         return changed_robots
 
     def _enclaves(self, fleet: Fleet, robot: str) -> list[str]:
@@ -1249,9 +1272,9 @@ class _Publication:
 
         on_token = authority is not None and authority.on_token
         made = [(changed, work(changed))] if on_token else map_slices(changed, work)
-        self._made = [robot for _, part in made for robot in part]
+        self._outcomes = [robot for _, part in made for robot in part]
         lines = []
-        for robot, published, is_new, _, not_valid in self._made:
+        for robot, published, is_new, _, not_valid in self._outcomes:
             self.list.robots.pop(robot, None)
             if published:
                 self.list.robots[robot] = published
@@ -1340,7 +1363,7 @@ class _Publication:
         self.list.until = min(*self._composed.expires.values(), self.list.root_until)
         needed = {release.path(robot) for robot, release in releases.items()}
         needed |= {f"{_METADATA}/{version}.{n}.json" for n, version in self.list.versions.items()}
-        superseded = (path for path in self._paths() if path not in needed)
+        superseded = (path for path in self._removable_paths() if path not in needed)
         self.list.superseded = {
             path: self.list.superseded.get(path, self._now)
             for path in islice(superseded, _MOST_SUPERSEDED)
@@ -1357,7 +1380,8 @@ class _Publication:
             )
             self.notes.append(Note("fleet.archive-damaged", text))
         present, last = (
-            of.get("timestamp", 0) for of in (self._present.versions(), self.list.versions)
+            versions.get("timestamp", 0)
+            for versions in (self._present.versions(), self.list.versions)
         )
         if 0 < present < last and not self._is_other_folder:
             altered.append(TIMESTAMP_PATH)
@@ -1373,7 +1397,7 @@ class _Publication:
             **dict.fromkeys(altered, self._now),
         }
 
-    def _paths(self) -> Iterator[str]:
+    def _removable_paths(self) -> Iterator[str]:
         """Yield the paths of files in the folder that may be removed at some time."""
         if not (self._folder / _ARCHIVES).exists():
             return  # a dry run, before anything was published
@@ -1444,7 +1468,7 @@ class _Publication:
         outcomes = {robot: RobotRelease(robot, "removed", None, "") for robot in self._removed}
         for robot, kept in self.list.robots.items():
             outcomes[robot] = RobotRelease(robot, "kept", kept.release.number, "")
-        for robot, published, is_new, why, _ in self._made:
+        for robot, published, is_new, why, _ in self._outcomes:
             if is_new or why:
                 number = published.release.number if published else None
                 outcome = "refused" if why else "published"
@@ -1470,7 +1494,7 @@ class _Publication:
 
 
 def _robots_without_ca(keystore: OpenedKeystore, robots: Iterable[str]) -> Iterator[str]:
-    """Yield the robots that by their last message do not trust the CA that seals releases."""
+    """Yield the robots that, by their last message, do not trust the CA that seals releases."""
     if not (keystore.root / RETIRED).exists():  # no CA was ever replaced
         return
     sealing_ca = digest(keystore.authority(PERMISSIONS)[0])

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from sros_tool.errors import DocumentError, KeystoreError, SrosError
-from sros_tool.keystore.delivery.archive import OF_ONE_ROBOT, stated_size
+from sros_tool.keystore.delivery.archive import LIMITS_OF_ONE_ROBOT, stated_size
 from sros_tool.keystore.delivery.release import Release, read_release, release_target
 from sros_tool.keystore.layout import IDENTITY, LIST_FILES, PUBLISHED
 from sros_tool.keystore.reader import OpenedKeystore
@@ -63,7 +63,7 @@ class PublishedRelease(NamedTuple):
 
     def checked(self) -> PublishedRelease:
         """Return this release; raise `ValueError` if it has a value that sros never publishes."""
-        for value, most in ((self.number, MOST_NUMBER), (self.length, OF_ONE_ROBOT.packed)):
+        for value, most in ((self.number, MOST_NUMBER), (self.length, LIMITS_OF_ONE_ROBOT.packed)):
             check_positive_number(value, most)
         if not (isinstance(self.sha256, str) and _DIGEST.match(self.sha256)):
             raise ValueError("a SHA-256 does not have 64 hexadecimal digits")
@@ -77,7 +77,7 @@ def check_positive_number(value: object, maximum: int = MOST_NUMBER) -> int:
     return value
 
 
-class Evaluated(NamedTuple):
+class PassedEvaluation(NamedTuple):
     """The evaluation that found no problem in a robot's files, and the time for which it holds.
 
     ``files`` is a digest of the files without revocation lists, and of the version of sros. From
@@ -104,11 +104,11 @@ class PublishedRobot(NamedTuple):
     release: PublishedRelease
     content: str
     files: str
-    evaluated: Evaluated | None = None
+    evaluated: PassedEvaluation | None = None
 
 
 @dataclass
-class Published:
+class PublicationRecord:
     """The last publication: the releases by robot, and the versions of the metadata by name.
 
     ``superseded`` maps paths in the publishing folder that nothing names any more to the time when
@@ -171,25 +171,25 @@ class Published:
 
 
 def altered_lately(altered: Mapping[str, datetime], now: datetime) -> dict[str, datetime]:
-    """Return the files of ``Published.altered`` that were found in the last day before ``now``."""
+    """Return the files of `PublicationRecord.altered` that were found in the day before ``now``."""
     return {path: at for path, at in altered.items() if now - at < _ALTERED_FOR}
 
 
-def read_published(keystore: OpenedKeystore) -> Published:
+def read_published(keystore: OpenedKeystore) -> PublicationRecord:
     """Return the record of the last publication; an empty record if nothing was published.
 
     Raises:
         DocumentError: the file is damaged.
     """
     if not keystore.has(PUBLISHED):
-        return Published()
+        return PublicationRecord()
     try:
         path = keystore.root / PUBLISHED
         value = parse_json(read_bytes(path, "list of what is published", max_bytes=_MOST_BYTES))
         until, root_until = (
             parse_iso(end) if (end := value.get(name)) else None for name in ("until", "root_until")
         )
-        return Published(
+        return PublicationRecord(
             {name: _robot_from(robot_value) for name, robot_value in value["robots"].items()},
             {name: check_positive_number(version) for name, version in value["versions"].items()},
             {path: parse_iso(time) for path, time in value["superseded"].items()},
@@ -255,10 +255,10 @@ def releases_in(folder: Path, robots: int) -> Iterator[Release]:
     excess, size = f"more than {most}" if len(archives) > most else "", 0
     for path in () if excess else archives:
         try:
-            data = read_bytes(path, "archive", max_bytes=OF_ONE_ROBOT.packed)
+            data = read_bytes(path, "archive", max_bytes=LIMITS_OF_ONE_ROBOT.packed)
         except (SrosError, OSError):
             continue
-        size += max(len(data), min(stated_size(data), OF_ONE_ROBOT.unpacked))
+        size += max(len(data), min(stated_size(data), LIMITS_OF_ONE_ROBOT.unpacked))
         if size > most * _MEAN_ARCHIVE_BYTES:
             excess = f"more than {most * _MEAN_ARCHIVE_BYTES // 1024**2} MiB, unpacked, of"
             break
@@ -286,7 +286,7 @@ def damaged_list_error(keystore: OpenedKeystore, why: str = "") -> DocumentError
 def _robot_from(value: Mapping[str, Any]) -> PublishedRobot:
     release = PublishedRelease(value["number"], value["sha256"], value["length"]).checked()
     files, *times = value.get("evaluated", [""])
-    evaluated = Evaluated(str(files), *map(parse_iso, times)) if times else None
+    evaluated = PassedEvaluation(str(files), *map(parse_iso, times)) if times else None
     return PublishedRobot(release, str(value["content"]), str(value["files"]), evaluated)
 
 
@@ -306,7 +306,7 @@ class MetadataExpiry(NamedTuple):
     snapshot: timedelta = timedelta(days=7)
     timestamp: timedelta = timedelta(days=1)
 
-    def of(self, name: str) -> timedelta:
-        """Return how long the metadata ``name`` is valid; bins are like targets."""
+    def lifetime(self, name: str) -> timedelta:
+        """Return how long the metadata ``name`` is valid; bins of robots are like ``targets``."""
         of_roles: dict[str, timedelta] = self._asdict()
         return of_roles.get(name, self.targets)

@@ -24,7 +24,7 @@ from cryptography import x509
 
 from sros_tool.errors import DocumentError, SrosError, UnavailableError
 from sros_tool.fleet.robots import name_problem
-from sros_tool.keystore.delivery.archive import OF_ONE_ROBOT, listed_digests, pack, unpack
+from sros_tool.keystore.delivery.archive import LIMITS_OF_ONE_ROBOT, listed_digests, pack, unpack
 from sros_tool.keystore.layout import (
     ENCLAVES,
     KEY_FILE,
@@ -115,7 +115,7 @@ def read_release(data: bytes) -> Release:
             enclave's release, such as a private key; or its files differ from the list in the seal.
     """
     try:
-        files = unpack(data, OF_ONE_ROBOT)
+        files = unpack(data, LIMITS_OF_ONE_ROBOT)
         seal = files.pop(RELEASE_SEAL, b"")
         if not seal:
             raise DocumentError(f"it lacks {RELEASE_SEAL}")

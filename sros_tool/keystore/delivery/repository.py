@@ -441,7 +441,7 @@ class MetadataComposer:
         The last version can be in another folder, if the keystore published there since.
         """
         signed = metadata.signed
-        lasts = signed.expires - self._now > self._expiry.of(signed.type) / 2
+        lasts = signed.expires - self._now > self._expiry.lifetime(signed.type) / 2
         return lasts and signed.version == self.versions[name]
 
     def _can_be_kept(self, metadata: Metadata[_Content]) -> bool:
@@ -459,7 +459,7 @@ class MetadataComposer:
                 "Somebody with its key has used up the version numbers.",
                 BEGIN_AGAIN,
             )
-        content.expires = self._now + self._expiry.of(name)
+        content.expires = self._now + self._expiry.lifetime(name)
         metadata = Metadata(content)
         for signer in signers:
             metadata.sign(signer, append=True)

@@ -106,33 +106,37 @@ def has_unpublished_restore(keystore: OpenedKeystore) -> bool:
     return not _WAITING.isdisjoint(restores_after_last_release(keystore))
 
 
-def refuse_unpublished_restore(keystore: OpenedKeystore, doing: str) -> None:
+def refuse_unpublished_restore(keystore: OpenedKeystore, action: str) -> None:
     """Raise `KeystoreError` if the keystore is known to be older than its robots.
 
-    ``doing`` is a verb form, such as "Publishing".
+    ``action`` is what the error says must wait: a verb form, such as "Publishing".
     """
     if has_unpublished_restore(keystore):
-        raise older_than_robots_error(keystore, doing)
+        raise older_than_robots_error(keystore, action)
 
 
 class RobotClaim(NamedTuple):
-    """What a robot says in its last message about a release that was never published."""
+    """What a robot says in its last message about a release that was never published.
+
+    ``release`` names the release in text, such as ``release 7``.
+    """
 
     robot: str
     release: str
 
 
 def older_than_robots_error(
-    keystore: OpenedKeystore, doing: str, folder: str = "", claim: RobotClaim | None = None
+    keystore: OpenedKeystore, action: str, folder: str = "", claim: RobotClaim | None = None
 ) -> KeystoreError:
     """Return the error for a keystore that is older than its robots, as their messages show.
 
-    With ``claim``, only the word of one robot shows this.
+    ``action`` is as in `refuse_unpublished_restore`.  ``folder`` is the publishing folder, or ""
+    for the recorded one.  With ``claim``, only the message of one robot shows the keystore's age.
     """
     where = quote(str(keystore.root))
     place = quote(folder or read_published(keystore).folder or "PUB")
     shown = f"the keystore '{keystore.root}' is older than its robots, as messages or releases show"
-    doing, other = f"The keystore was restored from a backup, or is a copy. {doing}", ""
+    action, other = f"The keystore was restored from a backup, or is a copy. {action}", ""
     if claim:
         shown = (
             f"the robot {claim.robot} says that it has {claim.release}, which the keystore "
@@ -143,10 +147,10 @@ def older_than_robots_error(
             f"messages: examine the robot, or run `sros revoke {where} --robot {claim.robot}`, so "
             "that its messages no longer count."
         )
-        doing = "Perhaps the keystore was restored from a backup, or is a copy: then, publishing"
+        action = "Perhaps the keystore was restored from a backup, or is a copy: then, publishing"
     return KeystoreError(
         shown,
-        f"{doing} would undo later changes, such as a revocation, or bring back rights that were "
+        f"{action} would undo later changes, such as a revocation, or bring back rights that were "
         "taken away.",
         f"Restore a later backup. If there is none, run `sros fleet collect {where} INBOX`, "
         f"revoke again what was revoked after the backup, and run `sros fleet publish {where} "
@@ -195,14 +199,14 @@ class LaterSeals:
                 return is_earlier and not smime.parse(seal.encode()).problem_for(self._authorities)
         return False
 
-    def _has_issued(self, sealed: bytes) -> bool:
+    def _has_issued(self, seal_text: bytes) -> bool:
         """Return whether the keystore issued all files that a seal lists, except certificates.
 
         If so, publishing was only interrupted before the ledger recorded the number of the release,
-        and whoever can read the folder has this seal.  Certificates need no comparison, because
-        permissions are signed again with each new certificate.
+        and everybody who can read the folder has the seal.  Certificates need no comparison,
+        because permissions are signed again with each new certificate.
         """
-        listed = _LISTED_FILE.findall(sealed.decode())
+        listed = _LISTED_FILE.findall(seal_text.decode())
         digests = {sha256 for sha256, _ in listed}
         try:
             entries = self._keystore.ledger_file.with_values("sha256", digests).entries
@@ -223,7 +227,7 @@ class LaterSeals:
 def later_changes(
     keystore: OpenedKeystore, last: Mapping[str, Release | None], now: datetime
 ) -> list[LaterChange]:
-    """Return what the last releases of robots show, and the keystore lacks.
+    """Return the changes that the last releases of robots show and the keystore lacks.
 
     ``last`` maps robots to their last releases; None stands for a release that cannot be read.
     Certificates that were revoked are left out, because only the revocation lists show them.
@@ -231,7 +235,7 @@ def later_changes(
     """
     fleet, changes = recorded_fleet(keystore), list[LaterChange]()
     releases = [release for release in last.values() if release]
-    known = _issued_documents(keystore, releases)
+    known = _issued_digests(keystore, releases)
     for robot, release in sorted(last.items()):
         member = fleet.robots.get(robot)
         own = enclaves_of_robot(keystore, fleet, member) if member else ()
@@ -249,11 +253,11 @@ def later_changes(
     if releases:
         changes += _governance_change(keystore, max(releases, key=lambda e: e.number), known)
     missing = [change.enclave for change in changes if change.change == "missing"]
-    revoked = KnownKeys(keystore).revoked_before(missing) if missing else ()
+    revoked = KnownKeys(keystore).enclaves_revoked_before(missing) if missing else ()
     return [change for change in changes if change.enclave not in revoked]
 
 
-def _issued_documents(keystore: OpenedKeystore, releases: Sequence[Release]) -> frozenset[str]:
+def _issued_digests(keystore: OpenedKeystore, releases: Sequence[Release]) -> frozenset[str]:
     """Return the SHA-256 of the signed documents in ``releases`` that the keystore issued."""
     files = (PERMISSIONS_FILE, GOVERNANCE_FILE)
     digests = {
@@ -273,7 +277,10 @@ def _changes_of(
     known: Collection[str],
     now: datetime,
 ) -> Iterator[LaterChange]:
-    """Yield the changes of an enclave that ``files`` of its last release show."""
+    """Yield the changes of an enclave that ``files`` of its last release show.
+
+    ``known`` has the SHA-256 of documents that the keystore issued: they show no change.
+    """
     certificate = None
     with suppress(SrosError):  # without a certificate on one side, no key was replaced
         certificate = load_certificates(files.get(CERTIFICATE_FILE, b""), name)[0]
@@ -332,7 +339,7 @@ def _has_earlier_key(
 def _governance_change(
     keystore: OpenedKeystore, release: Release, known: Collection[str]
 ) -> Iterator[LaterChange]:
-    """Yield the change if a release has another governance, which the keystore did not issue."""
+    """Yield the change if a release has another governance, whose SHA-256 is not in ``known``."""
     paths = (path for path in release.files if path.endswith(f"/{GOVERNANCE_FILE}"))
     sent = release.files[next(paths)]
     if hashlib.sha256(sent).hexdigest() in known:
@@ -398,8 +405,8 @@ def refuse_lost_changes(
 ) -> None:
     """Raise `KeystoreError` if publishing to ``folder`` would undo changes after the backup.
 
-    One error names all changes, so that the remedy for one does not undo another in silence. The
-    error asks for consent to rights that were taken away only if no other change is lost.
+    One error names all changes, so that the remedy for one does not undo another in silence.  If
+    the only lost changes are rights that were taken away, the error asks for consent to the rights.
     """
     root, names = quote(str(keystore.root)), defaultdict[str, list[str]](list)
     for change in changes:

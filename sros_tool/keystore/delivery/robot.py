@@ -24,7 +24,7 @@ from sros_tool.keystore.delivery.rollback import (
     public_key_of,
     retired_authorities,
 )
-from sros_tool.keystore.issuing.acceptance import refuse_stopping
+from sros_tool.keystore.issuing.acceptance import refuse_stopping_nodes
 from sros_tool.keystore.issuing.authority import Authority
 from sros_tool.keystore.issuing.keyring import no_secrets
 from sros_tool.keystore.known_keys import KnownKeys
@@ -380,7 +380,7 @@ def check_answer(answer: RequestAnswer, key: PublicKey, *, now: datetime) -> Ope
             certificate, weak cryptography, or a file changed in transit.
     """
     files = {path.rpartition("/")[2]: data for path, data in answer.files.items()}
-    state, problems = evaluate_delivered(answer.name, files, key, now=now)
+    state, problems = evaluate_delivered_files(answer.name, files, key, now=now)
     if state.permissions_ca and (problem := _answer_seal_problem(answer, [state.permissions_ca])):
         problems.append(f"{SEAL}: {problem}")
     if problems:
@@ -398,7 +398,7 @@ def check_answer(answer: RequestAnswer, key: PublicKey, *, now: datetime) -> Ope
     return state
 
 
-def evaluate_delivered(
+def evaluate_delivered_files(
     name: str, files: Mapping[str, bytes], key: PublicKey, *, now: datetime
 ) -> tuple[OpenedEnclave, list[str]]:
     """Return the enclave with the delivered files, and clauses on why it cannot be used.
@@ -501,7 +501,7 @@ def import_answer(
                 transaction.remove(f"{enclave_folder(name)}/{file}")
         notes = (
             *_lost_revocation_notes(place, answer),
-            *refuse_stopping(
+            *refuse_stopping_nodes(
                 transaction, now, allowed=allow_refusal, remedy=lambda: _SIGN_REQUEST_AGAIN
             ),
         )
@@ -613,7 +613,7 @@ def _check_newer(place: Path, answer: RequestAnswer, certificate: x509.Certifica
                 "docs/howto/keystore_is_lost.md says how. If this CA is right, because `sros "
                 "rotate_ca --identity-ca` or --permissions-ca named it, add --force.",
             )
-    if older := older_list(*_lists_here_and_sent(place, answer)):
+    if older := older_list(*_installed_and_sent_lists(place, answer)):
         here, _ = older
         raise KeystoreError(
             f"the answer for enclave {answer.name} has an older revocation list",
@@ -623,7 +623,7 @@ def _check_newer(place: Path, answer: RequestAnswer, certificate: x509.Certifica
         )
 
 
-def _lists_here_and_sent(
+def _installed_and_sent_lists(
     place: Path, answer: RequestAnswer
 ) -> tuple[dict[str, bytes], dict[str, bytes]]:
     """Return the files with revocation lists: the files here, and the files in the answer."""
@@ -636,7 +636,7 @@ def _lost_revocation_notes(place: Path, answer: RequestAnswer) -> Iterator[Note]
 
     Certificates that the list lacks may have expired since.
     """
-    if lost := lost_serials(*_lists_here_and_sent(place, answer)):
+    if lost := lost_serials(*_installed_and_sent_lists(place, answer)):
         text = (
             f"the earlier revocation list revokes {counted(len(lost), 'certificate')} that the new "
             f"list lacks, such as {min(lost):x}. This is right if these certificates have expired: "

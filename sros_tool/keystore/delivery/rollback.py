@@ -142,7 +142,7 @@ def check_rollback(
             "certificates that were revoked since then. Nothing was changed.",
             "The keystore may come from a backup (docs/howto/keystore_is_lost.md says how to go "
             "on), or the files in the folder are of another keystore. If the keystore's CA is "
-            f"right, first {_removal_of(target, later)}",
+            f"right, first {_removal_remedy(target, later)}",
         )
     if foreign := _foreign_authorities(keystore, present, files):
         path, authority = next(iter(foreign.items()))
@@ -155,7 +155,7 @@ def check_rollback(
             f"Export from the keystore that issued these files. If '{keystore.root}' is the right "
             "keystore, because it replaces a lost keystore (docs/howto/keystore_is_lost.md) or its "
             "ledger lacks a rotation, first "
-            f"{_removal_of(target, foreign)}",
+            f"{_removal_remedy(target, foreign)}",
         )
     if lost := _lost_revocations(keystore, present, files, now):
         path, (what, why) = next(iter(lost.items()))
@@ -167,11 +167,11 @@ def check_rollback(
             f"and `sros crl {quote(str(keystore.root))} --refresh --crl {file}` revokes the same "
             "certificates "
             f"again. If the keystore's list is right, export all enclaves of the folder, but first "
-            f"{_removal_of(target, lost)}",
+            f"{_removal_remedy(target, lost)}",
         )
 
 
-def trusted_in(target: Path, files: Mapping[str, bytes]) -> dict[str, bytes]:
+def trust_files_in(target: Path, files: Mapping[str, bytes]) -> dict[str, bytes]:
     """Map the paths of CA files and revocation lists in a folder to their content.
 
     These are the files of all enclaves in the folder, and the files at the paths of ``files``.
@@ -185,7 +185,7 @@ def trusted_in(target: Path, files: Mapping[str, bytes]) -> dict[str, bytes]:
     return {path: data for path in paths if (data := _read_file(target / path))}
 
 
-def _removal_of(target: Path, paths: Iterable[str]) -> str:
+def _removal_remedy(target: Path, paths: Iterable[str]) -> str:
     if target.name.endswith(SUFFIXES):
         return f"remove the archive: `rm {quote(str(target))}`."
     files = " ".join(quote(str(target / path)) for path in paths)
@@ -273,11 +273,13 @@ def _lost_revocations(
 ) -> Mapping[str, tuple[str, str]]:
     """Map paths of lists in ``present`` to evidence that the keystore's list is older.
 
+    The evidence is two texts: what the list in the folder is or does, and why.
+
     The lists of all enclaves in the folder are compared, because a new enclave does not have a list
     yet.  A list counts only if a CA in ``files`` signed it.  The list of the same CA in ``files``
     must have at least the same number. That list must also have every certificate of the list here,
-    with two exceptions: certificates that have expired by the ledger, and certificates of a CA
-    service, which knows more certificates than the ledger.
+    with two exceptions: certificates that have expired according to the ledger, and certificates of
+    a CA service, which knows more certificates than the ledger.
     """
     places: dict[bytes, list[str]] = defaultdict(list)
     for path, data in present.items():
@@ -343,7 +345,7 @@ def check_own_keys(target: Path, files: Mapping[str, bytes]) -> None:
 
 
 def public_key_of(place: Path, name: str) -> PublicKey:
-    """Return the public key of an enclave, from its key file or its signing request.
+    """Return the public key of an enclave, from its key file or its signing request in ``place``.
 
     A key on a token has no file, but it signed the request.
 

@@ -28,7 +28,7 @@ from sros_tool.keystore.fleet import (
 )
 from sros_tool.keystore.issuing.enclave import (
     Issuance,
-    Issued,
+    IssuedEnclave,
     NewIdentity,
     StatedRights,
     default_rights,
@@ -399,7 +399,7 @@ class _RequestCertifier:
                 )
             )
 
-    def certify(self, request: SigningRequest, *, renew: bool, named: bool) -> Issued:
+    def certify(self, request: SigningRequest, *, renew: bool, named: bool) -> IssuedEnclave:
         """Write all files of the request's enclave except its key.
 
         Args:
@@ -417,7 +417,7 @@ class _RequestCertifier:
         _check_requested_key(request, known, present)
         if not self._remove_key_other_than(request):
             _check_same_key(change.keystore, request, present)
-        if not renew and not named and known.revoked_before([name]):
+        if not renew and not named and known.enclaves_revoked_before([name]):
             raise KeystoreError(
                 f"enclave {name} was revoked in keystore '{root}'",
                 "Whoever has the revoked key could have made this request to get access again.",
@@ -425,7 +425,7 @@ class _RequestCertifier:
             )
         if present:
             note = _new_key_note(root, present, request, change.now)
-            change.notes += note or [*known.shared_notes([name])]
+            change.notes += note or [*known.shared_key_notes([name])]
         else:
             self._new.append(name)
             change.notes += known.revoked_before_notes([name])
@@ -436,7 +436,7 @@ class _RequestCertifier:
             if stated is None:
                 change.notes += _default_rights_notes(change, name)
             enclave = stated or default_rights(change.template, name)
-            rights = StatedRights(enclave, self._domains.of(name))
+            rights = StatedRights(enclave, self._domains.domains_of(name))
         unique = change.template.unique_subject or (
             present is not None and has_unique_part(present.subject)
         )
@@ -537,7 +537,7 @@ def _check_answer_is_new(answer: Path, force: bool) -> None:
 def _was_certified_after_backup(known: KnownKeys, request: SigningRequest) -> bool:
     """Return whether a restored keystore certified the key of a request after its last backup."""
     key = key_digest(request.public_key)
-    return any(entry.key == key for entry in known.shown_after_restore([request.name]))
+    return any(entry.key == key for entry in known.certificates_shown_after_restore([request.name]))
 
 
 def _check_requested_name(
@@ -579,7 +579,7 @@ def _check_requested_key(
         else None
     )
     holder = f"the request for {request.name}"
-    known_keys.refuse_revoked(request.public_key, holder, remedy, certificate)
+    known_keys.refuse_revoked_key(request.public_key, holder, remedy, certificate)
     if not certificate:
         known_keys.refuse_shared_key(request.public_key, request.name, remedy)
 
@@ -644,7 +644,7 @@ def _new_key_note(
 
 
 def _lost_rights_notes(
-    change: KeystoreChange, earlier_permissions: EarlierPermissions, issued: Issued
+    change: KeystoreChange, earlier_permissions: EarlierPermissions, issued: IssuedEnclave
 ) -> list[Note]:
     """Return notes on rights that the enclave loses, and on how long its old files still work."""
     (grant,) = issued.permissions.grants
@@ -697,7 +697,9 @@ def _earlier_rights(
     return change.recorded_rights.rights_to_sign(name, earlier.digest, earlier.grant)
 
 
-def _answer_files(keystore: OpenedKeystore, issued: Issued, zenoh: StagedZenoh) -> dict[str, bytes]:
+def _answer_files(
+    keystore: OpenedKeystore, issued: IssuedEnclave, zenoh: StagedZenoh
+) -> dict[str, bytes]:
     """Map the paths of the answer's files to their content, sorted by path."""
     name = issued.issuance.name
     folder = enclave_folder(name)

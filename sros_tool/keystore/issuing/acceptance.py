@@ -1,9 +1,9 @@
 """Whether DDS vendors accept enclaves, checked before a transaction puts new files in place.
 
-Every verb that changes trust calls `refuse_stopping` before it commits.  This function evaluates
-each changed enclave as every tested vendor would load it, before and after the change.  If a vendor
-accepts an enclave before the change and would refuse it afterwards, the vendor's nodes would not
-start again, so the change is refused.
+Every verb that changes trust calls `refuse_stopping_nodes` before it commits.  This function
+evaluates each changed enclave as every tested vendor would load it, before and after the change.
+If a vendor accepts an enclave before the change and would refuse it afterwards, the vendor's nodes
+would not start again, so the change is refused.
 
 If several enclaves are alike in everything that vendors examine, only one of them is evaluated.
 """
@@ -103,7 +103,7 @@ class _Refusals:
     reasons: tuple[str, ...]
 
 
-def refuse_stopping(
+def refuse_stopping_nodes(
     transaction: Transaction,
     now: datetime,
     *,
@@ -181,7 +181,7 @@ def _stopped_enclaves(
     put_back: list[str] = []
     for (_, own, _), names in _enclaves_by_kind(files, now).items():
         for tried, name in enumerate(names, 1):
-            before, after = files.before(name), files.after(name)
+            before, after = files.files_before(name), files.files_after(name)
             refused = refusals(name, after, now) if after else {}
             is_last = tried == min(len(names), _MOST_TRIED)
             # Today's acceptance matters if a vendor would refuse the enclave, or if another enclave
@@ -315,7 +315,7 @@ def _names_text(names: Sequence[str]) -> str:
 # ── CAs that are imported ──────────────────────────────────────────────────────────────────
 
 
-def imported_notes(
+def imported_ca_notes(
     transaction: Transaction,
     template: Template,
     authorities: Authorities,
@@ -484,12 +484,12 @@ class _FilesOfChange:
             self._places[linked] = self.transaction.place_after(path)
         return self._places[linked]
 
-    def before(self, name: str) -> Files:
+    def files_before(self, name: str) -> Files:
         """Return the present files of an enclave; empty if a required file is missing."""
         folder = enclave_folder(name)
         return _if_complete({file: self.content(f"{folder}/{file}") for file in _LOADED_FILES})
 
-    def after(self, name: str) -> Files:
+    def files_after(self, name: str) -> Files:
         """Return an enclave's files after the transaction; empty if a required file is missing."""
         places = self.places_after(name)
         return _if_complete({file: self.content_after(place) for file, place in places.items()})
@@ -593,7 +593,7 @@ def _refusable_parts_of_crl(crl: bytes) -> tuple[object, ...] | None:
 
 
 def _signature_properties(message: bytes) -> tuple[object, ...] | None:
-    """Return the certificates and the hash of a message's signature; None if unreadable."""
+    """Return the certificates and the hash algorithm of a signed message; None if unreadable."""
     try:
         signed = smime.parse(message)
     except SrosError:

@@ -180,13 +180,13 @@ def create_authorities(
                     "Run `sros create_keystore` with --identity-ca FILE, a file with this "
                     "certificate and the certificates of its issuers.",
                 )
-            existing = check_imported(role, imported_cas[role], None, now)
+            existing = check_imported_ca(role, imported_cas[role], None, now)
             transaction.write(f"{PUBLIC}/{file}.cert.pem", existing.bundle)
             notes.extend(existing.notes)
             return Authority(existing.certificate, None, service)
         key = keyring.make(transaction, path, role, template, compared=role in imported_cas)
         if role in imported_cas:
-            existing = check_imported(role, imported_cas[role], key, now)
+            existing = check_imported_ca(role, imported_cas[role], key, now)
             certificate, bundle = existing.certificate, existing.bundle
             notes.extend(existing.notes)
         else:
@@ -307,7 +307,7 @@ class ImportedAuthority:
     notes: tuple[Note, ...]
 
 
-def check_imported(
+def check_imported_ca(
     role: str, data: bytes, key: PrivateKey | None, now: datetime
 ) -> ImportedAuthority:
     """Return the CA to which ``key`` belongs, with its chain, after checks.

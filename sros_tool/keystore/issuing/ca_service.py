@@ -110,7 +110,7 @@ class CaService:
         Raises:
             CaServiceError: the program fails, or the certificate is not the requested one.
         """
-        answer = self._answer(request)
+        answer = self._run_program(request)
         try:
             certificate = load_certificate(answer, f"of {self.program}")
             fault = _certificate_problem(certificate, request, authority, now)
@@ -121,7 +121,7 @@ class CaService:
         _LOG.info("%s issued a certificate for %s", self.program, request.enclave)
         return certificate
 
-    def _answer(self, asked: CertificateRequest) -> bytes:
+    def _run_program(self, asked: CertificateRequest) -> bytes:
         """Run the program, and return its standard output."""
         program = shutil.which(self.program)
         if program is None or not Path(program).is_absolute():

@@ -117,7 +117,7 @@ class EnclaveTokens:
                     "Whoever has the robot could issue any identity, or sign any rights.",
                     remedy,
                 )
-        self.known.refuse_revoked(public, f"enclave {name}", remedy)
+        self.known.refuse_revoked_key(public, f"enclave {name}", remedy)
         self.known.refuse_shared_key(public, name, remedy)
         return key
 
@@ -175,7 +175,7 @@ class Issuance:
 
 
 @dataclass(frozen=True, slots=True)
-class Issued:
+class IssuedEnclave:
     """The certificate and the new permissions of an enclave.
 
     ``document`` is the signed ``permissions.p7s``.  If the permissions do not change,
@@ -216,7 +216,7 @@ class EnclaveWriter:
     """Writer of enclaves, which issues certificates and permissions within one transaction.
 
     ``identity`` signs certificates, ``permissions`` signs permissions.  ``entries`` collects
-    entries for the ledger.  ``grants`` collects the new grants of enclaves if the keystore has a
+    entries for the ledger.  ``signed`` collects the new rights of enclaves if the keystore has a
     Zenoh network.  ``notes`` report CAs that expire too early for the template's validities.
     ``keys_on_token`` says that enclaves get keys on a token.
     """
@@ -272,7 +272,7 @@ class EnclaveWriter:
         """
         return min(self._certificate_validity.not_after, self._permissions_validity.not_after)
 
-    def write(self, issuance: Issuance) -> Issued:
+    def write(self, issuance: Issuance) -> IssuedEnclave:
         """Issue, prove, sign, stage and record an enclave's certificate and permissions.
 
         A certificate expires with the identity CA at the latest; permissions expire with their
@@ -284,7 +284,7 @@ class EnclaveWriter:
         name, identity, rights = issuance.name, issuance.identity, issuance.rights
         certificate = self._issue(name, identity) if isinstance(identity, NewIdentity) else identity
         if rights is None:
-            return Issued(issuance, certificate)
+            return IssuedEnclave(issuance, certificate)
         subject = subject_text(certificate.subject)
         validity = self._validity_of_permissions(name, certificate)
         permissions = _permissions(rights, subject, validity)
@@ -309,7 +309,7 @@ class EnclaveWriter:
             (grant,) = permissions.grants
             self.signed[name] = SignedRights(grant, policy, nodes)
         short = self._template.longest_validity(name) is not None
-        return Issued(issuance, certificate, permissions, message, short_lived=short)
+        return IssuedEnclave(issuance, certificate, permissions, message, short_lived=short)
 
     def would_change_only_dates(
         self, rights: StatedRights, certificate: x509.Certificate, validity: Window, text: bytes
@@ -430,6 +430,8 @@ class EnclaveWriter:
     ) -> dict[str, Result]:
         """Run ``work`` for all enclaves on all cores, and map each enclave to its result.
 
+        This process calls ``progress`` with each enclave for which its own work is done.
+
         Everything that forked workers issue and stage is added to this writer and its transaction.
         If a CA key is on a token, no workers are forked, because the session of a token does not
         survive a fork.
@@ -478,7 +480,10 @@ def _permissions(
 def _early_expiry_note(
     label: str, wanted_validity: Window, authority: x509.Certificate, root: Path
 ) -> Note | None:
-    """Return a note if the CA's expiry shortens the validity by more than 1 %; otherwise None."""
+    """Return a note if the CA's expiry shortens the validity by more than 1 %; otherwise None.
+
+    ``label`` names the files in the note, such as "certificates".
+    """
     end = validity_of(authority).not_after
     lost = wanted_validity.not_after - end
     if lost <= max(

@@ -224,9 +224,9 @@ class Keyring:
     def _read(self, keystore: OpenedKeystore, path: Path, role: str) -> bytes:
         """Return the PEM of a CA key.
 
-        The settings, or a link, in another user's keystore could name a CA key that only this user
-        can read, and so make this key sign.  So the owner of the keystore must also own the key,
-        unless the user named the place.
+        In a keystore of another user, the settings or a link could name a CA key that only the
+        user who runs sros can read, and so make this key sign.  So the owner of the keystore must
+        also own the key, unless the user named the place.
 
         Raises:
             KeystoreError: the key file cannot be read, or belongs to another user than the

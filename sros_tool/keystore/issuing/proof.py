@@ -55,7 +55,7 @@ _ACTION_TOPICS = ("feedback", "status")
 
 
 def _service_topics(client: bool, part: str = "") -> tuple[tuple[str, str, str], ...]:
-    """Return (direction, prefix, suffix) of both DDS topics of a service.
+    """Return (direction, prefix, suffix) of both DDS topics of a service, for client or server.
 
     ``part`` stands between the name and the suffix, as in the services of an action.
     """
@@ -64,7 +64,7 @@ def _service_topics(client: bool, part: str = "") -> tuple[tuple[str, str, str],
 
 
 def _action_topics(client: bool) -> tuple[tuple[str, str, str], ...]:
-    """Return (direction, prefix, suffix) of all DDS topics of an action."""
+    """Return (direction, prefix, suffix) of all DDS topics of an action, for client or server."""
     direction = _SUBSCRIBE if client else _PUBLISH
     services = (end for p in _ACTION_SERVICES for end in _service_topics(client, f"/_action/{p}"))
     return (*services, *((direction, "rt", f"/_action/{topic}") for topic in _ACTION_TOPICS))
@@ -92,8 +92,11 @@ class ExpressionSets:
         """Return the empty sets: no right and no denial."""
         return cls({_PUBLISH: set(), _SUBSCRIBE: set()}, {_PUBLISH: set(), _SUBSCRIBE: set()})
 
-    def allow(self, verb: str, topic: str) -> bool:
-        """Return whether a policy allows ``topic``: a rule allows it, and no rule denies it."""
+    def allows(self, verb: str, topic: str) -> bool:
+        """Return whether a policy allows ``verb`` ("publish", "subscribe") for the DDS ``topic``.
+
+        It does if an expression in ``allowed`` matches, and no expression in ``denied``.
+        """
         return _any_matches(self.allowed[verb], topic) and not _any_matches(
             self.denied[verb], topic
         )
@@ -263,7 +266,7 @@ def differences(
             access = _access(vendor, permissions, domain)
             for topic in sorted(topics):
                 for verb in (_PUBLISH, _SUBSCRIBE):
-                    allowed = stated.allow(verb, topic)
+                    allowed = stated.allows(verb, topic)
                     outcome = access.decide(AccessVerb(verb), topic).outcome
                     if outcome.ok != allowed:
                         disagreements.append(Disagreement(verb, topic, allowed, vendor, outcome))
@@ -335,11 +338,11 @@ def _access(vendor: Vendor, permissions: Permissions, domain: int) -> Access:
     window = grant.validity
     middle = window.not_before + (window.not_after - window.not_before) / 2
     at = datetime.fromtimestamp(int(middle.timestamp()), UTC) + timedelta(seconds=1)
-    governed = GovernedDomain(vendor, _everything_controlled(domain), domain)
+    governed = GovernedDomain(vendor, _governance_with_access_control(domain), domain)
     return Access(governed, permissions, grant.subject, moment=at)
 
 
-def _everything_controlled(domain: int) -> Governance:
+def _governance_with_access_control(domain: int) -> Governance:
     topic = TopicRule("*", **attribute_values(TopicRule, protect=True))
     rule = DomainRule(
         domains=DomainSet.of((domain, domain)),

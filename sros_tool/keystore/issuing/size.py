@@ -89,7 +89,7 @@ _SIZE_MARGIN = 256
 
 
 class PermissionsBytes(NamedTuple):
-    """Size of the signed permissions."""
+    """Size of the signed permissions in bytes."""
 
     before: int
     """Size before the policy was minimized."""
@@ -126,7 +126,10 @@ class PolicyMinimization(NamedTuple):
 
 
 class Minimization(NamedTuple):
-    """A policy reduced to the observed rights, and the result for each enclave."""
+    """A policy reduced to the observed rights, and the result for each enclave.
+
+    ``document`` is the reduced policy as XML.
+    """
 
     document: bytes
     enclaves: Sequence[MinimizedEnclave]
@@ -203,7 +206,10 @@ def _node_basics() -> Sequence[Group]:
 def _node_notes(
     policy: Policy, observed: Iterable[Policy], result: MinimizedPolicy, *, strict: bool
 ) -> Iterator[Note]:
-    """Yield a note for each node that differs where its enclave as a whole does not."""
+    """Yield notes on nodes whose rights in the policy differ from the observed rights.
+
+    Differences that the comparison of the whole enclave shows are left out.
+    """
     of_enclaves = {use.enclave: set(use.differing()) for use in result.uses}
     differing = nodes_not_as_observed(policy, observed, () if strict else _node_basics())
     for path, nodes in differing.items():

@@ -32,7 +32,7 @@ from sros_tool.keystore.fleet import (
     with_routers_of_robots,
     write_fleet,
 )
-from sros_tool.keystore.issuing.acceptance import refuse_stopping
+from sros_tool.keystore.issuing.acceptance import refuse_stopping_nodes
 from sros_tool.keystore.issuing.authority import Authorities, Authority, load_authority
 from sros_tool.keystore.issuing.enclave import EnclaveTokens, EnclaveWriter
 from sros_tool.keystore.issuing.keyring import IN_KEYSTORE, Keyring
@@ -53,7 +53,7 @@ from sros_tool.keystore.ledger import (
     certificate_entry,
     document_entry,
 )
-from sros_tool.keystore.lifecycle.replaced import ReplacedRights, Superseded
+from sros_tool.keystore.lifecycle.replaced import ReplacedRights, SupersededCertificate
 from sros_tool.keystore.outcomes import StagedZenoh
 from sros_tool.keystore.reader import OpenedKeystore, check_domain
 from sros_tool.keystore.rights import RecordedRights, SignedRights
@@ -311,7 +311,7 @@ class KeystoreChange:
         before = before or self.fleet
         wanted = with_routers_of_robots(network, before, self.fleet)
         missing = {*wanted.router_names()}.difference(self.names)
-        gone = set() if self.is_new else self.known.revoked_before(missing)
+        gone = set() if self.is_new else self.known.enclaves_revoked_before(missing)
         if not gone:
             return wanted
         return with_routers_of_robots(network, before, self.fleet, gone)
@@ -364,7 +364,7 @@ class KeystoreChange:
         public: PublicKey = certificate.public_key()  # type: ignore[assignment]
         where = f"{quote(str(self.root))} {name}"
         remedy = f"Give the enclave another key with `sros renew {where} --new-key --revoke-old`."
-        self.known.refuse_revoked(public, f"enclave {name}", remedy, certificate)
+        self.known.refuse_revoked_key(public, f"enclave {name}", remedy, certificate)
         return public
 
     def tokens(self, places: Mapping[str, TokenUri]) -> EnclaveTokens:
@@ -414,7 +414,10 @@ class KeystoreChange:
         )
 
     def revoke_superseded(
-        self, superseded: Sequence[Superseded], *, recipients: Sequence[str] | None = None
+        self,
+        superseded: Sequence[SupersededCertificate],
+        *,
+        recipients: Sequence[str] | None = None,
     ) -> None:
         """Revoke all earlier certificates of the enclaves whose certificates are ``superseded``.
 
@@ -424,7 +427,7 @@ class KeystoreChange:
         if not superseded:
             return
         lists = self.revocation_lists()
-        revocations = lists.superseded(superseded)
+        revocations = lists.superseded_revocations(superseded)
         if recipients is None:
             recipients = lists.recipients()
         self.restart = self.names if recipients is None else tuple(recipients)
@@ -512,7 +515,7 @@ class KeystoreChange:
         if signer is None:
             signer = self.permissions if self.identity.service else self.identity
             self._check_certificates_of_service()
-        if behind := self.keystore.ledger_file.clock_behind(self.now):
+        if behind := self.keystore.ledger_file.clock_clause(self.now):
             text = (
                 f"{behind}. If the clock is wrong, set it: files that are made now are valid for "
                 "too short a time. If it is right, it was ahead at the last change: the ledger "
@@ -606,7 +609,7 @@ class KeystoreChange:
             )
             self.notes.append(Note("service.not-asked", text))
         else:
-            self.notes += refuse_stopping(
+            self.notes += refuse_stopping_nodes(
                 self.transaction,
                 self.moment,
                 keystore=self.keystore,

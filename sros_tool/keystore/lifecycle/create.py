@@ -39,7 +39,7 @@ from sros_tool.keystore.fleet import (
     refuse_stale_domains,
     unrecorded_notes,
 )
-from sros_tool.keystore.issuing.acceptance import imported_notes
+from sros_tool.keystore.issuing.acceptance import imported_ca_notes
 from sros_tool.keystore.issuing.authority import create_authorities, write_copies
 from sros_tool.keystore.issuing.enclave import (
     EnclaveTokens,
@@ -79,7 +79,7 @@ from sros_tool.keystore.ledger import RESTORED, certificate_entry, document_entr
 from sros_tool.keystore.lifecycle.change import Changed, ChangeOptions, KeystoreChange
 from sros_tool.keystore.lifecycle.replaced import (
     ReplacedRights,
-    Superseded,
+    SupersededCertificate,
     counterpart_notes,
     earlier_permissions,
     replaced_rights,
@@ -185,7 +185,7 @@ def create_keystore(
         change.notes += change.authorities.notes
         # A CA service would issue a certificate for the example.
         if imported_cas and not change.identity.service:
-            change.notes += imported_notes(
+            change.notes += imported_ca_notes(
                 change.transaction, template, change.authorities, domains, change.now
             )
             if IDENTITY in imported_cas:
@@ -244,7 +244,7 @@ def create_permission(
     set: then the enclaves get new certificates for the same keys, and all earlier certificates are
     revoked.  With ``keep_same``, permissions that state the same rights are kept, as by
     `generate_artifacts`.  If ``policy`` is for a fleet, the permissions are for the domains of the
-    enclaves' robots.
+    enclaves' robots.  ``domain`` is as for `create_enclaves`.
 
     Raises:
         KeystoreError: an enclave does not exist; the fleet of the policy and the keystore's fleet
@@ -298,12 +298,13 @@ def generate_artifacts(
     If a policy names an existing enclave, the enclave's permissions are replaced, and with
     ``revoke_old`` also its certificate, as by `create_permission`.  Permissions that state the same
     rights and do not expire soon are kept (`EnclaveWriter.would_change_only_dates`).  With
-    ``revoke_old``, this requires that no other permissions fit the certificate.  The protection of
+    ``revoke_old``, this requires that no other permissions fit the certificate.  ``domain`` and
+    ``key`` are as for `create_enclaves`.  The protection of
     each name is raised to the level that the policies demand.  If the keystore does not exist and
     ``create`` is given, it is created from that template.
 
     All policies for a fleet must be for the same fleet, which the keystore records.  A new keystore
-    is for the domains of the robots.
+    is for ``domains``, or else for the domains of the robots.
 
     Raises:
         KeystoreError: a policy names a revoked enclave that ``enclaves`` does not name, or a robot
@@ -413,7 +414,7 @@ def _revoked_before_notes(
     """
     existing, known, root = frozenset(change.names), change.known, change.root
     missing = [name for name in wanted_names if name not in existing]
-    revoked = known.revoked_before(missing) if missing else ()
+    revoked = known.enclaves_revoked_before(missing) if missing else ()
     revoked_before = [name for name in missing if name in revoked]
 
     def command(names: Sequence[str]) -> str:
@@ -433,7 +434,7 @@ def _revoked_before_notes(
             "with -e: "
             f"{command(unasked)}.",
         )
-    later = _certified_after_backup(change, missing) - {*revoked_before, *named}
+    later = _enclaves_certified_after_backup(change, missing) - {*revoked_before, *named}
     if unasked := [name for name in missing if name in later]:
         raise KeystoreError(
             f"the keystore '{root}' lacks {first_few(unasked, 3)}, certified after the last backup",
@@ -447,11 +448,13 @@ def _revoked_before_notes(
     return list(known.revoked_before_notes(revoked_before))
 
 
-def _certified_after_backup(change: KeystoreChange, missing: Sequence[str]) -> frozenset[str]:
+def _enclaves_certified_after_backup(
+    change: KeystoreChange, missing: Sequence[str]
+) -> frozenset[str]:
     """Return the enclaves in ``missing`` that got a valid certificate after the last backup."""
     if not missing or not restored_at(change.keystore):
         return frozenset()
-    shown = change.known.shown_after_restore(missing)
+    shown = change.known.certificates_shown_after_restore(missing)
     return frozenset(entry.enclave for entry in shown if entry.not_after > iso(change.now))
 
 
@@ -613,7 +616,7 @@ def _check_not_keystore(root: Path) -> None:
 
 
 def _folder_owner_notes(root: Path) -> Iterator[Note]:
-    """Yield a note if other users than this user and root can replace a new keystore."""
+    """Yield a note if users other than the present one and root can replace a new keystore."""
     trusted = frozenset({0, os.geteuid()})
     replaceable = list(replaceable_on_the_way(root, trusted))
     if root.exists() and (why := other_writers(root.stat(), trusted)):
@@ -636,7 +639,7 @@ def _already_exists_error(root: Path) -> KeystoreError:
 
 
 def _check_typo(root: Path) -> None:
-    """Raise an error if a keystore's name looks like a typo of a sibling keystore's name."""
+    """Raise `UsageError` if a keystore's name looks like a typo of a sibling keystore's name."""
     for similar in similar_keystores(root):
         raise UsageError(
             f"'{root}' does not exist, and '{similar.name}' next to it is a keystore",
@@ -651,7 +654,7 @@ _MOST_SHOWN = 5
 def write_governance(
     change: KeystoreChange, governance: Governance, *, names: Sequence[str]
 ) -> None:
-    """Sign, stage and record the governance of a keystore that is made from settings.
+    """Sign, stage and record ``governance``, which was made from the keystore's settings.
 
     Enclaves in ``names`` that have a copy of the document instead of a link also get the new
     document.
@@ -757,7 +760,11 @@ def _zenoh_notes(template: Template) -> tuple[Note, ...]:
 
 
 def restart_note(mismatch: Mismatch, *, revoked: bool = False) -> Note:
-    """Return a note on which processes to restart, and in which order."""
+    """Return a note on which processes to restart, and in which order.
+
+    ``mismatch`` is the communication that fails between old and new processes.  ``revoked`` says
+    that certificates were revoked.
+    """
     return Note("keystore.restart", _restart_text(mismatch, revoked=revoked))
 
 
@@ -885,7 +892,7 @@ class _EnclaveOutcome:
     outcome: str
     notes: tuple[Note, ...]
     replaced: ReplacedRights | None = None
-    superseded: Superseded | None = None
+    superseded: SupersededCertificate | None = None
     other_files: str = ""
 
 
@@ -931,7 +938,7 @@ class _EnclaveMaker:
         rights = None
         if policy or PERMISSIONS_FILE not in present:
             enclave = policy or _default_rights(change.template, name)
-            rights = StatedRights(enclave, self._domains.of(name))
+            rights = StatedRights(enclave, self._domains.domains_of(name))
         if (
             rights
             and certificate
@@ -961,8 +968,8 @@ class _EnclaveMaker:
             replaced = replaced_rights(name, earlier, grant, change.now) if earlier else None
             if old is None:
                 return _EnclaveOutcome("changed", notes, replaced)
-            superseded = Superseded.record(name, old, issued.certificate, change.now)
-            revoked = replaced and replaced.revoked()
+            superseded = SupersededCertificate.record(name, old, issued.certificate, change.now)
+            revoked = replaced and replaced.after_revocation()
             return _EnclaveOutcome("changed", notes, revoked, superseded, other_files)
         if rights and policy is None:
             notes += tuple(self._lost_rights_notes(rights.enclave, present))
@@ -1113,7 +1120,7 @@ class _EnclaveMaker:
             else open_enclave_key(place_in_file(path), self._tokens.secrets)
         ).public_key()
         remedy = f"Move '{path}' away: then a new key is created."
-        change.known.refuse_revoked(public, f"enclave {name}", remedy)
+        change.known.refuse_revoked_key(public, f"enclave {name}", remedy)
         change.known.refuse_shared_key(public, name, remedy)
         return NewIdentity(subject, public)
 

@@ -28,7 +28,11 @@ from sros_tool.keystore.issuing.enclave import (
 from sros_tool.keystore.layout import KEY_URI_FILE, enclave_path, has_key
 from sros_tool.keystore.ledger import RENEWED_BY_NAME, RESTORED, Entry
 from sros_tool.keystore.lifecycle.change import Changed, ChangeOptions, KeystoreChange
-from sros_tool.keystore.lifecycle.replaced import Superseded, certificates_until, may_lack_entries
+from sros_tool.keystore.lifecycle.replaced import (
+    SupersededCertificate,
+    certificates_until,
+    may_lack_entries,
+)
 from sros_tool.keystore.rights import RecordedRights, SignedRights
 from sros_tool.keystore.selection import missing_enclave_error
 from sros_tool.names import check_enclave_name
@@ -122,8 +126,8 @@ def renew(
         with suppress(SrosError):  # the governance is not part of a renewal
             change.notes += change.edit_notes()
         if not (new_key or places):
-            change.notes += change.known.shared_notes(renewed)
-        change.entries += _marked_by_name(change, writer.entries, names)
+            change.notes += change.known.shared_key_notes(renewed)
+        change.entries += _with_consent_marks(change, writer.entries, names)
         if revoke_old:
             change.revoke_superseded(replaced)
         if replaced:
@@ -141,7 +145,7 @@ def renew(
     )
 
 
-def _marked_by_name(
+def _with_consent_marks(
     change: KeystoreChange, entries: Iterable[Entry], names: Sequence[str]
 ) -> Iterator[Entry]:
     """Yield ``entries``; in a restored keystore, mark the permissions of the enclaves ``names``.
@@ -167,7 +171,7 @@ def _due_enclave_names(
     lifetimes, unreadable = survey(change.keystore)
     refuse_unreadable(tuple(enclave for enclave in unreadable if enclave.name in names), "renewed")
     for lifetime in lifetimes:
-        if lifetime.name in names and lifetime.due(threshold, change.now):
+        if lifetime.name in names and lifetime.is_due(threshold, change.now):
             yield lifetime.name
 
 
@@ -191,7 +195,7 @@ class _Renewer:
         self._tokens = tokens
         self._unique = unique
 
-    def renew(self, names: Sequence[str], progress: Progress | None) -> list[Superseded]:
+    def renew(self, names: Sequence[str], progress: Progress | None) -> list[SupersededCertificate]:
         """Renew the enclaves ``names``, and return the replaced certificates.
 
         Raises:
@@ -200,9 +204,9 @@ class _Renewer:
         done = self._writer.for_each(names, self._renew_one, progress).values()
         unreadable = tuple(result for result in done if isinstance(result, UnreadableEnclave))
         refuse_unreadable(unreadable, "renewed")
-        return [result for result in done if isinstance(result, Superseded)]
+        return [result for result in done if isinstance(result, SupersededCertificate)]
 
-    def _renew_one(self, name: str) -> Superseded | UnreadableEnclave:
+    def _renew_one(self, name: str) -> SupersededCertificate | UnreadableEnclave:
         now = self._change.now
         try:
             state = read_credentials(self._change.keystore, name)
@@ -211,7 +215,7 @@ class _Renewer:
             raise
         except SrosError as error:
             return UnreadableEnclave(name, error)
-        return Superseded.record(name, state.certificate, issued.certificate, now)
+        return SupersededCertificate.record(name, state.certificate, issued.certificate, now)
 
     def _issuance(self, state: Credentials) -> Issuance:
         """Return the issuance for an enclave, after verifying the enclave's present files."""

@@ -21,7 +21,7 @@ from sros_tool.dds.permissions import Grant
 from sros_tool.errors import Note, SrosError
 from sros_tool.fleet.robots import Fleet, folded_lines
 from sros_tool.keystore.delivery.published import may_have_later_releases
-from sros_tool.keystore.known_keys import IssuedEarlier, restored_at
+from sros_tool.keystore.known_keys import IssuedCredentials, restored_at
 from sros_tool.keystore.layout import PERMISSIONS_FILE
 from sros_tool.keystore.ledger import Entry, certificate_entry
 from sros_tool.keystore.reader import OpenedKeystore
@@ -77,7 +77,7 @@ class ReplacedRights:
     copy, or was restored from a backup.
     """
 
-    def revoked(self) -> ReplacedRights:
+    def after_revocation(self) -> ReplacedRights:
         """Return the same rights after the revocation of the enclave's earlier certificate."""
         return replace(self, works_until=None)
 
@@ -219,7 +219,7 @@ def with_expiries_in_ledger(
     """
     if not replaced_rights:
         return ()
-    issued = IssuedEarlier(keystore, {rights.enclave for rights in replaced_rights})
+    issued = IssuedCredentials(keystore, {rights.enclave for rights in replaced_rights})
     may_work_longer = may_lack_entries(keystore)
     return tuple(
         replace(
@@ -238,7 +238,7 @@ def with_expiries_in_ledger(
 
 
 def certificates_until(
-    keystore: OpenedKeystore, superseded: Collection[Superseded], template: Template
+    keystore: OpenedKeystore, superseded: Collection[SupersededCertificate], template: Template
 ) -> datetime | None:
     """Return when the last replaced certificate stops working; None if none was replaced.
 
@@ -253,7 +253,7 @@ def certificates_until(
         needs_permissions = template.zenoh is None and all(
             rule.enable_join_access_control for rule in rules
         )
-    issued = IssuedEarlier(keystore, {replaced.name for replaced in superseded})
+    issued = IssuedCredentials(keystore, {replaced.name for replaced in superseded})
     ends = (
         issued.certificates_until(replaced.old, replaced.new_subject if needs_permissions else None)
         for replaced in superseded
@@ -270,7 +270,7 @@ def may_lack_entries(keystore: OpenedKeystore) -> bool:
 
 
 @dataclass(frozen=True, slots=True)
-class Superseded:
+class SupersededCertificate:
     """A replaced certificate, with the key digest and the subject of the new certificate."""
 
     name: str
@@ -281,7 +281,7 @@ class Superseded:
     @classmethod
     def record(
         cls, name: str, old: x509.Certificate, new: x509.Certificate, now: datetime
-    ) -> Superseded:
+    ) -> SupersededCertificate:
         """Return the record that the certificate ``new`` replaced ``old`` at the time ``now``."""
         entry = certificate_entry(now, "certificate", old, name)
         key = key_digest(new.public_key())  # type: ignore[arg-type]
@@ -307,7 +307,7 @@ def _described_rights(rights: Sequence[Right]) -> list[str]:
 
 
 def old_program_text(replaced_rights: Iterable[ReplacedRights]) -> str:
-    """Return a sentence on restarts of programs that still use lost rights; "" without any."""
+    """Return a sentence on programs that still use lost rights; "" if no rights were lost."""
     if not any(rights.lost_text() for rights in replaced_rights):
         return ""
     return (
@@ -317,7 +317,7 @@ def old_program_text(replaced_rights: Iterable[ReplacedRights]) -> str:
 
 
 def lasting_text(root: Path, replaced_rights: Sequence[ReplacedRights]) -> str:
-    """Return sentences on lost rights that still work, and on how to end them; "" without any."""
+    """Return sentences on lost rights that still work, and on how to end them; "" if none works."""
     lasting = [
         rights
         for rights in replaced_rights

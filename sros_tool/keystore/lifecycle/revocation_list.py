@@ -26,7 +26,7 @@ from sros_tool.keystore.known_keys import (
     certificates_of_revoked,
     known_expiries,
     restored_at,
-    revoked_issues,
+    revoked_entries,
     revoked_serials,
 )
 from sros_tool.keystore.layout import (
@@ -44,7 +44,7 @@ from sros_tool.keystore.ledger import (
     certificate_entry,
     document_entry,
 )
-from sros_tool.keystore.lifecycle.replaced import Superseded
+from sros_tool.keystore.lifecycle.replaced import SupersededCertificate
 from sros_tool.keystore.lifecycle.rotation import (
     Replacement,
     RotationStage,
@@ -307,7 +307,7 @@ class RevocationListSigner:
         # A certificate that has certainly expired need not be revoked when it is replaced.
         if keep is not None:
             present = {name: entry for name, entry in last.items() if entry.not_after >= moment}
-        for name, valid in self._still_valid(last, present, listed).items():
+        for name, valid in self._unexpired_certificates(last, present, listed).items():
             for serial, entry in valid.items():
                 if serial not in recorded:
                     recorded.add(serial)
@@ -327,7 +327,7 @@ class RevocationListSigner:
         self._last = last
         return revocations
 
-    def superseded(self, superseded: Iterable[Superseded]) -> list[Entry]:
+    def superseded_revocations(self, superseded: Iterable[SupersededCertificate]) -> list[Entry]:
         """Return the ledger entries for revoking all earlier certificates of enclaves."""
         by_name = {certificate.name: certificate for certificate in superseded}
         entries = self.revocations(
@@ -345,7 +345,7 @@ class RevocationListSigner:
             self.remarks.append(Note("crl.web-server", text))
         return entries
 
-    def _still_valid(
+    def _unexpired_certificates(
         self, names: Iterable[str], present: Mapping[str, Entry], listed_serials: Collection[int]
     ) -> dict[str, dict[int, Entry]]:
         """Map each enclave to its certificates that may not have expired, by serial number.
@@ -367,7 +367,7 @@ class RevocationListSigner:
             ):
                 certificates[entry.enclave][int(entry.serial, 16)] = entry
         for certificate in certificates_of_revoked(
-            self._keystore, self._recorded_as_moved(listed_serials)
+            self._keystore, self._serials_not_to_search(listed_serials)
         ):
             name = common_name_of(certificate.subject)
             if name in certificates and validity_of(certificate).not_after >= self._known_time:
@@ -377,7 +377,7 @@ class RevocationListSigner:
             certificates[name][int(entry.serial, 16)] = entry
         return certificates
 
-    def _recorded_as_moved(self, listed_serials: Collection[int]) -> Container[str]:
+    def _serials_not_to_search(self, listed_serials: Collection[int]) -> Container[str]:
         """Return the serial numbers of certificates that need not be read in ``revoked``.
 
         These are ``listed_serials``, and certificates in the folder that the ledger certainly has.
@@ -571,7 +571,7 @@ class RevocationListSigner:
         on_a_list = {
             f"{entry.serial:x}" for crl in keystore.revocation_lists for entry in crl.revoked
         }
-        missed = {entry.serial for entry in revoked_issues(keystore, on_a_list)}
+        missed = {entry.serial for entry in revoked_entries(keystore, on_a_list)}
         moment = iso(self._now)
         return [
             RevocationEntry(serial, self._now.replace(microsecond=0), reason)
@@ -681,7 +681,7 @@ class RevocationListSigner:
 
 
 def _link_everywhere(transaction: Transaction, names: Sequence[str]) -> None:
-    """Stage the link ``crl.pem`` to the revocation list for each enclave without it."""
+    """Stage ``crl.pem``, a link to the revocation list, for the enclaves ``names`` that lack it."""
     root, is_first = transaction.root, not os.path.lexists(transaction.root / CRL)
     lacking = []
     for name in names:

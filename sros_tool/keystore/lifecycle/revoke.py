@@ -50,13 +50,13 @@ _MOVED_FILES = (
 _PRIVATE_FILE = "key.pem"
 _MOST_SHOWN = 5
 REVOKED_AGAIN = "fleet.revocations-restored"
-"""The id of the note that `restored_note` returns."""
+"""The id of the note that `restored_list_note` returns."""
 REPLACED_AFTER_BACKUP = "fleet.replaced-after-backup"
 """The id of a note on enclaves of which a restored keystore has only revoked certificates."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Restored(Changed):
+class RestoredRevocations(Changed):
     """The result of `restore_revocations`.
 
     ``replaced`` maps enclaves that stay, although their certificate is revoked, to whether their
@@ -152,7 +152,7 @@ def _later_keys_notes(
     """Yield a note on revoked keys that a restored keystore certified after its last backup."""
     names = {
         entry.enclave
-        for entry in change.known.shown_after_restore(last)
+        for entry in change.known.certificates_shown_after_restore(last)
         if entry.serial in revoked and entry.key != last[entry.enclave].key
     }
     if names:
@@ -173,7 +173,7 @@ def restore_revocations(
     shown_by: str = "",
     enclaves_with_named_rights: Collection[str] = (),
     **options: Unpack[ChangeOptions],
-) -> Restored:
+) -> RestoredRevocations:
     """Revoke again all certificates on revocation lists that the keystore signed and lost.
 
     The next list has a higher number than the lost lists.
@@ -229,12 +229,12 @@ def restore_revocations(
             if (entry.enclave, entry.key) in replaced_keys and not is_known:
                 reasons[entry.serial], issued[entry.serial] = SUPERSEDED, entry
         later_keys = [of.key for serial, of in unknown.items() if serial not in reasons]
-        for entry in _vouched_since(change, forgotten_lists, issued, later_keys):
+        for entry in _vouched_certificates(change, forgotten_lists, issued, later_keys):
             reasons[entry.serial], issued[entry.serial] = SUPERSEDED, entry
             replaced_keys.add((entry.enclave, entry.key))
         _check_names(change, tuple(lost_revocations))
         # Certificates from after the backup that no list has are good, as of a robot's new key.
-        shown = change.known.shown_after_restore(lost_revocations)
+        shown = change.known.certificates_shown_after_restore(lost_revocations)
         good = {entry.serial for entry in shown}.difference(reasons)
         revocations = [
             entry
@@ -288,7 +288,7 @@ def restore_revocations(
         change.notes.append(_unknown_note(change, unknown))
     change.notes += _replaced_notes(change, replaced)
     outcomes = dict.fromkeys(lost_revocations, "revoked") | dict.fromkeys(replaced, "replaced")
-    return change.result(Restored, outcomes=outcomes, replaced=replaced)
+    return change.result(RestoredRevocations, outcomes=outcomes, replaced=replaced)
 
 
 def _replaced_keys(
@@ -300,12 +300,18 @@ def _replaced_keys(
     unless its serial number is in ``reasons``, which maps revoked serial numbers to reasons. The
     keys of valid certificates are left out.
     """
-    kept = {(of.enclave, of.key) for serial, of in unknown.items() if serial not in reasons}
-    replaced = {(of.enclave, of.key) for s, of in issued.items() if reasons[s] == SUPERSEDED}
-    return {of for of in replaced - kept if of[1]}
+    kept = {
+        (entry.enclave, entry.key) for serial, entry in unknown.items() if serial not in reasons
+    }
+    replaced = {
+        (entry.enclave, entry.key)
+        for serial, entry in issued.items()
+        if reasons[serial] == SUPERSEDED
+    }
+    return {(enclave, key) for enclave, key in replaced - kept if key}
 
 
-def _vouched_since(
+def _vouched_certificates(
     change: KeystoreChange,
     forgotten_lists: LostRecords,
     issued: Mapping[str, Entry],
@@ -324,7 +330,7 @@ def _vouched_since(
     for serial in issued.keys() & dates.keys():
         name = issued[serial].enclave
         since[name] = min(dates[serial], since.get(name, dates[serial]))
-    shown = change.known.shown_after_restore(since)
+    shown = change.known.certificates_shown_after_restore(since)
     others = {"", *later_keys, *(entry.key for entry in (*issued.values(), *shown))}
     for name in since:
         with suppress(SrosError):  # the enclave does not exist, or a file of it is broken
@@ -389,7 +395,7 @@ def _reasons_of_revoked(change: KeystoreChange, unknown: Mapping[str, Entry]) ->
         for entry in change.keystore.ledger_file.with_values("enclave", enclaves).entries
         if entry.what == "revocation" and entry.reason != SUPERSEDED
     }
-    gone = change.known.revoked_before(enclaves)
+    gone = change.known.enclaves_revoked_before(enclaves)
     return {
         serial: reasons.get(entry.enclave, "unspecified")
         for serial, entry in unknown.items()
@@ -418,11 +424,14 @@ def _unknown_note(change: KeystoreChange, unknown: Mapping[str, Entry]) -> Note:
     return Note("fleet.certificates-restored", f"{text}.")
 
 
-def restored_note(restored: Changed, lists_from: str) -> Note:
-    """Return a note on lists that `restore_revocations` took from ``lists_from``."""
+def restored_list_note(restored: Changed, holders: str) -> Note:
+    """Return a note on the lists from which `restore_revocations` revoked certificates again.
+
+    ``holders`` is a subject with its verb that says who has the lists, such as "r1 and r2 have".
+    """
     verb = "would be revoked again" if restored.dry_run else "is revoked again"
     text = (
-        f"{lists_from} a revocation list that the keystore signed but does not know: the keystore "
+        f"{holders} a revocation list that the keystore signed but does not know: the keystore "
         f"was restored from a backup, or is a copy. Everything on the list {verb}"
     )
     if again_revoked := restored.names("revoked"):

@@ -28,7 +28,7 @@ from sros_tool.keystore.fleet_status import fleet_status
 from sros_tool.keystore.issuing.authority import (
     Authority,
     ImportedAuthority,
-    check_imported,
+    check_imported_ca,
     write_bundle,
     write_copies,
 )
@@ -410,7 +410,7 @@ def renew_identity_ca(
             )
         old, *above = change.keystore.certificates_of("identity_ca")
         if issued or change.keyring.ca_service(root, IDENTITY, change.template):
-            renewed = _renewed_by_service(change, old, issued)
+            renewed = _certificate_renewed_by_service(change, old, issued)
             new, bundle, signer = renewed.certificate, renewed.bundle, change.permissions
         else:
             key = change.keyring.open(change.keystore, IDENTITY, change.template)
@@ -439,7 +439,7 @@ def renew_identity_ca(
     return _step_result(change, stage=RotationStage.NONE, files=("identity_ca",))
 
 
-def _renewed_by_service(
+def _certificate_renewed_by_service(
     change: KeystoreChange, old: x509.Certificate, issued: bytes
 ) -> ImportedAuthority:
     """Return a CA service's own new certificate: the same name and key, with later dates."""
@@ -451,7 +451,7 @@ def _renewed_by_service(
             if issued
             else "Give its new certificate with --identity-ca FILE.",
         )
-    renewed = check_imported(IDENTITY, issued, None, change.now)
+    renewed = check_imported_ca(IDENTITY, issued, None, change.now)
     new = renewed.certificate
     if (old.subject, old.public_key()) != (new.subject, new.public_key()):
         raise KeystoreError(
@@ -662,8 +662,8 @@ class _Rotator:
     def _reissue(
         self, successors: list[_Successor], stage: RotationStage, progress: Progress | None
     ) -> None:
-        of = {role: successor for successor in successors for role in successor.roles}
-        self._issue_again(of.get(IDENTITY), of.get(PERMISSIONS), progress)
+        by_role = {role: successor for successor in successors for role in successor.roles}
+        self._issue_again(by_role.get(IDENTITY), by_role.get(PERMISSIONS), progress)
         self.replacements = []
         for successor in successors:
             trusted = (
@@ -732,7 +732,7 @@ class _Rotator:
             change.permissions = permissions.new
             change.stage_zenoh(writer.signed)
         if identity:
-            change.notes += change.known.shared_notes(change.names)
+            change.notes += change.known.shared_key_notes(change.names)
 
     def _sign_governance(self, permissions: _Successor) -> None:
         """Stage the governance, unchanged but signed by the new CA, with its copies in enclaves."""
@@ -842,7 +842,7 @@ def _issuance(
     identity: _Successor | None,
     permissions: _Successor | None,
 ) -> Issuance | None:
-    """Return what the new CAs issue for an enclave; None if it has no certificate.
+    """Return what the new CAs issue for an enclave; None for an enclave without a certificate.
 
     Raises:
         KeystoreError: the old CA did not issue the certificate or sign the permissions, or the
@@ -867,7 +867,7 @@ def _issuance(
             f"Revoke the enclave again, with `sros revoke {where}` (with --robot: all enclaves "
             f"of its robot); to keep it, renew it with `sros renew {where} --new-key --revoke-old`."
         )
-        change.known.refuse_revoked(key, f"enclave {name}", remedy, kept, publish_first=False)
+        change.known.refuse_revoked_key(key, f"enclave {name}", remedy, kept, publish_first=False)
         certificate = NewIdentity(kept.subject, key)
     rights = None
     if permissions and (folder / PERMISSIONS_FILE).exists():
@@ -1059,7 +1059,7 @@ def _existing_ca(
             certificate.
         KeystoreError: the CA has a chain, or is a permissions CA with another name than ``name``.
     """
-    imported = [check_imported(role, data, key, change.now) for role in roles]
+    imported = [check_imported_ca(role, data, key, change.now) for role in roles]
     certificate = imported[0].certificate
     if imported[0].bundle != pem(certificate) or (
         PERMISSIONS in roles and certificate.subject != name

@@ -75,7 +75,7 @@ from sros_tool.keystore.lifecycle.renew import checked_rights
 from sros_tool.keystore.lifecycle.replaced import (
     EarlierPermissions,
     ReplacedRights,
-    Superseded,
+    SupersededCertificate,
     replaced_rights,
     rights_text,
     with_expiries_in_ledger,
@@ -401,12 +401,12 @@ def _pending_stages(present_settings: PresentSettings, goal: _Goal) -> tuple[Upd
 
 
 @dataclass(frozen=True, slots=True)
-class _Reissued:
+class _ReissuedEnclave:
     """An enclave after its update; ``old`` is the record of its replaced certificate, or None."""
 
     name: str
     rights: ReplacedRights
-    old: Superseded | None
+    old: SupersededCertificate | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -417,7 +417,7 @@ class _KeptWideRights:
     """
 
     name: str
-    reissued: _Reissued | None
+    reissued: _ReissuedEnclave | None
 
 
 class _Updater:
@@ -486,7 +486,7 @@ class _Updater:
         change.record()
         rights = tuple(document.rights for document in reissued)
         if revoked:
-            rights = tuple(replaced.revoked() for replaced in rights)
+            rights = tuple(replaced.after_revocation() for replaced in rights)
         else:
             rights = with_expiries_in_ledger(change.keystore, rights, change.now)
         settings = (
@@ -523,7 +523,7 @@ class _Updater:
 
     # ── enclaves ───────────────────────────────────────────────────────────────────────────
 
-    def _reissue(self, names: Sequence[str], progress: Progress | None) -> list[_Reissued]:
+    def _reissue(self, names: Sequence[str], progress: Progress | None) -> list[_ReissuedEnclave]:
         before, after = self._present.settings, self._goal.settings
         same_settings = (before.default_permissions, before.short_lived) == (
             after.default_permissions,
@@ -536,7 +536,7 @@ class _Updater:
 
         keystore = self._change.keystore
 
-        def work(name: str) -> _Reissued | _KeptWideRights | UnreadableEnclave | None:
+        def work(name: str) -> _ReissuedEnclave | _KeptWideRights | UnreadableEnclave | None:
             try:
                 state = read_credentials(keystore, name)
                 done = self._reissue_one(state)
@@ -557,9 +557,9 @@ class _Updater:
         reissued = [
             result.reissued if isinstance(result, _KeptWideRights) else result for result in results
         ]
-        return [document for document in reissued if isinstance(document, _Reissued)]
+        return [document for document in reissued if isinstance(document, _ReissuedEnclave)]
 
-    def _reissue_one(self, state: Credentials) -> _Reissued | None:
+    def _reissue_one(self, state: Credentials) -> _ReissuedEnclave | None:
         name = state.name
         change = self._change
         earlier = checked_rights(state, change.authorities, change.recorded_rights)
@@ -570,7 +570,7 @@ class _Updater:
         rights: SignedRights | StatedRights
         if replaces_default:
             enclave = default_rights(self._goal.settings, name)
-            rights = StatedRights(enclave, self._after.of(name))
+            rights = StatedRights(enclave, self._after.domains_of(name))
         else:
             rights = earlier._replace(grant=self._grant_for_new_domains(name, earlier.grant))
         identity = self._new_identity(state) if certificate else state.certificate
@@ -579,8 +579,10 @@ class _Updater:
         present = EarlierPermissions(state.certificate, state.grant)
         old = None
         if certificate:
-            old = Superseded.record(name, state.certificate, issued.certificate, change.now)
-        return _Reissued(name, replaced_rights(name, present, grant, change.now), old)
+            old = SupersededCertificate.record(
+                name, state.certificate, issued.certificate, change.now
+            )
+        return _ReissuedEnclave(name, replaced_rights(name, present, grant, change.now), old)
 
     def _changes_longest_validity(self, name: str) -> bool:
         """Return whether the update changes the longest validity of an enclave's files."""
@@ -606,7 +608,7 @@ class _Updater:
         default = default_rights(before, state.name)
         if earlier_rights.policy not in ("", default.digest):
             return False
-        validity, domains = state.lifetime().permissions, self._before.of(state.name)
+        validity, domains = state.lifetime().permissions, self._before.domains_of(state.name)
         (grant,) = permissions_for(
             default, subject=state.grant.subject, validity=validity, domains=domains
         ).grants
@@ -622,7 +624,7 @@ class _Updater:
         Raises:
             KeystoreError: a rule is not for the domains of the keystore.
         """
-        before, after = self._before.of(name), self._after.of(name)
+        before, after = self._before.domains_of(name), self._after.domains_of(name)
         if before == after:
             return grant
         if any(rule.domains.closed() != before for rule in grant.rules):
@@ -816,8 +818,8 @@ def _with_routers_of_robots(change: KeystoreChange, network: ZenohNetwork) -> Ze
     """
     complete = change.with_routers_of_robots(network)
     asked, before = (
-        {router.name: router for router in (of.routers if of else ())}
-        for of in (network, change.template.zenoh)
+        {router.name: router for router in (known.routers if known else ())}
+        for known in (network, change.template.zenoh)
     )
     for router in complete.routers:
         of_fleet = asked.get(router.name) not in (router, before.get(router.name))
