@@ -268,6 +268,7 @@ def _check_dates_here(
     """
     from sros_tool.explain.answer import Evaluator, ask
     from sros_tool.keystore.participant import load_enclave_of
+    from sros_tool.keystore.settings import lengthening_remedy
 
     if not context.zone.utcoffset(context.at.replace(tzinfo=None)):
         return
@@ -277,9 +278,8 @@ def _check_dates_here(
         raise KeystoreError(
             f"a process cannot run in enclave {name} in this time zone",
             f"{answer.decision.text.removesuffix('.')}.",
-            "Set the time zone of the process to UTC (`TZ=UTC`), or sign permissions that are "
-            "valid for longer: `sros update_keystore KEYSTORE --set permissions.validity=2d "
-            f"--allow-looser`, then `sros renew KEYSTORE {quote(name)}`.",
+            "Set the time zone of the process to UTC (`TZ=UTC`), or renew the enclave (`sros renew "
+            f"KEYSTORE {quote(name)}`). {lengthening_remedy(keystore.settings, name)}".rstrip(),
         )
 
 

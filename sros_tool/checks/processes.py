@@ -56,6 +56,7 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.ledger import Entry
 from sros_tool.keystore.reader import OpenedKeystore
+from sros_tool.keystore.settings import LENGTHEN_PERMISSIONS
 from sros_tool.names import check_enclave_name
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import load_certificates, subject_text, validity_of
@@ -129,9 +130,8 @@ PROCESS_LOCAL_TIME = FindingKind(
     'Fast DDS reads the dates of permissions in the local time of the process, and says "Not '
     'found the identity subject name in permissions file".',
     "Fast DDS 2.6 to 3.6 (mktime); tested.",
-    "Start the process with TZ=UTC, or renew the enclave (`sros renew KEYSTORE ENCLAVE`). If its "
-    "permissions are valid for less than a day, first lengthen this time with `sros "
-    "update_keystore KEYSTORE --set permissions.validity=2d --allow-looser`.",
+    "Start the process with TZ=UTC, or renew the enclave (`sros renew KEYSTORE ENCLAVE`). "
+    f"{LENGTHEN_PERMISSIONS}",
     vendors=FAST_DDS,
 )
 PROCESS_REPLACEABLE = FindingKind(

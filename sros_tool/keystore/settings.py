@@ -11,7 +11,7 @@ import tomllib
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from datetime import datetime
+from datetime import datetime, timedelta
 from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, NamedTuple
@@ -24,7 +24,7 @@ from sros_tool.keystore.ledger import Entry, Ledger
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.template import Template, parse_template, render_template, settings_values
 from sros_tool.translate import governance_for, protection_for
-from sros_tool.validity import iso
+from sros_tool.validity import duration_text, iso
 from sros_tool.wording import first_few
 
 if TYPE_CHECKING:
@@ -191,6 +191,42 @@ def edit_remedy(root: Path | str) -> str:
     return (
         f"`sros update_keystore {shown} --take-edits --dry-run` shows what accepting the edits "
         f"would change; `sros update_keystore {shown} --discard-edits` undoes the edits."
+    )
+
+
+_LONG_ENOUGH = timedelta(days=2)
+LENGTHEN_PERMISSIONS = (
+    "If new permissions are valid for less than a day, first lengthen this time in `sros.toml` of "
+    "the keystore: the validity of the [[enclaves]] entry for the enclave, or, without such an "
+    "entry, of [permissions]. Then run `sros update_keystore KEYSTORE --take-edits "
+    "--allow-looser`."
+)
+"""How to lengthen the validity of permissions if the settings of their keystore are not known."""
+
+
+def lengthening_remedy(settings: Template | None, enclave: str) -> str:
+    """Return how to lengthen the validity of an enclave's new permissions.
+
+    The text is "" if new permissions are valid for at least two days, or until a fixed time.
+    """
+    if settings is None:
+        return LENGTHEN_PERMISSIONS
+    usual, short = settings.permissions_validity, settings.longest_validity(enclave)
+    limits = [validity for validity in (usual, short) if isinstance(validity, timedelta)]
+    shortest = min(limits, default=_LONG_ENOUGH)
+    if shortest >= _LONG_ENOUGH:
+        return ""
+    enough = duration_text(_LONG_ENOUGH)
+    if shortest == usual:
+        setting = "permissions.validity"
+        how = f"run `sros update_keystore KEYSTORE --set {setting}={enough} --allow-looser`"
+    else:
+        setting = "the [[enclaves]] entry for this enclave in `sros.toml`"
+        how = f'write validity = "{enough}" there, and run `sros update_keystore KEYSTORE '
+        how += "--take-edits --allow-looser`"
+    return (
+        f"New permissions are valid for {duration_text(shortest)}, because of {setting}. "
+        f"If this is too short, first {how}."
     )
 
 

@@ -116,7 +116,7 @@ def test_dates_that_are_not_valid_in_every_time_zone_have_a_remedy_that_helps(
     wait = f"Wait until {iso(validity.not_before + timedelta(hours=12))}: then they are valid"
     for now, said in (
         (validity.not_before + timedelta(hours=11), wait),
-        (validity.not_after - timedelta(hours=13), "--set permissions.validity=2d --allow-looser`"),
+        (validity.not_after - timedelta(hours=13), f"(`sros renew {bench.checked} /"),
     ):
         options = {"now": now, **bench.options}
         found = keystore_findings(OpenedKeystore(bench.checked), Circumstances(**options))

@@ -747,7 +747,7 @@ def test_permissions_that_fast_dds_takes_for_expired_here_start_nothing(tmp_path
         refused = sros("env", tmp_path / "ks", "/a", env={**fast, "TZ": zone})
         assert (refused.status, refused.out) == (2, render_refusal("sh"))
         assert "cannot run in enclave /a in this time zone" in refused.err
-        assert "`TZ=UTC`" in refused.err
+        assert "`TZ=UTC`" in refused.err and "--set permissions.validity=2d" in refused.err
         sros("env", tmp_path / "ks", "/a", env={**cyclone, "TZ": zone}).ok()
     for zone in ("UTC", "America/Los_Angeles"):
         sros("env", tmp_path / "ks", "/a", env={**fast, "TZ": zone}).ok()

@@ -41,7 +41,7 @@ from sros_tool.keystore.lifecycle.update import (
     update_keystore,
 )
 from sros_tool.keystore.reader import OpenedKeystore, open_enclave
-from sros_tool.keystore.settings import present_settings
+from sros_tool.keystore.settings import lengthening_remedy, present_settings
 from sros_tool.keystore.template import (
     NamedValues,
     ShortLived,
@@ -52,6 +52,7 @@ from sros_tool.keystore.template import (
 from sros_tool.pki.certificates import validity_of
 from sros_tool.policy.document import read_policy
 from sros_tool.translate import governance_for
+from sros_tool.validity import parse_span
 from tests.support import made_by_ros2
 from tests.support.harness import (
     certificate,
@@ -65,6 +66,7 @@ from tests.support.harness import (
     sros,
     topics_of,
 )
+from tests.support.tables import for_every
 
 NOW = datetime.now(UTC)
 LATER = NOW + timedelta(hours=1)
@@ -841,3 +843,36 @@ def test_the_settings_are_in_the_ledger(root: Path) -> None:
     to(root, "production")
     entries = [each for each in OpenedKeystore(root).ledger.entries if each.what == "settings"]
     assert ['name = "production"' in each.settings for each in entries] == [False, True]
+
+
+PERMISSIONS_VALIDITY = "KEYSTORE --set permissions.validity=2d --allow-looser`"
+
+
+@for_every(
+    [
+        ("180d", {}, "/operator/anna", ""),
+        ("180d", {"/operator/*": 1}, "/base", ""),
+        ("180d", {"/operator/*": 48}, "/operator/anna", ""),
+        ("2030-01-01", {}, "/base", ""),
+        ("1d", {}, "/base", PERMISSIONS_VALIDITY),
+        ("5h", {"/operator/*": 24}, "/operator/anna", PERMISSIONS_VALIDITY),
+        ("180d", {"/operator/*": 1}, "/operator/anna", 'write validity = "2d" there, and run'),
+        ("1d", {"/operator/*": 1}, "/operator/anna", 'write validity = "2d" there, and run'),
+    ]
+)
+def test_the_setting_that_limits_permissions_is_the_one_to_lengthen(
+    case: tuple[str, dict[str, int], str, str],
+) -> None:
+    usual, short, enclave, said = case
+    settings = replace(
+        load_template("production"),
+        permissions_validity=parse_span(usual),
+        short_lived=tuple(ShortLived(name, timedelta(hours=h)) for name, h in short.items()),
+    )
+    remedy = lengthening_remedy(settings, enclave)
+    assert (said in remedy) if said else not remedy, remedy
+
+
+def test_without_settings_both_places_of_the_validity_are_named() -> None:
+    assert "[[enclaves]]" in lengthening_remedy(None, "/a")
+    assert "of [permissions]" in lengthening_remedy(None, "/a")

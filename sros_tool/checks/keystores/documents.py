@@ -35,7 +35,7 @@ from sros_tool.faults import REFUSE_STRANGERS
 from sros_tool.fleet.robots import robot_of
 from sros_tool.keystore.fleet import EnclaveDomains
 from sros_tool.keystore.layout import GOVERNANCE_FILE, GOVERNANCE_XML
-from sros_tool.keystore.settings import edit_remedy
+from sros_tool.keystore.settings import LENGTHEN_PERMISSIONS, edit_remedy, lengthening_remedy
 from sros_tool.keystore.template import Template
 from sros_tool.names import ROS_DISCOVERY_TOPIC
 from sros_tool.pki import smime
@@ -132,6 +132,11 @@ TIME_FORMAT = FindingKind(
     "KEYSTORE ENCLAVE POLICY_FILE` for one. In documents that sros does not sign, "
     "write CCYY-MM-DDThh:mm:ssZ.",
 )
+_RENEW_IN_TIME = (
+    "Let the hosts run in UTC, or renew the enclave at least 14 hours before its permissions "
+    "expire (`sros renew KEYSTORE ENCLAVE`)."
+)
+_RENEW_OR_UTC = "Let the host run in UTC, or renew the enclave (`sros renew KEYSTORE ENCLAVE`)."
 TIME_WINDOW = FindingKind(
     "portable.validity-window",
     WARNING,
@@ -139,10 +144,7 @@ TIME_WINDOW = FindingKind(
     "Fast DDS reads the dates of permissions in the host's local time: the permissions begin up "
     "to 12 hours late in the west, and expire up to 14 hours early in the east.",
     "Fast DDS 2.6 to 3.6 (mktime); tested in Los Angeles and Tokyo.",
-    "Let the hosts run in UTC, or renew the enclave at least 14 hours before its permissions "
-    "expire (`sros renew KEYSTORE ENCLAVE`). If its permissions are valid for less than a day, "
-    "first lengthen this time with `sros update_keystore KEYSTORE --set permissions.validity=2d "
-    "--allow-looser`.",
+    f"{_RENEW_IN_TIME} {LENGTHEN_PERMISSIONS}",
     vendors=FAST_DDS,
 )
 LOCAL_TIME = FindingKind(
@@ -152,9 +154,7 @@ LOCAL_TIME = FindingKind(
     'Fast DDS reads the dates of permissions in local time, and says "Not found the identity '
     'subject name in permissions file".',
     "Fast DDS 2.6 to 3.6 (mktime); tested.",
-    "Let the host run in UTC, or renew the enclave (`sros renew KEYSTORE ENCLAVE`). If its "
-    "permissions are valid for less than a day, first lengthen this time with `sros "
-    "update_keystore KEYSTORE --set permissions.validity=2d --allow-looser`.",
+    f"{_RENEW_OR_UTC} {LENGTHEN_PERMISSIONS}",
     vendors=FAST_DDS,
 )
 CHARACTER_CLASS = FindingKind(
@@ -329,6 +329,7 @@ def _validity_findings(enclave: CheckedEnclave, grant: Grant, file: str) -> Iter
     if not window.contains(now):
         return
     text = f"they are valid from {grant.not_before} to {grant.not_after}"
+    longer = lengthening_remedy(enclave.keystore.settings, enclave.name)
     begin, end = (
         read_date(DateRule.LOCAL, moment, enclave.keystore.at.zone)
         for moment in (grant.not_before, grant.not_after)
@@ -339,18 +340,22 @@ def _validity_findings(enclave: CheckedEnclave, grant: Grant, file: str) -> Iter
         zone, dates = enclave.keystore.at.zone, f"{_utc_text(begin)} to {_utc_text(end)}"
         utc_dates = f"in {zone} Fast DDS reads these dates as {dates}"
         accepted = enclave.accepts_expiry if now.timestamp() > end else ""
-        yield LOCAL_TIME.found(enclave.name, f"{text}, and {utc_dates}", file, accepted=accepted)
+        text = f"{text}, and {utc_dates}"
+        remedy = f"{_RENEW_OR_UTC} {longer}".rstrip()
+        yield LOCAL_TIME.found(enclave.name, text, file, remedy=remedy, accepted=accepted)
     elif now - _WEST < window.not_before or now + _EAST > window.not_after:
         is_early = now - _WEST < window.not_before
         accepted = "" if is_early else enclave.accepts_expiry
         text = f"{text}, and now it is {iso(now)}"
-        remedy = is_early and (
-            f"Wait until {iso(window.not_before + _WEST)}: then they are valid in every time zone. "
-            "Until then, let the hosts run in UTC. Sign later permissions with a not_before at "
-            "least "
-            "12 hours in the past, as sros does once the CA is that old."
-        )
-        yield TIME_WINDOW.found(enclave.name, text, file, remedy=remedy or "", accepted=accepted)
+        remedy = f"{_RENEW_IN_TIME} {longer}".rstrip()
+        if is_early:
+            moment = iso(window.not_before + _WEST)
+            remedy = (
+                f"Wait until {moment}: then they are valid in every time zone. Until then, let the "
+                "hosts run in UTC. Sign later permissions with a not_before at least 12 hours in "
+                "the past, as sros does once the CA is that old."
+            )
+        yield TIME_WINDOW.found(enclave.name, text, file, remedy=remedy, accepted=accepted)
 
 
 def _utc_text(seconds: float) -> str:
