@@ -587,7 +587,9 @@ class _Round:
                 f"Until {iso(max(closed.values()))}{READABLE_KEYS}"
                 f"{counted(len(closed), 'private key')}: {first_few(sorted(closed), 2)}. The mode "
                 "is correct now, but somebody may have copied a key: run `sros renew KEYSTORE "
-                "ENCLAVE --new-key --revoke-old`, and bring the new key."
+                "ENCLAVE --new-key --revoke-old`, and bring the new key. If the key was made on "
+                "this robot, revoke the enclave, and make a new key here "
+                "(docs/howto/one_robot.md: Keys that are made on the robot)."
             )
 
     def _copied_key(self, path: str) -> CopiedKey:

@@ -242,7 +242,14 @@ def refuse_unreadable(
         raise unreadable[0].error
     if unreadable:
         names = ", ".join(enclave.name for enclave in unreadable)
-        reasons = " ".join(f"{enclave.error.what}." for enclave in unreadable)
+        alike: dict[str, list[str]] = {}  # reasons that differ only in the enclave's name
+        for enclave in unreadable:
+            what = enclave.error.what
+            alike.setdefault(what.replace(enclave.name, ""), []).append(what)
+        reasons = " ".join(
+            f"{whats[0]}{f' ({len(whats)} such enclaves)' if whats[1:] else ''}."
+            for whats in alike.values()
+        )
         first = unreadable[0]
         how = f" For {first.name}: {first.error.remedy}" if first.error.remedy else ""
         others = ", or name the other enclaves in the command" * takes_names

@@ -389,6 +389,11 @@ def test_every_one_that_cannot_be_renewed_is_named_at_once(
             renew(root, chosen, now=LATER, expiring=expiring)
         assert ", or name the other enclaves in the command. For /n003: " in told.value.remedy
         assert snapshot(root) == before
+    for name in names[4:7]:
+        (root / f"enclaves{name}/key.pem").unlink()
+    refused = sros("renew", root, *names[4:7], "--new-key").err
+    assert refused.count("is not in this keystore") == 1 and "(3 such enclaves)" in refused
+    before = snapshot(root)
     updated = sros("update_keystore", root, "--domain", "0-9", "--allow-looser")
     assert "2 enclaves cannot be updated: /n003, /n023" in updated.err
     assert "Repair or revoke them. For /n003: " in updated.err
