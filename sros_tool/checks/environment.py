@@ -579,7 +579,10 @@ def _override_findings(
     effective: ConfigurationDocument,
     overrides: tuple[tuple[str, str], ...],
 ) -> Iterator[Finding]:
-    """Yield a finding if the overrides change more than the router address and the TLS paths."""
+    """Yield a finding if the overrides change more than the router address and the TLS paths.
+
+    ``effective`` is ``document`` after the overrides were applied.
+    """
     unchanged = replace(
         effective, connect=document.connect, tls=replace(effective.tls, named=document.tls.named)
     )

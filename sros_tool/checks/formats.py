@@ -73,7 +73,7 @@ def folded_findings(
 
 
 def _key_without_enclave(group: tuple[Finding, ...]) -> Hashable:
-    """Return a key that is equal for findings which differ only in their enclave."""
+    """Return a key that is equal for groups of one finding that differ only in the enclave."""
     finding = group[0]
     enclave = finding.subject
     is_enclave = enclave.startswith("/") and enclave not in ("/", finding.file)

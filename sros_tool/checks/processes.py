@@ -390,7 +390,10 @@ class _Ledgers:
         self._read: dict[int, int] = defaultdict(int)
 
     def entries(self, enclave: ProcessEnclave, user: int) -> tuple[Sequence[Entry], str]:
-        """Return an enclave's entries, and a clause that says why they cannot be read, or ""."""
+        """Return an enclave's entries, and a clause that says why they cannot be read, or "".
+
+        ``user`` is the user whose process names the ledger.
+        """
         if enclave.local_keystore is None:
             return (), "its keystore is not at this path here"
         try:

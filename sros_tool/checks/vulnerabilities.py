@@ -86,7 +86,10 @@ def vulnerability_findings(
     libraries: Iterable[MappedLibrary] = (),
     advisories: Sequence[Advisory] | None = None,
 ) -> Iterator[Finding]:
-    """Yield one finding for each DDS library of the processes, and of ``libraries``."""
+    """Yield one finding for each DDS library of the processes, and of ``libraries``.
+
+    ``advisories`` are the known vulnerabilities; None means the advisories that ship with sros.
+    """
     users = _users_by_library(running, libraries)
     by = {library: [f"loaded by {names_text(of)}"] if of else [] for library, of in users.items()}
     yield from _library_findings(by, advisories)
@@ -100,7 +103,7 @@ def robot_findings(
     """Yield a finding for each DDS library of robots, and a finding on robots with unknown DDS.
 
     ``robots`` maps names of robots to the DDS that they reported, or to None.  ``names_as_text``
-    returns names of robots as a text.
+    returns names of robots as a text.  ``advisories`` are as for `vulnerability_findings`.
     """
     seen: dict[MappedLibrary, dict[LibraryUse, list[str]]] = {}
     lacking: dict[str, list[str]] = {}
@@ -139,6 +142,7 @@ def is_fixed_later(library: RobotLibrary, advisories: Sequence[Advisory] | None 
     """Return whether a later release of the same major version fixes a known vulnerability.
 
     False for packages of Debian and Ubuntu, whose version does not tell which fixes they have.
+    ``advisories`` are as for `vulnerability_findings`.
     """
     known = known_vulnerabilities(library.product, library.version, advisories)
     numbers = version_numbers(library.version)

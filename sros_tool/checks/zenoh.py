@@ -437,15 +437,15 @@ def _denial_findings(document: ConfigurationDocument) -> Iterator[Finding]:
         overlapping = [other for other in access.subjects if other.overlaps(subject)]
         for rule in denials:
             for kind, text in (
-                (DENY_IN_WILDCARD, _wildcard_that_circumvents(rule, subject, access, limit)),
-                (DENY_OVERRULED, _overruling_subject(rule, overlapping, access, limit)),
+                (DENY_IN_WILDCARD, _wildcard_circumvention_clause(rule, subject, access, limit)),
+                (DENY_OVERRULED, _overruling_subject_clause(rule, overlapping, access, limit)),
             ):
                 if text and (kind.id, rule.id) not in reported:
                     reported.add((kind.id, rule.id))
                     yield kind.found(f"rule {rule.id}", text, document.name, rule.line)
 
 
-def _wildcard_that_circumvents(
+def _wildcard_circumvention_clause(
     rule: AclRule, subject: AclSubject, access: Enforcement, limit: ComparisonLimit
 ) -> str:
     """Return how a message with a wildcard circumvents a denial, or "" if none can."""
@@ -474,10 +474,10 @@ def _wildcard_that_circumvents(
     return ""
 
 
-def _overruling_subject(
+def _overruling_subject_clause(
     rule: AclRule, other_subjects: Sequence[AclSubject], access: Enforcement, limit: ComparisonLimit
 ) -> str:
-    """Return one of ``other_subjects`` that allows a message which ``rule`` denies, or ""."""
+    """Return a clause on one of ``other_subjects`` that allows what ``rule`` denies, or ""."""
     for other, flow, message in product(other_subjects, rule.flows, rule.messages):
         other_rules = _rules_for(access.rules_of(other.id), flow, message)
         denied, allowed = _keys(other_rules, allows=False), _keys(other_rules, allows=True)

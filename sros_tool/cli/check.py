@@ -760,6 +760,7 @@ def renewal_markdown(
     """Return the enclaves to renew soon as Markdown, or a sentence that there are none.
 
     ``due`` and ``unknown`` are lines on enclaves to renew and on enclaves that cannot be read.
+    ``text_if_none`` is the sentence, and ``threshold`` the time within which a file is due.
     """
     from sros_tool.markdown import bounded_list, code, plain
 

@@ -347,7 +347,10 @@ _NOT_PROVED = (
 def _show_end(
     robot: LocalRobot, closed: CloseState, *, apply: bool, holds: bool, partial: bool
 ) -> None:
-    """Print whether the robot is closed, the reasons, and what to do next."""
+    """Print whether the robot is closed, the reasons, and what to do next.
+
+    ``holds`` says whether the robot is proved closed; ``apply`` and ``partial`` are options.
+    """
     from sros_tool.close.state import CONNECTED, TALK
 
     folder, observed = shlex.quote(str(robot.folder)), closed.observed
@@ -420,7 +423,10 @@ def _show_end(
 
 
 def _idle_lines(closed: CloseState, ask: str) -> list[str]:
-    """Return how to prove the robot closed without the processes that do not run now."""
+    """Return how to prove the robot closed without the processes that do not run now.
+
+    ``ask`` is the command for the proof.
+    """
     idle = closed.stopped if closed.secured else {*closed.observed.ended}
     if not (stopped := sorted(idle.intersection(closed.pending))):
         return []

@@ -1107,7 +1107,10 @@ def _wrapped_lines(text: str, indent: str) -> list[str]:
 
 
 def print_findings_after_signing(groups: Sequence[Sequence[Finding]], files: Iterable[str]) -> None:
-    """Print on stderr the findings about policies whose permissions were just signed."""
+    """Print on stderr the findings about policies whose permissions were just signed.
+
+    ``files`` are the files of the policies, for a command that shows all findings.
+    """
     from sros_tool.checks.kind import Severity
 
     for group in groups[:_MOST_SHOWN]:

@@ -461,7 +461,10 @@ def sign_request(
 def _show_signed(
     signed: SignedRequests, answer: Path | None, *, existed: bool, as_json: bool
 ) -> None:
-    """Print what was done with signed requests; ``answer`` is the file for the robot."""
+    """Print what was done with signed requests; ``answer`` is the file for the robot.
+
+    ``existed`` says whether this file existed before.
+    """
     from sros_tool.pki.certificates import digest
 
     stream = answer == _STREAM

@@ -63,7 +63,8 @@ class _Range(NamedTuple):
 class Advisory(NamedTuple):
     """A known vulnerability of one product.
 
-    ``needs`` and ``gives`` are words of ``database_specific``.  ``unclear_lines`` are release
+    ``ranges`` and ``versions`` are the affected releases.  ``needs`` and ``gives`` are words of
+    ``database_specific``.  ``unclear_lines`` are release
     lines, such as 2.14, that may be affected.  ``unread`` are the listed versions that do not
     consist of three numbers, such as release candidates; `affects` ignores them.
     """

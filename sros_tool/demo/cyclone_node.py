@@ -47,7 +47,10 @@ class CycloneNode:
         self._readers.append((reader, hear))
 
     def types(self, name: str, *, of_publishers: bool) -> Sequence[str]:
-        """Return the ROS types of a topic's discovered publishers, or of its subscriptions."""
+        """Return the ROS types of a topic's discovered publishers.
+
+        If ``of_publishers`` is False, return the types of the topic's subscriptions.
+        """
         participant, topic = self._participant, self.wire_name(name)
         endpoints = participant.publications() if of_publishers else participant.subscriptions()
         return [ros_type(endpoint.type_name) for endpoint in endpoints if endpoint.topic == topic]

@@ -175,10 +175,13 @@ class Node(Protocol):
         """Subscribe to a topic; ``hear`` is called with every text received."""
 
     def types(self, name: str, *, of_publishers: bool) -> Sequence[str]:
-        """Return the ROS types of a topic's discovered publishers, or of its subscriptions."""
+        """Return the ROS types of a topic's discovered publishers.
+
+        If ``of_publishers`` is False, return the types of the topic's subscriptions.
+        """
 
     def count(self, name: str, kind: str, on_count: Callable[[int], None]) -> str:
-        """Count messages of a type other than string; return why that is impossible, or "".
+        """Count messages of the ROS type ``kind``; return why that is impossible, or "".
 
         ``on_count`` is called with the number of messages since its last call.
         """

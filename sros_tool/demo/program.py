@@ -516,7 +516,8 @@ class RunPlan:
     """The rows to run, and the settings to run them with.
 
     ``domains`` has one domain per row; ``topic`` is absolute; ``period`` is in seconds.  With
-    ``own_networks``, each row gets a separate network namespace.
+    ``own_networks``, each row gets a separate network namespace.  ``started`` is the time at which
+    the plan was made (CLOCK_MONOTONIC, s).
     """
 
     rows: tuple[Row, ...]

@@ -126,11 +126,13 @@ class RowResult:
     accepted: bool = False
     """Whether `--accept-open` names the row."""
     unaccepted: bool = False
+    """Whether the user's keystore allows the attack, and `--accept-open` does not name the row."""
     applies: bool = True
     """Whether the keystore has an enclave for each part; if not, the row was skipped."""
     scenario: str = ""
     """Name of the scenario."""
     libraries: frozenset[MappedLibrary] = frozenset()
+    """DDS libraries that the processes of the row had mapped."""
 
     @property
     def as_expected(self) -> bool:
@@ -561,6 +563,7 @@ class ScenarioResult:
     cast: tuple[CastMember, ...] = ()
     """With `--keystore`: the enclaves that played a part."""
     attacked: KeystoreSummary | None = None
+    """The user's keystore; its tests that did not run lack the skipped rows (see `keystore`)."""
 
     @property
     def wrong(self) -> tuple[RowResult, ...]:

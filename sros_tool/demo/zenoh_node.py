@@ -131,7 +131,10 @@ class _ZenohNode:
         self._keep(self._session.declare_subscriber(key, lambda it: hear(_text_of(it.payload))))
 
     def types(self, name: str, *, of_publishers: bool) -> Sequence[str]:
-        """Return the ROS types of a topic's publishers in the graph, or of its subscriptions."""
+        """Return the ROS types of a topic's publishers in the graph.
+
+        If ``of_publishers`` is False, return the types of the topic's subscriptions.
+        """
         return [ros_type(kind) for kind, _ in self._types(name, "MP" if of_publishers else "MS")]
 
     def _types(self, name: str, kind: str) -> list[tuple[str, str]]:

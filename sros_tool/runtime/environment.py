@@ -450,9 +450,9 @@ _LONGEST_PLAIN = 40
 class Container:
     """A container whose process runs in an enclave.
 
-    ``folder`` is the absolute path of the enclave's files in the container and, for Compose, also
-    on the machine that runs the container.  Without ``image``, the result has to be merged with a
-    definition that has an image.
+    ``name`` is the name of the service or object.  ``folder`` is the absolute path of the enclave's
+    files in the container and, for Compose, also on the machine that runs the container.  Without
+    ``image``, the result has to be merged with a definition that has an image.
     """
 
     enclave: str

@@ -114,7 +114,8 @@ class ArrivedEnclave:
 class Arrival:
     """The enclaves in a folder on a robot, or a single enclave, with the errors and warnings.
 
-    ``root`` is the folder that contains the enclaves folder; ``kind`` is keystore or enclave.
+    ``path`` is what the user named; ``root`` is the folder that contains the enclaves folder;
+    ``kind`` is keystore or enclave.
     """
 
     path: Path

@@ -277,7 +277,10 @@ def _governance_findings(
 
 
 def _with_real_file(finding: Finding, keystore: OpenedKeystore, real_root: str) -> Finding:
-    """Return the finding with the path of the shared file instead of an enclave's link to it."""
+    """Return the finding with the path of the shared file instead of an enclave's link to it.
+
+    ``real_root`` is the real path of the keystore.
+    """
     if "/enclaves/" not in finding.file or finding.id.startswith("keystore.link"):
         return finding
     real = Path(os.path.realpath(finding.file))

@@ -244,7 +244,11 @@ class RuleVerdict(NamedTuple):
 
 
 class _TopicEntry(NamedTuple):
-    """A ``<topic>`` of a rule, with the ``partitions`` that the vendor compares for the topic."""
+    """A ``<topic>`` of a rule, with the ``partitions`` that the vendor compares for the topic.
+
+    ``rule`` is the index of the rule in the grant; ``criteria_index`` is equal for all topics of
+    the same criteria.
+    """
 
     criteria_index: int
     rule: int
@@ -771,7 +775,10 @@ class Access:
     def decide(
         self, verb: AccessVerb, topic: str = "", partitions: tuple[str, ...] = ()
     ) -> Decision:
-        """Return the decision on ``verb``; ``topic`` is the DDS name (``rt/chatter``)."""
+        """Return the decision on ``verb``; ``topic`` is the DDS name (``rt/chatter``).
+
+        ``partitions`` are the partitions of the endpoint; () means the default partition.
+        """
         return self.join() if verb is AccessVerb.JOIN else self._endpoint(verb, topic, partitions)
 
     def join(self) -> Decision:

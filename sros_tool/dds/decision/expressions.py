@@ -119,7 +119,8 @@ class _FnmatchSets:
     def _closed_and_plain_from(self, index: int, *, is_first: bool) -> tuple[bool, bool]:
         """Return whether a set is closed after ``index``, and whether its ``[`` matches itself.
 
-        The second value counts only if the set is not closed.
+        The second value counts only if the set is not closed.  ``is_first`` says that ``index`` is
+        the place of the first member, where a ``]`` does not close the set.
 
         Results are cached, because many unclosed sets would otherwise take quadratic time.
         """

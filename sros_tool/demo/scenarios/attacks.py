@@ -4,6 +4,9 @@ The attacker is the intruder of a row.  A row that expects the attack to fail ha
 same listener must hear the permitted talker at the same time.  For each attack there is also a row
 with ``defence_removed``, which shows that the attack succeeds without that defense: an attack that
 never works would prove nothing.
+
+Most parameters of the functions for rows are fields of `Row`.  ``attacker`` is the identity of the
+attacker, and ``victims`` is the keystore of the other parties.
 """
 
 from __future__ import annotations

@@ -3,6 +3,9 @@
 A world is a group of rows that share processes, among them a router. An attacker's process does not
 enforce its own rules, so that only the rules of other processes stop the attack. Each attack has a
 control, and is tried again without the defense that stops it.
+
+Most parameters of the functions for rows are fields of `Row`; ``keystore`` is the keystore of all
+parties.
 """
 
 from __future__ import annotations
