@@ -306,8 +306,12 @@ def _matching_enclaves(patterns: Sequence[str], enclaves: Collection[str]) -> se
 def restricted_enclaves(
     requirement: Requirement, enclaves: Collection[str]
 ) -> tuple[set[str], ...]:
-    """Return the sets of enclaves that a requirement restricts by listing them, or ()."""
+    """Return the sets of enclaves to which a requirement applies; () if it applies to all."""
     match requirement:
+        case Only(enclaves=listed):
+            return (set(enclaves) - _matching_enclaves(listed, enclaves),)
+        case Must(enclave=enclave):
+            return ({enclave}.intersection(enclaves),)
         case Widest(enclaves=listed) | NothingBut(enclaves=listed):
             return (_matching_enclaves(listed, enclaves),)
         case Apart(sources=sources, targets=targets, through=through):

@@ -965,9 +965,7 @@ def dropped_requirements(
     All other requirements of ``before`` hold wherever all requirements of ``after`` hold.
     """
     after = tuple(after)
-    new_parts = [
-        (part, new_requirement) for new_requirement in after for part in _parts(new_requirement)
-    ]
+    similar_requirements = similarity_to(after)
     is_demanded = _demanded_by(after)
     is_demanded_elsewhere = _demanded_by(filter(None, (new.elsewhere for new in after)))
     dropped = []
@@ -975,14 +973,27 @@ def dropped_requirements(
         here, elsewhere = is_demanded(requirement), requirement.elsewhere
         if here and (elsewhere is None or is_demanded_elsewhere(elsewhere)):
             continue
-        parts = tuple(_parts(requirement))
-        remaining = (
-            new_requirement
-            for new_part, new_requirement in new_parts
-            if any(_is_about_same(new_part, part) for part in parts)
-        )
-        dropped.append(DroppedRequirement(requirement, tuple(dict.fromkeys(remaining)), here))
+        dropped.append(DroppedRequirement(requirement, similar_requirements(requirement), here))
     return tuple(dropped)
+
+
+def similarity_to(
+    requirements: Iterable[Requirement],
+) -> Callable[[Requirement], tuple[Requirement, ...]]:
+    """Return a function that returns the requirements that are similar to its argument.
+
+    Similar requirements are of the same kind, and about some of the same names or enclaves.
+    """
+    parts = [(part, requirement) for requirement in requirements for part in _parts(requirement)]
+
+    def similar_requirements(requirement: Requirement) -> tuple[Requirement, ...]:
+        own_parts = tuple(_parts(requirement))
+        similar = (
+            other for part, other in parts if any(_is_about_same(part, own) for own in own_parts)
+        )
+        return tuple(dict.fromkeys(similar))
+
+    return similar_requirements
 
 
 def _demanded_by(requirements: Iterable[Requirement]) -> Callable[[Requirement], bool]:

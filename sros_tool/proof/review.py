@@ -113,6 +113,7 @@ from sros_tool.proof.requirements import (
     dropped_findings,
     dropped_requirements,
     read_requirements,
+    similarity_to,
 )
 from sros_tool.proof.sources import AccessSource, load_policies, load_side
 from sros_tool.proof.system import System, load_system, policy_system
@@ -1238,7 +1239,7 @@ class _Review:
         left: list[Finding] = []
         if moved:
             with suppress(SrosError, OSError):  # the comparison reports the error
-                left = list(_left_requirement_findings(wanted_requirements, *moved()))
+                left = list(_left_requirement_findings(earlier, wanted_requirements, *moved()))
         if not (dropped or left):
             return None
         assert self.base
@@ -1455,9 +1456,15 @@ def _status(chosen_findings: ChosenFindings) -> int:
 
 
 def _left_requirement_findings(
-    requirements: Sequence[Requirement], before: AccessSource, after: AccessSource
+    earlier: Sequence[Requirement],
+    requirements: Sequence[Requirement],
+    before: AccessSource,
+    after: AccessSource,
 ) -> Iterator[Finding]:
-    """Yield a finding for each requirement on an enclave that a node leaves for another enclave."""
+    """Yield a finding for each node that moves to an enclave to which a requirement does not apply.
+
+    Before the move, the requirement and a similar one of ``earlier`` applied to the node's enclave.
+    """
     old_enclaves, new_enclaves = (
         _enclaves_by_node(source.enclaves.values()) for source in (before, after)
     )
@@ -1466,20 +1473,30 @@ def _left_requirement_findings(
         for node, old in old_enclaves.items()
         if new_enclaves.get(node, old) - old
     ]
+    similar_requirements = similarity_to(earlier)
     for requirement in requirements if moves else ():
         restricted = zip(
             restricted_enclaves(requirement, before.enclaves),
             restricted_enclaves(requirement, after.enclaves),
             strict=True,
         )
-        for was, now in restricted:
-            for node, old, new in moves:
-                if old & was and new - now:
-                    place = requirement.source
-                    name, to = expand("~", *node), first_few(sorted(new - now), 3)
-                    text = f"node {name} moves to enclave {to}, outside of the requirement"
-                    remedy = "Add the enclave to the requirement, or approve this in the review."
-                    yield DROPPED.found(str(requirement), text, place.file, place.line, remedy)
+        left = [
+            (node, old & was, at, new - now)
+            for at, (was, now) in enumerate(restricted)
+            for node, old, new in moves
+            if old & was and new - now
+        ]
+        required = [
+            restricted_enclaves(similar, before.enclaves)
+            for similar in (similar_requirements(requirement) if left else ())
+        ]
+        for node, was_in, at, outside in left:
+            if any(was_in & was[at] for was in required):
+                place = requirement.source
+                name, to = expand("~", *node), first_few(sorted(outside), 3)
+                text = f"node {name} moves to enclave {to}, outside of the requirement"
+                remedy = "Let the requirement apply to the enclave, or approve this in the review."
+                yield DROPPED.found(str(requirement), text, place.file, place.line, remedy)
 
 
 def _enclaves_by_node(enclaves: Iterable[Enclave]) -> dict[NodeName, set[str]]:
