@@ -4,10 +4,10 @@
 match one character of a set, and ``[!a-c]`` one character outside of it.  This is fnmatch of glibc
 without escapes, as in the DDS vendors.
 
-`overlap` and `covers` compare two expressions, `Names` searches many expressions. `common_name`
-compares any number of expressions, also with exceptions, and returns an example, which is a valid
-absolute ROS name. `listed_expressions` replaces an expression by several expressions without ``?``
-and sets of characters.
+`overlap` and `covers` compare two expressions, `Names` searches many expressions.
+`renamed_matches` follows names to new names. `common_name` compares any number of expressions, also
+with exceptions, and returns an example, which is a valid absolute ROS name. `listed_expressions`
+replaces an expression by several expressions without ``?`` and sets of characters.
 """
 
 from __future__ import annotations
@@ -93,6 +93,45 @@ def overlap(first: str, second: str) -> bool:
         return matches(first, second)
     shorter, longer = sorted((literal_prefix(first), literal_prefix(second)), key=len)
     return longer.startswith(shorter) and _pattern(first).overlaps(_pattern(second))
+
+
+def renamed_matches(expression: str, old: str, new: str) -> Iterator[tuple[str, str]]:
+    """Yield the names, among ``old``, that ``expression`` matches, each with its new name.
+
+    ``new`` replaces the characters of ``old`` before the first wildcard; the rest of both is equal,
+    as in ``/a/n/*`` and ``/b/m/*``.  The yielded names may be expressions.  Together they match
+    all such names, and perhaps further names that fit the beginning of ``old``.
+    """
+    if covers(expression, old):
+        yield old, new
+    elif overlap(expression, old):
+        begin, new_begin = literal_prefix(old), literal_prefix(new)
+        for rest in _rests(expression, begin):
+            name = begin + rest
+            # A name has no "//" and no "/" at the end.
+            if "//" not in name and name[-1:] != "/" and overlap(name, old):
+                yield name, new_begin + rest
+
+
+def _rests(expression: str, begin: str) -> Iterator[str]:
+    """Yield expressions for the rest of the names that begin with ``begin``, and match."""
+    pieces = _pieces(expression)
+    texts = [match[0] for match in _PIECE.finditer(expression)]
+
+    def with_stars_skipped(positions: Iterable[int]) -> set[int]:
+        reached = set(positions)
+        for i, piece in enumerate(pieces):
+            if i in reached and piece is _STAR:
+                reached.add(i + 1)
+        return reached
+
+    reached = {0}
+    for letter in begin:
+        before = with_stars_skipped(reached)
+        reached = {i for i in before if i < len(pieces) and pieces[i] is _STAR}
+        reached |= {i + 1 for i in before if i < len(pieces) and letter in pieces[i]}
+    for i in sorted(reached):
+        yield "".join(texts[i:])
 
 
 _Pieces = tuple[frozenset[str], ...]

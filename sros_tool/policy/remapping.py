@@ -28,7 +28,7 @@ from sros_tool.names import (
     is_expression,
 )
 from sros_tool.policy.model import ALLOW, DENY, Group, Policy, Profile
-from sros_tool.policy.patterns import matches
+from sros_tool.policy.patterns import Names, literal_prefix, matches, renamed_matches
 from sros_tool.policy.rights import (
     NodeName,
     Right,
@@ -67,7 +67,8 @@ class UsedRule(NamedTuple):
     """A use of a rule: it changed the name of ``node``, or a name in a group of the node.
 
     ``kind`` is the kind of the group, or "" if the name of the node changed.  ``old`` and ``new``
-    are the full names before and after the change.
+    are the full names before and after the change.  If the name of the node changes, so do all
+    names below it, which have no uses of their own.
     """
 
     rule: Remapping
@@ -75,6 +76,19 @@ class UsedRule(NamedTuple):
     kind: str = ""
     old: str = ""
     new: str = ""
+
+    def names_denied_by(self, denied: str, kind: str) -> Iterator[tuple[str, str]]:
+        """Yield the changed names that a DENY of ``denied`` matches, each with its new name."""
+        if not self.kind:
+            yield from _renamed_with_node(denied, self.old, self.new)
+        elif self.kind == kind:
+            yield from renamed_matches(denied, self.old, self.new)
+
+
+def _renamed_with_node(names: str, old: str, new: str) -> Iterator[tuple[str, str]]:
+    """Yield the ``names`` that change if the node ``old`` is ``new``, each with its new name."""
+    yield from renamed_matches(names, old, new)
+    yield from renamed_matches(names, f"{old}/*", f"{new}/*")
 
 
 def parse_remapping(text: str) -> Remapping:
@@ -143,17 +157,25 @@ def remapped_name(name: str, ns: str, rules: Iterable[Remapping]) -> list[str]:
     stays, and the new name is added.
     """
     rules = tuple(rules)
+    names = [name]
     for rule in rules:
-        own = expand("~", ns, rule.node)
-        if rule.old == _NODE and f"{name}/".startswith(f"{own}/"):
-            name = expand("~", ns, rule.new) + name.removeprefix(own)
+        own, new = expand("~", ns, rule.node), expand("~", ns, rule.new)
+        if rule.old != _NODE:
+            continue
+        if f"{name}/".startswith(f"{own}/"):
+            names = [new + name.removeprefix(own)]
             break
-    new_names: dict[str, str] = {}
-    for rule in rules:
-        if rule.old != _NODE and matches(name, old := expand(rule.old, ns, rule.node)):
-            new_names.setdefault(old, expand(rule.new, ns, rule.node))
-    kept = [name] if is_expression(name) or not new_names else []
-    return [*kept, *new_names.values()]
+        added = [new_name for _, new_name in _renamed_with_node(name, own, new)]
+        names += [new_name for new_name in added if not Names(names).cover(new_name)]
+    result = []
+    for each in names:
+        new_names: dict[str, str] = {}
+        for rule in rules:
+            if rule.old != _NODE and matches(each, old := expand(rule.old, ns, rule.node)):
+                new_names.setdefault(old, expand(rule.new, ns, rule.node))
+        kept = [each] if is_expression(each) or not new_names else []
+        result += [*kept, *new_names.values()]
+    return list(dict.fromkeys(result))
 
 
 def has_new_name(rule: Remapping, names: Iterable[str], namespaces: Iterable[str]) -> bool:
@@ -203,8 +225,9 @@ def remapped_policies(
     """
     rules = [parse_remapping(text) for text in texts]
     policies = tuple(policies)
-    moved = {use for policy in policies for use in remapped_policy(policy, rules)[1] if use.kind}
-    stated = {right for policy in policies for right in policy_rights(policy)}
+    first_pass = [remapped_policy(policy, rules) for policy in policies]
+    moved = {use for _, uses in first_pass for use in uses}
+    stated = {right for policy, _ in first_pass for right in policy_rights(policy)}
     remapped = [remapped_policy(policy, rules, moved, stated) for policy in policies]
     notes = []
     for rule in rules:
@@ -218,7 +241,7 @@ def remapped_policies(
                 f"with --node, or write its name, as in {nodes[0]}:{rule}."
             )
             notes.append(Note("merge.remapped-nodes", text))
-        if any(use.kind == "actions" for use in uses):
+        if rule.old != _NAMESPACE and any(use.kind == "actions" for use in uses):
             text = f"--remap {rule} renames an action: {renamed_action_text(rule)}"
             notes.append(Note("merge.remapped-action", text))
     result = [policy for policy, _ in remapped]
@@ -301,7 +324,7 @@ def _notes_on_requirements(
             str(use.rule._replace(node=use.node if use.rule.depends_on_node else ""))
             for _, uses in remapped
             for use in uses
-            if use.old in gone or f"{use.old}/*" in gone
+            if f"{use.old}/*" in gone or any(matches(name, use.old) for name in gone)
         }
         text = (
             f"if requirements name {first_few(sorted(gone), _MOST_SHOWN)}, check them with "
@@ -326,11 +349,13 @@ def _notes_on_old_names(
     if not denials:
         return
     rules = Rules(right for policy in (file, *remapped) for right in policy_rights(policy))
-    for kind, old, new in sorted({(use.kind, use.old, use.new) for use in moved_names}):
-        for denied in denials:
-            right = denied.right
-            is_old = right.kind == kind and matches(right.name, old)
-            if is_old and not rules.cover(right._replace(name=new)):
+    for denied in denials:
+        right = denied.right
+        names = {
+            pair for use in moved_names for pair in use.names_denied_by(right.name, right.kind)
+        }
+        for old, new in sorted(names):
+            if not rules.cover(right._replace(name=new)):
                 text = (
                     f"{right} at {denied.source} does not change, and does not apply to {new}, "
                     f"the new name of {old}. If the new name is meant, too, add it there."
@@ -390,8 +415,8 @@ def remapped_policy(
 
     A wildcard that matches an old name stays, and the new name is added to its group.  The new
     names in ``moved_names``, of any node, are also added to each DENY that matches the old name. An
-    old name stays denied if a wildcard of its enclave, among the rights ``stated`` by all policies,
-    would allow the name.
+    old name stays denied if a wildcard of its enclave, among the rights ``stated`` by all policies
+    after remapping, would allow the name.
     """
     used: set[UsedRule] = set()
     wildcards = Rules(right for right in stated if is_expression(right.name))
@@ -405,17 +430,26 @@ def remapped_policy(
         own, new = expand("~", profile.ns, profile.node), expand("~", ns, node)
         used.update(UsedRule(rule, profile.node, "", own, new) for rule in renamed[:1] + moved[:1])
         of_names = [rule for rule in of_node if rule.old != _NAMESPACE]
+        new_profile = replace(profile, ns=ns, node=node)
         groups = []
         for group in profile.groups:
-            groups.append(_remapped_group(group, of_names, ns, node, used))
+            groups.append(_remapped_group(group, of_names, profile, new_profile, used))
+            stated_names = _full_names(group, profile)
+            present = _full_names(groups[-1], new_profile)
+            if ns != profile.ns:
+                used.update(
+                    UsedRule(moved[0], profile.node, group.kind, old, new)
+                    for name, old in zip(group.names, stated_names, strict=True)
+                    if name[0] not in "~/" and (new := expand(name, ns, node)) in present
+                )
             by_wildcards = {
                 name
-                for name in (expand(name, ns, node) for name in group.names)
+                for name in stated_names
                 for right, qualifier in group.rights
                 if qualifier is DENY and wildcards.overlaps(Right(enclave, ALLOW, right, name))
             }
-            groups += _more_denials(group, groups[-1], moved_names, by_wildcards, ns, node)
-        return replace(profile, ns=ns, node=node, groups=tuple(groups))
+            groups += _more_denials(group, stated_names, present, moved_names, by_wildcards)
+        return replace(new_profile, groups=tuple(groups))
 
     enclaves = tuple(
         enclave.with_profiles(partial(remapped, enclave.path)) for enclave in policy.enclaves
@@ -423,21 +457,33 @@ def remapped_policy(
     return replace(policy, enclaves=enclaves), used
 
 
+def _full_names(group: Group, profile: Profile) -> list[str]:
+    return [expand(name, profile.ns, profile.node) for name in group.names]
+
+
 def _remapped_group(
-    group: Group, rules: Iterable[Remapping], ns: str, node: str, used: set[UsedRule]
+    group: Group,
+    rules: Iterable[Remapping],
+    profile: Profile,
+    new_profile: Profile,
+    used: set[UsedRule],
 ) -> Group:
-    """Return a node's group with remapped names, and add the uses of rules to ``used``."""
+    """Return a node's group with remapped names, and add the uses of rules to ``used``.
+
+    The namespace and the node are already the new ones in ``new_profile``.
+    """
+    ns, node = new_profile.ns, new_profile.node
     by_name: dict[str, Remapping] = {}
     for rule in rules:
         by_name.setdefault(expand(rule.old, ns, node), rule)
 
     def new_names(name: str) -> Iterator[str]:
-        full = expand(name, ns, node)
+        full, before = expand(name, ns, node), expand(name, profile.ns, profile.node)
+        begin, begin_before = literal_prefix(full), literal_prefix(before)
         fitting = [rule for old, rule in by_name.items() if matches(full, old)]
-        used.update(
-            UsedRule(rule, node, group.kind, expand(rule.old, ns, node), expand(rule.new, ns, node))
-            for rule in fitting
-        )
+        for rule in fitting:
+            old = begin_before + expand(rule.old, ns, node).removeprefix(begin)
+            used.add(UsedRule(rule, node, group.kind, old, expand(rule.new, ns, node)))
         if not fitting or is_expression(full):
             yield name
         yield from (rule.new for rule in fitting)
@@ -454,29 +500,27 @@ def _remapped_group(
 
 def _more_denials(
     group: Group,
-    remapped: Group,
+    stated: Sequence[str],
+    present: Collection[str],
     moved_names: Iterable[UsedRule],
     by_wildcards: Collection[str],
-    ns: str,
-    node: str,
 ) -> Iterator[Group]:
     """Yield a group with the additional names, if any, that a DENY of ``group`` must deny.
 
     These are the new names in ``moved_names``, and the old names in ``by_wildcards``, which a
     wildcard would otherwise allow.  An old name that is a new name of some node is left out.
+    ``stated`` and ``present`` are the full names of the group before and after remapping.
     """
     denials = tuple(right for right in group.rights if right[1] is DENY)
     if not denials:
         return
-    stated = [expand(name, ns, node) for name in group.names]
-    present = {expand(name, ns, node) for name in remapped.names}
-    lines: dict[str, int] = {}
+    denied, lines = Names(present), dict[str, int]()
     for use in sorted(moved_names, key=lambda use: (use.old, use.new)):
-        if use.kind == group.kind and use.new not in present:
-            denying = [index for index, full in enumerate(stated) if matches(full, use.old)]
-            for index in denying[:1]:
-                lines.setdefault(use.new, group.source_of(index).line)
-    taken = present.union(use.new for use in moved_names)
+        for index, full in enumerate(stated):
+            for _, new in use.names_denied_by(full, group.kind):
+                if not denied.cover(new):
+                    lines.setdefault(new, group.source_of(index).line)
+    taken = {*present, *(use.new for use in moved_names)}
     for index, full in enumerate(stated):
         if full in by_wildcards and full not in taken:
             lines.setdefault(full, group.source_of(index).line)

@@ -113,22 +113,35 @@ def test_a_policy_whose_names_are_remapped(rules: list[str], names: set[str] | N
 
 
 @pytest.mark.parametrize(
-    ("denied", "rule", "names"),
+    ("denied", "rules", "names"),
     [
         ("/*x", "n:x:=/mux/x_of_n", {"/*x", "/mux/x_of_n"}),
         ("x", "n:x:=~/speed", {"/x", "/n/speed"}),
         ("/*z", "n:x:=/mux/x_of_n", {"/*z"}),
         ("x", "x:=/other", {"/other"}),
         ("/*x", "x:=/other", {"/*x", "/other"}),
+        ("/*n/y", "n:__node:=q", {"/*n/y", "/q/y"}),
+        ("n/y", "n:__node:=q", {"/n/y", "/q/y"}),
+        ("n/y", "__node:=q", {"/n/y", "/q/y"}),
+        ("/n*", "n:__node:=q", {"/n*", "/q", "/q/*"}),
+        ("/[n]/?*z", "n:__node:=q", {"/[n]/?*z", "/q/?*z"}),
+        ("/*/y", "n:__node:=q", {"/*/y"}),
+        ("/nn/y", "n:__node:=q", {"/nn/y"}),
+        ("n/y", "n:__node:=q q:__ns:=/l", {"/n/y", "/l/q/y"}),
+        ("x", "n:__ns:=/l", {"/x", "/l/x"}),
+        ("x", "n:__ns:=/l n:x:=/b", {"/x", "/b"}),
+        ("n/y", "n:__ns:=/l", {"/n/y", "/l/n/y"}),
+        ("other", "n:__ns:=/l", {"/other"}),
+        ("w/a", "n:__ns:=/l", {"/w/a", "/l/w/a"}),
     ],
 )
 def test_a_new_name_of_one_node_stays_denied_to_the_others(
-    denied: str, rule: str, names: set[str]
+    denied: str, rules: str, names: set[str]
 ) -> None:
     """Also where the rule is for one node: a DENY is a promise on what the name stands for."""
     denying = group("topics", denied, publish="DENY", subscribe="ALLOW")
-    policies = [one(denying, node="m"), one(group("topics", "x", publish="ALLOW"))]
-    (of_m, of_n), _ = remapped_policies(policies, [rule])
+    policies = [one(denying, node="m"), one(group("topics", "x w/*", publish="ALLOW"))]
+    (of_m, of_n), _ = remapped_policies(policies, rules.split())
     rights = policy_rights(of_m)
     assert {right.name for right in rights if right.right == "publish"} == names
     assert all((right.qualifier is DENY) == (right.right == "publish") for right in rights)
@@ -139,6 +152,7 @@ def test_a_new_name_of_one_node_stays_denied_to_the_others(
     ("rules", "denied"),
     [
         (["x:=/left/x"], {"/x", "/left/x"}),
+        (["__ns:=/left"], {"/x", "/left/x"}),
         (["x:=z", "y:=x"], {"/z"}),  # the name now stands for what was y, and was allowed
     ],
 )
@@ -161,6 +175,11 @@ def test_a_denial_of_an_old_name_in_the_file_is_told() -> None:
     _, notes = remapped_policies([camera, reader], ["x:=/mux/speed"], file)
     assert [note.id for note in notes] == [OF_REQUIREMENTS, "merge.old-name-denied"]
     assert "/a DENY publish topic /*x at" in notes[1].text
+    file_of_node = one(group("services", "/*n/open", request="DENY"), node="m")
+    _, (_, note) = remapped_policies(
+        [one(group("services", "~/open", reply="ALLOW"))], ["n:__node:=y"], file_of_node
+    )
+    assert "does not apply to /y/open, the new name of /n/open" in note.text
     for others, rule in (
         ([], "x:=/front/x"),
         ([one(group("topics", "/mux/*", publish="DENY"), node="m")], "x:=/mux/speed"),
@@ -194,6 +213,10 @@ def test_a_name_of_no_single_node_is_remapped() -> None:
         ("/l/n/*", ["n:__node:=m"], ["/l/m/*"]),
         ("/l/nn/a", ["n:__node:=m"], ["/l/nn/a"]),
         ("/l/a", ["n:a:=~/b"], ["/l/n/b"]),
+        ("/*n/a", ["n:__node:=m"], ["/*n/a", "/l/m/a"]),
+        ("/l/n*", ["n:__node:=m"], ["/l/n*", "/l/m", "/l/m/*"]),
+        ("/*n/a", ["n:__node:=m", "m:~/a:=/b"], ["/*n/a", "/b"]),
+        ("*/a", ["n:__node:=m"], ["*/a"]),
     ):
         assert remapped_name(name, "/l", map(parse_remapping_of_names, texts)) == names
 

@@ -21,6 +21,7 @@ from sros_tool.policy.patterns import (
     literal_prefix,
     matches,
     overlap,
+    renamed_matches,
 )
 from tests.support.long_form import some
 
@@ -194,3 +195,14 @@ def test_too_many_choices_are_refused() -> None:
     for expression in ("/[a-h][a-i]", "/???", "/" + "?" * 900):
         with pytest.raises(TooManyNames):
             listed_expressions(expression, 64)
+
+
+@given(patterns, st.text("ab/", max_size=6))
+@example("/*a/b", "b")
+@example("/a/[ab]?", "ab")
+def test_no_renamed_name_is_lost(expression: str, rest: str) -> None:
+    name = f"/a/{rest}"
+    news = [new for _, new in renamed_matches(expression, "/a/*", "/c/d/*")]
+    is_name = "//" not in name and name[-1] != "/"
+    found = any(matches(new, f"/c/d/{rest}") for new in news)
+    assert found == matches(expression, name) or not is_name
