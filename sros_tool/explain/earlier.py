@@ -125,7 +125,8 @@ def note_on_revoked_enclaves(
     """Yield notes on enclaves whose revoked certificates are still accepted and give the right.
 
     DDS processes without the current revocation list accept revoked certificates; Zenoh (``vendor``
-    None) has no revocation list.  ``named`` are the enclaves that have the right now.
+    None) has no revocation list.  ``named`` are the enclaves that have the right now; on Zenoh, a
+    revoked certificate keeps the rights of such an enclave.
     """
     kind = "explain.revoked-enclaves"
     try:
@@ -160,8 +161,12 @@ def note_on_revoked_enclaves(
         (True, "have the right"),
         (False, "work with permissions that are not here, whose rights are not known"),
     ):
-        gone = {of.name: of.until for of in revoked if of.decided is decided}
-        if gone := {name: until for name, until in gone.items() if name not in named}:
+        gone = {
+            of.name: of.until
+            for of in revoked
+            if of.decided is decided and (vendor or of.name not in named)
+        }
+        if gone:
             text = (
                 f"revoked certificates of {first_few(sorted(gone), 3)} {has_right}. A process "
                 f"without {old} still accepts them, until {max(gone.values())}: each process has "
@@ -218,6 +223,17 @@ def _revoked_enclaves_with_right(
                 for of in fitting
                 if of.sha256 in documents
             }
+            # Permissions for the certificate that replaced this one have the rights of its policy.
+            for of in permissions[name]:
+                if of.policy and of.policy not in allowed and of.sha256 in documents:
+                    allowed[of.policy] = _allows(
+                        keystore,
+                        documents[of.sha256],
+                        certificate._replace(subject=of.subject or certificate.subject),
+                        question,
+                        vendor,
+                        asking._replace(at=parse_iso(of.not_before) + timedelta(seconds=1)),
+                    )
             for of in fitting:
                 until = min(certificate.not_after, of.not_after or certificate.not_after)
                 has_right = allowed.get(of.policy or of.sha256)

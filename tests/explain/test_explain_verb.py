@@ -883,6 +883,23 @@ def test_a_revoked_enclave_with_earlier_permissions(keystore: Path, tmp_path: Pa
     assert f"certificates of {ENCLAVE} have the right" in revoked_notes(*asked, "/other")
 
 
+@pytest.mark.parametrize("template", ["development", "production"])
+def test_a_certificate_that_was_revoked_when_its_enclave_got_another(
+    template: str, tmp_path: Path
+) -> None:
+    """In production, the permissions of the new certificate do not fit the revoked one."""
+    keystore = tmp_path / "ks"
+    sros("create_keystore", keystore, "--template", template).ok()
+    sros("generate_artifacts", "-k", keystore, "-e", ENCLAVE, "-p", POLICY).ok()
+    asked = (keystore, "--who", "publish")
+    assert not revoked_notes(*asked, "/chatter")
+    sros("renew", keystore, ENCLAVE, "--new-key", "--revoke-old").ok()
+    note = f"revoked certificates of {ENCLAVE} have the right. A process without the current revoc"
+    assert note in revoked_notes(*asked, "/chatter")
+    assert not revoked_notes(*asked, "/nothing")
+    assert not revoked_notes(*asked, "/chatter", "--at", "2090-01-01")
+
+
 def test_a_revoked_certificate_on_zenoh(keystore: Path) -> None:
     asked = (keystore, "--who", "publish", "/chatter", "--vendor", "zenoh")
     sros("zenoh", keystore).ok()
@@ -894,7 +911,8 @@ def test_a_revoked_certificate_on_zenoh(keystore: Path) -> None:
     sros("generate_artifacts", "-k", keystore, "-e", ENCLAVE, "-p", POLICY).ok()
     again = f"whoever kept a revoked certificate of {ENCLAVE} and its key may do it, too"
     assert again in revoked_notes(*asked)
-    assert not revoked_notes(keystore, "--who", "publish", "/chatter")
+    note = f"revoked certificates of {ENCLAVE} have the right. A process without the current revoc"
+    assert note in revoked_notes(keystore, "--who", "publish", "/chatter")
     sros("rotate_ca", keystore, "--finish").ok()
     assert not revoked_notes(*asked)
 
