@@ -153,7 +153,7 @@ def look_at_processes(
         for process in readers
         if process.label in without_files and is_enclave_below_root(_enclave_of(process))
     ]
-    complete = not (running.unseen or running.hidden or running.container) and all(
+    complete = not (running.unseen or running.hidden or running.is_in_container) and all(
         process.enclave and not process.enclave.problem
         for process in (*own_processes, *other_processes)
         if process not in elsewhere

@@ -1085,7 +1085,7 @@ def _different_security_findings(
 
 def _unseen_process_findings(running: RunningProcesses) -> Iterator[Finding]:
     """Yield a finding for each node that could not be examined, and a finding with their number."""
-    remedy = ROOT_IS_NOT_ENOUGH if running.by_root else ""
+    remedy = ROOT_IS_NOT_ENOUGH if running.is_run_by_root else ""
     for process in running.unseen:
         if process.uses_ros:
             text = f"it speaks ROS 2, but cannot be examined: {process.why}"
@@ -1096,7 +1096,7 @@ def _unseen_process_findings(running: RunningProcesses) -> Iterator[Finding]:
         processes = first_few([f"{process.label} ({process.why})" for process in doubtful], 3)
         may_be = "may be a node" if len(doubtful) == 1 else "may be nodes"
         reasons.append(f"{processes} {may_be}, but cannot be examined")
-    if running.container:
+    if running.is_in_container:
         text = (
             f"{len(running.processes)} of them "
             f"{'speaks' if len(running.processes) == 1 else 'speak'} ROS 2"

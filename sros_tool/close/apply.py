@@ -282,7 +282,7 @@ class _RemainingProcesses:
                 )
         if running.processes.hidden or any(not unseen.uses_ros for unseen in unseen_processes):
             why = "some processes cannot be examined"
-            by_root = running.processes.by_root
+            by_root = running.processes.is_run_by_root
             remedy = f". {ROOT_IS_NOT_ENOUGH}" if by_root else ": run this command as root"
             self._robot.shell.say(f"{why}{remedy}")
 

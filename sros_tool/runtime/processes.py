@@ -310,15 +310,15 @@ class RunningProcesses:
     """The processes that use ROS 2, and the processes that could not be examined.
 
     Processes that only wait for another process are left out.  ``hidden`` is a clause on the
-    processes that /proc does not show, or "".  ``container`` says whether only the processes of a
-    container can be seen, ``by_root`` whether sros ran as root.
+    processes that /proc does not show, or "".  ``is_in_container`` says that sros can see only the
+    processes of its container, and ``is_run_by_root`` that sros runs as root.
     """
 
     processes: tuple[Process, ...] = ()
     unseen: tuple[UnseenProcess, ...] = ()
     hidden: str = ""
-    container: bool = False
-    by_root: bool = False
+    is_in_container: bool = False
+    is_run_by_root: bool = False
 
 
 def boot_id(proc: Path = Path("/proc")) -> str:

@@ -288,7 +288,7 @@ CASES: dict[str, Change] = {
     "runtime.process-elsewhere": changed(0, network="net:[1]"),
     "runtime.process-not-seen": _unseen,
     "runtime.container-alone": lambda state, _: replace(
-        state, running=replace(state.running, container=True)
+        state, running=replace(state.running, is_in_container=True)
     ),
     "runtime.zenoh-process-unread": on_zenoh("mode: client\n"),
     "runtime.zenoh-open": on_zenoh(**{SESSION: None}),

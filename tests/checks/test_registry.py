@@ -233,7 +233,7 @@ def test_what_could_not_be_looked_at_is_neither_nothing_nor_a_finding(
     assert ended.status == 2
     assert "process 9 (talker): warning: processes that sros could not examine" in ended.out
     assert "Run the check as root" in ended.out
-    by_root = RunningProcesses(unseen=(unseen,), by_root=True)
+    by_root = RunningProcesses(unseen=(unseen,), is_run_by_root=True)
     monkeypatch.setattr(ProcessTable, "look", lambda *_: by_root)
     told = sros("check", "runtime").out
     assert "Run it as root" not in told and "CAP_SYS_PTRACE" in told

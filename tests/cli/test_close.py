@@ -683,7 +683,7 @@ def test_what_systemd_does_not_start_is_done_by_hand(
     assert "/listener open: cd /opt && /opt/run listener --ro" in robot.close("--undo").err
     assert "\nsome processes cannot be examined: run this command as root\n" in undone.err
     assert "the robot is open: " in undone.err
-    looked = replace(robot.look(None, datetime.now(UTC)), by_root=True)
+    looked = replace(robot.look(None, datetime.now(UTC)), is_run_by_root=True)
     robot.more, robot.unseen = (), ()
     undone = robot.close("--undo", status=1)
     assert undone.out.startswith("no process of the robot runs, open or secured: start its proc")

@@ -258,10 +258,10 @@ def test_what_proc_hides_is_said(proc: Proc) -> None:
 def test_a_namespace_of_processes_does_not_show_those_of_others(
     proc: Proc, number: int, alone: bool
 ) -> None:
-    assert not proc.look().container
+    assert not proc.look().is_in_container
     (proc.path / "self/ns").mkdir(parents=True)
     (proc.path / "self/ns/pid").symlink_to(f"pid:[{number}]")
-    assert proc.look().container is alone
+    assert proc.look().is_in_container is alone
 
 
 @pytest.mark.skipif(os.getuid() != 0, reason="only root can become another user")
