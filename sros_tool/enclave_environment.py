@@ -242,14 +242,14 @@ def _with_join_faults(
     """
     from sros_tool.dds.decision.vendors import TESTED
     from sros_tool.faults import Fault
-    from sros_tool.keystore.participant import evaluated
+    from sros_tool.keystore.participant import evaluate_enclave
 
     vendors = (vendor,) if vendor else TESTED
-    evaluation = evaluated(
+    evaluation = evaluate_enclave(
         name, folder, state, moment=context.at, domain=context.domain, vendors=vendors
     )
     # `_check_rmw_reads_tokens` says that a vendor reads no token.
-    refusals = evaluation.stopped(ignored=(Fault.KEY_ON_TOKEN.id,))
+    refusals = evaluation.refusal_sentences(ignored=(Fault.KEY_ON_TOKEN.id,))
     if evaluation.state.problems or not refusals:
         return evaluation.state
     raise KeystoreError(
@@ -855,7 +855,7 @@ def other_node_notes(
         return ()
     known = nodes_of_rights(grant_rights(enclave, grant))
     digest = hashlib.sha256(state.files.get(PERMISSIONS_FILE, b"")).hexdigest()
-    recorded = RecordedRights(keystore).latest(enclave, digest)
+    recorded = RecordedRights(keystore).latest_entry(enclave, digest)
     if recorded:
         known += nodes_from_text(recorded.nodes)
     notes = [_other_node_note(enclave, known, *node, all_known=bool(recorded)) for node in started]

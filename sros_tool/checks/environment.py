@@ -321,7 +321,7 @@ def _governed_domains(keystore: OpenedKeystore) -> DomainSet | None:
     """Return the ROS domains of a keystore's governance, or None if it is unreadable."""
     try:
         message = keystore.read(GOVERNANCE_P7S, "governance document")
-        signed = keystore.files.signed(message)
+        signed = keystore.files.signed_document(message)
         return parse_governance(signed.document).domains().closed()
     except SrosError:  # reported for each enclave, which has a copy of the file in an export
         return None

@@ -417,7 +417,7 @@ def _shared_expiries(keystore: OpenedKeystore) -> Iterator[Expiry]:
         # The governance has no expiry of its own: it is valid as long as the CA that signed it.
         with suppress(SrosError):
             authority = keystore.ca_certificate(PERMISSIONS)
-            keystore.governance_by(authority)
+            keystore.governance_signed_by(authority)
             yield Expiry("governance", "", validity_of(authority).not_after)
     with suppress(SrosError):
         if crl := keystore.revocation_list:

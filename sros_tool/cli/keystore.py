@@ -824,7 +824,7 @@ def update_keystore(
     elif take_edits:
         target, domains = edited_settings(keystore, present)
     else:
-        target = present.without_edits() if discard_edits else present.settings_to_change()
+        target = present.settings_without_edits() if discard_edits else present.settings_to_change()
     target = with_values(
         target,
         [_key_and_value(value) for value in values],

@@ -244,11 +244,11 @@ def revoke(
     """
     from sros_tool.keystore.lifecycle.revoke import revoke as work
     from sros_tool.keystore.reader import OpenedKeystore
-    from sros_tool.keystore.selection import select_to_revoke
+    from sros_tool.keystore.selection import select_enclaves_to_revoke
 
     root, given = split_root(arguments)
     check_chosen(given, patterns, robots)
-    names, selection_notes = select_to_revoke(
+    names, selection_notes = select_enclaves_to_revoke(
         OpenedKeystore(root), given, patterns, robots, now=now()
     )
     words_of_rfc = reason.replace("-", "_").split("_")

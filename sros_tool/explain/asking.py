@@ -285,7 +285,7 @@ def planned_enclave(
     that the policy demands.
     """
     from sros_tool.keystore.participant import plan_enclave
-    from sros_tool.keystore.protection import governance_with_stated
+    from sros_tool.keystore.protection import governance_with_stated_protections
     from sros_tool.keystore.template import DEFAULT_TEMPLATE, load_template
     from sros_tool.policy.model import stated_protections
 
@@ -294,7 +294,7 @@ def planned_enclave(
     domain = asking.context(None).domain
     stated = stated_protections([policy])
     protection = load_template(DEFAULT_TEMPLATE).protection
-    governance = governance_with_stated(protection, stated, domain)
+    governance = governance_with_stated_protections(protection, stated, domain)
     return plan_enclave(policy, governance, moment=asking.at)
 
 

@@ -264,7 +264,7 @@ def _allows(
     asking: AskingContext,
 ) -> bool:
     """Return whether signed permissions give a right, or an acting part of it, to a certificate."""
-    governance, document = keystore.governance, keystore.files.signed(permissions).document
+    governance, document = keystore.governance, keystore.files.signed_document(permissions).document
     grant = parse_permissions(document).grant_of(certificate.subject)
     if vendor is None and grant:
         asking = asking._replace(at=grant.validity.not_before)

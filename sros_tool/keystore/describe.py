@@ -45,7 +45,7 @@ from sros_tool.keystore.layout import (
     search_enclaves,
 )
 from sros_tool.keystore.ledger import GAP, RESTORED, SEALED, Entry
-from sros_tool.keystore.participant import EvaluatedEnclave, evaluated
+from sros_tool.keystore.participant import EvaluatedEnclave, evaluate_enclave
 from sros_tool.keystore.reader import FilesReadOnce, OpenedEnclave, OpenedKeystore, open_enclave
 from sros_tool.keystore.zenoh_files import OpenedZenoh, ZenohFault, open_zenoh
 from sros_tool.pki.certificates import (
@@ -561,7 +561,7 @@ def describe(
         of_enclave = (CERTIFICATE_FILE, PERMISSIONS_FILE, KEY_URI_FILE)
         if any((path / name).exists() for name in of_enclave):
             state = open_enclave(path, now=now, files=files)
-            evaluation = evaluated("", path, state, moment=now)
+            evaluation = evaluate_enclave("", path, state, moment=now)
             elsewhere = state.key_on_robot
             facts = (
                 _facts_in_keystore(evaluation, state) if elsewhere else _enclave_facts(evaluation)
@@ -604,7 +604,7 @@ def _describe_file(
         mode = path.stat().st_mode & 0o777
         return DescribedKey(path, algorithm(load_key(data, "in it")), f"{mode:04o}")
     if b"multipart/signed" in data[:1000].lower():
-        signed = files.signed(data)
+        signed = files.signed_document(data)
         signature = _describe_signature(path, data, now, authority, files)
         if signed.document.lstrip()[:1] == b"<":
             return _describe_document(path, signed.document, signature, now)
@@ -729,7 +729,7 @@ def _describe_zenoh(folder: Path, now: datetime) -> ZenohFiles | None:
 def _describe_enclave(keystore: OpenedKeystore, name: str, now: datetime) -> KeystoreEnclave:
     """Describe an enclave of a keystore."""
     state = keystore.enclave(name, now=now)
-    evaluation = evaluated(name, keystore.folder(name), state, moment=now)
+    evaluation = evaluate_enclave(name, keystore.folder(name), state, moment=now)
     return KeystoreEnclave(name, state.key_on_robot, _facts_in_keystore(evaluation, state))
 
 
@@ -821,7 +821,7 @@ def _describe_signature(
     path: Path, data: bytes, now: datetime, authority: Path | None, files: FilesReadOnce
 ) -> SignatureFacts:
     """Describe the signature of the signed document ``data`` at ``path``."""
-    signed = files.signed(data)
+    signed = files.signed_document(data)
     authority_file = authority or permissions_ca_for(path)
     reason = "no certificate of a permissions CA is next to the document; name one with --ca"
     verified: bool | None = None
@@ -849,7 +849,7 @@ def _describe_signature_next_to(
         return _NOT_SIGNED
     message = files.read(signed, "signed document")
     signature = _describe_signature(signed, message, now, authority, files)
-    if files.signed(message).text == data or signature.signer is None:
+    if files.signed_document(message).text == data or signature.signer is None:
         return signature
     problem = f"{path.name} is not the document that {signed.name} signs"
     signer = signature.signer._replace(signature_problem=problem)

@@ -1335,7 +1335,7 @@ class _KeystoreRecords:
         with suppress(SrosError):
             data = self._keystore.read(difference.path, "document")
             authorities = self._keystore.authority(PERMISSIONS)
-            return bool(self._keystore.files.signed(data).problem_for(authorities))
+            return bool(self._keystore.files.signed_document(data).problem_for(authorities))
         return True
 
     def _identify(self, difference: _Difference, kind: str, name: str) -> tuple[State, str, str]:

@@ -292,7 +292,7 @@ def _signature_problems(
     if file not in state.files or not signers:
         return
     try:
-        text = _signer_fault(traits, state.signed(file), signers, moment)
+        text = _signer_fault(traits, state.signed_document(file), signers, moment)
     except PkiError as error:
         text = str(error)
     if text:

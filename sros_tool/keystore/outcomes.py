@@ -49,7 +49,7 @@ class StagedZenoh:
     restart: tuple[str, ...] = ()
     notes: tuple[Note, ...] = ()
 
-    def without(self, names: Collection[str]) -> StagedZenoh:
+    def without_restart_of(self, names: Collection[str]) -> StagedZenoh:
         """Return a copy in which the enclaves ``names`` need no restart."""
         return replace(self, restart=tuple(name for name in self.restart if name not in names))
 

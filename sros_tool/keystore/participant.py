@@ -219,7 +219,7 @@ def plan_enclave(policy: Enclave, governance: Governance, *, moment: datetime) -
 
 def _signed_document(state: OpenedEnclave, file: str) -> bytes:
     with suppress(SrosError):
-        return state.signed(file).document
+        return state.signed_document(file).document
     return b""
 
 
@@ -339,7 +339,7 @@ class VendorParticipant:
         return self.refusal
 
     def causes(self) -> tuple[RefusalCause, ...]:
-        """Return why no node can run in the enclave, or why peers refuse it; () if nodes run.
+        """Return why no node can run in the enclave, or why peers refuse nodes; () if nodes run.
 
         Rights to topics are not considered, because they are a matter of the policy.
         """
@@ -402,7 +402,7 @@ class EvaluatedEnclave(NamedTuple):
     state: OpenedEnclave
     participants: tuple[VendorParticipant, ...]
 
-    def stopped(self, ignored: Collection[str] = ()) -> str:
+    def refusal_sentences(self, ignored: Collection[str] = ()) -> str:
         """Return why no vendor runs a process in the enclave, as sentences; "" if a vendor does.
 
         Causes whose reason is in ``ignored`` do not count.
@@ -432,7 +432,7 @@ class EvaluatedEnclave(NamedTuple):
     def problems(self) -> tuple[str, ...]:
         """Clauses on problems that stop a process; a key that is on the robot is not a problem."""
         named = tuple(map(str, self.state.problems_in_keystore))
-        return named or tuple(filter(None, (self.stopped().removesuffix("."),)))
+        return named or tuple(filter(None, (self.refusal_sentences().removesuffix("."),)))
 
     @property
     def problems_here(self) -> tuple[str, ...]:
@@ -440,7 +440,7 @@ class EvaluatedEnclave(NamedTuple):
         return tuple(map(str, self.state.problems)) or self.problems
 
 
-def evaluated(
+def evaluate_enclave(
     name: str,
     folder: Path,
     state: OpenedEnclave,
@@ -484,7 +484,7 @@ def accepted_state(
         or problem.fault is Fault.CRL_LEFT_OUT
         or (problem.fault in _VENDOR_SPECIFIC_FAULTS and not sound)
         or all(problem in participant.problems for participant in participants)
-        or (problem.fault is Fault.SIGNATURE and not _signed_by_ca(state, problem.file))
+        or (problem.fault is Fault.SIGNATURE and not _is_signed_by_ca(state, problem.file))
     )
     if any(problem.fault is Fault.SIGNATURE for problem in problems):
         named = tuple(_with_acceptance(state, problem, participants) for problem in problems)
@@ -519,14 +519,14 @@ def _with_acceptance(
 def _signers(state: OpenedEnclave, file: str) -> set[x509.Certificate | None]:
     """Return the certificates of a document's signers; None stands for a missing certificate."""
     with suppress(SrosError):
-        signed = state.signed(file)
+        signed = state.signed_document(file)
         data = state.files.get(PERMISSIONS_CA_FILE, b"")
         known = (*signed.certificates, *load_certificates(data, PERMISSIONS_CA_FILE))
         return {signature.signer_among(known) for signature in signed.signatures}
     return set()
 
 
-def _signed_by_ca(state: OpenedEnclave, file: str) -> bool:
+def _is_signed_by_ca(state: OpenedEnclave, file: str) -> bool:
     """Return whether all signers of a document have CA certificates."""
     signers = _signers(state, file)
     return bool(signers) and all(signer is not None and _is_ca(signer) for signer in signers)

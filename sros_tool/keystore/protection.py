@@ -54,7 +54,7 @@ def contradictions(
 # ── from statements to the protection of a keystore ────────────────────────────────────────
 
 
-def with_stated(
+def with_stated_protections(
     protection: DomainProtection, stated_protections: Sequence[StatedProtection]
 ) -> DomainProtection:
     """Return ``protection``, raised to the levels that policies state, but never lowered.
@@ -78,21 +78,21 @@ def with_stated(
     }.values():
         raised.state(stated_protection)
     result = raised.result()
-    missing = next(less_protected(governance_for_all(result), stated_protections), None)
+    missing = next(unfulfilled_protections(governance_for_all(result), stated_protections), None)
     assert missing is None, f"{missing} is not protected as stated"
     return result
 
 
-def governance_with_stated(
+def governance_with_stated_protections(
     protection: DomainProtection, stated_protections: Sequence[StatedProtection], domain: int = 0
 ) -> Governance:
-    """Return the governance for ``protection`` in a domain, raised as `with_stated` does.
+    """Return the governance for a raised ``protection`` (`with_stated_protections`) in a domain.
 
     Raises:
-        PolicyError: as `with_stated`.
+        PolicyError: as `with_stated_protections`.
     """
     return governance_for(
-        with_stated(protection, stated_protections), DomainSet.of((domain, domain))
+        with_stated_protections(protection, stated_protections), DomainSet.of((domain, domain))
     )
 
 
@@ -117,10 +117,12 @@ class _RaisedProtection:
         self._topics = Names(self._owner)
 
     def result(self) -> DomainProtection:
+        """Return the raised protection."""
         named = (*self._added, *self._named)
         return replace(self._protection, named=named)
 
     def state(self, protection: StatedProtection) -> None:
+        """Raise the protection of a name to the level that a policy states."""
         topics = protected_topics(protection.kind, protection.name)
         deciding = {topic: self._deciding_entry(topic, protection) for topic in topics}
         if len({self._value(number) for number in deciding.values()}) > 1:
@@ -210,10 +212,10 @@ def _strength(level: str) -> int:
 # ── from a governance back to statements ───────────────────────────────────────────────────
 
 
-def less_protected(
+def unfulfilled_protections(
     governance: Governance, stated_protections: Iterable[StatedProtection]
 ) -> Iterator[tuple[StatedProtection, Level]]:
-    """Yield the statements that a governance does not fulfill, with the level that it gives.
+    """Yield the statements that a governance does not fulfill, with its level for the name.
 
     The level of a name is the lowest level of its DDS topics in all domains.  A topic without a
     rule does not count, because no vendor allows its use.
@@ -232,7 +234,7 @@ def less_protected(
 
 
 class _DomainRules:
-    """The topic rules of a domain, with a fast search for those that apply to a topic."""
+    """The topic rules of a domain, with a fast search for the rules that apply to a topic."""
 
     def __init__(self, rule: DomainRule) -> None:
         self._rtps = rule.rtps_protection_kind

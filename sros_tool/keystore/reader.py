@@ -103,7 +103,7 @@ class FilesReadOnce:
     """A cache that reads each file at most once, even if it is reached through different links.
 
     The content that was read first is kept for a path.  A file that could not be read fails again.
-    Once the cache holds 16 MiB, it is `full`, and other files are read each time.
+    Once the cache holds 16 MiB, it `is_full`, and other files are read each time.
     """
 
     def __init__(self) -> None:
@@ -130,12 +130,12 @@ class FilesReadOnce:
         except SrosError as error:
             self._errors[name, label] = error
             raise
-        if not self.full:
+        if not self.is_full:
             self._by_path[name] = data
         return data
 
     @property
-    def full(self) -> bool:
+    def is_full(self) -> bool:
         """Whether the cache accepts no further files."""
         return self._size > _MOST_CACHED_BYTES
 
@@ -145,12 +145,12 @@ class FilesReadOnce:
             if data is not None and len(data) <= max_bytes:
                 return data
         state, data = read_file(path, label, max_bytes=max_bytes)
-        if not self.full:
+        if not self.is_full:
             self._by_file[_file_identity(state)] = data
             self._size += len(data)
         return data
 
-    def signed(self, message: bytes) -> smime.SignedDocument:
+    def signed_document(self, message: bytes) -> smime.SignedDocument:
         """Return the signed document in ``message``; each message is parsed and verified only once.
 
         Raises:
@@ -162,7 +162,7 @@ class FilesReadOnce:
                 known = smime.parse(message)
             except SrosError as error:
                 known = error
-            if not self.full:
+            if not self.is_full:
                 self._signed[message] = known
         if isinstance(known, SrosError):
             raise known.with_traceback(None)
@@ -233,7 +233,7 @@ class OpenedKeystore:
         is not kept once `files` is full.
         """
         if key not in self._parts:
-            if self.files.full and isinstance(key, tuple) and key[0] in _ENCLAVE_PART_KEYS:
+            if self.files.is_full and isinstance(key, tuple) and key[0] in _ENCLAVE_PART_KEYS:
                 return read()
             try:
                 self._parts[key] = read()
@@ -470,9 +470,9 @@ class OpenedKeystore:
         Raises:
             KeystoreError: the governance is missing or malformed, or its signature does not verify.
         """
-        return self.governance_by(self.ca_certificate(PERMISSIONS))
+        return self.governance_signed_by(self.ca_certificate(PERMISSIONS))
 
-    def governance_by(self, authority: x509.Certificate) -> Governance:
+    def governance_signed_by(self, authority: x509.Certificate) -> Governance:
         """Return the governance that DDS loads, after verifying that ``authority`` signed it.
 
         Raises:
@@ -483,7 +483,7 @@ class OpenedKeystore:
     def _governance_by(self, authority: x509.Certificate) -> Governance:
         path = self.root / GOVERNANCE_P7S
         try:
-            signed = self.files.signed(self.read(path, "governance document"))
+            signed = self.files.signed_document(self.read(path, "governance document"))
             signed.verify(authority)
             return parse_governance(signed.document, f"'{path}'")
         except SrosError as error:
@@ -598,7 +598,7 @@ def _read_signed_grant(path: Path, subject: str, files: FilesReadOnce | None = N
     """
     files = files or FilesReadOnce()
     message = files.read(path, "permissions document")
-    signed = files.signed(message)
+    signed = files.signed_document(message)
     permissions = parse_permissions(signed.document, f"'{path}'")
     return SignedGrant(signed, hashlib.sha256(message).hexdigest(), permissions.grant_of(subject))
 
@@ -657,13 +657,13 @@ class OpenedEnclave:
     )
     """A cache of the enclave's files, and of files that it shares with other enclaves."""
 
-    def signed(self, file: str) -> smime.SignedDocument:
+    def signed_document(self, file: str) -> smime.SignedDocument:
         """Return a signed document of the enclave, whose signature need not be verified yet.
 
         Raises:
             PkiError: the file does not exist, or is not a signed message.
         """
-        return self.read_once.signed(self.files.get(file, b""))
+        return self.read_once.signed_document(self.files.get(file, b""))
 
     @cached_property
     def subject(self) -> str:
@@ -742,7 +742,7 @@ def weaknesses(state: OpenedEnclave) -> Iterator[tuple[str, str]]:
                     yield file, text
     for file in (GOVERNANCE_FILE, PERMISSIONS_FILE):
         with suppress(SrosError):
-            if text := state.signed(file).weakness():
+            if text := state.signed_document(file).weakness():
                 yield file, text
 
 
@@ -1044,7 +1044,7 @@ class _EnclaveFiles:
         if data is None:
             return None
         try:
-            signed = self._files.signed(data)
+            signed = self._files.signed_document(data)
             if authority:
                 signed.verify(authority)
             return signed.document
@@ -1136,7 +1136,7 @@ def read_consistently(
 def _ledger_state(root: Path) -> object:
     """Return a value that differs after each change of a keystore.
 
-    The value identifies the file of the ledger.
+    The value identifies the files of the ledger and of the settings.
     """
     file_states: list[tuple[int, int, int] | None] = []
     for name in (LEDGER, SETTINGS):

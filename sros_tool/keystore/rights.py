@@ -120,7 +120,7 @@ class RightsSource:
     key_domains: Mapping[Right, frozenset[int | None]] = field(default_factory=dict)
     policy: Policy | None = None
 
-    def without_rights(self) -> set[str]:
+    def enclaves_without_rights(self) -> set[str]:
         """Return the enclaves of a policy or of permissions that have no rights at all."""
         return self.stated_enclaves() - {right.enclave for right in self.rights}
 
@@ -512,7 +512,7 @@ class _Reader:
         data = self.files.read(file, "permissions document")
         if b"multipart/signed" in data[:1000].lower():
             try:
-                signed = self.files.signed(data)
+                signed = self.files.signed_document(data)
             except SrosError as error:
                 raise DocumentError(f"'{file}' cannot be read: {error.what}", error.why) from error
             self._verify(signed, file, label)
@@ -766,7 +766,7 @@ def compare_sources(
     enclaves = [
         (sign, enclave)
         for sign, side, other in (("-", *sides), ("+", *sides[::-1]))
-        for enclave in sorted(side.without_rights() - other.stated_enclaves())
+        for enclave in sorted(side.enclaves_without_rights() - other.stated_enclaves())
         if other.kind != "zenoh" and (scope is None or enclave in scope)
     ]
     unclear = [*_unclear_enclaves(first_source, second_source, scope)]
@@ -814,7 +814,7 @@ def _governances(source: RightsSource) -> set[Governance]:
         places |= {source.path / GOVERNANCE_P7S} if keystore.has(GOVERNANCE_P7S) else set()
     documents = {keystore.read(place, "governance document") for place in places if place.exists()}
     return {
-        parse_governance(keystore.files.signed(document).document, f"'{source.path}'")
+        parse_governance(keystore.files.signed_document(document).document, f"'{source.path}'")
         for document in documents
     }
 
@@ -886,7 +886,11 @@ def _stated_domains(source: RightsSource) -> dict[str, str]:
                 unlimited.add(enclave)
             else:
                 ranges[enclave] += ((part.first or 0, part.last or 0) for part in domains.ranges)
-    return {name: str(DomainSet.of(*of)) for name, of in ranges.items() if name not in unlimited}
+    return {
+        name: str(DomainSet.of(*own_ranges))
+        for name, own_ranges in ranges.items()
+        if name not in unlimited
+    }
 
 
 def _protection_differences(
@@ -894,7 +898,8 @@ def _protection_differences(
 ) -> list[tuple[str, StatedProtection]]:
     """Return the protection that only one of two policies states.
 
-    Each is paired with "-" if the first policy states it, and with "+" if the second one does.
+    Each protection is paired with "-" if the first policy states it, and with "+" if the second
+    policy does.
     """
     if first_source.protections is None or second_source.protections is None:
         return []
@@ -1021,21 +1026,21 @@ class RecordedRights:
 
     def nodes(self, name: str) -> str:
         """Return the ledger's text with the nodes of an enclave's last permissions, or ""."""
-        last = self.last(name)
+        last = self.last_entry(name)
         return last.nodes if last else ""
 
-    def last(self, name: str) -> Entry | None:
+    def last_entry(self, name: str) -> Entry | None:
         """Return the ledger entry of an enclave's last permissions, or None."""
         return self._ledger_part(name).last.get(name)
 
-    def latest(self, name: str, digest: str) -> Entry | None:
+    def latest_entry(self, name: str, digest: str) -> Entry | None:
         """Return the last ledger entry of an enclave if it records these permissions, else None.
 
         ``name`` and ``digest`` are as for `policy`.
         """
         with suppress(KeystoreError):
             self.policy(name, digest)
-            return self.last(name)
+            return self.last_entry(name)
         return None
 
     def unproven_entries(self) -> dict[str, Entry]:

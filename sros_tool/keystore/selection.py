@@ -102,7 +102,7 @@ def select_enclaves(
     return tuple(chosen | dict.fromkeys(_enclaves_of_robots(keystore, robots, checked, {})))
 
 
-def select_to_revoke(
+def select_enclaves_to_revoke(
     keystore: OpenedKeystore,
     names: Sequence[str],
     patterns: Sequence[str],
@@ -126,7 +126,7 @@ def select_to_revoke(
         return tuple(names), tuple(_revoked_notes(revoked))
     chosen = dict.fromkeys(select_enclaves(keystore, names, patterns))
     unrecorded: dict[str, UnrecordedEnclaves] = {}
-    by_name = partial(_revocation_by_name, keystore, robots)
+    by_name = partial(_advice_on_revoking_by_name, keystore, robots)
     if fleet := checked_fleet(keystore, by_name) if robots else None:
         possible = _possible_enclaves(keystore, fleet, robots)
         unrecorded = unrecorded_enclaves(fleet, possible, set(robots))
@@ -146,7 +146,7 @@ def select_to_revoke(
 
 
 def _is_revoked(keystore: OpenedKeystore, name: str, now: datetime) -> bool:
-    """Return whether an enclave is gone, and each of its valid certificates is revoked."""
+    """Return whether an enclave no longer exists, and all its valid certificates are revoked."""
     if keystore.has_enclave(name) or not revocation_of(keystore, name):
         return False
     if not keystore.revocation_lists:  # the revocation is not in force
@@ -170,7 +170,7 @@ def _revoked_notes(names: Sequence[str]) -> Iterator[Note]:
         )
 
 
-def _revocation_by_name(keystore: OpenedKeystore, robots: Sequence[str]) -> str:
+def _advice_on_revoking_by_name(keystore: OpenedKeystore, robots: Sequence[str]) -> str:
     """Return sentences on how to revoke the enclaves of robots although the fleet was edited.
 
     The sentences name the enclaves that the edited file gives to the robots, and the enclaves with
@@ -238,7 +238,7 @@ def _other_computers_notes(
     robots: Sequence[str],
     revoked: Collection[str],
 ) -> Iterator[Note]:
-    """Yield a note on robots that share a namespace with ``robots``, and keep enclaves."""
+    """Yield a note on robots in the namespaces of ``robots`` that have enclaves not ``revoked``."""
     asked = [fleet.robots[name] for name in robots if name in fleet.robots] if fleet else []
     for namespace, domain in dict.fromkeys((robot.namespace, robot.domain) for robot in asked):
         assert fleet

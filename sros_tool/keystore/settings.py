@@ -99,7 +99,7 @@ class PresentSettings(NamedTuple):
         """The domains of the signed governance."""
         return self.governance.domains().closed()
 
-    def without_edits(self) -> Template:
+    def settings_without_edits(self) -> Template:
         """Return the settings without edits, from the ledger, or else from `settings_to_change`.
 
         Raises:
@@ -152,7 +152,7 @@ def present_settings(keystore: OpenedKeystore) -> PresentSettings:
                 "from a backup.",
             ) from error
         loaded, unreadable = recorded, f"{error.what}: {error.why}".removesuffix(".")
-    recorded = with_places(recorded, loaded) if recorded else None
+    recorded = with_key_places(recorded, loaded) if recorded else None
     settings = recorded or loaded
     if protection := protection_for(governance):
         settings = replace(settings, protection=protection)
@@ -170,7 +170,7 @@ def edit_notes(keystore: OpenedKeystore, governance: Governance) -> tuple[Note, 
 
     ``governance`` is the signed governance of the keystore.
     """
-    edits = found_edits(keystore, governance)
+    edits = find_edits(keystore, governance)
     if not edits:
         return ()
     clauses = first_few(edits.clauses(), _MOST_SHOWN, "; ", "; and ")
@@ -179,7 +179,7 @@ def edit_notes(keystore: OpenedKeystore, governance: Governance) -> tuple[Note, 
     return (Note("keystore.edited", text),)
 
 
-def found_edits(keystore: OpenedKeystore, governance: Governance | None) -> HandEdits:
+def find_edits(keystore: OpenedKeystore, governance: Governance | None) -> HandEdits:
     """Return the manual edits; ``governance`` is the signed governance, None if unreadable."""
     ledger = keystore.ledger_with("what", "settings")
     return hand_edits(keystore, ledger, keystore.settings, governance)
@@ -280,7 +280,7 @@ def _governance_edit(keystore: OpenedKeystore) -> str:
     try:
         plain = keystore.read(GOVERNANCE_XML, "governance document")
         message = keystore.read(GOVERNANCE_P7S, "governance document")
-        signed = keystore.files.signed(message).document
+        signed = keystore.files.signed_document(message).document
     except SrosError:
         return ""
     if plain.replace(b"\r\n", b"\n").strip() == signed.replace(b"\r\n", b"\n").strip():
@@ -291,7 +291,7 @@ def _governance_edit(keystore: OpenedKeystore) -> str:
     return f"{GOVERNANCE_XML} differs from the signed governance"
 
 
-def with_places(template: Template, source: Template) -> Template:
+def with_key_places(template: Template, source: Template) -> Template:
     """Return ``template`` with the places of the CA keys from the template ``source``.
 
     If ``template`` has no Zenoh network, the result has the network of ``source``.

@@ -50,7 +50,7 @@ _PLURAL_KINDS: dict[str, str] = {"topic": "topics", "service": "services", "acti
 _TYPE_TEXTS: dict[type, str] = {str: "a string", bool: "a boolean", list: "a list"}
 
 
-class ShortLived(NamedTuple):
+class ShortLivedEnclaves(NamedTuple):
     """The validity of the enclaves whose names match ``name``, which may have wildcards."""
 
     name: str
@@ -83,7 +83,7 @@ class Template:
     permissions_key: str = ""
     unique_subject: bool = False
     revocation_validity: timedelta = timedelta(days=3650)
-    short_lived: tuple[ShortLived, ...] = ()
+    short_lived: tuple[ShortLivedEnclaves, ...] = ()
     zenoh: ZenohNetwork | None = None
     distributions: tuple[str, ...] = ()
 
@@ -248,7 +248,7 @@ def _read_distributions(table: _Table) -> tuple[str, ...]:
     return tuple(name for name in DISTRIBUTIONS if name in named)
 
 
-def _read_short_lived(table: _Table) -> Iterator[ShortLived]:
+def _read_short_lived(table: _Table) -> Iterator[ShortLivedEnclaves]:
     for entry in table.tables("enclaves"):
         validity = entry.duration("validity")
         for name in entry.texts("names"):
@@ -258,7 +258,7 @@ def _read_short_lived(table: _Table) -> Iterator[ShortLived]:
                 raise _TemplateError(
                     f"{entry.path}.names has {name!r}, which is not the name of an enclave: {why}"
                 )
-            yield ShortLived(name, validity)
+            yield ShortLivedEnclaves(name, validity)
         entry.finish()
 
 

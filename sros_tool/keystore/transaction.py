@@ -156,11 +156,11 @@ class Changes(Sequence[Change]):
             self._ends.append(len(self) + len(names))
 
     def mark(self) -> int:
-        """Return a mark of the changes so far, for `since`."""
+        """Return a mark of the changes so far, for `added_since`."""
         self._last_is_open = False
         return len(self._runs)
 
-    def since(self, mark: int) -> tuple[ChangeRun, ...]:
+    def added_since(self, mark: int) -> tuple[ChangeRun, ...]:
         """Return the changes that were added after ``mark``."""
         return tuple(self._runs[mark:])
 
@@ -192,7 +192,7 @@ class Changes(Sequence[Change]):
 
 
 @dataclass(frozen=True, slots=True)
-class Staged:
+class StagedChanges:
     """The changes that a forked worker staged, sent to the process that commits.
 
     ``kept`` has the new files and link targets of a dry run; None stands for files beyond the
@@ -326,7 +326,7 @@ def _checked_stage_target(folder: Folder) -> str | None:
     return to
 
 
-def check_interrupted(folder: Folder) -> tuple[str | None, tuple[Move, ...]]:
+def check_interrupted_change(folder: Folder) -> tuple[str | None, tuple[Move, ...]]:
     """Return the target of ``live`` in a stage, and the moves to complete or undo.
 
     Raises:
@@ -532,7 +532,7 @@ class Transaction:
             if self._sibling:
                 with Folder(self.root.parent) as parent, contextlib.suppress(OSError):
                     parent.remove_tree(self._sibling)
-            elif self._lock and self._lock.held:
+            elif self._lock and self._lock.is_held:
                 _recover(self._target_folder)
         finally:
             if self._lock:
@@ -628,7 +628,7 @@ class Transaction:
         Links to a first revocation list are left out.
         """
         folders: dict[str, set[str]] = {}
-        for run in self.changes.since(0):
+        for run in self.changes.added_since(0):
             if run.file:
                 continue
             folders.setdefault(run.folder.removesuffix("/"), set()).update(run.names)
@@ -764,13 +764,13 @@ class Transaction:
         own_process, first_change, first_move = os.getpid(), self.changes.mark(), len(self._moves)
         first_kept = len(self._kept_content)
 
-        def work_on(part: Sequence[Item]) -> tuple[Result, Staged | None]:
+        def work_on(part: Sequence[Item]) -> tuple[Result, StagedChanges | None]:
             result = work(part)
             if os.getpid() == own_process:
                 return result, None
-            changes, moves = self.changes.since(first_change), self._moves[first_move:]
+            changes, moves = self.changes.added_since(first_change), self._moves[first_move:]
             kept = dict(islice(self._kept_content.items(), first_kept, None))
-            return result, Staged(changes, tuple(moves), kept)
+            return result, StagedChanges(changes, tuple(moves), kept)
 
         slices = [(items, work_on(items))] if alone else map_slices(items, work_on)
         for _, (_, staged) in slices:
@@ -820,7 +820,7 @@ class Transaction:
         _point_live(folder, _AFTER)
         self._undo.clear()
         with contextlib.suppress(OSError, SrosError):  # already committed; `_end` tries again
-            complete(folder, self._moves)
+            _complete_commit(folder, self._moves)
         self._finish()
         for path in self._exposed_keys():
             with contextlib.suppress(OSError):  # `check` reports what stays open
@@ -1019,7 +1019,7 @@ class KeystoreLock:
         self._handle = -1
 
     @property
-    def held(self) -> bool:
+    def is_held(self) -> bool:
         """Whether this process holds the lock."""
         return self._handle >= 0
 
@@ -1036,7 +1036,7 @@ class KeystoreLock:
         deadline = time.monotonic() + wait
         while not self._try_to_lock() and time.monotonic() < deadline:
             time.sleep(_LOCK_RETRY_SECONDS)
-        if not self.held:
+        if not self.is_held:
             state = self._folder.state(LOCK)
             if state and os.geteuid() not in (0, state.st_uid):  # who is at work hands it over
                 raise _left_by_root_error(self._folder.path / LOCK)
@@ -1149,10 +1149,10 @@ def _left_by_root_error(path: Path) -> KeystoreError:
 
 
 def _complete_or_undo(folder: Folder) -> None:
-    to, moves = check_interrupted(folder)
+    to, moves = check_interrupted_change(folder)
     if to == _AFTER:
         _LOG.info("moving the committed files to their places in the keystore '%s'", folder.path)
-        complete(folder, moves)
+        _complete_commit(folder, moves)
         return
     if to == _BEFORE:
         _LOG.info("undoing an uncommitted transaction in the keystore '%s'", folder.path)
@@ -1160,7 +1160,7 @@ def _complete_or_undo(folder: Folder) -> None:
     _remove_stage(folder)
 
 
-def complete(folder: Folder, moves: Sequence[Move]) -> None:
+def _complete_commit(folder: Folder, moves: Sequence[Move]) -> None:
     """Move all committed files to their places, and remove the stage."""
     _replace_links(folder, moves)
     if folder.is_folder(f"{STAGE}/{_ADDED}"):

@@ -196,7 +196,7 @@ def is_signed(
     files = files or FilesReadOnce()
     try:
         message = files.read(path.with_name(ZENOH_SIGNED[path.name]), "signed document")
-        signed = files.signed(message)
+        signed = files.signed_document(message)
         signed.verify(authority)
     except SrosError:
         return False
@@ -221,7 +221,7 @@ def _read_configuration(
     except SrosError as error:
         return ZenohProblem(file, str(error), ZenohFault.UNREADABLE)
     try:
-        signed = state.read_once.signed(message)
+        signed = state.read_once.signed_document(message)
         if state.permissions_ca is None:
             text = (
                 "the permissions CA of the enclave is missing, so the signature cannot be verified"
@@ -259,8 +259,8 @@ def _out_of_date_clause(
     """Return how a configuration differs from its enclave's permissions, as a clause, or ""."""
     is_session = file == SESSION_FILE
     if is_session is (configuration.mode is Mode.ROUTER):
-        of, wanted = ("router", "session") if is_session else ("session", "router")
-        return f"it is the configuration of a {of}, not of a {wanted}"
+        present, wanted = ("router", "session") if is_session else ("session", "router")
+        return f"it is the configuration of a {present}, not of a {wanted}"
     if not is_session or state.grant is None:
         return ""
     control = configuration.access_control
@@ -638,8 +638,8 @@ def _router_files(
     for name in rules:
         sides[network.router_of(name).name].append(name)
     together = {
-        router: joined_rights(router, (rights for n in of if (rights := rules[n].rights)))
-        for router, of in sides.items()
+        router: joined_rights(router, (rights for n in enclaves if (rights := rules[n].rights)))
+        for router, enclaves in sides.items()
         if network.routers
     }
     for router in routers if network.routers else ():
@@ -791,7 +791,9 @@ class _RightsReader:
         issued = {name: rights for name in names if (rights := self._change.issued.get(name))}
         certificates = results_of((e for e in names if e not in issued), self._certificate)
         messages = results_of(certificates, self._message)
-        signed = results_of(messages, lambda name: self._keystore.files.signed(messages[name]))
+        signed = results_of(
+            messages, lambda name: self._keystore.files.signed_document(messages[name])
+        )
         verified = results_of(signed, lambda name: self._verify(name, messages[name], signed[name]))
         grants = results_of(
             verified, lambda name: self._grant(name, signed[name].document, certificates[name])
@@ -853,7 +855,7 @@ class _RightsReader:
 
     def _grant(self, name: str, document: bytes, certificate: x509.Certificate) -> Grant:
         subject = subject_text(certificate.subject)
-        grant = grant_for_all(document, f"the permissions of {name}", subject)
+        grant = grant_for_all_vendors(document, f"the permissions of {name}", subject)
         if grant is None:
             raise KeystoreError("its permissions are not for its certificate")
         now = self._now
@@ -1098,7 +1100,7 @@ _TOPIC_PREFIX = "rt"
 _ROS_PREFIXES = (_TOPIC_PREFIX, "rq", "rr")
 
 
-def grant_for_all(document: bytes, name: str, subject: str) -> Grant | None:
+def grant_for_all_vendors(document: bytes, name: str, subject: str) -> Grant | None:
     """Return the grant in signed permissions on which all vendors agree; None if there is none.
 
     ``name`` is the name of the document in errors, and ``subject`` the subject of the certificate.
@@ -1287,13 +1289,15 @@ def _joined_rules(rules: Iterable[Rule]) -> tuple[Rule, ...]:
     """Return one rule with all denials and one with all rights, regardless of their order."""
     joined = []
     for allow in (False, True):
-        of = [rule for rule in rules if rule.allow is allow]
+        alike = [rule for rule in rules if rule.allow is allow]
         publish, subscribe = (
-            _plain_criteria(tuple(topic for rule in of for topic in _topics(getattr(rule, verb))))
+            _plain_criteria(
+                tuple(topic for rule in alike for topic in _topics(getattr(rule, verb)))
+            )
             for verb in _ACCESS_VERBS
         )
         if publish or subscribe:
-            joined.append(Rule(allow, of[0].domains, publish, subscribe))
+            joined.append(Rule(allow, alike[0].domains, publish, subscribe))
     return tuple(joined)
 
 

@@ -40,7 +40,7 @@ from sros_tool.keystore.layout import (
     is_original_keystore,
 )
 from sros_tool.keystore.participant import JoinContext, LoadedEnclave, deciding_enclave
-from sros_tool.keystore.protection import governance_with_stated
+from sros_tool.keystore.protection import governance_with_stated_protections
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.rights import FOREIGN_GRANT, RELAY, load_rights, load_zenoh_rights
 from sros_tool.keystore.template import DEFAULT_TEMPLATE, Template, load_template
@@ -167,7 +167,7 @@ def policy_system(policy: Policy, at: Circumstances, template: Template | None =
     stated = _stated_topics([enclave.path for enclave in policy.enclaves], rights)
     protections = stated_protections(policy.enclaves)
     protection = (template or load_template(DEFAULT_TEMPLATE)).protection
-    governance = governance_with_stated(protection, protections, domain)
+    governance = governance_with_stated_protections(protection, protections, domain)
     demanded = None if template else _demanded_topics(protections)
     subjects = {enclave.path: f"CN={enclave.path}" for enclave in policy.enclaves}
     unique = template is not None and template.unique_subject

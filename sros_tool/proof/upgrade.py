@@ -66,7 +66,7 @@ from sros_tool.keystore.participant import (
     deciding_enclave,
     plan_enclave,
 )
-from sros_tool.keystore.protection import governance_with_stated
+from sros_tool.keystore.protection import governance_with_stated_protections
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.rights import load_rights, load_zenoh_rights
 from sros_tool.keystore.template import DEFAULT_TEMPLATE, load_template
@@ -157,7 +157,7 @@ def _planned_files(policy: Policy, at: Circumstances) -> DecidedFiles:
     """Return the enclaves of a policy as they would be signed, with the default template."""
     template = load_template(DEFAULT_TEMPLATE)
     stated = stated_protections(policy.enclaves)
-    governance = governance_with_stated(template.protection, stated, at.domain or 0)
+    governance = governance_with_stated_protections(template.protection, stated, at.domain or 0)
     enclaves = {
         enclave.path: plan_enclave(enclave, governance, moment=at.now)
         for enclave in policy.enclaves

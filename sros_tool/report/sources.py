@@ -28,8 +28,8 @@ from sros_tool.graph.observation import observation_from_json
 from sros_tool.keystore.fleet import load_fleet
 from sros_tool.keystore.known_keys import KnownKeys
 from sros_tool.keystore.layout import PUBLIC, ROUTER_FILE, is_keystore
-from sros_tool.keystore.participant import evaluated
-from sros_tool.keystore.protection import governance_with_stated
+from sros_tool.keystore.participant import evaluate_enclave
+from sros_tool.keystore.protection import governance_with_stated_protections
 from sros_tool.keystore.reader import (
     OpenedEnclave,
     OpenedKeystore,
@@ -145,7 +145,10 @@ def draw(request: PictureRequest) -> tuple[Picture, Folding]:
         read = [
             source
             if source.governance
-            else replace(source, governance=governance_with_stated(protection, source.protections))
+            else replace(
+                source,
+                governance=governance_with_stated_protections(protection, source.protections),
+            )
             for source in read
         ]
     robots: dict[str, Robot] = {}
@@ -601,7 +604,7 @@ def _with_keystore(source: PictureSource, sample: SampledKeystore, now: datetime
     enclaves, validities = [], set()
     for name in sample.enclaves:
         opened = keystore.enclave(name, now=now)
-        evaluation = evaluated(name, keystore.folder(name), opened, moment=now)
+        evaluation = evaluate_enclave(name, keystore.folder(name), opened, moment=now)
         enclaves.append(_pictured_enclave(name, evaluation.state, evaluation.problems))
         validities |= set(_validities_of(name, evaluation.state))
         governances.append(evaluation.state.governance)
@@ -642,7 +645,7 @@ def _joint_governance(governances: Iterable[Governance | None]) -> Governance | 
 
 def _with_enclave(source: PictureSource, folder: Path, now: datetime) -> PictureSource:
     name = next(iter(sorted(source.scope or ())), _base_name(folder))
-    evaluation = evaluated(name, folder, open_enclave(folder, now=now), moment=now)
+    evaluation = evaluate_enclave(name, folder, open_enclave(folder, now=now), moment=now)
     state = evaluation.state
     return replace(
         source,

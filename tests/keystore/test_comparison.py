@@ -18,7 +18,7 @@ from sros_tool.keystore.comparison import (
 )
 from sros_tool.keystore.template import (
     NamedValues,
-    ShortLived,
+    ShortLivedEnclaves,
     Template,
     load_template,
     parse_template,
@@ -149,7 +149,10 @@ def test_settings(values: tuple[str, str], effect: str) -> None:
 )
 def test_short_lived_enclaves(before: tuple[int], after: tuple[int], effect: str) -> None:
     old, new = (
-        replace(PRODUCTION, short_lived=tuple(ShortLived("/op/*", timedelta(days=d)) for d in days))
+        replace(
+            PRODUCTION,
+            short_lived=tuple(ShortLivedEnclaves("/op/*", timedelta(days=d)) for d in days),
+        )
         for days in (before, after)
     )
     (change,) = compare_settings(old, new, NOW)

@@ -9,7 +9,7 @@ import pytest
 
 from sros_tool.dds.governance import parse_governance
 from sros_tool.files import templates_dir
-from sros_tool.keystore.protection import less_protected
+from sros_tool.keystore.protection import unfulfilled_protections
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.pki import smime
 from sros_tool.policy.document import read_policy
@@ -48,7 +48,7 @@ def missing(root: Path, policy: Path) -> list[str]:
     settings = OpenedKeystore(root).template
     assert governance == governance_for(settings.protection, governance.domains().closed())
     stated = stated_protections(read_policy(policy).enclaves)
-    return [str(each) for each, _ in less_protected(governance, stated)]
+    return [str(each) for each, _ in unfulfilled_protections(governance, stated)]
 
 
 def test_an_existing_keystore_gets_a_governance_that_keeps_to_it(folder: Path) -> None:

@@ -12,8 +12,8 @@ from sros_tool.errors import PolicyError
 from sros_tool.keystore.protection import (
     contradictions,
     governance_for_all,
-    less_protected,
-    with_stated,
+    unfulfilled_protections,
+    with_stated_protections,
 )
 from sros_tool.policy.model import (
     DomainProtection,
@@ -75,7 +75,7 @@ def test_each_name_gets_what_is_demanded_and_keeps_what_it_had() -> None:
     for seed in range(60):
         before, demands = drawn(random.Random(seed))
         try:
-            after = with_stated(before, demands)
+            after = with_stated_protections(before, demands)
         except PolicyError:
             refused += 1
             continue
@@ -98,8 +98,8 @@ def test_each_name_gets_what_is_demanded_and_keeps_what_it_had() -> None:
                 expressions = protected_topics(each.kind, each.name)
                 if any(matches(expression, topic) for expression in expressions):
                     assert has >= strength(each.level), (seed, topic)
-        assert with_stated(after, demands) == after, seed
-        assert not list(less_protected(governance_for_all(after), demands))
+        assert with_stated_protections(after, demands) == after, seed
+        assert not list(unfulfilled_protections(governance_for_all(after), demands))
     assert raised > 10
     assert refused > 3
 
@@ -117,26 +117,26 @@ def test_one_name_has_one_protection(one: str, other: str, kind: str) -> None:
     said = [stated(one, Level.SIGN, line=3), stated(other, Level.ENCRYPT, kind, line=9)]
     assert list(contradictions(said)) == [(said[0], said[1])]
     with pytest.raises(PolicyError, match=r"p\.xml:9: .*encrypt.* at p\.xml:3") as found:
-        with_stated(DomainProtection(), said)
+        with_stated_protections(DomainProtection(), said)
     assert "one governance" in str(found.value)
-    with_stated(DomainProtection(), [said[0], stated("/elsewhere", Level.ENCRYPT)])
+    with_stated_protections(DomainProtection(), [said[0], stated("/elsewhere", Level.ENCRYPT)])
 
 
 def test_settings_that_meet_a_demand_in_some_names_are_refused() -> None:
     named = (NamedProtection("topics", "/camera/*", OPEN),)
     settings = DomainProtection(rtps=Level.NONE, named=named)
     with pytest.raises(PolicyError, match=r"already protect topic /camera/\*"):
-        with_stated(settings, [stated("/*/image", Level.ENCRYPT)])
-    raised = with_stated(settings, [stated("/*", Level.ENCRYPT)])
+        with_stated_protections(settings, [stated("/*/image", Level.ENCRYPT)])
+    raised = with_stated_protections(settings, [stated("/*", Level.ENCRYPT)])
     assert raised.named[0].protection.data is Level.ENCRYPT
 
 
 def test_the_domain_can_protect_enough() -> None:
     settings = DomainProtection(rtps=Level.ENCRYPT, default=OPEN)
-    assert with_stated(settings, [stated("/scan", Level.ENCRYPT)]) == settings
+    assert with_stated_protections(settings, [stated("/scan", Level.ENCRYPT)]) == settings
     signed = DomainProtection(rtps=Level.SIGN, default=OPEN)
-    assert with_stated(signed, [stated("/scan", Level.SIGN)]) == signed
-    assert with_stated(signed, [stated("/scan", Level.ENCRYPT)]) != signed
+    assert with_stated_protections(signed, [stated("/scan", Level.SIGN)]) == signed
+    assert with_stated_protections(signed, [stated("/scan", Level.ENCRYPT)]) != signed
 
 
 def test_many_names_take_no_longer_for_each() -> None:
@@ -144,5 +144,5 @@ def test_many_names_take_no_longer_for_each() -> None:
 
     said = [stated(f"/robot{number}/cmd_vel", Level.ENCRYPT) for number in range(2000)]
     began = time.process_time()
-    assert len(with_stated(DomainProtection(default=OPEN), said).named) == 2000
+    assert len(with_stated_protections(DomainProtection(default=OPEN), said).named) == 2000
     assert time.process_time() - began < 20

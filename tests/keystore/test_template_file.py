@@ -15,7 +15,7 @@ from sros_tool.errors import DocumentError
 from sros_tool.keystore.template import (
     EVERYTHING,
     NODE_BASICS,
-    ShortLived,
+    ShortLivedEnclaves,
     Template,
     load_template,
     parse_template,
@@ -70,7 +70,8 @@ templates = st.builds(
     st.sampled_from((EVERYTHING, NODE_BASICS)),
     protections,
     short_lived=st.lists(
-        st.builds(ShortLived, st.sampled_from(("/operator/*", "/a", "/b?")), durations), max_size=3
+        st.builds(ShortLivedEnclaves, st.sampled_from(("/operator/*", "/a", "/b?")), durations),
+        max_size=3,
     ).map(tuple),
 )
 
@@ -111,7 +112,9 @@ def test_the_enclaves_of_people_live_for_a_day(enclave: str, longest: int | None
 
 
 def test_the_shortest_of_several_validities_counts() -> None:
-    both = tuple(ShortLived(name, timedelta(hours=h)) for name, h in (("/a/*", 9), ("/a/b*", 3)))
+    both = tuple(
+        ShortLivedEnclaves(name, timedelta(hours=h)) for name, h in (("/a/*", 9), ("/a/b*", 3))
+    )
     template = replace(load_template("production"), short_lived=both)
     assert template.longest_validity("/a/c") == timedelta(hours=9)
     assert template.longest_validity("/a/b") == timedelta(hours=3)

@@ -897,10 +897,10 @@ def test_changes_are_those_that_were_added() -> None:
         changes.add("create", path)
     mark = changes.mark()
     changes.add("create", "enclaves/a/permissions.xml")
-    assert [run.names for run in changes.since(mark)] == [("permissions.xml",)]
+    assert [run.names for run in changes.added_since(mark)] == [("permissions.xml",)]
     for path in paths[4:]:
         other.add("replace", path)
-    changes.extend(other.since(0))
+    changes.extend(other.added_since(0))
     expected = [Change("create", path) for path in (*paths[:4], "enclaves/a/permissions.xml")]
     expected += [Change("replace", path) for path in paths[4:]]
     assert changes == expected

@@ -44,7 +44,7 @@ from sros_tool.keystore.reader import OpenedKeystore, open_enclave
 from sros_tool.keystore.settings import lengthening_remedy, present_settings
 from sros_tool.keystore.template import (
     NamedValues,
-    ShortLived,
+    ShortLivedEnclaves,
     Template,
     load_template,
     with_values,
@@ -220,7 +220,7 @@ def test_only_what_follows_from_a_setting_changes(
 
 def test_short_lived_enclaves_are_issued_again_alone(root: Path) -> None:
     settings = present_settings(OpenedKeystore(root)).settings
-    short = (ShortLived("/free", timedelta(days=2)),)
+    short = (ShortLivedEnclaves("/free", timedelta(days=2)),)
     done = to(root, replace(settings, short_lived=short))
     assert (done.names("renewed"), done.names("signed")) == (("/free",), ())
     assert until(root, "/free") == (2, 2)
@@ -589,7 +589,10 @@ def test_an_edit_is_found_and_taken_over_or_undone(case: str, root: Path, tmp_pa
         assert edit_again != edited
         return
     update_keystore(
-        root, present_settings(OpenedKeystore(root)).without_edits(), now=LATER, replace_edits=True
+        root,
+        present_settings(OpenedKeystore(root)).settings_without_edits(),
+        now=LATER,
+        replace_edits=True,
     )
     assert {each: (root / each).read_bytes() for each in clean} == clean
     assert finding not in found(root)
@@ -867,7 +870,9 @@ def test_the_setting_that_limits_permissions_is_the_one_to_lengthen(
     settings = replace(
         load_template("production"),
         permissions_validity=parse_span(usual),
-        short_lived=tuple(ShortLived(name, timedelta(hours=h)) for name, h in short.items()),
+        short_lived=tuple(
+            ShortLivedEnclaves(name, timedelta(hours=h)) for name, h in short.items()
+        ),
     )
     remedy = lengthening_remedy(settings, enclave)
     assert (said in remedy) if said else not remedy, remedy

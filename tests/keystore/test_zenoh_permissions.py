@@ -17,7 +17,7 @@ from sros_tool.dds.domains import DomainRange, DomainSet
 from sros_tool.dds.governance import parse_governance
 from sros_tool.dds.permissions import Criteria, Grant, Permissions, Rule
 from sros_tool.errors import DocumentError, PolicyError
-from sros_tool.keystore.zenoh_files import grant_for_all, rights_in_domain
+from sros_tool.keystore.zenoh_files import grant_for_all_vendors, rights_in_domain
 from sros_tool.names import dds_names
 from sros_tool.translate_zenoh.rights import remote_of
 from sros_tool.zenoh.access import AccessControl, Flow, Message
@@ -248,7 +248,7 @@ OTHERS = allow(criteria("publish", "rt/secret"))
     ],
 )
 def test_the_grant_that_every_vendor_takes(document: bytes) -> None:
-    taken = grant_for_all(document, "the permissions of /t", "CN=/t")
+    taken = grant_for_all_vendors(document, "the permissions of /t", "CN=/t")
     assert taken and taken.rules[-1].publish == (Criteria(("rt/a",)),)
 
 
@@ -278,5 +278,5 @@ def test_the_grant_that_every_vendor_takes(document: bytes) -> None:
 )
 def test_what_vendors_take_differently_is_refused(document: bytes, text: str) -> None:
     with pytest.raises(DocumentError) as refused:
-        grant_for_all(document, "the permissions of /t", "CN=/t")
+        grant_for_all_vendors(document, "the permissions of /t", "CN=/t")
     assert text in str(refused.value)

@@ -39,7 +39,7 @@ from sros_tool.keystore.layout import (
     search_enclaves,
     waits_for_answer,
 )
-from sros_tool.keystore.participant import evaluated
+from sros_tool.keystore.participant import evaluate_enclave
 from sros_tool.keystore.reader import FilesReadOnce, OpenedEnclave, OpenedKeystore, open_enclave
 from sros_tool.pki.certificates import load_request
 from sros_tool.pki.token import Secrets, TokenUri, open_enclave_key
@@ -287,9 +287,9 @@ def _enclave(
         return ArrivedEnclave(name, False, "", None)
     state = keystore.enclave(name, now=now, domain=domain)
     domains = state.joined_domains()
-    evaluation = evaluated(name, folder, state, moment=now, domain=domain, zone=zone)
+    evaluation = evaluate_enclave(name, folder, state, moment=now, domain=domain, zone=zone)
     state = evaluation.state
-    loadable = not (state.problems or evaluation.stopped())
+    loadable = not (state.problems or evaluation.refusal_sentences())
     # A folder without a ledger is on a robot, where a missing key is a lost key.
     has_ledger = (keystore.root / LEDGER).is_file()
     elsewhere = has_ledger and state.key_on_robot and not state.problems_in_keystore
@@ -326,7 +326,7 @@ def open_installed(
         place = enclave_path(folder, name)
         with suppress(SrosError, OSError):
             state = open_enclave(place, now=now, files=files)
-            evaluation = evaluated(name, place, state, moment=now)
+            evaluation = evaluate_enclave(name, place, state, moment=now)
             opened[name] = InstalledEnclave(evaluation.state, "; ".join(evaluation.problems_here))
     return opened
 

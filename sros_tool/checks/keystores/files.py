@@ -381,11 +381,11 @@ def _unread_path_finding(error: OSError, root: str) -> Finding:
 
 def _interrupted_change_finding(parent: Path, root: str) -> Finding:
     from sros_tool.folders import Folder
-    from sros_tool.keystore.transaction import check_interrupted
+    from sros_tool.keystore.transaction import check_interrupted_change
 
     try:
         with Folder(parent) as folder:
-            check_interrupted(folder)
+            check_interrupted_change(folder)
     except KeystoreError as error:
         return FOREIGN_STAGE.found(root, f"{error.what}. {error.why}", str(parent / STAGE))
     except OSError as error:

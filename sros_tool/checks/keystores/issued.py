@@ -34,7 +34,7 @@ from sros_tool.keystore.layout import (
     folder_of_closed_robot,
     is_original_keystore,
 )
-from sros_tool.keystore.protection import less_protected
+from sros_tool.keystore.protection import unfulfilled_protections
 from sros_tool.pki.certificates import (
     authority_text,
     load_certificates,
@@ -336,10 +336,12 @@ def _lower_protection_findings(keystore: CheckedKeystore) -> Iterator[Finding]:
     if not stated:
         return
     try:
-        governance = parse_governance(keystore.opened.files.signed(keystore.governance).document)
+        governance = parse_governance(
+            keystore.opened.files.signed_document(keystore.governance).document
+        )
     except SrosError:
         return  # another check reports it
-    for protection, level in less_protected(governance, stated):
+    for protection, level in unfulfilled_protections(governance, stated):
         text = f"{protection} has {level.lower()}, but the policy demands {protection.word}"
         yield LESS_PROTECTED.found(
             protection.enclave, text, protection.source.file, protection.source.line

@@ -270,7 +270,7 @@ def _governance_findings(
             yield from governance_findings(keystore, enclave.state.governance, file, vendors)
         return
     with suppress(SrosError):  # `sros create_enclave` reports the error
-        document = keystore.opened.files.signed(keystore.governance).document
+        document = keystore.opened.files.signed_document(keystore.governance).document
         governance = parse_governance(document, GOVERNANCE_P7S)
         file = keystore.shown_path(GOVERNANCE_P7S)
         yield from governance_findings(keystore, governance, file, vendors)

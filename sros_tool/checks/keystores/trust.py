@@ -377,7 +377,9 @@ class _TargetGovernance:
         documents = []
         for message in signed:
             with suppress(SrosError):
-                documents.append(parse_governance(self._keystore.files.signed(message).document))
+                documents.append(
+                    parse_governance(self._keystore.files.signed_document(message).document)
+                )
         return tuple(documents)
 
     @cached_property

@@ -66,7 +66,7 @@ from sros_tool.keystore.outcomes import (
     EnclaveResult,
     enclave_result,
 )
-from sros_tool.keystore.participant import EvaluatedEnclave, evaluated
+from sros_tool.keystore.participant import EvaluatedEnclave, evaluate_enclave
 from sros_tool.keystore.reader import OpenedEnclave, OpenedKeystore, read_consistently
 from sros_tool.keystore.selection import missing_enclave_error
 from sros_tool.keystore.transaction import Change, Transaction
@@ -394,7 +394,9 @@ _DATE_FAULTS = frozenset(
 
 
 def _evaluate_enclave(keystore: OpenedKeystore, name: str, now: datetime) -> EvaluatedEnclave:
-    return evaluated(name, keystore.folder(name), keystore.enclave(name, now=now), moment=now)
+    return evaluate_enclave(
+        name, keystore.folder(name), keystore.enclave(name, now=now), moment=now
+    )
 
 
 def _refused_enclave_error(

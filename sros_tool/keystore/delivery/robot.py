@@ -58,7 +58,7 @@ from sros_tool.keystore.outcomes import (
     changes_below,
     trusted_authorities,
 )
-from sros_tool.keystore.participant import evaluated
+from sros_tool.keystore.participant import evaluate_enclave
 from sros_tool.keystore.reader import (
     OpenedEnclave,
     OpenedKeystore,
@@ -413,7 +413,7 @@ def evaluate_delivered_files(
         for file, data in files.items():
             write_new_file(Path(folder, file), data)
         opened = replace(open_enclave(Path(folder), now=now), key_on_robot=True)
-        evaluation = evaluated(name, Path(folder), opened, moment=now)
+        evaluation = evaluate_enclave(name, Path(folder), opened, moment=now)
         state = evaluation.state
         zenoh = open_zenoh(Path(folder), name, state)
     problems = list(evaluation.problems)

@@ -664,7 +664,11 @@ def _default_rights_notes(change: KeystoreChange, name: str) -> Iterator[Note]:
     Such an enclave had other rights before it was revoked or removed, or belongs to a robot of the
     fleet.
     """
-    root, fleet, last = quote(str(change.root)), change.fleet, change.recorded_rights.last(name)
+    root, fleet, last = (
+        quote(str(change.root)),
+        change.fleet,
+        change.recorded_rights.last_entry(name),
+    )
     had_others = last and last.policy != default_rights(change.template, name).digest
     of_robot = bool(fleet and robot_of(fleet, name))
     if had_others or of_robot:

@@ -60,7 +60,7 @@ from sros_tool.keystore.rights import RecordedRights, SignedRights
 from sros_tool.keystore.settings import (
     edit_notes,
     edit_remedy,
-    found_edits,
+    find_edits,
     present_settings,
     write_settings,
 )
@@ -326,7 +326,7 @@ class KeystoreChange:
         if network == self.template.zenoh:
             return
         check_network(network)
-        if not self.is_new and (edits := found_edits(self.keystore, self.governance)):
+        if not self.is_new and (edits := find_edits(self.keystore, self.governance)):
             raise KeystoreError(
                 f"the settings of keystore '{self.root}' would get other Zenoh routers, but its "
                 f"files were edited by hand: {'; '.join(edits.clauses())}",
@@ -493,7 +493,7 @@ class KeystoreChange:
                 *_left_out_notes(wanted.left_out),
                 *_revoked_name_notes(wanted.ledger, names, self.now, replaced),
             ),
-        ).without(created)
+        ).without_restart_of(created)
         self.notes += self.zenoh.notes
 
     def _permissions_certificate(self) -> x509.Certificate:

@@ -85,10 +85,10 @@ from sros_tool.keystore.lifecycle.replaced import (
     replaced_rights,
     with_expiries_in_ledger,
 )
-from sros_tool.keystore.protection import less_protected, with_stated
+from sros_tool.keystore.protection import unfulfilled_protections, with_stated_protections
 from sros_tool.keystore.reader import OpenedKeystore, check_domain
 from sros_tool.keystore.selection import missing_enclave_error
-from sros_tool.keystore.settings import edit_remedy, found_edits, with_places, write_settings
+from sros_tool.keystore.settings import edit_remedy, find_edits, with_key_places, write_settings
 from sros_tool.keystore.template import NODE_BASICS, Template, template_names
 from sros_tool.keystore.transaction import recover_keystore
 from sros_tool.names import check_enclave_name
@@ -343,7 +343,7 @@ def generate_artifacts(
         return creation(change, rights)
     domains = domains or _domains_of(fleet, domain)
     check_domain(domains, domain, root)
-    create = replace(create, protection=with_stated(create.protection, protections))
+    create = replace(create, protection=with_stated_protections(create.protection, protections))
     with change:
         _write_keystore(change, create, domains, _NONE_IMPORTED)
         if fleet:
@@ -463,7 +463,7 @@ def refuse_other_template(root: Path, template: Template) -> None:
     present = OpenedKeystore(root).template
     named = template.name == present.name and template.name in template_names()
     plain = replace(template, name=present.name, description=present.description)
-    if not (named or with_places(plain, present) == present):
+    if not (named or with_key_places(plain, present) == present):
         where = quote(str(root))
         raise UsageError(
             f"keystore '{root}' already exists, with the template {present.name}",
@@ -683,8 +683,8 @@ def _raise_protection(
             hand.
     """
     root, template, governance = change.root, change.template, change.governance
-    protection = with_stated(template.protection, stated_protections)
-    less = [demanded for demanded, _ in less_protected(governance, stated_protections)]
+    protection = with_stated_protections(template.protection, stated_protections)
+    less = [demanded for demanded, _ in unfulfilled_protections(governance, stated_protections)]
     if not less:
         return
     demand = f"{less[0].source} demands that {less[0]} has protect={less[0].word!r}"
@@ -695,7 +695,7 @@ def _raise_protection(
             f"Give it settings first: `sros update_keystore {quote(str(root))} --template "
             "NAME|FILE --dry-run` shows what they would change.",
         )
-    if edits := found_edits(change.keystore, governance):
+    if edits := find_edits(change.keystore, governance):
         raise KeystoreError(
             f"{demand}, and files of keystore '{root}' were edited by hand: "
             f"{'; '.join(edits.clauses())}",
@@ -737,7 +737,7 @@ def refuse_less_protected(
     would need the new governance.
     """
     root = keystore.root
-    for name, level in less_protected(governance, stated_protections):
+    for name, level in unfulfilled_protections(governance, stated_protections):
         kinds = "data=ENCRYPT" if name.level is Level.ENCRYPT else "metadata=SIGN"
         raise KeystoreError(
             f"{name.source} demands that {name} has protect={name.word!r}, and keystore '{root}' "
@@ -1040,7 +1040,7 @@ class _EnclaveMaker:
         If the ledger does not record the lost permissions, their unsigned copy shows that the
         enclave had permissions.
         """
-        name, last = default.path, self._change.recorded_rights.last(default.path)
+        name, last = default.path, self._change.recorded_rights.last_entry(default.path)
         if last.policy == default.digest if last else "permissions.xml" not in existing_files:
             return
         text = (
@@ -1069,10 +1069,10 @@ class _EnclaveMaker:
             return False
         try:
             message = change.keystore.read(signed_path, "permissions document")
-            entry = change.recorded_rights.latest(name, hashlib.sha256(message).hexdigest())
+            entry = change.recorded_rights.latest_entry(name, hashlib.sha256(message).hexdigest())
             if entry is None:
                 return False
-            signed = change.keystore.files.signed(message)
+            signed = change.keystore.files.signed_document(message)
             signed.verify(change.permissions.certificate)
             validity = Window(parse_iso(entry.not_before), parse_iso(entry.not_after))
         except (SrosError, ValueError):  # these are not files that `write` would leave as they are

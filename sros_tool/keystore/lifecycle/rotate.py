@@ -80,7 +80,7 @@ from sros_tool.keystore.lifecycle.rotation import (
 )
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.rights import SignedRights
-from sros_tool.keystore.settings import edit_remedy, found_edits, write_settings
+from sros_tool.keystore.settings import edit_remedy, find_edits, write_settings
 from sros_tool.keystore.template import Template
 from sros_tool.parallel import Progress
 from sros_tool.pki.certificates import (
@@ -313,7 +313,7 @@ def _refuse_edited(keystore: OpenedKeystore) -> None:
     root, governance = keystore.root, None
     with suppress(SrosError):  # signing the governance again reports the error
         governance = keystore.governance
-    if edits := found_edits(keystore, governance):
+    if edits := find_edits(keystore, governance):
         raise KeystoreError(
             f"files of keystore '{root}' were edited by hand: {'; '.join(edits.clauses())}",
             "The new CA would sign the governance without these edits.",
@@ -745,7 +745,9 @@ class _Rotator:
             file = self._root / path
             if not file.is_file() or file.is_symlink():
                 continue
-            signed = self._keystore.files.signed(self._keystore.read(file, "governance document"))
+            signed = self._keystore.files.signed_document(
+                self._keystore.read(file, "governance document")
+            )
             signed.verify(permissions.old[0])
             parse_governance(signed.document)  # raises an error if the governance is malformed
             message = permissions.new.sign(signed.document, "the governance document")

@@ -234,7 +234,7 @@ def _count_enclaves(
                 fits = [issued_by(own_certificate, authority) for authority in authorities]
             else:
                 message = keystore.read(folder / PERMISSIONS_FILE, "permissions")
-                signer = keystore.files.signed(message).signer()
+                signer = keystore.files.signed_document(message).signer()
                 fits = [signer == authority for authority in authorities]
         except SrosError:  # `sros inspect` reports the error
             continue

@@ -86,9 +86,9 @@ from sros_tool.keystore.rights import RecordedRights, SignedRights
 from sros_tool.keystore.settings import (
     PresentSettings,
     edit_remedy,
-    found_edits,
+    find_edits,
     present_settings,
-    with_places,
+    with_key_places,
     write_settings,
 )
 from sros_tool.keystore.template import EVERYTHING, NODE_BASICS, Template, with_values
@@ -242,7 +242,7 @@ def _checked_target(
                 f"The rule for {by} decides on the same names.",
                 "State one rule for these names.",
             )
-    return with_places(with_values(target), present_settings.settings)
+    return with_key_places(with_values(target), present_settings.settings)
 
 
 # ── the update ─────────────────────────────────────────────────────────────────────────────
@@ -851,7 +851,7 @@ def _check_settings(change: KeystoreChange) -> None:
             f"Run `sros update_keystore {where} --template sros2 --dry-run`, which shows the "
             "changed settings, and then without --dry-run.",
         )
-    if edits := found_edits(change.keystore, change.governance):
+    if edits := find_edits(change.keystore, change.governance):
         raise KeystoreError(
             f"files of keystore '{root}' were edited by hand: {'; '.join(edits.clauses())}",
             "Writing the settings would undo the edit, or apply it unnoticed.",
