@@ -996,6 +996,19 @@ def similarity_to(
     return similar_requirements
 
 
+def renamed_names(old: Requirement, new: Requirement) -> dict[str, str]:
+    """Map the names of ``old`` to the names of ``new`` if they are the only difference, else {}."""
+    if not (isinstance(old, RightsRequirement) and isinstance(new, RightsRequirement)):
+        return {}
+    pairs, new_pairs = [*_single_rights(old.rights)], [*_single_rights(new.rights)]
+    with_new_names = _only_demand(replace(old, rights=new.rights))
+    same_rights = [right for right, _ in pairs] == [right for right, _ in new_pairs]
+    if not same_rights or with_new_names != _only_demand(new):
+        return {}
+    names = zip(pairs, new_pairs, strict=True)
+    return {name: new_name for (_, (name,)), (_, (new_name,)) in names if name != new_name}
+
+
 def _demanded_by(requirements: Iterable[Requirement]) -> Callable[[Requirement], bool]:
     """Return a function that returns whether ``requirements`` fully demand a requirement."""
     parts = [part for requirement in requirements for part in _parts(requirement)]

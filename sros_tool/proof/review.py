@@ -112,7 +112,9 @@ from sros_tool.proof.requirements import (
     Requirement,
     dropped_findings,
     dropped_requirements,
+    read_all_requirements,
     read_requirements,
+    renamed_names,
     similarity_to,
 )
 from sros_tool.proof.sources import AccessSource, load_policies, load_side
@@ -1091,7 +1093,14 @@ class _Review:
                 if subject in earlier_sources:
                     rights = earlier_sources[subject]().rights
             sources = moved.get(subject)
-            elsewhere = partial(self._failing_elsewhere, files.values(), wanted, system, sources)
+            elsewhere = partial(
+                self._failing_elsewhere,
+                files.values(),
+                base_files.values(),
+                wanted,
+                system,
+                sources,
+            )
             yield from self._step_result(
                 "requirements",
                 subject,
@@ -1142,13 +1151,15 @@ class _Review:
     def _failing_elsewhere(
         self,
         files: Iterable[Path],
+        base_files: Iterable[Path],
         requirements: Sequence[Requirement],
         system: System,
         sources: Callable[[], tuple[AccessSource, AccessSource]] | None,
     ) -> Iterator[Finding]:
         """Yield findings on requirements that fail in another namespace only because of the change.
 
-        A requirement fails if it is broken, or if no right is left for any name in it.
+        A requirement fails if it is broken, or if no right is left for any name in it.  It does not
+        fail because of the change if BASE has the same failure under names that the change renames.
         Users may put the nodes of a package, and its requirements, into their own namespaces.
         ``requirements`` are the requirements in ``files`` for the namespace / of ``system``.
         """
@@ -1176,22 +1187,25 @@ class _Review:
             return policy_system(policy, self._circumstances(), self._template())
 
         for ns in namespaces[:_MOST_NAMESPACES]:
-            moved = list(
-                chain.from_iterable(
-                    read_requirements(path, namespaces=(ns,), remaps=asked.remaps) for path in files
-                )
+            moved, earlier = (
+                read_all_requirements(paths, namespaces=(ns,), remaps=asked.remaps)
+                for paths in (files, base_files)
             )
             before, after = cache(partial(system_in, ns, base)), system_in(ns, head)
+            dropped = cache(partial(_dropped_failures, earlier, moved, before))
             for at in sorted(left):
                 broken = _failures(moved[at], after, before)
-                known = _failures(moved[at], before()) if broken else ()
+                if not broken:
+                    continue
+                known = [*_failures(moved[at], before()), *_with_new_names(moved[at], dropped())]
                 texts = {(finding.subject, finding.text) for finding in known}
                 broken = [
                     finding for finding in broken if (finding.subject, finding.text) not in texts
                 ]
                 if broken:
                     left.remove(at)
-                    yield from broken
+                    place = f"in namespace {ns}, which the review tries"
+                    yield from (one._replace(text=f"{place}: {one.text}") for one in broken)
 
     def place(self) -> str:
         """Return a clause with the namespaces of the requirements; "" without namespaces."""
@@ -1449,6 +1463,32 @@ def _failures(
     rights = before().rights if before and decided.unnamed else ()
     findings = decided_findings(decided, system, rights)
     return [finding for finding in findings if finding.kind in (VIOLATED, VACUOUS)]
+
+
+def _dropped_failures(
+    earlier: Iterable[Requirement],
+    requirements: Iterable[Requirement],
+    before: Callable[[], System],
+) -> list[tuple[Requirement, list[Finding]]]:
+    """Return the requirements of ``earlier`` that were dropped, with their failures in BASE."""
+    dropped = dropped_requirements(earlier, requirements)
+    return [(of.requirement, _failures(of.requirement, before())) for of in dropped]
+
+
+def _with_new_names(
+    requirement: Requirement, dropped: Iterable[tuple[Requirement, list[Finding]]]
+) -> Iterator[Finding]:
+    """Yield failures of dropped requirements that differ from a requirement only in their names.
+
+    The findings have the names of the requirement.
+    """
+    for old, findings in dropped:
+        if names := renamed_names(old, requirement):
+            for finding in findings:
+                text = finding.text
+                for name, new_name in names.items():
+                    text = text.replace(name.rstrip("*"), new_name.rstrip("*"))
+                yield finding._replace(text=text)
 
 
 def _status(chosen_findings: ChosenFindings) -> int:

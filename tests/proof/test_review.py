@@ -1460,7 +1460,27 @@ def test_a_wildcard_that_leaves_out_one_namespace_breaks_requirements_in_others(
     asked = ("--policy", "robot.xml", "--requirements", "robot.toml", "--new-access", "allow")
     ended = change.review(*asked)
     assert ended.status == 1, ended
-    assert f"error: {namespace}/b: may publish {namespace}/x" in ended.out
+    place = f"in namespace {namespace}, which the review tries"
+    assert f"error: {namespace}/b: {place}: may publish {namespace}/x" in ended.out
+
+
+@pytest.mark.parametrize(
+    ("writer", "status"),
+    [("/b", 0), ("/c", 1)],  # the second enclave breaks the requirement only after the change
+)
+def test_a_renamed_requirement_may_stay_broken_in_a_namespace(
+    change: Change, writer: str, status: int
+) -> None:
+    only = '[[only]]\npublish = ["x"]\nenclaves = ["/a"]\n'
+    enclaves = {"/a": publish("x"), "/b": publish("/left/x"), "/c": publish("y")}
+    change.base = change.commit({"robot.xml": policy_text(enclaves), "robot.toml": only})
+    renamed = enclaves | {"/a": publish("z"), "/b": publish("y"), writer: publish("/left/z")}
+    change.commit({"robot.xml": policy_text(renamed), "robot.toml": only.replace('"x"', '"z"')})
+    asked = ("--policy", "robot.xml", "--requirements", "robot.toml", "--new-access", "allow")
+    assert "requirement.dropped" in change.review(*asked).out
+    ended = change.review(*asked, "--dropped-requirements", "allow")
+    assert ended.status == status, ended
+    assert (f"{writer}: in namespace /left, which the review" in ended.out) == bool(status), ended
 
 
 _DENIED = publish("/left/*") + publish("x").replace("ALLOW", "DENY")
@@ -1486,4 +1506,4 @@ def test_names_that_do_not_move_break_requirements_together_with_names_that_do(
     change.commit({"robot.xml": policy_text({**text, "/b": after})})
     asked = ("--policy", "robot.xml", "--requirements", "robot.toml", "--new-access", "allow")
     ended = change.review(*asked)
-    assert ended.status == 1 and "error: /left/b: may publish /left/" in ended.out, ended
+    assert ended.status == 1 and "which the review tries: may publish /left/" in ended.out, ended
