@@ -163,6 +163,7 @@ class AccessAnswer:
     ``until`` is the first expiry among the enclave's files, in UTC.  ``remedy`` says what to do if
     the cause of a denial is not the policy.  ``counts_key`` says that the enclave's key is not
     here, and was assumed to exist: on its robot, or in the keystore from which this copy was made.
+    ``assumption`` says which distribution decided in place of an unsupported one, or is "".
     """
 
     allowed: bool
@@ -174,6 +175,7 @@ class AccessAnswer:
     until: datetime | None = None
     remedy: str = ""
     counts_key: bool = False
+    assumption: str = ""
 
     def __bool__(self) -> bool:
         return self.allowed
@@ -740,6 +742,7 @@ def explain_access(
         (True, 'rule 1 allows publish rt/chatter by rt/chatter')
     """
     from sros_tool.dds.decision.vendors import ZENOH, Vendor
+    from sros_tool.distributions import find_distribution
     from sros_tool.explain.answer import Evaluator, ask
     from sros_tool.explain.asking import AskingContext, question_meant
     from sros_tool.explain.explanation import explain
@@ -773,6 +776,7 @@ def explain_access(
         answer.until,
         answer.remedy,
         answer.counts_key,
+        find_distribution(distribution).assumption if distribution else "",
     )
 
 

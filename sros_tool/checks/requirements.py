@@ -20,11 +20,9 @@ VACUOUS = FindingKind(
     "The named part protects nothing: perhaps a name is misspelled or was changed, or the "
     "exceptions cover every enclave.",
     "The requirements file.",
-    "Correct the name or its kind (service or action), in the requirement or in the policy, or "
-    "name fewer exceptions. (Was a topic, node or enclave renamed? If by `merge_policy "
-    "--remap`, check with the same --remap.) For a name that is to stay unused, write "
-    "[[nobody]]. For enclaves that come and go, such as laptops, write who may ([[only]]), not "
-    "who may not.",
+    "Correct the name, its kind (service or action) or the exceptions. After `merge_policy "
+    "--remap`, check with the same --remap. For a name that is to stay unused, write [[nobody]]; "
+    "for enclaves that come and go, such as laptops, write [[only]].",
 )
 UNKNOWN_ENCLAVE = FindingKind(
     "requirement.unknown-enclave",
@@ -82,12 +80,14 @@ ASSUMED = FindingKind(
 HOLDS_ALONE = FindingKind(
     "requirement.holds-alone",
     NOTE,
-    "a requirement that no enclave of this policy can break",
-    "Its names are relative, as in the requirements of a package, and only enclaves that users of "
-    "the package add could break it. So this check did not test it.",
+    "a requirement that holds, but that this policy does not test",
+    "No right in this policy comes close to breaking it. Its names are relative, as in the "
+    "requirements of a package, so perhaps only the policies of the package's users have the "
+    "enclaves that could break it.",
     "The requirements file.",
-    "To test it, check a policy that has other enclaves, too: `sros check ROBOT_POLICY "
-    "--requirements FILE --namespace NS`.",
+    "If this is the policy of a package, also check a policy that has other enclaves: `sros check "
+    "ROBOT_POLICY --requirements FILE --namespace NS`. If it is the policy of a whole robot, "
+    "ignore this finding.",
     prominent=True,
 )
 NOT_CROSSING = FindingKind(

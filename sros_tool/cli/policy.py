@@ -64,8 +64,8 @@ if TYPE_CHECKING:
     metavar="[NODE:]FROM:=TO",
     multiple=True,
     help="Remap a name of OTHER, as `--ros-args -r` does for a node; also __node:=NAME, __ns:=NS. "
-    "Applies after --namespace.  Give the same rules to `sros check --remap` for requirements; it "
-    "takes no __ns, so use --namespace for that in both commands.  Can be repeated.",
+    "Applies after --namespace.  If requirements have an old name, a note states the rules for "
+    "`sros check --remap`; in place of __ns, use --namespace in both commands.  Can be repeated.",
 )
 @click.option(
     "--enclave",

@@ -1305,7 +1305,8 @@ def undenied_name(denied: Right, stated: Rules) -> str | None:
         return None if allowed else denied.name
     names = [right.name for right in (*allowed, *stated.overlapping(denied))]
     # A DENY of "/*stop" is for all namespaces: a name in a namespace shows best what it lost.
-    in_namespace = denied.name.startswith("/*") and common_name([denied.name, "/*/*"], names)
+    shown = [denied.name, "/any_namespace/*"]
+    in_namespace = denied.name.startswith("/*") and common_name(shown, names)
     return in_namespace or common_name([denied.name], names)
 
 
