@@ -569,7 +569,7 @@ def _vendor_lines(explanation: DdsExplanation) -> Iterator[str]:
         yield from _answer_lines(explanation.answer, explanation.vendor_why)
     else:
         yield from _table_lines(explanation)
-    yield from _zenoh_decision_lines(explanation.beside)
+    yield from _zenoh_decision_lines(explanation.zenoh_next_to_dds)
 
 
 def _zenoh_decision_lines(on_zenoh: ZenohNextToDds | None) -> Iterator[str]:

@@ -184,7 +184,7 @@ def propose(denials: Iterable[Denial]) -> MissingRights:
         kind = (
             "remote" if denial.remote
             else "by_rule" if denial.by_rule
-            else "foreign" if not _is_ros(denial.topic)
+            else "foreign" if not _has_ros_name(denial.topic)
             else "unclear" if not denial.direction
             else ""
         )  # fmt: skip
@@ -207,7 +207,7 @@ def node_denied_own_service(denial: Denial) -> str:
     return node_of_service(service) if denial.direction and offered else ""
 
 
-def _is_ros(topic: str) -> bool:
+def _has_ros_name(topic: str) -> bool:
     if is_expression(topic) or expression_problem(topic[2:]):
         return False  # a topic named like a wildcard must not become a wildcard
     return topic.startswith("rt/") or bool(service_of(topic)[0])

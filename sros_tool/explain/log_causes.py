@@ -337,7 +337,7 @@ class Examiner:
         ``ns`` is the namespace that is missing in all names of the process, or "".
         """
         line, text = named[0][0], " ".join(named[0][1].split())
-        right, name, kind = _in_ros_terms(denial)
+        right, name, kind = _operation_in_ros_terms(denial)
         denied = f"action {name}, of which {denial.topic} is a part" if kind == "action" else name
         who = "a peer" if denial.remote else denial.enclave or "the process"
         if enclave := None if denial.remote else self._find(denial.enclave):
@@ -606,7 +606,7 @@ class Examiner:
 
         The nodes are those that logged and those in the policy, both in the namespace ``space``.
         """
-        if self._policy is None or denial.remote or _in_ros_terms(denial)[0] == "call":
+        if self._policy is None or denial.remote or _operation_in_ros_terms(denial)[0] == "call":
             return ""  # a node calls the services of other nodes
         for node in self._logging_nodes.get(denial.process, ()):
             if node.startswith(f"{space}/") and name.startswith(f"{node}/"):
@@ -813,7 +813,7 @@ def _nothing_found_text(enclave: LoadedEnclave) -> str:
     )
 
 
-def _in_ros_terms(denial: Denial) -> tuple[str, str, str]:
+def _operation_in_ros_terms(denial: Denial) -> tuple[str, str, str]:
     """Return the denied operation (one of `answer.WORDS`, or "use"), the ROS name, and its type.
 
     A topic or a service of an action counts as the action. For a topic without a ROS name, the name
@@ -846,7 +846,7 @@ _WORDS_OF_TYPES = {
 
 def _questions_to_ask(denial: Denial) -> tuple[Question, ...]:
     """Return the questions to ask `sros explain` about a denied topic; () without a ROS name."""
-    right, name, kind = _in_ros_terms(denial)
+    right, name, kind = _operation_in_ros_terms(denial)
     if not kind:
         return ()
     words = _WORDS_OF_TYPES[kind] if right == "use" else (right,)

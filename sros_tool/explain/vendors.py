@@ -79,7 +79,13 @@ class ZenohNextToDds(NamedTuple):
     problem: str = ""
 
 
-@shows("asked", "answer", "vendor_why", "beside", spread=("asked", "answer", "beside"))
+@shows(
+    "asked",
+    "answer",
+    "vendor_why",
+    "zenoh_next_to_dds",
+    spread=("asked", "answer", "zenoh_next_to_dds"),
+)
 class VendorExplanation(NamedTuple):
     """The decision of one DDS vendor."""
 
@@ -87,7 +93,7 @@ class VendorExplanation(NamedTuple):
     answer: Answer
     vendor_why: str
     """Reason for the choice of this vendor."""
-    beside: ZenohNextToDds | None
+    zenoh_next_to_dds: ZenohNextToDds | None
     notes: tuple[Note, ...]
 
     @property
@@ -140,9 +146,9 @@ class DistributionAnswer(NamedTuple):
 
 
 @shows(
-    *("asked", "vendors", "distributions", "differ", "beside"),
+    *("asked", "vendors", "distributions", "differ", "zenoh_next_to_dds"),
     optional=("vendors", "distributions"),
-    spread=("asked", "beside"),
+    spread=("asked", "zenoh_next_to_dds"),
 )
 class Comparison(NamedTuple):
     """The decisions of all DDS vendors, or of the DDS of all supported distributions.
@@ -157,7 +163,7 @@ class Comparison(NamedTuple):
     """The decision for each DDS of each distribution, the earliest distribution first; present
     only with ``--all-distros``.
     """
-    beside: ZenohNextToDds | None
+    zenoh_next_to_dds: ZenohNextToDds | None
     allowed: bool
     notes: tuple[Note, ...]
 
@@ -206,7 +212,7 @@ def explain_on_dds(
     evaluator = Evaluator(vendor, enclave, context)
     question, taken = question_meant(evaluator, asked_enclave, question, kind)
     answer = explain(evaluator, question)
-    beside = _zenoh_decision(enclave, question, context)
+    zenoh_next_to_dds = _zenoh_decision(enclave, question, context)
     is_on_robot = enclave.state is not None and enclave.state.key_on_robot
     copied = enclave.keystore if answer.counts_key and not is_on_robot else None
     refuse = f"Run {REFUSE_STRANGERS}."
@@ -230,7 +236,7 @@ def explain_on_dds(
     if compared is ComparedDecisions.VENDORS:
         evaluators = {v: Evaluator(v, enclave, context) for v in Vendor if v is not vendor}
         answers = [answer if v is vendor else explain(evaluators[v], question) for v in Vendor]
-        return Comparison(asked, answers, None, beside, answer.allowed, notes)
+        return Comparison(asked, answers, None, zenoh_next_to_dds, answer.allowed, notes)
     if compared is ComparedDecisions.DISTRIBUTIONS:
         deciding = {v for distribution in SUPPORTED for v in distribution.vendors}
         by_vendor = {v: Evaluator(v, enclave, context).answer(question) for v in deciding}
@@ -239,14 +245,14 @@ def explain_on_dds(
             for distribution in SUPPORTED
             for shipped in distribution.shipped
         ]
-        return Comparison(asked, None, by_distribution, beside, answer.allowed, notes)
+        return Comparison(asked, None, by_distribution, zenoh_next_to_dds, answer.allowed, notes)
     tested = [
         answer if v is vendor else Evaluator(v, enclave, context).answer(question)
         for v in DEFAULT_RELEASES
     ]
     if len({tested_answer.outcome for tested_answer in tested}) > 1:
         notes = (*notes, Note("explain.vendors-differ", f"{_vendor_differences(tested)}."))
-    return VendorExplanation(asked, answer, why, beside, notes)
+    return VendorExplanation(asked, answer, why, zenoh_next_to_dds, notes)
 
 
 def _vendor_differences(answers: Sequence[Answer]) -> str:

@@ -86,7 +86,7 @@ class FleetPolicy(Mapping[str, Enclave]):
                 )
 
     def __getitem__(self, path: str) -> Enclave:
-        return self._expanded(path, *self._of[path])
+        return self._expanded_enclave(path, *self._of[path])
 
     def __contains__(self, path: object) -> bool:
         return path in self._of
@@ -147,10 +147,10 @@ class FleetPolicy(Mapping[str, Enclave]):
         except DocumentError as error:
             raise PolicyError(f"{source}: {error.what}", error.why, error.remedy) from error
 
-    def _expanded(self, path: str, enclave: Enclave, robot: Robot | None) -> Enclave:
+    def _expanded_enclave(self, path: str, enclave: Enclave, robot: Robot | None) -> Enclave:
         count = 0
 
-        def filled(profile: Profile) -> Profile:
+        def filled_profile(profile: Profile) -> Profile:
             nonlocal count
             ns, node = (self._filled_name(text, robot) for text in (profile.ns, profile.node))
             if has_placeholder(profile.ns):
@@ -169,7 +169,7 @@ class FleetPolicy(Mapping[str, Enclave]):
                     groups.append(group)
             return replace(profile, ns=ns, node=node, groups=tuple(groups))
 
-        return replace(enclave.with_profiles(filled), path=path)
+        return replace(enclave.with_profiles(filled_profile), path=path)
 
     def _filled_name(self, text: str, robot: Robot | None) -> str:
         if robot is None or not has_placeholder(text):

@@ -869,7 +869,7 @@ class _Denials:
         self._index = ExpressionIndex(style, (text for _, text in pairs))
         self.names = names_of(style, (text for _, text in pairs))
 
-    def of(self, topic: str) -> Right | None:
+    def first_denial(self, topic: str) -> Right | None:
         """Return the first right that denies a topic, or None."""
         at = self._index.first(topic)
         return None if at is None else self._rights[at]
@@ -987,7 +987,7 @@ class _StatedRights:
         expression: str,
         topic: str,
     ) -> Gain:
-        denied = self._denials(place.enclave, verb, place.world.style).of(topic)
+        denied = self._denials(place.enclave, verb, place.world.style).first_denial(topic)
         name, action = topic, "write" if verb is AccessVerb.PUBLISH else "read"
         if right:
             at = expression.find(right.name)  # a name in permissions may be empty

@@ -1074,7 +1074,7 @@ class _Review:
                 policies, self._circumstances(fleet), self._template()
             )
         if not systems:
-            yield from self._read(files, lambda: fleet)
+            yield from self._read_requirements(files, lambda: fleet)
         for subject, load in systems.items():
             try:
                 system = load()
@@ -1082,10 +1082,10 @@ class _Review:
             except (SrosError, OSError) as error:
                 yield _undecided("requirements", subject, error)
                 continue
-            read = yield from self._read(files, system.fleet)
+            read = yield from self._read_requirements(files, system.fleet)
             wanted = [*chain.from_iterable(read.values())]
             self.is_relative |= any(requirement.is_relative for requirement in wanted)
-            earlier = yield from self._read(
+            earlier = yield from self._read_requirements(
                 base_files, partial(_without_left_robots, before, system.fleet)
             )
             rights: frozenset[Right] = frozenset()
@@ -1117,7 +1117,7 @@ class _Review:
                 "requirements-before", subject, decide, is_wanted=len(read) == len(files)
             )
 
-    def _read(
+    def _read_requirements(
         self, files: Mapping[str, Path], fleet: FleetSource
     ) -> Generator[ReviewStep, None, dict[str, Sequence[Requirement]]]:
         """Map paths to the requirements of files; yield a step for each unreadable file."""

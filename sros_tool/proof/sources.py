@@ -203,7 +203,9 @@ def load_side(path: Path, fleet: Fleet | None = None) -> AccessSource:
     if path.is_dir() and not is_keystore(path) and not (path / PERMISSIONS_FILE).exists():
         files = list(files_of_policies(path))
         if files:
-            return _access_of_policies(str(path), [_read(file, fleet) for file in files])
+            return _access_of_policies(
+                str(path), [_read_policy_and_fleet(file, fleet) for file in files]
+            )
     source = load_rights(path, fleet, hidden=True)
     for note in source.notes:
         if not source.sound or note.id in UNCERTAIN:
@@ -213,7 +215,7 @@ def load_side(path: Path, fleet: Fleet | None = None) -> AccessSource:
                 f"`sros check {quote(str(path))}` shows what is wrong with it.",
             )
     if source.kind == "policy":
-        return _access_of_policies(str(path), [_read(path, fleet)])
+        return _access_of_policies(str(path), [_read_policy_and_fleet(path, fleet)])
     return _access_of_source(path, source)
 
 
@@ -510,7 +512,10 @@ def _without_dates(permissions: Permissions) -> Permissions:
 
 def _access_at_revision(revision: Revision, fleet: Fleet | None) -> AccessSource:
     try:
-        policies = [_read(policy.place, fleet, policy.read) for policy in revision.policies()]
+        policies = [
+            _read_policy_and_fleet(policy.place, fleet, policy.read)
+            for policy in revision.policies()
+        ]
         side = _access_of_policies(str(revision), policies)
     except SrosError as error:
         texts = (revision.with_git_paths(part) for part in (error.what, error.why, error.remedy))
@@ -518,10 +523,12 @@ def _access_at_revision(revision: Revision, fleet: Fleet | None) -> AccessSource
     return replace(side, revision=revision)
 
 
-_Read = tuple[Policy, Fleet | None]
+_PolicyAndFleet = tuple[Policy, Fleet | None]
 
 
-def _read(path: Path, fleet: Fleet | None, policy_files: PolicyFiles | None = None) -> _Read:
+def _read_policy_and_fleet(
+    path: Path, fleet: Fleet | None, policy_files: PolicyFiles | None = None
+) -> _PolicyAndFleet:
     """Return the policy in a file, and the fleet with its enclaves (None without a fleet)."""
     if fleet is None:
         return read_policy(path, policy_files=policy_files), None
@@ -529,7 +536,7 @@ def _read(path: Path, fleet: Fleet | None, policy_files: PolicyFiles | None = No
     return expanded.policy(), fleet.with_enclaves(expanded.patterns)
 
 
-def _access_of_policies(shown: str, policies: list[_Read]) -> AccessSource:
+def _access_of_policies(shown: str, policies: list[_PolicyAndFleet]) -> AccessSource:
     if not policies:
         raise DocumentError(f"'{shown}' has no policies", "", "Name a policy file.")
     policy = join_policies([policy for policy, _ in policies])
@@ -560,4 +567,4 @@ def load_policies(files: Iterable[Path], shown: str, fleet: Fleet | None = None)
     Raises:
         SrosError: a policy cannot be read, or two policies have the same enclave.
     """
-    return _access_of_policies(shown, [_read(file, fleet) for file in files])
+    return _access_of_policies(shown, [_read_policy_and_fleet(file, fleet) for file in files])

@@ -220,10 +220,10 @@ class UnitNames:
         """Return a text split at the names of units: whole words, or parts between underscores."""
         split = self._texts.get(text)
         if split is None:
-            split = self._texts[text] = self._read(text)
+            split = self._texts[text] = self._split_at_units(text)
         return split
 
-    def _read(self, text: str) -> UnitText:
+    def _split_at_units(self, text: str) -> UnitText:
         parts, named = [""], []
         end = 0
         for match in _WORD.finditer(text):
@@ -376,7 +376,7 @@ class _Draft:
             if len(members) > 1:
                 usual.setdefault(self._units[members[0]].family, members[0])
         sizes = Counter(unit.family for unit in self._units)
-        named = self._named_by(usual)
+        named = self._number_of_users(usual)
         for unit, *later_units in classes.values():
             family = self._units[unit].family
             near = family in usual and self._are_alike(parts[unit], parts[usual[family]])
@@ -425,7 +425,7 @@ class _Draft:
         )
         return 2 * len(own & others) >= max(len(own), len(others))
 
-    def _named_by(self, families: Container[int]) -> Counter[int]:
+    def _number_of_users(self, families: Container[int]) -> Counter[int]:
         """Map each unit to how many other units of its family have rights to its names.
 
         Only units of ``families`` are counted.

@@ -135,7 +135,7 @@ def draw(request: PictureRequest) -> tuple[Picture, Folding]:
         )
     titles = _titles([*sources, *request.observed])
     read = [
-        _read(path, fleet, request, title).with_title(title)
+        _read_source(path, fleet, request, title).with_title(title)
         for path, fleet, title in zip(sources, fleets, titles, strict=False)
     ]
     observed = [read_source(path, now=request.now) for path in request.observed]
@@ -226,7 +226,9 @@ def _compared_picture(
     return overlay(first, second, "drift", hosts)
 
 
-def _read(path: Path, fleet: Fleet | None, request: PictureRequest, title: str) -> PictureSource:
+def _read_source(
+    path: Path, fleet: Fleet | None, request: PictureRequest, title: str
+) -> PictureSource:
     """Read a source, with findings of ``sros check`` if ``request`` asks for them.
 
     A source that ``sros check`` does not read has the finding ``view.not-checked`` instead.
