@@ -167,7 +167,7 @@ def test_without_a_pin_the_fingerprints_to_compare_are_printed(tmp_path: Path) -
     said = sros("import", tmp_path / "answer.tgz", robot).ok().out
     assert next(iter(pin(home))) in said
     assert next(iter(pin(home, "identity"))) in said
-    assert "without it, import does not verify them" in said
+    assert "without --ca, import does not verify the CAs" in said
 
 
 def test_an_answer_of_a_weak_ca_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
