@@ -31,6 +31,7 @@ from sros_tool.close.nodes import (
     ros_use,
 )
 from sros_tool.close.processes import ObservedProcesses
+from sros_tool.close.rights import ordinary_uses
 from sros_tool.close.robot import MOST_NAMES, OBSERVER, LocalRobot
 from sros_tool.close.state import (
     CONNECTED,
@@ -65,7 +66,10 @@ from sros_tool.policy.patterns import overlap
 from sros_tool.policy.rights import (
     Right,
     RightsDifference,
+    Rules,
     lost_counterpart_text,
+    order,
+    policy_rights,
     rights_without_counterpart,
 )
 from sros_tool.proof.requirements import Must, read_requirements
@@ -651,6 +655,29 @@ class _TalkComparison:
         later = sorted({*map(node_name, nodes)} - known)
         return [*later, *_endpoint_texts((node, use) for node, use in uses if node in known)]
 
+    def _unused_rights(self) -> list[str]:
+        """Return the rights of the policy to one name that no node used, then or now."""
+        policy, robot = self._nodes.policy, self._running.robot
+        nodes = [*self._nodes.expected(self.current).nodes, *self.current.nodes]
+        used = {
+            (enclave, endpoint)
+            for node in nodes
+            for enclave in node.enclaves
+            for endpoint in node.endpoints
+        }
+        running = {enclave for enclave, _ in used}.difference(self._away, [OBSERVER])
+        rights = policy_rights(policy)
+        rules, ordinary = Rules(rights), ordinary_uses(policy, robot.folder)
+        return [
+            f"{right.enclave} {right.describe()}"
+            for right in sorted(rights, key=order)
+            if right.enclave in running
+            and not is_expression(right.name)
+            and rules.allow(right.enclave, right.right, right.name)
+            and (right.enclave, right.right, right.name) not in ordinary
+            and used.isdisjoint((right.enclave, endpoint) for endpoint in _endpoints(right))
+        ]
+
     def summary(self) -> str:
         """Return text on the comparison, on rights that the policy takes away, and on new nodes."""
         before = self._nodes.nodes_to_compare(self._away)
@@ -668,6 +695,9 @@ class _TalkComparison:
         if not_now:
             text += "; allowed, but not seen now, and not always seen in the watch: "
             text += first_few(_endpoint_texts(not_now), MOST_NAMES)
+        if unused := self._unused_rights():
+            text += "; allowed, but not seen on the open robot, and not now: "
+            text += first_few(unused, MOST_NAMES)
         text += (
             ""
             if self._audited["settled"]
@@ -834,6 +864,13 @@ def _endpoints_without_peer(
         )
     }
     return [f"{node} {right} {name}" for node, right, name in sorted(lonely)]
+
+
+def _endpoints(right: Right) -> Iterator[Endpoint]:
+    """Yield the endpoints that a node may have with a right."""
+    for direction, topics in zip((PUBLISH, SUBSCRIBE), right.topics, strict=True):
+        for topic in topics:
+            yield Endpoint(topic, direction)
 
 
 def _opposite(endpoint: Endpoint) -> Endpoint:

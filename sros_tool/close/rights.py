@@ -119,7 +119,7 @@ def _users_by_name(
     rights, of_nodes = policy_rights(policy) | others, NodeRights(others)
     rules, enclaves = Rules(rights), sorted({right.enclave for right in rights})
     allowed = {right for right in rights if right.qualifier is ALLOW}
-    ordinary = _ordinary_uses(policy, folder)
+    ordinary = ordinary_uses(policy, folder)
     ordinary |= {(use.enclave, use.right, use.name) for use in others if of_nodes.needs(use)}
     expressions = {right for right in allowed if is_expression(right.name)}
 
@@ -151,7 +151,7 @@ def _users_by_name(
     }
 
 
-def _ordinary_uses(policy: Policy, folder: Path) -> set[tuple[str, str, str]]:
+def ordinary_uses(policy: Policy, folder: Path) -> set[tuple[str, str, str]]:
     """Return enclave, right and name for the rights that the common parts give to every node."""
     common = common_parts(folder, policies_dir())
     parts = [part for part in _NODE_PARTS if part in common.rights]

@@ -1233,7 +1233,7 @@ def test_a_renamed_node_is_compared_and_a_new_one_is_named(
     assert f"{renamed}dom" in said
     copied = re.sub(r'( *<profile ns="/nav" node=")stern(.*?</profile>)', r"\1stern\2\n\1bow\2",
                     policy.read_text(), flags=re.DOTALL)  # fmt: skip
-    policy.write_text(copied)
+    policy.write_text(copied.replace(">/cmd_vel<", ">/cmd_vel</topic><topic>/plan_b<", 1))
     robot.close()
     seen = robot.folder / "robot/observed.json"
     value = json.loads(seen.read_text())
@@ -1245,7 +1245,9 @@ def test_a_renamed_node_is_compared_and_a_new_one_is_named(
     seen.write_text(json.dumps(value))
     bow_camera = ros_node("nav/bow_camera", of, "publish rt/nav/bow_camera/image")
     robot.remaining = (TALKER, LISTENER, stern_camera, bow_camera)
+    unused, before = "allowed, but not seen on the open robot, and not now: ", said
     said = robot.close("--proof").out
+    assert f"; {unused}/listener publish topic /plan_b; not" in said and unused not in before
     assert (
         "policy has no profile for them any more: /rear_camera (a renamed node is compared if"
         in said
