@@ -714,7 +714,12 @@ def _open_rights_notes(root: Path, template: Template) -> list[Note]:
     metavar="IDS",
     help="New ROS domains of the keystore's enclaves, such as 0 or 0,7 or 10-19.",
 )
-@click.option("--take-edits", is_flag=True, help="Apply the edits in sros.toml or governance.xml.")
+@click.option(
+    "--take-edits",
+    is_flag=True,
+    help="Apply the edits in sros.toml (also of [[enclaves]], which has no option) or "
+    "governance.xml.",
+)
 @click.option(
     "--discard-edits", is_flag=True, help="Undo the edits in sros.toml and governance.xml."
 )

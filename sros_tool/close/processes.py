@@ -198,11 +198,14 @@ class ClosedProcess(NamedTuple):
         words = (*(("env", *variables) if variables else ()), *(self.launch or self.command))
         return f"cd {_shell_word(self.folder)} && {' '.join(map(_shell_word, words))}"
 
-    def secured_command(self, folder: Path, launch_enclave: str = "") -> str:
+    def secured_command(
+        self, folder: Path, launch_enclave: str = "", *, export: Path | None = None
+    ) -> str:
         """Return the shell command that starts the process, its launch or containers with security.
 
         ``folder`` is the folder of the closed robot, and ``launch_enclave`` the enclave of the node
-        of the launch itself. A Python program that runs a launch description gets variables with
+        of the launch itself. ``export`` is the export with the enclave; None for the export in
+        ``folder``. A Python program that runs a launch description gets variables with
         which none of its nodes starts, unless it secures them: see `launch_advice`.
         """
         if self.container:
@@ -219,7 +222,7 @@ class ClosedProcess(NamedTuple):
             words = (*words, ROS_ARGS, "--enclave", self.enclave)
         enclave = launch_enclave if self.launch else self.enclave
         if enclave:
-            words = (*run_words(folder / "export", enclave, self.rmw), *words)
+            words = (*run_words(export or folder / "export", enclave, self.rmw), *words)
         elif variables:
             words = ("env", *(f"{name}={value}" for name, value in variables.items()), *words)
         return f"cd {_shell_word(self.folder)} && {' '.join(map(_shell_word, words))}"

@@ -334,7 +334,8 @@ def test_a_policy_that_was_changed_stays_and_is_followed(robot: Robot) -> None:
     assert f"{except_for}talk: 2 nodes with 35 endpoints as before (types are not compared)" in said
     alone = "left without a partner: /talker may publish /chatter, but no enclave may subscribe to "
     alone = f"1 right that the robot used: /listener subscribe topic /chatter; {alone}it any more"
-    assert f"; the policy takes away {alone}\n" in said
+    unused = "not seen on the open robot, and not now: /listener subscribe topic /old/chatter"
+    assert f"; the policy takes away {alone}; allowed, but {unused}\n" in said
     (denied,) = json.loads(robot.close("--proof", "--json").out)["denied"]
     assert denied.startswith("/listener subscribe topic /chatter (/listener): ")
 
@@ -1808,7 +1809,7 @@ def test_an_enclave_that_belongs_to_another_machine(robot: Robot) -> None:
     )
     assert not (robot.folder / left).exists() and "/listener: process" not in ended.out
     commands = robot.folder / "robot/start/commands.txt"
-    there = "\n# cd /opt && sros run FOLDER/export /listener -- /opt/run listener\n"
+    there = "\n# cd /opt && sros run FOLDER /listener -- /opt/run listener\n"
     assert there in commands.read_text()
     required = robot.folder / "required.toml"
     widest = '[[widest]]\nenclaves = ["%s"]\npublish = ["/x"]\n'
