@@ -677,7 +677,10 @@ KEYSTORES: dict[str, tuple[Callable[[Path], object], str]] = {
     ),
     "encrypted CA key": (_encrypt, "passphrase"),
     "Ed25519 CA key": (_other_kind_of_key, "neither"),
-    "empty CA key": (lambda ks: (ks / "private/identity_ca.key.pem").write_bytes(b""), "damaged"),
+    "empty CA key": (
+        lambda ks: (ks / "private/identity_ca.key.pem").write_bytes(b""),
+        "is an empty file",
+    ),
     "CA key is a folder": (
         lambda ks: _replace(ks / "private/identity_ca.key.pem", Path.mkdir),
         "not a regular file",
