@@ -575,16 +575,14 @@ class Examiner:
             for question in _questions_to_ask(denial)
         ]
         if commands:
-            shows = "shows" if len(commands) == 1 else "show"
+            one = len(commands) == 1
+            show = f"{' and '.join(commands)} {'shows' if one else 'show'}"
             if denial.by_rule:
-                return (
-                    f"{' and '.join(commands)} {shows} the DENY, and where the policy has it: no "
-                    "ALLOW helps against it."
-                )
+                return f"{show} the DENY, and where the policy has it: no ALLOW helps against it."
             return (
-                f"{' and '.join(commands)} {shows} what is missing in the policy. If the policy is "
-                "for another version of the node, use the policy of the node's version; otherwise, "
-                f"add what is missing{advice}.{_parameter_client_hint(denial, name)}"
+                "If the policy is for another version of the node, use the policy of the node's "
+                f"version. Otherwise, {show} what is missing in the policy: add it{advice}."
+                f"{_parameter_client_hint(denial, name)}"
             )
         folder = f"{root}/enclaves/{enclave.lstrip('/')}".rstrip("/")
         return (

@@ -1104,7 +1104,7 @@ def test_a_log_of_a_robot_that_has_the_policy_in_a_namespace(
     )
     said = sros("explain", policy, *named, "--log", log).out
     assert f"`sros explain {policy} /a publish /x` shows what is missing in the policy" in said
-    assert "add what is missing as x, without a / at its beginning: the robot of the log" in said
+    assert "add it as x, without a / at its beginning: the robot of the log" in said
     assert "no rule allows publish rt/left/x" in said
     assert "the policy allows it to /a, which is /left/a in namespace /left\n" in said
     assert "merged with --remap, and the process lacks the remapping. Ask for the robot's" in said
@@ -1129,10 +1129,10 @@ def test_a_private_name_is_not_written_with_the_name_of_the_node(
     started = STARTED.format("/k", "/left/a")
     logged = "[INFO] [1.0] [left.new]: up\n"
     log.write_text(started + logged + denied)
-    assert f"add what is missing as {advice}" in sros("explain", policy, "--log", log).out
+    assert f"add it as {advice}" in sros("explain", policy, "--log", log).out
     log.write_text(logged + denied)  # without the namespace
     said = sros("explain", policy, "/a", "--log", log).out
-    assert ("add what is missing as ~/purge: it" in said) is (topic == "rq/left/new/purgeRequest")
+    assert ("add it as ~/purge: it" in said) is (topic == "rq/left/new/purgeRequest")
 
 
 @pytest.mark.parametrize(
@@ -1171,8 +1171,8 @@ def test_a_node_of_another_version_than_its_policy(tmp_path: Path) -> None:
     denied = "[SECURITY Error] rq/calibrate/_action/send_goalRequest topic not found in allow rule"
     log.write_text(f"{denied}. -> check_create_datareader\n")
     said = sros("explain", policy, "/a", "--log", log).out
-    assert "missing in the policy. If the policy is for another version of the node, use" in said
-    assert "add what is missing. If the node's command renames the action: start" in said
+    assert "remedy    If the policy is for another version of the node, use the policy" in said
+    assert "missing in the policy: add it. If the node's command renames the action: start" in said
 
 
 def test_a_log_without_the_namespace_that_its_names_show(tmp_path: Path) -> None:
