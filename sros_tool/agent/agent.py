@@ -249,7 +249,7 @@ class _Round:
         self._note_due_restarts((), self._enclaves())
         if self._machine.restarted:
             self._forget_restarts()
-        clock = self._clock(self._proven_moment())
+        clock = self._clock_compared_with_proven_time(self._proven_moment())
         # Verified documents prove that ``before.latest`` has passed, whatever the clock shows.
         certain = max(now, before.latest) if before.latest else now
         # Remembered now, because installing closes the keys of changed enclaves to others.
@@ -340,7 +340,7 @@ class _Round:
         if not self._try_part(lambda: write_state(self._folder, self._state)):
             mark_outdated(self._folder)
 
-    def _clock(self, proven_time: datetime | None) -> RobotClock:
+    def _clock_compared_with_proven_time(self, proven_time: datetime | None) -> RobotClock:
         now = self._machine.now
         if proven_time and now + _CLOCK_TOLERANCE < proven_time:
             documents_made = (

@@ -578,7 +578,7 @@ def _apply_changes(folder: Path, changes: Mapping[str, _Change]) -> dict[str, st
         OSError: the disk is full; at most revocation lists were written.
     """
     try:
-        _commit(folder, changes.values())
+        _write_changes(folder, changes.values())
         return {}
     except (SrosError, OSError) as error:
         if isinstance(error, OSError) and error.errno in _DISK_FULL:
@@ -590,13 +590,13 @@ def _apply_changes(folder: Path, changes: Mapping[str, _Change]) -> dict[str, st
     failed = {}
     for name, change in changes.items():
         try:
-            _commit(folder, [change])
+            _write_changes(folder, [change])
         except (SrosError, OSError) as error:
             failed[name] = _error_clause(error)
     return failed
 
 
-def _commit(folder: Path, changes: Iterable[_Change]) -> None:
+def _write_changes(folder: Path, changes: Iterable[_Change]) -> None:
     with Transaction(folder, partial=True) as transaction, Folder(folder) as opened:
         for change in changes:
             _check_seen(opened, change)
@@ -630,7 +630,7 @@ def _commit_lists(folder: Path, changes: Iterable[_Change]) -> None:
             lists.append(_Change(write=crls, seen=change.seen))
     with suppress(SrosError, OSError):
         if lists:
-            _commit(folder, lists)
+            _write_changes(folder, lists)
 
 
 def _error_clause(error: SrosError | OSError) -> str:

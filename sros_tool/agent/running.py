@@ -303,7 +303,7 @@ class Systemd:
         Raises:
             UnavailableError: the command cannot be run, or fails.
         """
-        listing = self._run(
+        listing = self._run_systemctl(
             "list-units", "--plain", "--no-legend", "--state=active", "sros@*.service",
             seconds=_COMMAND_SECONDS,
         )  # fmt: skip
@@ -315,9 +315,9 @@ class Systemd:
         Raises:
             UnavailableError: the unit does not restart; the error says why.
         """
-        self._run("restart", unit, seconds=_RESTART_SECONDS)
+        self._run_systemctl("restart", unit, seconds=_RESTART_SECONDS)
 
-    def _run(self, *words: str, seconds: float) -> str:
+    def _run_systemctl(self, *words: str, seconds: float) -> str:
         failure = f"`{' '.join((*self._command, *words[:1], *words[-1:]))}` failed"
         try:
             done = subprocess.run(

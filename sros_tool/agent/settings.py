@@ -195,7 +195,7 @@ def settings_from(value: Mapping[str, Any], label: str) -> AgentSettings:
         elif key in _LIST_KEYS and _is_list_of_texts(entry):
             fields[key] = tuple(entry)
         elif key == "unit" and isinstance(entry, list):
-            fields["units"] = tuple(_unit(unit, label) for unit in entry)
+            fields["units"] = tuple(_unit_from_table(unit, label) for unit in entry)
         else:
             raise _invalid_settings_error(
                 label, f"{key} is not a known key, or its value has the wrong form"
@@ -221,7 +221,7 @@ def settings_from(value: Mapping[str, Any], label: str) -> AgentSettings:
     return settings
 
 
-def _unit(value: Any, label: str) -> Unit:
+def _unit_from_table(value: Any, label: str) -> Unit:
     if not isinstance(value, dict) or value.keys() != {"name", "enclaves"}:
         raise _invalid_settings_error(
             label, "a unit does not have exactly the keys name and enclaves"

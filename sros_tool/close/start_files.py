@@ -91,7 +91,7 @@ def _compose_text(
         "# Give these services the names that they have in your own file, and give both files to "
         "Docker Compose 2."
     )
-    return _text([heading, *(["services:"] if services else []), *services])
+    return _text_of_lines([heading, *(["services:"] if services else []), *services])
 
 
 def drop_in_heading(robot: LocalRobot) -> str:
@@ -127,7 +127,7 @@ def _commands_text(robot: LocalRobot, state: CloseState) -> str:
     if shutil.which("ros2", path=robot.shell.environment.get("PATH")):
         launch = shlex.join(launch_words(folder, ("ros2", "launch"), ("PACKAGE", "FILE")))
         lines += ["", "# Any launch file; each process needs name= in it.", launch]
-    return _text(lines).lstrip()
+    return _text_of_lines(lines).lstrip()
 
 
 def _warning_of_rmw(rmw: str) -> str:
@@ -163,5 +163,5 @@ def _commands_elsewhere(moved: Sequence[ClosedProcess], folder: Path) -> Iterato
         yield f"# {process.secured_command(folder, export=Path('FOLDER'))}"
 
 
-def _text(lines: Iterable[str]) -> str:
+def _text_of_lines(lines: Iterable[str]) -> str:
     return "".join(f"{line}\n" for line in lines)

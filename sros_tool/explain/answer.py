@@ -647,7 +647,7 @@ def deciding_lines(policy: Enclave, answer: Answer) -> tuple[PolicyLine, ...]:
     other = AccessVerb.SUBSCRIBE if part.verb is AccessVerb.PUBLISH else AccessVerb.PUBLISH
     for verb in (part.verb, other):
         lines = tuple(
-            _line(placed)
+            _policy_line(placed)
             for placed in placed_rights(policy)
             if placed.right.qualifier is qualifier
             and expression in getattr(placed.right.topics, verb)
@@ -660,10 +660,10 @@ def deciding_lines(policy: Enclave, answer: Answer) -> tuple[PolicyLine, ...]:
 def lines_of_right(policy: Enclave, right: Right) -> tuple[PolicyLine, ...]:
     """Return the lines of an enclave's policy that state a right or denial."""
     stated = (placed for placed in placed_rights(policy) if placed.right[1:] == right[1:])
-    return tuple(map(_line, stated))
+    return tuple(map(_policy_line, stated))
 
 
-def _line(placed_right: PlacedRight) -> PolicyLine:
+def _policy_line(placed_right: PlacedRight) -> PolicyLine:
     right, written, source, group, profile = placed_right
     return PolicyLine(source, right.qualifier, right.right, written, group, profile)
 

@@ -516,17 +516,17 @@ def _unjudged_notes(observation: Observation) -> list[tuple[Note, str]]:
     strays = {endpoint.topic for _, endpoint in observation.strays}
     notes = [
         (
-            _note("tool", _TOOLS_TEXT, tools),
+            _note_on_subjects("tool", _TOOLS_TEXT, tools),
             f"{counted(len(active), 'node')} with a tool's name",
             active,
         ),
         (
-            _note("silent", _SILENT_TEXT, silent_nodes),
+            _note_on_subjects("silent", _SILENT_TEXT, silent_nodes),
             f"{counted(len(silent_nodes), 'node')} without endpoint",
             silent_nodes,
         ),
         (
-            _note("stray", _STRAYS_TEXT, strays),
+            _note_on_subjects("stray", _STRAYS_TEXT, strays),
             f"{counted(len(strays), 'topic')} of no node",
             strays,
         ),
@@ -540,11 +540,13 @@ def _unjudged_notes(observation: Observation) -> list[tuple[Note, str]]:
 
 def notes_on_ended_nodes(nodes: Iterable[str]) -> tuple[Note, ...]:
     """Return a note on nodes, by full name, that ended while the graph was observed."""
-    note = _note("ended", _ENDED_TEXT, (n for n in nodes if not is_tool_name(_base_name(n))))
+    note = _note_on_subjects(
+        "ended", _ENDED_TEXT, (n for n in nodes if not is_tool_name(_base_name(n)))
+    )
     return (note,) if note else ()
 
 
-def _note(kind: str, text: str, subjects: Iterable[str]) -> Note | None:
+def _note_on_subjects(kind: str, text: str, subjects: Iterable[str]) -> Note | None:
     names = sorted(subjects)
     return Note(f"audit.{kind}", f"{text}: {first_subjects(names)}") if names else None
 
@@ -661,12 +663,15 @@ def _rights_of(node: ObservedNode, enclave: str) -> Iterator[tuple[Right, tuple[
     """Yield the rights that a node uses, with the endpoints that need the right."""
     folded = rights_of_endpoints(node.endpoints)
     for right in folded.rights:
-        yield Right(enclave, ALLOW, right.right, right.name), _endpoints(right.right, right.name)
+        yield (
+            Right(enclave, ALLOW, right.right, right.name),
+            _endpoints_of_right(right.right, right.name),
+        )
     for endpoint in folded.halves | folded.foreign:
         yield Right(enclave, ALLOW, endpoint.direction, endpoint.topic), (endpoint,)
 
 
-def _endpoints(right: str, name: str) -> tuple[Endpoint, ...]:
+def _endpoints_of_right(right: str, name: str) -> tuple[Endpoint, ...]:
     names = dds_names(right, name)
     return (
         *(Endpoint(topic, PUBLISH) for topic in names.publish),
@@ -702,7 +707,7 @@ def _nodes_using_denied(denied: Iterable[DeniedRight], observation: Observation)
             continue
         needed = set(right.endpoints)
         if right.right.kind != "dds":
-            needed.update(_endpoints(right.right.right, right.right.name))
+            needed.update(_endpoints_of_right(right.right.right, right.right.name))
         for node in right.nodes:
             wanted.setdefault((right.right.enclave, node), set()).update(needed)
     return make_observation(

@@ -191,7 +191,7 @@ def propose(denials: Iterable[Denial]) -> MissingRights:
         if kind:
             skipped[kind].append(denial)
         else:
-            rights.setdefault(denial.enclave, set()).add(_right(denial))
+            rights.setdefault(denial.enclave, set()).add(_right_to_denied_topic(denial))
     return MissingRights(
         {enclave: _without_parts(right) for enclave, right in rights.items()},
         **{kind: tuple(denials_of_kind) for kind, denials_of_kind in skipped.items()},
@@ -213,7 +213,7 @@ def _has_ros_name(topic: str) -> bool:
     return topic.startswith("rt/") or bool(service_of(topic)[0])
 
 
-def _right(denial: Denial) -> NodeRight:
+def _right_to_denied_topic(denial: Denial) -> NodeRight:
     right, name = right_to_use(denial.topic, writes=denial.direction == PUBLISH)
     return NodeRight(*action_right(right, name))
 
@@ -383,7 +383,11 @@ def as_learned(
         )
         if reasons
     ]
-    return Learned(tuple(profiles), (*_notes(missing_rights), *notes), source=RightsOrigin.LOG)
+    return Learned(
+        tuple(profiles),
+        (*_notes_on_missing_rights(missing_rights), *notes),
+        source=RightsOrigin.LOG,
+    )
 
 
 def _lacking_parameter_services(denied: Set[NodeRight], rights: Set[NodeRight]) -> str:
@@ -485,7 +489,7 @@ def _profiles(policy: Policy | None, path: str) -> dict[tuple[str, str], frozens
     return profiles
 
 
-def _notes(missing_rights: MissingRights) -> tuple[Note, ...]:
+def _notes_on_missing_rights(missing_rights: MissingRights) -> tuple[Note, ...]:
     texts = {
         "log.unclear": (
             missing_rights.unclear,

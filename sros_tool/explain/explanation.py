@@ -479,10 +479,10 @@ def _group_edits(lifted_rights: list[Right], policy: Enclave) -> Iterator[GroupE
             )
             if rights:
                 kept.setdefault(rights, []).append(name)
-        yield GroupEdit(source, "\n".join(_xml(group.kind, *item) for item in kept.items()))
+        yield GroupEdit(source, "\n".join(_xml_element(group.kind, *item) for item in kept.items()))
 
 
-def _xml(kind: str, rights: tuple[tuple[str, str], ...], names: list[str]) -> str:
+def _xml_element(kind: str, rights: tuple[tuple[str, str], ...], names: list[str]) -> str:
     element = etree.Element(kind, dict(rights))
     for name in names:
         etree.SubElement(element, kind.removesuffix("s")).text = name

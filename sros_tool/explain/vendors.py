@@ -594,7 +594,7 @@ class WhoByVendor(NamedTuple):
         return self.vendor.documented_only
 
 
-def _title(vendor: Vendor, why: str) -> str:
+def _title_with_reason(vendor: Vendor, why: str) -> str:
     documented = ", as documented" if vendor.documented_only else ""
     return f"{vendor.title} ({why}{documented})"
 
@@ -665,7 +665,7 @@ class VendorOfPolicy(NamedTuple):
     @property
     def title(self) -> str:
         """Name of the vendor, and the reason to choose it."""
-        return _title(self.vendor, self.why)
+        return _title_with_reason(self.vendor, self.why)
 
     def rights_naming(self, name: str) -> Iterator[Right]:
         """Return the rights of the policy to a ROS name."""
@@ -713,10 +713,10 @@ class VendorOfKeystore(NamedTuple):
     @property
     def title(self) -> str:
         """Name of the vendor, and the reason to choose it."""
-        return _title(self.vendor, self._reason)
+        return _title_with_reason(self.vendor, self._reason_for_vendor)
 
     @property
-    def _reason(self) -> str:
+    def _reason_for_vendor(self) -> str:
         names = self.keystore.names if self.names is None else self.names
         titles = {vendor.title for name in names if (vendor := self.stated(name))}
         if not (titles := titles - {self.vendor.title}):
@@ -783,7 +783,7 @@ class VendorOfKeystore(NamedTuple):
         return WhoByVendor(
             str(question),
             self.vendor,
-            self._reason,
+            self._reason_for_vendor,
             self.asking.domain,
             outcomes,
             not is_original_keystore(self.keystore.root),

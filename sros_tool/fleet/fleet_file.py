@@ -435,8 +435,8 @@ class _Inventory:
         """Host → variables that groups of the same depth set to different values."""
         self._groups: dict[str, set[str]] = {}
         self._steps = 0
-        meta = self._mapping(groups.get("_meta"), "_meta")
-        self._of_list = self._mapping(meta.get("hostvars"), "_meta.hostvars")
+        meta = self._checked_mapping(groups.get("_meta"), "_meta")
+        self._of_list = self._checked_mapping(meta.get("hostvars"), "_meta.hostvars")
         self._top = groups
 
     def table(self) -> dict[str, Any]:
@@ -444,7 +444,7 @@ class _Inventory:
             self._read_group(name, self._top[name], (), {})
         return {
             "groups": {name: {} for name in sorted(self._groups) if not name_problem(name)},
-            "robots": dict(self._robots()),
+            "robots": dict(self._robot_tables()),
         }
 
     def _top_level_groups(self, groups: Mapping[str, Any]) -> Iterator[str]:
@@ -467,7 +467,9 @@ class _Inventory:
         if name in parent_groups or len(parent_groups) > _MAX_DEPTH:
             raise self._error(f"the group {name} contains itself, or is in too many other groups")
         if not isinstance(group, dict):
-            group = {"hosts": group} if isinstance(group, list) else self._mapping(group, name)
+            group = (
+                {"hosts": group} if isinstance(group, list) else self._checked_mapping(group, name)
+            )
         inside = (*parent_groups, name)
         set_here = self._used_variables(group.get("vars"), f"{name}.vars")
         variables = {
@@ -479,12 +481,12 @@ class _Inventory:
         hosts = group.get("hosts") or {}
         if isinstance(hosts, list):
             hosts = dict.fromkeys(map(str, hosts))
-        for host, own in self._mapping(hosts, f"{name}.hosts").items():
+        for host, own in self._checked_mapping(hosts, f"{name}.hosts").items():
             self._read_host(host, own, inside, variables)
         children = group.get("children") or {}
         if isinstance(children, list):  # of `ansible-inventory --list`: groups at the top
             children = {group: self._top.get(group) for group in map(str, children)}
-        for child, value in self._mapping(children, f"{name}.children").items():
+        for child, value in self._checked_mapping(children, f"{name}.children").items():
             self._read_group(child, value, inside, variables)
 
     def _count_step(self) -> None:
@@ -519,7 +521,7 @@ class _Inventory:
 
     def _used_variables(self, value: Any, at: object) -> dict[str, Any]:
         """Return the variables that a fleet uses; other variables are left out."""
-        values = self._mapping(value, at)
+        values = self._checked_mapping(value, at)
         return {
             key: values[key] for key in (*_VARIABLES.values(), _ROBOT_VARIABLE) if key in values
         }
@@ -534,7 +536,7 @@ class _Inventory:
             )
         return {key: value for key, (_, value) in self._inherited[host].items()} | own
 
-    def _robots(self) -> Iterator[tuple[str, dict[str, Any]]]:
+    def _robot_tables(self) -> Iterator[tuple[str, dict[str, Any]]]:
         of: dict[str, list[str]] = {host: [] for host in self._own}
         for group, hosts in self._groups.items():
             for host in hosts:
@@ -564,7 +566,7 @@ class _Inventory:
                 robot["domain"] = int(domain)  # variables of INI inventories are text
             yield name, {"address": host, **robot, "groups": sorted(of[host])}
 
-    def _mapping(self, value: Any, at: object) -> dict[Any, Any]:
+    def _checked_mapping(self, value: Any, at: object) -> dict[Any, Any]:
         if value is None:
             return {}
         if not isinstance(value, dict):
@@ -580,7 +582,7 @@ class _Inventory:
 
 def inventory(fleet: Fleet) -> dict[str, Any]:
     """Return a static inventory of the robots: Ansible reads it from a file in YAML or JSON."""
-    hosts = {robot.name: _variables(robot) for robot in fleet.robots.values()}
+    hosts = {robot.name: _ansible_variables(robot) for robot in fleet.robots.values()}
     groups: dict[str, Any] = {
         name: {"hosts": {member: {} for member in members}}
         for name, members in fleet.groups.items()
@@ -592,14 +594,16 @@ def script_inventory(fleet: Fleet) -> dict[str, Any]:
     """Return the inventory in the form of a dynamic inventory script (``--list``)."""
     ungrouped = [robot.name for robot in fleet.robots.values() if not robot.groups]
     return {
-        "_meta": {"hostvars": {robot.name: _variables(robot) for robot in fleet.robots.values()}},
+        "_meta": {
+            "hostvars": {robot.name: _ansible_variables(robot) for robot in fleet.robots.values()}
+        },
         "all": {"children": [*fleet.groups, "ungrouped"]},
         **{name: {"hosts": list(members)} for name, members in fleet.groups.items()},
         "ungrouped": {"hosts": ungrouped},
     }
 
 
-def _variables(robot: Robot) -> dict[str, Any]:
+def _ansible_variables(robot: Robot) -> dict[str, Any]:
     settings = {**robot._asdict(), "crossing": list(robot.crossing)}
     shown = {
         variable: settings[key]

@@ -703,11 +703,11 @@ def _similar_chains(
             continue
         changed = [replace(hop, target=enclave) for hop in before]
         changed.append(replace(after, source=enclave))
-        if all(any(_passes(of, hop) for of in worlds) for hop in changed):
+        if all(any(_hop_passes(of, hop) for of in worlds) for hop in changed):
             yield (*changed, *chain[2:])
 
 
-def _passes(world: World, hop: TopicHop) -> bool:
+def _hop_passes(world: World, hop: TopicHop) -> bool:
     crossing = world.topics_between(hop.source, hop.target)
     return (
         hop.source in world.writers_of(hop.topic)

@@ -441,7 +441,7 @@ def _without_namespace_repeats(
     return reversed({(r.source, r.robot, why): (r, why) for r, why in pairs}.values())
 
 
-def _text(violation: Violation) -> str:
+def _violation_text(violation: Violation) -> str:
     requirement = violation.requirement
     text = f"{_violation_clause(violation)}, but {demand(requirement)}"
     if violation.worlds:
@@ -478,7 +478,7 @@ def _violation_finding(violation: Violation) -> Finding:
     )
     return VIOLATED.found(
         _subject(violation),
-        _text(violation),
+        _violation_text(violation),
         first.file,
         first.line,
         _CLOSE_GOVERNANCE if ANYBODY in violation.witness.enclaves else _edit_text(violation),

@@ -371,7 +371,7 @@ def compare_access(base: AccessSource, head: AccessSource) -> Growth:
         _with_default_domains_and_governance(base, head),
         _with_default_domains_and_governance(head, base),
     )
-    worlds = _worlds(before, after)
+    worlds = _compared_worlds(before, after)
     added = tuple(_gains(before, after, worlds, scope, limit))
     lost = tuple(dict.fromkeys(_lost_protection(base, head, limit, rules=not added)))
     new_nodes = tuple(_new_nodes(base, head, limit))
@@ -491,7 +491,7 @@ class _World:
     longest: int | None = None
 
 
-def _worlds(base: AccessSource, head: AccessSource) -> list[_World]:
+def _compared_worlds(base: AccessSource, head: AccessSource) -> list[_World]:
     worlds = []
     if "zenoh" not in (base.kind, head.kind):
         domains = _domains(base, head)
@@ -999,9 +999,9 @@ class _StatedRights:
             right,
             name,
             topic,
-            _source(self._new_sources, self._new, right),
+            _source_of_right(self._new_sources, self._new, right),
             denied,
-            _source(self._old_sources, self._old, denied),
+            _source_of_right(self._old_sources, self._old, denied),
             (place.world.title,),
             (place.domain,),
         )
@@ -1014,7 +1014,7 @@ _Sources = dict[str, dict[Right, Source]]
 """Cache that maps enclaves and rights to the file and line that states the right."""
 
 
-def _source(known: _Sources, side: AccessSource, right: Right | None) -> Source | None:
+def _source_of_right(known: _Sources, side: AccessSource, right: Right | None) -> Source | None:
     if right is None:
         return None
     if right.enclave not in known:

@@ -355,13 +355,19 @@ def added_crossing(
         return
     kept = {*before.router_names()} & {*after.router_names()}
     for router in sorted(kept):
-        old_crossing, new_crossing = _expressions(before, router), _expressions(after, router)
+        old_crossing, new_crossing = (
+            _crossing_of_router(before, router),
+            _crossing_of_router(after, router),
+        )
         if old_crossing != new_crossing and (
             name := _newly_passing_name(old_crossing, new_crossing, limit)
         ):
             meaning = f"{name} may pass between this router and others"
             yield _looser_change(
-                f"crossing of router {router}", _text(old_crossing), _text(new_crossing), meaning
+                f"crossing of router {router}",
+                _crossing_text(old_crossing),
+                _crossing_text(new_crossing),
+                meaning,
             )
     yield from _moved_enclaves(before, after, {*new.permissions, *new.certified, *kept}, limit)
 
@@ -372,7 +378,9 @@ def _moved_enclaves(
     """Yield moves of enclaves to other routers that let more names of these enclaves pass."""
     places: dict[tuple[str, str], str] = {}
     for enclave in sorted(enclaves):
-        places.setdefault((_router(before, enclave), _router(after, enclave)), enclave)
+        places.setdefault(
+            (_router_name_of(before, enclave), _router_name_of(after, enclave)), enclave
+        )
     for (old_router, new_router), enclave in places.items():
         if old_router == new_router:
             continue
@@ -383,7 +391,7 @@ def _moved_enclaves(
             if name := _newly_passing_name(
                 _crossing_of_both(before, old_router, old_place), has, limit
             ):
-                crossing = _text(_crossing_of_both(before, old_router, old_place))
+                crossing = _crossing_text(_crossing_of_both(before, old_router, old_place))
                 yield _looser_change(
                     f"router of {enclave}",
                     f"{old_router}, which passes on {crossing}",
@@ -428,19 +436,21 @@ _Crossing = tuple[tuple[str, ...], ...]
 
 def _newly_passing_name(before: _Crossing, after: _Crossing, limit: SearchLimit) -> str:
     """Return a name that may pass by ``after`` but not by ``before``; "" if there is none."""
-    names = _names(after) - _names(before)
+    names = _passing_names(after) - _passing_names(before)
     return (names & _ABSOLUTE_NAMES).example(limit) or names.example(limit) or ""
 
 
 @lru_cache(maxsize=1024)
-def _names(crossing: _Crossing) -> NameSet:
+def _passing_names(crossing: _Crossing) -> NameSet:
+    """Return the names that match every list of a crossing; all names if it has no list."""
     names = _ALL_NAMES
     for expressions in crossing:
         names &= NameSet.union(map(names_of_expression, expressions))
     return names
 
 
-def _expressions(network: ZenohNetwork, router: str) -> _Crossing:
+def _crossing_of_router(network: ZenohNetwork, router: str) -> _Crossing:
+    """Return the limits that the network and a robot's router set for what leaves the robot."""
     own_expressions = next(
         (known.crossing for known in network.routers if known.name == router), ()
     )
@@ -449,15 +459,20 @@ def _expressions(network: ZenohNetwork, router: str) -> _Crossing:
 
 def _crossing_of_both(network: ZenohNetwork, first_router: str, second_router: str) -> _Crossing:
     return tuple(
-        dict.fromkeys((*_expressions(network, first_router), *_expressions(network, second_router)))
+        dict.fromkeys(
+            (
+                *_crossing_of_router(network, first_router),
+                *_crossing_of_router(network, second_router),
+            )
+        )
     )
 
 
-def _router(network: ZenohNetwork, enclave: str) -> str:
+def _router_name_of(network: ZenohNetwork, enclave: str) -> str:
     return enclave if enclave in network.router_names() else network.router_of(enclave).name
 
 
-def _text(crossing: _Crossing) -> str:
+def _crossing_text(crossing: _Crossing) -> str:
     return " within ".join(",".join(expressions) for expressions in crossing) or "everything"
 
 

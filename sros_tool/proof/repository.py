@@ -318,12 +318,12 @@ class Repository:
         Raises:
             DocumentError: a parent in the path is not a folder, but for instance a link.
         """
-        entry = _top(self, commit)
+        entry = _top_folder(self, commit)
         gone: list[str] = []
         for part in path.split("/") if path else ():
             if entry.mode != FOLDER:
                 raise DocumentError(f"'{'/'.join(gone)}' is not a folder of the revision")
-            tree_entry = _folder(self, entry.id).get(part)
+            tree_entry = _entries_of_folder(self, entry.id).get(part)
             if tree_entry is None:
                 return None
             entry = tree_entry
@@ -364,7 +364,7 @@ class Repository:
         Raises:
             DocumentError: the file is missing, damaged, or larger than `_MOST_BYTES`.
         """
-        return _content(self, digits)
+        return _content_of_file(self, digits)
 
     def _objects(self, ids: Sequence[str]) -> dict[str, tuple[str, bytes]]:
         """Return type and content of objects, by id; missing objects are left out.
@@ -402,7 +402,7 @@ class Repository:
                 )
             content = data[at : at + int(words[2])]
             at += len(content) + 1
-            if _digest(words[1], content, len(object_id)) != object_id:
+            if _object_id(words[1], content, len(object_id)) != object_id:
                 raise DocumentError(
                     f"the object {object_id} of the repository is damaged",
                     "Its content does not have this hash.",
@@ -530,17 +530,17 @@ class Repository:
 
 
 @lru_cache(maxsize=64)
-def _top(repository: Repository, commit: str) -> TreeEntry:
+def _top_folder(repository: Repository, commit: str) -> TreeEntry:
     return TreeEntry(FOLDER, repository.tree(commit))
 
 
 @lru_cache(maxsize=1024)  # an object with a given id never changes
-def _folder(repository: Repository, digits: str) -> dict[str, TreeEntry]:
+def _entries_of_folder(repository: Repository, digits: str) -> dict[str, TreeEntry]:
     return repository.folders([digits])[digits]
 
 
 @lru_cache(maxsize=256)
-def _content(repository: Repository, digits: str) -> bytes:
+def _content_of_file(repository: Repository, digits: str) -> bytes:
     return repository.contents([digits])[digits]
 
 
@@ -635,7 +635,7 @@ def _split_at_blank(line: str) -> tuple[str, str, str]:
     return line.partition(" ")
 
 
-def _digest(kind: str, content: bytes, digits: int) -> str:
+def _object_id(kind: str, content: bytes, digits: int) -> str:
     git_object = b"%s %d\0%s" % (kind.encode(), len(content), content)
     if digits == 40:
         return hashlib.sha1(git_object, usedforsecurity=False).hexdigest()

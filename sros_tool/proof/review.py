@@ -456,7 +456,7 @@ class _Review:
                 ]
         named = " ".join(asked.policies)
         complete = self.has_all_policies
-        findings = partial(self._findings, of_head, head_fleet)
+        findings = partial(self._policy_findings, of_head, head_fleet)
         if head_fleet:
             self.robots[named] = fleet_with_enclaves(head_fleet, of_head)
         yield from self._step_result(
@@ -477,25 +477,27 @@ class _Review:
             earlier[named] = before
         after = cache(partial(load_policies, of_head, _HEAD, head_fleet))
         both = {named: lambda: (before(), after())} if of_base else {}
-        yield from self._requirements(of_head, head_fleet, base_fleet, keystores, earlier, both)
+        yield from self._requirement_steps(
+            of_head, head_fleet, base_fleet, keystores, earlier, both
+        )
         if self.base:
             moving = cache(lambda: [*_fixed_or_moving_names(before(), after())])
             yield from self._step_result(
                 "new-access",
                 named,
-                lambda: self._access(of_base, base_fleet, before, after, moving),
+                lambda: self._access_change(of_base, base_fleet, before, after, moving),
                 is_wanted=bool(asked.policies),
                 complete=complete,
             )
             yield from self._step_result(
                 "rights",
                 named,
-                partial(self._rights, before, after, moving),
+                partial(self._rights_change, before, after, moving),
                 is_wanted=bool(of_base),
             )
         for path, keystore in keystores.items():
             earlier_keystore = base_keystores.get(path)
-            yield from self._keystore(path, keystore, earlier_keystore, of_head, head_fleet)
+            yield from self._keystore_steps(path, keystore, earlier_keystore, of_head, head_fleet)
         # Not allowed by --new-access: its user has read the commit, not a checkout, which may
         # differ.
         yield from self._step_result("files", "", self._converted_step, can_be_allowed=False)
@@ -740,7 +742,7 @@ class _Review:
                 lines.append((f"{_NOT_USED_TEXT} --leave-out {quote(path)}, or delete it", path))
         earlier = list(self._changed_files(self.base, self.head))
         for path in self._unreviewed_keystores([*changed, *earlier]):
-            if not self._has(self.head, str(Path(path) / ENCLAVES)):
+            if not self._has_entry(self.head, str(Path(path) / ENCLAVES)):
                 continue  # deleted by the change, or without enclaves
             is_top = path == "."  # all files of the repository would belong to it
             review = "move it into a folder" if is_top else "name it with --keystore"
@@ -761,7 +763,7 @@ class _Review:
             named.append(
                 ("changes and is an archive, or compressed: the review does not look into it", path)
             )
-        gone = [(path, entry) for path, entry in earlier if not self._has(self.head, path)]
+        gone = [(path, entry) for path, entry in earlier if not self._has_entry(self.head, path)]
         for path in self._policies_among(gone, self.base, known=False):
             new = names.get(dict(gone)[path].id)
             named.append((f"is renamed to '{new}'" if new else "is deleted", path))
@@ -871,7 +873,7 @@ class _Review:
         return f"a symbolic link to '{target[:_LONGEST_TARGET_SHOWN]}'"
 
     @staticmethod
-    def _has(side: CommitFiles, path: str) -> bool:
+    def _has_entry(side: CommitFiles, path: str) -> bool:
         try:
             return side.entry(path) is not None
         except DocumentError:
@@ -983,13 +985,15 @@ class _Review:
     def _circumstances(self, fleet: Fleet | None = None) -> Circumstances:
         return Circumstances(self.request.at, self.request.zone, fleet=fleet)
 
-    def _findings(self, policies: Sequence[Path], fleet: Fleet | None) -> tuple[int, Content]:
+    def _policy_findings(
+        self, policies: Sequence[Path], fleet: Fleet | None
+    ) -> tuple[int, Content]:
         found = policy_findings(policies, self._circumstances(fleet))
         template = self._template()
         chosen = FindingFilter().choose(e for e in found if not is_mended_by(template, e))
-        return _status(chosen), chosen
+        return _status_of_findings(chosen), chosen
 
-    def _access(
+    def _access_change(
         self,
         base_paths: Sequence[Path],
         base_fleet: Fleet | None,
@@ -997,6 +1001,10 @@ class _Review:
         after: Callable[[], AccessSource],
         moving: Callable[[], Sequence[PlacedRight]],
     ) -> tuple[int, Content]:
+        """Return the exit status for the access that the policies gain, and this access.
+
+        Without ``base_paths``, the policies are new, and the content says only this.
+        """
         head = after()
         if not base_paths:
             assert self.base
@@ -1025,11 +1033,12 @@ class _Review:
         return status, AccessChange(before, after, growth, dropped, elsewhere)
 
     @staticmethod
-    def _rights(
+    def _rights_change(
         before: Callable[[], AccessSource],
         after: Callable[[], AccessSource],
         moving: Callable[[], Sequence[PlacedRight]],
     ) -> tuple[int, Content] | None:
+        """Return the changed rights with the exit status, or None if no right changed."""
         first, second = before().as_rights(), after().as_rights()
         absolute = tuple(moved for moved in moving() if moved.written.startswith("/"))
         relative = tuple(moved for moved in moving() if not moved.written.startswith("/"))
@@ -1044,7 +1053,7 @@ class _Review:
 
     # ── requirements ───────────────────────────────────────────────────────────────────────
 
-    def _requirements(
+    def _requirement_steps(
         self,
         policies: Sequence[Path],
         fleet: Fleet | None,
@@ -1080,7 +1089,7 @@ class _Review:
                 system = load()
                 before = self._keystore_fleet(subject) if subject in keystores else base_fleet
             except (SrosError, OSError) as error:
-                yield _undecided("requirements", subject, error)
+                yield _undecided_step("requirements", subject, error)
                 continue
             read = yield from self._read_requirements(files, system.fleet)
             wanted = [*chain.from_iterable(read.values())]
@@ -1146,7 +1155,7 @@ class _Review:
         ]
         # In several namespaces, a requirement with absolute names is decided several times.
         chosen = FindingFilter().choose(dict.fromkeys(findings))
-        return _status(chosen), chosen
+        return _status_of_findings(chosen), chosen
 
     def _failing_elsewhere(
         self,
@@ -1272,7 +1281,7 @@ class _Review:
 
     # ── keystores ──────────────────────────────────────────────────────────────────────────
 
-    def _keystore(
+    def _keystore_steps(
         self,
         path: str,
         folder: Path,
@@ -1301,11 +1310,11 @@ class _Review:
             )
             strict = bool(self.base) and not is_same
             chosen = FindingFilter(exclude=_UNSIGNED_POLICY_IDS, strict=strict).choose(findings)
-            return _status(chosen), chosen
+            return _status_of_findings(chosen), chosen
 
         def signed() -> tuple[int, Content]:
             chosen = FindingFilter(include=_UNSIGNED_POLICY_IDS).choose(all_findings())
-            return _status(chosen), chosen
+            return _status_of_findings(chosen), chosen
 
         def access() -> tuple[int, Content]:
             if before:
@@ -1317,9 +1326,11 @@ class _Review:
         yield from self._step_result("signed", path, signed, is_wanted=bool(stated))
         if self.base:
             yield from self._step_result("new-access", path, access)
-        yield from self._step_result("expiry", path, lambda: self._expiry(before or folder, folder))
+        yield from self._step_result(
+            "expiry", path, lambda: self._expiring_enclaves(before or folder, folder)
+        )
 
-    def _expiry(self, settings_folder: Path, folder: Path) -> tuple[int, Content]:
+    def _expiring_enclaves(self, settings_folder: Path, folder: Path) -> tuple[int, Content]:
         settings = OpenedKeystore(settings_folder).template
         expiring = due_enclaves(
             OpenedKeystore(folder), self.request.renew_within, self.request.at, settings
@@ -1491,7 +1502,7 @@ def _with_new_names(
                 yield finding._replace(text=text)
 
 
-def _status(chosen_findings: ChosenFindings) -> int:
+def _status_of_findings(chosen_findings: ChosenFindings) -> int:
     return _FOUND if chosen_findings.fails(WARNING) else _OK
 
 
@@ -1566,7 +1577,7 @@ def _without_left_robots(before: Fleet | None, after: FleetSource) -> Fleet | No
     )
 
 
-def _undecided(kind: str, subject: str, error: SrosError | OSError) -> ReviewStep:
+def _undecided_step(kind: str, subject: str, error: SrosError | OSError) -> ReviewStep:
     known = error if isinstance(error, SrosError) else DocumentError(str(error))
     return ReviewStep(kind, subject, _UNDECIDED, known)
 
@@ -1580,7 +1591,7 @@ def _read_each(
         try:
             value = read(path)
         except (SrosError, OSError) as error:
-            yield _undecided(kind, path, error)
+            yield _undecided_step(kind, path, error)
         else:
             if value is not None:
                 values[path] = value

@@ -250,7 +250,7 @@ def _access_of_source(path: Path, source: RightsSource) -> AccessSource:
         )
     if source.kind == "enclave":
         has_one = (path / GOVERNANCE_FILE).exists()
-        governance = _governance(path / GOVERNANCE_FILE) if has_one else None
+        governance = _read_governance(path / GOVERNANCE_FILE) if has_one else None
         files = path / IDENTITY_CA_FILE, path / CRL_FILE
         trusts = _trusts(dict.fromkeys(source.scope or (), files), {})
         certified = _certified_enclaves(dict.fromkeys(source.scope or (), path))
@@ -385,7 +385,7 @@ def _exported_governance(root: Path, folders: Iterable[Path]) -> Governance:
                     "No node starts in this enclave.",
                     "Export the enclave again.",
                 )
-        enclaves.setdefault(_governance(folder / GOVERNANCE_FILE), folder)
+        enclaves.setdefault(_read_governance(folder / GOVERNANCE_FILE), folder)
     if len(enclaves) > 1:
         first, second, *_ = enclaves.values()
         raise DocumentError(
@@ -441,6 +441,7 @@ def _trusts(
 
     @lru_cache(maxsize=8)  # most enclaves have the same files, so this is cached
     def trust(pem: bytes, own_list: bytes | None) -> Trust:
+        """Return the trust by the content of a CA file and of the revocation list next to it."""
         authorities = load_certificates(pem, IDENTITY_CA_FILE)
         keys = [(authority, key_digest(authority.public_key())) for authority in authorities]  # type: ignore[arg-type]
         revoked = set()
@@ -482,7 +483,7 @@ def _trusts(
     return trusts
 
 
-def _governance(file: Path) -> Governance:
+def _read_governance(file: Path) -> Governance:
     data = read_bytes(file, "governance document")
     try:
         signed = smime.parse(data)

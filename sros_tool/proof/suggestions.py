@@ -408,7 +408,7 @@ def render_requirements(
     lines = [_HEADING.format(of=json.dumps(source_name))]
     for requirement in requirements:
         lines += [f"# {demand(requirement)}", f"[[{requirement.KIND}]]"]
-        lines += [f"{key} = {_toml(value)}" for key, value in _values(requirement)]
+        lines += [f"{key} = {_toml_value(value)}" for key, value in _values(requirement)]
         lines.append("")
     return "\n".join([*lines, *(f"{comment}\n" for comment in comments)])
 
@@ -437,7 +437,7 @@ def _values(requirement: Requirement) -> Iterator[tuple[str, object]]:
 _WIDTH = 80
 
 
-def _toml(value: object) -> str:
+def _toml_value(value: object) -> str:
     if not isinstance(value, tuple | list):
         return json.dumps(value)
     texts = [json.dumps(item) for item in value]

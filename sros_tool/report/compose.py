@@ -404,7 +404,7 @@ def _marked_rights(
         allowed_by: for a right of both sources, show the wildcards of the first source only.
             Without it, wildcards are shown if only wildcards give the right in both sources.
     """
-    sides = [{_identity(edge): edge for edge in side} for side in (first, second)]
+    sides = [{_edge_identity(edge): edge for edge in side} for side in (first, second)]
     edges = []
     for key in {**sides[0], **sides[1]}:
         left, right = sides[0].get(key), sides[1].get(key)
@@ -429,7 +429,7 @@ def _neutral_edge(edge: Edge, unseen: frozenset[str], observed: NamesOfRights) -
     return replace(edge, mark=OverlaySide.BOTH) if neutral else edge
 
 
-def _identity(edge: Edge) -> tuple[object, ...]:
+def _edge_identity(edge: Edge) -> tuple[object, ...]:
     return edge.enclave, edge.kind, edge.name, edge.right, edge.qualifier, edge.parts
 
 
@@ -693,9 +693,9 @@ def protection_of(governance: Governance | None, kind: str, name: str) -> Protec
     if governance is None or not governance.domain_access_rules:
         return UNKNOWN
     domain = governance.domain_access_rules[0]
-    topics = _topics(kind, name)
+    topics = _topics_of_name(kind, name)
     protections = [
-        _protection(domain, rule) for topic in topics for rule in _rules_of(domain, topic)
+        _protection_by_rules(domain, rule) for topic in topics for rule in _rules_of(domain, topic)
     ]
     anywhere = [
         (access, rule)
@@ -737,16 +737,21 @@ class _DemandedProtection:
 
     def protection(self, kind: str, name: str) -> Protection | None:
         """Return the weakest protection demanded for the topics of a name, or None."""
-        levels = [self._level(topic) for topic in _topics(kind, name)] if self._names else []
+        levels = (
+            [self._level_of_topic(topic) for topic in _topics_of_name(kind, name)]
+            if self._names
+            else []
+        )
         least = min(levels, key=_LEVEL_ORDER.index, default=WireLevel.UNKNOWN)
         return None if least is WireLevel.UNKNOWN else Protection(least)
 
-    def _level(self, topic: str) -> WireLevel:
+    def _level_of_topic(self, topic: str) -> WireLevel:
         covering = [level for level, names in self._names.items() if names.cover(topic)]
         return max(covering, key=_LEVEL_ORDER.index, default=WireLevel.UNKNOWN)
 
 
-def _topics(kind: str, name: str) -> tuple[str, ...]:
+def _topics_of_name(kind: str, name: str) -> tuple[str, ...]:
+    """Return the DDS topics of a ROS name; of kind "dds", the name is itself a topic."""
     if kind == "dds":
         return (name,)
     topics = (dds_names(right, name) for right in RIGHTS[kind])
@@ -766,16 +771,16 @@ def _rules_of(domain: DomainRule, topic: str) -> Iterator[TopicRule]:
                 return
 
 
-def _protection(domain: DomainRule, rule: TopicRule) -> Protection:
+def _protection_by_rules(domain: DomainRule, rule: TopicRule) -> Protection:
     data, metadata = rule.data_protection_kind, rule.metadata_protection_kind
     rtps = domain.rtps_protection_kind
     return Protection(
-        max((_level(kind) for kind in (data, metadata, rtps)), key=_LEVEL_ORDER.index),
+        max((_level_of_kind(kind) for kind in (data, metadata, rtps)), key=_LEVEL_ORDER.index),
         str(data),
         str(metadata),
         str(rtps),
     )
 
 
-def _level(kind: str) -> WireLevel:
+def _level_of_kind(kind: str) -> WireLevel:
     return WireLevel(str(kind).partition("_")[0].lower())

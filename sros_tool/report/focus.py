@@ -352,7 +352,7 @@ class _System:
             if focus.kind != _ENCLAVE and not is_expression(focus.name):
                 added |= set(self._edges_by_wildcard(focus.kind, focus.name))
         new = {(edge.kind, edge.name) for edge in added} - self._known
-        names = (*picture.names, *(self._name(*key) for key in new))
+        names = (*picture.names, *(self._name_with_protection(*key) for key in new))
         return replace(
             picture,
             edges=tuple(sorted((*picture.edges, *added), key=edge_order)),
@@ -372,7 +372,7 @@ class _System:
             by = sorted({right.name for right in rights if right.qualifier is qualifier})
             yield Edge(enclave, kind, name, verb, qualifier, tuple(by))
 
-    def _name(self, kind: str, name: str) -> Name:
+    def _name_with_protection(self, kind: str, name: str) -> Name:
         protection = protection_of(self._governance, kind, name)
         return Name(kind, name, namespace_of(name), protection, is_expression(name))
 
@@ -577,7 +577,7 @@ class _Draft:
             members[before, node].append(path)
         noted = enclave_notes(self._picture)
         for (before, node), paths in sorted(members.items()):
-            side = self._side(before)
+            side = self._hops_on_side(before)
             group, notes = "", []
             if node[0] == ":":
                 label = node.partition(" ")[2] or counted(len(paths), "enclave")
@@ -596,7 +596,7 @@ class _Draft:
     def _further_cards(self) -> Iterator[Card]:
         for before, paths in zip((True, False), self._further, strict=True):
             if paths:
-                side = self._side(before)
+                side = self._hops_on_side(before)
                 most = max(side[path] for path in paths)
                 hops = f"over up to {self._hops_to_focus(before, most)} hops"
                 notes = ["directly" if most <= (2 if before else 1) else hops]
@@ -630,7 +630,7 @@ class _Draft:
                 continue
             last = self._column_of(before, self._hops)
             near = {
-                path for path, hop in self._side(before).items() if hop == self._hops
+                path for path, hop in self._hops_on_side(before).items() if hop == self._hops
             } & self._enclaves_with_further_neighbors(before)
             for card in cards.values():
                 if card.column == last and not near.isdisjoint(card.members):
@@ -641,7 +641,7 @@ class _Draft:
         """Return the hops to show: an enclave in the focus is itself the first hop before it."""
         return hop - 1 if is_before_focus and self._flow.own else hop
 
-    def _side(self, is_before_focus: bool) -> Mapping[str, int]:
+    def _hops_on_side(self, is_before_focus: bool) -> Mapping[str, int]:
         return self._flow.before if is_before_focus else self._flow.after
 
     def _enclaves_with_further_neighbors(self, is_before_focus: bool) -> set[str]:

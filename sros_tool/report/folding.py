@@ -94,9 +94,10 @@ class Folding(NamedTuple):
         scenes = scenes_of(self.picture, with_places=with_places, drawn_as=self.names)
         if self.picture.focus:
             scenes = (flow_scene(self.picture, hops or HOPS, with_places=with_places), *scenes)
-        return tuple(map(self._scene, scenes))
+        return tuple(map(self._with_real_members, scenes))
 
-    def _scene(self, scene: Scene) -> Scene:
+    def _with_real_members(self, scene: Scene) -> Scene:
+        """Return a scene whose cards list the enclaves and names that they stand for."""
         cards = []
         for card in scene.cards:
             if card.kind:
@@ -324,7 +325,7 @@ class _Draft:
                     *(owner.form, group.form, enclave.observed, enclave.domains),
                     *(enclave.path in alarming, roles.get(enclave.path)),
                 )
-                yield self._kind(drawn), (*owner.units, *group.units), enclave.path
+                yield self._kind_number(drawn), (*owner.units, *group.units), enclave.path
         for edge in chain(self._picture.edges, self._stated_edges()):
             owner, name = owners[edge.enclave], self._text(edge.name)
             by = tuple(map(self._text, edge.by))
@@ -342,7 +343,7 @@ class _Draft:
                 *(edge.violates, (edge.kind, edge.name) in targets),
                 *((used.protection, used.wildcard) if used else ()),
             )
-            kind = self._kind(drawn)
+            kind = self._kind_number(drawn)
             if edge.common:
                 self._common_kinds.add(kind)
             yield kind, units, edge
@@ -358,7 +359,7 @@ class _Draft:
                     right = stated.kind, stated.name, stated.right, stated.qualifier
                     yield Edge(enclave.path, *right, mark=stated.mark)
 
-    def _kind(self, drawn: object) -> int:
+    def _kind_number(self, drawn: object) -> int:
         return self._kinds.setdefault(drawn, len(self._kinds))
 
     def _find_classes(self) -> dict[int, list[int]]:
@@ -455,7 +456,7 @@ class _Draft:
             enclaves=tuple(self._folded_enclaves(differing_parts)),
             names=tuple(self._folded_names(edges)),
             edges=edges,
-            focus=tuple(map(self._focus, self._picture.focus)),
+            focus=tuple(map(self._folded_focus, self._picture.focus)),
         )
         shown_domains = {self._domains(unit) for unit in self._unit_of.values()} - {""}
         units = sorted(
@@ -608,7 +609,7 @@ class _Draft:
                 path, group = self._path(enclave.path), self._text(enclave.group).fill(self._label)
                 yield replace(enclave, path=path, group=group, note=note)
 
-    def _focus(self, focus: Focus) -> Focus:
+    def _folded_focus(self, focus: Focus) -> Focus:
         def paths(enclaves: Iterable[str]) -> tuple[str, ...]:
             return tuple(dict.fromkeys(map(self._path, enclaves)))
 

@@ -147,7 +147,7 @@ def render_svg(picture: Picture, scene: Scene) -> str:
             for number, line in enumerate(text_lines)
         ),
         f'<g transform="translate(0 {top})">',
-        *_heads(scene),
+        *_svg_heads(scene),
     ]
     cards = {card.id: card for card in scene.cards}
     for frame in scene.frames:
@@ -164,8 +164,8 @@ def render_svg(picture: Picture, scene: Scene) -> str:
             *(link.violates, link.qualifier is not ALLOW, link.differs, rank[link.mark]),
         ),
     ):
-        lines.append(_link(link, cards, picture.overlay))
-    lines += [line for card in scene.cards for line in _card(card)]
+        lines.append(_svg_link(link, cards, picture.overlay))
+    lines += [line for card in scene.cards for line in _svg_card(card)]
     lines.append("</g>")
     for number, text in enumerate(legend):
         y = top + scene.height + 16 + 20 * number
@@ -205,7 +205,7 @@ def _lines(text: str, width: int) -> list[str]:
     return wrap(text, max(20, (width - 28) // 7), break_on_hyphens=False)
 
 
-def _heads(scene: Scene) -> Iterable[str]:
+def _svg_heads(scene: Scene) -> Iterable[str]:
     for head in scene.heads:
         text = escape(head.text.upper())
         yield f'<text class="head" x="{head.x}" y="4" text-anchor="{head.anchor}">{text}</text>'
@@ -243,7 +243,7 @@ def _link_classes(link: Link) -> str:
     return " ".join(classes)
 
 
-def _link(link: Link, cards: dict[str, Card], overlay: Overlay | None) -> str:
+def _svg_link(link: Link, cards: dict[str, Card], overlay: Overlay | None) -> str:
     source, target = cards[link.source], cards[link.target]
     return (
         f'<path class="{_link_classes(link)}" d="{_curve(link, source, target)}">'
@@ -251,7 +251,7 @@ def _link(link: Link, cards: dict[str, Card], overlay: Overlay | None) -> str:
     )
 
 
-def _card(card: Card) -> Iterable[str]:
+def _svg_card(card: Card) -> Iterable[str]:
     names = card.role == "names"
     lacks = lack_text(card.kind, card.lacks) if card.lacks else ""
     kind = f"card {card.role}{' chosen' if card.chosen else ''}{' lacking' if lacks else ''}"
@@ -386,16 +386,16 @@ _WAIT_SECONDS = 60
 def render_dot(picture: Picture, scene: Scene) -> str:
     """Return the scene as a directed graph in the DOT language."""
     lines = [
-        f"digraph {_quoted(picture.title)} {{",
+        f"digraph {_dot_quoted(picture.title)} {{",
         '  graph [rankdir=LR, fontname="sans-serif", ranksep=1.2, nodesep=0.15]',
-        f"  graph [labelloc=t, label={_quoted(_title(picture))}]",
+        f"  graph [labelloc=t, label={_dot_quoted(_picture_title(picture))}]",
         '  node [shape=box, style=rounded, fontname="monospace", fontsize=11]',
         '  edge [fontname="sans-serif", fontsize=9, color="#5d7590"]',
     ]
     cards = _node_cards(scene)
     clusters = _clusters(cards)
     for number, (title, members) in enumerate(clusters.items()):
-        lines.append(f"  subgraph cluster_{number} {{ label={_quoted(title)}; style=rounded")
+        lines.append(f"  subgraph cluster_{number} {{ label={_dot_quoted(title)}; style=rounded")
         lines += [f"    {_dot_node(scene, key, cards[key])}" for key in members]
         lines.append("  }")
     inside = {key for members in clusters.values() for key in members}
@@ -410,7 +410,7 @@ def render_mermaid(picture: Picture, scene: Scene) -> str:
     """Return the scene as a Mermaid flowchart."""
     cards = _node_cards(scene)
     clusters = _clusters(cards)
-    lines = ["---", f"title: {_yaml(_title(picture))}", "---", "flowchart LR"]
+    lines = ["---", f"title: {_yaml_quoted(_picture_title(picture))}", "---", "flowchart LR"]
     for number, (title, members) in enumerate(clusters.items()):
         lines.append(f'  subgraph g{number}["{_escaped_for_mermaid(title)}"]')
         lines += [f"    {_mermaid_node(scene, key, cards[key])}" for key in members]
@@ -513,7 +513,7 @@ def _graphviz_svg(dot: str) -> str:
 # ── both formats ───────────────────────────────────────────────────────────────────────────
 
 
-def _title(picture: Picture) -> str:
+def _picture_title(picture: Picture) -> str:
     return ". ".join((picture.title, *picture.headlines))
 
 
@@ -539,7 +539,7 @@ def _node_key(card: str) -> str:
     return card if card[0] == "n" else f"e{card[1:]}"
 
 
-def _texts(scene: Scene, card: Card) -> Iterable[str]:
+def _card_texts(scene: Scene, card: Card) -> Iterable[str]:
     if card.kind:
         yield KIND_NAMES[card.kind] + _level_text(card)
     yield from card.members if len(card.members) <= len(card.lines) else card.lines
@@ -574,30 +574,30 @@ def _link_label(picture: Picture, link: Link) -> str:
 
 
 def _dot_node(scene: Scene, key: str, card: Card) -> str:
-    texts = [_escaped(text) for text in _texts(scene, card)]
+    texts = [_dot_escaped(text) for text in _card_texts(scene, card)]
     label = r"\l".join((*texts, "") if len(texts) > 1 else texts)
     shape = ", style=filled, fillcolor=white, shape=note" if card.role == "names" else ""
-    return f'{_quoted(key)} [label="{label}"{shape}]'
+    return f'{_dot_quoted(key)} [label="{label}"{shape}]'
 
 
 def _dot_edge(picture: Picture, link: Link) -> str:
     denied = link.qualifier is not ALLOW
     attributes = [
-        f"label={_quoted(_link_label(picture, link))}",
+        f"label={_dot_quoted(_link_label(picture, link))}",
         f'color="{_VIOLATING if link.violates else _COLORS[link.mark]}"',
         f"style={_DOT_STYLES[link.level.value]}",
     ]
     attributes += ["arrowhead=tee"] if denied else []
     attributes += ["penwidth=3"] if link.violates else []
-    ends = f"{_quoted(_node_key(link.source))} -> {_quoted(_node_key(link.target))}"
+    ends = f"{_dot_quoted(_node_key(link.source))} -> {_dot_quoted(_node_key(link.target))}"
     return f"{ends} [{', '.join(attributes)}]"
 
 
-def _quoted(text: str) -> str:
-    return f'"{_escaped(text)}"'
+def _dot_quoted(text: str) -> str:
+    return f'"{_dot_escaped(text)}"'
 
 
-def _escaped(text: str) -> str:
+def _dot_escaped(text: str) -> str:
     return visible_line(text).replace("\\", "\\\\").replace('"', '\\"')
 
 
@@ -606,11 +606,11 @@ def _escaped(text: str) -> str:
 
 def _mermaid_node(scene: Scene, key: str, card: Card) -> str:
     around = '["{}"]' if card.role == "names" else '("{}")'
-    return _identifier(key) + around.format(_label(scene, card))
+    return _identifier(key) + around.format(_mermaid_label(scene, card))
 
 
-def _label(scene: Scene, card: Card) -> str:
-    return "<br/>".join(map(_escaped_for_mermaid, _texts(scene, card)))
+def _mermaid_label(scene: Scene, card: Card) -> str:
+    return "<br/>".join(map(_escaped_for_mermaid, _card_texts(scene, card)))
 
 
 def _node_id(card: str) -> str:
@@ -630,7 +630,7 @@ def _escaped_for_mermaid(text: str) -> str:
     return re.sub(r"[^A-Za-z0-9 /_.,:+-]", lambda letter: f"#{ord(letter[0])};", visible_line(text))
 
 
-def _yaml(text: str) -> str:
+def _yaml_quoted(text: str) -> str:
     return '"' + re.sub(r"[^A-Za-z0-9 /_.,:+-]", "_", text) + '"'
 
 

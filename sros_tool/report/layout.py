@@ -666,7 +666,7 @@ def _card_tops(
     The tallest column is placed first, as tight as possible. In the other columns, each card is
     placed near the cards to which lines connect it.
     """
-    extent = [_extent(column) for column in columns]
+    extent = [_column_height(column) for column in columns]
     tallest = max(range(len(columns)), key=lambda number: (extent[number], number % 2 == 1))
     tops: dict[str, float] = {}
     height = {item.id: item.height for column in columns for item in column}
@@ -684,7 +684,7 @@ def _card_tops(
     return tops
 
 
-def _extent(column: Sequence[ColumnItem]) -> float:
+def _column_height(column: Sequence[ColumnItem]) -> float:
     groups = len({item.group for item in column})
     return sum(item.height + _GAP for item in column) + _LEAD * groups
 

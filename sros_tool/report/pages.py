@@ -557,7 +557,7 @@ def render_fleet_page(
     head = (
         f"<header><h1>{current} of {robots} current</h1>"
         f"<p>Fleet of keystore <code>{escape(status['keystore'])}</code>, as of "
-        f"{_minute(status['at'])} UTC.{fact_lines}</p>"
+        f"{_text_to_minute(status['at'])} UTC.{fact_lines}</p>"
         f'<ul class="tiles">{tiles}</ul>{trusted}</header>'
     )
     heads = "".join(f'<th scope="col">{name}</th>' for name in _FLEET_COLUMNS)
@@ -596,14 +596,14 @@ _FLEET_COLUMNS = ("State", "Robots", "To do", "Details", "Confirmed (UTC)", "Fir
 _FLEET_CLASSES = ("error", "warning", "good")
 
 
-def _minute(moment: str) -> str:
+def _text_to_minute(moment: str) -> str:
     return moment[:16].replace("T", " ")
 
 
 def _fleet_row(row: Sequence[str], words: Mapping[str, str]) -> str:
     state, robots, confirmed, expiry, to_do, why = row
     chip = f'<span class="chip {_fleet_class(state)}">{words.get(state, state)}</span>'
-    texts = (to_do, why, confirmed and _minute(confirmed), expiry[:10])
+    texts = (to_do, why, confirmed and _text_to_minute(confirmed), expiry[:10])
     cells = "".join(
         f'<td data-label="{label}">{_with_marks(text)}</td>' if text else "<td></td>"
         for label, text in zip(_FLEET_COLUMNS[2:], texts, strict=True)

@@ -676,17 +676,19 @@ def _pictured_enclave(
 
 def _validities_of(name: str, state: OpenedEnclave) -> Iterator[Validity]:
     if state.certificate:
-        yield _certificate(state.certificate, "certificate", name, name)
+        yield _certificate_validity(state.certificate, "certificate", name, name)
     for grant in state.permissions.grants if state.permissions else ():
-        yield _grant(grant, name)
+        yield _grant_validity(grant, name)
 
 
-def _grant(grant: Grant, name: str) -> Validity:
+def _grant_validity(grant: Grant, name: str) -> Validity:
     window = grant.validity
     return Validity(iso(window.not_after), iso(window.not_before), "permissions", name, name)
 
 
-def _certificate(certificate: x509.Certificate, kind: str, title: str, name: str) -> Validity:
+def _certificate_validity(
+    certificate: x509.Certificate, kind: str, title: str, name: str
+) -> Validity:
     window = validity_of(certificate)
     return Validity(iso(window.not_after), iso(window.not_before), kind, title, name)
 
@@ -701,7 +703,7 @@ def _authorities(keystore: OpenedKeystore) -> Iterator[Validity]:
     for certificate, certificate_roles in roles.items():
         named = [role for role in certificate_roles if role != "ca"] or certificate_roles
         title = f"{' and '.join(dict.fromkeys(named))} CA, {authority_text(certificate)}"
-        yield _certificate(certificate, "authority", title, "")
+        yield _certificate_validity(certificate, "authority", title, "")
     for crl in keystore.revocation_lists:
         title = f"revocation list {crl.number}"
         yield Validity(iso(crl.next_update), iso(crl.this_update), "revocation list", title)
