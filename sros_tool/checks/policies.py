@@ -221,6 +221,17 @@ NO_COUNTERPART = FindingKind(
     "Compare the names that senders and receivers have after remapping, and name all policies of "
     "the robot in one command.",
 )
+NOT_OFFERED = FindingKind(
+    "policy.not-offered",
+    NOTE,
+    "a called service or action that the node in its name may not offer",
+    "The node is in the policy, but may not offer this service or action, so no call succeeds. "
+    "Perhaps a new version of the node renamed it.",
+    "sros: compares the rights of all enclaves in the policies that are checked together.",
+    "Write the new name at the node that calls, or allow the other node to offer the old name. "
+    "Ignore this finding if another policy of the robot has the server.",
+    prominent=True,
+)
 MISSPELT = FindingKind(
     "policy.name-misspelt",
     WARNING,
@@ -323,6 +334,10 @@ def _check_counterparts(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
     for statement in alone:
         if not _is_service_of_every_node(statement.name):
             offered[statement.name].append(statement)
+    nodes = {
+        expand("~", statement.profile.ns, statement.profile.node)
+        for statement in checked_policy.statements
+    }
     near = NearNames(offered)
     spelled = cache(lambda side: NearNames(e for e in names[side] if not is_expression(e)))
     for statement in checked_policy.statements:
@@ -369,7 +384,12 @@ def _check_counterparts(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
             # All of the similar names are used.
             if similar := spelled(other).similar_names(statement.name):
                 hint = f"; perhaps you mean {' or '.join(similar[:_NAMES_SHOWN])} ({other})"
-            yield statement.found(NO_COUNTERPART, f"no enclave may {other} {statement.name}{hint}")
+            name = statement.name
+            is_of_node = statement.right.kind != "topics" and name.rpartition("/")[0] in nodes
+            kind = NO_COUNTERPART
+            if is_of_node and not _is_service_of_every_node(name):
+                kind = NOT_OFFERED
+            yield statement.found(kind, f"no enclave may {other} {name}{hint}")
     for statement in checked_policy.statements:
         other, name = OFFERING_RIGHT.get(statement.right.right), statement.name
         if other not in ("publish", "reply") or not statement.allows or not is_expression(name):

@@ -101,6 +101,8 @@ CASES = [
     Case("policy.name-misspelt",
          services("request", "gripper/set") + OTHER + services("reply", "griper/set"),
          services("request", "gripper/set") + OTHER + services("reply", "gripper/set")),
+    Case("policy.not-offered", EVENTS + OTHER + services("request", "n/release"),
+         services("reply", "~/release") + OTHER + services("request", "n/release")),
     Case("policy.side-mistaken", services("request", "~/home"), services("reply", "~/home")),
     Case("policy.several-profiles",
          '</profile></profiles><profiles><profile ns="/" node="m">' + BASICS,
