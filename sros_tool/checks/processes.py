@@ -245,6 +245,10 @@ def _required_files(enclave: ProcessEnclave) -> Sequence[str]:
     return [file.name for file in enclave.files if file.name not in (CRL_FILE, KEY_URI_FILE)]
 
 
+PLACE_OR_MODE = "(its place or mode)"
+"""The text of `newer_files` after a file or folder that has the same content as before."""
+
+
 def newer_files(process: Process, enclave: ProcessEnclave) -> Iterator[str]:
     """Yield the names of the files that changed, or were removed, since a process started.
 
@@ -266,7 +270,7 @@ def newer_files(process: Process, enclave: ProcessEnclave) -> Iterator[str]:
     yield from (f"{file} (removed)" for file in gone)
     if not newer and not gone:
         moved = [path for path, moment in enclave.moved.items() if moment > process.started]
-        yield from (f"'{_plain_path(file)}' (its place or mode)" for file in moved[:1])
+        yield from (f"'{_plain_path(file)}' {PLACE_OR_MODE}" for file in moved[:1])
 
 
 def may_lack_list(

@@ -504,6 +504,12 @@ def _other_machines_lines(robot: LocalRobot, closed: CloseState) -> list[str]:
             "other machines have, as you said with --brought, the current files of "
             f"{_times_text(brought)}"
         )
+    if here := " ".join(robot.named_here):
+        lines.append(
+            f"the other machine still has the key of {here}: delete the files there, or replace "
+            f"the key: `sros renew {keystore} {here} --new-key --revoke-old`, then "
+            f"`{robot.close_command}`, and restart all processes"
+        )
     if expired := closed.expired_elsewhere:
         lines.append(
             f"on other machines, files that have expired: {_times_text(expired)}; to renew them, "

@@ -10,7 +10,12 @@ from functools import cached_property
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
-from sros_tool.checks.processes import newer_files, why_order_is_unknown, zenoh_findings
+from sros_tool.checks.processes import (
+    PLACE_OR_MODE,
+    newer_files,
+    why_order_is_unknown,
+    zenoh_findings,
+)
 from sros_tool.close.processes import (
     ROUTER,
     ClosedProcess,
@@ -181,7 +186,8 @@ class RunningRobot:
             return f"{warning}{clock}, and {newer} may have changed after the start of"
         if names == [CRL_FILE]:
             return f"{warning}{_ACCEPTS_REVOKED}"
-        return f"{warning}{newer} changed, or got another mode, after the start of"
+        or_mode = "" if newer.endswith(PLACE_OR_MODE) else ", or got another mode,"
+        return f"{warning}{newer} changed{or_mode} after the start of"
 
     def not_observed(self) -> Sequence[str]:
         """Return the processes in enclaves that sros did not observe, as text.

@@ -535,6 +535,12 @@ class Examiner:
             )
         if is_used is False and self._keystore:
             place = self._keystore.kind
+            if place == "export":
+                remedy = (
+                    "If the enclave at the other end is not in this export (it may be on another "
+                    "machine), ask the whole keystore: `sros explain KEYSTORE --log LOG`. "
+                    f"Otherwise, {remedy}"
+                )
             return [f"no enclave of the {place} may {PEER_RIGHT[denied.right]} {name}"], (
                 f"{remedy} Or, if another name is meant, the node lacks a remapping, or has a "
                 "wrong one: compare its start command with the command in the robot's launch files "

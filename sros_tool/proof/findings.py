@@ -399,7 +399,7 @@ def decided_findings(
     """Return the findings of decisions: broken requirements first, in order."""
     findings = [_violation_finding(violation) for violation in decided.violations]
     findings += [
-        _part_finding(VACUOUS, requirement, why, _namespace_remedy(requirement, system.rights))
+        _part_finding(VACUOUS, requirement, why, _vacuous_remedy(requirement, system.rights))
         for requirement, why in _without_namespace_repeats(decided.vacuous)
     ]
     for kind, decisions in (
@@ -624,6 +624,18 @@ def _part_finding(
     place = requirement.source
     text = f"{'; '.join(why)}; required: {demand(requirement)}"
     return kind.found(place.file, text, place.file, place.line, remedy)
+
+
+_NOBODY_REMEDY = (
+    "Correct the name, or its kind (service or action). After `merge_policy --remap`, check with "
+    "the same --remap."
+)
+
+
+def _vacuous_remedy(requirement: Requirement, rights: Iterable[Right]) -> str:
+    """Return a remedy that fits better than the remedy of `VACUOUS`; "" if there is none."""
+    other_namespace = _namespace_remedy(requirement, rights)
+    return other_namespace or (_NOBODY_REMEDY if isinstance(requirement, Nobody) else "")
 
 
 def _namespace_remedy(requirement: Requirement, rights: Iterable[Right]) -> str:

@@ -1833,6 +1833,7 @@ def test_an_enclave_that_belongs_to_another_machine(robot: Robot) -> None:
     ended = robot.close("--here", "/listener")
     assert (robot.folder / left / "key.pem").exists(), ended
     assert "not on this machine" not in ended.out
+    assert "still has the key of /listener: delete the files there, or replace the" in ended.err
     assert "/listener: no process runs its command: by hand\n" in ended.out
     assert there not in commands.read_text()
     assert "already belongs to this" in robot.close("--here", "/listener", status=2).err

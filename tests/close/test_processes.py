@@ -249,8 +249,14 @@ def test_an_enclave_is_closed_only_if_all_its_processes_are(tmp_path: Path) -> N
     later, user = now + timedelta(1), os.geteuid()
     fresh = Process(7, ("a",), variables, later, enclave=enclave, configuration=rules, user=user)
     old, unread = replace(fresh, started=now - timedelta(1)), LoadedFile("/s.json5", problem="odd")
+    unchanged = LoadedFile("cert.pem", now - timedelta(2))
+    placed = replace(enclave, files=(unchanged,), moved={"/export": now})
     robot: Any = SimpleNamespace(export=tmp_path, domain=0)
     for processes, why in (
+        (
+            (replace(old, enclave=placed),),
+            "'/export' (its place or mode) changed after the start of",
+        ),
         ((fresh,), None),
         ((fresh, replace(old, user=4321)), None),
         ((fresh, old), "cert.pem changed, or got another mode, after the start of"),

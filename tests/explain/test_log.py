@@ -1444,6 +1444,7 @@ def test_the_other_side_of_a_name_tells_whether_a_remapping_may_be_forgotten(
     sros("distribute_key", keystore, "/weed", export).ok()
     found = sros("explain", export, "--log", log, "/weed").out
     assert "no enclave of the export may publish /odometry\n" in found
+    assert "ask the whole keystore: `sros explain KEYSTORE --log LOG`. Otherwise, " in found
     assert "Or, if another name is meant, the node lacks a remapping" in found
     (keystore / "enclaves/camera/permissions.p7s").write_text("damaged")
     found = sros("explain", keystore, "/weed", "--log", log).out

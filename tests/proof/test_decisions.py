@@ -397,6 +397,9 @@ def test_a_guard_of_a_name_that_only_wildcards_match(name: str) -> None:
     if name in SLIPS:
         hint = "perhaps /cmd_vel is meant"
         assert (reasons, unnamed) == ([f"only wildcards match topic {name} ({hint})"], [])
+        required = parse_requirements(f'[[nobody]]\npublish = ["{name}"]'.encode(), "r.toml")
+        (finding, *_) = requirement_findings(required, robot(READ_BY_ALL))
+        assert finding.id == VACUOUS and "write [[nobody]]" not in finding.remedy
     else:
         assert (reasons, unnamed) == ([], [f"topic {name}"])
     stated = decided(
