@@ -34,7 +34,7 @@ from sros_tool.names import (
     is_expression,
     right_to_use,
 )
-from sros_tool.policy.model import PEER_RIGHT, RIGHTS
+from sros_tool.policy.model import PEER_RIGHT, RIGHTS, below_namespace
 from sros_tool.policy.patterns import covers
 from sros_tool.policy.rights import KIND_OF, is_of_every_node
 from sros_tool.proof.requirements import (
@@ -293,30 +293,45 @@ def _topics_of_rights(rights: RightNames) -> Iterator[tuple[str, _TopicOfRight, 
                 yield right, part, part.topics(name)
 
 
-def _matching_enclaves(patterns: Sequence[str], enclaves: Collection[str]) -> set[str]:
-    """Return the enclaves that match a pattern of the list, and no exception in the list."""
+def _matching_enclaves(
+    patterns: Sequence[str], enclaves: Collection[str], namespace: str = "/"
+) -> set[str]:
+    """Return the enclaves that match a pattern of the list, and no exception in the list.
+
+    Enclaves, and patterns that begin with ``/``, are in a namespace, but are written without it.
+    """
     matching: set[str] = set()
     excepted: set[str] = set()
     for pattern in patterns:
         to = excepted if pattern[0] == EXCEPT else matching
-        to.update(fnmatch.filter(enclaves, pattern.removeprefix(EXCEPT)))
+        name = pattern.removeprefix(EXCEPT)
+        if name[0] == "/" or namespace == "/":
+            to.update(fnmatch.filter(enclaves, name))
+        else:
+            below = {below_namespace(path, namespace): path for path in enclaves}
+            to.update(below[path] for path in fnmatch.filter(below, name))
     return matching - excepted
 
 
 def restricted_enclaves(
-    requirement: Requirement, enclaves: Collection[str]
+    requirement: Requirement, enclaves: Collection[str], namespace: str = "/"
 ) -> tuple[set[str], ...]:
-    """Return the sets of enclaves to which a requirement applies; () if it applies to all."""
+    """Return the sets of enclaves to which a requirement applies; () if it applies to all.
+
+    Both are decided in a namespace, but written without it.
+    """
     match requirement:
         case Only(enclaves=listed):
-            return (set(enclaves) - _matching_enclaves(listed, enclaves),)
+            return (set(enclaves) - _matching_enclaves(listed, enclaves, namespace),)
         case Must(enclave=enclave):
             return ({enclave}.intersection(enclaves),)
         case Widest(enclaves=listed) | NothingBut(enclaves=listed):
-            return (_matching_enclaves(listed, enclaves),)
+            return (_matching_enclaves(listed, enclaves, namespace),)
         case Apart(sources=sources, targets=targets, through=through):
-            free = _matching_enclaves(through, enclaves)
-            return tuple(_matching_enclaves(ends, enclaves) - free for ends in (sources, targets))
+            free = _matching_enclaves(through, enclaves, namespace)
+            return tuple(
+                _matching_enclaves(ends, enclaves, namespace) - free for ends in (sources, targets)
+            )
     return ()
 
 

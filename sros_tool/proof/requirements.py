@@ -207,6 +207,18 @@ class Apart(Requirement):
     through: tuple[str, ...] = ()
 
 
+def patterns_of_enclaves(requirement: Requirement) -> tuple[str, ...]:
+    """Return the enclaves and patterns of a requirement, without ``!``."""
+    match requirement:
+        case Only(enclaves=listed) | Widest(enclaves=listed) | NothingBut(enclaves=listed):
+            pass
+        case Apart(sources=sources, targets=targets, through=through):
+            listed = (*sources, *targets, *through)
+        case _:
+            return ()
+    return tuple(name.removeprefix(EXCEPT) for name in listed)
+
+
 def demand(requirement: Requirement) -> str:
     """Return a requirement's demand as a clause, such as ``nobody may publish /x``."""
     enclaves_text = partial(_enclaves_text, of_robots=requirement.of_robots)

@@ -112,6 +112,7 @@ from sros_tool.proof.requirements import (
     Requirement,
     dropped_findings,
     dropped_requirements,
+    patterns_of_enclaves,
     read_all_requirements,
     read_requirements,
     renamed_names,
@@ -1259,10 +1260,12 @@ class _Review:
             requirement.requirement
             for requirement in dropped_requirements(earlier, wanted_requirements)
         ]
+        sources = None
+        with suppress(SrosError, OSError):  # the comparison reports the error
+            sources = moved() if moved else None
         left: list[Finding] = []
-        if moved:
-            with suppress(SrosError, OSError):  # the comparison reports the error
-                left = list(_left_requirement_findings(earlier, wanted_requirements, *moved()))
+        if sources:
+            left = [*_left_requirement_findings(earlier, wanted_requirements, *sources)]
         if not (dropped or left):
             return None
         assert self.base
@@ -1448,15 +1451,10 @@ def _namespaces_to_try(before: AccessSource, after: AccessSource) -> list[str]:
     fixed = {of.right.name for of in placed if of.written.startswith(("/", "*"))}
     changed = {right.name for right in before.rights ^ after.rights}
     names = sorted(fixed, key=lambda name: (name not in changed, name))
-    examples = [name for name in (common_name([name, "/*/*"]) for name in names) if name]
-    parts_of_names = (name.split("/")[:-1] for name in examples)
-    namespaces = [
-        "/".join(parts[:end]) for parts in parts_of_names for end in range(2, len(parts) + 1)
-    ]
     ordinary = "/any_namespace"
     while any(ordinary in right.name for right in (*before.rights, *after.rights)):
         ordinary += "_"
-    return [*dict.fromkeys([ordinary, *namespaces])]
+    return [*dict.fromkeys([ordinary, *_namespaces_in(names)])]
 
 
 _NOT_OF_DROPPED = tuple(kind.id for kind in (VACUOUS, MISSPELLED_ENCLAVE, UNKNOWN_ENCLAVE))
@@ -1526,28 +1524,49 @@ def _left_requirement_findings(
     ]
     similar_requirements = similarity_to(earlier)
     for requirement in requirements if moves else ():
-        restricted = zip(
-            restricted_enclaves(requirement, before.enclaves),
-            restricted_enclaves(requirement, after.enclaves),
-            strict=True,
-        )
-        left = [
-            (node, old & was, at, new - now)
-            for at, (was, now) in enumerate(restricted)
-            for node, old, new in moves
-            if old & was and new - now
-        ]
-        required = [
-            restricted_enclaves(similar, before.enclaves)
-            for similar in (similar_requirements(requirement) if left else ())
-        ]
-        for node, was_in, at, outside in left:
-            if any(was_in & was[at] for was in required):
+        # The namespaces of a fleet are known, and its policies name the enclaves in them.
+        for ns in ("/",) if after.fleet else _namespaces_of_patterns(requirement):
+            was_restricted, now_restricted = (
+                restricted_enclaves(requirement, source.enclaves, ns) for source in (before, after)
+            )
+            left = [
+                (node, old & was, at, new - now)
+                for at, (was, now) in enumerate(zip(was_restricted, now_restricted, strict=True))
+                for node, old, new in moves
+                if old & was and new - now
+            ]
+            required = [
+                restricted_enclaves(similar, before.enclaves, ns)
+                for similar in (similar_requirements(requirement) if left else ())
+            ]
+            left = [move for move in left if any(move[1] & was[move[2]] for was in required)]
+            for node, _, _, outside in left:
                 place = requirement.source
                 name, to = expand("~", *node), first_few(sorted(outside), 3)
                 text = f"node {name} moves to enclave {to}, outside of the requirement"
+                text += f" for users in namespace {ns}" if ns != "/" else ""
                 remedy = "Let the requirement apply to the enclave, or approve this in the review."
                 yield DROPPED.found(str(requirement), text, place.file, place.line, remedy)
+            if left:
+                break
+
+
+def _namespaces_of_patterns(requirement: Requirement) -> list[str]:
+    """Return namespaces in which a requirement may apply to other enclaves than in ``/``.
+
+    They are in the patterns of enclaves that do not move with the namespace, and follow ``/``.
+    """
+    fixed = (name for name in patterns_of_enclaves(requirement) if not name.startswith("/"))
+    is_moving = requirement.is_relative and requirement.elsewhere
+    elsewhere = _namespaces_in(fixed) if is_moving else ()
+    return [*dict.fromkeys(["/", *islice(elsewhere, _MOST_NAMESPACES)])]
+
+
+def _namespaces_in(names: Iterable[str]) -> Iterator[str]:
+    """Yield the namespaces of names, and of a name that matches each expression."""
+    for expression in names:
+        parts = (common_name([expression, "/*/*"]) or "").split("/")[:-1]
+        yield from ("/".join(parts[:end]) for end in range(2, len(parts) + 1))
 
 
 def _enclaves_by_node(enclaves: Iterable[Enclave]) -> dict[NodeName, set[str]]:
