@@ -980,7 +980,10 @@ def _gain_text(sign: str, gain: Gain, growth: Growth) -> str:
         text += f", which {other} denies by {gain.denied.name}{at}"
     if gain.worlds != growth.worlds:
         text += f"; with {', '.join(joined_titles(gain.worlds))}"
-    if gain.domains != (0,) or len(growth.domains) > 1:
+    if growth.other_domain in gain.domains:
+        if lacked := [str(domain) for domain in growth.domains if domain not in gain.domains]:
+            text += f"; in every domain except {', '.join(lacked)}"
+    elif gain.domains != (0,) or len(growth.domains) > 1:
         text += f"; in domain {', '.join(map(str, gain.domains))}"
     return text
 

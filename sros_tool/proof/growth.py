@@ -219,7 +219,8 @@ class Growth:
     """Access and protection that HEAD adds and removes.
 
     In a condition, the value is True if HEAD adds access or protects less.  ``reach_unknown`` says
-    why ``reach`` is not known, or is "".
+    why ``reach`` is not known, or is "".  ``other_domain`` is the one of ``domains`` that stands
+    for every domain that no robot has, if both sides are policies; otherwise it is None.
     """
 
     added: tuple[Gain, ...]
@@ -250,6 +251,7 @@ class Growth:
     """Nodes that HEAD assigns to an enclave of BASE, and that thereby get more rights."""
     dropped_denials: tuple[DroppedDenial, ...]
     """Denials that HEAD drops or narrows, without allowing their names; this is not new access."""
+    other_domain: int | None
 
     @property
     def new_access(self) -> bool:
@@ -391,6 +393,11 @@ def compare_access(base: AccessSource, head: AccessSource) -> Growth:
     if None in sides:
         unknown = f"there are more than {_MOST_HOPS:,} hops between enclaves"
     gained = dict.fromkeys(_lost_protection(head, base, limit, rules=False))
+    domains = sorted({domain for world in worlds for domain in world.domains})
+    other_domain = None
+    if {base.kind, head.kind} == {"policy"}:
+        own = {*_domains_of_robots(base, head).values(), *_domains_of_robots(head, base).values()}
+        other_domain = next((domain for domain in domains if domain not in own), None)
     return Growth(
         added,
         tuple(_gains(after, before, worlds, scope, limit)),
@@ -399,12 +406,13 @@ def compare_access(base: AccessSource, head: AccessSource) -> Growth:
         lost,
         tuple(replace(change, effect=Effect.TIGHTER) for change in gained),
         tuple(world.title for world in worlds),
-        tuple(sorted({domain for world in worlds for domain in world.domains})),
+        tuple(domains),
         tuple(_assumptions(base, head)),
         tuple(_left_out_texts(base, head)),
         unclear,
         new_nodes,
         tuple(_dropped_denials(base, head)),
+        other_domain,
     )
 
 

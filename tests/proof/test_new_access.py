@@ -710,6 +710,8 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "fleet.xml").write_text(FLEET_POLICY)
     for name, line in (("any", ""), ("seven", "domain = 7"), ("eight", "domain = 8")):
         (folder / f"{name}.toml").write_text(ROBOTS.format(line))
+    more = "domain = 7\n[robots.r3]"  # r3 has no domain
+    (folder / "r3.toml").write_text(ROBOTS.format(more))
     sros("create_keystore", "ks", cwd=folder, env={"ROS_DOMAIN_ID": None}).ok()
     sros("update_keystore", "ks", "--domain", "0,7", "--allow-looser", cwd=folder).ok()
     made = ("generate_artifacts", "-k", "ks", "-p", "fleet.xml", "--fleet", "seven.toml")
@@ -731,14 +733,15 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
                 "seven",
                 "any",
                 1,
-                "+ /r1/base publish topic /r1/status  (fleet.xml:3); in domain 0\n",
+                "+ /r1/base publish topic /r1/status  (fleet.xml:3); in every domain except 7\n",
             ),
             (
                 "any",
                 "seven",
                 0,
-                "- /r1/base publish topic /r1/status  (fleet.xml:3); in domain 0\n",
+                "- /r1/base publish topic /r1/status  (fleet.xml:3); in every domain except 7\n",
             ),
+            ("seven", "r3", 1, "+ /r3/base publish topic /r3/status  (fleet.xml:3)\n"),
             ("seven", "seven", 0, ""),
             ("ks", "seven", 0, ""),
             ("seven", "ks", 0, ""),
