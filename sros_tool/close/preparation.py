@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from itertools import chain
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
 from sros_tool.checks.processes import has_other_files, other_folder_findings
@@ -376,7 +376,9 @@ def _remove_enclaves(robot: LocalRobot) -> list[FileChange]:
             for entry in (f"{folder}/{name}" for name in export.names(folder)):
                 if not stat.S_ISDIR(export.mode(entry)):
                     export.unlink(entry)
-        for folder in sorted(map(enclave_folder, removed), reverse=True):  # inner ones first
+        folders = {*map(PurePosixPath, map(enclave_folder, removed))}
+        folders |= {parent for folder in folders for parent in folder.parents if parent.parent.name}
+        for folder in map(str, sorted(folders, reverse=True)):  # inner ones first
             if not export.names(folder):
                 export.rmdir(folder)
     paths = {str(enclave_path(robot.export, name)): why for name, why in removed.items()}

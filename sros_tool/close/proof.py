@@ -41,6 +41,7 @@ from sros_tool.close.state import (
     Proof,
     RunningRobot,
     current_state,
+    earlier_files_until,
     keystore_text,
     wait_until,
 )
@@ -75,6 +76,7 @@ from sros_tool.policy.rights import (
 from sros_tool.proof.requirements import Must, read_requirements
 from sros_tool.runtime.environment import ROS_ARGS, named_enclave
 from sros_tool.runtime.variables import ENCLAVE
+from sros_tool.validity import iso
 from sros_tool.wording import counted, enumerated, first_few
 
 _CLAIM_STARTED = "every process was started in its enclave"
@@ -236,7 +238,13 @@ def _expired_text(robot: LocalRobot, expired: Sequence[str]) -> str:
         )
     if to_renew := [name for name in _expired_enclaves(robot, robot.keystore) if name in expired]:
         words = ("sros", "renew", str(robot.keystore), *to_renew)
-        text += f"run `{shlex.join(words)}`, and then "
+        text += f"run `{shlex.join(words)}`"
+        if earlier := earlier_files_until(robot, to_renew):
+            text += (
+                f" (with --revoke-old, because earlier files of {', '.join(earlier)} still work "
+            )
+            text += f"for whoever kept them, until {iso(max(earlier.values()))})"
+        text += ", and then "
     return f"{text}run `{robot.close_command}`, and restart all processes together"
 
 

@@ -558,7 +558,7 @@ def current_state(robot: LocalRobot, policy: Policy | None) -> CloseState:
         },
         brought=brought,
         expired_elsewhere=(expired := _expired_enclaves(robot, changed_at)),
-        earlier_elsewhere=_earlier_files_until(robot, expired),
+        earlier_elsewhere=earlier_files_until(robot, expired),
         valid_until=(until := _valid_until(robot)),
         expires_soon=_expiring_enclaves(robot) if until else (),
         denied=(),
@@ -601,7 +601,7 @@ def _expiring_enclaves(robot: LocalRobot) -> Sequence[str]:
     return [lifetime.name for lifetime in lifetimes if lifetime.is_due(Threshold(), now)]
 
 
-def _earlier_files_until(robot: LocalRobot, names: Collection[str]) -> Mapping[str, datetime]:
+def earlier_files_until(robot: LocalRobot, names: Collection[str]) -> Mapping[str, datetime]:
     """Map each named enclave with earlier files that still work to the expiry of these files."""
     if not names:
         return {}

@@ -1736,6 +1736,20 @@ def test_a_process_with_a_new_key_is_restarted_before_others(tmp_path: Path) -> 
     assert order == ["/c", "/a", "/b"]
 
 
+def test_of_revoked_enclaves_no_folder_stays_in_the_export(keystore: Path, tmp_path: Path) -> None:
+    """A folder that another enclave needs stays."""
+    (tmp_path / "keystore").symlink_to(keystore)
+    names = ("/mast/imu", "/mast/top/cam", "/arm", "/arm/left", "/arm/right")
+    sros("create_enclave", keystore, *names).ok()
+    sros("distribute_key", keystore, *names, tmp_path / "export").ok()
+    sros("revoke", keystore, *names[:4]).ok()
+    shell = Shell(close._run, print, {}, lambda: datetime.now(UTC), UTC)
+    preparation._remove_enclaves(LocalRobot(tmp_path, 0, shell))
+    enclaves = tmp_path / "export/enclaves"
+    folders = {str(path.relative_to(enclaves)) for path in enclaves.rglob("*") if path.is_dir()}
+    assert folders == {"arm", "arm/right"}
+
+
 def test_a_robot_whose_files_expire_soon(keystore: Path, tmp_path: Path) -> None:
     sros("distribute_key", keystore, "/a", "/b", tmp_path / "export").ok()
     sros("create_enclave", keystore, "/operator/look").ok()  # works for a day
@@ -1763,6 +1777,9 @@ def test_a_robot_whose_files_expire_soon(keystore: Path, tmp_path: Path) -> None
     expired = datetime.now(UTC) + timedelta(days=2)
     said = close._other_machines_lines(robot_at(expired), state_at(expired))[-1]
     (until,) = state_at(expired).earlier_elsewhere.values()
+    here = proof._expired_text(robot_at(expired), ["/operator/look"])
+    assert "(with --revoke-old, because earlier files of /operator/look still work for" in here
+    assert "--revoke-old" not in proof._expired_text(robot_at(later), ["/a"])
     assert timedelta(days=3) < until - expired < timedelta(days=5)
     assert f"the rights until they expire: /operator/look ({iso(until)}); to end this" in said
     (tmp_path / "export/enclaves/b/permissions.p7s").write_bytes(b"damaged")
