@@ -30,6 +30,7 @@ from sros_tool.fleet.robots import (
 from sros_tool.keystore.layout import FLEET, FLEET_ROOT, remedy_in_closed_robot
 from sros_tool.keystore.ledger import LEDGER_REMEDY, Entry, Ledger
 from sros_tool.keystore.reader import OpenedKeystore
+from sros_tool.pki.certificates import subject_text
 from sros_tool.policy.placeholders import has_placeholder
 from sros_tool.validity import iso
 from sros_tool.wording import first_few
@@ -411,13 +412,25 @@ def refuse_stale_domains(
     for name in keystore.names:
         if name in stated or robot_of(fleet, name) is None:
             continue
-        if before.domains_of(name) != (domains := after.domains_of(name)):
+        former, domains = before.domains_of(name), after.domains_of(name)
+        if former == domains:
+            continue
+        if (signed := _signed_domains(keystore, name) or former) != domains:
             raise KeystoreError(
                 f"according to the fleet file, enclave {name} belongs to domain {domains}, but it "
-                f"would keep its permissions for domain {before.domains_of(name)}",
+                f"would keep its permissions for domain {signed}",
                 "No policy of this command states its rights, so it gets no new permissions.",
                 "Name the policies of all enclaves whose robots change their domain.",
             )
+
+
+def _signed_domains(keystore: OpenedKeystore, name: str) -> DomainSet | None:
+    """Return the domains of an enclave's permissions; None if they cannot be read."""
+    with suppress(SrosError):
+        subject = subject_text(keystore.certificate_of(name).subject)
+        if grant := keystore.signed_grant(name, subject).grant:
+            return grant.domains().closed()
+    return None
 
 
 def notes_on_lost_enclaves(keystore: OpenedKeystore, before: Fleet, after: Fleet) -> Iterator[Note]:

@@ -267,3 +267,25 @@ def test_permissions_are_for_the_domain_in_the_fleet_file(
     if name == "/p01/wheels" or not recorded:
         made = sros("generate_artifacts", "-k", "ks", "-p", "new.xml", *words, cwd=tmp_path)
         assert "loses" not in made.ok().err and '"domain 20"' not in made.out
+
+
+def test_an_enclave_that_has_its_robots_domain_already_needs_no_policy(tmp_path: Path) -> None:
+    """Its request was signed for the fleet file before the keystore recorded the robot."""
+    south = FLEET.replace('["pickers", "north"] }\np02', '["pickers", "south"] }\np02')
+    without = FLEET.replace('p01 = { groups = ["pickers", "north"] }\n', "")
+    for file, text in {"f.toml": FLEET, "without.toml": without, "south.toml": south}.items():
+        (tmp_path / file).write_text(text)
+    (tmp_path / "p.xml").write_text(POLICY)
+    eye = policy_text({"/{robot:pickers}/eye": publish("/hall/seen")})
+    (tmp_path / "eye.xml").write_text(eye)
+    (tmp_path / "rest.xml").write_text(POLICY.replace("/{robot:pickers}/eye", "/eye"))
+    sros("create_keystore", "ks", "--domain", "10,20", cwd=tmp_path).ok()
+    generate = ("generate_artifacts", "-k", "ks", "-p")
+    sros(*generate, "p.xml", "--fleet", "without.toml", cwd=tmp_path).ok()
+    sros("create_request", "/p01/eye", "robot", cwd=tmp_path).ok()
+    request = "robot/enclaves/p01/eye/request.pem"
+    words = ("ks", request, "-p", "eye.xml", "--fleet", "f.toml", "-o", "answer.tgz")
+    sros("sign_request", *words, cwd=tmp_path).ok()
+    refused = sros(*generate, "rest.xml", "--fleet", "south.toml", cwd=tmp_path)
+    assert (refused.status, "permissions for domain 10." in refused.err) == (2, True)
+    sros(*generate, "rest.xml", "--fleet", "f.toml", cwd=tmp_path).ok()
