@@ -105,7 +105,7 @@ def test_a_robot_is_closed(tmp_path: Path) -> None:
     assert said["open"].status == 0, said["open"]
     assert "  topic /chatter: /talker -> /listener\n" in said["open"].out
     assert said["applied"].status == 1
-    assert f"start it with:\n  cd {tmp_path} && sros run " in said["applied"].out
+    assert f", and start again with:\n  cd {tmp_path} && sros run " in said["applied"].out
 
     assert said["not yet"].status == 1
     (first,) = proofs(said["not yet"]).values()
