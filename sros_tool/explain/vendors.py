@@ -263,7 +263,11 @@ def _vendor_differences(answers: Sequence[Answer]) -> str:
 
 
 def _differing_titles(who: str, decided: Sequence[tuple[str, Outcome]]) -> str:
-    """Return a sentence with the titles whose outcome differs from the first outcome."""
+    """Return a clause that names whose outcome differs from the first one's.
+
+    ``who`` is a plural, such as "vendors"; ``decided`` has a title and an outcome for each of them.
+    If all outcomes are equal, the clause says that all decide alike.
+    """
     title, first = decided[0]
     differing = [f"{other} ({outcome})" for other, outcome in decided if outcome != first]
     if not differing:

@@ -115,10 +115,11 @@ def restored_at(keystore: OpenedKeystore) -> str:
 
 
 def subjects_since_restore(keystore: OpenedKeystore, ledger: Ledger) -> frozenset[str] | None:
-    """Return the subjects first recorded after the last restore; None if no restore matters.
+    """Return the subjects first recorded after the last restore.
 
-    The ledger may lack certificates and permissions that were issued after the backup, but none of
-    them has one of these subjects.  A restore no longer matters once both CAs have been replaced.
+    For these subjects, the ledger is complete: the certificates and permissions that it may lack,
+    because they were issued after the backup, have other subjects.  The result is None if there was
+    no restore, or if both CAs have been replaced since.
     Subjects that only messages or published releases showed are left out
     (`KnownKeys.certificates_shown_after_restore`).
     """

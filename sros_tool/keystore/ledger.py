@@ -141,9 +141,9 @@ class Entry(NamedTuple):
     key: str = ""
     """SHA-256 of the public key (DER) of the certificate, or of the revoked certificate."""
     number: int = 0
-    """The number of an answer or of releases (later ones have higher numbers); the last line of a
-    gap; the number of the sealed part; after a restore, a number above all numbers that the
-    keystore gave before. Otherwise 0.
+    """By `what`. Of an answer or a release: its number (later ones have higher numbers). Of a gap:
+    the number of the last line that is missing or changed. Of a sealed part: its number. Of a
+    restore: a number above all that the keystore gave before. Otherwise 0.
     """
     settings: str = ""
     """The settings of the keystore, as TOML."""

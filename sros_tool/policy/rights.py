@@ -333,8 +333,8 @@ def compare(
 
     An action counts as its services and topics.  A right that only one side states is no difference
     if it is covered by wildcards that both sides state, because large permissions leave such rights
-    out.  There is one exception: if the whole action is a difference, a part of the action that the
-    other side states also counts as a difference.
+    out.  There is one exception: if one side has a whole action that the other side lacks, the
+    parts of this action that the other side states are differences, too.
     """
     first, second = (
         join_actions(right for right in side if scope is None or right.enclave in scope)

@@ -487,8 +487,8 @@ class AclSubject:
     def overlaps(self, other: AclSubject) -> bool:
         """Return whether a process can match both subjects, and then has the rights of both.
 
-        The result is False for subjects that restrict the same properties, because Zenoh joins such
-        subjects for common values.
+        The result is False for subjects that restrict the same properties: a value that both list
+        is one subject for Zenoh, with the rules of both.
         """
         pairs = [(getattr(self, name), getattr(other, name)) for name in PROPERTIES]
         return any((first is None) is not (second is None) for first, second in pairs) and all(

@@ -1024,7 +1024,7 @@ class _EnclaveMaker:
         if ledger.gaps or ledger.unchained:
             return "entries of the ledger may be missing", working, None
         if may_have_later_releases(keystore):
-            return "the published folder has later releases", working, None
+            return "the published folder has later releases than the keystore knows", working, None
         revoked = revoked_serials(keystore)
         for entry in ledger.entries:
             certificates, permissions = working.setdefault(entry.enclave, (set(), []))
@@ -1034,14 +1034,21 @@ class _EnclaveMaker:
                 permissions.append(entry.subject)
         return "", working, since
 
-    def _lost_rights_notes(self, default: Enclave, existing_files: set[str]) -> Iterator[Note]:
+    def _lost_rights_notes(
+        self, default_enclave: Enclave, existing_files: set[str]
+    ) -> Iterator[Note]:
         """Yield a note if an enclave that gets the default permissions had other rights before.
 
         If the ledger does not record the lost permissions, their unsigned copy shows that the
         enclave had permissions.
         """
-        name, last = default.path, self._change.recorded_rights.last_entry(default.path)
-        if last.policy == default.digest if last else "permissions.xml" not in existing_files:
+        name = default_enclave.path
+        last = self._change.recorded_rights.last_entry(name)
+        if (
+            last.policy == default_enclave.digest
+            if last
+            else "permissions.xml" not in existing_files
+        ):
             return
         text = (
             f"enclave {name} had lost its {PERMISSIONS_FILE}: it now has the default permissions "
