@@ -207,7 +207,7 @@ def kind_of(data: bytes) -> str:
     if text.lstrip()[:1] == b"<":
         return XML
     if not text.strip():
-        return "an empty file"
+        return "a file with only blanks" if data else "an empty file"
     if _BASE64_WITHOUT_PEM.fullmatch(text[:_MOST_EXAMINED]):
         return "base64 without its lines '-----BEGIN' and '-----END'"
     return ""

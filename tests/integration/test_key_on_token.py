@@ -31,7 +31,7 @@ def secret_files(*folders: Path) -> set[str]:
 
 def pin_file(folder: Path) -> Path:
     path = folder / "pin"
-    path.write_text("1234")
+    path.write_text("no-hex-1")
     path.chmod(0o600)
     return path
 
@@ -82,7 +82,7 @@ def test_a_copy_of_the_folder_without_the_token_cannot_talk(
     own = tmp_path / "own.conf"
     own.write_text(f"directories.tokendir = {tmp_path / 'own'}\nobjectstore.backend = file\n")
     theirs = token | {"SOFTHSM2_CONF": str(own)}
-    initialize = "--init-token --free --label robot --pin 1234 --so-pin 5678"
+    initialize = "--init-token --free --label robot --pin no-hex-1 --so-pin 5678"
     run(["softhsm2-util", *initialize.split()], env=theirs)
     assert sros(theirs, "create_request", TALKER, tmp_path / "x", "--key", place).returncode == 0
     failed = sros(theirs, "verify", stolen, "--tokens")
@@ -101,7 +101,7 @@ def test_the_life_of_a_key_that_is_on_a_token(token: dict[str, str], tmp_path: P
     def done(*words: object, status: int = 0, env: dict[str, str] = token) -> str:
         ended = sros(env, *words)
         assert ended.returncode == status, (words, ended.stdout, ended.stderr)
-        assert "1234" not in ended.stdout + ended.stderr
+        assert "no-hex-1" not in ended.stdout + ended.stderr
         return ended.stdout + ended.stderr
 
     done("create_keystore", root, "--template", "production")
@@ -158,7 +158,7 @@ def test_a_key_that_was_ever_out_of_its_token_is_noticed(
     from sros_tool.pki.keys import generate_key, key_pem
 
     (key := tmp_path / "key.pem").write_bytes(key_pem(generate_key()))
-    words = f"--import {key} --token robot --label copied --id 01 --pin 1234"
+    words = f"--import {key} --token robot --label copied --id 01 --pin no-hex-1"
     run(["softhsm2-util", *words.split()], env=token)
     place = f"pkcs11:token=robot;object=copied?module-path={MODULE}"
     made = sros(token, "create_request", "/a", tmp_path / "robot", "--key", place)

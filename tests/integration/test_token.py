@@ -24,14 +24,14 @@ pytestmark = pytest.mark.skipif(
 
 @pytest.fixture
 def token(tmp_path: Path) -> dict[str, str]:
-    """The environment in which a token named robot is there, with the PIN 1234."""
+    """The environment in which a token named robot is there, with the PIN no-hex-1."""
     (tmp_path / "tokens").mkdir()
     configuration = tmp_path / "softhsm2.conf"
     configuration.write_text(
         f"directories.tokendir = {tmp_path / 'tokens'}\nobjectstore.backend = file\n"
     )
-    environment = {**os.environ, "SOFTHSM2_CONF": str(configuration), "SROS_PKCS11_PIN": "1234"}
-    words = "--init-token --free --label robot --pin 1234 --so-pin 5678"
+    environment = {**os.environ, "SOFTHSM2_CONF": str(configuration), "SROS_PKCS11_PIN": "no-hex-1"}
+    words = "--init-token --free --label robot --pin no-hex-1 --so-pin 5678"
     run(["softhsm2-util", *words.split()], env=environment)
     return environment
 

@@ -76,6 +76,7 @@ def test_what_openssl_writes_is_recognized(folder: Path, kind: str) -> None:
         (b"PK\x03\x04", "ZIP"),
         (b"\x1f\x8b\x08", "gzip"),
         (b" \n", "blanks"),
+        (b"", "empty"),
         (b"call Bob", ""),
         (b"0\x80", ""),
         (b"0\x03\x02\x01", ""),
