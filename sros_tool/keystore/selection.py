@@ -26,7 +26,7 @@ from sros_tool.fleet.robots import (
     unrecorded_enclaves,
 )
 from sros_tool.keystore.fleet import arguments_for, checked_fleet, enclaves_of_robot, load_fleet
-from sros_tool.keystore.known_keys import revoked_serials
+from sros_tool.keystore.known_keys import restored_at
 from sros_tool.keystore.layout import (
     CLOSED_KEYSTORE,
     CLOSED_POLICY,
@@ -135,7 +135,12 @@ def select_enclaves_to_revoke(
         assert fleet
         own = enclaves_of(fleet, fleet.robots[name])
         gone = [enclave for enclave in own if _is_revoked(keystore, enclave, now)]
-        if gone and not unrecorded[name].below and not any(map(keystore.has_enclave, own)):
+        others = set(own).difference(gone)
+        may_exist = any(
+            keystore.has_enclave(enclave) or _valid_serials(keystore, enclave, now)
+            for enclave in others
+        )
+        if gone and not unrecorded[name].below and not may_exist:
             left_robots.remove(name)
             revoked += gone
     chosen |= dict.fromkeys(_enclaves_of_robots(keystore, left_robots, True, unrecorded))
@@ -146,19 +151,28 @@ def select_enclaves_to_revoke(
 
 
 def _is_revoked(keystore: OpenedKeystore, name: str, now: datetime) -> bool:
-    """Return whether an enclave no longer exists, and all its valid certificates are revoked."""
+    """Return whether an enclave no longer exists, and all its valid certificates are revoked.
+
+    The revocation lists have to have these certificates, because an earlier list may have been put
+    back.  The result is False if the keystore was restored: it may lack certificates.
+    """
     if keystore.has_enclave(name) or not revocation_of(keystore, name):
         return False
-    if not keystore.revocation_lists:  # the revocation is not in force
+    if not keystore.revocation_lists or restored_at(keystore):
         return False
-    valid = {
+    listed = {entry.serial for crl in keystore.revocation_lists for entry in crl.revoked}
+    return _valid_serials(keystore, name, now) <= listed
+
+
+def _valid_serials(keystore: OpenedKeystore, name: str, now: datetime) -> set[int]:
+    """Return the serial numbers of the certificates of an enclave that have not expired."""
+    return {
         int(entry.serial or "0", 16)
         for entry in keystore.ledger_with("enclave", name).entries
         if entry.enclave == name
         and entry.what == "certificate"
         and not "" < entry.not_after <= iso(now)
     }
-    return valid <= revoked_serials(keystore)
 
 
 def _revoked_notes(names: Sequence[str]) -> Iterator[Note]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 import subprocess
 from collections.abc import Iterator
 from hashlib import sha256
@@ -204,6 +205,19 @@ def test_the_other_computer_of_a_revoked_robot_is_named(tmp_path: Path) -> None:
     assert f"`sros revoke {root} --robot b`" in said
     for robots_words in (("--robot", "a", "--robot", "b"), ("--robot", "elsewhere")):
         assert "still valid" not in sros("revoke", root, *robots_words, "--dry-run").ok().err
+
+
+def test_a_robot_with_a_lost_enclave_is_not_revoked_already(tmp_path: Path) -> None:
+    """The certificate of an enclave whose folder was removed is still valid."""
+    root, policy = tmp_path / "ks", tmp_path / "policy.xml"
+    (tmp_path / "fleet.toml").write_text("[robots]\nr1 = {}\n")
+    policy.write_text(policy_text({"/{robot}/a": publish("x"), "/{robot}/b": publish("y")}))
+    sros("create_keystore", root).ok()
+    words = ("-p", policy, "--fleet", tmp_path / "fleet.toml")
+    sros("generate_artifacts", "-k", root, *words).ok()
+    sros("revoke", root, "/r1/a").ok()
+    shutil.rmtree(root / "enclaves/r1/b")
+    assert sros("revoke", root, "--robot", "r1").status == 2
 
 
 def test_what_is_left_below_a_robot_is_revoked_later(unknown: Path, tmp_path: Path) -> None:

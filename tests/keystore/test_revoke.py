@@ -419,7 +419,13 @@ def test_the_program(tmp_path: Path) -> None:
     assert sros("revoke", root, "/b", "--reason", "boredom").status == 2
     assert sros("revoke", root, "/a").ok().err == "/a was revoked before: nothing to do.\n"
     assert sros("revoke", root).status == 2
+    list_file = (root / "public/identity_ca.crl.pem").resolve()
+    earlier = list_file.read_bytes()
     done = sros("revoke", root, "/b").ok()
+    later = list_file.read_bytes()
+    list_file.write_bytes(earlier)
+    assert sros("revoke", root, "/b").status == 2, "the list lacks /b"
+    list_file.write_bytes(later)
     assert "restart the processes of 1 enclave for the change to take effect: /c" in done.err
     assert "\n  1 enclave\n" in sros("inspect", root).ok().out
 
