@@ -263,9 +263,9 @@ class EnclaveDomains(NamedTuple):
         robot = robot_of(self.fleet, enclave) if self.fleet else None
         if self.fleet and stated and robot is None:
             robot = self.fleet.robots.get(stated.name)
-        if robot and stated and robot.domain != stated.domain:
-            raise _moved_robot_error(robot, stated)
         robot = robot or stated
+        if robot and stated and self._domains_with(robot) != self._domains_with(stated):
+            raise _moved_robot_error(robot, stated)
         if robot is None or robot.domain is None:
             return self.keystore
         if robot.domain not in self.keystore:
@@ -277,6 +277,11 @@ class EnclaveDomains(NamedTuple):
                 f"{self.keystore},{robot.domain} --allow-looser`, or give the robot another "
                 "domain in the fleet file.",
             )
+        return self._domains_with(robot)
+
+    def _domains_with(self, robot: Robot) -> DomainSet:
+        if robot.domain is None:
+            return self.keystore
         return DomainSet.of((robot.domain, robot.domain))
 
 

@@ -316,15 +316,13 @@ def _matching_enclaves(
 def restricted_enclaves(
     requirement: Requirement, enclaves: Collection[str], namespace: str = "/"
 ) -> tuple[set[str], ...]:
-    """Return the sets of enclaves to which a requirement applies; () if it applies to all.
+    """Return the sets of enclaves that a requirement restricts; () if it restricts all or none.
 
     Both are decided in a namespace, but written without it.
     """
     match requirement:
         case Only(enclaves=listed):
             return (set(enclaves) - _matching_enclaves(listed, enclaves, namespace),)
-        case Must(enclave=enclave):
-            return ({enclave}.intersection(enclaves),)
         case Widest(enclaves=listed) | NothingBut(enclaves=listed):
             return (_matching_enclaves(listed, enclaves, namespace),)
         case Apart(sources=sources, targets=targets, through=through):

@@ -1510,9 +1510,9 @@ def _left_requirement_findings(
     before: AccessSource,
     after: AccessSource,
 ) -> Iterator[Finding]:
-    """Yield a finding for each node that moves to an enclave to which a requirement does not apply.
+    """Yield a finding for each node that moves to an enclave that a requirement does not restrict.
 
-    Before the move, the requirement and a similar one of ``earlier`` applied to the node's enclave.
+    Before the move, the requirement and a similar one of ``earlier`` restricted its enclave.
     """
     old_enclaves, new_enclaves = (
         _enclaves_by_node(source.enclaves.values()) for source in (before, after)

@@ -269,6 +269,28 @@ def test_permissions_are_for_the_domain_in_the_fleet_file(
         assert "loses" not in made.ok().err and '"domain 20"' not in made.out
 
 
+@pytest.mark.parametrize("verb", ["sign_request", "create_permission"])
+@pytest.mark.parametrize(
+    ("recorded", "stated"),
+    [("p01 = {}", "p01 = { domain = 10 }"), ("p01 = { domain = 10 }", "p01 = {}")],
+)
+def test_the_only_domain_of_a_keystore_may_be_stated_or_not(
+    tmp_path: Path, verb: str, recorded: str, stated: str
+) -> None:
+    (tmp_path / "p.xml").write_text(policy_text({"/{robot}/wheels": publish("/speed")}))
+    (tmp_path / "f.toml").write_text(f"[robots]\n{recorded}\n")
+    (tmp_path / "stated.toml").write_text(f"[robots]\n{stated}\n")
+    sros("create_keystore", "ks", "--domain", "10", cwd=tmp_path).ok()
+    sros("generate_artifacts", "-k", "ks", "-p", "p.xml", "--fleet", "f.toml", cwd=tmp_path).ok()
+    words: tuple[str, ...] = ("ks", "/p01/wheels", "p.xml")
+    if verb == "sign_request":
+        sros("revoke", "ks", "/p01/wheels", cwd=tmp_path).ok()
+        sros("create_request", "/p01/wheels", "robot", cwd=tmp_path).ok()
+        request = "robot/enclaves/p01/wheels/request.pem"
+        words = ("ks", request, "--enclave", "/p01/wheels", "-p", "p.xml", "-o", "answer.tgz")
+    sros(verb, *words, "--fleet", "stated.toml", cwd=tmp_path).ok()
+
+
 def test_an_enclave_that_has_its_robots_domain_already_needs_no_policy(tmp_path: Path) -> None:
     """Its request was signed for the fleet file before the keystore recorded the robot."""
     south = FLEET.replace('["pickers", "north"] }\np02', '["pickers", "south"] }\np02')

@@ -1067,12 +1067,6 @@ def _moved(node: str, path: str) -> dict[str, str]:
                 "node /eye moves to enclave /lens/eye",
             ),
             (
-                _NODES | {"/drive": publish("/cmd") + _EYE.replace("eye", "mux")},
-                '[[must]]\nenclave = "/drive"\npublish = ["/cmd"]\n',
-                _NODES | {"/operator/mux": publish("/image")},
-                "node /mux moves to enclave /operator/mux",
-            ),
-            (
                 _NODES,
                 '[[apart]]\nfrom = ["/eyes/*"]\nto = ["/drive"]\nthrough = ["/mux/*"]\n',
                 _moved("eye", "/mux/eye"),
@@ -1089,6 +1083,13 @@ def _moved(node: str, path: str) -> dict[str, str]:
             (_NODES, _ONLY_OPERATORS, _moved("eye", "/lens/eye"), ""),
             (_NODES, _ONLY_OPERATORS, _moved("drive", "/operator/drive"), ""),
             (_NODES, _ONLY_OPERATORS, _NODES | {"/operator/hand": publish("/cmd")}, ""),
+            # The enclave keeps the right that it must have.
+            (
+                _NODES | {"/drive": publish("/cmd") + _EYE.replace("eye", "mux")},
+                '[[must]]\nenclave = "/drive"\npublish = ["/cmd"]\n',
+                _NODES | {"/operator/mux": publish("/image")},
+                "",
+            ),
             # Only the change brings this requirement.
             (
                 _NODES,
