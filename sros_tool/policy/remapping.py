@@ -415,11 +415,18 @@ def remapped_policy(
 
     A wildcard that matches an old name stays, and the new name is added to its group.  The new
     names in ``moved_names``, of any node, are also added to each DENY that matches the old name. An
-    old name stays denied if a wildcard of its enclave, among the rights ``stated`` by all policies
-    after remapping, would allow the name.
+    old name stays denied if its enclave would allow the name, by the rights ``stated`` by all
+    policies after remapping.  A literal right to a new name of some node does not count.
     """
     used: set[UsedRule] = set()
-    wildcards = Rules(right for right in stated if is_expression(right.name))
+    new_names = {use.new for use in moved_names if use.kind}
+    new_nodes = tuple(f"{use.new}/" for use in moved_names if not use.kind)
+    other = Rules(
+        right
+        for right in stated
+        if is_expression(right.name)
+        or not (right.name in new_names or right.name.startswith(new_nodes))
+    )
 
     def remapped(enclave: str, profile: Profile) -> Profile:
         renamed = [rule for rule in rules if rule.old == _NODE and rule.node in ("", profile.node)]
@@ -442,13 +449,13 @@ def remapped_policy(
                     for name, old in zip(group.names, stated_names, strict=True)
                     if name[0] not in "~/" and (new := expand(name, ns, node)) in present
                 )
-            by_wildcards = {
+            otherwise_allowed = {
                 name
                 for name in stated_names
                 for right, qualifier in group.rights
-                if qualifier is DENY and wildcards.overlaps(Right(enclave, ALLOW, right, name))
+                if qualifier is DENY and other.overlaps(Right(enclave, ALLOW, right, name))
             }
-            groups += _more_denials(group, stated_names, present, moved_names, by_wildcards)
+            groups += _more_denials(group, stated_names, present, moved_names, otherwise_allowed)
         return replace(new_profile, groups=tuple(groups))
 
     enclaves = tuple(
@@ -503,12 +510,12 @@ def _more_denials(
     stated: Sequence[str],
     present: Collection[str],
     moved_names: Iterable[UsedRule],
-    by_wildcards: Collection[str],
+    otherwise_allowed: Collection[str],
 ) -> Iterator[Group]:
     """Yield a group with the additional names, if any, that a DENY of ``group`` must deny.
 
-    These are the new names in ``moved_names``, and the old names in ``by_wildcards``, which a
-    wildcard would otherwise allow.  An old name that is a new name of some node is left out.
+    These are the new names in ``moved_names``, and the old names in ``otherwise_allowed``.
+    An old name that is a new name of some node is left out.
     ``stated`` and ``present`` are the full names of the group before and after remapping.
     """
     denials = tuple(right for right in group.rights if right[1] is DENY)
@@ -522,7 +529,7 @@ def _more_denials(
                     lines.setdefault(new, group.source_of(index).line)
     taken = {*present, *(use.new for use in moved_names)}
     for index, full in enumerate(stated):
-        if full in by_wildcards and full not in taken:
+        if full in otherwise_allowed and full not in taken:
             lines.setdefault(full, group.source_of(index).line)
     if lines:
         names = tuple(lines)

@@ -167,6 +167,26 @@ def test_a_wildcard_does_not_allow_an_old_name_that_was_denied(
         assert {right.name for right in rights if right.qualifier is DENY} == denied
 
 
+@pytest.mark.parametrize(
+    ("denied", "allowed", "rules", "after"),
+    [
+        ("~/x", "/n/x", ["n:__node:=q"], {"/n/x", "/q/x"}),
+        ("~/*", "/n/x", ["n:__node:=q"], {"/n/*", "/q/*"}),
+        ("x", "/x", ["n:x:=/y"], {"/x", "/y"}),
+        ("~/x", "~/x", ["n:__node:=m", "m:__node:=n"], {"/m/x"}),  # /n/x is now a name of m
+        ("~/*", "~/x", ["n:__node:=m", "m:__node:=n"], {"/m/*"}),
+        ("x", "z", ["n:x:=y", "m:z:=x"], {"/y"}),
+    ],
+)
+def test_an_old_name_that_another_node_uses_stays_denied(
+    denied: str, allowed: str, rules: list[str], after: set[str]
+) -> None:
+    groups = group("topics", denied, publish="DENY"), group("topics", allowed, publish="ALLOW")
+    both = [one(each, node=node) for each, node in zip(groups, "nm", strict=True)]
+    rights = {r for policy in remapped_policies(both, rules)[0] for r in policy_rights(policy)}
+    assert {right.name for right in rights if right.qualifier is DENY} == after
+
+
 def test_a_denial_of_an_old_name_in_the_file_is_told() -> None:
     """What was merged before, such as another node of the same package, does not change."""
     file = one(group("topics", "/*x", publish="DENY"), node="m")
