@@ -53,7 +53,7 @@ RMW_NOT_INSTALLED = FindingKind(
 RMW_INSECURE = FindingKind(
     "runtime.rmw-without-security",
     ERROR,
-    "an RMW that does not enforce DDS Security",
+    "an RMW that is not known to enforce DDS Security",
     "The RMW was built without security, or sros does not know whether it enforces security. "
     "Nodes fail, or run unsecured.",
     "Found by a test (`sros doctor`), or by the name of the RMW.",

@@ -184,7 +184,7 @@ def audit(
             unknown = str(error)
     audited = judge(snapshot.everything)
     if unknown:
-        notes = (*audited.notes, Note("audit.zenoh-unknown", unknown))
+        notes = (*audited.notes, Note("audit.zenoh-unknown", f"a DDS vendor decided. {unknown}"))
         audited = replace(audited, unjudged=(*audited.unjudged, _NO_ZENOH_FILES), notes=notes)
     kept_changing = snapshot.seconds if not snapshot.settled else 0
     left_out = [
@@ -202,7 +202,7 @@ def audit(
             why_no_node_was_observed(environment, snapshot.seconds, rmw, enclave),
         )
     ended = audits.notes_on_ended_nodes(snapshot.gone)
-    by_vendor = (audits.BY_VENDOR_ON_ZENOH,) if on_zenoh and not enclaves.zenoh else ()
+    by_vendor = (audits.BY_VENDOR_ON_ZENOH,) if on_zenoh and not (enclaves.zenoh or unknown) else ()
     audited = replace(audited, notes=(*audited.notes, *ended, *by_vendor))
     existed = patch is not None and patch.exists()
     written = _write_patch(audited, patch, dry_run=dry_run)

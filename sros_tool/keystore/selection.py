@@ -43,6 +43,7 @@ from sros_tool.keystore.layout import (
 from sros_tool.keystore.ledger import Entry
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.names import check_enclave_name
+from sros_tool.pki.crl import signed_by
 from sros_tool.validity import iso
 from sros_tool.values import NamedKeystore, shows
 from sros_tool.wording import first_few
@@ -153,24 +154,31 @@ def select_enclaves_to_revoke(
 def _is_revoked(keystore: OpenedKeystore, name: str, now: datetime) -> bool:
     """Return whether an enclave no longer exists, and all its valid certificates are revoked.
 
-    The revocation lists have to have these certificates, because an earlier list may have been put
-    back.  The result is False if the keystore was restored: it may lack certificates.
+    The revocation list has to have these certificates, because an earlier list may have been put
+    back, and the identity CA has to have signed the list.  The result is False in a rotation, which
+    has several lists, and if the ledger may lack certificates.
     """
-    if keystore.has_enclave(name) or not revocation_of(keystore, name):
+    lists, file = keystore.revocation_lists, keystore.identity_file
+    if keystore.has_enclave(name) or not revocation_of(keystore, name) or file is None:
         return False
-    if not keystore.revocation_lists or restored_at(keystore):
+    authorities = keystore.certificates_of(file)
+    if len(lists) != 1 or len(authorities) != 1 or not signed_by(lists[0].list, authorities[0]):
         return False
-    listed = {entry.serial for crl in keystore.revocation_lists for entry in crl.revoked}
+    ledger = keystore.ledger
+    if ledger.gaps or ledger.unchained or restored_at(keystore):
+        return False
+    listed = {entry.serial for entry in lists[0].revoked}
     return _valid_serials(keystore, name, now) <= listed
 
 
 def _valid_serials(keystore: OpenedKeystore, name: str, now: datetime) -> set[int]:
     """Return the serial numbers of the certificates of an enclave that have not expired."""
     return {
-        int(entry.serial or "0", 16)
+        int(entry.serial, 16)
         for entry in keystore.ledger_with("enclave", name).entries
         if entry.enclave == name
-        and entry.what == "certificate"
+        and entry.what in ("certificate", "revocation")
+        and entry.serial
         and not "" < entry.not_after <= iso(now)
     }
 

@@ -1555,11 +1555,21 @@ def _namespaces_of_patterns(requirement: Requirement) -> list[str]:
     """Return namespaces in which a requirement may apply to other enclaves than in ``/``.
 
     They are in the patterns of enclaves that do not move with the namespace, and follow ``/``.
+
+    Raises:
+        DocumentError: there are more namespaces than a review tries.
     """
     fixed = (name for name in patterns_of_enclaves(requirement) if not name.startswith("/"))
     is_moving = requirement.is_relative and requirement.elsewhere
-    elsewhere = _namespaces_in(fixed) if is_moving else ()
-    return [*dict.fromkeys(["/", *islice(elsewhere, _MOST_NAMESPACES)])]
+    namespaces = dict.fromkeys(["/", *(_namespaces_in(fixed) if is_moving else ())])
+    if len(namespaces) > _MOST_NAMESPACES + 1:
+        raise DocumentError(
+            f"the enclaves of a requirement name more than {_MOST_NAMESPACES} namespaces: "
+            f"{requirement}",
+            "So it is not known whether a node moves out of the requirement in one of them.",
+            "Name fewer, or name the namespaces of the robots with --namespace.",
+        )
+    return [*namespaces]
 
 
 def _namespaces_in(names: Iterable[str]) -> Iterator[str]:

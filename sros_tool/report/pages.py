@@ -467,7 +467,7 @@ def _demo_scenario(scenario: Json, *, is_only: bool) -> str:
 def _demo_table(rows: Sequence[Json]) -> str:
     lines = [
         '<table class="rows"><thead><tr><th scope="col"><span class="hidden">Result</span></th>'
-        '<th scope="col">Tried</th><th scope="col">Expected</th><th scope="col">LibraryUse</th>'
+        '<th scope="col">Tried</th><th scope="col">Expected</th><th scope="col">Seen</th>'
         '<th scope="col">Why</th></tr></thead>'
     ]
     for attack, attack_rows in groupby(rows, key=lambda row: row.get("attack", "")):
@@ -505,7 +505,7 @@ def _demo_row(row: Json) -> Iterator[str]:
         f'<tr class="{"" if row["as_expected"] else "wrong"}"><td>{mark}</td>'
         f'<th scope="row" data-label="Tried">{tried}</th>'
         f'<td data-label="Expected">{escape(row["expected"])}</td>'
-        f'<td data-label="LibraryUse">{escape(row["observed"])}</td>'
+        f'<td data-label="Seen">{escape(row["observed"])}</td>'
         f'<td data-label="Why">{mechanism}</td></tr>'
     )
 

@@ -225,7 +225,8 @@ class Process:
         """
         flags = list(takewhile(lambda word: word.startswith("-"), self.command[1:]))
         module = "".join(self.command[len(flags) + 1 : len(flags) + 2])
-        is_demo = flags[-1:] == ["-m"] and _DEMO_MODULE.fullmatch(module) is not None
+        is_python = Path(self.command[0] if self.command else "").name.startswith("python")
+        is_demo = is_python and flags[-1:] == ["-m"] and bool(_DEMO_MODULE.fullmatch(module))
         return bool(self.libraries & _DDS_NAMES) and "librcl" not in self.libraries and not is_demo
 
     @property

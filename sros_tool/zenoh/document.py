@@ -222,7 +222,10 @@ def _override(root: _Section, path: str, value: str) -> None:
 
 
 def _no_setting_error(path: str) -> DocumentError:
-    return DocumentError(f"ZENOH_CONFIG_OVERRIDE sets {path[:80]!r}, but Zenoh has no such setting")
+    return DocumentError(
+        f"ZENOH_CONFIG_OVERRIDE sets {path[:80]!r}, but Zenoh has no such setting",
+        remedy="Correct the name, or take it out of ZENOH_CONFIG_OVERRIDE.",
+    )
 
 
 def _root(data: bytes, name: str, *, lines: bool) -> _Section:

@@ -17,7 +17,7 @@ import pytest
 from sros_tool.keystore.reader import read_certificate
 from sros_tool.pki.certificates import validity_of
 from sros_tool.runtime.processes import ProcessTable, RunningProcesses, UnseenProcess
-from tests.cli.test_json import LibraryUse
+from tests.cli.test_json import Seen
 from tests.support.harness import Ended, copy_of, policy_text, publish, snapshot, sros
 
 FLEET = """
@@ -87,7 +87,7 @@ def world(prepared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> It
 
 
 def test_from_home_to_the_robot_and_back(world: World) -> None:
-    seen = LibraryUse()
+    seen = Seen()
     planned = world.run(*INIT, "--dry-run", "--json").ok()
     assert not (world.folder / "robot/.agent").exists()
     made = world.run(*INIT, "--json").ok()

@@ -69,7 +69,13 @@ def test_an_audit_says_by_whose_rules_it_decides_and_which_nodes_ended(
         ("new", (), 0, "", "with 2 endpoints, by the keystore's files for Zenoh\n"),
         ("old", (), 1, "/t publish topic /x (/talker): put 0/x/", "write the files again with"),
         ("none", (), 1, "", "not judged: what the keystore's files for Zenoh allow"),
-        ("none", ("--unjudged",), 0, "", "[audit.zenoh-unknown]: keystore 'ks' has no Zenoh"),
+        (
+            "none",
+            ("--unjudged",),
+            0,
+            "",
+            "[audit.zenoh-unknown]: a DDS vendor decided. keystore 'ks' has no Zenoh",
+        ),
         ("old", ("--vendor", "fastdds"), 0, "", "by the rules of Fast DDS 2.14\nnote [audit.on-z"),
     ],
 )

@@ -50,7 +50,7 @@ from sros_tool.runtime.processes import (
 )
 from sros_tool.validity import iso, time_of_file
 from sros_tool.values import as_plain
-from tests.cli.test_json import LibraryUse
+from tests.cli.test_json import Seen
 from tests.graph.fake_graph import Beside, graph
 from tests.runtime.test_origins import made_up
 from tests.support.harness import Ended, policy_text, publish, snapshot, sros
@@ -1613,7 +1613,7 @@ def test_what_is_printed_as_json(robot: Robot, monkeypatch: pytest.MonkeyPatch) 
         return replace(made, pid=made.pid + 1000 * is_secured)
 
     monkeypatch.setattr(robot, "process", process_of)
-    seen = LibraryUse()
+    seen = Seen()
     robot.units = UNITS
     for words in ("--dry-run", "", "--apply", "--proof", "--undo"):
         ended = robot.close(*words.split(), "--json")

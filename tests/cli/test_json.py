@@ -109,7 +109,7 @@ def test_the_page_is_made_from_the_schemas() -> None:
 # ── what is printed ────────────────────────────────────────────────────────────────────────
 
 
-class LibraryUse:
+class Seen:
     """Checks what verbs print against their schemas, and remembers the properties it has."""
 
     def __init__(self) -> None:
@@ -240,7 +240,7 @@ ON_A_ROBOT = {verb for verb in CASES if verb.startswith("agent ") or verb == "cl
     "verb", sorted({*CASES} - {"check", "demo", "doctor", *WITH_A_GRAPH, *ON_A_ROBOT})
 )
 def test_what_a_verb_prints(verb: str, made_folder: Path, tmp_path: Path) -> None:
-    seen = LibraryUse()
+    seen = Seen()
     whole = drawn(verb, 1 / 4)
     for case in CASES[verb] if whole else CASES[verb][:1]:
         seen.check(verb, both_ways(verb, case, made_folder, tmp_path))
@@ -253,7 +253,7 @@ def test_what_a_verb_prints(verb: str, made_folder: Path, tmp_path: Path) -> Non
 def test_what_a_verb_prints_beside_a_graph(
     verb: str, made_folder: Path, tmp_path: Path, beside_graph: Beside
 ) -> None:
-    seen = LibraryUse()
+    seen = Seen()
     for case in CASES[verb]:
         seen.check(verb, both_ways(verb, case, made_folder, tmp_path))
     copy_of(made_folder / "broken", tmp_path / "ks")
@@ -272,7 +272,7 @@ def test_what_a_verb_prints_beside_a_graph(
 def test_what_check_prints(
     made_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    seen = LibraryUse()
+    seen = Seen()
     for case in CASES["check"]:
         seen.check("check", both_ways("check", case, made_folder, tmp_path))
     elsewhere = Process(7, ("talker",), {}, datetime.now(UTC), network="net:[1]")
@@ -287,7 +287,7 @@ def test_what_check_prints(
 
 def test_what_doctor_prints(made_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ProcessTable, "look", lambda *_: RunningProcesses())
-    seen = LibraryUse()
+    seen = Seen()
     for stacks, status in (((RMW, CYCLONE), 1), ((RMW,), 1), ((CYCLONE,), 0)):
         monkeypatch.setattr(doctor, "examine", lambda *_, found=stacks: Diagnosis(found))
         provider = SecurityProvider("sros_tool", ("sros2",)) if status else None
@@ -302,7 +302,7 @@ def test_what_doctor_prints(made_folder: Path, monkeypatch: pytest.MonkeyPatch) 
 def test_what_demo_prints(
     made_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    seen = LibraryUse()
+    seen = Seen()
     for case in CASES["demo"]:
         seen.check("demo", both_ways("demo", case, made_folder, tmp_path))
     shown = result(CLOSED, TWIN, OPEN)
@@ -321,7 +321,7 @@ def test_what_demo_prints(
 
 
 def test_every_shared_part_is_seen(made_folder: Path, tmp_path: Path) -> None:
-    seen = LibraryUse()
+    seen = Seen()
     for verb, case in SHARED_PARTS.items():
         seen.check(verb, both_ways(verb, case, made_folder, tmp_path))
     assert seen.unseen(SHARED) == []
@@ -368,7 +368,7 @@ def _named(enclave: Any) -> Any:
 
 def test_a_property_that_no_schema_has_is_found(made_folder: Path) -> None:
     ended = sros("list_enclaves", "ks", "--json", cwd=made_folder)
-    seen = LibraryUse()
+    seen = Seen()
     seen.check("list_enclaves", ended)
     more = json.dumps({**json.loads(ended.out), "more": 1})
     with pytest.raises(AssertionError, match="more"):

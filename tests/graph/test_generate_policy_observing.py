@@ -12,7 +12,7 @@ import pytest
 from sros_tool.cli import observing
 from sros_tool.graph.observation import IntermittentEndpoint, intermittent_from_json
 from sros_tool.graph.observe import Snapshot
-from tests.cli.test_json import LibraryUse
+from tests.cli.test_json import Seen
 from tests.graph.fake_graph import Beside, graph
 from tests.graph.graphs import graph as known_graph
 from tests.graph.graphs import node
@@ -90,7 +90,7 @@ def test_json_names_what_a_watch_saw_for_a_part_of_its_time(
     snapshot = Snapshot(seen, seen, 9.0, True, frozenset({lost}), grew=True)
     monkeypatch.setattr(observing, "observe", lambda *_, **__: (snapshot, "rmw_fake"))
     ended = sros("generate_policy", "robot.xml", "--watch", "9s", "--json", cwd=tmp_path)
-    LibraryUse().check("generate_policy", ended.ok())
+    Seen().check("generate_policy", ended.ok())
     assert intermittent_from_json(json.loads(ended.out)) == [lost]
     assert json.loads(ended.out)["settled"] is False
     assert ended.err == (

@@ -33,7 +33,7 @@ KILLS = 5
 
 
 @dataclass(frozen=True)
-class LibraryUse:
+class Seen:
     """What DDS could load at a moment: enclaves with their certificates, and the list's number."""
 
     enclaves: tuple[tuple[str, bytes], ...]
@@ -43,7 +43,7 @@ class LibraryUse:
         return tuple(name for name, _ in self.enclaves)
 
 
-def see(root: Path) -> LibraryUse:
+def see(root: Path) -> Seen:
     """Check what must hold at any moment, and tell what is there."""
     check_whole(root)
     loadable = []
@@ -62,10 +62,10 @@ def see(root: Path) -> LibraryUse:
     assert len(lists) == 1, "some refuse the revoked, others do not"
     crl = OpenedKeystore(root).revocation_list
     assert lists == {(root / "public/identity_ca.crl.pem").read_bytes() if crl else b""}
-    return LibraryUse(tuple(loadable), crl.number if crl else 0)
+    return Seen(tuple(loadable), crl.number if crl else 0)
 
 
-def settled(root: Path) -> LibraryUse:
+def settled(root: Path) -> Seen:
     """As `see`, when all is done: nothing is left behind, and the ledger knows everything."""
     assert not remains(root.parent)
     assert not history(OpenedKeystore(root), now=LATER).unexplained
@@ -98,7 +98,7 @@ def life(keystore: Path) -> Path:
     return keystore
 
 
-def check_end(verb: str, before: LibraryUse, after: LibraryUse) -> None:
+def check_end(verb: str, before: Seen, after: Seen) -> None:
     if verb.startswith("renew"):
         assert after.names() == before.names()
         assert after.crl == before.crl

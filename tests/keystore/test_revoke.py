@@ -17,7 +17,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 
 from sros_tool.errors import KeystoreError, SrosError, UsageError
 from sros_tool.keystore.delivery.export import distribute
-from sros_tool.keystore.layout import enclave_path, list_enclaves
+from sros_tool.keystore.layout import LEDGER, enclave_path, list_enclaves
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
@@ -426,6 +426,11 @@ def test_the_program(tmp_path: Path) -> None:
     list_file.write_bytes(earlier)
     assert sros("revoke", root, "/b").status == 2, "the list lacks /b"
     list_file.write_bytes(later)
+    assert "nothing to do" in sros("revoke", root, "/b").ok().err
+    ledger = (root / LEDGER).read_bytes()
+    (root / LEDGER).write_bytes(b"".join(ledger.splitlines(keepends=True)[-1:]))
+    assert sros("revoke", root, "/b").status == 2, "the ledger lacks lines"
+    (root / LEDGER).write_bytes(ledger)
     assert "restart the processes of 1 enclave for the change to take effect: /c" in done.err
     assert "\n  1 enclave\n" in sros("inspect", root).ok().out
 

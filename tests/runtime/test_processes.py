@@ -216,6 +216,7 @@ def test_the_configuration_of_zenoh_is_that_of_the_environment_whatever_the_prog
     [
         ("python3 -P -m sros_tool.demo.cyclone_node talker", False),
         ("python3 raw.py", True),
+        ("/opt/gateway -m sros_tool.demo.cyclone_node", True),
         ("python3 raw.py -m sros_tool.demo.cyclone_node", True),
         ("python3 raw.py sros_tool.demo.cyclone_node", True),
     ],
