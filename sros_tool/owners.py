@@ -14,6 +14,8 @@ from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
 
+from sros_tool.errors import KeystoreError
+
 _ROOT = frozenset({0})
 _MOST_LINKS = 40
 
@@ -53,8 +55,22 @@ def replaceable_on_the_way(path: Path, trusted_users: frozenset[int]) -> Iterato
             yield step, why
 
 
-def link_of_stranger(path: Path) -> Path | None:
-    """Return a link on the way to ``path`` that another user made where everybody can write."""
+def refuse_link_of_stranger(path: Path) -> None:
+    """Refuse to write keys where a link of another user leads.
+
+    Raises:
+        KeystoreError: another user made a link on the way to ``path`` where everybody can write.
+    """
+    if link := _link_of_stranger(path):
+        raise KeystoreError(
+            f"'{link}' is a link of another user",
+            "Every user can create a link at this path, and this link leads to "
+            f"'{os.path.realpath(link)}'.",
+            "Choose another folder, or name the folder itself.",
+        )
+
+
+def _link_of_stranger(path: Path) -> Path | None:
     for step, state in _path_states(path):
         if (
             stat.S_ISLNK(state.st_mode)

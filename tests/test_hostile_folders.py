@@ -801,7 +801,7 @@ def test_no_key_is_left_to_the_owner_of_a_folder_that_waited_there(
 
 
 @as_root
-@pytest.mark.parametrize("below", ["", "/robot"])
+@pytest.mark.parametrize("below", ["", "/robot", "/a.tar.gz"])
 def test_no_key_goes_where_the_link_of_another_user_leads(
     below: str, keystore: Path, sticky: Path, tmp_path: Path
 ) -> None:

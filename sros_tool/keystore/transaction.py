@@ -67,7 +67,7 @@ from sros_tool.keystore.layout import (
     readable_enclaves,
     search_enclaves,
 )
-from sros_tool.owners import link_of_stranger
+from sros_tool.owners import refuse_link_of_stranger
 from sros_tool.parallel import map_slices
 from sros_tool.xml import read_bytes
 
@@ -460,7 +460,7 @@ class Transaction:
         """
         try:
             if self._may_be_new:
-                self._refuse_link_of_stranger()
+                refuse_link_of_stranger(self.root)
             if self._may_be_new and not self._new_root:
                 self._refuse_folder_of_stranger()
             if not self.dry_run:
@@ -499,16 +499,6 @@ class Transaction:
         if self._new_root:
             return ()
         return search_enclaves(self.root)[0] if self._partial else readable_enclaves(self.root)
-
-    def _refuse_link_of_stranger(self) -> None:
-        """Refuse to write keys where a link of another user leads."""
-        if link := link_of_stranger(self.root):
-            raise KeystoreError(
-                f"'{link}' is a link of another user",
-                "Every user can create a link at this path, and this link leads to "
-                f"'{os.path.realpath(link)}'.",
-                "Choose another folder, or name the folder itself.",
-            )
 
     def _refuse_folder_of_stranger(self) -> None:
         """Refuse to write keys, as root, into a folder that another user may have prepared."""

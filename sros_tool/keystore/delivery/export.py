@@ -72,6 +72,7 @@ from sros_tool.keystore.selection import missing_enclave_error
 from sros_tool.keystore.transaction import Change, Transaction
 from sros_tool.keystore.zenoh_files import open_zenoh
 from sros_tool.names import check_enclave_name
+from sros_tool.owners import refuse_link_of_stranger
 from sros_tool.pki.certificates import (
     fingerprints,
     load_certificates,
@@ -637,6 +638,7 @@ def _write_archive(
     force: bool,
     dry_run: bool,
 ) -> Sequence[Change]:
+    refuse_link_of_stranger(target)
     data, before = pack(files), _state_of(target)
     if before:
         if not target.is_file():
