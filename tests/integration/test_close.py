@@ -116,7 +116,8 @@ def test_a_robot_is_closed(tmp_path: Path) -> None:
     assert said["closed"].status == 1, said["closed"]
     processes, files, required, talk, silence = proofs(said["closed"]).values()
     assert files["holds"] is True and required["holds"] is True, (files, required)
-    # The nodes secure themselves, without rcl: sros cannot see whether they do.
+    # The nodes secure themselves, without rcl: sros cannot see that they do, so they count as open.
+    assert processes["holds"] is False, processes
     for reason in processes["reason"].split("; "):
         assert reason.endswith(f"it runs in domain {DOMAIN} with ROS_SECURITY_ENABLE=true"), reason
     # On the wheels of rclpy, which enforce no security, there is no observer with an enclave.
