@@ -158,8 +158,10 @@ def _is_revoked(keystore: OpenedKeystore, name: str, now: datetime) -> bool:
     back, and the identity CA has to have signed the list.  The result is False in a rotation, which
     has several lists, and if the ledger may lack certificates.
     """
+    if keystore.has_enclave(name) or not revocation_of(keystore, name):
+        return False
     lists, file = keystore.revocation_lists, keystore.identity_file
-    if keystore.has_enclave(name) or not revocation_of(keystore, name) or file is None:
+    if file is None:
         return False
     authorities = keystore.certificates_of(file)
     if len(lists) != 1 or len(authorities) != 1 or not signed_by(lists[0].list, authorities[0]):
