@@ -15,7 +15,6 @@ from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from enum import StrEnum
 from functools import cached_property
-from importlib.util import find_spec
 from itertools import chain
 from shlex import quote
 from typing import Annotated, NamedTuple
@@ -51,7 +50,7 @@ from sros_tool.keystore.confirmation import (
     refusals,
     shows_old_copy,
 )
-from sros_tool.keystore.delivery.published import altered_lately, read_published
+from sros_tool.keystore.delivery.published import altered_lately, read_published, unseen_clause
 from sros_tool.keystore.fleet import enclaves_of_robot, fleet_edits_clause, recorded_fleet
 from sros_tool.keystore.known_keys import restored_at
 from sros_tool.keystore.layout import (
@@ -731,18 +730,6 @@ def fleet_status(keystore: OpenedKeystore, names: Sequence[str] = ()) -> FleetSt
     )
 
 
-def _unseen_clause(missing: str | None) -> str:
-    """Return why the publishing folder cannot be examined, or "".
-
-    ``missing`` is the result of `PublicationRecord.first_missing`.
-    """
-    if missing is None:
-        return "is not on this machine, or cannot be read"
-    if find_spec("tuf") is None:
-        return "cannot be verified, because the Python package tuf is not installed"
-    return ""
-
-
 # ── comparing a confirmation with the keystore's files ────────────────────────────────────────
 
 
@@ -1012,7 +999,7 @@ class _KeystoreRecords:
                 published.folder,
                 published.until,
                 published.root_until,
-                unseen=_unseen_clause(missing),
+                unseen=unseen_clause(missing),
                 lacks=missing or "",
                 refused=metadata_problem(keystore),
                 altered=published.altered,

@@ -571,6 +571,11 @@ def _(bench: Bench) -> None:
     ledger.write_text("\n".join([*lines, json.dumps(restored)]) + "\n")
 
 
+@case("keystore.publication-unseen")
+def _(bench: Bench) -> None:
+    bench.path("published.json").write_text("damaged")
+
+
 @case("enclave.old-permissions")
 def _(bench: Bench) -> None:
     path = bench.path("enclaves/base/permissions.p7s")

@@ -1145,12 +1145,16 @@ def test_a_publishing_folder_that_lost_its_files_is_not_in_order(
     home.run("fleet", "collect", "ks", "inbox")
     status = ("fleet", "status", "ks")
     sros(*status, cwd=home.folder).ok()
+    check = ("check", "ks", "--include", "keystore.publication-unseen")
+    sros(*check, cwd=home.folder).ok()
     pub, archive = home.folder / "pub", published.robots["r2"].release.path("r2")
     pub.rename(home.folder / "elsewhere")
     for fail_on, exit_status in (("delivery", 1), ("unmended", 1), ("seen", 0)):
         ended = sros(*status, "--fail-on", fail_on, cwd=home.folder)
         assert f"'{pub}', is not on this machine, or cannot be read: it is" in ended.out
         assert ended.status == exit_status
+    checked = sros(*check, cwd=home.folder)
+    assert f"'{pub}', is not on this machine" in checked.out and checked.status == 1
     metrics = sros(*status, "--prometheus", cwd=home.folder).out
     assert all(
         re.search(rf"(?m)^sros_fleet_{end}$", metrics) for end in ("complete{.*} 0", "seen{.*} 1")
@@ -1160,9 +1164,12 @@ def test_a_publishing_folder_that_lost_its_files_is_not_in_order(
         patched.setitem(sys.modules, "tuf", None)
         ended = sros(*status, cwd=home.folder)
         assert "package tuf is not installed: it is not known" in ended.out and ended.status == 1
+        checked = sros(*check, cwd=home.folder)
+        assert "package tuf is not installed" in checked.out and checked.status == 1
     targets = next((pub / "metadata").glob("*.targets.json"))
     targets.rename(home.folder / "kept")
-    assert f"lacks metadata/{targets.name}, which" in sros(*status, cwd=home.folder).out
+    for verb in (status, check):
+        assert f"lacks metadata/{targets.name}" in sros(*verb, cwd=home.folder).out
     (home.folder / "kept").rename(targets)
     publish = ("fleet", "publish", "ks", str(pub))
     command = f"`sros {' '.join(publish)}`"

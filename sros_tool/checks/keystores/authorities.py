@@ -350,6 +350,16 @@ OLDER_THAN_ROBOTS = FindingKind(
     "Run `sros fleet status KEYSTORE`, which names the command that publishes with --restored; "
     "docs/howto/keystore_is_lost.md has the other steps.",
 )
+PUBLICATION_UNSEEN = FindingKind(
+    "keystore.publication-unseen",
+    WARNING,
+    "a last publication that cannot be examined",
+    "If the keystore was restored from a backup, only the publishing folder may show it: the "
+    "keystore may lack revocations.",
+    "sros: published.json has the folder and the versions of the last publication.",
+    "Run `sros fleet status KEYSTORE`, which names the remedy. If the folder belongs on another "
+    "machine, add `--exclude keystore.publication-unseen`.",
+)
 CRL_EXPIRES_SOON = FindingKind(
     "keystore.revocation-list-ends",
     ERROR,
@@ -441,10 +451,21 @@ def _restore_findings(keystore: CheckedKeystore, file: str) -> Iterator[Finding]
     if not (opened.has(PUBLISHED) or was_restored):
         return
     # Most keystores publish nothing, and do not need it.
-    from sros_tool.keystore.delivery.publish import unpublished_restore_clause
+    from sros_tool.keystore.delivery.publish import (
+        unpublished_restore_clause,
+        unseen_publication_clause,
+    )
 
     if why := unpublished_restore_clause(opened):
         yield OLDER_THAN_ROBOTS.found("keystore", why, file)
+        return
+    try:
+        why, remedy = unseen_publication_clause(opened), ""
+    except SrosError as error:
+        why, remedy = error.what, error.remedy
+    if why:
+        path = keystore.shown_path(PUBLISHED)
+        yield PUBLICATION_UNSEEN.found("keystore", why, path, remedy=remedy)
 
 
 def _settings_and_ledger_findings(keystore: CheckedKeystore) -> Iterator[Finding]:

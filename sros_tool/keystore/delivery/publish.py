@@ -44,6 +44,7 @@ from sros_tool.keystore.delivery.published import (
     may_have_later_releases,
     read_published,
     releases_in,
+    unseen_clause,
 )
 from sros_tool.keystore.delivery.release import (
     RELEASE_FILES,
@@ -376,6 +377,23 @@ def unpublished_restore_clause(keystore: OpenedKeystore) -> str:
     if has_unpublished_restore(keystore):
         return "robots have releases that it sealed but does not know"
     return _newer_folder_clause(keystore)
+
+
+def unseen_publication_clause(keystore: OpenedKeystore) -> str:
+    """Return why later releases than the keystore's cannot be seen here, as a clause, or "".
+
+    Raises:
+        DocumentError: the list of published files is damaged.
+    """
+    known = read_published(keystore)
+    if not known.robots:
+        return ""
+    missing = known.first_missing()
+    if why := unseen_clause(missing):
+        return f"the folder of the last publication, '{known.folder or 'not recorded'}', {why}"
+    if missing and missing.startswith("metadata/"):
+        return f"'{known.folder}' lacks {missing}"
+    return metadata_problem(keystore)
 
 
 def older_keystore_notes(keystore: OpenedKeystore) -> Iterator[Note]:

@@ -12,6 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta
+from importlib.util import find_spec
 from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -168,6 +169,18 @@ class PublicationRecord:
             "altered": {path: iso(time) for path, time in sorted(self.altered.items())},
         }
         return json.dumps({**value, "superseded": superseded, "robots": robots}).encode()
+
+
+def unseen_clause(missing: str | None) -> str:
+    """Return why the publishing folder cannot be examined, as a clause, or "".
+
+    ``missing`` is the result of `PublicationRecord.first_missing`.
+    """
+    if missing is None:
+        return "is not on this machine, or cannot be read"
+    if find_spec("tuf") is None:
+        return "cannot be verified, because the Python package tuf is not installed"
+    return ""
 
 
 def altered_lately(altered: Mapping[str, datetime], now: datetime) -> dict[str, datetime]:
