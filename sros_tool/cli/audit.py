@@ -186,12 +186,11 @@ def audit(
     if unknown:
         notes = (*audited.notes, Note("audit.zenoh-unknown", f"a DDS vendor decided. {unknown}"))
         audited = replace(audited, unjudged=(*audited.unjudged, _NO_ZENOH_FILES), notes=notes)
-    kept_changing = snapshot.seconds if not snapshot.settled else 0
     left_out = [
         text
         for is_left_out, text in (
             (audited.unseen and not partial, _UNSEEN),
-            ((audited.unjudged or kept_changing) and not unjudged, _UNJUDGED),
+            ((audited.unjudged or snapshot.unsettled) and not unjudged, _UNJUDGED),
         )
         if is_left_out
     ]
@@ -223,7 +222,7 @@ def audit(
                 unseen=audited.unseen,
                 unjudged=audited.unjudged,
                 observation=audited.observation,
-                settled=snapshot.settled,
+                settled=not snapshot.unsettled,
                 partial=partial,
                 unjudged_accepted=unjudged,
                 patch=patch if written else None,
@@ -233,7 +232,7 @@ def audit(
             )
         )
     else:
-        _show(audited, enclaves, kept_changing, on_zenoh=on_zenoh)
+        _show(audited, enclaves, snapshot.unsettled, on_zenoh=on_zenoh)
     print_notes((*audited.notes, *audited.missing.notes))
     if audited.allowed and left_out:
         echo(f"the exit status is 1: {'; '.join(left_out)}", err=True)
@@ -300,9 +299,7 @@ def _advice_to_add_by_hand(sources: Sequence[Path], fleet: Fleet, audited: Audit
 # ── output ──────────────────────────────────────────────────────────────────────────────
 
 
-def _show(
-    audited: Audit, enclaves: AuditedEnclaves, changing_seconds: float, *, on_zenoh: bool
-) -> None:
+def _show(audited: Audit, enclaves: AuditedEnclaves, unsettled: str, *, on_zenoh: bool) -> None:
     """Print denied rights, unseen nodes and a verdict that says what the audit did not cover."""
     for line in (*audited.lines().values(), *(f"not seen: {node}" for node in audited.unseen)):
         echo(line)
@@ -320,11 +317,8 @@ def _show(
         verdict = f"only {seen} {'was' if 1 in (of, number) else 'were'} seen: {verdict}"
     if audited.unjudged:
         verdict += f"; not judged: {', '.join(audited.unjudged)}"
-    if changing_seconds:
-        verdict += (
-            f"; the ROS graph kept changing for {changing_seconds:.0f} s, or could not be read in "
-            "time"
-        )
+    if unsettled:
+        verdict += f"; {unsettled}"
     echo(verdict, err=True)
     if any(denied_right.by_rule for denied_right in audited.denied):
         echo(

@@ -487,7 +487,7 @@ def generate_policy(
     if not learned.profiles:
         if as_json:
             value = _learned_json(None, file, learned, seen.observation, dry_run)
-            print_json(value._replace(settled=snapshot.settled and not snapshot.grew))
+            print_json(value._replace(settled=not snapshot.unsettled))
         echo(_NO_NODES, err=True)
         print_notes(learned.notes)
         echo(why_no_node_was_observed(environment, snapshot.seconds, rmw, enclave), err=True)
@@ -500,7 +500,7 @@ def generate_policy(
             _learned_json(plan, file, learned, seen.observation, dry_run)._replace(
                 ended=ended,
                 intermittent=sorted(snapshot.intermittent),
-                settled=snapshot.settled and not snapshot.grew,
+                settled=not snapshot.unsettled,
             )
         )
     else:
@@ -510,18 +510,10 @@ def generate_policy(
         nodes = first_subjects(gone)
         text = f"left out, because these nodes ended while the graph was observed: {nodes}"
         echo(f"{text}; --watch keeps them.", err=True)
-    if not snapshot.settled:
-        echo(
-            f"the ROS graph kept changing for {snapshot.seconds:.0f} s, or could not be read in "
-            "time, so nodes may be missing; --watch collects nodes that come and go.",
-            err=True,
-        )
-    elif snapshot.grew:
-        echo(
-            "new nodes or endpoints still appeared when the watch ended, so others may be missing; "
-            "watch again for longer.",
-            err=True,
-        )
+    if why := snapshot.unsettled:
+        advice = "--watch collects nodes that come and go"
+        advice = "watch again for longer" if snapshot.grew else advice
+        echo(f"{why}, so others may be missing; {advice}.", err=True)
     return 0
 
 

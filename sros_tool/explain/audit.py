@@ -332,7 +332,9 @@ class AuditResult(NamedTuple):
     """
     observation: Observation
     settled: bool
-    """Whether the whole ROS graph was seen: it stopped changing, or was watched without a gap."""
+    """Whether the whole ROS graph was seen: it stopped changing, or was watched without a gap and
+    did not grow any more at the end.
+    """
     partial: bool
     """Whether ``--partial`` accepted nodes that were not seen."""
     unjudged_accepted: bool

@@ -289,6 +289,15 @@ class Snapshot:
     grew: bool = False
 
     @property
+    def unsettled(self) -> str:
+        """Why nodes or endpoints may be missing, as a clause; "" if the whole graph was seen."""
+        if self.grew:
+            return "new nodes or endpoints still appeared when the watch ended"
+        if self.settled:
+            return ""
+        return f"the ROS graph kept changing for {self.seconds:.0f} s, or could not be read in time"
+
+    @property
     def gone(self) -> frozenset[str]:
         """Full names of the nodes that left while the graph was observed."""
         stayed = {(node.participant, node.fqn) for node in self.observation.nodes}

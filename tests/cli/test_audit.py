@@ -63,6 +63,21 @@ def test_an_audit_says_by_whose_rules_it_decides_and_which_nodes_ended(
     assert "such nodes: /talker\nnote [audit.on-zenoh]: " in ended.err
 
 
+def test_a_graph_that_still_grew_when_the_watch_ended_is_no_pass(
+    program: Program, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for grew, accepted, status in ((False, (), 0), (True, (), 1), (True, ("--unjudged",), 0)):
+
+        def growing(*asked: Any, grew: bool = grew, **more: Any) -> tuple[Snapshot, str]:
+            snapshot, rmw = observe(*asked, **more)
+            return replace(snapshot, grew=grew), rmw
+
+        monkeypatch.setattr(audit, "observe", growing)
+        ended = program(graph(FINE), "robot.xml", *SHORT, *accepted)
+        assert ended.status == status
+        assert ("; new nodes or endpoints still appeared when" in ended.err) is grew
+
+
 @pytest.mark.parametrize(
     ("files", "words", "status", "out", "err"),
     [
