@@ -456,10 +456,12 @@ def test_an_expired_certificate_counts_only_with_the_key_of_now(home: Home) -> N
 
 def test_a_message_that_was_replayed(home: Home) -> None:
     first = home.send("r1").read_bytes()
-    home.send("r1")
+    last = home.send("r1").read_bytes()
     assert home.of("r1").outcome == "kept"
     home.put("r1", first)
     refused = home.of("r1")
+    home.put("r1", last)  # whoever has the inbox can put back what was accepted
+    assert home.of("r1").outcome == "unchanged" and "r1" in refusals(OpenedKeystore(home.root))
     assert refused.outcome == "refused" and "not higher than 2" in refused.why
     assert "--restored r1" in refused.why and home.kept("r1") == 2
     # Another message with the same number, and one after somebody confirmed without a number.
@@ -470,6 +472,7 @@ def test_a_message_that_was_replayed(home: Home) -> None:
     home.put("r1", first)
     assert home.of("r1").outcome == "refused" and home.kept("r1") == 2
     assert home.of("r1", restored=("r1",)).outcome == "kept" and home.kept("r1") == 1
+    assert not refusals(OpenedKeystore(home.root))
     with pytest.raises(DocumentError, match="no robot 'r9'"):
         home.collect(restored=("r9",))
 

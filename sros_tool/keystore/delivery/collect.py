@@ -297,14 +297,15 @@ def _refusals(
 ) -> dict[str, str]:
     """Map robots to the reasons why their last messages were refused.
 
-    A missing or older message keeps the reason from before.
+    Only a new message that is verified removes the reason from before: whoever has the inbox can
+    put back an earlier one.
     """
     refused = {}
     for message in messages:
         name = message.robot.name
         if message.outcome == "refused":
             refused[name] = message.why
-        elif message.outcome in ("missing", "older") and name in before:
+        elif message.outcome in ("missing", "older", "unchanged") and name in before:
             refused[name] = before[name].why
     return refused
 
