@@ -392,6 +392,7 @@ def test_what_a_killed_run_of_root_left_is_said_and_ended_by_root(
         path.mkdir(mode=0o700)
     said = in_process_of(OWNER, lambda: create_enclaves(keystore, ["/new"], now=NOW))
     assert f"'{path}' is in the way" in said and "Run the command once as root" in said
+    assert "It belongs to user root, whose run" in said
     create_enclaves(keystore, ["/new"], now=NOW)
     assert in_process_of(OWNER, lambda: create_enclaves(keystore, ["/other"], now=NOW)) == ""
 
@@ -403,11 +404,12 @@ def test_a_file_system_without_locks_is_said_and_nothing_stays(
         raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
 
     monkeypatch.setattr("fcntl.flock", refuse)
-    around = sorted(os.listdir(keystore.parent))
+    around, handles = sorted(os.listdir(keystore.parent)), len(os.listdir("/proc/self/fd"))
     for words in (("create_enclave", keystore, "/new"), ("create_keystore", f"{keystore}2")):
         said = sros(*words).err
         assert "cannot be locked" in said and "Use a folder on a local disk" in said
     assert sorted(os.listdir(keystore.parent)) == around
+    assert len(os.listdir("/proc/self/fd")) == handles
 
 
 def test_the_lock_is_of_one_holder_at_a_time(keystore: Path) -> None:

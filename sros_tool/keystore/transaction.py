@@ -67,7 +67,7 @@ from sros_tool.keystore.layout import (
     readable_enclaves,
     search_enclaves,
 )
-from sros_tool.owners import refuse_link_of_stranger
+from sros_tool.owners import refuse_link_of_stranger, user_name
 from sros_tool.parallel import map_slices
 from sros_tool.xml import read_bytes
 
@@ -1029,7 +1029,7 @@ class KeystoreLock:
         if not self.is_held:
             state = self._folder.state(LOCK)
             if state and os.geteuid() not in (0, state.st_uid):  # who is at work hands it over
-                raise _left_by_root_error(self._folder.path / LOCK)
+                raise _left_by_other_user_error(self._folder.path / LOCK)
             raise KeystoreError(
                 f"{self._what} '{self._folder.path}' is busy",
                 f"Another process has been writing to it for {wait:.0f} seconds.",
@@ -1042,12 +1042,13 @@ class KeystoreLock:
         try:
             with _signals_held_back():
                 handle = self._folder.open_private(LOCK)
-                if stat.S_ISREG(os.fstat(handle).st_mode) and try_lock(handle):
-                    if self._is_there(handle):
+                try:
+                    regular = stat.S_ISREG(os.fstat(handle).st_mode)
+                    if regular and try_lock(handle) and self._is_there(handle):
                         self._handle = handle
-                        return True
-                    os.close(handle)
-                    return False
+                finally:
+                    if not self.is_held:
+                        os.close(handle)
         except FileNotFoundError:
             return False  # another process has just removed it
         except PermissionError:
@@ -1058,11 +1059,9 @@ class KeystoreLock:
             if error.errno not in (errno.ELOOP, errno.ENXIO):  # a link or a socket
                 raise
             raise self._blocked_lock_error() from error
-        regular = stat.S_ISREG(os.fstat(handle).st_mode)
-        os.close(handle)
         if not regular:
             raise self._blocked_lock_error()
-        return False
+        return self.is_held
 
     def _blocked_lock_error(self) -> KeystoreError:
         return KeystoreError(
@@ -1125,16 +1124,19 @@ def _recover(folder: Folder) -> None:
     except PermissionError as error:
         if os.geteuid() == 0:
             raise
-        raise _left_by_root_error(Path(os.fsdecode(error.filename or STAGE))) from error
+        raise _left_by_other_user_error(Path(os.fsdecode(error.filename or STAGE))) from error
 
 
-def _left_by_root_error(path: Path) -> KeystoreError:
+def _left_by_other_user_error(path: Path) -> KeystoreError:
     """Return the error for a file of an interrupted run that this user cannot open or remove."""
+    user = "another user"
+    with contextlib.suppress(OSError):
+        user = user_name(path.lstat().st_uid)
     return KeystoreError(
         f"'{path}' is in the way, and this user cannot open it",
-        "Perhaps a run of sros by root was killed before it gave the file to the owner of the "
-        "folder.",
-        "Run the command once as root: it completes or undoes what was interrupted.",
+        f"It belongs to {user}, whose run of sros is not finished, or was killed.",
+        "Wait until no such run is at work. Run the command once as root if the file stays: it "
+        "completes or undoes what was interrupted.",
     )
 
 
