@@ -15,6 +15,7 @@ from bisect import bisect_left
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import NamedTuple
 
 from sros_tool.errors import PolicyError
@@ -208,7 +209,8 @@ def nodes_not_as_observed(
 
     All nodes of an enclave have its rights, so in the comparison of whole enclaves, the rights of
     one node hide those of another.  The denials of all nodes of the enclave apply to each node.
-    Left out are enclaves without an observed node, and enclaves with a wildcard for other nodes.
+    A wildcard for nodes states rights of every node that it matches.  It is compared with what all
+    observed nodes that it matches used.  Left out are enclaves without an observed node.
     """
     nodes = policy.nodes()
     seen: dict[str, dict[str, list[Profile]]] = defaultdict(lambda: defaultdict(list))
@@ -218,24 +220,49 @@ def nodes_not_as_observed(
             seen[home][profile.full_name].append(profile)
     differing = {}
     for enclave in policy.enclaves:
-        names = {*nodes[enclave.path], *seen[enclave.path]}
-        unseen = names - seen[enclave.path].keys()
-        if len(names) == 1 or not seen[enclave.path] or any(map(is_expression, unseen)):
+        of_enclave = seen[enclave.path]
+        names = sorted({*nodes[enclave.path], *of_enclave})
+        if len(names) == 1 or not of_enclave:
             continue
-        stated = Policy(tuple(_enclave_of_node(enclave, name) for name in sorted(names)))
-        used = (
-            Enclave(name, (Profiles(tuple(profiles)),))
-            for name, profiles in seen[enclave.path].items()
+        matching = {name: [node for node in of_enclave if covers(name, node)] for name in names}
+        stating = {name: [wide for wide in names if covers(wide, name)] for name in names}
+        itself = {name: [name] for name in names}
+        own_uses, allowed_uses = (
+            _uses_of_nodes(enclave, stated, of_enclave, used, common)
+            for stated, used in ((itself, matching), (stating, itself))
         )
-        uses = minimize(stated, policy_rights(Policy(tuple(used))), common).uses
+        uses = [
+            replace(own, not_allowed=allowed.not_allowed)
+            for own, allowed in zip(own_uses, allowed_uses, strict=True)
+        ]
         differing[enclave.path] = [use for use in uses if not use.is_as_observed]
     return differing
 
 
-def _enclave_of_node(enclave: Enclave, node: str) -> Enclave:
-    """Return an enclave named like a node, with its rights, and with the denials of all nodes."""
+def _uses_of_nodes(
+    enclave: Enclave,
+    stated: Mapping[str, Sequence[str]],
+    seen: Mapping[str, Sequence[Profile]],
+    used: Mapping[str, Sequence[str]],
+    common: Sequence[Group],
+) -> tuple[EnclaveUse, ...]:
+    """Compare the rights of each node with its use.
+
+    ``stated`` and ``used`` map each node to the profiles in the policy that state its rights, and
+    to the observed nodes whose use counts for it.
+    """
+    policy = Policy(tuple(_enclave_of_node(enclave, *item) for item in stated.items()))
+    observed = (
+        Enclave(name, (Profiles(tuple(chain.from_iterable(seen.get(n, ()) for n in nodes))),))
+        for name, nodes in used.items()
+    )
+    return minimize(policy, policy_rights(Policy(tuple(observed))), common).uses
+
+
+def _enclave_of_node(enclave: Enclave, node: str, stated: Sequence[str]) -> Enclave:
+    """Return an enclave named like a node, with the rights in some profiles, and all denials."""
     profiles = (
-        profile if profile.full_name == node else only_denials(profile)
+        profile if profile.full_name in stated else only_denials(profile)
         for profile in enclave.all_profiles()
     )
     return Enclave(node, (Profiles(tuple(profiles)),))
