@@ -1008,8 +1008,8 @@ def similarity_to(
     return similar_requirements
 
 
-def renamed_names(old: Requirement, new: Requirement) -> dict[str, str]:
-    """Map the names of ``old`` to the names of ``new`` if they are the only difference, else {}."""
+def renamed_names(old: Requirement, new: Requirement) -> dict[tuple[str, str], str]:
+    """Map rights and names of ``old`` to names of ``new`` if only these differ, else return {}."""
     if not (isinstance(old, RightsRequirement) and isinstance(new, RightsRequirement)):
         return {}
     pairs, new_pairs = [*_single_rights(old.rights)], [*_single_rights(new.rights)]
@@ -1018,7 +1018,9 @@ def renamed_names(old: Requirement, new: Requirement) -> dict[str, str]:
     if not same_rights or with_new_names != _only_demand(new):
         return {}
     names = zip(pairs, new_pairs, strict=True)
-    return {name: new_name for (_, (name,)), (_, (new_name,)) in names if name != new_name}
+    return {
+        (right, name): new_name for (right, (name,)), (_, (new_name,)) in names if name != new_name
+    }
 
 
 def _demanded_by(requirements: Iterable[Requirement]) -> Callable[[Requirement], bool]:

@@ -1207,15 +1207,12 @@ class _Review:
                 broken = _failures(moved[at], after, before)
                 if not broken:
                     continue
-                known = [*_failures(moved[at], before()), *_with_new_names(moved[at], dropped())]
-                texts = {(finding.subject, finding.text) for finding in known}
-                broken = [
-                    finding for finding in broken if (finding.subject, finding.text) not in texts
-                ]
-                if broken:
-                    left.remove(at)
-                    place = f"in namespace {ns}, which the review tries"
-                    yield from (one._replace(text=f"{place}: {one.text}") for one in broken)
+                known = {*_failures(moved[at], before()), *_with_new_names(moved[at], dropped())}
+                place = f"in namespace {ns}, which the review tries"
+                for failure, finding in broken.items():
+                    if failure not in known:
+                        left.discard(at)
+                        yield finding._replace(text=f"{place}: {finding.text}")
 
     def place(self) -> str:
         """Return a clause with the namespaces of the requirements; "" without namespaces."""
@@ -1461,9 +1458,45 @@ _NOT_OF_DROPPED = tuple(kind.id for kind in (VACUOUS, MISSPELLED_ENCLAVE, UNKNOW
 """Findings that a dropped requirement does not need."""
 
 
+class _Failure(NamedTuple):
+    """What is wrong with a requirement: uses that break it, or why it protects nothing (a text)."""
+
+    uses: tuple[tuple[str, str, str, str], ...] = ()
+    """Enclaves, rights, names, and the wildcards that allow them ("" without wildcard)."""
+    others: frozenset[str] = frozenset()
+    """Further enclaves that break the requirement."""
+    worlds: tuple[str, ...] = ()
+    missing: str = ""
+    """An enclave that has to have rights, and does not exist."""
+    idle: bool = False
+    """Whether the enclave that has to have rights cannot start."""
+    text: str = ""
+
+    def with_new_names(self, names: Mapping[tuple[str, str], str]) -> _Failure:
+        """Return the same failure under new names, which are given by right and old name."""
+
+        def renamed(right: str, name: str) -> str:
+            for (of_right, old), new in names.items():
+                begin = old.removesuffix("*")
+                if right == of_right and (name == old or (begin != old and name.startswith(begin))):
+                    return new.removesuffix("*") + name.removeprefix(begin)
+            return name
+
+        uses = tuple(
+            (enclave, right, renamed(right, name), renamed(right, by))
+            for enclave, right, name, by in self.uses
+        )
+        new_names = {old: new for (_, old), new in names.items()}
+        text = _ABSOLUTE_NAME.sub(lambda found: new_names.get(found[0], found[0]), self.text)
+        return self._replace(uses=uses, text=text)
+
+
+_ABSOLUTE_NAME = re.compile(r"(?<!\S)(?<!enclave )/[^\s,;:()]*")
+
+
 def _failures(
     requirement: Requirement, system: System, before: Callable[[], System] | None = None
-) -> list[Finding]:
+) -> dict[_Failure, Finding]:
     """Return the findings which say that a requirement does not hold, or protects nothing.
 
     A name that no right states counts only if a right of ``before`` states it.
@@ -1471,33 +1504,39 @@ def _failures(
     decided = decide_all([requirement], system)
     rights = before().rights if before and decided.unnamed else ()
     findings = decided_findings(decided, system, rights)
-    return [finding for finding in findings if finding.kind in (VIOLATED, VACUOUS)]
+    failures = {
+        _Failure(text=finding.text): finding for finding in findings if finding.kind is VACUOUS
+    }
+    broken = (finding for finding in findings if finding.kind is VIOLATED)
+    for violation, finding in zip(decided.violations, broken, strict=True):
+        steps = ((step.use, step.stated_form()[3]) for step in violation.steps)
+        uses = tuple((use.enclave, use.right, use.name, by) for use, by in steps)
+        others = {use.enclave for uses in violation.witness.others for use in uses}
+        why = violation.worlds, violation.missing, violation.idle
+        failures[_Failure(uses, frozenset(others), *why)] = finding
+    return failures
 
 
 def _dropped_failures(
     earlier: Iterable[Requirement],
     requirements: Iterable[Requirement],
     before: Callable[[], System],
-) -> list[tuple[Requirement, list[Finding]]]:
+) -> list[tuple[Requirement, Sequence[_Failure]]]:
     """Return the requirements of ``earlier`` that were dropped, with their failures in BASE."""
     dropped = dropped_requirements(earlier, requirements)
-    return [(of.requirement, _failures(of.requirement, before())) for of in dropped]
+    return [(of.requirement, [*_failures(of.requirement, before())]) for of in dropped]
 
 
 def _with_new_names(
-    requirement: Requirement, dropped: Iterable[tuple[Requirement, list[Finding]]]
-) -> Iterator[Finding]:
+    requirement: Requirement, dropped: Iterable[tuple[Requirement, Sequence[_Failure]]]
+) -> Iterator[_Failure]:
     """Yield failures of dropped requirements that differ from a requirement only in their names.
 
-    The findings have the names of the requirement.
+    The failures have the names of the requirement.
     """
-    for old, findings in dropped:
+    for old, failures in dropped:
         if names := renamed_names(old, requirement):
-            for finding in findings:
-                text = finding.text
-                for name, new_name in names.items():
-                    text = text.replace(name.rstrip("*"), new_name.rstrip("*"))
-                yield finding._replace(text=text)
+            yield from (failure.with_new_names(names) for failure in failures)
 
 
 def _status_of_findings(chosen_findings: ChosenFindings) -> int:

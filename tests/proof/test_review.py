@@ -1475,22 +1475,50 @@ def test_a_wildcard_that_leaves_out_one_namespace_breaks_requirements_in_others(
 
 
 @pytest.mark.parametrize(
-    ("writer", "status"),
-    [("/b", 0), ("/c", 1)],  # the second enclave breaks the requirement only after the change
+    ("writers", "later", "new", "status"),
+    [
+        ("/b", "/b", "z", 0),
+        ("/b", "/c", "z", 1),  # the second enclave breaks the requirement only after the change
+        ("/b /x", "/b /x", "z", 0),
+        ("/b /x", "/b /z", "z", 1),  # an enclave that is named like the new name
+        ("/b", "/b", "xx", 0),
+        ("/b /x", "/b /xx", "xx", 1),
+    ],
 )
 def test_a_renamed_requirement_may_stay_broken_in_a_namespace(
-    change: Change, writer: str, status: int
+    change: Change, writers: str, later: str, new: str, status: int
 ) -> None:
-    only = '[[only]]\npublish = ["x"]\nenclaves = ["/a"]\n'
-    enclaves = {"/a": publish("x"), "/b": publish("/left/x"), "/c": publish("y")}
-    change.base = change.commit({"robot.xml": policy_text(enclaves), "robot.toml": only})
-    renamed = enclaves | {"/a": publish("z"), "/b": publish("y"), writer: publish("/left/z")}
-    change.commit({"robot.xml": policy_text(renamed), "robot.toml": only.replace('"x"', '"z"')})
+    only = '[[only]]\npublish = ["x", "w"]\nenclaves = ["/a", "/d"]\n'
+
+    def policy(name: str, writers: str) -> str:
+        enclaves = dict.fromkeys(("/b", "/c", "/x", "/z", "/xx"), publish("y"))
+        enclaves |= dict.fromkeys(writers.split(), publish(f"/left/{name}"))
+        return policy_text({"/a": publish(name), "/d": publish("w"), **enclaves})
+
+    change.base = change.commit({"robot.xml": policy("x", writers), "robot.toml": only})
+    renamed = only.replace('"x"', f'"{new}"')
+    change.commit({"robot.xml": policy(new, later), "robot.toml": renamed})
     asked = ("--policy", "robot.xml", "--requirements", "robot.toml", "--new-access", "allow")
     assert "requirement.dropped" in change.review(*asked).out
     ended = change.review(*asked, "--dropped-requirements", "allow")
     assert ended.status == status, ended
-    assert (f"{writer}: in namespace /left, which the review" in ended.out) == bool(status), ended
+    assert ("in namespace /left, which the review" in ended.out) == bool(status), ended
+
+
+def test_requirements_may_swap_their_names(change: Change) -> None:
+    """Twin: another enclave breaks one of them only after the change."""
+    only = '[[only]]\npublish = ["{}"]\nsubscribe = ["{}"]\nenclaves = ["/a"]\n'
+    asked = ("--policy", "robot.xml", "--requirements", "robot.toml", "--new-access", "allow")
+    for later, status in (("/b", 0), ("/c", 1)):
+        both = publish("x", "y")
+        enclaves = {"/a": both + both.replace("publish", "subscribe")}
+        enclaves |= dict.fromkeys(("/b", "/c"), publish("q"))
+        before = policy_text(enclaves | {"/b": publish("/left/x")})
+        change.base = change.commit({"robot.xml": before, "robot.toml": only.format("x", "y")})
+        after = policy_text(enclaves | {later: publish("/left/y")})
+        change.commit({"robot.xml": after, "robot.toml": only.format("y", "x")})
+        ended = change.review(*asked, "--dropped-requirements", "allow")
+        assert ended.status == status, ended
 
 
 _DENIED = publish("/left/*") + publish("x").replace("ALLOW", "DENY")
