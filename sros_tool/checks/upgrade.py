@@ -78,7 +78,7 @@ BUFFERS = FindingKind(
 ZENOH = FindingKind(
     "upgrade.zenoh-release",
     NOTE,
-    "another release of rmw_zenoh",
+    "a different release of rmw_zenoh",
     "The files that sros writes work with all supported releases, from the named version on.",
     "ros2/rmw_zenoh, its changelogs.",
     "Install at least that version on every robot.",
@@ -98,7 +98,7 @@ VULNERABILITIES = FindingKind(
 EXPIRED_PEERS = FindingKind(
     "upgrade.expired-peers",
     NOTE,
-    "another effect of an expired certificate on running processes",
+    "a different effect of an expired certificate on running processes",
     "With one release, running processes lose each other when the certificate of one of them "
     "expires. With the other release, they keep communicating until they restart.",
     "sros: measured with the named releases; CVE-2025-67108.",

@@ -228,7 +228,7 @@ class VendorTraits:
     reads_trusted_certificates: bool = True
     """A certificate may be in a PEM block ``TRUSTED CERTIFICATE``."""
     reads_files_as_text: bool = False
-    """A zero byte in a file of certificates or lists ends the line, or the whole file."""
+    """A zero byte in a certificate file or a revocation list ends the line, or the whole file."""
     hashes: Hashes = Hashes.ANY
     keys: Keys = Keys.ANY
     reads_tokens: bool = True

@@ -656,8 +656,7 @@ def _rogue_router_row(
         RowStatus.HEARD if succeeds else RowStatus.NOT_HEARD,
         "sessions trust this router"
         if succeeds
-        else "a session accepts data from the router only if the sender's certificate has the "
-        "router's name",
+        else "a session exchanges data only with a router whose certificate has the router's name",
         hears(rogue.name, "talker") if router_reads else hears("listener", rogue.name),
         (rogue, *_topic_pair(keystore)[1:]),
         () if part == "router" else _CHATTER,
