@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import re
+from collections import defaultdict
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -1563,6 +1564,7 @@ def _left_requirement_findings(
     ]
     similar_requirements = similarity_to(earlier)
     for requirement in requirements if moves else ():
+        reported: dict[NodeName, set[str]] = defaultdict(set)
         # The namespaces of a fleet are known, and its policies name the enclaves in them.
         for ns in ("/",) if after.fleet else _namespaces_of_patterns(requirement):
             was_restricted, now_restricted = (
@@ -1580,14 +1582,15 @@ def _left_requirement_findings(
             ]
             left = [move for move in left if any(move[1] & was[move[2]] for was in required)]
             for node, _, _, outside in left:
+                if outside <= reported[node]:
+                    continue
+                reported[node] |= outside
                 place = requirement.source
                 name, to = expand("~", *node), first_few(sorted(outside), 3)
                 text = f"node {name} moves to enclave {to}, outside of the requirement"
                 text += f" for users in namespace {ns}" if ns != "/" else ""
                 remedy = "Let the requirement apply to the enclave, or approve this in the review."
                 yield DROPPED.found(str(requirement), text, place.file, place.line, remedy)
-            if left:
-                break
 
 
 def _namespaces_of_patterns(requirement: Requirement) -> list[str]:

@@ -1027,9 +1027,9 @@ _NODES = {"/eyes/eye": publish("/image"), "/drive": publish("/cmd"), "/eyes/ear"
 _EYE = f'</profile><profile ns="/" node="eye">{NODE}{publish("/image")}'
 
 
-def _moved(node: str, path: str) -> dict[str, str]:
-    """Return the enclaves of `_NODES` with another path for the enclave of a node."""
-    return {path if old.endswith(f"/{node}") else old: rights for old, rights in _NODES.items()}
+def _moved(node: str, path: str, enclaves: dict[str, str] = _NODES) -> dict[str, str]:
+    """Return enclaves with another path for the enclave of a node."""
+    return {path if old.endswith(f"/{node}") else old: rights for old, rights in enclaves.items()}
 
 
 @pytest.mark.parametrize(
@@ -1078,6 +1078,15 @@ def _moved(node: str, path: str) -> dict[str, str]:
                 _moved("eye", "/operator/eye"),
                 "node /eye moves to enclave /operator/eye, outside of the requirement for users in "
                 "namespace /arm",
+            ),
+            # Each node moves out in another namespace.
+            (
+                _NODES,
+                '[[only]]\npublish = ["cmd"]\n'
+                'enclaves = ["/drive", "*/arm/operator/*", "*/leg/helper/*"]\n',
+                _moved("eye", "/operator/eye", _moved("ear", "/helper/ear")),
+                "node /ear moves to enclave /helper/ear, outside of the requirement for users in "
+                "namespace /leg",
             ),
             # Both enclaves are bound, or both are exempt; or the node is new.
             (_NODES, _ONLY_OPERATORS, _moved("eye", "/lens/eye"), ""),
