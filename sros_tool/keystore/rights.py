@@ -21,7 +21,7 @@ from cryptography import x509
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import Governance, parse_governance
-from sros_tool.dds.permissions import Grant, Permissions, Rule, parse_permissions
+from sros_tool.dds.permissions import Grant, Permissions, parse_permissions
 from sros_tool.errors import DocumentError, KeystoreError, Note, SrosError
 from sros_tool.fleet.expansion import FleetPolicy, read_policy_for
 from sros_tool.fleet.robots import Fleet, robot_of
@@ -608,18 +608,21 @@ def _discovery_notes(permissions: Permissions) -> Iterator[Note]:
 
 
 def _missing_discovery(grant: Grant) -> list[str]:
-    """Return which of "publish" and "subscribe" the rules do not allow on every node's topic."""
+    """Return which of "publish" and "subscribe" the rules do not allow on every node's topic.
 
-    def match(rules: Iterable[Rule], verb: str) -> bool:
-        criteria = (criterion for rule in rules for _, criterion in rule.criteria_of((verb,)))
-        return any(matches(e, ROS_DISCOVERY_TOPIC) for c in criteria for e in c.topics)
+    The first rule that matches the topic decides.
+    """
 
-    allowed, denied = ([r for r in grant.rules if r.allow is allow] for allow in (True, False))
-    return [
-        verb
-        for verb in ("publish", "subscribe")
-        if match(denied, verb) or not (grant.default_allow or match(allowed, verb))
-    ]
+    def is_allowed(verb: str) -> bool:
+        matching = (
+            rule.allow
+            for rule in grant.rules
+            for _, criterion in rule.criteria_of((verb,))
+            if any(matches(e, ROS_DISCOVERY_TOPIC) for e in criterion.topics)
+        )
+        return next(matching, grant.default_allow)
+
+    return [verb for verb in ("publish", "subscribe") if not is_allowed(verb)]
 
 
 # ── the JSON of a comparison ────────────────────────────────────────────────────────────────

@@ -37,6 +37,7 @@ BOTH = rule(
     "ros_discovery_info",
     rest="</publish><subscribe><topics><topic>ros_*</topic></topics></subscribe><publish>" + RAW,
 )
+_NO_DISCOVERY = rule("ros_discovery_info", "deny_rule")
 
 
 def told(source: RightsSource) -> list[str]:
@@ -146,6 +147,24 @@ def test_what_rights_do_not_tell(
         "rights.unsigned",
         *notes,
     ]
+
+
+@pytest.mark.parametrize(
+    ("document", "lacking"),
+    [
+        (grant(BOTH, _NO_DISCOVERY), ""),  # the first rule that matches decides
+        (grant(_NO_DISCOVERY, BOTH), "publish"),
+        (grant(rule("ros_discovery_info")), "subscribe"),
+        (grant(rule()), "publish or subscribe"),
+        (grant(rule(), default="ALLOW"), ""),
+    ],
+)
+def test_a_topic_that_every_node_needs(tmp_path: Path, document: str, lacking: str) -> None:
+    file = tmp_path / "permissions.xml"
+    file.write_text(DOCUMENT.format(document))
+    notes = [note.text for note in load_rights(file).notes if note.id == "rights.discovery"]
+    assert len(notes) == bool(lacking)
+    assert all(f": /a may not {lacking} ros_discovery_info: " in note for note in notes)
 
 
 @pytest.mark.parametrize(
