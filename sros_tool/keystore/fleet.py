@@ -252,6 +252,14 @@ class EnclaveDomains(NamedTuple):
         """Return the robots of the fleet."""
         return self.fleet.robots.values() if self.fleet else ()
 
+    def robot_of(self, enclave: str) -> Robot | None:
+        """Return the robot of an enclave, as the keystore's fleet has it if it has the robot."""
+        stated = self.stated_robots.get(enclave)
+        robot = robot_of(self.fleet, enclave) if self.fleet else None
+        if self.fleet and stated and robot is None:
+            robot = self.fleet.robots.get(stated.name)
+        return robot or stated
+
     def domains_of(self, enclave: str) -> DomainSet:
         """Return the ROS domains for which an enclave gets permissions.
 
@@ -259,11 +267,7 @@ class EnclaveDomains(NamedTuple):
             KeystoreError: the enclave's robot is in a domain that the keystore does not have, or
                 the fleet file of the command and the keystore's fleet have it in different domains.
         """
-        stated = self.stated_robots.get(enclave)
-        robot = robot_of(self.fleet, enclave) if self.fleet else None
-        if self.fleet and stated and robot is None:
-            robot = self.fleet.robots.get(stated.name)
-        robot = robot or stated
+        stated, robot = self.stated_robots.get(enclave), self.robot_of(enclave)
         if robot and stated and self._domains_with(robot) != self._domains_with(stated):
             raise _moved_robot_error(robot, stated)
         if robot is None or robot.domain is None:

@@ -219,6 +219,32 @@ def test_a_name_that_nobody_has_leads_to_that_of_the_robot(halls: Path) -> None:
 
 
 MOVED = FLEET.replace('"pickers", "north"', '"pickers", "south"')
+
+
+@pytest.mark.parametrize(
+    ("keystore", "name", "words", "noted"),
+    [
+        ("new", "/p02/eye", ("-p", "literal.xml", "--fleet", "f.toml"), True),
+        ("new", "/p02/eye", ("-p", "p.xml", "--fleet", "f.toml"), False),
+        ("ks", "/p03/eye", (), True),
+        ("ks", "/p02/new", ("-p", "new.xml", "--fleet", "f.toml"), False),
+    ],
+)
+def test_a_request_that_gets_the_domains_of_all_robots_is_noted(
+    halls: Path, tmp_path: Path, keystore: str, name: str, words: tuple[str, ...], *, noted: bool
+) -> None:
+    (halls / "literal.xml").write_text(POLICY.replace("/{robot:pickers}/eye", "/p02/eye"))
+    (halls / "new.xml").write_text(NEW)
+    sros("create_request", name, tmp_path / "robot").ok()
+    if not (halls / "new").exists():
+        sros("create_keystore", "new", "--domain", "10,20", cwd=halls).ok()
+    request = tmp_path / f"robot/enclaves{name}/request.pem"
+    sign = ("sign_request", keystore, request, "--dry-run")
+    signed = sros(*sign, "--enclave", name, *words, cwd=halls).ok()
+    said = f"[request.all-domains]: {name} belongs to no robot of the fleet, so its permissions"
+    assert (said in signed.err) is noted
+
+
 NEW = POLICY.replace("/{robot:pickers}/eye", "/{robot:pickers}/new")
 """A policy whose robots are known to the keystore, but not with this enclave path."""
 

@@ -168,7 +168,8 @@ def sign_request(
         files = _answer_files(change.keystore, issued, change.zenoh)
         number = change.keystore.ledger_file.next_number()
         sealed = seal(files, number, change.permissions)
-        if not change.has_placeholder_certificates:
+        unsigned = change.dry_run and change.zenoh.written  # a dry run signs no configurations
+        if not (unsigned or change.has_placeholder_certificates):
             _check_answer_usable(RequestAnswer(name, files, sealed), request, change.moment)
         archive = pack({SEAL: sealed, **files})
         change.entries.append(
@@ -188,11 +189,13 @@ class _StatedRights(NamedTuple):
 
     ``path`` is the enclave's path in the policy if it has placeholders of a fleet, or else "".
     ``robot`` is the enclave's robot in the policy's fleet; None if the path has no placeholders.
+    ``robots`` are all robots of this fleet.
     """
 
     enclave: Enclave | None = None
     path: str = ""
     robot: Robot | None = None
+    robots: Collection[Robot] = ()
 
 
 def _stated_rights(
@@ -210,6 +213,7 @@ def _stated_rights(
     if isinstance(policy, FleetPolicy):
         for name in names:
             enclave, robot = policy.stated_enclave(name)
+            stated[name] = stated[name]._replace(robots=policy.fleet.robots.values())
             if robot:
                 stated[name] = stated[name]._replace(path=enclave.path, robot=robot)
     return stated
@@ -437,6 +441,7 @@ class _RequestCertifier:
                 change.notes += _default_rights_notes(change, name)
             enclave = stated or default_rights(change.template, name)
             rights = StatedRights(enclave, self._domains.domains_of(name))
+            change.notes += self._all_domains_notes(name)
         unique = change.template.unique_subject or (
             present is not None and has_unique_part(present.subject)
         )
@@ -453,6 +458,20 @@ class _RequestCertifier:
         change.notes += issued.notes()
         self._certified[name] = stated
         return issued
+
+    def _all_domains_notes(self, name: str) -> Iterator[Note]:
+        """Yield a note if an enclave of no robot gets rights in the domains of all robots."""
+        robots = (*self._domains.robots(), *self._stated_rights[name].robots)
+        apart = any(robot.domain is not None for robot in robots)
+        domains = self._change.domains
+        if self._domains.robot_of(name) or not apart or len([*domains]) == 1:
+            return
+        yield Note(
+            "request.all-domains",
+            f"{name} belongs to no robot of the fleet, so its permissions are for all domains of "
+            f"the keystore ({domains}). If it belongs to a robot, sign its request again with "
+            "--renew, --fleet FLEET_FILE, and a policy that has {robot} in its path.",
+        )
 
     def _remove_key_other_than(self, request: SigningRequest) -> bool:
         """Remove the enclave's private key in the keystore unless it is the key of the request.
