@@ -187,12 +187,12 @@ def close(
             )
         name = shlex.quote(str(folder))
         raise UsageError(f"'{folder}' has no watched robot", "", f"Run `sros close {name}` first.")
-    if undo:
-        closed = open_again(robot, dry_run=dry_run)
-    elif prove:
-        closed = prove_closed(robot)
-    else:
-        with nullcontext() if dry_run else robot.locked():
+    with nullcontext() if dry_run or prove else robot.locked():
+        if undo:
+            closed = open_again(robot, dry_run=dry_run)
+        elif prove:
+            closed = prove_closed(robot)
+        else:
             closed = prepare(robot, duration, partial=partial, dry_run=dry_run)
             if apply and not closed.problems:
                 closed = apply_security(robot, closed, dry_run=dry_run)

@@ -173,7 +173,7 @@ class LocalRobot:
                 raise UnavailableError(
                     f"another `{self.close_command}` is at work",
                     "The other command would overwrite what this command writes.",
-                    "Wait for it, or end it. --proof, --undo and --dry-run work meanwhile.",
+                    "Wait for it, or end it. --proof and --dry-run work meanwhile.",
                 ) from None
             except OSError:  # a file system without locks
                 pass

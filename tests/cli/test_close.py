@@ -1567,11 +1567,13 @@ def test_one_run_at_a_time_writes_into_the_folder(robot: Robot) -> None:
     folder = os.open(robot.folder / "robot", os.O_RDONLY)
     fcntl.flock(folder, fcntl.LOCK_SH)  # even with this, nobody is alone
     before = snapshot(robot.folder)
-    said = robot.close("--elsewhere", "/listener", status=2).err
-    assert "another `sros close robot` is at work" in said and snapshot(robot.folder) == before
+    # After an --undo meanwhile, an --apply would close again what was said to be open.
+    for words in (("--elsewhere", "/listener"), ("--undo",)):
+        said = robot.close(*words, status=2).err
+        assert "another `sros close robot` is at work" in said and snapshot(robot.folder) == before
     robot.close("--dry-run")
     robot.close("--proof", status=1)
-    robot.close("--undo")
+    robot.close("--undo", "--dry-run")
     os.close(folder)
     shell = Shell(close._run, print, os.environ, lambda: datetime.now(UTC), UTC)
     waits, works = (LocalRobot(robot.folder / "robot", None, shell) for _ in range(2))
