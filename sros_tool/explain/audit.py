@@ -429,6 +429,7 @@ def audit(observation: Observation, enclaves: AuditedEnclaves, observer: str = "
     refused: dict[str, str] = {}
     judged: list[ObservedNode] = []
     unclear, divided, without_enclave = [], [], []
+    undecided: set[str] = set()
     for nodes in processes.values():
         names = ", ".join(sorted(node.fqn for node in nodes))
         candidates, together = _enclaves_of(nodes, enclaves.nodes)
@@ -453,6 +454,7 @@ def audit(observation: Observation, enclaves: AuditedEnclaves, observer: str = "
             unclear.append(f"{names} in {' or '.join(chosen)}")
         for name in chosen:
             denied += answers[name].denied
+            undecided |= answers[name].undecided
             if answers[name].refused:
                 refused[name] = answers[name].refused
         judged += (replace(node, enclaves=tuple(chosen)) for node in nodes)
@@ -460,6 +462,12 @@ def audit(observation: Observation, enclaves: AuditedEnclaves, observer: str = "
         for node in enclave_per_node(make_observation(without_enclave)).observation.nodes:
             judged.append(node)
             denied += _rights_without_enclave(node, enclaves.what)
+    if note := _note_on_subjects("undecided", _UNDECIDED_TEXT, undecided):
+        notes.append(note)
+        topics = counted(len(undecided), "topic")
+        unjudged.append(
+            (note, f"{topics} without a ROS name ({first_few(sorted(undecided), _MOST_NAMES)})")
+        )
     if divided:
         notes.append(
             Note(
@@ -502,6 +510,10 @@ _ENDED_TEXT = (
     "security, anyone on the network can show such nodes"
 )
 _SILENT_TEXT = "not judged, because these nodes were announced but had no endpoint"
+_UNDECIDED_TEXT = (
+    "not judged, because these topics have no ROS name, and the permissions that decide on them do "
+    "not load (`sros check` on the keystore says why)"
+)
 _STRAYS_TEXT = "not judged, because the writers or readers of these topics belong to no ROS node"
 
 
@@ -589,11 +601,13 @@ def _enclaves_of(
 class _Judgement:
     """The rights that a process would be denied in an enclave.
 
-    ``refused`` is the reason why the process cannot start in the enclave, or "".
+    ``refused`` is the reason why the process cannot start in the enclave, or "".  ``undecided`` are
+    topics without a ROS name on which only permissions decide that do not load.
     """
 
     denied: tuple[DeniedRight, ...]
     refused: str = ""
+    undecided: frozenset[str] = frozenset()
 
 
 def _judge(process: Sequence[ObservedNode], enclave: str, enclaves: AuditedEnclaves) -> _Judgement:
@@ -614,7 +628,9 @@ def _judge(process: Sequence[ObservedNode], enclave: str, enclaves: AuditedEncla
         by_permissions = {denied_right.right for denied_right in denied}
         dropped = (right for node in process for right in _dropped_rights(node, enclave, zenoh))
         denied += (right for right in dropped if right.right not in by_permissions)
-    return _Judgement(tuple(denied))
+    used = () if join.allowed else (right for n in process for right, _ in _rights_of(n, enclave))
+    undecided = frozenset(right.name for right in used if right.kind == "dds")
+    return _Judgement(tuple(denied), undecided=undecided)
 
 
 def _denied_rights(

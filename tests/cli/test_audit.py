@@ -92,6 +92,9 @@ def test_a_graph_that_still_grew_when_the_watch_ended_is_no_pass(
             "[audit.zenoh-unknown]: a DDS vendor decided. keystore 'ks' has no Zenoh",
         ),
         ("old", ("--vendor", "fastdds"), 0, "", "by the rules of Fast DDS 2.14\nnote [audit.on-z"),
+        ("damaged", (), 0, "", "with 2 endpoints, by the keystore's files for Zenoh\n"),
+        ("damaged", ("raw",), 1, "", "; not judged: 1 topic without a ROS name (raw)\n"),
+        ("new", ("raw",), 1, "/t publish DDS topic raw (/talker): no rule names publish raw", ""),
     ],
 )
 def test_on_zenoh_the_files_of_the_keystore_decide(
@@ -120,7 +123,11 @@ def test_on_zenoh_the_files_of_the_keystore_decide(
     if files == "old":
         for file in Path("before").rglob("*.json5*"):
             shutil.copy(file, "ks" / file.relative_to("before"))
-    ended = program(graph(("/t", *LOUD[1:])), "ks", *SHORT, *words)
+    if files == "damaged":
+        Path("ks/enclaves/t/permissions.p7s").write_text("")
+    raw = ("publish raw",) if "raw" in words else ()
+    node = ("/t", *LOUD[1:-1], [*LOUD[-1], *raw])
+    ended = program(graph(node), "ks", *SHORT, *(word for word in words if word != "raw"))
     assert (ended.status, ended.out[: len(out)]) == (status, out)
     assert err in ended.err
 
