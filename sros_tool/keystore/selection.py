@@ -356,11 +356,11 @@ def missing_enclave_error(
 ) -> SrosError:
     """Return the error for the missing enclave ``name``, with similar ``existing_enclaves``.
 
-    Without ``may_create``, the error does not suggest creating the enclave.
+    Without ``may_create``, the error does not suggest creating the enclave, also if it was revoked.
     """
     root = keystore.root
     if revocation := revocation_of(keystore, name):
-        return _revoked_enclave_error(keystore, revocation)
+        return _revoked_enclave_error(keystore, revocation, may_create=may_create)
     missing = f"enclave {name} does not exist in keystore '{root}'"
     names = sorted(existing_enclaves)
     if below := [existing for existing in names if name and existing.startswith(f"{name}/")]:
@@ -463,16 +463,24 @@ def revocation_of(keystore: OpenedKeystore, name: str) -> Entry | None:
     return next(kept, of_enclave[-1])
 
 
-def _revoked_enclave_error(keystore: OpenedKeystore, entry: Entry) -> SrosError:
+def _revoked_enclave_error(
+    keystore: OpenedKeystore, entry: Entry, *, may_create: bool
+) -> SrosError:
     root = keystore.root
+    again = f"sros generate_artifacts -k {quote(str(root))} -e {entry.enclave} -p POLICY_FILE"
+    again += " --fleet FLEET_FILE" if (root / FLEET).exists() else ""
+    remedy = f"To use it again, with another key: `{again}`."
+    if not may_create:
+        remedy = (
+            "If the revocation list may lack it, sign the list again: `sros crl "
+            f"{quote(str(root))} --refresh`."
+        )
     reason = "" if entry.reason in ("", "unspecified") else f" ({entry.reason})"
     folder = root / REVOKED / entry.serial
     return KeystoreError(
         f"enclave {entry.enclave} of keystore '{root}' was revoked at {entry.time}{reason}",
         f"Its files are in '{folder}'." if folder.is_dir() else "",
-        f"To use it again, with another key: `sros generate_artifacts -k {quote(str(root))} -e "
-        f"{entry.enclave} -p POLICY_FILE{' --fleet FLEET_FILE' if (root / FLEET).exists() else ''}`"
-        ".",
+        remedy,
     )
 
 

@@ -424,7 +424,8 @@ def test_the_program(tmp_path: Path) -> None:
     done = sros("revoke", root, "/b").ok()
     later = list_file.read_bytes()
     list_file.write_bytes(earlier)
-    assert sros("revoke", root, "/b").status == 2, "the list lacks /b"
+    refused = sros("revoke", root, "/b")
+    assert refused.status == 2 and f"`sros crl {root} --refresh`" in refused.err, "no /b listed"
     list_file.write_bytes(later)
     assert "nothing to do" in sros("revoke", root, "/b").ok().err
     ledger = (root / LEDGER).read_bytes()
