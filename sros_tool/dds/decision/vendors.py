@@ -185,7 +185,7 @@ class VendorTraits:
     """A decision that reads an expression or a default without text crashes the process."""
     topic_names: TopicNames = TopicNames.ANY
     longest_topic_name: int | None = None
-    """Longest topic name that rules match, in bytes; longer topics can still be created."""
+    """Longest topic name that rules match, in bytes; longer names can still be created."""
     creates_topics: bool = False
     """Creating an endpoint first creates its topic; this needs a right to publish or subscribe.
 
