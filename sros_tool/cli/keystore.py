@@ -724,11 +724,6 @@ def _open_rights_notes(root: Path, template: Template) -> list[Note]:
     "--discard-edits", is_flag=True, help="Undo the edits in sros.toml and governance.xml."
 )
 @click.option(
-    "--trust-records",
-    is_flag=True,
-    help="Accept the rights in a ledger of version 0.1, which has no hash chain against tampering.",
-)
-@click.option(
     "--next", "next_stage", is_flag=True, help="Make the change in stages: do only the next stage."
 )
 @click.option(
@@ -749,7 +744,6 @@ def update_keystore(
     domain: str | None,
     take_edits: bool,
     discard_edits: bool,
-    trust_records: bool,
     next_stage: bool,
     allow_looser: bool,
     revoke_old: bool,
@@ -792,16 +786,6 @@ def update_keystore(
     if take_edits and (template_name is not None or discard_edits):
         raise UsageError("--take-edits excludes --template and --discard-edits")
     chosen = (template_name, values, rules, dropped, domain, take_edits, discard_edits)
-    if trust_records:
-        from sros_tool.keystore.lifecycle.update import trust_records as trust
-
-        if next_stage or any(value not in (None, (), False) for value in chosen):
-            raise UsageError(
-                "--trust-records and other changes exclude each other", "", "Give it alone."
-            )
-        update = trust(root, **change_options(dry_run=dry_run))
-        _show_update(update, (), "", as_json)
-        return 0
     if not any(value not in (None, (), False) for value in chosen):
         command = f"sros update_keystore {quote(str(root))} --template production --next"
         raise UsageError(

@@ -3,10 +3,9 @@
 The file has one JSON object per line; lines are only added.  Entries are part of the transaction
 that issues, so the ledger has exactly the certificates and documents that were installed.
 
-The lines are a chain: ``previous`` is the SHA-256 of the line before, without its line end.  On the
-first line that has ``previous``, it is the SHA-256 of all lines before, joined by line ends,
-because earlier versions of sros wrote no chain.  The signed document ``ledger.p7s`` states the
-number of lines and the SHA-256 of the last line.  So a changed, removed, added or truncated line is
+The lines are a chain: ``previous`` is the SHA-256 of the line before, without its line end, or of
+nothing on the first line.  The signed document ``ledger.p7s`` states the number of lines and the
+SHA-256 of the last line.  So a changed, removed, added or truncated line is
 noticed.  If a fault is noticed when a line is added, an entry ``gap`` before the new line records
 the fault.
 
@@ -158,14 +157,12 @@ class Ledger(NamedTuple):
 
     ``gaps`` are clauses about missing, changed or unreadable lines.  Faults from before the present
     CAs are left out, because nothing that earlier CAs signed is valid.  ``certain`` are the entries
-    after the last gap, among which none is missing.  ``unchained`` is the number of lines before
-    the chain, from which lines may have been removed.  ``lines`` is the number of all lines.
+    after the last gap, among which none is missing.  ``lines`` is the number of all lines.
     """
 
     entries: tuple[Entry, ...] = ()
     gaps: tuple[str, ...] = ()
     certain: tuple[Entry, ...] = ()
-    unchained: int = 0
     lines: int = 0
 
     def next_number(self) -> int:
@@ -626,9 +623,7 @@ class LedgerFile:
                     self._entries[posting.digest] = _entry_at(posting, index, file)
         entries = tuple(self._entries[posting.digest] for posting in postings)
         numbers = [posting.number for posting in postings]
-        return _ReadLines(
-            entries, numbers, (), head.lines, 0, True, head.last, head.last, ended=True
-        )
+        return _ReadLines(entries, numbers, (), head.lines, head.last, head.last, ended=True)
 
     def _read_head(self, read_content: Callable[[Path, str], bytes]) -> _Head | None:
         """Return the head of the ledger; None if there is none."""
@@ -733,15 +728,15 @@ class LedgerFile:
 
         stated = head.lines if head else 0
         read = _read_lines(indexed(), _IN_NO_LINE, stated, _MOST_LINES, _MOST_BYTES)
-        if read is None or read.faults or read.unchained:
+        if read is None or read.faults:
             return index, False
-        return index, not _head_fault(head, read.lines, read.signed, is_chained=read.chained)
+        return index, not _head_fault(head, read.lines, read.signed)
 
     def _compared_with_head(self, files: _OpenedFiles, read: _ReadLines) -> _Reading:
         if not read.lines:
             return self._without_lines(file_exists=files.state is not None)
         entries, numbers, faults = read.entries, read.numbers, [*read.faults]
-        if fault := _head_fault(files.head, read.lines, read.signed, is_chained=read.chained):
+        if fault := _head_fault(files.head, read.lines, read.signed):
             faults.append(fault)
         if files.later:
             text = f"{files.later} is a later part of the ledger, so an earlier ledger was put back"
@@ -756,12 +751,10 @@ class LedgerFile:
             entries,
             tuple(dict.fromkeys(fault.text for fault in all_faults if fault.line >= start)),
             entries[bisect_right(numbers, last_fault) :],
-            0 if start > read.unchained else read.unchained,
             read.lines,
         )
         unrecorded = [fault for fault in faults if fault.line >= last_recorded]
-        sound = not (faults or read.unchained)
-        return _Reading(ledger, unrecorded, read.previous, read.ended, sound)
+        return _Reading(ledger, unrecorded, read.previous, read.ended, not faults)
 
     def _open(self, name: str = LEDGER) -> BinaryIO | None:
         """Return the ledger file, or its part ``name``, open for reading; None if there is none.
@@ -882,17 +875,14 @@ def _last_line_digest(file: BinaryIO, size: int) -> str:
 class _ReadLines(NamedTuple):
     """The entries in a ledger with the ``numbers`` of their lines, and the faults of the chain.
 
-    ``unchained`` is the number of lines before the chain, ``lines`` the number of all lines.
-    ``signed`` is the digest of the line that the head states as the last one.  The other fields are
-    as in `_Reading`.
+    ``lines`` is the number of all lines.  ``signed`` is the digest of the line that the head states
+    as the last one.  The other fields are as in `_Reading`.
     """
 
     entries: tuple[Entry, ...]
     numbers: Sequence[int]
     faults: Sequence[_Fault]
     lines: int
-    unchained: int
-    chained: bool
     signed: str
     previous: str
     ended: bool
@@ -910,22 +900,17 @@ def _read_lines(
     numbers = array("Q")
     faults: list[_Fault] = []
     damaged = 0  # number of lines directly before this one that are not entries
-    unchained = number = size = 0
-    chained = False
-    before = line = b""
+    number = size = 0
+    line = b""
     # The digests of the previous line, and of the line with the number ``stated``.
-    last = signed = ""
-    all_before = hashlib.sha256()
+    last, signed = _sha256(b""), ""
     for number, line in enumerate(lines, 1):
         size += len(line)
         if number > maximum or size > most_bytes:
             return None
         text = line.removesuffix(b"\n")
-        if not chained and number > 1:
-            all_before.update((b"\n" if number > 2 else b"") + before)
         if (
-            chained
-            and not damaged
+            not damaged
             and needed_text not in text
             and text.endswith(b'","previous":"%b"}' % last.encode())
             and _GAP_TEXT not in text
@@ -937,31 +922,21 @@ def _read_lines(
         else:
             if damaged:
                 faults.append(_not_entries_fault(number - 1, damaged))
-            if chained and not entry.previous:
+            if not entry.previous:
                 faults.append(_Fault(number, f"line {number} was added by another program"))
-            elif entry.previous:
-                expected = last if chained else all_before.hexdigest()
-                if entry.previous != expected and not damaged:
-                    reason = f"before line {number}, a line was changed or removed"
-                    faults.append(_Fault(number - 1, reason))
-                if not chained:
-                    chained, unchained = True, number - 1
+            elif entry.previous != last and not damaged:
+                reason = f"before line {number}, a line was changed or removed"
+                faults.append(_Fault(number - 1, reason))
             damaged = 0
             entries.append(entry)
             numbers.append(number)
-        before, last = text, _sha256(text)
+        last = _sha256(text)
         if number == stated:
             signed = last
     if damaged:
         faults.append(_not_entries_fault(number, damaged))
-    if not chained:
-        unchained = number
-        if number:
-            all_before.update((b"\n" if number > 1 else b"") + before)
-    previous = last if chained else all_before.hexdigest()
     ended = line.endswith(b"\n") or not number
-    read = tuple(entries)
-    return _ReadLines(read, numbers, faults, number, unchained, chained, signed, previous, ended)
+    return _ReadLines(tuple(entries), numbers, faults, number, signed, last, ended)
 
 
 @lru_cache(maxsize=4)  # a verb asks several times
@@ -1084,14 +1059,13 @@ class _Head(NamedTuple):
     index_root: str = ""
 
 
-def _head_fault(head: _Head | None, lines: int, signed: str, *, is_chained: bool) -> _Fault | None:
+def _head_fault(head: _Head | None, lines: int, signed: str) -> _Fault | None:
     """Return the fault if a ledger and its signed head disagree, or None.
 
     ``signed`` is the digest of the line that the head states as the last one.
     """
     if not head:
-        text = f"{LEDGER_HEAD}, which signs the end of the ledger, is missing"
-        return _Fault(lines, text) if is_chained else None
+        return _Fault(lines, f"{LEDGER_HEAD}, which signs the end of the ledger, is missing")
     if head.fault:
         return _Fault(lines, head.fault)
     if head.lines > lines:

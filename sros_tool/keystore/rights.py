@@ -968,16 +968,12 @@ For more enclaves, the whole ledger is read.
 class _LedgerPermissions:
     """The permissions in the ledger, or in the part of the ledger about some enclaves.
 
-    ``last`` maps enclaves to their last permissions.  ``chained`` are the enclaves with permissions
-    in the lines that have a hash chain.  ``certain`` are the enclaves with permissions after the
-    last gap.
+    ``last`` maps enclaves to their last permissions.  ``certain`` are the enclaves with
+    permissions after the last gap.
     """
 
     def __init__(self, ledger: Ledger, keystore: OpenedKeystore) -> None:
         self.gaps = ledger.gaps
-        self.unchained = ledger.unchained
-        chained = ledger.entries[ledger.unchained :]
-        self.chained = {entry.enclave for entry in chained if entry.what == "permissions"}
         # The first write of sros records the files of ros2/sros2.
         self.complete = not keystore.was_written_only_by_sros2
         self.last = {
@@ -1046,13 +1042,6 @@ class RecordedRights:
             return self.last_entry(name)
         return None
 
-    def unproven_entries(self) -> dict[str, Entry]:
-        """Map enclaves to their last entries if these are from before the hash chain."""
-        of_all = self._whole_ledger
-        if not of_all.unchained:
-            return {}
-        return {name: entry for name, entry in of_all.last.items() if name not in of_all.chained}
-
     def policy(self, name: str, digest: str) -> str:
         """Return the SHA-256 of the policy of an enclave's permissions; "" if the ledger lacks it.
 
@@ -1076,15 +1065,6 @@ class RecordedRights:
                 "missing."
             )
             more = f" With --all in place of {name}, the command states the rights of all enclaves."
-        elif recorded.unchained and name not in recorded.chained:
-            why = (
-                f"Nothing shows whether one of the first {recorded.unchained} lines of the ledger "
-                "was removed, so later permissions may be missing."
-            )
-            more = (
-                " If you know that nobody else could change the ledger since version 0.1 of sros "
-                f"wrote it, run `sros update_keystore {quote(str(self._root))} --trust-records`."
-            )
         elif not last and recorded.complete:
             why = "The ledger has no permissions for this enclave."
         else:

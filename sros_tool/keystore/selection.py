@@ -167,7 +167,7 @@ def _is_revoked(keystore: OpenedKeystore, name: str, now: datetime) -> bool:
     if len(lists) != 1 or len(authorities) != 1 or not signed_by(lists[0].list, authorities[0]):
         return False
     ledger = keystore.ledger
-    if ledger.gaps or ledger.unchained or restored_at(keystore):
+    if ledger.gaps or restored_at(keystore):
         return False
     listed = {entry.serial for entry in lists[0].revoked}
     return _valid_serials(keystore, name, now) <= listed

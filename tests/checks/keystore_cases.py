@@ -531,13 +531,6 @@ def _(bench: Bench) -> None:
     own.write_bytes(data)
 
 
-@case("keystore.ledger-unchained", "keystore.ledger-unproven")
-def _(bench: Bench) -> None:
-    bench.unlink("ledger.p7s")
-    ledger = bench.path("ledger.jsonl")
-    ledger.write_text(re.sub(r',"previous":"[0-9a-f]+"', "", ledger.read_text()))
-
-
 # ── the ledger, and policies ───────────────────────────────────────────────────────────────
 
 

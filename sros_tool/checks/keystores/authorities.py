@@ -15,7 +15,7 @@ from cryptography.hazmat.primitives.asymmetric import ec, rsa
 
 from sros_tool.checks.keystores.files import UNREADABLE, key_mode_findings
 from sros_tool.checks.keystores.opened import CheckedKeystore
-from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind, names_text
+from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind
 from sros_tool.dds.decision.vendors import FAST_DDS, Vendor
 from sros_tool.errors import SrosError
 from sros_tool.faults import ORIGINAL_KEYSTORE, WAIT_FOR_CA
@@ -308,29 +308,6 @@ LEDGER_DAMAGED = FindingKind(
     "digest of the last line.",
     LEDGER_REMEDY,
 )
-LEDGER_UNCHAINED = FindingKind(
-    "keystore.ledger-unchained",
-    NOTE,
-    "a ledger with lines of an earlier sros, which no hash chain protects",
-    "If one of these lines was removed, nothing shows it.",
-    "sros: each line of ledger.jsonl has the digest of the line before it; ledger.p7s has the "
-    "digest of the last line.",
-    "New lines are chained. Once the CAs are replaced (`sros rotate_ca KEYSTORE --next`), the "
-    "earlier lines no longer matter.",
-)
-LEDGER_UNPROVEN = FindingKind(
-    "keystore.ledger-unproven",
-    WARNING,
-    "enclaves whose rights are recorded only in ledger lines without a hash chain",
-    "Version 0.1 of sros wrote such lines. Anyone who can remove such a line can put earlier "
-    "permissions back, so `sros renew`, `sros zenoh` and `sros rotate_ca` leave these enclaves out "
-    "or refuse them.",
-    "sros: each line of ledger.jsonl has the digest of the line before it; ledger.p7s has the "
-    "digest of the last line.",
-    "If you know that nobody else could change the keystore, run `sros update_keystore KEYSTORE "
-    "--trust-records`. Otherwise state the rights again, with `sros generate_artifacts -k KEYSTORE "
-    "-p POLICY_FILE` or `sros create_permission KEYSTORE ENCLAVE POLICY_FILE`.",
-)
 CLOCK_BEHIND = FindingKind(
     "keystore.clock-behind",
     WARNING,
@@ -493,15 +470,6 @@ def _settings_and_ledger_findings(keystore: CheckedKeystore) -> Iterator[Finding
         yield from _restore_findings(keystore, file)
     for gap in keystore.ledger.gaps:
         yield LEDGER_DAMAGED.found("ledger", gap, file)
-    if count := keystore.ledger.unchained:
-        yield LEDGER_UNCHAINED.found(
-            "ledger", f"{counted(count, 'line')} without a hash chain", file
-        )
-        from sros_tool.keystore.rights import RecordedRights
-
-        unproven = RecordedRights(keystore.opened, keystore.ledger).unproven_entries()
-        if names := [name for name in keystore.names if name in unproven]:
-            yield LEDGER_UNPROVEN.found("ledger", names_text(names), file)
 
 
 def _authority(

@@ -1021,7 +1021,7 @@ class _EnclaveMaker:
             since = subjects_since_restore(keystore, keystore.ledger) if is_restored else None
         except SrosError:
             return "a sealed part of the ledger is in an archive", working, None
-        if ledger.gaps or ledger.unchained:
+        if ledger.gaps:
             return "entries of the ledger may be missing", working, None
         if may_have_later_releases(keystore):
             return "the published folder has later releases than the keystore knows", working, None

@@ -397,10 +397,6 @@ class RevocationListSigner:
         serials = {entry.serial for entry in self._last.values()}
         ledger = self._keystore.ledger_file.with_values("serial", serials)
         why = list(ledger.gaps)
-        if ledger.unchained:
-            why.append(
-                f"nothing shows whether one of its first {ledger.unchained} lines was removed"
-            )
         recorded = {int(entry.serial, 16) for entry in ledger.entries if entry.serial}
         lacking = (
             name for name, entry in self._last.items() if int(entry.serial, 16) not in recorded

@@ -56,7 +56,6 @@ from sros_tool.keystore.layout import (
     enclave_path,
     waits_for_answer,
 )
-from sros_tool.keystore.ledger import Entry
 from sros_tool.keystore.lifecycle.change import (
     Changed,
     ChangeOptions,
@@ -82,7 +81,7 @@ from sros_tool.keystore.lifecycle.replaced import (
 )
 from sros_tool.keystore.lifecycle.rotation import RotationStage, read_rotation
 from sros_tool.keystore.reader import OpenedKeystore
-from sros_tool.keystore.rights import RecordedRights, SignedRights
+from sros_tool.keystore.rights import SignedRights
 from sros_tool.keystore.settings import (
     PresentSettings,
     edit_remedy,
@@ -105,7 +104,6 @@ from sros_tool.translate import (
     protection_for,
 )
 from sros_tool.translate_zenoh.graph import shared_nodes
-from sros_tool.validity import iso
 from sros_tool.xml import read_bytes
 from sros_tool.zenoh.configuration import ZenohNetwork, check_network
 
@@ -707,65 +705,6 @@ class _Updater:
         if read_rotation(self._change.keystore).stage is RotationStage.NONE:
             return f"`{command}{role} --next` begins that"
         return f"`{command} --next` goes on with the rotation that is under way"
-
-
-# ── rights that only an old ledger has ─────────────────────────────────────────────────────
-
-
-def trust_records(root: Path, **options: Unpack[ChangeOptions]) -> KeystoreUpdate:
-    """Record again the permissions that sros 0.1 recorded without a chain of ledger lines.
-
-    Permissions are recorded only if the permissions CA signed them and they are the last ones of
-    their enclave in the ledger.  If any enclave has other permissions, nothing is written.
-
-    Raises:
-        KeystoreError: the ledger is damaged, no enclave needs this, or an enclave has other
-            permissions than the last ones in the ledger.
-    """
-    with KeystoreChange(root, **options) as change:
-        ledger = change.ledger
-        if ledger.gaps:
-            raise KeystoreError(
-                f"the ledger of '{root}' is damaged: {ledger.gaps[0]}",
-                "Damaged records cannot be trusted.",
-                f"See `sros check {quote(str(root))}`.",
-            )
-        last = RecordedRights(change.keystore, ledger).unproven_entries()
-        names = [name for name in change.names if name in last]
-        if not names:
-            raise KeystoreError(
-                f"'{root}' has no enclave with rights that are only in ledger lines without a chain"
-            )
-        entries: list[Entry] = []
-        other_names: list[str] = []
-        for name in names:
-            state = change.keystore.enclave(name, now=change.now)
-            message = state.files.get(PERMISSIONS_FILE, b"")
-            if state.grant and hashlib.sha256(message).hexdigest() == last[name].sha256:
-                entries.append(
-                    last[name]._replace(time=iso(change.now), reason="taken on trust", previous="")
-                )
-            else:
-                other_names.append(name)
-        if other_names:
-            raise KeystoreError(
-                f"the permissions of {', '.join(other_names)} are not the last ones in the ledger",
-                "Perhaps older permissions were put back, with rights that were removed since.",
-                f"State their rights with `sros create_permission {quote(str(root))} "
-                f"{' '.join(map(quote, other_names))} POLICY_FILE`, and try again.",
-            )
-        change.open_authorities()
-        change.entries += entries
-        change.record()
-        change.transaction.commit()
-    text = (
-        f"accepted without proof: the rights of {', '.join(names)}, as the ledger has them in "
-        "lines without a chain. If somebody removed one of these lines, older "
-        "permissions may be in force again: compare them with your policy (`sros diff_policy`)."
-    )
-    change.remarks.append(Note("keystore.taken-on-trust", text))
-    name = change.template.name
-    return change.result(KeystoreUpdate, before=name, after=name)
 
 
 def set_zenoh(
