@@ -42,9 +42,12 @@ _MOST_COMMANDS = 10_000
 """Number of commands of processes that are kept; of others, the start command is not known."""
 _SHELL_VARIABLES = re.compile(
     r"_|SHLVL|PWD|OLDPWD|COLUMNS|LINES|PS[0-4]|PROMPT_COMMAND|HIST\w+|TERM\w*|COLORTERM|LS_COLORS"
-    rf"|LESS(OPEN|CLOSE)|debian_chroot|VIRTUAL_ENV_PROMPT|{DOMAIN}"
+    r"|LESS(OPEN|CLOSE)|debian_chroot|VIRTUAL_ENV_PROMPT"
+    rf"|INVOCATION_ID|JOURNAL_STREAM|SYSTEMD_EXEC_PID|MEMORY_PRESSURE_\w+|{DOMAIN}"
 )
-"""Matches variables that differ between shells, are of interactive shells, or that commands set."""
+"""Matches variables that differ between shells, that interactive shells, systemd or the start
+commands set.
+"""
 
 _StartedProcesses = dict[tuple[str, ...], tuple[Process, ProcessOrigin]]
 """Processes by their commands, with what started them."""
@@ -215,8 +218,16 @@ def _observed_processes(
 
 
 def _show_variables(running: RunningRobot, observed: ObservedProcesses) -> None:
-    """Print variables of the processes that neither their commands nor this shell set."""
-    robot, rmws = running.robot, {process.pid: process.rmw for process in observed.processes}
+    """Print variables of processes that neither their commands nor this shell set.
+
+    Processes that a unit or a container starts keep their variables.
+    """
+    robot = running.robot
+    rmws = {
+        process.pid: process.rmw
+        for process in observed.processes
+        if not process.unit and not process.container
+    }
     by_variables: dict[tuple[str, ...], list[str]] = {}
     for process in running.processes.processes:
         unset = process.environment.keys() - robot.shell.environment.keys()

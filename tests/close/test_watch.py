@@ -14,11 +14,14 @@ from sros_tool.runtime.processes import Process, ProcessOrigin, RunningProcesses
 def test_variables_that_a_command_does_not_set_are_named() -> None:
     variables = {"HOME": "/", "RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp", "GAIN": "2"}
     talkers = tuple(
-        Process(pid, ("talk",), {**variables, "PS1": "$ ", "HISTSIZE": "1"}, datetime.now(UTC))
-        for pid in (1, 2)
+        Process(pid, ("talk",), {**variables, "PS1": "$ ", "INVOCATION_ID": "1"}, datetime.now(UTC))
+        for pid in (1, 2, 3)
     )
-    origin = ProcessOrigin("", "/opt")
-    closed = [ClosedProcess.from_process(of, "/talker", origin, "program") for of in talkers]
+    origins = [ProcessOrigin("", "/opt"), ProcessOrigin("", "/opt"), ProcessOrigin("a.service", "/")]
+    closed = [
+        ClosedProcess.from_process(process, "/talker", origin, "program")
+        for process, origin in zip(talkers, origins, strict=True)
+    ]
     shown: list[str] = []
     shell = SimpleNamespace(environment={"HOME": "/root"}, say=shown.append)
     robot = SimpleNamespace(shell=shell, commands_file="commands.txt")
