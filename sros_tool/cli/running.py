@@ -440,7 +440,8 @@ class _VerbWithCommandAfterDashes(_VerbWithCommand):
     type=click.Choice([job.value for job in Job]),
     help="renew: renew enclaves that expire soon, daily. check: check the keystore "
     "daily. metrics: write the keystore's metrics every 15 minutes. fleet: write the metrics of "
-    "`sros fleet status` every 15 minutes. collect: run `sros fleet collect KEYSTORE INBOX "
+    "`sros fleet status` every 15 minutes. status: run `sros fleet status` each morning, and "
+    "fail if something has to be done. collect: run `sros fleet collect KEYSTORE INBOX "
     "--publish PUB` every 5 minutes. guard: watch all ROS processes of the machine "
     "(runs as root, without a timer). agent: run `sros agent` for the security folder KEYSTORE of "
     "a robot every 5 minutes.  Can be repeated.",
@@ -461,8 +462,8 @@ class _VerbWithCommandAfterDashes(_VerbWithCommand):
 @click.option(
     "--max-age",
     metavar="DURATION",
-    help="With --job fleet: robots without a confirmation for longer than this are offline. "
-    "[default: 1d for robots that fetch]",
+    help="With --job fleet and --job status: robots without a confirmation for longer than this "
+    "are offline. [default: 1d for robots that fetch]",
 )
 @click.option(
     "--target",
@@ -536,6 +537,7 @@ def units(
       $ sros units /etc/sros/keystore --job agent units  # on a robot
     """
     from sros_tool.runtime.units import (
+        FLEET_STATUS_JOBS,
         SIGNING_JOBS,
         WrittenUnits,
         job_units,
@@ -556,8 +558,8 @@ def units(
         raise UsageError(
             "--job collect needs --inbox INBOX and --publish PUB; no other job takes them"
         )
-    if max_age is not None and Job.FLEET not in jobs:
-        raise UsageError("--max-age is only for --job fleet")
+    if max_age is not None and not FLEET_STATUS_JOBS.intersection(jobs):
+        raise UsageError("--max-age is only for --job fleet and --job status")
     if user is not None and Job.GUARD in jobs:
         raise UsageError(
             "--user is not for --job guard",

@@ -81,6 +81,7 @@ class Job(StrEnum):
     CHECK = "check"
     METRICS = "metrics"
     FLEET = "fleet"
+    STATUS = "status"
     COLLECT = "collect"
     GUARD = "guard"
     AGENT = "agent"
@@ -92,6 +93,7 @@ _SCHEDULES = {
     Job.CHECK: "daily",
     Job.METRICS: _OFTEN_SCHEDULE,
     Job.FLEET: _OFTEN_SCHEDULE,
+    Job.STATUS: "07:00",
     Job.COLLECT: "*:0/5",
 }
 _RANDOM_DELAYS = {
@@ -99,8 +101,11 @@ _RANDOM_DELAYS = {
     Job.CHECK: "1h",
     Job.METRICS: "30s",
     Job.FLEET: "30s",
+    Job.STATUS: "30s",
     Job.COLLECT: "30s",
 }
+FLEET_STATUS_JOBS = frozenset({Job.FLEET, Job.STATUS})
+"""The jobs that run `sros fleet status`."""
 SIGNING_JOBS = frozenset({Job.RENEW, Job.COLLECT})
 """The jobs that need the keys of the CAs."""
 
@@ -268,8 +273,8 @@ def job_units(
         writable: folders besides the keystore in which the agent writes.
         inbox: the path of the folder with the messages of robots, for `Job.COLLECT`.
         publishing: the path of the folder in which `Job.COLLECT` publishes releases.
-        max_age: the age of a confirmation from which a robot is offline for `Job.FLEET`; None for
-            the default of `sros fleet status`.
+        max_age: the age of a confirmation from which a robot is offline for `Job.FLEET` and
+            `Job.STATUS`; None for the default of `sros fleet status`.
 
     Raises:
         UsageError: a path cannot be written in a unit.
@@ -310,6 +315,11 @@ def job_units(
                 "# Status 1: some robots lack the current files. The metrics show this.",
                 "SuccessExitStatus=1",
             ],
+        ),
+        Job.STATUS: (
+            f"Fail if something has to be done for the fleet of {root}",
+            ("fleet", "status", root, *oldest, "--fail-on", "unmended"),
+            ["PrivateNetwork=yes"],
         ),
         Job.COLLECT: (
             f"Collect the messages of the fleet of {root}, and publish its releases",

@@ -205,7 +205,7 @@ def test_the_agent_is_of_the_owner_and_may_write_into_its_inbox(made: Path, tmp_
         (("--job", "check", "F", "--passphrase-file", "/x"), "only for --job renew"),
         (("--job", "collect", "F", "--inbox", "/in"), "needs --inbox INBOX and --publish PUB"),
         (("--job", "check", "F", "--publish", "/pub"), "no other job takes them"),
-        (("--job", "check", "F", "--max-age", "15m"), "only for --job fleet"),
+        (("--job", "check", "F", "--max-age", "15m"), "only for --job fleet and --job status"),
         (("--job", "fleet", "F", "--max-age", "15m\nUser=root"), "is not a duration"),
         (("/leg", "F", "--target", "/a b"), "cannot be written in a unit"),
         (("/leg", "F", "--target", "k"), "--target 'k'"),

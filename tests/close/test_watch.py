@@ -17,7 +17,11 @@ def test_variables_that_a_command_does_not_set_are_named() -> None:
         Process(pid, ("talk",), {**variables, "PS1": "$ ", "INVOCATION_ID": "1"}, datetime.now(UTC))
         for pid in (1, 2, 3)
     )
-    origins = [ProcessOrigin("", "/opt"), ProcessOrigin("", "/opt"), ProcessOrigin("a.service", "/")]
+    origins = [
+        ProcessOrigin("", "/opt"),
+        ProcessOrigin("", "/opt"),
+        ProcessOrigin("a.service", "/"),
+    ]
     closed = [
         ClosedProcess.from_process(process, "/talker", origin, "program")
         for process, origin in zip(talkers, origins, strict=True)

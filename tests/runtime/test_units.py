@@ -110,6 +110,7 @@ def test_systemd_finds_nothing_wrong_in_the_jobs(passphrase: str, tmp_path: Path
         "check runtime --watch",
         f"metrics /srv/ks -o {METRICS_FILE}",
         f"fleet status /srv/ks --prometheus -o {FLEET_FILE}",
+        "fleet status /srv/ks --fail-on unmended",
         "fleet collect /srv/ks /srv/in --publish /srv/pub",
     }
     renew = files["sros-renew.service"]
@@ -131,6 +132,7 @@ def test_systemd_finds_nothing_wrong_in_the_mail_of_the_page(tmp_path: Path) -> 
         for block in blocks(page)
         if block.file.startswith("units/")
     }
+    files |= job_units(Job.STATUS, "/srv/keystore", user="root", sros="/bin/true")
     mail = "mail@sros-status.service.service"
     said = verified(tmp_path, files, "sros-status.service", "sros-status.timer", mail)
     assert f"OnFailure: {mail}" in said
