@@ -74,7 +74,7 @@ from sros_tool.translate_zenoh.graph import GRAPH, example_token
 from sros_tool.translate_zenoh.rights import ANY_TYPE, untyped
 from sros_tool.values import shows
 from sros_tool.zenoh.access import AccessControl, Enforcement, Flow, Message, MessageFilter, Remote
-from sros_tool.zenoh.configuration import Mode, RenderedReader, SettingsEdition
+from sros_tool.zenoh.configuration import Mode, RenderedReader
 from sros_tool.zenoh.delivery import (
     Check,
     Delivery,
@@ -557,8 +557,7 @@ class ZenohEvaluator:
         """Return a process's mode, its access control, and its endpoints."""
         data = self.keystore.read(path, "Zenoh configuration")
         rendered = self._rendered.read(data)
-        # In this form of the file, each rule is written once, with the id from the file.
-        if rendered and rendered.edition is SettingsEdition.RULES_ONCE:
+        if rendered:
             texts = rendered.listen if rendered.mode is Mode.ROUTER else rendered.connect
             return rendered.mode, rendered.access_control, tuple(map(ZenohEndpoint, texts))
         document = parse_configuration(data, str(path), lines=False)

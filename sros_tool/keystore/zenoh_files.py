@@ -100,7 +100,6 @@ from sros_tool.zenoh.configuration import (
     Mode,
     RenderedReader,
     RenderedRights,
-    SettingsEdition,
     ZenohNetwork,
     parse_rendered,
     render_configuration,
@@ -413,13 +412,12 @@ def _without_rules_for(
 ) -> bytes | None:
     """Return a configuration without the rules for the enclaves ``names``.
 
-    The result is None if ``names`` is not empty and this version of sros would write the file in
-    another way.
+    The result is None if ``names`` is not empty and this version of sros did not write the file.
     """
     if not names:
         return document
     configuration = reader.read(document)
-    if configuration is None or configuration.edition is not SettingsEdition.RULES_ONCE:
+    if configuration is None:
         return None
     remotes = configuration.access_control.remotes
     kept = tuple(rights for rights in remotes if rights.common_name not in names)

@@ -207,15 +207,12 @@ class AccessControl:
                     yield rule
 
 
-def rule_ids(
-    rules: Sequence[Sequence[Hashable]], names: Sequence[str], *, once: bool = True
-) -> list[list[str]]:
+def rule_ids(rules: Sequence[Sequence[Hashable]], names: Sequence[str]) -> list[list[str]]:
     """Return the ids of rules in a file: a list per remote process, in the order of ``names``.
 
-    With ``once``, a rule that several processes have has one shared id.  In older files, such a
-    rule has an id for each process.
+    A rule that several processes have has one shared id.
     """
-    uses = Counter(rule for of in rules for rule in of if once)
+    uses = Counter(rule for of in rules for rule in of)
     number = count()
     shared = {rule: f"several#{next(number)}" for rule, times in uses.items() if times > 1}
     return [

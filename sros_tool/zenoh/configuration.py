@@ -12,8 +12,8 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from enum import Enum, StrEnum
+from dataclasses import dataclass, replace
+from enum import StrEnum
 from fnmatch import fnmatchcase
 from functools import lru_cache
 from hashlib import sha256
@@ -146,31 +146,13 @@ _MICROSECONDS_UNTIL_CLOSED = 60_000_000
 """Time that a session of rmw_zenoh waits for a stuck receiver before closing the connection."""
 
 
-class SettingsEdition(Enum):
-    """The edition of a configuration file that sros wrote.
-
-    Editions differ in settings that do not affect security, and in the repetition of equal rules.
-    """
-
-    FEW = "few"
-    """Few settings, as in the first files; a session ends if its router is missing."""
-    OF_RMW_ZENOH = "of rmw_zenoh"
-    """All settings of rmw_zenoh that differ from Zenoh's defaults; a session waits for its router.
-
-    The settings are the same in rmw_zenoh 0.1.9, 0.2.10, 0.6.7 and 0.10.5.
-    """
-    RULES_ONCE = "rules once"
-    """The settings of `OF_RMW_ZENOH`; a rule that several enclaves have is written only once."""
-
-
 @dataclass(frozen=True, slots=True)
 class Configuration:
     """The configuration of a Zenoh process: its endpoints and its access control.
 
     The process listens at ``listen`` and connects to ``connect``, in the form ``tls/HOST:PORT``.
     ``revoked`` is the time of the last revocation in UTC, which identifies older files; "" if no
-    enclave was revoked, or if the age of the file does not matter.  ``edition`` is the edition of
-    a file that was read.
+    enclave was revoked, or if the age of the file does not matter.
     """
 
     mode: Mode
@@ -178,17 +160,14 @@ class Configuration:
     connect: tuple[str, ...]
     access_control: AccessControl
     revoked: str = ""
-    edition: SettingsEdition = field(default=SettingsEdition.RULES_ONCE, compare=False)
 
-    def render(self, edition: SettingsEdition = SettingsEdition.RULES_ONCE) -> bytes:
+    def render(self) -> bytes:
         """Return the file as JSON; equal configurations have equal files.
 
         The file does not name the TLS files, which $ZENOH_CONFIG_OVERRIDE has to name.
         """
         rights = [render_rights(remote) for remote in self.access_control.remotes]
-        return render_configuration(
-            self.mode, self.listen, self.connect, rights, self.revoked, edition
-        )
+        return render_configuration(self.mode, self.listen, self.connect, rights, self.revoked)
 
 
 class RenderedRights(NamedTuple):
@@ -204,27 +183,21 @@ def render_configuration(
     connect: tuple[str, ...],
     rights: Iterable[RenderedRights],
     revoked: str = "",
-    edition: SettingsEdition = SettingsEdition.RULES_ONCE,
 ) -> bytes:
     """Return the bytes of `Configuration.render`, from rights that are already rendered."""
-    control = _access_control_text([*rights], once=edition is SettingsEdition.RULES_ONCE)
-    without_control = _text_without_control(mode, listen, connect, revoked, edition)
-    return f"{without_control}{_CONTROL_BEGIN}{control}".encode()
+    without_control = _text_without_control(mode, listen, connect, revoked)
+    return f"{without_control}{_CONTROL_BEGIN}{_access_control_text([*rights])}".encode()
 
 
 _CONTROL_BEGIN = ',\n "access_control": {\n'
 
 
-def _access_control_text(rendered_rights: Sequence[RenderedRights], *, once: bool) -> str:
-    """Return the text of a file's access control.
-
-    With ``once``, a rule that several enclaves have is written once; otherwise, it is repeated for
-    every enclave.
-    """
+def _access_control_text(rendered_rights: Sequence[RenderedRights]) -> str:
+    """Return the text of a file's access control; a rule of several enclaves is written once."""
     rules: dict[str, str] = {}
     lines: dict[str, list[str]] = {"rules": [], "subjects": [], "policies": []}
     names = [rights.name for rights in rendered_rights]
-    every_ids = rule_ids([rights.rules for rights in rendered_rights], names, once=once)
+    every_ids = rule_ids([rights.rules for rights in rendered_rights], names)
     for rights, ids in zip(rendered_rights, every_ids, strict=True):
         rules.update(zip(ids, rights.rules, strict=True))
         own_names = _list([rights.name])
@@ -247,7 +220,6 @@ def _text_without_control(
     listen: tuple[str, ...],
     connect: tuple[str, ...],
     revoked: str,
-    edition: SettingsEdition,
 ) -> str:
     """Return the text of a configuration without access control and the closing brace."""
     document: dict[str, Any] = {
@@ -283,8 +255,7 @@ def _text_without_control(
         },
         "adminspace": {"enabled": False},
     }
-    if edition is not SettingsEdition.FEW:
-        _add_settings_of_rmw_zenoh(document, mode)
+    _add_settings_of_rmw_zenoh(document, mode)
     if revoked:
         document["metadata"] = {_REVOKED_KEY: revoked}
     return json.dumps(document, indent=1).removesuffix("\n}")
@@ -396,19 +367,13 @@ class RenderedReader:
                 return None
             configuration = self._parse_without_rules(beginning)
             rights = self._rendered_rights(sections)
-            edition = configuration.edition
-            if (
-                edition is not SettingsEdition.FEW
-                and _access_control_text(rights, once=True) == control
-            ):
-                edition = SettingsEdition.RULES_ONCE
-            elif _access_control_text(rights, once=False) != control:
+            if _access_control_text(rights) != control:
                 return None
             remotes = tuple(
                 RemoteRights(rendered.name, tuple(map(self._rule, rendered.rules)))
                 for rendered in rights
             )
-            return replace(configuration, access_control=AccessControl(remotes), edition=edition)
+            return replace(configuration, access_control=AccessControl(remotes))
         except (ValueError, KeyError, IndexError, TypeError, RecursionError):
             return None
 
@@ -423,13 +388,10 @@ class RenderedReader:
             mode = Mode(document["mode"])
             listen, connect = (tuple(document[key]["endpoints"]) for key in ("listen", "connect"))
             revoked = document.get("metadata", {}).get(_REVOKED_KEY, "")
-            editions = [
-                edition
-                for edition in SettingsEdition
-                if _text_without_control(mode, listen, connect, revoked, edition) == text
-            ]
+            if _text_without_control(mode, listen, connect, revoked) != text:
+                raise ValueError("not as it is rendered")
             self._beginnings[text] = Configuration(
-                mode, listen, connect, AccessControl(()), revoked, editions[0]
+                mode, listen, connect, AccessControl(()), revoked
             )
         return self._beginnings[text]
 

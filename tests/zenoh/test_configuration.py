@@ -20,7 +20,6 @@ from sros_tool.zenoh.configuration import (
     Configuration,
     Mode,
     RenderedReader,
-    SettingsEdition,
     parse_rendered,
 )
 from sros_tool.zenoh.document import parse_configuration
@@ -39,23 +38,18 @@ SAME = (RIGHTS, RemoteRights("/b", RIGHTS.rules), RemoteRights("/c", ()))
 
 
 @pytest.mark.parametrize("remotes", [(), (RIGHTS,), SAME])
-@pytest.mark.parametrize("settings", SettingsEdition)
 @pytest.mark.parametrize("mode", Mode)
-def test_it_reads_back_as_it_was(
-    mode: Mode, settings: SettingsEdition, remotes: tuple[RemoteRights, ...]
-) -> None:
+def test_it_reads_back_as_it_was(mode: Mode, remotes: tuple[RemoteRights, ...]) -> None:
     control, revoked = AccessControl(remotes), "2026-11-25T00:00:00Z" if remotes else ""
     written = Configuration(mode, ("tls/a:1",), ("tls/b:2",), control, revoked)
-    data = written.render(settings)
+    data = written.render()
     assert parse_rendered(data, "file") == written
     control = json.loads(data)["access_control"]
     assert (control["enabled"], control["default_permission"]) == (True, "deny")
-    once = settings is SettingsEdition.RULES_ONCE
-    stated = min(len(remotes), 1 if once else 2)
-    assert len(control["rules"]) == stated * len(RIGHTS.rules)
+    assert len(control["rules"]) == min(len(remotes), 1) * len(RIGHTS.rules)
     for rule in control["rules"]:
         lines = [line for line in data.decode().splitlines() if json.dumps(rule["id"]) in line]
-        assert len(lines) == (3 if once and remotes is SAME else 2), "a rule, and its policies"
+        assert len(lines) == (3 if remotes is SAME else 2), "a rule, and its policies"
 
 
 def test_another_text_of_the_same_configuration_is_not_one_that_sros_writes() -> None:
