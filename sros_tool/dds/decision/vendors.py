@@ -91,7 +91,7 @@ class Signers(Enum):
     LISTED = auto()
     """Anyone whose certificate is in the permissions CA's file; no chain is needed (2.14)."""
     CHAIN = auto()
-    """Anyone whose S/MIME certificate is in the message and chains to the permissions CA."""
+    """Anyone whose certificate is in the signed document and chains to the permissions CA."""
 
 
 class Hashes(Enum):
