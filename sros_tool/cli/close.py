@@ -375,7 +375,7 @@ def _show_end(
         exceptions = "" if is_asked else ", except for the claims that were not checked"
         if missing := [name for name in closed.without if name not in closed.secured]:
             exceptions += f", without a process of {', '.join(missing)}"
-        answer, details = f"the robot is closed{exceptions}", _validity_lines(closed)
+        answer, details = f"the robot is closed{exceptions}", _validity_lines(robot, closed)
         if robot.keystore.exists():
             details.append(f"bring {folder}/keystore to another machine: it has the CA keys")
     elif closed.proofs:
@@ -416,7 +416,7 @@ def _show_end(
         if not_starting := _advice_without_security(robot, closed):
             following, details = not_starting, []
         answer = f"{_state_text(closed, apply=apply)}; next: {following}"
-        details += _validity_lines(closed)
+        details += _validity_lines(robot, closed)
     echo(answer, err=True)
     for detail in (*details, *_other_machines_lines(robot, closed)):
         echo(f"  {detail}", err=True)
@@ -529,8 +529,15 @@ def _times_text(enclaves: Mapping[str, datetime]) -> str:
     return ", ".join(f"{name} ({iso(moment)})" for name, moment in enclaves.items())
 
 
-def _validity_lines(closed: CloseState) -> list[str]:
-    """Return when the files of the closed processes expire; no line if none runs closed."""
+def _validity_lines(robot: LocalRobot, closed: CloseState) -> list[str]:
+    """Return which files of this machine have expired, or when those of closed processes expire.
+
+    There is no line on files that are valid if no process runs closed.
+    """
+    from sros_tool.close.proof import expired_enclaves, expired_text
+
+    if expired := expired_enclaves(robot, robot.export):
+        return [expired_text(robot, expired)]
     if not (closed.secured and closed.valid_until):
         return []
     from sros_tool.keystore.expiry import renewal_command

@@ -110,7 +110,7 @@ def proofs_of(robot: LocalRobot, state: CloseState, patience: float) -> list[Pro
 
     If the enclave of the observer has expired, only the files are examined.
     """
-    expired = _expired_enclaves(robot, robot.export)
+    expired = expired_enclaves(robot, robot.export)
     if OBSERVER in expired:
         return [_proof_of_files(robot, expired)]
     expected = {process.enclave for process in state.observed.processes} | {*state.new}
@@ -162,7 +162,7 @@ def _proof_of_files(robot: LocalRobot, expired: Sequence[str]) -> Proof:
     holds = {0: True, 1: False}.get(status)
     reason = "sros check finds no error" if holds else "sros could not check them"
     if expired:
-        holds, reason = False, _expired_text(robot, expired)
+        holds, reason = False, expired_text(robot, expired)
     elif holds is False:
         reason = _errors_text(robot, str(robot.export))
     if holds and robot.keystore.exists():  # an outdated export has no error of its own
@@ -221,14 +221,14 @@ def _revoking_advice(robot: LocalRobot) -> str:
     return f"`{robot.close_command}` says how to revoke or keep such an enclave"
 
 
-def _expired_enclaves(robot: LocalRobot, root: Path) -> list[str]:
+def expired_enclaves(robot: LocalRobot, root: Path) -> list[str]:
     """Return the enclaves below ``root`` whose certificate or permissions have expired."""
     lifetimes, _ = survey(OpenedKeystore(root)) if root.exists() else ((), ())
     now = robot.shell.now()
     return [lifetime.name for lifetime in lifetimes if lifetime.first_expiry() < now]
 
 
-def _expired_text(robot: LocalRobot, expired: Sequence[str]) -> str:
+def expired_text(robot: LocalRobot, expired: Sequence[str]) -> str:
     """Return text on expired enclaves of the export, and on how to renew them."""
     text = f"the files of {first_few(expired, MOST_NAMES)} have expired; "
     if not robot.keystore.exists():
@@ -236,7 +236,7 @@ def _expired_text(robot: LocalRobot, expired: Sequence[str]) -> str:
             f"{text}renew them where the keystore is (`{renewal_command(Path('KEYSTORE'))}`), "
             f"export them again, and restart all processes together"
         )
-    if to_renew := [name for name in _expired_enclaves(robot, robot.keystore) if name in expired]:
+    if to_renew := [name for name in expired_enclaves(robot, robot.keystore) if name in expired]:
         words = ("sros", "renew", str(robot.keystore), *to_renew)
         text += f"run `{shlex.join(words)}`"
         if earlier := earlier_files_until(robot, to_renew):

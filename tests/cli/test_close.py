@@ -1767,7 +1767,8 @@ def test_a_robot_whose_files_expire_soon(keystore: Path, tmp_path: Path) -> None
 
     now = state_at(datetime.now(UTC))
     assert now.valid_until and not now.expired_elsewhere
-    (soon,) = close._validity_lines(state_at(now.valid_until - timedelta(days=1)))
+    early = now.valid_until - timedelta(days=1)
+    (soon,) = close._validity_lines(robot_at(early), state_at(early))
     assert soon.endswith("Z; renew them now: sros renew robot/keystore --all-expiring soon")
     later = now.valid_until + timedelta(seconds=1)
     said = close._other_machines_lines(robot_at(later), state_at(later))[-1]
@@ -1779,9 +1780,12 @@ def test_a_robot_whose_files_expire_soon(keystore: Path, tmp_path: Path) -> None
     expired = datetime.now(UTC) + timedelta(days=2)
     said = close._other_machines_lines(robot_at(expired), state_at(expired))[-1]
     (until,) = state_at(expired).earlier_elsewhere.values()
-    here = proof._expired_text(robot_at(expired), ["/operator/look"])
+    here = proof.expired_text(robot_at(expired), ["/operator/look"])
     assert "(with --revoke-old, because earlier files of /operator/look still work for" in here
-    assert "--revoke-old" not in proof._expired_text(robot_at(later), ["/a"])
+    assert "--revoke-old" not in proof.expired_text(robot_at(later), ["/a"])
+    ended = proof.expired_text(robot_at(later), ["/a", "/b"])
+    assert close._validity_lines(robot_at(later), state_at(later)) == [ended]
+    assert ended.startswith("the files of /a, /b have expired; run `sros renew "), ended
     assert timedelta(days=3) < until - expired < timedelta(days=5)
     assert f"the rights until they expire: /operator/look ({iso(until)}); to end this" in said
     (tmp_path / "export/enclaves/b/permissions.p7s").write_bytes(b"damaged")
