@@ -128,7 +128,7 @@ def prepare(robot: LocalRobot, duration: str | None, *, partial: bool, dry_run: 
     if dry_run or is_stopped:
         return state._replace(problems=problems, changes=ignored)
     denied_rights = _denied_rights(robot)
-    remappings = _denied_remappings(denied_rights, state.observed.processes)
+    remappings = denied_remappings(denied_rights, state.observed.processes)
     state = state._replace(denied_remappings=remappings)
     changes = [*ignored, *write_start_files(robot, state), *removed]
     denied = [str(right) for right in denied_rights]
@@ -219,10 +219,13 @@ def _denied_rights(robot: LocalRobot) -> Sequence[DeniedRight]:
     return nodes.denied_rights(nodes.expected())
 
 
-def _denied_remappings(
+def denied_remappings(
     denied: Sequence[DeniedRight], processes: Sequence[ClosedProcess]
 ) -> dict[str, Sequence[str]]:
-    """Map enclaves to the remapping rules of their start commands that give a denied name."""
+    """Map enclaves to the remapping rules of their start commands that give a denied name.
+
+    A rule for one node counts for this node only.  Rules that name the node itself are left out.
+    """
     remappings: dict[str, Sequence[str]] = {}
     for process in processes:
         names = {
@@ -232,9 +235,13 @@ def _denied_remappings(
             for node in right.nodes
         }
         rules = [
-            f"{old}:={new}"
-            for _, old, new in remapping_rules(process.command)
-            if any(expand(new, ns or "/", node) == name for ns, node, name in names)
+            f"{of_node}{':' * bool(of_node)}{old}:={new}"
+            for of_node, old, new in remapping_rules(process.command)
+            if not old.startswith("__")
+            and any(
+                of_node in ("", node) and expand(new, ns or "/", node) == name
+                for ns, node, name in names
+            )
         ]
         if rules:
             remappings[process.enclave] = rules

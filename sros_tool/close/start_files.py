@@ -123,7 +123,7 @@ def _commands_text(robot: LocalRobot, state: CloseState) -> str:
     if rest:
         lines += ["", "# These processes run closed, with the current files."]
     lines += _command_lines(rest, folder, state.denied_remappings)
-    lines += _commands_elsewhere(state.observed.moved, folder)
+    lines += commands_elsewhere(state.observed.moved, folder)
     if shutil.which("ros2", path=robot.shell.environment.get("PATH")):
         launch = shlex.join(launch_words(folder, ("ros2", "launch"), ("PACKAGE", "FILE")))
         lines += ["", "# Any launch file; each process needs name= in it.", launch]
@@ -151,7 +151,7 @@ def _command_lines(
         yield command
 
 
-def _commands_elsewhere(moved: Sequence[ClosedProcess], folder: Path) -> Iterator[str]:
+def commands_elsewhere(moved: Sequence[ClosedProcess], folder: Path) -> Iterator[str]:
     """Yield comments with the commands of processes that moved from here to other machines.
 
     Launches and containers are left out: their files belong to this machine.

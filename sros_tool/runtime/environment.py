@@ -313,7 +313,8 @@ def remapping_rules(command: Sequence[str]) -> Iterator[tuple[str, str, str]]:
             of_ros = False
         elif of_ros and before in _REMAP_OPTIONS:
             rule, _, value = word.partition(":=")
-            node, _, what = rule.rpartition(":")
+            # rcl allows rostopic:// or rosservice:// in front of the name (lexer.c).
+            node, _, what = re.sub("ros(topic|service)://", "", rule).rpartition(":")
             yield node, what, value
 
 
