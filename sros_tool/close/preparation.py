@@ -52,7 +52,7 @@ from sros_tool.keystore.rights import load_rights
 from sros_tool.keystore.selection import revocation_of
 from sros_tool.names import expand
 from sros_tool.policy.document import read_policy
-from sros_tool.policy.rights import policy_rights
+from sros_tool.policy.rights import Rules, policy_rights
 from sros_tool.proof.requirements import RightsRequirement, read_requirements
 from sros_tool.runtime.environment import RMW_ZENOH, node_argument, remapping_rules
 from sros_tool.runtime.processes import SEVERAL_USERS, without_launch_files
@@ -345,11 +345,14 @@ def _lost_protection(robot: LocalRobot) -> Iterator[str]:
     """Yield a text for each requirement with a name that only the signed permissions have.
 
     If the policy gave the name up for another one, the requirement does not protect the new name.
+    A new wildcard in place of the name, in the same enclaves, is no other name.
     """
     if not robot.keystore.exists():
         return
-    signed = {right.name for right in load_rights(OpenedKeystore(robot.keystore)).rights}
-    gone = signed - {right.name for right in policy_rights(read_policy(robot.policy))}
+    signed = load_rights(OpenedKeystore(robot.keystore)).rights
+    stated = policy_rights(read_policy(robot.policy))
+    new_rules, kept = Rules(stated - signed), {right.name for right in stated}
+    gone = {right.name for right in signed if right.name not in kept and not new_rules.cover(right)}
     for requirement in read_requirements(robot.requirements):
         if not isinstance(requirement, RightsRequirement):
             continue

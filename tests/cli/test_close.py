@@ -1710,11 +1710,16 @@ def test_a_requirement_that_lost_its_right_is_told_before_a_review_fails(tmp_pat
     sros("generate_artifacts", "-k", robot.keystore, "-p", robot.policy).ok()
     assert preparation._run_step(robot, guard, partial=False) == ("done", []), "as before"
     robot.requirements.write_text(needed.replace("gone", "x"))
-    robot.policy.write_text(policy_text({"/a": publish("y")}))
-    state_of_step, (problem,) = preparation._run_step(robot, guard, partial=False)
-    assert (
-        state_of_step == "findings" and "toml:1 protects /x, which the policy does not" in problem
-    )
+    for groups, other, lost in (
+        (publish("*"), "", False),  # a wildcard in place of the name
+        (publish("y"), publish("*"), True),  # a wildcard that another enclave has
+        (publish("y"), "", True),
+    ):
+        robot.policy.write_text(policy_text({"/a": groups, "/b": other}))
+        state_of_step, problems = preparation._run_step(robot, guard, partial=False)
+        assert state_of_step == ("findings" if lost else "done"), groups
+        said_now = "toml:1 protects /x, which the policy does not"
+        assert [said_now in problem for problem in problems] == [True] * lost
     assert preparation._run_step(robot, guard, partial=True) == ("done", [])
 
 
