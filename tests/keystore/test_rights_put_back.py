@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
@@ -11,16 +10,12 @@ from pathlib import Path
 import pytest
 
 from sros_tool.errors import KeystoreError
-from sros_tool.keystore.delivery.archive import pack, unpack
 from sros_tool.keystore.delivery.robot import create_request, import_answer
 from sros_tool.keystore.delivery.signing import SignedRequests, sign_request
-from sros_tool.keystore.issuing.authority import load_authorities
-from sros_tool.keystore.issuing.keyring import IN_KEYSTORE
-from sros_tool.keystore.layout import LEDGER, LEDGER_HEAD, SEAL
+from sros_tool.keystore.layout import LEDGER, LEDGER_HEAD
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, create_permission
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.rotate import rotate_ca
-from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.template import load_template
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import Policy
@@ -162,34 +157,6 @@ def test_the_number_of_an_answer_orders_it(later: timedelta, root: Path, tmp_pat
     assert not import_answer(robot, newer, now=NOW).changes
     assert snapshot(robot) == before
     import_answer(robot, older, now=NOW, force=True)
-
-
-def without_number(root: Path, archive: bytes) -> bytes:
-    """Return an answer as an earlier version of sros sealed it."""
-    files = {path: data for path, data in unpack(archive).items() if path != SEAL}
-    digests = sorted(f"{hashlib.sha256(data).hexdigest()}  {path}" for path, data in files.items())
-    listed = "\n".join(["sros answer 1", *digests, ""]).encode()
-    signer = load_authorities(
-        OpenedKeystore(root), OpenedKeystore(root).template, IN_KEYSTORE, NOW
-    ).permissions
-    return pack({SEAL: signer.sign(listed, "the list"), **files})
-
-
-def test_answers_without_a_number(root: Path, tmp_path: Path) -> None:
-    robot = tmp_path / "robot"
-    create_request(robot, "/arm")
-    first = without_number(root, answer(root, tmp_path, "rosout", "wide").archive)
-    second = without_number(
-        root, answer(root, tmp_path, "rosout", now=NOW + timedelta(hours=1)).archive
-    )
-    import_answer(robot, first, now=NOW)
-    import_answer(robot, second, now=NOW)
-    with pytest.raises(KeystoreError, match="older than the installed one"):
-        import_answer(robot, first, now=NOW)
-    import_answer(robot, answer(root, tmp_path, "x", now=NOW + timedelta(hours=2)).archive, now=NOW)
-    with pytest.raises(KeystoreError, match="older than the installed one") as caught:
-        import_answer(robot, second, now=NOW)
-    assert "no number" in caught.value.why
 
 
 def test_a_number_is_never_given_twice(root: Path, tmp_path: Path) -> None:

@@ -285,8 +285,8 @@ def _certificates(path: Path) -> tuple[x509.Certificate, ...]:
 _OPTIONAL_ANSWER_FILES = (*OPTIONAL_FILES, *ZENOH_FILES)
 _REQUIRED_ANSWER_FILES = tuple(file for file in REQUIRED_FILES if file != KEY_FILE)
 _SIGN_REQUEST_AGAIN = "Have the request signed again, and import the new answer."
-_SEAL_HEAD = re.compile(rb"sros answer (?:1|2\nnumber ([1-9][0-9]{0,12}))\n")
-"""Matches the first lines of a seal; earlier versions of sros wrote no number."""
+_SEAL_HEAD = re.compile(rb"sros answer 2\nnumber ([1-9][0-9]{0,12})\n")
+"""Matches the first lines of a seal."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -333,9 +333,9 @@ def seal(files: dict[str, bytes], number: int, authority: Authority) -> bytes:
 
 
 def _answer_number(message: bytes) -> int:
-    """Return the number in a seal; 0 if an earlier version of sros wrote no number."""
+    """Return the number in a seal; 0 for a document that is no seal."""
     head = _SEAL_HEAD.match(smime.parse(message).text)
-    return int(head[1] or 0) if head else 0
+    return int(head[1]) if head else 0
 
 
 def _read_answer(data: bytes) -> RequestAnswer:
@@ -649,9 +649,9 @@ def _lost_revocation_notes(place: Path, answer: RequestAnswer) -> Iterator[Note]
 
 
 def _check_number(path: Path, answer: RequestAnswer, remedy: str) -> bool:
-    """Return whether both answers have numbers, so that the new answer is not older.
+    """Return whether the installed answer has a number, so that the new answer is not older.
 
-    Without numbers, the caller has to compare times.  ``path`` is the seal of the installed answer.
+    Without one, the caller has to compare times.  ``path`` is the seal of the installed answer.
 
     Raises:
         KeystoreError: the number of the new answer is not higher than the number of the installed
@@ -663,11 +663,7 @@ def _check_number(path: Path, answer: RequestAnswer, remedy: str) -> bool:
     old, new = _answer_number(present), _answer_number(answer.seal)
     if not old or present == answer.seal:
         return bool(old)
-    if not new:
-        why = (
-            f"It has no number, and the installed one has {old}: an earlier sros made this answer."
-        )
-    elif new < old:
+    if new < old:
         why = f"It has the number {new}, and the installed answer has {old}."
     elif new == old:
         why = f"Both answers have the number {old}, so the keystore's ledger was reset in between."
