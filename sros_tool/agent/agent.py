@@ -1258,7 +1258,13 @@ def _write_message(inbox: Path, robot: str, message: bytes) -> None:
         raise UnavailableError(
             f"the message cannot be written into '{inbox}'",
             f"{error.strerror or error}.",
-            "The agent tries again at its next run.",
+            "The agent tries again at its next run."
+            + (
+                " If a unit runs it, `sros units --job agent`, run after `sros agent init`, writes a "
+                "unit that may write there."
+                if error.errno == errno.EROFS
+                else ""
+            ),
         ) from error
 
 

@@ -156,8 +156,11 @@ def _toml_boolean(value: bool) -> str:
     return "true" if value else "false"
 
 
-def read_settings(folder: Path) -> AgentSettings:
+def read_settings(folder: Path, *, to_run: bool = True) -> AgentSettings:
     """Return the settings of the agent of ``folder``.
+
+    ``to_run`` says that the caller runs the agent: other users must not be able to change the
+    settings then.
 
     Raises:
         KeystoreError: there are no settings, or other users can change them.
@@ -170,7 +173,8 @@ def read_settings(folder: Path) -> AgentSettings:
             f"'{path}' does not exist.",
             "Make it with `sros agent init`.",
         )
-    check_owner(folder)
+    if to_run:
+        check_owner(folder)
     shown_path = f"'{path}'"
     return settings_from(read_toml(read_bytes(path, "agent's settings"), shown_path), shown_path)
 

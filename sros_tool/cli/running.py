@@ -46,7 +46,7 @@ from sros_tool.enclave_environment import (
     other_node_notes,
     target_path,
 )
-from sros_tool.errors import KeystoreError, Note, UnavailableError, UsageError
+from sros_tool.errors import Note, UnavailableError, UsageError
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.runtime.environment import COMPOSE, CONTAINER_FORMS, KUBERNETES, SECRET
 from sros_tool.runtime.units import Job
@@ -606,6 +606,8 @@ def units(
         notes = [*notes, *_passphrase_notes(keystore, passphrase, is_here=target is None)]
         if Job.RENEW in signing:
             notes = [*notes, *_late_renewal_notes(keystore)]
+    writable, inbox_notes = _agent_inbox(root) if Job.AGENT in jobs else ([], [])
+    notes = [*notes, *inbox_notes]
     for job in jobs:
         files |= job_units(
             Job(job),
@@ -614,7 +616,7 @@ def units(
             sros=program or _this_program(),
             passphrase=_without_dots(Path(passphrase)) if passphrase else "",
             domain=domain_of(domain) or 0,
-            writable=_inbox(root) if job == Job.AGENT else (),
+            writable=writable,
             inbox=_without_dots(inbox) if inbox else "",
             publishing=_without_dots(publishing) if publishing else "",
             max_age=parse_duration(max_age) if max_age is not None else None,
@@ -706,15 +708,19 @@ def _validities(keystore: OpenedKeystore) -> Iterator[tuple[str, timedelta]]:
         yield f"files of {first_few(names, 3)}", shortest
 
 
-def _inbox(root: Path) -> tuple[str, ...]:
-    """Return the inbox of the agent of a security folder, if it is a folder of this machine."""
-    from sros_tool.agent.settings import read_settings
+def _agent_inbox(root: Path) -> tuple[list[str], list[Note]]:
+    """Return the inbox of the agent of a security folder if it is a local folder, and notes."""
+    from sros_tool.agent.settings import SETTINGS_FILE, agent_folder, read_settings
 
-    try:
-        inbox = read_settings(root).inbox
-    except KeystoreError:  # units for another machine, or before `sros agent init`
-        return ()
-    return () if "://" in inbox else (inbox,)
+    if not os.access(agent_folder(root) / SETTINGS_FILE, os.R_OK):
+        text = (
+            f"`sros agent init` has not run in '{root}': if the agent's inbox will be a folder "
+            "(not a URL), write the units again afterwards, because the unit lets the agent write "
+            "only into folders that it names"
+        )
+        return [], [Note("units.no-agent", text)]
+    inbox = read_settings(root, to_run=False).inbox
+    return ([] if "://" in inbox else [inbox]), []
 
 
 def _owner(root: Path) -> str:
