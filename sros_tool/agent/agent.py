@@ -1260,8 +1260,8 @@ def _write_message(inbox: Path, robot: str, message: bytes) -> None:
             f"{error.strerror or error}.",
             "The agent tries again at its next run."
             + (
-                " If a unit runs it, `sros units --job agent`, run after `sros agent init`, writes a "
-                "unit that may write there."
+                " If a unit runs it, `sros units --job agent`, run after `sros agent init`, writes "
+                "a unit that may write there."
                 if error.errno == errno.EROFS
                 else ""
             ),
