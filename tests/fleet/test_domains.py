@@ -295,6 +295,20 @@ def test_permissions_are_for_the_domain_in_the_fleet_file(
         assert "loses" not in made.ok().err and '"domain 20"' not in made.out
 
 
+def test_check_wants_the_domain_that_the_keystore_has_for_a_robot(tmp_path: Path) -> None:
+    """As create_permission gives it, also if the fleet file has moved the robot since."""
+    files = {"f.toml": FLEET, "moved.toml": MOVED, "p.xml": POLICY, "new.xml": NEW}
+    for file, text in files.items():
+        (tmp_path / file).write_text(text)
+    sros("create_keystore", "ks", "--domain", "10,20", cwd=tmp_path).ok()
+    words = ("-k", "ks", "-p", "p.xml", "--fleet", "f.toml", "--robot", "p01")
+    sros("generate_artifacts", *words, cwd=tmp_path).ok()
+    sros("create_enclave", "ks", "/p01/new", cwd=tmp_path).ok()
+    for fleet in ("f.toml", "moved.toml"):
+        checked = sros("check", "ks", "--policy", "new.xml", "--fleet", fleet, cwd=tmp_path)
+        assert "are for domain 10,20, but its robot is in domain 10\n" in checked.out, fleet
+
+
 @pytest.mark.parametrize("verb", ["sign_request", "create_permission"])
 @pytest.mark.parametrize(
     ("recorded", "stated"),

@@ -462,9 +462,13 @@ def _domain_findings(enclave: CheckedEnclave, grant: Grant, file: str) -> Iterat
     if grant.default_allow and not allowed.ranges:
         return  # by default, permissions are for every domain
     with suppress(SrosError):
-        recorded, stated = enclave.keystore.fleet, enclave.keystore.at.fleet
-        known = recorded is not None and robot_of(recorded, enclave.name) is not None
-        wanted = EnclaveDomains(governed, recorded if known else stated).domains_of(enclave.name)
+        recorded, fleet = enclave.keystore.fleet, enclave.keystore.at.fleet
+        stated = robot_of(fleet, enclave.name) if fleet else None
+        robots = {enclave.name: stated} if stated else {}
+        # The keystore's fleet decides, also if the fleet file has moved the robot.
+        if robot := EnclaveDomains(governed, recorded, robots).robot_of(enclave.name):
+            robots = {enclave.name: robot}
+            wanted = EnclaveDomains(governed, None, robots).domains_of(enclave.name)
     if allowed == wanted:
         return
     text = f"the permissions are for domain {str(allowed) or 'none'}, but "
