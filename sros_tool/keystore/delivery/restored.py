@@ -443,13 +443,8 @@ def refuse_lost_changes(
         taken = [
             (e.enclave, f"{e.enclave}: {e.what}") for e in changes if e.change == "rights_taken"
         ]
-        texts = [" ".join(text.split()) for text in folded_lines(recorded_fleet(keystore), taken)]
-        for text in texts:
-            _LOG.info("right that was taken away after the backup: %s", text)
-        short = [textwrap.shorten(text, _LONGEST, placeholder=" ...") for text in texts[:_NAMED]]
-        more = "; -v shows more" if short != texts else ""
+        why = _few_changes(keystore, taken, "right that was taken away after the backup")
         perhaps = ", or may have been" * any(": not known, because" in text for _, text in taken)
-        why = f"{'; '.join(short)}{more}"
         what.append(f"rights of {shown(rights)} were taken away{perhaps} ({why})")
         steps.append("Sign the present policy again, with `sros generate_artifacts`.")
         if not (certificates or keys or names["governance"]):
@@ -468,6 +463,15 @@ def refuse_lost_changes(
             "Publishing would undo this.",
             f"{' '.join(steps)} Then repeat this command, with --restored.",
         )
+
+
+def _few_changes(keystore: OpenedKeystore, lines: Sequence[tuple[str, str]], label: str) -> str:
+    """Return the first of the texts in ``lines`` on enclaves, shortened; log all with a label."""
+    texts = [" ".join(text.split()) for text in folded_lines(recorded_fleet(keystore), lines)]
+    for text in texts:
+        _LOG.info("%s: %s", label, text)
+    short = [textwrap.shorten(text, _LONGEST, placeholder=" ...") for text in texts[:_NAMED]]
+    return "; ".join(short) + ("; -v shows more" if short != texts else "")
 
 
 def _missing_step(root: str, missing: Sequence[str]) -> str:
@@ -532,22 +536,22 @@ def check_authorities(keystore: OpenedKeystore, folder: Path, last: Release) -> 
 def other_changes_notes(keystore: OpenedKeystore, changes: Sequence[LaterChange]) -> Iterator[Note]:
     """Yield a note on changes that do not keep the keystore from publishing."""
     texts = {
-        "rights_given": "got rights that the keystore does not give: {}",
-        "missing": "is in the last release of its robot, and the keystore lacks it",
-        "added": "is not in the last release of its robot",
+        "rights_given": "has rights there that the keystore does not give: {}",
+        "added": "is missing there",
     }
     lines = [
         (change.enclave, f"{change.enclave} {texts[change.change].format(change.what)}")
         for change in changes
         if change.change in texts
     ]
+    missing = [change.enclave for change in changes if change.change == "missing"]
+    sentences = [_missing_step(quote(str(keystore.root)), missing)] if missing else []
     if lines:
-        shown = first_few([*folded_lines(recorded_fleet(keystore), lines)], _SHOWN)
-        missing = [change.enclave for change in changes if change.change == "missing"]
-        first = f"{_missing_step(quote(str(keystore.root)), missing)} " if missing else ""
-        yield Note(
-            "fleet.changed-after-backup",
-            f"the releases from after the backup show other changes: {shown}. {first}Sign the "
-            "present policy and fleet again with `sros generate_artifacts`, and remove the "
-            "enclaves that robots should not have any more.",
+        shown = _few_changes(keystore, lines, "difference from the releases after the backup")
+        sentences.append(f"The releases after the backup differ from the keystore: {shown}.")
+    if sentences:
+        sentences.append(
+            "Sign the present policy and fleet again, with `sros generate_artifacts`; revoke "
+            "enclaves that robots should not have."
         )
+        yield Note("fleet.changed-after-backup", " ".join(sentences))
