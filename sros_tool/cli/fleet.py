@@ -605,6 +605,7 @@ class ComparedFleet(NamedTuple):
 @fleet.command("status")
 @keystore_argument()
 @robot_option("Show only this robot of the fleet, with all its problems and files.")
+@click.option("--all", "apart", is_flag=True, help="Show each robot in a line of its own.")
 @click.option(
     "--max-age",
     metavar="DURATION",
@@ -640,6 +641,7 @@ class ComparedFleet(NamedTuple):
 def _status(
     root: Path,
     robots: tuple[str, ...],
+    apart: bool,
     max_age: str | None,
     prometheus: bool,
     html: bool,
@@ -657,12 +659,12 @@ def _status(
     missing; or unknown (never issued by this keystore). Processes use new files only after a
     restart. Confirmations by the Ansible collection and `sros agent` say which restarts are due.
     Confirmations by `sros fleet report` say this only if it saw all processes, or with --restarted.
-    A robot without a recent confirmation is offline. Robots with the same state share a line. A
-    robot that reports a release which was never published has a line of its own, even if its files
-    are current.
-    The first line also counts the robots whose DDS has known vulnerabilities (advisories of sros)
-    that a later release of the same major version fixes. --advisories FILE lists these
-    vulnerabilities, and so does --robot NAME with --fail-on vulnerabilities.
+    A robot without a recent confirmation is offline. Robots with the same state share a line, and
+    there is no table if all are current; with --all, each robot has a line. A robot that reports a
+    release which was never published has a line of its own, even if its files are current.
+    The last line names the robots whose DDS has known vulnerabilities (advisories of sros) that a
+    later release of the same major version fixes. --advisories FILE lists these vulnerabilities,
+    and so does --robot NAME with --fail-on vulnerabilities.
 
     The revocation list is in force on a robot if the robot has the list, and confirms that no
     process has to restart for it. An earlier list that revokes the same certificates counts, too.
@@ -695,6 +697,12 @@ def _status(
 
     if as_json + prometheus + html > 1:
         raise UsageError("--json, --prometheus and --html exclude each other", "", "Choose one.")
+    if apart and (robots or as_json or prometheus or html):
+        raise UsageError(
+            "--all is for the table of robots",
+            "--robot, --json and --prometheus show each robot by itself. --html joins equal ones.",
+            "Leave one of them out.",
+        )
     if as_json and output:
         raise UsageError("--json takes no --output", "", "Leave one of them out.")
     on_vulnerabilities = "vulnerabilities" in fail_on
@@ -755,7 +763,8 @@ def _status(
         )
     else:
         names_them = advisories is not None or (bool(robots) and on_vulnerabilities)
-        lines = _lines(compared, robots, findings=names_them)
+        apart = apart or bool(robots)
+        lines = _lines(compared, robots, apart=apart, findings=names_them)
         text = "".join(f"{visible_line(line)}\n" for line in lines)
     if output and not dry_run:
         echo(save(output, text.encode()), err=True)
@@ -786,16 +795,15 @@ _MOST_LINES, _MOST_GROUPS = 50, 3
 
 
 def _lines(
-    compared_fleet: ComparedFleet, robots: Sequence[str], *, findings: bool
+    compared_fleet: ComparedFleet, robots: Sequence[str], *, apart: bool, findings: bool
 ) -> Iterator[str]:
     """Yield the number of robots by state, a table of robots, and findings on their DDS.
 
-    Unless ``findings`` is set, the findings are only counted.
+    With ``apart``, each robot has a row.  Unless ``findings`` is set, the findings are only
+    counted.
     """
     status = compared_fleet.status
     counts = ", ".join(f"{number} {_state_text(state)}" for state, number in status.counts.items())
-    outdated = len(compared_fleet.outdated_dds)
-    upgrade = f"; {outdated} with a DDS to upgrade (known vulnerabilities)" if outdated else ""
     doubt = next(
         (
             text
@@ -809,9 +817,9 @@ def _lines(
         "",
     )
     doubt = f" ({doubt})" if doubt else ""
-    yield f"{counted(len(status.robots), 'robot')}: {counts}{doubt}{upgrade}"
+    yield f"{counted(len(status.robots), 'robot')}: {counts}{doubt}"
     yield from _fleet_facts(compared_fleet)
-    rows = list(_rows(compared_fleet, robots))
+    rows = list(_rows(compared_fleet, robots, apart=apart))
     widths = [max(len(row[column]) for row in rows) for column in range(4)] if rows else []
     for row in rows:
         cells = (f"{cell:{width}}" for cell, width in zip(row, widths, strict=False))
@@ -1033,20 +1041,21 @@ class _Group(NamedTuple):
 
 def _groups(
     compared_fleet: ComparedFleet,
-    robots: Sequence[str],
     problems: Callable[[RobotStatus], Iterable[str]],
+    *,
+    apart: bool,
 ) -> list[_Group]:
     """Group robots with the same state, remedy and summary; the last group has the current robots.
 
-    If ``robots`` are named, each robot is a group of its own.  ``problems`` returns the clauses of
-    the summary on a robot's problems.
+    With ``apart``, each robot is a group of its own.  ``problems`` returns the clauses of the
+    summary on a robot's problems.
     """
     status, places = compared_fleet.status, _robot_positions(compared_fleet.status.names)
     robots_by_texts: dict[tuple[str, ...], list[RobotStatus]] = {}
     current: list[RobotStatus] = []
     clauses_by_robot: dict[str, str] = {}
     for robot in sorted(status.robots, key=lambda robot: places[robot.robot]):
-        if robots or robot.state != "current" or robot.notes or robot.problems:
+        if apart or robot.state != "current" or robot.notes or robot.problems:
             files = (
                 *_expiry_clauses(robot, compared_fleet.at),
                 *_summary(robot, status.stage, compared_fleet.at),
@@ -1056,7 +1065,7 @@ def _groups(
             what = _CLOCK_SENTENCE.sub("", _without_robot_name("; ".join(clauses), robot.robot))
             clauses_by_robot[robot.robot] = what
             row = (robot.state.value, robot.to_do, *_DURATION.split(what))
-            robots_by_texts.setdefault((*row, robot.robot if robots else ""), []).append(robot)
+            robots_by_texts.setdefault((*row, robot.robot if apart else ""), []).append(robot)
         else:
             current.append(robot)
     groups = []
@@ -1068,11 +1077,14 @@ def _groups(
     return [*groups, _Group(current, "current", "", "")] if current else groups
 
 
-def _rows(compared_fleet: ComparedFleet, robots: Sequence[str]) -> Iterator[tuple[str, ...]]:
+def _rows(
+    compared_fleet: ComparedFleet, robots: Sequence[str], *, apart: bool
+) -> Iterator[tuple[str, ...]]:
     """Yield the header and the rows of a table, or nothing if no robot needs a row."""
     # Of named robots, `_file_details` shows the problems.
-    groups = _groups(compared_fleet, robots, (lambda _: ()) if robots else _gravest_problem)
-    if not robots and all(group.state == "current" for group in groups):
+    problems = (lambda _: ()) if robots else _gravest_problem
+    groups = _groups(compared_fleet, problems, apart=apart)
+    if not apart and all(group.state == "current" for group in groups):
         groups = [group for group in groups if group.what]
     if not groups:
         return
@@ -1104,7 +1116,7 @@ def _page_rows(compared_fleet: ComparedFleet, robots: Sequence[str]) -> Iterator
     def problems(robot: RobotStatus) -> Iterable[str]:
         return robot.problem_clauses if robots else _gravest_problem(robot)
 
-    for group in _groups(compared_fleet, robots, problems):
+    for group in _groups(compared_fleet, problems, apart=bool(robots)):
         status, most = compared_fleet.status, len(group.robots)
         names = _robot_names(group.names, status.names, status.groups, most)
         received = group.oldest_confirmation(compared_fleet.at).received
