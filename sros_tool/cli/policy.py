@@ -250,14 +250,15 @@ def diff_policy(
 ) -> int:
     """Compare the rights that A and B give: "-" is only in A, "+" only in B.
 
-    A and B are policy files, permissions (.p7s or .xml), folders of enclaves, keystores, exports,
-    or Zenoh configurations such as router.json5. Permissions and Zenoh rules are shown in ROS
-    terms; the signature of permissions is verified if the permissions CA is next to them. "!" marks
-    a right of B whose counterpart, such as the subscriber, only A has. If A or B covers only some
-    enclaves, as an export does, only these are compared. A policy may lack Zenoh routers: if they
-    have only the rights that every node needs, a note names them in place of a difference. Lines
-    that differ only in the robot of a fleet are shown as one. Two policies are also compared by the
-    protection that they demand, two keystores by their governance.
+    "~" marks an enclave that has the same rights under another name. A and B are policy files,
+    permissions (.p7s or .xml), folders of enclaves, keystores, exports, or Zenoh configurations
+    such as router.json5. Permissions and Zenoh rules are shown in ROS terms; the signature of
+    permissions is verified if the permissions CA is next to them. "!" marks a right of B whose
+    counterpart, such as the subscriber, only A has. If A or B covers only some enclaves, as an
+    export does, only these are compared. A policy may lack Zenoh routers: if they have only the
+    rights that every node needs, a note names them in place of a difference. Lines that differ only
+    in the robot of a fleet are shown as one. Two policies are also compared by the protection that
+    they demand, two keystores by their governance.
 
     The exit status is 1 if A and B differ (notes name differences that are not in the rights),
     or if DDS would refuse A or B.
@@ -309,7 +310,7 @@ def diff_policy(
     elif form == "markdown":
         echo_lines(rights_markdown(first, second, compared))
     else:
-        lines = _difference_lines(difference, first.fleet, second.fleet)
+        lines = folded_differences(first, second, difference)
         lines += enclave_lines(compared, first.fleet or second.fleet)
         unanswered = unanswered_lines(compared, second.fleet)
         for line in (*lines, *protection_lines(protections), *unanswered):
@@ -471,10 +472,15 @@ def folded_differences(
     difference: RightsDifference,
     sides: tuple[str, str] = ("A", "B"),
 ) -> list[str]:
-    """Return the lines for a difference, with one line for each enclave that was renamed."""
+    """Return the lines for a difference, with one line for each enclave that was renamed.
+
+    If a source covers only some enclaves, no enclave counts as renamed.
+    """
     from sros_tool.policy.rights import renamed_enclaves
 
-    renamed = renamed_enclaves(first_source.rights, second_source.rights)
+    renamed: dict[str, str] = {}
+    if first_source.scope is None and second_source.scope is None:
+        renamed = renamed_enclaves(first_source.rights, second_source.rights)
     unrenamed = difference.without({*renamed, *renamed.values()})
     return [
         *_renamed_lines(renamed, second_source.fleet),

@@ -322,6 +322,21 @@ def test_diff_of_the_same(folder: Path) -> None:
     assert json.loads(sros("diff_policy", "a.xml", "a.xml", "--json").out)["equal"] is True
 
 
+def test_diff_shows_a_renamed_enclave_as_one_line(folder: Path) -> None:
+    """It still differs; twins: the enclave has another right, or only a part is compared."""
+    (folder / "b.xml").write_text(policy_text({"/b": publish("x", "y")}))
+    sros("create_keystore", "ks", cwd=folder).ok()
+    sros("generate_artifacts", "-k", "ks", "-p", "b.xml", cwd=folder).ok()
+    renamed = "~ enclave /b is now /c, with the same rights"
+    for other, names, folded in (("b.xml", "xy", True), ("b.xml", "xyz", False), ("ks", "xy", True),
+                                 ("ks/enclaves/b", "xy", False)):  # fmt: skip
+        (folder / "c.xml").write_text(policy_text({"/c": publish(*names)}))
+        ended = sros("diff_policy", other, "c.xml")
+        assert (ended.status, renamed in ended.out) == (1, folded), ended
+        assert ("- /b ALLOW publish topic /x" in ended.out) != folded, ended
+        assert "rights" in ended.err and "differ\n" in ended.err
+
+
 def test_an_enclave_without_rights_is_a_difference(folder: Path) -> None:
     rights = {"/a": publish("x")}
     (folder / "less.xml").write_text(policy_text(rights))
