@@ -282,9 +282,9 @@ def test_changed_rights_are_named_and_decided_over_all_policies(change: Change) 
     assert ended.status == 1, ended
     assert "robot.xml second.xml: 1 right is new only for users who put the node into" in ended.out
     assert "\n  + /c subscribe topic /x in another namespace  (second.xml:3)\n" in ended.out
-    # The name of node n is the same in every namespace.
+    # The name of node c is the same in every namespace.
     change.base = change.commit({"second.xml": policy_text({"/c": reads.replace(">x", ">~/x")})})
-    change.commit({"second.xml": policy_text({"/c": reads.replace(">x", ">n/x")})})
+    change.commit({"second.xml": policy_text({"/c": reads.replace(">x", ">c/x")})})
     change.review("--policy", "robot.xml\nsecond.xml").ok()
     denies = '<topics publish="DENY"><topic>{}</topic></topics>'
     change.base = change.commit({"second.xml": policy_text({"/c": denies.format("/stop*")})})
