@@ -32,6 +32,7 @@ def staged_file(
     data: bytes,
     *,
     mode: int = 0o600,
+    ignores_umask: bool = False,
     like: os.stat_result | None = None,
     for_owner: bool = False,
 ) -> Iterator[Callable[[], None]]:
@@ -45,6 +46,7 @@ def staged_file(
         target: the path of the file.
         data: its content.
         mode: its permission bits from the first byte on, before the umask.
+        ignores_umask: give it these bits whatever the umask is, because others have to read it.
         like: a file to copy the permission bits and, if permitted, the owner from.
         for_owner: whether a file that root makes belongs to the owner of its folder.
 
@@ -54,7 +56,7 @@ def staged_file(
     with Folder(target.parent, for_owner=for_owner) as folder:
         prefix = f".{target.name[:200]}.sros-"
         _remove_stale(folder, prefix)
-        spare, handle = _locked_file(folder, prefix, mode)
+        spare, handle = _locked_file(folder, prefix, mode, ignores_umask=ignores_umask)
 
         def put_in_place() -> None:
             folder.replace(spare, target.name)
@@ -73,11 +75,11 @@ def staged_file(
             os.close(handle)
 
 
-def _locked_file(folder: Folder, prefix: str, mode: int) -> tuple[str, int]:
+def _locked_file(folder: Folder, prefix: str, mode: int, *, ignores_umask: bool) -> tuple[str, int]:
     """Create and lock a temporary file; return its name and a descriptor that the caller closes."""
     while True:
         name = f"{prefix}{secrets.token_hex(4)}"
-        handle = folder.create(name, mode)
+        handle = folder.create(name, mode, ignores_umask=ignores_umask)
         fcntl.flock(handle, fcntl.LOCK_EX)
         if folder.state(name):
             return name, handle

@@ -167,8 +167,14 @@ class Folder:
 
     # ── making ─────────────────────────────────────────────────────────────────────────────
 
-    def create(self, path: str, mode: int) -> int:
-        """Make the new file ``path``; ``mode`` has its permission bits (before umask).
+    def create(self, path: str, mode: int, *, ignores_umask: bool = False) -> int:
+        """Make the new file ``path``; ``mode`` has its permission bits.
+
+        Args:
+            path: the path in this folder.
+            mode: the permission bits.
+            ignores_umask: give the file these bits whatever the umask is, because others have to
+                read it.
 
         Returns:
             A descriptor for writing, which the caller closes.
@@ -176,17 +182,21 @@ class Folder:
         parent, name = self._folder_and_name(path)
         with self._adding_path_to_errors(path):
             handle = os.open(name, _NEW_FILE_FLAGS, mode, dir_fd=parent)
+            if ignores_umask:
+                os.fchmod(handle, mode)
             if self._hand_over:
                 os.fchown(handle, *self._owner)
         return handle
 
-    def write(self, path: str, data: bytes, mode: int) -> None:
+    def write(self, path: str, data: bytes, mode: int, *, ignores_umask: bool = False) -> None:
         """Write the new file ``path``, with permission bits as in `create`."""
-        self.write_parts(path, (data,), mode)
+        self.write_parts(path, (data,), mode, ignores_umask=ignores_umask)
 
-    def write_parts(self, path: str, parts: Iterable[bytes], mode: int) -> None:
+    def write_parts(
+        self, path: str, parts: Iterable[bytes], mode: int, *, ignores_umask: bool = False
+    ) -> None:
         """Write the new file ``path`` part by part, with permission bits as in `create`."""
-        handle = self.create(path, mode)
+        handle = self.create(path, mode, ignores_umask=ignores_umask)
         try:
             for part in parts:
                 with self._adding_path_to_errors(path):

@@ -183,3 +183,11 @@ def free_umask() -> Iterator[None]:
     before = os.umask(0)
     yield
     os.umask(before)
+
+
+@pytest.fixture
+def strict_umask() -> Iterator[None]:
+    """A process whose files only its user can read, as under systemd's ``UMask=0077``."""
+    before = os.umask(0o077)
+    yield
+    os.umask(before)

@@ -1252,7 +1252,8 @@ def _write_message(inbox: Path, robot: str, message: bytes) -> None:
         with Folder(inbox) as folder:
             if not folder.is_folder(robot):
                 folder.mkdir(robot, 0o755)
-        with staged_file(inbox / robot / MESSAGE_FILE, message, mode=0o644) as put_in_place:
+        file = inbox / robot / MESSAGE_FILE  # the keystore machine's account has to read it
+        with staged_file(file, message, mode=0o644, ignores_umask=True) as put_in_place:
             put_in_place()
     except OSError as error:
         raise UnavailableError(

@@ -120,10 +120,15 @@ def test_a_server_that_is_not_there_is_said(inbox: str) -> None:
         send(inbox, "r1", b"message")
 
 
-def test_a_folder_gets_the_message_whole_and_no_link_is_followed(tmp_path: Path) -> None:
+def test_a_folder_gets_the_message_whole_and_no_link_is_followed(
+    tmp_path: Path, strict_umask: None
+) -> None:
+    """The account of the keystore machine can read the message whatever the agent's umask is."""
     for data in (b"first", b"second"):
         send(str(tmp_path), "r1", data)
         assert (tmp_path / "r1/confirmation.p7s").read_bytes() == data
+        assert (tmp_path / "r1/confirmation.p7s").stat().st_mode & 0o777 == 0o644
+    assert (tmp_path / "r1").stat().st_mode & 0o777 == 0o755
     assert os.listdir(tmp_path / "r1") == ["confirmation.p7s"]
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "r2").symlink_to("elsewhere")

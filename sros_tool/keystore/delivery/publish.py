@@ -262,6 +262,8 @@ def publish(
             # Of the folders that were made, only the empty ones.
             stack.callback(remove_folders, made)
             opened = stack.enter_context(Folder(folder))
+            if made:  # web servers have to read it, whatever the umask is
+                folder.chmod(0o755)
             for part in (_METADATA, _TARGETS, _ARCHIVES):
                 if not opened.is_folder(part):
                     opened.mkdir(part, 0o755)
@@ -1553,5 +1555,5 @@ def _put_file(folder: Folder, path: str, data: bytes) -> None:
     parent, _, name = path.rpartition("/")
     spare = f"{parent}/.{name}.new"
     folder.unlink(spare, missing_ok=True)
-    folder.write(spare, data, 0o644)
+    folder.write(spare, data, 0o644, ignores_umask=True)  # web servers have to read it
     folder.replace(spare, path)
