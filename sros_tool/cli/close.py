@@ -362,6 +362,8 @@ def _show_end(
         if proof.holds and proof.denied:
             answer += ", except for what the policy takes away"
         echo(f"{answer}{accept}: {proof.claim}: {proof.reason}")
+        for detail in proof.details:
+            echo(f"  {detail}")
         claims = {proof.claim for proof in closed.proofs}
         if proof.holds and proof.claim == TALK and CONNECTED not in claims:
             echo(_NOT_PROVED)

@@ -540,7 +540,7 @@ def _proof_of_talk(running: RunningRobot, nodes: ObservedNodes, away: Collection
         try:
             status, audited = robot.shell.read_json(words)
         except UnavailableError as error:
-            return Proof(TALK, None, f"{error}{_renamed_text(nodes, None, fails=False)}")
+            return Proof(TALK, None, str(error), details=[*_renamed(nodes, None, fails=False)])
         comparison = _TalkComparison(running, nodes, away, audited)
         differences = {**comparison.differences(), "not judged": audited["unjudged"]}
         # If everything is seen that the open robot did, the graph may keep changing.
@@ -552,12 +552,12 @@ def _proof_of_talk(running: RunningRobot, nodes: ObservedNodes, away: Collection
             if names
         }
         if not reasons:
-            renamed = _renamed_text(nodes, comparison.current, fails=False)
-            return Proof(TALK, True, f"{comparison.summary()}{renamed}", comparison.denied)
+            details = [*comparison.details(), *_renamed(nodes, comparison.current, fails=False)]
+            return Proof(TALK, True, comparison.summary(), comparison.denied, details)
     first, *others = reasons
     texts = f"{reasons[first]}{_remedy(robot, first)}", *(f"also {reasons[why]}" for why in others)
-    renamed = _renamed_text(nodes, comparison.current, fails=True)
-    return Proof(TALK, False, f"{'; '.join(texts)}{renamed}", comparison.denied)
+    details = [*_renamed(nodes, comparison.current, fails=True)]
+    return Proof(TALK, False, "; ".join(texts), comparison.denied, details)
 
 
 def _remedy(robot: LocalRobot, difference: str) -> str:
@@ -687,30 +687,34 @@ class _TalkComparison:
         ]
 
     def summary(self) -> str:
-        """Return text on the comparison, on rights that the policy takes away, and on new nodes."""
+        """Return text on what was compared."""
         before = self._nodes.nodes_to_compare(self._away)
-        as_now = self._nodes.nodes_to_compare(self._away, self.current)
-        not_now = self._lost_endpoints(as_now.nodes)
-        endpoints = {*endpoints_of(as_now.nodes)} - _denied_endpoints(self._denied) - not_now
+        as_now = self._nodes.nodes_to_compare(self._away, self.current).nodes
+        endpoints = {*endpoints_of(as_now)} - _denied_endpoints(self._denied)
+        endpoints -= self._lost_endpoints(as_now)
         text = f"{nodes_text(before.nodes)} with {len(endpoints)} endpoints as before (types are "
         text += "not compared)"
-        text += f", without {', '.join(sorted(self._away))}" if self._away else ""
+        return text + (f", without {', '.join(sorted(self._away))}" if self._away else "")
+
+    def details(self) -> Iterator[str]:
+        """Yield clauses on rights that the policy takes away, unused rights, and new nodes."""
+        before = self._nodes.nodes_to_compare(self._away)
+        as_now = self._nodes.nodes_to_compare(self._away, self.current)
         if denied := self._denied:
-            text += f"; the policy takes away {counted(len(denied), 'right')} that the robot used: "
-            text += ", ".join(f"{right.right.enclave} {right.right.describe()}" for right in denied)
+            rights = ", ".join(f"{each.right.enclave} {each.right.describe()}" for each in denied)
+            number = counted(len(denied), "right")
+            yield f"the policy takes away {number} that the robot used: {rights}"
             lost = _without_counterpart(self._running.robot, [right.right for right in denied])
-            text += f"; left without a partner: {first_few(lost, MOST_NAMES, '; ')}" if lost else ""
-        if not_now:
-            text += "; allowed, but not seen now, and not always seen in the watch: "
-            text += first_few(_endpoint_texts(not_now), MOST_NAMES)
+            if lost:
+                yield f"left without a partner: {first_few(lost, MOST_NAMES, '; ')}"
+        if not_now := self._lost_endpoints(as_now.nodes):
+            names = first_few(_endpoint_texts(not_now), MOST_NAMES)
+            yield f"allowed, but not seen now, and not always seen in the watch: {names}"
         if unused := self._unused_rights():
-            text += "; allowed, but not seen on the open robot, and not now: "
-            text += first_few(unused, MOST_NAMES)
-        text += (
-            ""
-            if self._audited["settled"]
-            else "; the ROS graph kept changing meanwhile, or could not be read in time"
-        )
+            names = first_few(unused, MOST_NAMES)
+            yield f"allowed, but not seen on the open robot, and not now: {names}"
+        if not self._audited["settled"]:
+            yield "the ROS graph kept changing meanwhile, or could not be read in time"
         known = {*map(node_name, before.nodes)}
         with_profile, without_profile = self._nodes.divide_by_profile(self.current.nodes)
         new = sorted(
@@ -718,14 +722,18 @@ class _TalkComparison:
             for node in without_profile
             if node_name(node) not in known and not is_tool(node)
         )
-        text += f"; new, without a profile: {first_few(new, MOST_NAMES)}" if new else ""
+        if new:
+            yield f"new, without a profile: {first_few(new, MOST_NAMES)}"
         if later := self._later_names(with_profile):
-            text += "; not compared, because `sros close` did not see these on the open robot: "
-            text += first_few(later, MOST_NAMES)
+            names = first_few(later, MOST_NAMES)
+            yield (
+                f"not compared, because `sros close` did not see these on the open robot: {names}"
+            )
         if topics := self._nodes.topics_without_node:
-            text += "; not compared, because they belonged to no ROS node: writers or readers of "
-            text += f"{topics} (programs without security cannot talk to the closed robot)"
-        return text
+            yield (
+                "not compared, because they belonged to no ROS node: writers or readers of "
+                f"{topics} (programs without security cannot talk to the closed robot)"
+            )
 
 
 def _without_counterpart(robot: LocalRobot, denied: Sequence[Right]) -> list[str]:
@@ -745,12 +753,11 @@ def _without_counterpart(robot: LocalRobot, denied: Sequence[Right]) -> list[str
     return [*map(lost_counterpart_text, lost)]
 
 
-def _renamed_text(nodes: ObservedNodes, current: Observation | None, *, fails: bool) -> str:
-    """Return, as text, which nodes were compared under new names, and which were not compared."""
-    renamed, text = nodes.renamed, ""
-    if renamed:
+def _renamed(nodes: ObservedNodes, current: Observation | None, *, fails: bool) -> Iterator[str]:
+    """Yield clauses on nodes that were compared under new names, and that were not compared."""
+    if renamed := nodes.renamed:
         names = [f"{old} as {expand('~', *renamed[old])}" for old in sorted(renamed)]
-        text = f"; compared under a new name: {first_few(names, MOST_NAMES)}"
+        text = f"compared under a new name: {first_few(names, MOST_NAMES)}"
         pairs = nodes.moved_endpoints(current)
         topics = sorted({(ros_use(pair.old)[1], ros_use(pair.new)[1]) for pair in pairs})
         private = tuple(f"{name}/" for name in renamed)
@@ -762,17 +769,17 @@ def _renamed_text(nodes: ObservedNodes, current: Observation | None, *, fails: b
                 " (if the new name belongs to another node, remove the unused rights from "
                 "the profile of that node)"
             )
+        yield text
     _, without_profile = nodes.divide_by_profile(nodes.as_observed)
     not_compared = {
         node_name(node) for node in without_profile if not is_tool(node)
     } - renamed.keys()
     if not_compared and not fails:
-        text += (
-            "; not compared, as the policy has no profile for them any more: "
+        yield (
+            "not compared, as the policy has no profile for them any more: "
             f"{first_few(sorted(not_compared), MOST_NAMES)} (a renamed node is compared if its "
             "enclave has no other new or renamed node)"
         )
-    return text
 
 
 def _ended_since(running: RunningRobot) -> dict[str, str]:

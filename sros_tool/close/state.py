@@ -363,6 +363,8 @@ class Proof(NamedTuple):
     denied: Sequence[str] = ()
     """The rights, as sentences, that the robot used when sros watched, and that the keystore now
     denies. The claim holds except for these."""
+    details: Sequence[str] = ()
+    """What else was seen, as clauses, such as rights that no node used, and new nodes."""
 
     @property
     def fails(self) -> bool:

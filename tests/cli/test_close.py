@@ -333,9 +333,9 @@ def test_a_policy_that_was_changed_stays_and_is_followed(robot: Robot) -> None:
     except_for = "yes, except for what the policy takes away: everything that talked can still "
     assert f"{except_for}talk: 2 nodes with 35 endpoints as before (types are not compared)" in said
     alone = "left without a partner: /talker may publish /chatter, but no enclave may subscribe to "
-    alone = f"1 right that the robot used: /listener subscribe topic /chatter; {alone}it any more"
+    alone = f"1 right that the robot used: /listener subscribe topic /chatter\n  {alone}it any more"
     unused = "not seen on the open robot, and not now: /listener subscribe topic /old/chatter"
-    assert f"; the policy takes away {alone}; allowed, but {unused}\n" in said
+    assert f"\n  the policy takes away {alone}\n  allowed, but {unused}\n" in said
     (denied,) = json.loads(robot.close("--proof", "--json").out)["denied"]
     assert denied.startswith("/listener subscribe topic /chatter (/listener): ")
 
@@ -935,10 +935,10 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
         intermittently_used(robot, "/listener", "rt/chatter", "subscribe")
         said = robot.close("--proof").out
     assert (
-        "talk: 2 nodes with 35 endpoints as before (types are not compared); allowed, but" in said
+        "talk: 2 nodes with 35 endpoints as before (types are not compared)\n  allowed, but" in said
     )
     not_now = "allowed, but not seen now, and not always seen in the watch: "
-    not_now += "/listener subscribe /chatter; "
+    not_now += "/listener subscribe /chatter\n  "
     assert f"{not_now}the ROS graph kept changing meanwhile, or could not be read in time\n" in said
     robot.remaining = (TALKER, ros_node("guest", "05"))
     said = robot.close("--proof", status=1).out
@@ -1204,12 +1204,13 @@ def test_a_renamed_node_is_compared_and_a_new_one_is_named(
     said = robot.close("--apply").out
     talk = "yes, except for what the policy takes away: everything that talked can still talk: "
     assert (
-        f"{talk}3 nodes with 56 endpoints as before (types are not compared); "
+        f"{talk}3 nodes with 56 endpoints as before (types are not compared)\n  "
         "the policy takes away 1 right that the robot " in said
     )
-    assert f"{denied}; new, without a profile: /ghost_node in /listener; compared " in said
+    new = "new, without a profile: /ghost_node in /listener"
+    assert f"{denied}\n  {new}\n  compared " in said
     renamed = "compared under a new name: /rear_camera as /nav/stern_camera, and so /odom as /nav/o"
-    assert f"; {renamed}dom (to keep a name, write it in policy.xml with a leading /)\n" in said
+    assert f"\n  {renamed}dom (to keep a name, write it in policy.xml with a leading /)\n" in said
     renamed_alone = policy.read_text()
     policy.write_text(
         renamed_alone.replace(">odom</topic>", ">odom</topic><topic>/odom</topic>", 1)
@@ -1248,17 +1249,17 @@ def test_a_renamed_node_is_compared_and_a_new_one_is_named(
     robot.remaining = (TALKER, LISTENER, stern_camera, bow_camera)
     unused, before = "allowed, but not seen on the open robot, and not now: ", said
     said = robot.close("--proof").out
-    assert f"; {unused}/listener publish topic /plan_b; not" in said and unused not in before
+    assert f"\n  {unused}/listener publish topic /plan_b\n  not" in said and unused not in before
     assert (
         "policy has no profile for them any more: /rear_camera (a renamed node is compared if"
         in said
     )
     assert (
-        "; not compared, because `sros close` did not see these on the open robot: "
-        "/nav/bow_camera, /nav/stern_camera, /talker publish /chatter; not"
+        "\n  not compared, because `sros close` did not see these on the open robot: "
+        "/nav/bow_camera, /nav/stern_camera, /talker publish /chatter\n  not"
     ) in said
     assert (
-        "; not compared, because they belonged to no ROS node: writers or readers of rt/odom ("
+        "\n  not compared, because they belonged to no ROS node: writers or readers of rt/odom ("
         in (said)
     )
 
