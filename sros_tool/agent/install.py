@@ -103,12 +103,12 @@ class Installation(NamedTuple):
 class _Change:
     """The changes of an enclave's files: new contents by path, and paths to remove.
 
-    ``seen`` has the files with which the new files were compared, by path; None for a missing file.
+    ``seen`` has the files with which the new files were compared, by path, as `_content` has them.
     """
 
     write: dict[str, bytes] = field(default_factory=dict)
     remove: list[str] = field(default_factory=list)
-    seen: dict[str, bytes | None] = field(default_factory=dict)
+    seen: dict[str, bytes | str | None] = field(default_factory=dict)
 
     def __bool__(self) -> bool:
         return bool(self.write or self.remove)
@@ -468,18 +468,24 @@ def _present_key(folder: Folder, name: str, files: Mapping[str, bytes]) -> Publi
     )
 
 
-def _files_seen(folder: Folder, name: str) -> dict[str, bytes | None]:
-    """Return the files that show how new an enclave is, by path; None for a file without content.
+def _files_seen(folder: Folder, name: str) -> dict[str, bytes | str | None]:
+    """Return the files that show how new an enclave is, by path, as `_content` has them."""
+    paths = [f"{enclave_folder(name)}/{file}" for file in _DATED_FILES]
+    return {path: _content(folder, path) for path in paths}
 
-    Such a file is missing, or cannot be read.
+
+def _content(folder: Folder, path: str) -> bytes | str | None:
+    """Return the content of a file; None if it is missing.
+
+    Of a file that cannot be read, return text with the reason, and with the inode and time.
     """
-    seen: dict[str, bytes | None] = {}
-    for file in _DATED_FILES:
-        path = f"{enclave_folder(name)}/{file}"
-        seen[path] = None
+    try:
+        return _read_file(folder, path)
+    except (SrosError, OSError) as error:
         with suppress(SrosError, OSError):
-            seen[path] = _read_file(folder, path)
-    return seen
+            if state := folder.state(path):
+                return f"{error} {state.st_ino} {state.st_mtime_ns}"
+        return str(error)
 
 
 def _check_place(folder: Folder, place: str) -> None:
@@ -610,10 +616,7 @@ def _write_changes(folder: Path, changes: Iterable[_Change]) -> None:
 def _check_seen(folder: Folder, change: _Change) -> None:
     """Raise `KeystoreError` if files changed after the new ones were compared with them."""
     for path, before in change.seen.items():
-        present = None
-        with suppress(SrosError, OSError):
-            present = _read_file(folder, path)
-        if present != before:
+        if _content(folder, path) != before:
             raise KeystoreError(
                 "its files changed meanwhile",
                 f"Another program changed or removed '{folder.path / path}'; the next round "

@@ -346,12 +346,21 @@ def test_what_a_play_brought_meanwhile_is_not_taken_back(home: Home, robot: Path
     assert done.changed == ("/r1/a",), "files that no process can load are not newer"
 
 
-def test_a_list_that_a_play_brings_during_the_installation_stays(home: Home, robot: Path) -> None:
-    """The lists were compared before it came, and the older one would be written over it."""
-    newer = list_of_nobody(home, later=1)
+@pytest.mark.parametrize("readable", [True, False])
+def test_a_list_that_a_play_brings_during_the_installation_stays(
+    home: Home, robot: Path, tmp_path: Path, *, readable: bool
+) -> None:
+    """The lists were compared before it came, and the older one would be written over it.
+
+    A link out of the folder cannot be read, which is something else than a missing list.
+    """
+    newer, outside = list_of_nobody(home, later=1), tmp_path / "newer.pem"
+    outside.write_bytes(newer)
 
     def bring(_: object) -> None:
-        (robot / A / "crl.pem").write_bytes(newer)
+        path = robot / A / "crl.pem"
+        path.unlink(missing_ok=True)
+        path.write_bytes(newer) if readable else path.symlink_to(outside)
 
     done = install(robot, home.revoked, before=bring)
     assert set(done.kept) == {"/r1/a"} and "changed meanwhile" in done.kept["/r1/a"]
