@@ -105,7 +105,6 @@ VERBS: Mapping[str, str | Shapes] = {
         {
             "the list": "sros_tool.policy.document:ShippedPolicies",
             "--copy": "sros_tool.policy.document:CopiedPolicies",
-            "--convert": "sros_tool.policy.document:PrintedConversion",
         },
     ),
     "diff_policy": Shapes(

@@ -662,41 +662,13 @@ def _as_written(value: Any) -> Any:
     help="Copy the policies to the folder DIR, as a start for your own; if DIR is named "
     "common, only the common parts.",
 )
-@click.option(
-    "--convert",
-    "earlier",
-    type=PATH,
-    metavar="OLD",
-    help="Convert the policy OLD from format 0.1.0 to the current format.",
-)
-@click.option(
-    "--with-node-rights",
-    "complete",
-    is_flag=True,
-    help="With --convert: add the rights that every node of today's ROS 2 needs (common/node.xml).",
-)
-@output_option("Write the converted policy to FILE.")
-@force_option
 @json_option
 @dry_run_option
-def policies(
-    target: Path | None,
-    earlier: Path | None,
-    complete: bool,
-    output: Path | None,
-    force: bool,
-    as_json: bool,
-    dry_run: bool,
-) -> int:
+def policies(target: Path | None, as_json: bool, dry_run: bool) -> None:
     """List the policies that ship with sros, each with its enclaves, or copy these policies.
 
     --copy adds missing files to an existing folder, and replaces nothing: if a file differs,
     nothing is copied.
-
-    --convert gives a policy of version 0.1.0 (ROS 2 Crystal to Eloquent) the current format, with
-    the same rights: each node becomes an enclave with the node's name. Nodes of a later ROS 2 need
-    more rights; --with-node-rights adds them. The result is one file: includes are resolved, and
-    comments are lost. The exit status is 1 if a part was left out.
 
     Example:
       $ sros policies
@@ -706,25 +678,14 @@ def policies(
       copied the policies to 'my_policies'
       $ sros policies --copy common
       copied the common parts of policies to 'common'
-      $ sros policies --convert eloquent.xml -o robot.policy.xml
-      converted 2 nodes of 'eloquent.xml' to enclaves: /listener, /talker
-      wrote 'robot.policy.xml'
     """
     from sros_tool.files import policies_dir
     from sros_tool.policy.document import PolicyFile, ShippedPolicies, read_policy
 
-    if earlier is not None:
-        if target is not None:
-            raise UsageError("--convert and --copy exclude each other")
-        return _convert(
-            earlier, output, complete=complete, force=force, as_json=as_json, dry_run=dry_run
-        )
-    if output or force or complete:
-        raise UsageError("--with-node-rights, --output and --force are for --convert only")
     source = policies_dir()
     if target is not None:
         _copy(source, target, as_json=as_json, dry_run=dry_run)
-        return 0
+        return
     shipped = {path: read_policy(path) for path in sorted(source.glob("*.xml"))}
     if as_json:
         listed = [
@@ -732,12 +693,11 @@ def policies(
             for path, policy in shipped.items()
         ]
         print_json(ShippedPolicies(listed))
-        return 0
+        return
     width = max(len(path.name) for path in shipped)
     for path, policy in shipped.items():
         echo(f"{path.name:{width}}  {', '.join(enclave.path for enclave in policy.enclaves)}")
     echo(f"they are in '{source}'", err=True)
-    return 0
 
 
 def _copy(source: Path, target: Path, *, as_json: bool, dry_run: bool) -> None:
@@ -755,73 +715,6 @@ def _copy(source: Path, target: Path, *, as_json: bool, dry_run: bool) -> None:
         echo(f"nothing to copy: '{target}' already has the {kind}")
     else:
         echo(f"{'would copy' if dry_run else 'copied'} the {kind} to '{target}'")
-
-
-def _convert(
-    earlier: Path,
-    output: Path | None,
-    *,
-    complete: bool,
-    force: bool,
-    as_json: bool,
-    dry_run: bool,
-) -> int:
-    """Convert a policy; return the exit status."""
-    from sros_tool.files import policies_dir
-    from sros_tool.policy.document import (
-        PrintedConversion,
-        checked_text,
-        convert_policy,
-        with_node_rights,
-    )
-
-    if output:
-        check_output(output, force=force)
-    converted = convert_policy(earlier)
-    policy = converted.policy
-    if complete:
-        policy = with_node_rights(policy, policies_dir())
-    document = checked_text(policy, output or earlier, "converted")
-    names = ", ".join(enclave.path for enclave in policy.enclaves)
-    changes = file_change(output, existed=output.exists()) if output else ()
-    saved = save(output, document) if output and not dry_run else ""
-    if as_json:
-        print_json(
-            PrintedConversion(
-                earlier,
-                [enclave.path for enclave in policy.enclaves],
-                [note.text for note in converted.left_out],
-                output=output if saved else None,
-                dry_run=dry_run,
-                document=None if output or dry_run else document.decode(),
-                changes=changes,
-                notes=converted.notes,
-            )
-        )
-    elif output is None and not dry_run:
-        echo_document(document)
-    result = f"{counted(len(policy.enclaves), 'node')} of '{earlier}' to enclaves: {names}"
-    if dry_run and not as_json:
-        echo(f"would convert {result}")
-        if output:
-            echo(f"would {'replace' if output.exists() else 'write'} {output}")
-    elif not dry_run:
-        echo(f"converted {result}", err=True)
-    print_notes(converted.notes)
-    for note in converted.left_out:
-        echo(f"left out: {note.text}", err=True)
-    if saved:
-        echo(saved, err=True)
-        if not complete:
-            new_arguments = f"{quote(str(earlier))} -o {quote(str(output))} --force"
-            echo(
-                "no rights were added; nodes of a later ROS 2 need more, such as publishing "
-                f"/rosout from a namespace: add them with `sros policies --convert {new_arguments} "
-                "--with-node-rights`",
-                err=True,
-            )
-        echo(f"check the result: `sros check {quote(str(output))}`", err=True)
-    return 1 if converted.left_out else 0
 
 
 # ── diff_policy --no-new-access ───────────────────────────────────────────────────────────────

@@ -172,7 +172,7 @@ def load_rights(
 
         return _zenoh_rights(path, parse_configuration(data, str(path), lines=False))
     signed = b"multipart/signed" in data[:1000].lower()
-    # An earlier format has <profiles> at the top; read_policy says how to convert it.
+    # An earlier format has <profiles> at the top; read_policy says how it differs.
     if not signed and parse(data, f"'{path}'").tag in ("policy", "profiles"):
         return _policy_rights(path, fleet)
     return _document_rights(path, "permissions", path)

@@ -1,8 +1,5 @@
 """Policy files (SROS2 policy XML 0.2.0): reading them with their includes, and writing them.
 
-Policies of version 0.1.0 (ROS 2 Crystal to Eloquent) are converted: such policies have a profile
-for each node and no enclaves.
-
 The grammar follows the schema of ros2/sros2.  In addition, every name is checked: a name that ROS
 does not allow is an error, because the author of the policy relies on the right or the denial.
 
@@ -22,7 +19,7 @@ import hashlib
 import os
 import re
 import stat
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from shlex import quote
@@ -31,11 +28,10 @@ from urllib.parse import unquote
 
 from lxml import etree
 
-from sros_tool.errors import DocumentError, InvalidNameError, Note, PolicyError, UsageError
+from sros_tool.errors import DocumentError, InvalidNameError, PolicyError, UsageError
 from sros_tool.names import (
     check_enclave_name,
     check_namespace,
-    expand,
     expression_problem,
     node_name_problem,
 )
@@ -51,7 +47,6 @@ from sros_tool.policy.model import (
     Profiles,
     Qualifier,
     Source,
-    with_profiles,
 )
 from sros_tool.policy.placeholders import (
     Parts,
@@ -61,7 +56,7 @@ from sros_tool.policy.placeholders import (
     parts_of,
     sample,
 )
-from sros_tool.values import DryRun, FileChange, FileChanges, Notes, shows
+from sros_tool.values import DryRun, FileChange, FileChanges, Notes
 from sros_tool.xml import parse, read_bytes, tag_of
 
 _NAMESPACES = ("http://www.w3.org/2001/XInclude", "http://www.w3.org/2003/XInclude")
@@ -393,12 +388,10 @@ def _too_large_error(where: str, limit: str) -> PolicyError:
 
 _XML_ATTRIBUTES = ("{http://www.w3.org/XML/1998/namespace}",)
 _VERSION = re.compile(r"0\.2\.[0-9]+\Z")
-_EARLIER_VERSION_TEXT = (
-    "Version 0.1.0, of ROS 2 Crystal to Eloquent, has nodes in place of enclaves."
+_REMEDY_FOR_0_1 = (
+    "Version 0.1.0, of ROS 2 Crystal to Eloquent, has nodes in place of enclaves: write each "
+    '<profile> into <enclaves><enclave path="/NAME"><profiles>.'
 )
-_EARLIER_BLOCKS = ("profiles", "contexts")
-_EARLIER_ROOTS = ("profiles",)
-"""Root elements of earlier formats that are converted without a <policy> around them."""
 _REQUIRED_ATTRIBUTES = {
     "version": '<policy version="0.2.0">',
     "path": 'path="/NAME", with the name of the enclave',
@@ -457,8 +450,6 @@ def refuse_fallbacks(policy: Policy) -> None:
 
 
 class _Reader:
-    _other_roots: tuple[str, ...] = ()
-    """Root elements that are accepted in addition to <policy>."""
     may_be_empty = False
 
     def __init__(
@@ -488,21 +479,13 @@ class _Reader:
         if not _VERSION.match(version):
             raise PolicyError(
                 f"{where}: the policy has version {_short(version)}",
-                f"sros reads version {VERSION} of the SROS2 policy format. {_EARLIER_VERSION_TEXT}"
-                if version == "0.1.0"
-                else f"sros reads version {VERSION} of the SROS2 policy format.",
-                self._conversion_remedy()
+                f"sros reads version {VERSION} of the SROS2 policy format.",
+                _REMEDY_FOR_0_1
                 if version == "0.1.0"
                 else f'If the policy has that format, write version="{VERSION}".',
             )
-        blocks = self._read_children(root, place)
-        if len(blocks) == 1 and blocks[0][0].tag in _EARLIER_BLOCKS:
-            raise PolicyError(
-                f"{where}: the policy has <{blocks[0][0].tag}> in place of <enclaves>",
-                f"The policy names version {version}, but its content has an earlier format.",
-                self._conversion_remedy(),
-            )
-        blocks = [self._expect(child, at, "enclaves") for child, at in blocks]
+        children = self._read_children(root, place)
+        blocks = [self._expect(child, at, "enclaves") for child, at in children]
         if len(blocks) != 1:
             raise PolicyError(f"{where}: <policy> must contain exactly one <enclaves>")
         return self._read_policy(*blocks[0], version)
@@ -510,31 +493,23 @@ class _Reader:
     def _root(self) -> tuple[etree._Element, IncludedFile]:
         root = self._includer.load(self._file)
         place = IncludedFile(self._file)
-        if root.tag not in ("policy", *self._other_roots):
-            why = f"Its root element is <{tag_of(root)}>, not <policy>."
-            remedy = ""
-            if root.tag == "profile":
-                remedy = "It is a fragment for other policies to include."
-            elif root.tag in _EARLIER_ROOTS:
-                why += f" {_EARLIER_VERSION_TEXT}"
-                remedy = self._conversion_remedy()
+        if root.tag != "policy":
+            remedies = {
+                "profile": "It is a fragment for other policies to include.",
+                "profiles": _REMEDY_FOR_0_1,
+            }
             raise PolicyError(
-                f"{self._place_text(root, place)}: the file is not a policy", why, remedy
+                f"{self._place_text(root, place)}: the file is not a policy",
+                f"Its root element is <{tag_of(root)}>, not <policy>.",
+                remedies.get(tag_of(root), ""),
             )
         return root, place
 
-    def _conversion_remedy(self) -> str:
-        shown = str(self._shown)
-        new = self._shown.with_name(f"{self._shown.stem}.policy.xml")
-        return f"Convert it with `sros policies --convert {quote(shown)} -o {quote(str(new))}`."
-
-    def _read_policy(
-        self, element: etree._Element, place: IncludedFile, version: str, tag: str = "enclave"
-    ) -> Policy:
-        """Return the policy whose enclaves are the children of ``element`` with the tag ``tag``."""
+    def _read_policy(self, element: etree._Element, place: IncludedFile, version: str) -> Policy:
+        """Return the policy whose enclaves are the children of ``element``."""
         enclaves: dict[str, Enclave] = {}
         for child, at in self._read_children(element, place):
-            enclave = self._read_enclave(*self._expect(child, at, tag))
+            enclave = self._read_enclave(*self._expect(child, at, "enclave"))
             if enclave.path in enclaves:
                 raise PolicyError(
                     f"{enclave.source}: the enclave {enclave.path} is defined twice",
@@ -543,9 +518,6 @@ class _Reader:
                     "Join the two into one <enclave>.",
                 )
             enclaves[enclave.path] = enclave
-        return self._policy_of(enclaves, version)
-
-    def _policy_of(self, enclaves: Mapping[str, Enclave], version: str) -> Policy:
         if not enclaves and not self.may_be_empty:
             raise PolicyError(f"'{self._shown}': the policy has no enclave")
         digest = self._includer.digest()
@@ -715,7 +687,7 @@ class _Reader:
         return PROTECT[word]
 
     def _name(self, element: etree._Element, place: IncludedFile, node: str) -> str:
-        name = self._written_name(element)
+        name = element.text or ""
         sampled = self._example_name(name, element, place, several=True)
         inner = next((child for child in element if isinstance(child.tag, str)), None)
         problem = (
@@ -739,10 +711,6 @@ class _Reader:
             )
         self._check_attributes(element, place)
         return name
-
-    def _written_name(self, element: etree._Element) -> str:
-        """Return the text of a name's element, as it stands in the file."""
-        return element.text or ""
 
     def _example_name(
         self, text: str, element: etree._Element, place: IncludedFile, *, several: bool
@@ -867,38 +835,7 @@ def _with_absolute_namespaces(profile: Profile) -> tuple[Profile, ...]:
     return (*narrow, wide)
 
 
-# ── earlier formats ────────────────────────────────────────────────────────────────────────
-
-
-class ConvertedPolicy(NamedTuple):
-    """A policy converted from an earlier format, with the same rights.
-
-    ``left_out`` are profiles for which no enclave is possible, with reasons. Without these
-    profiles, the converted policy permits less than the original.
-    """
-
-    policy: Policy
-    notes: tuple[Note, ...]
-    left_out: tuple[Note, ...]
-
-
-@shows(optional=("document",))
-class PrintedConversion(NamedTuple):
-    """The result of converting a policy of an earlier format."""
-
-    policy: Path
-    """Path of the policy in the earlier format."""
-    enclaves: Sequence[str]
-    """Paths of the enclaves in the converted policy."""
-    left_out: Sequence[str]
-    """Profiles that cannot be converted, with reasons; the exit status is then 1."""
-    output: Path | None
-    """Path of the file that was written, or null."""
-    dry_run: DryRun
-    changes: FileChanges
-    notes: Notes
-    document: str | None
-    """The converted policy as XML, or null if it was written to a file."""
+# ── shipped policies ───────────────────────────────────────────────────────────────────────
 
 
 class PolicyFile(NamedTuple):
@@ -964,148 +901,6 @@ def copy_policies(source: Path, target: Path, *, dry_run: bool = False) -> list[
         else:
             write_new_folder(target, missing)
     return [FileChange("create", str(target / name)) for name in missing]
-
-
-def convert_policy(path: Path) -> ConvertedPolicy:
-    """Convert a policy file of version 0.1.0 to a policy with an enclave for each node.
-
-    The path of an enclave is the node's namespace and name, like the folder of the node's keys in
-    ros2/sros2 0.6 to 0.8.  A private name is ``~/name`` since ROS 2 Eloquent, and ``~name`` in
-    earlier versions.  Files with version 0.1.0 and ``<enclaves>`` are converted, too, as are files
-    with ``<contexts>`` (ros2/sros2 of April 2020, never released).
-
-    Raises:
-        PolicyError: (or another `DocumentError`, with file and line) the file violates the format,
-            or already has version 0.2.0.
-    """
-    return _EarlierReader(path, None).converted()
-
-
-_POLICY_OF_ONE_NODE = f"""<policy version="{VERSION}" xmlns:xi="http://www.w3.org/2001/XInclude">
-<enclaves><enclave path="/node"><profiles><profile ns="/" node="node">
-<xi:include href="common/node.xml" xpointer="xpointer(/profile/*)"/>
-</profile></profiles></enclave></enclaves></policy>"""
-
-
-def with_node_rights(policy: Policy, folder: Path) -> Policy:
-    """Return the policy with the rights that every node needs added to every profile.
-
-    ``common/node.xml`` in ``folder`` states these rights.
-    """
-    needed = (
-        read_policy(folder / "node.xml", _POLICY_OF_ONE_NODE.encode()).enclaves[0].all_profiles()[0]
-    )
-
-    def completed_profile(profile: Profile) -> Profile:
-        present = {
-            (right, expand(name, profile.ns, profile.node))
-            for group in profile.groups
-            for name in group.names
-            for right, _ in group.rights
-        }
-        added = []
-        for group in needed.groups:
-            lacking = tuple(
-                name
-                for name in group.names
-                if not present.issuperset(
-                    (right, expand(name, profile.ns, profile.node)) for right, _ in group.rights
-                )
-            )
-            if lacking:
-                added.append(Group(group.kind, group.rights, lacking, group.protect))
-        return replace(profile, groups=(*profile.groups, *added))
-
-    return with_profiles(policy, completed_profile)
-
-
-class _EarlierReader(_Reader):
-    """A reader of policies in an earlier format."""
-
-    _other_roots = _EARLIER_ROOTS
-
-    def __init__(self, path: Path, content: bytes | None) -> None:
-        super().__init__(path, content)
-        self._private: list[str] = []
-
-    def converted(self) -> ConvertedPolicy:
-        root, place = self._root()
-        where = self._place_text(root, place)
-        if root.tag in _EARLIER_ROOTS:
-            version, blocks = "", [(root, place)]
-        else:
-            self._check_attributes(root, place, optional=("version",))
-            version = root.get("version", "")
-            blocks = self._read_children(root, place)
-        tags = [tag_of(child) for child, _ in blocks]
-        if _VERSION.match(version) and tags == ["enclaves"]:
-            raise PolicyError(
-                f"{where}: the policy is of version {version} already",
-                "There is nothing to convert.",
-                "Use the file without conversion.",
-            )
-        if len(tags) != 1 or tags[0] not in ("enclaves", *_EARLIER_BLOCKS):
-            raise PolicyError(
-                f"{where}: <policy> must contain exactly one <profiles> or <enclaves>",
-                f"It contains {', '.join(f'<{tag}>' for tag in tags) or 'nothing'}.",
-                "Correct it first.",
-            )
-        left_out: list[Note] = []
-        if tags == ["profiles"]:
-            policy = self._policy_of(self._enclaves_of_nodes(*blocks[0], left_out), VERSION)
-        else:
-            policy = self._read_policy(*blocks[0], VERSION, tags[0].removesuffix("s"))
-        return ConvertedPolicy(policy, tuple(self._notes(policy)), tuple(left_out))
-
-    def _enclaves_of_nodes(
-        self, element: etree._Element, place: IncludedFile, left_out: list[Note]
-    ) -> dict[str, Enclave]:
-        self._check_attributes(element, place, optional=("type",))
-        enclaves: dict[str, Enclave] = {}
-        for child, at in self._read_children(element, place):
-            profile = self._read_profile(*self._expect(child, at, "profile"))
-            name = expand(profile.node, profile.ns, "")
-            why = ""
-            try:
-                check_enclave_name(name if profile.node else "")
-            except InvalidNameError as error:
-                why = f"{name!r} cannot be the name of an enclave. {error.why}"
-            if name in enclaves:
-                why = (
-                    f"{enclaves[name].source} has the node {name}, too. ros2/sros2 gives a node "
-                    "the rights of its first profile."
-                )
-            if why:
-                left_out.append(Note("convert.left-out", f"{profile.source}: {why}"))
-            else:
-                blocks = (Profiles((profile,)),)
-                enclaves[name] = Enclave(name, blocks, profile.source)
-        if not enclaves and left_out:
-            why = left_out[0].text
-            raise PolicyError(
-                f"nothing in '{self._shown}' can be converted", why, "Correct it first."
-            )
-        return enclaves
-
-    def _notes(self, policy: Policy) -> Iterator[Note]:
-        if self._private:
-            names = ", ".join(dict.fromkeys(self._private[:3]))
-            yield Note(
-                "convert.private-name",
-                f"{names}: sros added the slash that a private name needs since ROS 2 Eloquent. "
-                "But ros2/sros2 of Eloquent joined the names of node and topic without a slash.",
-            )
-        for enclave in policy.enclaves:
-            if not any(profile.groups for profile in enclave.all_profiles()):
-                text = f"{enclave.source}: {enclave.path} has no right at all, as before."
-                yield Note("convert.no-right", text)
-
-    def _written_name(self, element: etree._Element) -> str:
-        text = super()._written_name(element)
-        if len(text) < 2 or text[0] != "~" or text[1] == "/":
-            return text
-        self._private.append(text)
-        return f"~/{text[1:]}"
 
 
 _PROTECT_WORDS = {level: word for word, level in PROTECT.items()}

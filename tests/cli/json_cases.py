@@ -45,8 +45,6 @@ _WILD = """<topics publish="ALLOW" subscribe="ALLOW"><topic>/*</topic></topics>
 <services request="ALLOW"><service>/s*</service></services>"""
 _SUBSCRIBE = '<topics subscribe="ALLOW"><topic>/x</topic></topics>'
 _DENIED = '<topics publish="DENY"><topic>/x</topic></topics>'
-_OLD = """<policy version="0.1.0"><profiles><profile ns="/" node="n">
-<topics publish="ALLOW"><topic>/x</topic></topics></profile></profiles></policy>"""
 POLICIES = {
     "crew.xml": policy_text({"/{robot}": publish("/x")}),
     "policy.xml": policy_text({"/a": publish("/x"), "/b": publish("/y") + _SUBSCRIBE}),
@@ -64,8 +62,6 @@ POLICIES = {
     "equal.xml": policy_text(
         {f"/r{n}": publish(*(f"/r{n}/{e}" for e in ("xyq" if n == 4 else "xyz"))) for n in range(5)}
     ),
-    "old.xml": _OLD,
-    "odd.xml": _OLD.replace("</profiles>", '<profile ns="/" node="b*"/></profiles>'),
 }
 
 
@@ -349,10 +345,6 @@ CASES: dict[str, tuple[Case, ...]] = {
         Case(""),
         Case("--copy mine"),
         Case("--copy mine --dry-run"),
-        Case("--convert old.xml"),
-        Case("--convert old.xml -o new.xml"),
-        Case("--convert old.xml -o new.xml --dry-run"),
-        Case("--convert odd.xml", 1),
     ),
     "explain": (
         Case("ks /a publish /x --policy policy.xml"),

@@ -15,7 +15,6 @@ from sros_tool.pki import smime
 from sros_tool.pki.certificates import load_certificate
 from sros_tool.pki.keys import load_key
 from sros_tool.values import as_plain
-from tests.policy.earlier_policies import EARLIER, policies
 from tests.support.harness import policy_text, publish, sros
 
 PASSPHRASE = "the passphrase"
@@ -148,8 +147,6 @@ def make_corpus(root: Path) -> Corpus:
         frozenset((Endpoint("rt/chatter", "publish"), Endpoint("rq/addRequest", "subscribe"))),
     )
     (root / "observation.json").write_text(json.dumps(as_plain(make_observation([node])), indent=1))
-    earlier = dict(policies(EARLIER))["private-gauge"]
-    (root / "earlier.xml").write_text(earlier)
     (root / "shipped.xml").write_bytes((policies_dir() / "mobile_robot.xml").read_bytes())
     key = load_key((keystore / "private/identity_ca.key.pem").read_bytes(), "of the corpus")
     assert isinstance(key, ec.EllipticCurvePrivateKey)

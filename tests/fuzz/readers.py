@@ -54,7 +54,7 @@ from sros_tool.pki.certificates import (
 from sros_tool.pki.chains import Checks, chain_fault
 from sros_tool.pki.crl import load_crl, signed_by
 from sros_tool.pki.keys import load_key
-from sros_tool.policy.document import convert_policy, policy_xml, read_policy
+from sros_tool.policy.document import policy_xml, read_policy
 from sros_tool.policy.rights import policy_rights
 from sros_tool.prometheus import render_metrics
 from sros_tool.report.sources import read_source
@@ -200,15 +200,9 @@ def _governance(data: bytes, place: Place) -> None:
 
 def _policy(data: bytes, place: Place) -> None:
     policy = read_policy(place.put("drawn.xml", data))
-    policy_rights(policy)
-    policy_xml(policy)
+    written = place.put("written.xml", policy_xml(policy))
+    assert policy_rights(read_policy(written)) == policy_rights(policy)
     load_rights(place.folder / "drawn.xml")
-
-
-def _earlier_policy(data: bytes, place: Place) -> None:
-    converted = convert_policy(place.put("drawn.xml", data)).policy
-    written = place.put("converted.xml", policy_xml(converted))
-    assert policy_rights(read_policy(written)) == policy_rights(converted)
 
 
 def _template(data: bytes, place: Place) -> None:
@@ -295,7 +289,6 @@ READERS: dict[str, Reader] = {
     ),
     "governance": Reader(_governance, ("ks/enclaves/governance.xml",), 2),
     "policy": Reader(_policy, ("policy.xml", "shipped.xml"), 3),
-    "earlier policy": Reader(_earlier_policy, ("earlier.xml",)),
     "template": Reader(_template, ("ks/sros.toml",), 2),
     "scenario": Reader(_scenario, ("scenario.toml",), 2),
     "ledger": Reader(_ledger, ("ks/ledger.jsonl",)),
