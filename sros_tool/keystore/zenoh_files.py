@@ -23,7 +23,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from enum import Enum, StrEnum
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 from shlex import quote
 from string import ascii_letters, digits
@@ -734,6 +734,7 @@ class _RulesOfEnclave(NamedTuple):
     rights: RemoteRights | None
 
 
+@dataclass(frozen=True)
 class _RightsReader:
     """A reader of enclaves' rights, in the form of other processes' rules.
 
@@ -741,30 +742,27 @@ class _RightsReader:
     whose files have older or other permissions gets no rules.
     """
 
-    def __init__(
-        self,
-        keystore: OpenedKeystore,
-        authority: x509.Certificate,
-        domains: Sequence[int],
-        network: ZenohNetwork,
-        now: datetime | None,
-        change: ZenohChange,
-        only_enclaves: Collection[str],
-    ) -> None:
-        self._keystore = keystore
-        self._authority = authority
-        self._domains = domains
-        self._network = network
-        self._now = now
-        self._change = change
-        self._only = only_enclaves
-        self.ledger = keystore.ledger
-        self._recorded = RecordedRights(keystore, self.ledger)
-        self._revoked = {
-            certificate.serial
-            for revocations in keystore.revocation_lists
-            for certificate in revocations.revoked
-        }
+    keystore: OpenedKeystore
+    authority: x509.Certificate
+    domains: Sequence[int]
+    network: ZenohNetwork
+    now: datetime | None
+    change: ZenohChange
+    only_enclaves: Collection[str]
+
+    @property
+    def ledger(self) -> Ledger:
+        """The ledger of the keystore."""
+        return self.keystore.ledger
+
+    @cached_property
+    def _recorded(self) -> RecordedRights:
+        return RecordedRights(self.keystore, self.ledger)
+
+    @cached_property
+    def _revoked(self) -> frozenset[int]:
+        lists = self.keystore.revocation_lists
+        return frozenset(entry.serial for crl in lists for entry in crl.revoked)
 
     def read(self, names: Sequence[str]) -> dict[str, _RulesOfEnclave | str]:
         """Map enclaves to their rules, or to the reason why they get none (a clause)."""
@@ -786,11 +784,11 @@ class _RightsReader:
                     left_out[name] = error.what
             return done
 
-        issued = {name: rights for name in names if (rights := self._change.issued.get(name))}
+        issued = {name: rights for name in names if (rights := self.change.issued.get(name))}
         certificates = results_of((e for e in names if e not in issued), self._certificate)
         messages = results_of(certificates, self._message)
         signed = results_of(
-            messages, lambda name: self._keystore.files.signed_document(messages[name])
+            messages, lambda name: self.keystore.files.signed_document(messages[name])
         )
         verified = results_of(signed, lambda name: self._verify(name, messages[name], signed[name]))
         grants = results_of(
@@ -803,12 +801,12 @@ class _RightsReader:
             for name, domains in joined.items()
         }
         remotes = {name: self._remote(name, rights) for name, rights in stated.items()}
-        asked = [name for name in remotes if not self._only or name in self._only]
+        asked = [name for name in remotes if not self.only_enclaves or name in self.only_enclaves]
         for name in asked:
             _check_rules_match(name, remotes[name], stated[name])
         routers = {
             name: render_rights(
-                rights_given_to_router(self._network.router_of(name).name, remotes[name])
+                rights_given_to_router(self.network.router_of(name).name, remotes[name])
             )
             for name in asked
         }
@@ -820,15 +818,15 @@ class _RightsReader:
                 rendered[name],
                 routers.get(name),
                 announced_nodes(remotes[name].rules, name),
-                remotes[name] if self._network.mode is Mode.PEER or self._network.routers else None,
+                remotes[name] if self.network.mode is Mode.PEER or self.network.routers else None,
             )
             for name in names
         }
 
     def _certificate(self, name: str) -> x509.Certificate:
-        path = self._keystore.folder(name) / CERTIFICATE_FILE
+        path = self.keystore.folder(name) / CERTIFICATE_FILE
         try:
-            certificate = self._keystore.certificate(path)
+            certificate = self.keystore.certificate(path)
         except SrosError as error:
             raise error if path.exists() else KeystoreError("it has no certificate yet") from None
         if certificate.serial_number in self._revoked:
@@ -841,14 +839,14 @@ class _RightsReader:
         return certificate
 
     def _message(self, name: str) -> bytes:
-        path = self._keystore.folder(name) / PERMISSIONS_FILE
+        path = self.keystore.folder(name) / PERMISSIONS_FILE
         try:
-            return self._keystore.read(path, "permissions document")
+            return self.keystore.read(path, "permissions document")
         except SrosError as error:
             raise error if path.exists() else KeystoreError("it has no permissions") from None
 
     def _verify(self, name: str, message: bytes, signed: smime.SignedDocument) -> None:
-        signed.verify(self._authority)
+        signed.verify(self.authority)
         self._recorded.policy(name, hashlib.sha256(message).hexdigest())
 
     def _grant(self, name: str, document: bytes, certificate: x509.Certificate) -> Grant:
@@ -856,7 +854,7 @@ class _RightsReader:
         grant = grant_for_all_vendors(document, f"the permissions of {name}", subject)
         if grant is None:
             raise KeystoreError("its permissions are not for its certificate")
-        now = self._now
+        now = self.now
         # Without a valid certificate, the enclave gets no connection, so changing its rules would
         # be useless.
         if now and grant.validity.not_after < now <= validity_of(certificate).not_after:
@@ -864,14 +862,14 @@ class _RightsReader:
         return grant
 
     def _domains_of_grant(self, grant: Grant) -> tuple[int, ...]:
-        domains = _joined_domains(grant, self._domains)
+        domains = _joined_domains(grant, self.domains)
         if not domains:
             elsewhere = "its permissions are for no domain of the keystore"
-            raise KeystoreError(OTHER_DOMAINS if self._network.domains else elsewhere)
+            raise KeystoreError(OTHER_DOMAINS if self.network.domains else elsewhere)
         return domains
 
     def _nodes(self, name: str) -> str:
-        issued = self._change.issued.get(name)
+        issued = self.change.issued.get(name)
         return issued.nodes if issued else self._recorded.nodes(name)
 
     def _remote(
@@ -880,7 +878,7 @@ class _RightsReader:
         try:
             return remote_of(name, stated_rights, nodes_from_text(self._nodes(name)))
         except PolicyError:
-            if policy := self._change.stated.get(name):
+            if policy := self.change.stated.get(name):
                 remote_rights(policy, min(stated_rights))  # the error names the line of the policy
             raise
 

@@ -839,7 +839,7 @@ def write_enclaves(
     maker = _EnclaveMaker(
         change,
         writer,
-        places,
+        change.tokens(places),
         wanted_enclaves,
         EnclaveDomains(change.domains, change.fleet, stated_robots),
         revoke_old=revoke_old,
@@ -904,32 +904,21 @@ def _other_files_notes(done: Mapping[str, _EnclaveOutcome]) -> Iterator[Note]:
         yield Note("permissions.others-fit", f"{first_few(names, 5)}: {text}.")
 
 
+@dataclass(frozen=True)
 class _EnclaveMaker:
     """Makes enclaves one at a time, within a change."""
 
-    def __init__(
-        self,
-        change: KeystoreChange,
-        writer: EnclaveWriter,
-        places: Mapping[str, TokenUri],
-        names: Iterable[str],
-        domains: EnclaveDomains,
-        *,
-        revoke_old: bool,
-        keep_same: bool,
-    ) -> None:
-        self._change = change
-        self._root = change.root
-        self._writer = writer
-        self._names = names
-        self._tokens: EnclaveTokens = change.tokens(places)
-        self._domains = domains
-        self._revoke_old = revoke_old
-        self._keep_same = keep_same
+    change: KeystoreChange
+    writer: EnclaveWriter
+    tokens: EnclaveTokens
+    names: Iterable[str]
+    domains: EnclaveDomains
+    revoke_old: bool
+    keep_same: bool
 
     def make(self, name: str, policy: Enclave | None) -> _EnclaveOutcome:
         """Stage the missing files of an enclave, and if ``policy`` is not None, its permissions."""
-        change, root = self._change, self._root
+        change, root = self.change, self.change.root
         present = present_files(root, name)
         before = len(change.transaction.changes)
         identity = self._identity(name, present, replaced=bool(policy))
@@ -938,25 +927,25 @@ class _EnclaveMaker:
         rights = None
         if policy or PERMISSIONS_FILE not in present:
             enclave = policy or _default_rights(change.template, name)
-            rights = StatedRights(enclave, self._domains.domains_of(name))
+            rights = StatedRights(enclave, self.domains.domains_of(name))
         if (
             rights
             and certificate
             and PERMISSIONS_FILE in present
             and self._is_kept(certificate, rights)
         ):
-            other_files = self._why_other_files_work(name, certificate) if self._revoke_old else ""
+            other_files = self._why_other_files_work(name, certificate) if self.revoke_old else ""
             if not other_files:
                 rights = None
         if rights and PERMISSIONS_FILE in present:
             earlier = earlier_permissions(
                 change.keystore, name, change.permissions.certificate, certificate
             )
-            if self._revoke_old and certificate:
+            if self.revoke_old and certificate:
                 old = certificate
                 public = change.unrevoked_key(name, old)
                 identity = NewIdentity(enclave_subject(name, unique=True), public)
-        issued = self._writer.write(Issuance(name, identity, rights))
+        issued = self.writer.write(Issuance(name, identity, rights))
         link_shared_files(change.transaction, name, present)
         notes = tuple(issued.notes())
         if isinstance(identity, NewIdentity) and isinstance(identity.new_key, TokenKey):
@@ -1011,10 +1000,10 @@ class _EnclaveMaker:
         of their permissions; expired and revoked certificates are left out.  The third value is the
         result of `subjects_since_restore`.
         """
-        keystore, now = self._change.keystore, iso(self._change.now)
+        keystore, now = self.change.keystore, iso(self.change.now)
         working: dict[str, tuple[set[int], list[str]]] = {}
         try:
-            ledger = keystore.ledger_file.with_values("enclave", {*self._names})
+            ledger = keystore.ledger_file.with_values("enclave", {*self.names})
             restored = keystore.ledger_with("what", RESTORED)
             is_restored = any(entry.what == RESTORED for entry in restored.entries)
             # Only the whole ledger has the order of marks and subjects.
@@ -1043,7 +1032,7 @@ class _EnclaveMaker:
         enclave had permissions.
         """
         name = default_enclave.path
-        last = self._change.recorded_rights.last_entry(name)
+        last = self.change.recorded_rights.last_entry(name)
         if (
             last.policy == default_enclave.digest
             if last
@@ -1053,7 +1042,7 @@ class _EnclaveMaker:
         text = (
             f"enclave {name} had lost its {PERMISSIONS_FILE}: it now has the default permissions "
             "of the keystore's template, and no longer the rights of its policy. To give it the "
-            f"rights of its policy again: `sros create_permission {quote(str(self._root))} "
+            f"rights of its policy again: `sros create_permission {quote(str(self.change.root))} "
             f"{quote(name)} POLICY`."
         )
         yield Note("keystore.rights-lost", text)
@@ -1065,11 +1054,11 @@ class _EnclaveMaker:
             KeystoreError: the key of the enclave was revoked, so DDS would not accept the
                 permissions.
         """
-        if not self._keep_same:
+        if not self.keep_same:
             return False
-        change, name = self._change, rights.enclave.path
+        change, name = self.change, rights.enclave.path
         change.unrevoked_key(name, certificate)
-        folder = enclave_path(self._root, name)
+        folder = enclave_path(self.change.root, name)
         signed_path, xml = folder / PERMISSIONS_FILE, folder / "permissions.xml"
         # A link could lead to a file that others can change.
         if signed_path.is_symlink() or xml.is_symlink():
@@ -1085,7 +1074,7 @@ class _EnclaveMaker:
         except (SrosError, ValueError):  # these are not files that `write` would leave as they are
             return False
         text = signed.text
-        return self._writer.would_change_only_dates(
+        return self.writer.would_change_only_dates(
             rights, certificate, validity, text
         ) and _has_content(xml, text)
 
@@ -1101,10 +1090,10 @@ class _EnclaveMaker:
             KeystoreError: the certificate cannot be used, or the current permissions are not the
                 latest.
         """
-        change, root = self._change, self._root
+        change, root = self.change, self.change.root
         folder = enclave_path(root, name)
-        if name in self._tokens.places and not existing_files.isdisjoint(_KEY_OR_REQUEST_FILES):
-            self._tokens.check_present(name, root)
+        if name in self.tokens.places and not existing_files.isdisjoint(_KEY_OR_REQUEST_FILES):
+            self.tokens.check_present(name, root)
         if CERTIFICATE_FILE in existing_files:
             if not existing_files & _KEY_OR_REQUEST_FILES:
                 raise KeystoreError(
@@ -1118,13 +1107,13 @@ class _EnclaveMaker:
         if PERMISSIONS_FILE in existing_files and not replaced:
             subject = self._subject_of_permissions(name, subject)
         if existing_files.isdisjoint(KEY_FILES):
-            new_key = self._tokens.key(name) if name in self._tokens.places else generate_key()
+            new_key = self.tokens.key(name) if name in self.tokens.places else generate_key()
             return NewIdentity(subject, new_key.public_key(), new_key)
         path = folder / next(file for file in KEY_FILES if file in existing_files)
         public = (
             load_key(read_bytes(path, "private key"), f"'{path}'")
             if path.name == KEY_FILE
-            else open_enclave_key(place_in_file(path), self._tokens.secrets)
+            else open_enclave_key(place_in_file(path), self.tokens.secrets)
         ).public_key()
         remedy = f"Move '{path}' away: then a new key is created."
         change.known.refuse_revoked_key(public, f"enclave {name}", remedy)
@@ -1133,11 +1122,11 @@ class _EnclaveMaker:
 
     def _subject_of_permissions(self, name: str, own_subject: x509.Name) -> x509.Name:
         """Return the subject in an enclave's signed permissions, or else ``own_subject``."""
-        path = enclave_path(self._root, name) / PERMISSIONS_FILE
-        for subject in _permissions_subjects(path, self._change.permissions.certificate):
+        path = enclave_path(self.change.root, name) / PERMISSIONS_FILE
+        for subject in _permissions_subjects(path, self.change.permissions.certificate):
             if common_name_of(subject) == common_name_of(own_subject):
-                message = self._change.keystore.read(path, "permissions document")
-                self._change.recorded_rights.policy(name, hashlib.sha256(message).hexdigest())
+                message = self.change.keystore.read(path, "permissions document")
+                self.change.recorded_rights.policy(name, hashlib.sha256(message).hexdigest())
                 return subject
         return own_subject
 
@@ -1147,9 +1136,9 @@ class _EnclaveMaker:
         Raises:
             KeystoreError: DDS would refuse the certificate.
         """
-        path = enclave_path(self._root, name) / CERTIFICATE_FILE
-        certificate = self._change.keystore.certificate(path)
-        authority = self._change.identity.certificate
+        path = enclave_path(self.change.root, name) / CERTIFICATE_FILE
+        certificate = self.change.keystore.certificate(path)
+        authority = self.change.identity.certificate
         if not issued_by(certificate, authority):
             raise KeystoreError(
                 f"the certificate of enclave {name} was not issued by the identity CA of this "
@@ -1159,22 +1148,22 @@ class _EnclaveMaker:
                 "Restore the right certificate, or remove the enclave's folder and create it "
                 "again.",
             )
-        if not validity_of(certificate).contains(self._change.now):
+        if not validity_of(certificate).contains(self.change.now):
             raise self._not_valid_error()
         return certificate
 
     def _not_valid_error(self) -> KeystoreError:
         """Return the error that names all enclaves whose certificates are not valid now."""
         windows: dict[str, Window] = {}
-        for name in self._names:
+        for name in self.names:
             with suppress(SrosError):
-                path = enclave_path(self._root, name) / CERTIFICATE_FILE
-                validity = validity_of(self._change.keystore.certificate(path))
-                if not validity.contains(self._change.now):
+                path = enclave_path(self.change.root, name) / CERTIFICATE_FILE
+                validity = validity_of(self.change.keystore.certificate(path))
+                if not validity.contains(self.change.now):
                     windows[name] = validity
         name, validity = next(iter(windows.items()))
         dates = f"is valid from {iso(validity.not_before)} to {iso(validity.not_after)}."
-        command = f"`sros renew {quote(str(self._root))} {self._robots_or_names(windows)}`"
+        command = f"`sros renew {quote(str(self.change.root))} {self._robots_or_names(windows)}`"
         if len(windows) == 1:
             return KeystoreError(
                 f"the certificate of enclave {name} is not valid now",
@@ -1194,9 +1183,9 @@ class _EnclaveMaker:
         A robot stands for its enclaves if all of them are in ``names``.
         """
         words, left = [], list(names)
-        fleet = load_fleet(self._change.keystore)
+        fleet = load_fleet(self.change.keystore)
         for robot in fleet.robots.values() if fleet and len(names) > 1 else ():
-            own = enclaves_of_robot(self._change.keystore, fleet, robot) if fleet else ()
+            own = enclaves_of_robot(self.change.keystore, fleet, robot) if fleet else ()
             if own and {*own} <= {*names}:
                 words.append(f"--robot {robot.name}")
                 left = [name for name in left if name not in own]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Container, Iterable, Iterator, Sequence
 from contextlib import suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 from shlex import quote
 from typing import Unpack
@@ -175,25 +176,16 @@ def _due_enclave_names(
             yield lifetime.name
 
 
+@dataclass
 class _Renewer:
     """Renews enclaves one at a time; ``notes`` are about their keys."""
 
-    def __init__(
-        self,
-        change: KeystoreChange,
-        writer: EnclaveWriter,
-        *,
-        new_key: bool,
-        tokens: EnclaveTokens,
-        unique: bool,
-    ) -> None:
-        self.notes: list[Note] = []
-        self._change = change
-        self._root = change.root
-        self._writer = writer
-        self._new_key = new_key
-        self._tokens = tokens
-        self._unique = unique
+    change: KeystoreChange
+    writer: EnclaveWriter
+    new_key: bool
+    tokens: EnclaveTokens
+    unique: bool
+    notes: list[Note] = field(default_factory=list)
 
     def renew(self, names: Sequence[str], progress: Progress | None) -> list[SupersededCertificate]:
         """Renew the enclaves ``names``, and return the replaced certificates.
@@ -201,16 +193,16 @@ class _Renewer:
         Raises:
             KeystoreError: enclaves cannot be read; the error names all of them.
         """
-        done = self._writer.for_each(names, self._renew_one, progress).values()
+        done = self.writer.for_each(names, self._renew_one, progress).values()
         unreadable = tuple(result for result in done if isinstance(result, UnreadableEnclave))
         refuse_unreadable(unreadable, "renewed")
         return [result for result in done if isinstance(result, SupersededCertificate)]
 
     def _renew_one(self, name: str) -> SupersededCertificate | UnreadableEnclave:
-        now = self._change.now
+        now = self.change.now
         try:
-            state = read_credentials(self._change.keystore, name)
-            issued = self._writer.write(self._issuance(state))
+            state = read_credentials(self.change.keystore, name)
+            issued = self.writer.write(self._issuance(state))
         except CaServiceError:
             raise
         except SrosError as error:
@@ -220,43 +212,43 @@ class _Renewer:
     def _issuance(self, state: Credentials) -> Issuance:
         """Return the issuance for an enclave, after verifying the enclave's present files."""
         name = state.name
-        rights = checked_rights(state, self._change.authorities, self._change.recorded_rights)
+        rights = checked_rights(state, self.change.authorities, self.change.recorded_rights)
         # If a unique subject made earlier permissions useless, they must not become useful again.
-        unique = self._unique or has_unique_part(state.certificate.subject)
+        unique = self.unique or has_unique_part(state.certificate.subject)
         subject = enclave_subject(name, unique=unique)
-        if name in self._tokens.places:
+        if name in self.tokens.places:
             self._refuse_key_on_robot(name)
-            token_key = self._tokens.key(name)
+            token_key = self.tokens.key(name)
             self.notes += token_notes(token_key)
             identity = NewIdentity(subject, token_key.public_key(), token_key)
-        elif self._new_key:
+        elif self.new_key:
             key = self._generate_key(name)
             identity = NewIdentity(subject, key.public_key(), key)
         else:
-            identity = NewIdentity(subject, self._change.unrevoked_key(name, state.certificate))
+            identity = NewIdentity(subject, self.change.unrevoked_key(name, state.certificate))
         return Issuance(name, identity, rights)
 
     def _generate_key(self, name: str) -> PrivateKey:
-        folder = enclave_path(self._root, name)
+        folder = enclave_path(self.change.root, name)
         if (folder / KEY_URI_FILE).exists():
             raise KeystoreError(
                 f"the key of enclave {name} is on a token",
                 f"A new key in a file would have no effect: {KEY_URI_FILE} names the current key.",
-                f"Make a key on the token: `sros renew {quote(str(self._root))} {name} --key "
+                f"Make a key on the token: `sros renew {quote(str(self.change.root))} {name} --key "
                 "'pkcs11:token=NAME;object=LABEL'`, with a label that the token does not have.",
             )
         self._refuse_key_on_robot(name)
         return generate_key()
 
     def _refuse_key_on_robot(self, name: str) -> None:
-        if not has_key(enclave_path(self._root, name)):
+        if not has_key(enclave_path(self.change.root, name)):
             raise KeystoreError(
                 f"the key of enclave {name} is not in this keystore",
                 "It was generated on the robot and stays there, so no new key is generated here.",
                 "Remove the enclave's folder on the robot, create a new request there with "
                 "`sros create_request`, and sign it here with `sros sign_request --renew`. To "
                 "revoke the earlier key, then run "
-                f"`sros renew {quote(str(self._root))} {quote(name)} --revoke-old`.",
+                f"`sros renew {quote(str(self.change.root))} {quote(name)} --revoke-old`.",
             )
 
 
