@@ -398,8 +398,13 @@ def _has_one_name(state: os.stat_result) -> bool:
     return stat.S_ISDIR(state.st_mode) or (stat.S_ISREG(state.st_mode) and state.st_nlink == 1)
 
 
-def make_folders(path: Path) -> list[Path]:
+def make_folders(path: Path, mode: int | None = None) -> list[Path]:
     """Make the folder at ``path`` and its parents; return the folders that were made, inner first.
+
+    Args:
+        path: the path of the folder.
+        mode: the permission bits of the folder if it is made, whatever the umask is; None for the
+            bits that the umask leaves.
 
     Raises:
         OSError: a folder cannot be made; the folders that were made before are removed.
@@ -411,6 +416,8 @@ def make_folders(path: Path) -> list[Path]:
             with contextlib.suppress(FileExistsError):  # another process created it meanwhile
                 folder.mkdir()
                 paths.insert(0, folder)
+                if mode is not None and folder == path:
+                    folder.chmod(mode)
     except BaseException:
         remove_folders(paths)
         raise

@@ -1261,8 +1261,8 @@ def _write_message(inbox: Path, robot: str, message: bytes) -> None:
             f"{error.strerror or error}.",
             "The agent tries again at its next run."
             + (
-                " If a unit runs it, `sros units --job agent`, run after `sros agent init`, writes "
-                "a unit that may write there."
+                " If a unit runs it, write the unit again, because `sros agent init` had not run "
+                "then: `sros units KEYSTORE --job agent FOLDER`."
                 if error.errno == errno.EROFS
                 else ""
             ),

@@ -258,12 +258,10 @@ def publish(
         )
     with ExitStack() as stack:
         if not dry_run:
-            made = make_folders(folder)
+            made = make_folders(folder, mode=0o755)  # web servers have to read it
             # Of the folders that were made, only the empty ones.
             stack.callback(remove_folders, made)
             opened = stack.enter_context(Folder(folder))
-            if made:  # web servers have to read it, whatever the umask is
-                folder.chmod(0o755)
             for part in (_METADATA, _TARGETS, _ARCHIVES):
                 if not opened.is_folder(part):
                     opened.mkdir(part, 0o755)
