@@ -501,8 +501,9 @@ def run_by_hand(
         }
         result = results.get(node.role, "")
         was_short = duration is not None and duration.total_seconds() < _SILENCE_SECONDS
-        if result and was_short and not (heard or seen):
-            result += ", but the time may be too short to find other nodes: use --for 10s"
+        done = heard if node.role is Role.LISTENER else seen
+        if result and was_short and not done:
+            result += ", but the time may be too short to connect to other nodes: use --for 10s"
         say(f"stopped{by_force}{result}")
     elif last and last.stage is ProcessStage.ENDPOINT and os.environ.get(ENABLE) == "true":
         verb = "publish" if node.role is Role.TALKER else "subscribe"

@@ -166,7 +166,7 @@ def test_a_listener_ends_after_its_time_and_without_a_reader(
 
     (last,) = apart(played)
     assert last.startswith(
-        "stopped; heard 0 messages, but the time may be too short to find other nodes:"
+        "stopped; heard 0 messages, but the time may be too short to connect to other nodes:"
     )
     assert "--for is for a talker" in sros("demo", "--for", "3s").err
 
@@ -175,25 +175,41 @@ _NODE = """#!/bin/sh
 for report; do :; done
 tell() { printf '{"event": "%s", "time": 1, "text": "%s", "count": %s}\\n' "$@" > "$report"; }
 trap 'tell heard "2 messages of nav_msgs/msg/Odometry" 2; exit 0' TERM
-tell ready "" 0
 SEEN
+tell ready "" 0
 tell heard "4 messages of nav_msgs/msg/Odometry" 4
 tell heard "3 messages of love" 1
 while :; do sleep 0.01; done
 """
 _SEEN = "/odom has 1 subscription of nav_msgs/msg/Odometry"
+_HEARS_NOTHING = """trap 'exit 0' TERM
+tell seen "/odom has 1 publisher of nav_msgs/msg/Odometry" 0
+tell ready "" 0
+while :; do sleep 0.01; done"""
 
 
 @pytest.mark.parametrize(
-    ("role", "seen", "result"),
+    ("role", "seen", "seconds", "result"),
     [
-        (Role.LISTENER, "", "heard 7 messages"),
-        (Role.TALKER, f'tell seen "{_SEEN}" 0; tell seen "" 0', _SEEN),
-        (Role.TALKER, "", "found no subscription of /odom"),
+        (Role.LISTENER, "", None, "heard 7 messages"),
+        (Role.TALKER, f'tell seen "{_SEEN}" 0; tell seen "" 0', None, _SEEN),
+        (Role.TALKER, "", None, "found no subscription of /odom"),
+        (
+            Role.LISTENER,
+            _HEARS_NOTHING,
+            0.01,
+            "heard 0 messages, but the time may be too short to connect to other nodes: use --for "
+            "10s",
+        ),
     ],
 )
 def test_a_node_by_hand_ends_with_what_it_heard_and_saw(
-    role: Role, seen: str, result: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    role: Role,
+    seen: str,
+    seconds: float | None,
+    result: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Also messages that it reports only when it ends; a text that looks like a sum is one."""
     node, lines = tmp_path / "node", list[str]()
@@ -207,7 +223,8 @@ def test_a_node_by_hand_ends_with_what_it_heard_and_saw(
             os.kill(os.getpid(), signal.SIGTERM)
 
     def played() -> list[str]:
-        run_by_hand(HandNode(role, "cyclone", "/odom"), say)
+        duration = timedelta(seconds=seconds) if seconds else None
+        run_by_hand(HandNode(role, "cyclone", "/odom"), say, duration)
         return lines
 
     assert apart(played)[-1] == f"stopped; {result}"
