@@ -21,8 +21,7 @@ VACUOUS = FindingKind(
     "exceptions cover every enclave.",
     "The requirements file.",
     "Correct the name, its kind (service or action) or the exceptions. After `merge_policy "
-    "--remap`, check with the same --remap. For a name that is to stay unused, write [[nobody]]; "
-    "for enclaves that come and go, such as laptops, write [[only]].",
+    "--remap`, check with the same --remap. For a name that is to stay unused, write [[nobody]].",
 )
 UNKNOWN_ENCLAVE = FindingKind(
     "requirement.unknown-enclave",

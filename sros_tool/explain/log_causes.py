@@ -394,7 +394,7 @@ class Examiner:
             remedy = (
                 f"All names that are denied to the process lack the namespace {ns}: start it with "
                 f"`--ros-args -r __ns:={quote(ns)}`, or with `namespace=` in its launch file. If "
-                f"{name} is right, {finding.remedy}"
+                f"{name} is right, {_within_sentence(finding.remedy)}"
             )
         else:
             other, better = self._other_node_cause(denial, answer)
@@ -406,7 +406,8 @@ class Examiner:
                 better = (
                     f"Perhaps the robot has the policy in {likely} (`--namespace {quote(likely)}` "
                     "of `sros merge_policy`). If so, rcl's line `Found security directory` in the "
-                    f"whole log names an enclave in {likely}. Otherwise, {finding.remedy}"
+                    f"whole log names an enclave in {likely}. Otherwise, "
+                    f"{_within_sentence(finding.remedy)}"
                 )
             elif not other:
                 better = self._remedy_in_a_namespace(denial, name, better or finding.remedy)
@@ -500,7 +501,7 @@ class Examiner:
                 use = f"{question.word} {misspelled}, {nobody}"
                 return [f"the enclave may {use}: perhaps {name} is meant"], (
                     f"If the policy misspells the name, write {name} in place of {misspelled} "
-                    f"there. Otherwise, {remedy}"
+                    f"there. Otherwise, {_within_sentence(remedy)}"
                 )
             names = tuple(other for other in names if _last_part(other) == _last_part(name))
         own = [right.name for right in named_rights(asked) if right.right == denied.right]
@@ -531,20 +532,24 @@ class Examiner:
                 f"{misspelled}If the node lacks a remapping{add} If the policy lacks a remapping "
                 f"that the node has, remove it from the node, write {name} in place of {meant} in "
                 f"the policy, or merge the policy with `--remap {quote(meant)}:={quote(name)}`. "
-                f"Otherwise, {remedy}"
+                f"Otherwise, {_within_sentence(remedy)}"
             )
         if is_used is False and self._keystore:
             place = self._keystore.kind
+            facts = [f"no enclave of the {place} may {PEER_RIGHT[denied.right]} {name}"]
+            if len(own) == 1:
+                facts.append(f"the enclave may {question.word} only {own[0]}")
             if place == "export":
                 remedy = (
                     "If the enclave at the other end is not in this export (it may be on another "
                     "machine), ask the whole keystore: `sros explain KEYSTORE --log LOG`. "
-                    f"Otherwise, {remedy}"
+                    f"Otherwise, {_within_sentence(remedy)}"
                 )
-            return [f"no enclave of the {place} may {PEER_RIGHT[denied.right]} {name}"], (
-                f"{remedy} Or, if another name is meant, the node lacks a remapping, or has a "
-                "wrong one: compare its start command with the command in the robot's launch files "
-                f"(after `sros close`: start/commands.txt).{renamed or new_name}"
+            return facts, (
+                "Probably the node lacks a remapping, or has a wrong one: compare its start "
+                "command with the command in the robot's launch files (after `sros close`: "
+                f"start/commands.txt).{renamed or new_name} Otherwise, "
+                f"{_within_sentence(remedy)}"
             )
         if renamed and is_used:  # its peers may mean the new name, or the old one
             return [], f"{remedy}{renamed}{new_name}"
@@ -675,6 +680,11 @@ class Examiner:
                 "domain of the keystore", f"domain of the keystore, such as {next(iter(governed))}"
             ),
         )
+
+
+def _within_sentence(remedy: str) -> str:
+    """Return a remedy as it continues a sentence."""
+    return f"{remedy[:1].lower()}{remedy[1:]}"
 
 
 def _keystore_with(path: str) -> Path | None:

@@ -52,10 +52,12 @@ from sros_tool.proof.requirements import (
     Must,
     Nobody,
     NotBoth,
+    NothingBut,
     Only,
     Protected,
     Requirement,
     RightsRequirement,
+    Widest,
     demand,
     unused_remappings,
 )
@@ -631,11 +633,23 @@ _NOBODY_REMEDY = (
     "the same --remap."
 )
 
+_ENCLAVES_REMEDY = (
+    "Correct the names of the enclaves, or the exceptions. For enclaves that come and go, such as "
+    "laptops, write [[only]]."
+)
+
 
 def _vacuous_remedy(requirement: Requirement, rights: Iterable[Right]) -> str:
     """Return a remedy that fits better than the remedy of `VACUOUS`; "" if there is none."""
-    other_namespace = _namespace_remedy(requirement, rights)
-    return other_namespace or (_NOBODY_REMEDY if isinstance(requirement, Nobody) else "")
+    if other_namespace := _namespace_remedy(requirement, rights):
+        return other_namespace
+    match requirement:
+        case Nobody():
+            return _NOBODY_REMEDY
+        case Widest() | NothingBut() | Apart():
+            return _ENCLAVES_REMEDY
+        case _:
+            return ""
 
 
 def _namespace_remedy(requirement: Requirement, rights: Iterable[Right]) -> str:

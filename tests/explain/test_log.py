@@ -1416,13 +1416,14 @@ def test_the_other_side_of_a_name_tells_whether_a_remapping_may_be_forgotten(
             "/odometry",
             (
                 "no enclave of the keystore may publish /odometry\n",
-                "Or, if another name is meant, the node lacks a remapping",
+                "Probably the node lacks a remapping, or has a wrong one: compare its ",
+                "Otherwise, if the policy is for another version of the node, use the policy of",
             ),
         ),
     ):
         log.write_text(f"rt{topic} topic not found in allow rule. check_create_datareader\n")
         found = sros("explain", keystore, "/weed", "--log", log).out
-        for fact in ("-r /frnt/image:=", "no enclave ", "if another name is meant"):
+        for fact in ("-r /frnt/image:=", "no enclave ", "Probably the node lacks"):
             assert (fact in found) is any(fact in each for each in facts), (topic, found)
         assert all(fact in found for fact in facts) and "subscribe" in found
         assert ("-r /rear/image:=/front/image" in found) is (rear in facts)
@@ -1444,8 +1445,8 @@ def test_the_other_side_of_a_name_tells_whether_a_remapping_may_be_forgotten(
     sros("distribute_key", keystore, "/weed", export).ok()
     found = sros("explain", export, "--log", log, "/weed").out
     assert "no enclave of the export may publish /odometry\n" in found
-    assert "ask the whole keystore: `sros explain KEYSTORE --log LOG`. Otherwise, " in found
-    assert "Or, if another name is meant, the node lacks a remapping" in found
+    assert "ask the whole keystore: `sros explain KEYSTORE --log LOG`. Otherwise, if the" in found
+    assert "Probably the node lacks a remapping" in found and "Otherwise, If" not in found
     (keystore / "enclaves/camera/permissions.p7s").write_text("damaged")
     found = sros("explain", keystore, "/weed", "--log", log).out
     assert "no enclave" not in found  # nothing follows for the name

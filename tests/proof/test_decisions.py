@@ -380,6 +380,8 @@ def test_an_exception_for_an_enclave_that_does_not_exist(required: str, ids: set
     requirements = parse_requirements(required.encode(), "r.toml")
     found = requirement_findings(requirements, system)
     assert {finding.id for finding in found} == ids and len(found) == len(ids)
+    advised = ["write [[only]]" in finding.remedy for finding in found if finding.id == VACUOUS]
+    assert advised == [not required.startswith("[[only]]")] * (VACUOUS in ids)
 
 
 READ_BY_ALL = {"/mux": may("publish", "/cmd_vel", "/arm_l/cmd"), "/rec": may("subscribe", "/*")}
