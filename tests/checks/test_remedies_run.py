@@ -80,6 +80,14 @@ def commands(finding: Finding, policy: Path, target: Path, **others: object) -> 
     return [[str(words.get(word, word)) for word in each] for each in whole]
 
 
+def edit_settings(root: Path) -> None:
+    """Edit the settings of a keystore as remedies with --take-edits ask for."""
+    path = root / "sros.toml"
+    text = path.read_text()
+    path.write_text(re.sub(r'(\[permissions\][^[]*?validity = )"\w+"', r'\1"400d"', text))
+    assert path.read_text() != text
+
+
 def at(moment: datetime, monkeypatch: pytest.MonkeyPatch) -> None:
     """Have the program take a moment for the current one."""
     for each in pkgutil.iter_modules(cli.__path__, "sros_tool.cli."):
@@ -110,8 +118,12 @@ def test_no_remedy_names_a_command_that_refuses(
     copy_of(root, tmp_path / "broken")
     if (root / "fleet.toml").exists():
         shutil.copy(root / "fleet.toml", tmp_path)
+    else:
+        (tmp_path / "fleet.toml").write_text("[robots]\nr1 = {}\n")
 
     def run(words: list[str]) -> Ended:
+        if "--take-edits" in words:
+            edit_settings(root)
         return sros(*words, env=ENVIRONMENT, cwd=tmp_path)
 
     for words in commands(found[0], policy, tmp_path / "target", KEYSTORE=root):
@@ -235,4 +247,6 @@ def test_no_remedy_of_the_runtime_names_a_command_that_refuses(
     named = commands(found, tmp_path, tmp_path / "target", KEYSTORE=bench.root, IDS="0,7")
     assert named
     for words in named:
+        if "--take-edits" in words:
+            edit_settings(bench.root)
         sros(*words, env={**state.environment, **ENVIRONMENT}).ok()

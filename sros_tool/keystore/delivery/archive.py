@@ -27,7 +27,7 @@ This leaves room for the largest Zenoh configuration that sros reads, with its s
 def refuse_archive_name(folder: Path, remedy: str) -> None:
     """Raise `UsageError` if a new folder would have the name of an archive, or `-`."""
     name = folder.name
-    if not folder.is_dir() and (name == "-" or name.endswith((*SUFFIXES, *_OTHER_SUFFIXES))):
+    if (name == "-" or name.endswith((*SUFFIXES, *_OTHER_SUFFIXES))) and not folder.is_dir():
         raise UsageError(f"'{folder}' would become a folder, not an archive", "", remedy)
 
 

@@ -549,6 +549,7 @@ def _write_folder(
         raise KeystoreError(
             f"'{target}' is the keystore itself or a folder in it", "", "Choose another folder."
         )
+    refuse_link_of_stranger(target)
     if os.path.lexists(target) and not target.is_dir():
         raise KeystoreError(
             f"'{target}' is in the way", "It is not a folder.", "Choose another folder."
