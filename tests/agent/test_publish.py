@@ -26,6 +26,7 @@ from sros_tool.folders import Folder
 from sros_tool.keystore import transaction
 from sros_tool.keystore.delivery import publish as publishing
 from sros_tool.keystore.delivery import published
+from sros_tool.keystore.delivery.archive import stated_size
 from sros_tool.keystore.delivery.export import ReleasedEnclave
 from sros_tool.keystore.delivery.export import released_enclave as evaluate
 from sros_tool.keystore.delivery.publish import PublishedFleet, publish
@@ -941,8 +942,9 @@ def test_a_forged_timestamp_is_refused_without_unpacking_everything(
     forged["signed"]["version"] += 1
     timestamp.write_text(json.dumps(forged))
     for number in range(2):
-        archive = gzip.compress(bytes(2**20))
-        (publisher.pub / f"targets/robots/{number:064x}.r1.tar.gz").write_bytes(archive)
+        archive = gzip.compress(bytes(2**20 + number))
+        name = f"{hashlib.sha256(archive).hexdigest()}.r1.tar.gz"
+        (publisher.pub / "targets/robots" / name).write_bytes(archive)
     read: list[bytes] = []
     monkeypatch.setattr(published, "_MEAN_ARCHIVE_BYTES", 1024)
     monkeypatch.setattr(published, "read_release", read.append)
@@ -951,8 +953,34 @@ def test_a_forged_timestamp_is_refused_without_unpacking_everything(
     assert not publication.as_seen_at(publisher.now).is_in_order and not read
     ended = sros("fleet", "status", "ks", cwd=publisher.folder)
     assert "the published files do not verify" in ended.out and ended.status == 1
-    with pytest.raises(KeystoreError, match="more than 0 MiB, unpacked, of archives"):
+    with pytest.raises(KeystoreError, match="more than 0 MiB, unpacked, of archives") as refused:
         publisher.publish()
+    assert "move" in refused.value.remedy and "--new-folder" in refused.value.remedy
+    publisher.pub.rename(publisher.folder / "away")
+    assert publisher.publish(new_folder=True).names("published") == ["r1", "r2", "r5"]
+
+
+def test_damaged_archives_do_not_count_as_huge(
+    publisher: Home, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The last bytes of an archive state its size; in a damaged archive, they state anything."""
+    publisher.publish()
+    first, *others = (publisher.pub / "targets/robots").glob("*.tar.gz")
+    most = sum(stated_size(archive.read_bytes()) for archive in (first, *others))
+    count = published._ARCHIVES_OF_FLEET + 3 * published._ARCHIVES_OF_ROBOT
+    monkeypatch.setattr(published, "_MEAN_ARCHIVE_BYTES", most // count + 1)
+    for archive in others:
+        archive.write_bytes(archive.read_bytes() + b"x\n")
+    timestamp = publisher.pub / "metadata/timestamp.json"
+    forged = json.loads(timestamp.read_bytes())
+    forged["signed"]["version"] += 1
+    timestamp.write_text(json.dumps(forged))
+    with pytest.raises(KeystoreError, match="metadata that this keystore did not write") as refused:
+        publisher.publish()
+    damaged = sorted(archive.name.split(".")[1] for archive in others)
+    assert f"Archives are missing or changed, too: {', '.join(damaged)}" in refused.value.why
+    shutil.rmtree(publisher.pub / "metadata")
+    assert publisher.publish(new_folder=True).names("published") == ["r1", "r2", "r5"]
 
 
 def test_a_publishing_folder_that_was_lost(publisher: Home) -> None:

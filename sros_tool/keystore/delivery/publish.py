@@ -129,6 +129,8 @@ _ONLINE = _ROLES[1:]
 _METADATA, _TARGETS, _ARCHIVES = "metadata", "targets", "targets/robots"
 _MOST_NAMES = 3
 """Maximum number of enclaves that a message names."""
+_MOST_DAMAGED = 5
+"""Maximum number of robots with damaged archives that a message names."""
 _KEPT = timedelta(days=2)
 """How long unused files are kept, because robots may be in the middle of an update."""
 _REMOVABLE = re.compile(
@@ -745,6 +747,10 @@ class _Publication:
         except KeystoreError as error:
             if unknown := self._unknown_releases():
                 raise self._unknown_error(unknown) from error
+            robots = self.list.robots.items()
+            if damaged := [r for r, known in robots if not self._has_files_of(r, known.release)]:
+                names = first_few(damaged, _MOST_DAMAGED)
+                error.why += f" Archives are missing or changed, too: {names}."
             raise
         self._present_releases = self._present.releases()
         self._composed: NewMetadata | None = None
@@ -1391,10 +1397,10 @@ class _Publication:
         """Note which published files are missing, changed or older, and list them for a day."""
         altered = [release_target(robot) for robot in sorted(self._damaged)]
         if altered:
+            names = first_few(sorted(self._damaged), _MOST_DAMAGED)
             text = (
-                f"archives in '{self._folder}' were missing or changed: "
-                f"{first_few(sorted(self._damaged), 5)}. They are published again, with a new "
-                "number. Find out who else can write to this folder."
+                f"archives in '{self._folder}' were missing or changed: {names}. They are "
+                "published again, with a new number. Find out who else can write to this folder."
             )
             self.notes.append(Note("fleet.archive-damaged", text))
         present, last = (

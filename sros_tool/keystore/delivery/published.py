@@ -6,6 +6,7 @@ do not depend on it.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -257,7 +258,9 @@ def later_revoked_serials(keystore: OpenedKeystore) -> frozenset[int]:
 def releases_in(folder: Path, robots: int) -> Iterator[Release]:
     """Yield the releases in all archives of a publishing folder, whichever CA sealed them.
 
-    Archives that cannot be read are left out.  ``robots`` is the number of robots of the fleet.
+    Archives that cannot be read are left out, and so are archives whose name does not begin with
+    their SHA-256: their content is not as published.  ``robots`` is the number of robots of the
+    fleet.
 
     Raises:
         KeystoreError: the folder has more archives, or larger ones, than the fleet can need.
@@ -271,18 +274,24 @@ def releases_in(folder: Path, robots: int) -> Iterator[Release]:
             data = read_bytes(path, "archive", max_bytes=LIMITS_OF_ONE_ROBOT.packed)
         except (SrosError, OSError):
             continue
-        size += max(len(data), min(stated_size(data), LIMITS_OF_ONE_ROBOT.unpacked))
+        is_altered = hashlib.sha256(data).hexdigest() != path.name.partition(".")[0]
+        stated = 0 if is_altered else min(stated_size(data), LIMITS_OF_ONE_ROBOT.unpacked)
+        size += max(len(data), stated)
         if size > most * _MEAN_ARCHIVE_BYTES:
             excess = f"more than {most * _MEAN_ARCHIVE_BYTES // 1024**2} MiB, unpacked, of"
             break
-        with suppress(SrosError):
-            yield read_release(data)
+        if not is_altered:
+            with suppress(SrosError):
+                yield read_release(data)
     if excess:
         raise KeystoreError(
             f"'{folder / 'targets/robots'}' has {excess} archives",
             "The keystore did not publish so many. sros would have to read all of them, because "
             "the keystore does not know the metadata in this folder.",
-            "Find out who else can write to the folder, and remove what no keystore published.",
+            f"Find out who else can write to the folder. Then move '{folder}' away, and publish "
+            "with --new-folder of `sros fleet publish`. But if the keystore was restored from a "
+            "backup, the folder may show what was revoked after it: remove only what no keystore "
+            "published.",
         )
 
 
