@@ -343,13 +343,9 @@ class _Round:
     def _clock_compared_with_proven_time(self, proven_time: datetime | None) -> RobotClock:
         now = self._machine.now
         if proven_time and now + _CLOCK_TOLERANCE < proven_time:
-            documents_made = (
-                "verified documents were made at"
-                if self._state.latest
-                else "the certificates of this robot begin at"
-            )
+            what = "verified documents" if self._state.latest else "the certificates of this robot"
             self._problems.append(
-                f"The clock shows {iso(now)}, but {documents_made} {iso(proven_time)}: "
+                f"The clock shows {iso(now)}, but {what} are valid only from {iso(proven_time)}: "
                 f"the clock is at least {elapsed(proven_time - now)} behind. "
                 "Nothing is restarted; set the clock."
             )

@@ -683,7 +683,7 @@ def test_a_clock_before_the_first_certificates_is_said(r1: Robot) -> None:
     r1.release = None
     (problem,) = r1.round(moment() - timedelta(days=9)).problems
     assert problem.startswith("The clock shows") and problem.endswith("; set the clock.")
-    assert "the certificates of this robot begin at" in problem
+    assert "the certificates of this robot are valid only from" in problem
     assert r1.message().clock is RobotClock.BEHIND
     assert r1.round().problems == ()
 
@@ -713,7 +713,7 @@ def test_permissions_prove_time_as_certificates_do(home: Home, r1: Robot) -> Non
     r1.release = None
     assert early
     problems = r1.round(early + timedelta(minutes=5)).problems
-    assert "but verified documents were made at" in problems[0], problems
+    assert "but verified documents are valid only from" in problems[0], problems
 
 
 def test_a_grant_of_another_enclave_proves_no_time(home: Home, r1: Robot) -> None:
