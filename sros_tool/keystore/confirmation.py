@@ -480,6 +480,12 @@ class ReceivedConfirmation:
     time: datetime
     message: LastMessage | None = None
 
+    @property
+    def is_alternation_shown(self) -> bool:
+        """Whether messages of the last day came from two computers."""
+        alternated = self.message.alternated if self.message else None
+        return alternated is not None and self.time - alternated <= _ALTERNATED_SHOWN
+
     def two_computers_sentence(self, *, was_restored: bool) -> str:
         """Return a sentence if messages of the last day came from two computers, or "".
 
@@ -487,7 +493,7 @@ class ReceivedConfirmation:
         keys of the robot, so new keys do not end the problem (`collect`).
         """
         alternated = self.message.alternated if self.message else None
-        if alternated is None or self.time - alternated > _ALTERNATED_SHOWN:
+        if alternated is None or not self.is_alternation_shown:
             return ""
         return (
             f"{_TWO_COMPUTERS} seem to send messages in turn: the messages went back to an earlier "

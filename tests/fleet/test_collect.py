@@ -149,6 +149,11 @@ class Home:
         last = last_confirmation(OpenedKeystore(self.root), robot)
         return last.message.sequence if last and last.message else None
 
+    def alternated(self, robot: str) -> datetime | None:
+        """Return when messages of a robot last came from two computers in turn."""
+        last = last_confirmation(OpenedKeystore(self.root), robot)
+        return last.message.alternated if last and last.message else None
+
     def certificate(self, enclave: str) -> x509.Certificate:
         return OpenedKeystore(self.root).certificate_of(enclave)
 
@@ -382,7 +387,10 @@ def test_two_computers_that_are_alike_are_seen_by_their_starts(home: Home) -> No
         *((first, True), (other, True), (second, True)),
     ):
         home.send("r1", boot=boot)
-        assert home.of("r1").outcome == "kept"
+        remarks = home.of("r1").remarks
+        assert any("went back to an earlier start" in text for text in remarks) == (
+            is_seen and boot != other
+        )
         status = fleet_status(OpenedKeystore(home.root), ["r1"])
         (r1,) = status.robots
         assert any("Two computers" in text for text in r1.problems or ()) == is_seen, boot
@@ -404,7 +412,8 @@ def test_new_keys_end_the_alarm_of_two_computers(
 ) -> None:
     """Unless the earlier certificates are valid, or the other computer has the key, too.
 
-    After a restore, the ledger may lack earlier certificates: the problem says when it ends.
+    After a restore, the ledger may lack earlier certificates: the problem says when it ends, which
+    only the first message with new keys does not delay.
     """
     if restored:
         for module in ("delivery.collect", "fleet_status"):
@@ -413,17 +422,23 @@ def test_new_keys_end_the_alarm_of_two_computers(
     for boot in (*boots, boots[0]):
         home.send("r1", boot=boot)
         home.collect()
+    alternated = home.alternated("r1")
     later = NOW + timedelta(hours=1)
     names = [name for name in OpenedKeystore(home.root).names if name.startswith("/r1/")]
     renew(home.root, names, new_key=new_key, revoke_old=revoke_old, now=later)
     shutil.copytree(home.root / "enclaves/r1", home.folder / "r1/enclaves/r1", dirs_exist_ok=True)
     later += timedelta(hours=1)
-    home.send("r1", later, boot=boots[1])
-    assert home.of("r1", later).outcome == "kept"
-    (r1,) = fleet_status(OpenedKeystore(home.root), ["r1"]).robots
-    assert r1.is_doubtful != (new_key and revoke_old and not restored)
-    end = f"until a message comes after {iso(later + timedelta(days=1))}."
-    assert any(end in text for text in r1.problems or ()) == restored
+    is_explained = new_key and revoke_old
+    for boot, is_seen in ((boots[1], not is_explained), (boots[0], not is_explained or restored)):
+        home.send("r1", later, boot=boot)
+        remarks = "".join(home.of("r1", later).remarks)
+        assert ("two computers seem to have its keys" in remarks) == is_seen
+        (r1,) = fleet_status(OpenedKeystore(home.root), ["r1"]).robots
+        assert r1.is_doubtful == (not is_explained or restored)
+        since = later if is_seen else alternated if restored else None
+        assert home.alternated("r1") == since
+        end = f"until a message comes after {iso(since + timedelta(days=1))}." if since else "?"
+        assert any(end in text for text in r1.problems or ()) == restored
 
 
 def test_requests_of_strangers_neither_speak_for_sros_nor_fill_the_terminal(home: Home) -> None:

@@ -564,9 +564,15 @@ class _Verifier:
         went_back = installed is not None and installed < before_it and not is_restored
         boot = verified.confirmation.boot
         boots, alternated = (before or message).next_boots(boot, arrived)
+        is_earlier_start = before is not None and boot in before.boots[1:]
         if last and (alternated or went_back) and self._has_new_keys(robot, last):
-            went_back = False
-            boots, alternated = message.next_boots(boot, arrived)
+            if not restored_at(self._keystore):
+                went_back = is_earlier_start = False
+                boots, alternated = message.next_boots(boot, arrived)
+            elif last.is_alternation_shown and self._came_after(verified.certificate, last):
+                # The ledger may lack an earlier certificate: the problem stays for its day.
+                went_back = is_earlier_start = False
+                alternated = before.alternated if before else None
         # A new agent begins without a release, and a robot can only claim unpublished releases.
         if went_back and installed and self._is_published(before_it):
             alternated = arrived
@@ -583,6 +589,11 @@ class _Verifier:
                 f"it has {release}, and had release {before_it} before: its disk was restored, or "
                 "two computers have its keys"
             )
+        elif is_earlier_start:
+            remarks.append(
+                "two computers seem to have its keys: its messages went back to an earlier start "
+                "of the computer (`sros fleet status` says what to do)"
+            )
         return _ReceivedMessage(
             robot, "kept", verified=verified, received=received, remarks=remarks
         )
@@ -590,10 +601,9 @@ class _Verifier:
     def _has_new_keys(self, robot: Robot, last: ReceivedConfirmation) -> bool:
         """Return whether a robot got new keys after its last message, and its old keys are revoked.
 
-        Then another computer that has an earlier key of the robot can no longer use it.
+        Then another computer that has an earlier key of the robot can no longer use it, unless the
+        keystore was restored from a backup: its ledger may lack earlier keys.
         """
-        if restored_at(self._keystore):  # the ledger may lack a certificate
-            return False
         names = {
             *enclaves_of_robot(self._keystore, self._fleet, robot),
             *last.confirmation.enclaves(),
@@ -610,6 +620,11 @@ class _Verifier:
             and (entry.not_after <= iso(self._now) or int(entry.serial, 16) in self._revoked)
             for entry in earlier
         )
+
+    def _came_after(self, certificate: x509.Certificate, last: ReceivedConfirmation) -> bool:
+        """Return whether a certificate was issued after a message, according to the ledger."""
+        issued = self._issue_entry(digest(certificate))
+        return issued is not None and issued.time > iso(last.time)
 
     def _is_published(self, release: int) -> bool:
         """Return whether the ledger has a release with this number."""
