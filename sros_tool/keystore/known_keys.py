@@ -147,8 +147,7 @@ def _entries_since_trusted_ca(
 
     - there is no trusted CA;
     - a trusted CA was recorded only when it was renewed or replaced, because the earlier ledger was
-      lost;
-    - CAs are recorded without keys, as earlier versions did.
+      lost.
     """
     trusted = {_key_digest_of(ca) for ca in keystore.authority(role)}
     authorities = [
@@ -157,8 +156,7 @@ def _entries_since_trusted_ca(
         if entry.what == "ca" and entry.reason not in RECORDED_LATE
     ]
     places = (
-        next((place for place in authorities if entries[place].key in (key, "")), 0)
-        for key in trusted
+        next((place for place in authorities if entries[place].key == key), 0) for key in trusted
     )
     return entries[min(places, default=0) :]
 
@@ -583,9 +581,8 @@ class KnownKeys:
         """
         if "_enclaves_by_key" in self.__dict__ or not self._keystore.ledger_file.is_indexed:
             return self._enclaves_by_key.get(key, ())
-        # Earlier versions of sros recorded certificates without their keys.
-        entries = self._keystore.ledger_file.with_values("key", (key, "")).entries
-        recorded = {e.enclave for e in entries if e.what == "certificate" and e.key in ("", key)}
+        entries = self._keystore.ledger_file.with_values("key", (key,)).entries
+        recorded = {e.enclave for e in entries if e.what == "certificate" and e.key == key}
         return [name for name in sorted(recorded) if key in _key_digests(self._keystore, name)]
 
 

@@ -134,9 +134,7 @@ def _split_names(names: bytes) -> list[str]:
 
 def _terms(entry: IndexedEntry) -> Iterator[bytes]:
     for name in _INDEXED_FIELDS:
-        value = getattr(entry, name)
-        # Earlier versions recorded no keys; their certificates are found by the empty key.
-        if value or (name == "key" and entry.what == "certificate"):
+        if value := getattr(entry, name):
             yield _term(name, value)
     if entry.what not in _UNINDEXED_KINDS:
         yield _term("what", entry.what)
