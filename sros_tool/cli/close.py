@@ -201,12 +201,12 @@ def close(
         print_json(closed)
     elif undo:
         _show_undone(robot, closed)
-    elif not dry_run:
+    elif closed.problems or not dry_run:
         if not (apply or prove):
             _show(robot, closed)
         _show_end(robot, closed, apply=apply, holds=holds, partial=partial)
     if dry_run:
-        return 0
+        return int(bool(closed.problems) and not undo)
     return int(bool(closed.problems) or ((apply or prove) and not holds))
 
 

@@ -75,6 +75,8 @@ _GITIGNORE_TEXT = """\
 /seen.xml
 """
 
+_NOT_SIGNED = "nothing was signed"
+
 
 class CommandStep(NamedTuple):
     """A command line of sros that is a step of closing a robot."""
@@ -125,6 +127,8 @@ def prepare(robot: LocalRobot, duration: str | None, *, partial: bool, dry_run: 
     if not (dry_run or is_stopped):
         _write_later_processes(robot)
     state = current_state(robot, robot.read_policy())._replace(steps=done, dry_run=dry_run)
+    if dry_run and not is_stopped and robot.keystore.exists() and robot.export.exists():
+        problems += _problems_of(robot, state, partial=partial)
     if dry_run or is_stopped:
         return state._replace(problems=problems, changes=ignored)
     denied_rights = _denied_rights(robot)
@@ -251,13 +255,19 @@ def denied_remappings(
 def _run_steps(
     robot: LocalRobot, duration: str | None, *, partial: bool, dry_run: bool
 ) -> tuple[list[CloseStep], list[str], bool]:
-    """Run the steps; return their states, the problems, and whether a problem stopped the rest."""
+    """Run the steps; return their states, the problems, and whether a problem stopped the rest.
+
+    In a dry run, only the checks that come before the signing are run.
+    """
     done: list[CloseStep] = []
     problems: list[str] = []
     is_stopped = False
     for step in steps(robot, duration):
+        if is_stopped and dry_run:
+            break
         state = "kept" if step.made and step.made.exists() else "open"
-        if dry_run:
+        is_tried = step.guards and robot.policy.exists() and robot.requirements.exists()
+        if dry_run and not is_tried:
             robot.shell.say(f"{'kept' if state == 'kept' else 'would run'}: {step.command}")
             if step.signs and robot.keystore.exists():
                 _, output, messages = robot.shell.run((*step.words, "--dry-run"), False)
@@ -267,10 +277,12 @@ def _run_steps(
             problems += step_problems
             is_stopped = step.guards and state == "findings"
         done.append(CloseStep(step.command, state))
-        if step.into == robot.observation_file and not dry_run:
+        if step.into == robot.observation_file and not (dry_run and state == "open"):
             shared = [*_shared_program_problems(robot)]
             shared += [] if partial else _shared_node_problems(robot)
             problems, is_stopped = [*problems, *shared], bool(shared)
+    if dry_run:
+        problems = [text.replace(_NOT_SIGNED, "sros would sign nothing") for text in problems]
     return done, problems, is_stopped
 
 
@@ -331,7 +343,7 @@ def _run_step(robot: LocalRobot, step: CommandStep, *, partial: bool) -> tuple[s
             f"`sros review` refuses a requirement that nothing can break: edit {needed}"
         )
     if status:
-        remedy = "; nothing was signed" if step.guards else ""
+        remedy = f"; {_NOT_SIGNED}" if step.guards else ""
         if VIOLATED.id in output:
             remedy += f"; if you want the change, edit {needed}, or remove this file to get "
             remedy += "new requirements"
@@ -360,23 +372,22 @@ def _lost_protection(robot: LocalRobot) -> Iterator[str]:
         if lost := sorted(gone & required):
             yield (
                 f"{robot.requirements}:{requirement.source.line} protects {enumerated(lost)}, "
-                "which the policy does not name any more; nothing was signed. If the policy "
+                f"which the policy does not name any more; {_NOT_SIGNED}. If the policy "
                 "renamed a name, also rename it in the requirement. If nobody needs a name any "
                 "more, remove it there (or accept this with --partial)"
             )
 
 
-def _enclaves_without_origin(robot: LocalRobot) -> list[str]:
-    """Return the enclaves of the export that the keystore does not have any more."""
-    return sorted({*list_enclaves(robot.export)} - {*list_enclaves(robot.keystore)})
+def _enclaves_without_origin(robot: LocalRobot, *, revoked: bool) -> list[str]:
+    """Return the enclaves of the export that the keystore revoked, or that it lost otherwise."""
+    keystore = OpenedKeystore(robot.keystore)
+    names = {*list_enclaves(robot.export)} - {*list_enclaves(robot.keystore)}
+    return sorted(name for name in names if bool(revocation_of(keystore, name)) is revoked)
 
 
 def _remove_enclaves(robot: LocalRobot) -> list[FileChange]:
     """Remove from the export enclaves that were revoked, or that belong to other machines."""
-    keystore = OpenedKeystore(robot.keystore)
-    revoked_enclaves = [
-        name for name in _enclaves_without_origin(robot) if revocation_of(keystore, name)
-    ]
+    revoked_enclaves = _enclaves_without_origin(robot, revoked=True)
     removed = dict.fromkeys(revoked_enclaves, "its enclave was revoked")
     for name in robot.not_here.intersection(list_enclaves(robot.export)):
         if any((enclave_path(robot.keystore, name) / file).exists() for file in KEY_FILES):
@@ -402,7 +413,7 @@ def _problems_of(robot: LocalRobot, state: CloseState, *, partial: bool) -> Iter
     yield from _keystore_problems(robot)
     for name in sorted(robot.not_here & state.secured.keys()):
         yield f"{name} belongs to another machine, and a process runs in it here: stop it"
-    for name in _enclaves_without_origin(robot):
+    for name in _enclaves_without_origin(robot, revoked=False):
         remove = f"rm -r {shlex.quote(str(enclave_path(robot.export, name)))}"
         yield (
             f"the export has {name}, which is not in the keystore and was not revoked there: "
@@ -572,8 +583,8 @@ def _shared_program_problems(robot: LocalRobot) -> Iterator[str]:
         if len(enclaves) > 1 and sum(not process.chooses for process in processes) > 1:
             yield (
                 f"{shlex.join(processes[0].command)} starts the processes of "
-                f"{enumerated(enclaves)}, and all of them would run in one enclave; nothing "
-                f"was signed. In '{robot.policy}', move their profiles into one of these "
+                f"{enumerated(enclaves)}, and all of them would run in one enclave; "
+                f"{_NOT_SIGNED}. In '{robot.policy}', move their profiles into one of these "
                 "enclaves, which then has the rights of all, and remove the other "
                 "enclaves. Or let the program start each process with the method spawn after "
                 f"setting {ENCLAVE} in os.environ, and watch again: "
@@ -601,7 +612,7 @@ def _shared_node_problems(robot: LocalRobot) -> Iterator[str]:
         if len(twins) > 1:
             yield (
                 f"{enumerated([*twins.values()])} call themselves {enclave}, and the enclave of "
-                "this name would have the rights of all; nothing was signed. If one process is "
+                f"this name would have the rights of all; {_NOT_SIGNED}. If one process is "
                 f"not of the robot, stop it, remove '{robot.policy}', and watch again: "
                 f"{robot.close_command} --for 1m. If all are of the robot, add --partial"
             )

@@ -1586,6 +1586,25 @@ def test_one_run_at_a_time_writes_into_the_folder(robot: Robot) -> None:
     robot.close()
 
 
+def stops_as_the_run_stops(robot: Robot, policy: Path, signed: str) -> None:
+    """A dry run finds what the run would find, up to the first refusal."""
+    head, enclave, _ = signed.partition('    <enclave path="/talker">')
+    for edited, reason, signs in (
+        (signed.replace('subscribe="ALLOW"', 'publish="ALLOW"', 1), "edit robot/requireme", False),
+        (signed.replace("chatter", "chat"), "protects /chatter, which the policy does", False),
+        (f"{head}</enclaves></policy>\n", "the keystore has /talker, and the policy d", True),
+    ):
+        assert edited != signed and enclave
+        policy.write_text(edited)
+        before = snapshot(robot.folder)
+        dry = robot.close("--dry-run", status=1)
+        assert snapshot(robot.folder) == before
+        assert ("would run: sros generate_artifacts" in dry.err) is signs, dry
+        assert ("sros would sign nothing" in dry.out) is not signs, dry
+        for ended in (dry, robot.close(status=1)):
+            assert "; fix this first:\n  " in ended.out and reason in ended.out, ended
+
+
 def test_a_dry_run_changes_nothing(robot: Robot) -> None:
     assert "would run: sros generate_policy robot/policy.xml" in robot.close("--dry-run").err
     assert not (robot.folder / "robot").exists()
@@ -1600,6 +1619,7 @@ def test_a_dry_run_changes_nothing(robot: Robot) -> None:
     assert "/listener would lose: subscribe topic /chatter\n" in ended.err
     assert "would run: systemctl restart listener.service talker.service" in ended.err
     assert snapshot(robot.folder) == before
+    stops_as_the_run_stops(robot, policy, signed)
     policy.write_text(signed)
     robot.close("--apply")
     before = snapshot(robot.folder)
