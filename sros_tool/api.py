@@ -1034,11 +1034,14 @@ def new_access(
 
     Returns:
         What is ``added`` and ``removed``, whom enclaves can influence now (``reach``), the nodes
-        that get more rights in another enclave (``new_nodes``), and the protection that is ``lost``
-        and ``gained``. As a condition, the result is false if nothing is added, nothing is lost and
-        there are no new nodes. ``assumed`` and ``left_out`` state the assumptions: a policy counts
-        as signed, with a governance that controls all access; a policy as ``base`` also counts as
-        protected by the default governance.
+        that get more rights in another enclave (``new_nodes``), the rights that are new only for
+        users who put the node into another namespace (``elsewhere``: ``cmd`` became ``/cmd``), and
+        the protection that is ``lost`` and ``gained``. As a condition, the result is false if there
+        is no such access, and nothing is lost. Denials that ``head`` lacks
+        (``dropped_denials``) do not count: nobody gets access yet, but other policies may allow
+        the names now, so `sros review` fails. ``assumed`` and ``left_out`` state the assumptions: a
+        policy counts as signed, with a governance that controls all access; a policy as ``base``
+        also counts as protected by the default governance.
 
     Raises:
         SrosError: A path cannot be read, or the question cannot be decided, for instance because a

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
 from shlex import quote
@@ -41,7 +42,7 @@ if TYPE_CHECKING:
     from sros_tool.keystore.rights import RightsSource, SourcesDifference
     from sros_tool.policy.merge import Merged
     from sros_tool.policy.model import Source, StatedProtection
-    from sros_tool.policy.rights import PlacedRight, RightsDifference
+    from sros_tool.policy.rights import RightsDifference
     from sros_tool.proof.growth import DroppedDenial, Gain, Growth, NewNode, NewReach
     from sros_tool.proof.sources import AccessSource
 
@@ -250,15 +251,16 @@ def diff_policy(
 ) -> int:
     """Compare the rights that A and B give: "-" is only in A, "+" only in B.
 
-    "~" marks an enclave that has the same rights under another name. A and B are policy files,
-    permissions (.p7s or .xml), folders of enclaves, keystores, exports, or Zenoh configurations
-    such as router.json5. Permissions and Zenoh rules are shown in ROS terms; the signature of
-    permissions is verified if the permissions CA is next to them. "!" marks a right of B whose
-    counterpart, such as the subscriber, only A has. If A or B covers only some enclaves, as an
-    export does, only these are compared. A policy may lack Zenoh routers: if they have only the
-    rights that every node needs, a note names them in place of a difference. Lines that differ only
-    in the robot of a fleet are shown as one. Two policies are also compared by the protection that
-    they demand, two keystores by their governance.
+    "~" marks an enclave that has the same rights under another name, and a name that became
+    absolute or relative (cmd, /cmd), so that only users who put the node into another namespace get
+    other rights. A and B are policy files, permissions (.p7s or .xml), folders of enclaves,
+    keystores, exports, or Zenoh configurations such as router.json5. Permissions and Zenoh rules
+    are shown in ROS terms; the signature of permissions is verified if the permissions CA is next
+    to them. "!" marks a right of B whose counterpart, such as the subscriber, only A has. If A or B
+    covers only some enclaves, as an export does, only these are compared. A policy may lack Zenoh
+    routers: if they have only the rights that every node needs, a note names them in place of a
+    difference. Lines that differ only in the robot of a fleet are shown as one. Two policies are
+    also compared by the protection that they demand, two keystores by their governance.
 
     The exit status is 1 if A and B differ (notes name differences that are not in the rights),
     or if DDS would refuse A or B.
@@ -266,13 +268,14 @@ def diff_policy(
     With --no-new-access, A and B can also be folders of policies, or policies at a git revision, as
     git:REVISION:PATH; the output calls A BASE, and B HEAD. The exit status is 0 only if, for every
     vendor, domain and name, B gives no enclave any access that A does not give. Also, B must not
-    assign a node to an enclave with more rights, and must not protect anything less. The exit
-    status is 2 if sros cannot decide this. sros assumes that a policy is signed with a governance
-    that controls all access. If A is a policy, and B is a keystore that protects less than the
-    template production, this counts as more access. If A is a keystore, and B is a policy, B never
-    counts as less protection. The last line says what is assumed and what is left out, such as
-    dates. "!" marks a DENY of A that B lacks, for names that B does not allow. If only a DENY is
-    missing, nobody gets access, so the exit status is 0, but `sros review` fails.
+    assign a node to an enclave with more rights, must not protect anything less, and must not give
+    more access to users who put the node into another namespace. The exit status is 2 if sros
+    cannot decide this. sros assumes that a policy is signed with a governance that controls all
+    access. If A is a policy, and B is a keystore that protects less than the template production,
+    this counts as more access. If A is a keystore, and B is a policy, B never counts as less
+    protection. The last line says what is assumed and what is left out, such as dates. "!" marks a
+    DENY of A that B lacks, for names that B does not allow. If only a DENY is missing, nobody gets
+    access, so the exit status is 0, but `sros review` fails.
 
     Example:
       $ sros diff_policy robot.xml keystore
@@ -313,13 +316,19 @@ def diff_policy(
         lines = folded_differences(first, second, difference)
         lines += enclave_lines(compared, first.fleet or second.fleet)
         unanswered = unanswered_lines(compared, second.fleet)
-        for line in (*lines, *protection_lines(protections), *unanswered):
+        forms = changed_form_lines(compared, second.fleet)
+        for line in (*lines, *protection_lines(protections), *forms, *unanswered):
             echo(line)
         count = len(difference.only_first) + len(difference.only_second)
         of = f" of {first_few(sorted(compared.scope), _MOST_NEW_LINES)}" if compared.scope else ""
         differ = f"1 right{of} differs" if count == 1 else f"{count} rights{of} differ"
-        if count or not (compared.domains or compared.enclaves or compared.unclear):
+        other_parts = compared.domains, compared.enclaves, compared.unclear, compared.changed_forms
+        if count or not any(map(bool, other_parts)):
             echo(differ if count else f"the rights{of} are the same", err=True)
+        if compared.changed_forms:
+            became = f"{counted(len(compared.changed_forms), 'name')} became absolute or relative"
+            differ = "for users who put the node into another namespace, the rights differ"
+            echo(f"{became}: {differ}", err=True)
         if compared.domains:
             number = counted(len(compared.domains), "enclave")
             echo(f"the ROS domains of {number} differ", err=True)
@@ -364,6 +373,9 @@ def rights_markdown(
     lines += protection_lines(difference.protections)
     parts = []
     shown_by = "which `sros diff_policy` shows"
+    if forms := list(changed_form_lines(difference, second_source.fleet)):
+        parts.append(f"**{counted(len(forms), 'name')} made absolute or relative**")
+        parts.append(bounded_list(map(code, forms), 6000, shown_by))
     for sign, title in (("~", "renamed"), ("+", "added"), ("-", "removed"), ("?", "unclear")):
         signed = [line.removeprefix(f"{sign} ") for line in lines if line.startswith(sign)]
         if signed:
@@ -379,7 +391,8 @@ def rights_markdown(
     notes = [f"{note.id}: {note.text}" for note in (*first_source.notes, *second_source.notes)]
     if notes:
         parts += ["**Notes**", bounded_list(map(code, notes), 4000, shown_by)]
-    differ = counted(len(lines), "difference") if lines else "no difference"
+    count = len(lines) + len(forms)
+    differ = counted(count, "difference") if count else "no difference"
     title = f"### Rights: {plain(differ)}"
     if lines and drawn is None:
         parts.append(
@@ -427,6 +440,26 @@ def unanswered_lines(difference: SourcesDifference, fleet: Fleet | None) -> Iter
         (right.enclave, f"! {lost_counterpart_text(right)}") for right in difference.unanswered
     ]
     yield from folded_lines(fleet, lines)
+
+
+def changed_form_lines(difference: SourcesDifference, fleet: Fleet | None) -> Iterator[str]:
+    """Yield a line for each name that became absolute, or relative to its node's namespace.
+
+    Lines that differ only in the robot are merged.
+    """
+    from sros_tool.fleet.robots import folded_lines
+    from sros_tool.policy.model import ALLOW
+
+    made_absolute = "begins with / now, so that the namespace of its node does not apply"
+    made_relative = "no longer begins with /, so that the namespace of its node applies"
+    for is_absolute, made in ((True, made_absolute), (False, made_relative)):
+        lines = []
+        for form in difference.changed_forms:
+            if form.is_absolute == is_absolute:
+                denied = "" if form.right.qualifier is ALLOW else "DENY "
+                name = f"{form.right.enclave} {denied}{form.right.describe()}"
+                lines.append((form.right.enclave, f"~ {name} {made}  ({form.place})"))
+        yield from folded_lines(fleet, lines)
 
 
 def protection_lines(protections: Iterable[tuple[str, StatedProtection]]) -> list[str]:
@@ -745,15 +778,15 @@ def _show_new_access(
     if form == "json":
         print_json(NewAccess(ComparedSide.of(before), ComparedSide.of(after), growth))
     elif form == "markdown":
-        echo_document(access_markdown(before, after, growth, growth.dropped_denials))
+        echo_document(access_markdown(before, after, growth))
     else:
         for line in (
             *added_lines(before, after, growth),
             *_removed_lines(before, after, growth),
-            *dropped_lines(after, growth.dropped_denials),
+            *dropped_lines(after, growth),
         ):
             echo(line)
-        echo(access_summary(growth, growth.dropped_denials), err=True)
+        echo(access_summary(growth), err=True)
     if form != "json":
         print_notes((*before.notes, *after.notes))
     return int(bool(growth))
@@ -770,7 +803,7 @@ class PlacedChange(NamedTuple):
 
 
 def placed_changes(
-    base: AccessSource, head: AccessSource, growth: Growth, dropped: Iterable[DroppedDenial]
+    base: AccessSource, head: AccessSource, growth: Growth
 ) -> Iterator[PlacedChange]:
     """Yield the added access of a change and its dropped denials, each with its place in HEAD."""
     from sros_tool.proof.growth import renamed_between
@@ -789,7 +822,10 @@ def placed_changes(
         yield PlacedChange(node.enclave, _new_node_text(node), node.place)
     for change in growth.lost:
         yield PlacedChange(change.key, f"less protection: {change}", None)
-    for denial in dropped:
+    for right, _, place in growth.elsewhere:
+        text = f"may {right.describe()} in another namespace"
+        yield PlacedChange(right.enclave, text, place)
+    for denial in growth.dropped_denials:
         enclave = denial.denial.enclave
         yield PlacedChange(enclave, _dropped_text(denial), place_of(enclave), is_denial=True)
 
@@ -809,6 +845,10 @@ def added_lines(base: AccessSource, head: AccessSource, growth: Growth) -> list[
         *_new_node_lines(head, growth.new_nodes),
         *(f"+ less protection: {change}" for change in growth.lost),
         *_reach_lines(head, unrenamed.reach),
+        *(
+            f"+ {right.enclave} {right.describe()} in another namespace  ({place})"
+            for right, _, place in growth.elsewhere
+        ),
     ]
 
 
@@ -907,13 +947,13 @@ def _reach_lines(head: AccessSource, reach: Sequence[NewReach]) -> list[str]:
     return lines
 
 
-def dropped_lines(head: AccessSource, dropped: Iterable[DroppedDenial]) -> list[str]:
+def dropped_lines(head: AccessSource, growth: Growth) -> list[str]:
     """Return a line for each DENY that is dropped or narrowed; lines of robots are merged."""
     from sros_tool.fleet.robots import folded_lines
 
     lines = (
         (denial.denial.enclave, f"! {denial.denial.enclave} {_dropped_text(denial)}")
-        for denial in dropped
+        for denial in growth.dropped_denials
     )
     return list(folded_lines(head.fleet, lines))
 
@@ -928,26 +968,11 @@ def _dropped_text(dropped: DroppedDenial) -> str:
     return f"{text}: other policies may allow {'them' if name else 'it'} now"
 
 
-def elsewhere_lines(elsewhere: Iterable[PlacedRight]) -> list[str]:
-    """Return a line for each right that is new only in another namespace of its node."""
-    return [
-        f"+ {placed.right.enclave} {placed.right.describe()} in another namespace  "
-        f"({placed.source})"
-        for placed in elsewhere
-    ]
-
-
-def access_summary(
-    growth: Growth, dropped: Collection[DroppedDenial], elsewhere: Collection[PlacedRight] = ()
-) -> str:
-    """Return the added access and reach of a change, and its dropped denials, in one sentence.
-
-    ``elsewhere`` are the rights that are new only for users who put the node into another
-    namespace.
-    """
-    if elsewhere:
-        new = _count(len(elsewhere), "right")
-        here = access_summary(growth, dropped)
+def access_summary(growth: Growth) -> str:
+    """Return the added access and reach of a change, and its dropped denials, in one sentence."""
+    if growth.elsewhere:
+        new = _count(len(growth.elsewhere), "right")
+        here = access_summary(replace(growth, elsewhere=()))
         return (
             f"{new} new only for users who put the node into another namespace; otherwise: {here}"
         )
@@ -964,6 +989,7 @@ def access_summary(
         if clauses
     )
     rights_gone = f"; {_count(len(growth.removed), 'right')} gone" if growth.removed else ""
+    dropped = growth.dropped_denials
     denials_gone = f"{counted(len(dropped), 'DENY is', 'DENYs are')} gone"
     if not growth:
         same = f"nobody gets more access, and nothing is protected less ({worlds})"
@@ -995,27 +1021,21 @@ def _count(number: int, noun: str) -> str:
     return f"1 {noun} is" if number == 1 else f"{number} {noun}s are"
 
 
-def access_markdown(
-    base: AccessSource,
-    head: AccessSource,
-    growth: Growth,
-    dropped: Collection[DroppedDenial],
-    elsewhere: Collection[PlacedRight] = (),
-) -> str:
+def access_markdown(base: AccessSource, head: AccessSource, growth: Growth) -> str:
     """Return the added and removed access of a change, and its dropped denials, as Markdown."""
     from sros_tool.markdown import bounded_list, code, plain
 
     shown_by = "which `sros diff_policy --no-new-access` shows"
-    summary = access_summary(growth, dropped, elsewhere)
-    verdict = "yes" if growth or elsewhere else "none, but a DENY is gone" if dropped else "none"
+    summary = access_summary(growth)
+    without = "none, but a DENY is gone" if growth.dropped_denials else "none"
+    verdict = "yes" if growth else without
     parts = [f"### New access: {plain(verdict)}", plain(summary)]
     added, removed = added_lines(base, head, growth), _removed_lines(base, head, growth)
     renamed = [line for line in added if line.startswith("~")]
-    gone = dropped_lines(head, dropped)
+    gone = dropped_lines(head, growth)
     for title, lines in (
         ("renamed", renamed),
         ("added", added[len(renamed) :]),
-        ("new in another namespace", elsewhere_lines(elsewhere)),
         ("removed", removed),
         ("DENY gone" if len(gone) == 1 else "DENYs gone", gone),
     ):

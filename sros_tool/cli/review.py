@@ -36,7 +36,6 @@ if TYPE_CHECKING:
         Review,
         ReviewRequest,
         ReviewStep,
-        RightsChange,
     )
 
     _PathsType = click.ParamType[tuple[str, ...]]
@@ -446,10 +445,11 @@ def _sentence(result: Review, step: ReviewStep) -> str:
     match step.content:
         case ChosenFindings() as chosen:
             return f"{chosen.summary()}{place}"
-        case AccessChange(growth=growth, dropped=dropped, elsewhere=elsewhere):
-            return access_summary(growth, dropped, elsewhere)
-        case RightsChange(compared=compared, absolute=absolute, relative=relative):
+        case AccessChange(growth=growth):
+            return access_summary(growth)
+        case RightsChange(compared=compared):
             added, gone = len(compared.rights.only_second), len(compared.rights.only_first)
+            absolute = sum(form.is_absolute for form in compared.changed_forms)
             clauses = [
                 f"{counted(count, noun)} {verb}"
                 for count, noun, verb in (
@@ -457,8 +457,8 @@ def _sentence(result: Review, step: ReviewStep) -> str:
                     (gone, "written right", "gone"),
                     (len(compared.protections), "stated protection", "changed"),
                     (len(compared.enclaves), "empty enclave", "added or gone"),
-                    (len(absolute), "name", "made absolute"),
-                    (len(relative), "name", "made relative"),
+                    (absolute, "name", "made absolute"),
+                    (len(compared.changed_forms) - absolute, "name", "made relative"),
                 )
                 if count
             ]
@@ -557,14 +557,10 @@ def _access_findings(change: AccessChange, path: str) -> Iterator[Finding]:
 
     at: dict[tuple[bool, str, int], list[tuple[str, str]]] = {}
     for subject, text, place, is_denial in placed_changes(
-        change.before, change.after, change.growth, change.dropped
+        change.before, change.after, change.growth
     ):
         line = (place.file, place.line) if place and place.file else (path, 0)
         at.setdefault((is_denial, *line), []).append((subject, text))
-    for placed in change.elsewhere:
-        text = f"may {placed.right.describe()} in another namespace"
-        line = placed.source.file, placed.source.line
-        at.setdefault((False, *line), []).append((placed.right.enclave, text))
     for (is_denial, file, number), [(subject, text), *more] in at.items():
         text += f"; and {counted(len(more), 'more change')} by this line" if more else ""
         kind = DROPPED_DENIAL if is_denial else NEW_ACCESS
@@ -596,8 +592,8 @@ def _lines_to_read(step: ReviewStep) -> list[str]:
     from sros_tool.checks.kind import ChosenFindings
     from sros_tool.cli.policy import (
         added_lines,
+        changed_form_lines,
         dropped_lines,
-        elsewhere_lines,
         enclave_lines,
         folded_differences,
         protection_lines,
@@ -608,15 +604,14 @@ def _lines_to_read(step: ReviewStep) -> list[str]:
     match step.content:
         case StepFindings() as facts if len(facts.lines) > 1:
             return [f"'{name}' {text}" for text, name in facts.lines]
-        case AccessChange(before=before, after=after, growth=growth) as change:
-            lines = [*added_lines(before, after, growth), *elsewhere_lines(change.elsewhere)]
-            return [*lines, *dropped_lines(after, change.dropped)]
+        case AccessChange(before, after, growth):
+            return [*added_lines(before, after, growth), *dropped_lines(after, growth)]
         case RightsChange(before=before, after=after, compared=compared):
             unanswered = unanswered_lines(compared, after.fleet)
             differing = folded_differences(before, after, compared.rights, ("BASE", "HEAD"))
             differing += enclave_lines(compared, after.fleet or before.fleet)
             differing += protection_lines(compared.protections)
-            return [*unanswered, *_lines_of_changed_form(step.content), *differing]
+            return [*unanswered, *changed_form_lines(compared, after.fleet), *differing]
         case (ChosenFindings() as chosen) | DroppedRequirements(chosen=chosen):
             one_per_group = ((finding,) for finding in chosen.shown)
             return [
@@ -634,22 +629,6 @@ def _finding_line(finding: Finding) -> str:
     line = f"{finding.place}: {finding.severity.word}: {subject}{finding.text} [{finding.id}]"
     places = finding.related if finding.kind is DROPPED else ()
     return line + "".join(f" ({place.text}: {place})" for place in places)
-
-
-def _lines_of_changed_form(change: RightsChange) -> Iterator[str]:
-    """Yield a line for each name that became absolute, or relative to its node's namespace."""
-    from sros_tool.fleet.robots import folded_lines
-    from sros_tool.policy.model import ALLOW
-
-    made_absolute = "begins with / now, so that the namespace of its node does not apply"
-    made_relative = "no longer begins with /, so that the namespace of its node applies"
-    for made, changed in ((made_absolute, change.absolute), (made_relative, change.relative)):
-        lines = []
-        for right, _, source, _, _ in changed:
-            denied = "" if right.qualifier is ALLOW else "DENY "
-            text = f"~ {right.enclave} {denied}{right.describe()} {made}  ({source})"
-            lines.append((right.enclave, text))
-        yield from folded_lines(change.after.fleet, lines)
 
 
 def _verdict(result: Review) -> str:
@@ -732,14 +711,10 @@ def _detail(result: Review, step: ReviewStep, request: ReviewRequest) -> str:
             if step.allowed:
                 return f"### {_TITLES[step.kind]}: allowed\n\n{findings(chosen)}"
             return findings(chosen, _TITLES[step.kind])
-        case AccessChange(before, after, growth, dropped, elsewhere):
-            return access_markdown(before, after, growth, dropped, elsewhere)
-        case RightsChange(before=before, after=after, compared=compared) as change:
-            parts = [rights_markdown(before, after, compared)] if compared else []
-            if lines := list(_lines_of_changed_form(change)):
-                title = f"### {counted(len(lines), 'name')} made absolute or relative"
-                parts += [title, bounded_list(map(code, lines), 6000, shown_by)]
-            return "\n\n".join(part.rstrip("\n") for part in parts)
+        case AccessChange(before, after, growth):
+            return access_markdown(before, after, growth)
+        case RightsChange(before, after, compared):
+            return rights_markdown(before, after, compared)
         case DroppedRequirements(chosen=chosen):
             title = "### Requirements that changed, checked as they were before the change"
             return f"{title}\n\n{findings(chosen)}"

@@ -54,6 +54,7 @@ from sros_tool.policy.model import (
     StatedProtection,
     stated_protections,
 )
+from sros_tool.policy.namespaces import ChangedForm, changed_forms
 from sros_tool.policy.node_basics import are_basic
 from sros_tool.policy.patterns import matches
 from sros_tool.policy.rights import (
@@ -701,6 +702,11 @@ class PolicyDifference(NamedTuple):
     rules, missing rules for `ros_discovery_info`, or a default that allows everything. `notes` of A
     and B name the difference.
     """
+    changed_forms: Sequence[ChangedForm]
+    """Rights and denials of policy B that differ from A only for users who put the node into
+    another namespace, because the name became absolute or relative; empty for a fleet, whose
+    namespaces are known.
+    """
 
 
 class SourcesDifference(NamedTuple):
@@ -723,10 +729,12 @@ class SourcesDifference(NamedTuple):
     """As in `PolicyDifference`."""
     unclear: Sequence[str] = ()
     """As in `PolicyDifference`."""
+    changed_forms: Sequence[ChangedForm] = ()
+    """As in `PolicyDifference`."""
 
     def __bool__(self) -> bool:
         parts = self.rights, self.protections, self.domains, self.enclaves, self.unclear
-        return self.governance_differs or any(map(bool, parts))
+        return self.governance_differs or any(map(bool, (*parts, self.changed_forms)))
 
 
 def compared_enclaves(
@@ -773,8 +781,11 @@ def compare_sources(
         if other.kind != "zenoh" and (scope is None or enclave in scope)
     ]
     unclear = [*_unclear_enclaves(first_source, second_source, scope)]
+    forms: Iterable[ChangedForm] = ()
+    if first_source.policy and second_source.policy and not second_source.fleet:
+        forms = changed_forms(first_source.policy.enclaves, second_source.policy.enclaves)
     return SourcesDifference(
-        scope, difference, protections, unanswered, domains, enclaves, governed, unclear
+        scope, difference, protections, unanswered, domains, enclaves, governed, unclear, [*forms]
     )
 
 
@@ -942,6 +953,7 @@ def policy_difference(
         [DifferentEnclave(_SIDE_OF_SIGN[sign], enclave) for sign, enclave in difference.enclaves],
         difference.governance_differs,
         difference.unclear,
+        difference.changed_forms,
     )
 
 

@@ -49,7 +49,8 @@ from sros_tool.names import (
     service_of,
 )
 from sros_tool.policy.model import ALLOW, DENY, Profile, Qualifier, Source
-from sros_tool.policy.patterns import common_name, literal_prefix
+from sros_tool.policy.namespaces import ChangedForm, changed_forms, undenied_name
+from sros_tool.policy.patterns import literal_prefix
 from sros_tool.policy.rights import (
     KIND_OF,
     Right,
@@ -211,7 +212,7 @@ class DroppedDenial(NamedTuple):
 
 @shows(
     *("new_access", "worlds", "domains", "assumed", "left_out", "not_compared", "added", "reach"),
-    *("reach_known", "new_nodes", "less_protection", "dropped_denials", "removed"),
+    *("reach_known", "new_nodes", "elsewhere", "less_protection", "dropped_denials", "removed"),
     *("more_protection",),
 )
 @dataclass(frozen=True, slots=True)
@@ -251,6 +252,10 @@ class Growth:
     """Nodes that HEAD assigns to an enclave of BASE, and that thereby get more rights."""
     dropped_denials: tuple[DroppedDenial, ...]
     """Denials that HEAD drops or narrows, without allowing their names; this is not new access."""
+    elsewhere: tuple[ChangedForm, ...]
+    """Rights of HEAD that are new only for users who put the node into another namespace, because
+    the name became absolute or relative; empty for a fleet, whose namespaces are known.
+    """
     other_domain: int | None
 
     @property
@@ -279,7 +284,7 @@ class Growth:
         return [GainedProtection(change.key, change.after, change.before) for change in self.gained]
 
     def __bool__(self) -> bool:
-        return bool(self.added or self.lost or self.new_nodes)
+        return bool(self.added or self.lost or self.new_nodes or self.elsewhere)
 
     def without_renames(self, renamed: Mapping[str, str]) -> Growth:
         """Return this growth without access that only comes from the new names of enclaves.
@@ -377,8 +382,15 @@ def compare_access(base: AccessSource, head: AccessSource) -> Growth:
     added = tuple(_gains(before, after, worlds, scope, limit))
     lost = tuple(dict.fromkeys(_lost_protection(base, head, limit, rules=not added)))
     new_nodes = tuple(_new_nodes(base, head, limit))
+    changed = () if head.fleet else changed_forms(base.enclaves.values(), head.enclaves.values())
+    elsewhere, dropped_elsewhere = [], []
+    for form in changed:
+        if form.right.qualifier is ALLOW:
+            elsewhere.append(form._replace(place=head.shown_source(form.place)))
+        else:
+            dropped_elsewhere.append(DroppedDenial(form.right, form.example_elsewhere(), ""))
     unclear = tuple(_not_compared_clauses(base, head))
-    if unclear and not (added or lost or new_nodes):
+    if unclear and not (added or lost or new_nodes or elsewhere):
         raise DocumentError(
             f"'{head.shown}' cannot be compared: {unclear[0]}",
             "In all other parts, no access is new, and no protection is lost.",
@@ -411,7 +423,8 @@ def compare_access(base: AccessSource, head: AccessSource) -> Growth:
         tuple(_left_out_texts(base, head)),
         unclear,
         new_nodes,
-        tuple(_dropped_denials(base, head)),
+        (*_dropped_denials(base, head), *dropped_elsewhere),
+        tuple(elsewhere),
         other_domain,
     )
 
@@ -1299,23 +1312,6 @@ def _enclaves_near(robots: _EnclavesByRobot, robot: str) -> dict[str, Profile]:
     """Return the enclaves of a node that belong to ``robot`` or to no robot; for "", return all."""
     near = (robots.get("", {}), robots.get(robot, {})) if robot else robots.values()
     return {path: profile for profiles in near for path, profile in profiles.items()}
-
-
-def undenied_name(denied: Right, stated: Rules) -> str | None:
-    """Return a name, if any, that ``denied`` matches, but no rule of ``stated`` matches.
-
-    ``denied`` is not for an action.
-    """
-    if stated.cover(denied):
-        return None
-    allowed = stated.overlapping(denied._replace(qualifier=ALLOW))
-    if denied.kind == "dds":  # such a right has no ROS name to search for
-        return None if allowed else denied.name
-    names = [right.name for right in (*allowed, *stated.overlapping(denied))]
-    # A DENY of "/*stop" is for all namespaces: a name in a namespace shows best what it lost.
-    shown = [denied.name, "/any_namespace/*"]
-    in_namespace = denied.name.startswith("/*") and common_name(shown, names)
-    return in_namespace or common_name([denied.name], names)
 
 
 # ── what a side does not state ─────────────────────────────────────────────────────────────

@@ -15,7 +15,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, tzinfo
 from functools import cache, partial
-from itertools import chain, islice
+from itertools import chain
 from pathlib import Path
 from shlex import quote
 from typing import Annotated, NamedTuple, TypeVar
@@ -71,16 +71,13 @@ from sros_tool.keystore.rights import (
 from sros_tool.keystore.template import Template, load_template, read_template, template_names
 from sros_tool.names import expand
 from sros_tool.policy.document import read_policy
-from sros_tool.policy.model import ALLOW, DENY, Enclave, Policy, Profile, policy_in_namespace
-from sros_tool.policy.patterns import OTHER_NAMESPACE, common_name
+from sros_tool.policy.model import Enclave, Policy, policy_in_namespace
+from sros_tool.policy.patterns import common_name
 from sros_tool.policy.remapping import Remapping
 from sros_tool.policy.rights import (
     NodeName,
-    PlacedRight,
     Right,
-    Rules,
     nodes_of,
-    parts,
     placed_rights,
     policy_rights,
 )
@@ -105,7 +102,7 @@ from sros_tool.proof.findings import (
     requirement_findings,
     unused_remapping_findings,
 )
-from sros_tool.proof.growth import DroppedDenial, Growth, compare_access, undenied_name
+from sros_tool.proof.growth import Growth, compare_access
 from sros_tool.proof.repository import FILES, LINK, SUBMODULE, Repository, TreeEntry, walk
 from sros_tool.proof.requirements import (
     KINDS,
@@ -204,31 +201,20 @@ class ReviewRequest:
 
 @dataclass(frozen=True, slots=True)
 class AccessChange:
-    """Access that HEAD allows and BASE does not, and denials that HEAD drops or narrows.
-
-    ``elsewhere`` are the rights that are new only for nodes in another namespace.
-    """
+    """Access that HEAD allows and BASE does not, and denials that HEAD drops or narrows."""
 
     before: AccessSource
     after: AccessSource
     growth: Growth
-    dropped: tuple[DroppedDenial, ...]
-    elsewhere: tuple[PlacedRight, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
 class RightsChange:
-    """The differences between the rights of all reviewed policies in HEAD and in BASE.
-
-    ``absolute`` and ``relative`` are rights that are new only for users who put the node into
-    another namespace: absolute names that do not move with the node, and relative names that do.
-    """
+    """The differences between the rights of all reviewed policies in HEAD and in BASE."""
 
     before: RightsSource
     after: RightsSource
     compared: SourcesDifference
-    absolute: tuple[PlacedRight, ...]
-    relative: tuple[PlacedRight, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -483,18 +469,17 @@ class _Review:
             of_head, head_fleet, base_fleet, keystores, earlier, both
         )
         if self.base:
-            moving = cache(lambda: [*_fixed_or_moving_names(before(), after())])
             yield from self._step_result(
                 "new-access",
                 named,
-                lambda: self._access_change(of_base, base_fleet, before, after, moving),
+                lambda: self._access_change(of_base, base_fleet, before, after),
                 is_wanted=bool(asked.policies),
                 complete=complete,
             )
             yield from self._step_result(
                 "rights",
                 named,
-                partial(self._rights_change, before, after, moving),
+                partial(self._rights_change, before, after),
                 is_wanted=bool(of_base),
             )
         for path, keystore in keystores.items():
@@ -1001,7 +986,6 @@ class _Review:
         base_fleet: Fleet | None,
         before: Callable[[], AccessSource],
         after: Callable[[], AccessSource],
-        moving: Callable[[], Sequence[PlacedRight]],
     ) -> tuple[int, Content]:
         """Return the exit status for the access that the policies gain, and this access.
 
@@ -1017,41 +1001,26 @@ class _Review:
             )
             new = ((text, " ".join(self.request.policies)),)
             return _FOUND, StepFindings(new)
-        return self._compared_access(before(), head, moving())
+        return self._compared_access(before(), head)
 
-    def _compared_access(
-        self, before: AccessSource, after: AccessSource, moving: Sequence[PlacedRight] = ()
-    ) -> tuple[int, Content]:
+    @staticmethod
+    def _compared_access(before: AccessSource, after: AccessSource) -> tuple[int, Content]:
         growth = compare_access(before, after)
-        dropped = growth.dropped_denials
-        dropped += tuple(
-            DroppedDenial(moved.right, _example_elsewhere(moved), "")
-            for moved in moving
-            if moved.right.qualifier is DENY
-        )
-        # A fleet file states the namespace of each robot, so that the comparison has decided there.
-        elsewhere = () if after.fleet else tuple(m for m in moving if m.right.qualifier is ALLOW)
-        status = _FOUND if growth or dropped or elsewhere else _OK
-        return status, AccessChange(before, after, growth, dropped, elsewhere)
+        status = _FOUND if growth or growth.dropped_denials else _OK
+        return status, AccessChange(before, after, growth)
 
     @staticmethod
     def _rights_change(
-        before: Callable[[], AccessSource],
-        after: Callable[[], AccessSource],
-        moving: Callable[[], Sequence[PlacedRight]],
+        before: Callable[[], AccessSource], after: Callable[[], AccessSource]
     ) -> tuple[int, Content] | None:
         """Return the changed rights with the exit status, or None if no right changed."""
         first, second = before().as_rights(), after().as_rights()
-        absolute = tuple(moved for moved in moving() if moved.written.startswith("/"))
-        relative = tuple(moved for moved in moving() if not moved.written.startswith("/"))
         first, second = (
             without_enclaves_of_sros(first, second),
             without_enclaves_of_sros(second, first),
         )
         compared = compare_sources(first, second)
-        if not compared and not (absolute or relative):
-            return None
-        return _OK, RightsChange(first, second, compared, absolute, relative)
+        return (_OK, RightsChange(first, second, compared)) if compared else None
 
     # ── requirements ───────────────────────────────────────────────────────────────────────
 
@@ -1385,56 +1354,6 @@ def _is_below(path: str, folders: Iterable[str]) -> bool:
 
 def _is_same_file(base: CommitFiles | None, head: CommitFiles, path: str) -> bool:
     return base is not None and base.files.get(path) == head.files.get(path)
-
-
-def _fixed_or_moving_names(before: AccessSource, after: AccessSource) -> Iterator[PlacedRight]:
-    """Yield the rights in ``after`` that are new only for nodes in another namespace.
-
-    The names of these rights became absolute, or relative. Denials that deny less in another
-    namespace are yielded, too.
-    """
-    of_before, of_after = (
-        [*chain.from_iterable(map(_moved_rights, source.enclaves.values()))]
-        for source in (before, after)
-    )
-    (was, was_elsewhere), (now, now_elsewhere) = (
-        (Rules(placed.right for placed, _ in rights), Rules(moved for _, moved in rights))
-        for rights in (of_before, of_after)
-    )
-    for placed, moved in of_after:
-        allows = placed.right.qualifier is ALLOW
-        if allows and was.cover(placed.right) and not was_elsewhere.cover(moved):
-            yield placed
-    denials = [placed for placed, _ in of_after if placed.right.qualifier is DENY]
-    for placed, moved in of_before:
-        here, elsewhere = (
-            placed.right.qualifier is DENY
-            and any(undenied_name(part, rules) for part in parts(right))
-            for right, rules in ((placed.right, now), (moved, now_elsewhere))
-        )
-        if elsewhere and not here:
-            same = (denial for denial in denials if Rules([denial.right]).overlaps(placed.right))
-            yield from islice(same, 1)
-
-
-def _example_elsewhere(placed: PlacedRight) -> str:
-    """Return a name in another namespace that a DENY no longer denies because it became absolute.
-
-    The result is "" if the DENY is relative or has a wildcard.
-    """
-    name = placed.right.name
-    return f"/any_namespace{name}" if placed.written.startswith("/") and "*" not in name else ""
-
-
-def _moved_rights(enclave: Enclave) -> Iterator[tuple[PlacedRight, Right]]:
-    """Yield each right of an enclave, and the same right for a node in another namespace."""
-
-    def elsewhere(profile: Profile) -> Profile:
-        return replace(profile, ns=f"{OTHER_NAMESPACE}{profile.ns}".rstrip("/"))
-
-    moved = placed_rights(enclave.with_profiles(elsewhere))
-    for placed, moved_right in zip(placed_rights(enclave), moved, strict=True):
-        yield placed, moved_right.right
 
 
 def _namespaces_to_try(before: AccessSource, after: AccessSource) -> list[str]:

@@ -26,7 +26,6 @@ from sros_tool.policy.rights import Right, renamed_enclaves
 from sros_tool.proof import review
 from sros_tool.proof.commit_files import CommitFiles
 from sros_tool.proof.repository import Repository
-from sros_tool.proof.sources import load_policies
 from tests.support.code_host import NODE, PROJECT
 from tests.support.code_host import policy as policy_text
 from tests.support.harness import Ended, copy_of, publish, sros
@@ -369,33 +368,6 @@ def test_a_name_has_a_line_only_if_it_is_new_in_another_namespace(change: Change
         ended = change.review("--policy", "robot.xml")
         assert ended.out.count("  ~ /e publish topic /one begins with / now") == lines, ended
         assert "no longer begins" not in ended.out
-
-
-def test_some_namespaces_are_not_every_namespace(change: Change) -> None:
-    """A name that moves is not replaced by names in namespaces with certain letters."""
-
-    def found(qualifier: str, *sides: str) -> list[str]:
-        sources = []
-        for names in sides:
-            topics = "</topic><topic>".join(names.split())
-            group = f'<topics publish="{qualifier}"><topic>{topics}</topic></topics>'
-            (file := change.folder / "robot.xml").write_text(policy_text({"/e": group}))
-            sources.append(load_policies([file], ""))
-        return [placed.written for placed in review._fixed_or_moving_names(*sources)]
-
-    for narrowed in ("/c /n*/c", "/c /[!l]*/c", "/c /[l]*/c /[!l]*/c", "/c /?/c", "/c */c"):
-        assert found("DENY", "c", narrowed) == ["/c"], narrowed
-    assert found("ALLOW", "/c /n*/c", "c") == ["c"]
-    for before, after in (
-        ("c /d", "/d c"),
-        ("/c /n*/c", "/n*/c /c"),
-        ("c", "c /n*/c"),
-        ("c", "/*c"),
-        ("c", "/c /*/c"),
-        ("cmd*", "cmd cmd?*"),
-        ("/cmd*", "/cmd /cmd?*"),
-    ):
-        assert found("DENY", before, after) == [], (before, after)
 
 
 def test_a_renamed_policy_is_compared_by_its_folder(change: Change) -> None:
