@@ -309,7 +309,7 @@ class Wiretap:
             self._capture = Capture([*texts.values(), topic, _CERTIFICATE], keep=replayed)
             self._injector = _Injector() if replayed else None
         except OSError as error:
-            self.problem = f"capturing packets is not permitted: {error.strerror}"
+            self.problem = f"capturing packets needs root or CAP_NET_RAW: {error.strerror}"
             self.close()
             return
         asyncio.get_running_loop().add_reader(self._capture.fileno(), self._capture.drain)
