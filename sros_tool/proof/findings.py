@@ -655,22 +655,51 @@ def _vacuous_remedy(requirement: Requirement, rights: Iterable[Right]) -> str:
 def _namespace_remedy(requirement: Requirement, rights: Iterable[Right]) -> str:
     """Return a remedy if the rights have a requirement's name only in other namespaces, or "".
 
-    Only requirements with relative names that were read without a namespace have this remedy.
+    Only requirements with relative names have this remedy.
     """
-    was_moved = requirement.elsewhere is None
-    if was_moved or not requirement.is_relative or not isinstance(requirement, RightsRequirement):
+    if not requirement.is_relative or not isinstance(requirement, RightsRequirement):
         return ""
     stated = {right.name for right in rights if right.qualifier is ALLOW}
     absent = (name for _, names in requirement.rights for name in names if name not in stated)
+    was_moved = requirement.elsewhere is None
     for name in absent:
-        moved = (other.removesuffix(name) for other in stated if other.endswith(name))
-        if namespaces := sorted(ns for ns in moved if not is_expression(ns)):
+        space = requirement.namespace
+        if was_moved and (own := name.removeprefix(space.rstrip("/"))) in stated:
+            return (
+                f"The rights have {own}, as the policy of a package does: leave out `--namespace "
+                f"{quote(space)}`, or name the policy of a robot that was merged with it."
+            )
+        if not was_moved and (namespaces := sorted(_namespaces_with(name, stated))):
             options = " ".join(f"--namespace {quote(ns)}" for ns in namespaces[:_MOST_SHOWN])
             return (
                 f"The rights have {namespaces[0]}{name}: check the requirements of a package with "
                 f"its namespace: `{options}`. Otherwise, correct the name, here or in the policy."
             )
     return ""
+
+
+def _namespaces_with(name: str, stated: Iterable[str]) -> set[str]:
+    """Return the namespaces, except ``/``, in which names of rights end with ``name``."""
+    moved = {other.removesuffix(name) for other in stated if other.endswith(name)}
+    return {namespace for namespace in moved if namespace and not is_expression(namespace)}
+
+
+def common_namespaces(requirements: Iterable[Requirement], rights: Iterable[Right]) -> set[str]:
+    """Return the namespaces, except ``/``, in which rights have a name of every requirement.
+
+    Only requirements with relative names count, and of these only names without wildcards.
+    """
+    stated = {right.name for right in rights if right.qualifier is ALLOW}
+    common: set[str] | None = None
+    for requirement in requirements:
+        if not requirement.is_relative or not isinstance(requirement, RightsRequirement):
+            continue
+        names = [name for _, of_right in requirement.rights for name in of_right]
+        if all(map(is_expression, names)):
+            continue
+        found = set[str]().union(*(_namespaces_with(name, stated) for name in names))
+        common = found if common is None else common & found
+    return common or set()
 
 
 _GONE_REMEDY = (

@@ -96,6 +96,7 @@ from sros_tool.proof.commit_files import (
 )
 from sros_tool.proof.decide import restricted_enclaves
 from sros_tool.proof.findings import (
+    common_namespaces,
     decide_all,
     decided_findings,
     left_out_robot_findings,
@@ -408,6 +409,8 @@ class _Review:
     """Whether HEAD has every policy of the request."""
     is_relative: bool = False
     """Whether a requirement has a name that moves with the namespace."""
+    namespaces_to_add: set[str] = field(default_factory=set)
+    """Namespaces in which the policies or keystores have names of the requirements."""
     decided_elsewhere: str = "whether the change breaks them"
     """What the review decided about requirements in other namespaces; "" for nothing."""
 
@@ -903,10 +906,9 @@ class _Review:
         if self.decided_elsewhere:
             others = f": there, sros decided only {self.decided_elsewhere}"
         if self.is_relative and not asked.namespaces:
-            yield (
-                "requirements with relative names in namespaces other than / (add --namespace NS)"
-                f"{others}"
-            )
+            options = [f"--namespace {quote(name)}" for name in sorted(self.namespaces_to_add)]
+            add = f" (add {first_few(options, 3)})" if options else ""
+            yield f"requirements with relative names in namespaces other than /{add}{others}"
         if not self.base:
             yield "nothing is compared with an earlier commit, as the options say"
         if asked.allow_new_access:
@@ -1065,6 +1067,7 @@ class _Review:
             read = yield from self._read_requirements(files, system.fleet)
             wanted = [*chain.from_iterable(read.values())]
             self.is_relative |= any(requirement.is_relative for requirement in wanted)
+            self.namespaces_to_add |= common_namespaces(wanted, system.rights)
             earlier = yield from self._read_requirements(
                 base_files, partial(_without_left_robots, before, system.fleet)
             )

@@ -1389,13 +1389,13 @@ def test_requirements_of_a_package_are_decided_in_a_namespace(
     change.commit({"other": "1"})
     asked = ("--policy", "robot.xml", "--requirements", "robot.toml")
     ended = change.review(*asked).ok()
-    assert "namespaces other than / (add --namespace NS): there, sros decided only" in ended.out
+    assert "namespaces other than / (add --namespace /l): there, sros decided only" in ended.out
     with monkeypatch.context() as patched:
         patched.setattr(review, "_MOST_NAMESPACES", 1)
         some = "the change breaks them in 1 of 2 namespaces (those of changed names first)"
         assert some in change.review(*asked).ok().out
     assert (
-        "(add --namespace NS); nothing"
+        "(add --namespace /l); nothing"
         in sros("review", "--base", "none", *asked, cwd=change.folder).out
     )
     ended = change.review(*asked, "--namespace", "/l", "--namespace", "/")
@@ -1406,6 +1406,15 @@ def test_requirements_of_a_package_are_decided_in_a_namespace(
     assert "/a: may publish /x, but only /l/a may" in ended.out and "/l/x" not in ended.out, ended
     ended = change.review(*asked, "--remap", "z:=/z")
     assert (ended.status, "no requirement has the old name" in ended.out) == (2, True), ended
+    # No namespace fits the policy of a package, so that there is no option to add.
+    change.base = change.commit({"robot.xml": policy_text({"/a": publish("x", "/m/y")})})
+    change.commit({"other": "2"})
+    ended = change.review(*asked).ok()
+    assert "namespaces other than /: there, sros decided only" in ended.out, ended
+    moved = sros(
+        "check", "robot.xml", "--requirements", "robot.toml", "--namespace", "/m", cwd=change.folder
+    )
+    assert "/x, as the policy of a package does: leave out `--namespace /m`" in moved.out, moved
 
 
 def test_a_name_that_breaks_requirements_of_users_in_a_namespace(change: Change) -> None:
