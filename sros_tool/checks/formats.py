@@ -334,17 +334,18 @@ def keystore_metrics(
         KeystoreError: the path is not a keystore, or some enclaves cannot be listed.
     """
     # Imported here, because only metrics need these modules.
-    from sros_tool.keystore.expiry import survey
+    from sros_tool.keystore.expiry import enclaves_renewed_by_name, survey
     from sros_tool.prometheus import Metric, Sample
 
     lifetimes, unreadable = survey(keystore)
     expiries = [*_shared_expiries(keystore), *_enclave_expiries(keystore, lifetimes)]
     earliest: dict[str, datetime] = {}
-    settings = None
+    by_name: Sequence[str] = ()
     with suppress(SrosError):  # a finding reports the error
-        settings = keystore.settings
+        if settings := keystore.settings:
+            by_name = enclaves_renewed_by_name(keystore, settings, keystore.names)
     for expiry in expiries:
-        if settings and expiry.enclave and settings.longest_validity(expiry.enclave) is not None:
+        if expiry.enclave in by_name:
             continue
         earliest[expiry.kind] = min(expiry.moment, earliest.get(expiry.kind, expiry.moment))
     place = {"keystore": str(keystore.root.absolute())}

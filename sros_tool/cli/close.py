@@ -542,11 +542,16 @@ def _validity_lines(robot: LocalRobot, closed: CloseState) -> list[str]:
         return [expired_text(robot, expired)]
     if not (closed.secured and closed.valid_until):
         return []
-    from sros_tool.keystore.expiry import renewal_command
+    from sros_tool.keystore.expiry import enclaves_renewed_by_name, renewal_command
+    from sros_tool.keystore.reader import OpenedKeystore
 
     advice = "have them renewed before then (docs/howto/close.md, Renewal without hands)"
     if closed.expires_soon:
-        advice = f"renew them now: {renewal_command(closed.folder / 'keystore')}"
+        by_name = []
+        if robot.keystore.exists():
+            keystore = OpenedKeystore(robot.keystore)
+            by_name = enclaves_renewed_by_name(keystore, keystore.template, closed.expires_soon)
+        advice = f"renew them now: {renewal_command(closed.folder / 'keystore', *by_name)}"
     return [f"the files are valid until {iso(closed.valid_until)}; {advice}"]
 
 

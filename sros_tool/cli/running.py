@@ -685,7 +685,7 @@ def _validities(keystore: OpenedKeystore) -> Iterator[tuple[str, timedelta]]:
 
     A CA service, or the expiry of a CA, can make a validity shorter than the settings choose.
     """
-    from sros_tool.keystore.expiry import survey
+    from sros_tool.keystore.expiry import enclaves_renewed_by_name, survey
 
     template = keystore.template
     least = timedelta.max
@@ -697,10 +697,11 @@ def _validities(keystore: OpenedKeystore) -> Iterator[tuple[str, timedelta]]:
             least = min(least, validity)
             yield what, validity
     lifetimes, _ = survey(keystore) if keystore.names else ((), ())
+    by_name = enclaves_renewed_by_name(keystore, template, keystore.names)
     validities = {
         lifetime.name: min(lifetime.certificate.lifetime(), lifetime.permissions.lifetime())
         for lifetime in lifetimes
-        if template.longest_validity(lifetime.name) is None
+        if lifetime.name not in by_name
     }
     shortest = min(validities.values(), default=least)
     if shortest < least:

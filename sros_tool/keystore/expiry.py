@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -14,7 +14,11 @@ from cryptography import x509
 
 from sros_tool.dds.permissions import Grant
 from sros_tool.errors import KeystoreError, SrosError, UsageError
-from sros_tool.keystore.layout import CERTIFICATE_FILE, remedy_in_keystore
+from sros_tool.keystore.layout import (
+    CERTIFICATE_FILE,
+    enclaves_of_closed_robot,
+    remedy_in_keystore,
+)
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.template import Template
 from sros_tool.parallel import map_slices
@@ -139,7 +143,7 @@ class ExpiringEnclaves(NamedTuple):
     unreadable: Sequence[EnclaveProblem]
     """Enclaves whose expiry cannot be read."""
     short_lived: Sequence[DueEnclave]
-    """Short-lived enclaves with their expiry; ``sros renew`` renews these only by name."""
+    """Short-lived enclaves with their expiry that ``sros renew`` renews only by name."""
 
 
 def expiring_enclaves(renewals: ExpiryCheck) -> ExpiringEnclaves:
@@ -203,9 +207,9 @@ class ExpiryCheck(NamedTuple):
     due: tuple[Lifetime, ...]
     unreadable: tuple[UnreadableEnclave, ...]
     lasting: int
-    """Number of readable enclaves that are not short-lived."""
+    """Number of readable enclaves that are not in `short_lived`."""
     short_lived: tuple[Lifetime, ...]
-    """Enclaves that expire earlier than others, by the settings, and are only renewed if named."""
+    """Enclaves that are renewed only by name (`enclaves_renewed_by_name`)."""
     moment: datetime
 
     def short_lived_text(self) -> str:
@@ -215,17 +219,27 @@ class ExpiryCheck(NamedTuple):
         return f"{enclaves} (renewed only by name): {first_few(shown, 3)}" if shown else ""
 
 
+def enclaves_renewed_by_name(
+    keystore: OpenedKeystore, settings: Template, names: Iterable[str]
+) -> list[str]:
+    """Return the short-lived enclaves among ``names``, except those of a closed robot's processes.
+
+    An enclave of a person ends unless somebody renews it by name; a robot has to go on.
+    """
+    short_lived = [name for name in names if settings.longest_validity(name) is not None]
+    own = enclaves_of_closed_robot(keystore.root).here if short_lived else ()
+    return [name for name in short_lived if name not in own]
+
+
 def due_enclaves(
     keystore: OpenedKeystore, threshold: Threshold, moment: datetime, settings: Template
 ) -> ExpiryCheck:
     """Return the enclaves of a keystore, grouped by whether they are due for renewal."""
     lifetimes, unreadable = survey(keystore)
-    is_short = {
-        lifetime.name: settings.longest_validity(lifetime.name) is not None
-        for lifetime in lifetimes
-    }
-    short_lived = tuple(lifetime for lifetime in lifetimes if is_short[lifetime.name])
-    lasting = [lifetime for lifetime in lifetimes if not is_short[lifetime.name]]
+    names = [lifetime.name for lifetime in lifetimes]
+    by_name = {*enclaves_renewed_by_name(keystore, settings, names)}
+    short_lived = tuple(lifetime for lifetime in lifetimes if lifetime.name in by_name)
+    lasting = [lifetime for lifetime in lifetimes if lifetime.name not in by_name]
     due = tuple(lifetime for lifetime in lasting if lifetime.is_due(threshold, moment))
     return ExpiryCheck(due, unreadable, len(lasting), short_lived, moment)
 

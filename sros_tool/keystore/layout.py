@@ -15,8 +15,10 @@ from pathlib import Path
 from shlex import quote
 from typing import NamedTuple, TypeAlias
 
-from sros_tool.errors import DocumentError, KeystoreError
+from sros_tool.errors import DocumentError, KeystoreError, SrosError
 from sros_tool.faults import ORIGINAL_KEYSTORE, remedy_in_original_keystore
+from sros_tool.values import parse_json
+from sros_tool.xml import read_bytes
 
 ENCLAVES, PUBLIC, PRIVATE = "enclaves", "public", "private"
 CLOSED_PROCESSES, CLOSED_POLICY = "processes.json", "policy.xml"
@@ -294,6 +296,34 @@ def folder_of_closed_robot(root: Path) -> Path | None:
     folder = root / ".." if root.name in ("", "..") else root.parent  # such as "."
     made = all((folder / file).is_file() for file in (CLOSED_PROCESSES, CLOSED_POLICY))
     return folder if made else None
+
+
+class RobotEnclaves(NamedTuple):
+    """The enclaves of a robot that `sros close` closes."""
+
+    here: frozenset[str] = frozenset()
+    """The enclaves of the processes on this machine, also of those that do not always run."""
+    elsewhere: frozenset[str] = frozenset()
+    """The enclaves of other machines, such as laptops."""
+
+
+def enclaves_of_closed_robot(root: Path) -> RobotEnclaves:
+    """Return the enclaves that `sros close` remembers next to a keystore or export.
+
+    There are none if the folder is not of `sros close`, or if the list of processes is broken.
+    """
+    robot = folder_of_closed_robot(root.absolute())
+    try:
+        file = robot and read_bytes(robot / CLOSED_PROCESSES, "list of processes")
+        if not file:
+            return RobotEnclaves()
+        listed = parse_json(file)
+        here = {str(process["enclave"]) for process in listed["processes"]}
+        here |= {*map(str, listed.get("ended", ()))}
+        elsewhere = frozenset(map(str, listed["not_here"]))
+    except (SrosError, ValueError, TypeError, KeyError, AttributeError):
+        return RobotEnclaves()
+    return RobotEnclaves(frozenset({CLOSED_OBSERVER, *here}) - elsewhere, elsewhere)
 
 
 def how_to_learn_one_process(robot: Path, domain: int = 0) -> str:

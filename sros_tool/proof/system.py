@@ -29,12 +29,11 @@ from sros_tool.fleet.expansion import read_policy_for
 from sros_tool.fleet.robots import Fleet
 from sros_tool.keystore.fleet import checked_fleet
 from sros_tool.keystore.layout import (
-    CLOSED_PROCESSES,
     PERMISSIONS_FILE,
     ROUTER_FILE,
     enclave_names,
     enclave_path,
-    folder_of_closed_robot,
+    enclaves_of_closed_robot,
     has_zenoh_files,
     is_keystore,
     is_original_keystore,
@@ -77,8 +76,6 @@ from sros_tool.proof.worlds import (
 from sros_tool.translate import permissions_for, protected_topics
 from sros_tool.translate_zenoh.rights import remote_rights, stated_rights
 from sros_tool.validity import window
-from sros_tool.values import parse_json
-from sros_tool.xml import read_bytes
 from sros_tool.zenoh.access import AccessControl, Enforcement
 
 _ZENOH = "zenoh"
@@ -475,7 +472,7 @@ def _keystore_system(keystore: OpenedKeystore, at: Circumstances) -> System:
         worlds += on_zenoh
     is_export = not is_original_keystore(root)
     for world in worlds if is_export else ():
-        world.away = _enclaves_of_other_machines(root)
+        world.away = enclaves_of_closed_robot(root).elsewhere
     files = {name: str(enclave_path(root, name) / PERMISSIONS_FILE) for name in names}
     places = {
         name: [Place(r, Source(files[name], 0)) for r in source.rights if r.enclave == name]
@@ -489,17 +486,6 @@ def _keystore_system(keystore: OpenedKeystore, at: Circumstances) -> System:
         fleet=partial(checked_fleet, keystore),
         is_export=is_export,
     )
-
-
-def _enclaves_of_other_machines(export: Path) -> Sequence[str]:
-    """Return the enclaves that `sros close` left out of its export; none for other exports."""
-    robot = folder_of_closed_robot(export.absolute())
-    try:
-        file = robot and read_bytes(robot / CLOSED_PROCESSES, "list of processes")
-        names = parse_json(file)["not_here"] if file else []
-        return [name for name in names if isinstance(name, str)]
-    except (SrosError, ValueError, TypeError, KeyError):
-        return ()  # without the list, the enclaves are reported as missing
 
 
 def _link_domains(worlds: Sequence[World]) -> None:

@@ -1796,6 +1796,10 @@ def test_a_robot_whose_files_expire_soon(keystore: Path, tmp_path: Path) -> None
     early = now.valid_until - timedelta(days=1)
     (soon,) = close._validity_lines(robot_at(early), state_at(early))
     assert soon.endswith("Z; renew them now: sros renew robot/keystore --all-expiring soon")
+    settings = keystore / "sros.toml"
+    settings.write_text(settings.read_text() + '[[enclaves]]\nnames = ["/a"]\nvalidity = "3d"\n')
+    (soon,) = close._validity_lines(robot_at(early), state_at(early))
+    assert soon.endswith("renew them now: sros renew robot/keystore /a --all-expiring soon")
     later = now.valid_until + timedelta(seconds=1)
     said = close._other_machines_lines(robot_at(later), state_at(later))[-1]
     assert f"have expired: /b ({iso(now.valid_until)}), /operator/look (" in said

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -134,6 +135,33 @@ def test_a_short_lived_enclave_is_renewed_by_its_name_alone(tmp_path: Path) -> N
     assert f"[renew.short-lived]: not renewed: {SHORT} (short-lived enclaves are" in renewed.err
     renewed = sros("renew", root, SHORT, "--all-expiring", "30d").ok()
     assert renewed.out == f"renewed enclave {SHORT}\n"
+
+
+def test_a_process_of_a_closed_robot_is_renewed_with_all_others(tmp_path: Path) -> None:
+    """Nobody would name it: its certificate is as short as a person's, but the robot goes on."""
+    root = tmp_path / "keystore"
+    sros("create_keystore", root, "--template", "production").ok()
+    create(root)
+    (tmp_path / "policy.xml").write_text(policy_text({SHORT: publish("x")}))
+    expired = Circumstances(datetime.now(UTC) + 2 * DAY)
+    of_process = [{"enclave": SHORT}]
+    for processes, ended, not_here, is_due in (
+        (of_process, [], [], True),
+        ([], [SHORT], [], True),
+        (of_process, [], [SHORT], False),
+    ):
+        listed = {"processes": processes, "ended": ended, "not_here": not_here}
+        (tmp_path / "processes.json").write_text(json.dumps(listed))
+        due = sros("check", "keystore", root, "--needs-renewal", "30d")
+        assert (due.status, SHORT in due.out) == (int(is_due), is_due), due
+        found = keystore_findings(OpenedKeystore(root), expired)
+        accepted = {each.accepted != "" for each in found if "expired" in each.id}
+        assert accepted == {not is_due}, found
+        renewed = sros("renew", root, "--all-expiring", "30d").ok()
+        assert (f"renewed enclave {SHORT}\n" in renewed.out) is is_due
+        assert ("renew.short-lived" in renewed.err) is not is_due
+    (tmp_path / "processes.json").write_text("[]")
+    assert sros("check", "keystore", root, "--needs-renewal", "30d").ok()
 
 
 def test_a_robot_with_a_name_of_people_is_noted(tmp_path: Path) -> None:

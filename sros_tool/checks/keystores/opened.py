@@ -246,8 +246,12 @@ class CheckedEnclave:
     def accepts_expiry(self) -> str:
         """Text that names the template which accepts this enclave's early expiry, or ""."""
         settings = self.keystore.settings
-        short = settings is not None and settings.longest_validity(self.name) is not None
-        return f"template {settings.name}" if settings and short else ""
+        # Imported here, because it reads all about renewals.
+        from sros_tool.keystore.expiry import enclaves_renewed_by_name
+
+        opened, names = self.keystore.opened, [self.name]
+        accepts = settings and enclaves_renewed_by_name(opened, settings, names)
+        return f"template {settings.name}" if settings and accepts else ""
 
     def file(self, name: str) -> str:
         """Return the path of a file of the enclave in the form that findings show."""

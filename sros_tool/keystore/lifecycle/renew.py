@@ -14,6 +14,7 @@ from sros_tool.keystore.expiry import (
     Credentials,
     Threshold,
     UnreadableEnclave,
+    enclaves_renewed_by_name,
     read_credentials,
     refuse_unreadable,
     survey,
@@ -88,12 +89,8 @@ def renew(
                 raise missing_enclave_error(change.keystore, name, change.names)
         wanted = dict.fromkeys(names)
         if expiring is not None:
-            # A short-lived enclave, such as a person's, is meant to end unless somebody renews it
-            # by name.
             others = [name for name in change.names if name not in wanted]
-            short_lived = [
-                name for name in others if change.template.longest_validity(name) is not None
-            ]
+            short_lived = enclaves_renewed_by_name(change.keystore, change.template, others)
             wanted |= dict.fromkeys(
                 _due_enclave_names(change, {*others}.difference(short_lived), expiring)
             )
