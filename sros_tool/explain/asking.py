@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from datetime import datetime, tzinfo
 from pathlib import Path
-from shlex import quote
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 from sros_tool.dds.domains import DomainSet
@@ -233,8 +232,8 @@ def note_on_lacking_keys(keystore: OpenedKeystore) -> Iterator[Note]:
     if is_keystore(keystore.root) and not keystore.has_keys:
         text = (
             f"no enclave in '{keystore.root}' has its key: this is answered as if the keys were "
-            f"there. On the robot, `sros verify {quote(str(keystore.root))}` says whether the "
-            "keys are there."
+            "there. On the robot, `sros verify FOLDER`, with the folder of its enclaves, says "
+            "whether the keys are there."
         )
         yield Note("explain.without-keys", text)
 

@@ -1093,6 +1093,7 @@ def test_a_copy_without_keys_is_answered_as_if_they_were_there(whole: Path, tmp_
         key.unlink()
     said = explain(copy, ENCLAVE, "publish", "/chatter").ok()
     assert "note [explain.without-keys]: no enclave in" in said.err
+    assert "On the robot, `sros verify FOLDER`" in said.err, "the path here is of this machine"
     assert (
         "\n  key       missing here; the answer assumes that the process has the key\n" in said.out
     )
