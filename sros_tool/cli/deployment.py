@@ -46,6 +46,7 @@ from sros_tool.cli.common import (
 from sros_tool.errors import UsageError
 from sros_tool.terminal import Colored, echo, echo_bytes
 from sros_tool.values import FileChange, file_change
+from sros_tool.wording import first_few
 
 if TYPE_CHECKING:
     from cryptography import x509
@@ -60,6 +61,8 @@ if TYPE_CHECKING:
 
 _STREAM = Path("-")
 """The file argument that means standard input or output."""
+_MOST_NAMES = 5
+"""Maximum number of enclaves without keys that an export names."""
 
 
 @verb("distribute_key")
@@ -181,9 +184,13 @@ def distribute_key(
         print_json(ExportedEnclaves(root, dry_run, target, outcomes, left_out, changes, notes))
     else:
         print_notes(notes)
-    for name in exported if done else ():
-        if key_on_robot(keystore.folder(name)):
-            echo(f"{name}: without its key, which was made on its robot and stays there", err=True)
+    if keyless_names := [n for n in exported if done and key_on_robot(keystore.folder(n))]:
+        only = len(keyless_names) == len(exported) > _MOST_NAMES
+        whose = f"all {len(exported)}" if only else first_few(keyless_names, _MOST_NAMES)
+        text = "their keys, which were made on their robots and stay there"
+        if len(keyless_names) == 1:
+            text = "its key, which was made on its robot and stays there"
+        echo(f"{whose}: without {text}", err=True)
     for name in selection.left_out:
         echo(f"left out enclave {name}: its key was made on its robot", err=True)
 

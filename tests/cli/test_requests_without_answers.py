@@ -97,6 +97,8 @@ def test_requests_of_a_fleet(keystore: Path, tmp_path: Path) -> None:
         assert (robot / f"enclaves{name}/key.pem").read_bytes() == kept, "the only copy"
         assert f"{name}  loadable" in sros("verify", robot).ok().out
         assert not (keystore / f"enclaves{name}/key.pem").exists()
+    together = sros("distribute_key", keystore, A, B, tmp_path / "both", "--keyless").ok().err
+    assert f"{A}, {B}: without their keys, which were made on their robots" in together
     assert topics_of(robots[B] / f"enclaves{B}") == {"rt/two", "ros_discovery_info"}
 
     # Renewing needs no new request, and so does --renew with one.
