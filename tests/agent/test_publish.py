@@ -1429,7 +1429,11 @@ def test_a_restored_keystore_makes_no_key_for_a_robot_that_made_its_own(publishe
     publisher.publish()
     shutil.rmtree(root)
     backup.rename(root)
-    publisher.publish(restored=True)
+    notes = {note.id: note.text for note in publisher.publish(restored=True).notes}
+    assert (
+        "if the robot made its keys, sign its requests again (`sros sign_request "
+        in (notes["fleet.certificates-restored"])
+    )
     refused = sros(*generate, cwd=publisher.folder)
     assert refused.status == 2 and "lacks /r9/base, certified after the last backup" in refused.err
     assert "`sros sign_request ks REQUEST --no-answer -p POLICY_FILE --fleet" in refused.err

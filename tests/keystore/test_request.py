@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import io
 import os
+import re
 import stat
 import tarfile
 from collections.abc import Callable
@@ -60,6 +61,7 @@ from tests.support.harness import (
     publish,
     remains,
     snapshot,
+    sros,
     topics_of,
 )
 from tests.support.long_form import some
@@ -310,8 +312,38 @@ def test_a_revoked_enclave_comes_back_only_if_it_is_named(
     with pytest.raises(KeystoreError, match="should be for /base"):
         sign_request(home, request, now=NOW, only_enclaves=["/base"])
     assert snapshot(home) == before
+    both = request + make_request(generate_key(), "/base")
+    for revoked, asked in (
+        ((), f"give only requests of them, and add --enclave {NAME}."),
+        (["/base"], f"add --enclave {NAME} --enclave /base."),
+    ):
+        if revoked:
+            revoke(home, revoked, now=NOW)
+        with pytest.raises(KeystoreError, match=asked):
+            certify_requests(home, both, now=NOW)
     signed = sign_request(home, request, now=NOW, only_enclaves=[NAME])
     assert "keystore.revoked-before" in {each.id for each in signed.notes}
+
+
+def test_a_policy_asks_for_a_request_where_the_revoked_key_was_made_on_a_robot(
+    home: Path, robot: Path, tmp_path: Path
+) -> None:
+    sign(home, robot)
+    policy = tmp_path / "p.xml"
+    policy.write_text(policy_text({NAME: publish("a"), "/base": publish("b")}))
+    for revoked, ways in (
+        ([NAME], ["sign_request"]),
+        (["/base"], ["generate_artifacts", "sign_request"]),
+    ):
+        revoke(home, revoked, now=NOW)
+        refused = sros("generate_artifacts", "-k", home, "-p", policy)
+        assert refused.status == 2, refused
+        commands = re.findall("`sros ((?:gen|sign).+?)`", refused.err)
+        assert [command.split()[0] for command in commands] == ways
+    values = {"POLICY_FILE": policy, "-": create_request(tmp_path / "second", NAME).file}
+    for command in commands[::-1]:
+        sros(*(values.get(word, word) for word in command.split())).ok()
+    assert not (home / FOLDER / "key.pem").exists()
 
 
 def test_rights_that_an_enclave_had_are_not_lost_in_silence(home: Path, tmp_path: Path) -> None:

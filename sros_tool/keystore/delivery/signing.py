@@ -422,11 +422,7 @@ class _RequestCertifier:
         if not self._remove_key_other_than(request):
             _check_same_key(change.keystore, request, present)
         if not renew and not named and known.enclaves_revoked_before([name]):
-            raise KeystoreError(
-                f"enclave {name} was revoked in keystore '{root}'",
-                "Whoever has the revoked key could have made this request to get access again.",
-                f"If you have the robot back and it may have the enclave, add --enclave {name}.",
-            )
+            raise self._revoked_error(name)
         if present:
             note = _new_key_note(root, present, request, change.now)
             change.notes += note or [*known.shared_key_notes([name])]
@@ -458,6 +454,19 @@ class _RequestCertifier:
         change.notes += issued.notes()
         self._certified[name] = stated
         return issued
+
+    def _revoked_error(self, name: str) -> KeystoreError:
+        """Return the error for the requests of ``name`` and all other revoked enclaves."""
+        requested = self._stated_rights
+        revoked = sorted(self._change.known.enclaves_revoked_before([*requested]))
+        add = "add" if len(revoked) == len(requested) else "give only requests of them, and add"
+        options = " ".join(f"--enclave {quote(enclave)}" for enclave in revoked)
+        these = "the enclave" if len(revoked) == 1 else "these enclaves"
+        return KeystoreError(
+            f"enclave {name} was revoked in keystore '{self._root}'",
+            "Whoever has the revoked key could have made this request to get access again.",
+            f"If you have the robot back and it may have {these}, {add} {options}.",
+        )
 
     def _all_domains_notes(self, name: str) -> Iterator[Note]:
         """Yield a note if an enclave of no robot gets rights in the domains of all robots."""

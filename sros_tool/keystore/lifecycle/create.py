@@ -66,6 +66,7 @@ from sros_tool.keystore.layout import (
     PRIVATE,
     PUBLIC,
     REQUEST,
+    REVOKED,
     SETTINGS,
     enclave_path,
     is_keystore,
@@ -424,15 +425,27 @@ def _revoked_before_notes(
         )
 
     if unasked := [name for name in revoked_before if name not in named]:
-        them = "it" if len(unasked) == 1 else "them"
+        them, keys = ("it", "a new key") if len(unasked) == 1 else ("them", "new keys")
+        on_robots = _names_with_keys_made_on_robots(change, unasked)
+        steps = []
+        if here := [name for name in unasked if name not in on_robots]:
+            named = "them" if len(here) > 1 else here[0] if on_robots else "it"
+            steps.append(f"name {named} with -e: {command(here)}")
+        if on_robots:
+            options = " ".join(f"--enclave {quote(name)}" for name in on_robots)
+            steps.append(
+                f"for {first_few(on_robots, 3)}, whose keys were made on the robot, run `sros "
+                "create_request` there, and pass all these requests to `sros sign_request "
+                f"{quote(str(root))} - --no-answer -p POLICY_FILE"
+                f"{' --fleet FLEET_FILE' if fleet else ''} {options}`"
+            )
         raise KeystoreError(
             f"a policy names {', '.join(unasked)}, revoked in keystore '{root}'",
             f"The policy would create {them} again, and `distribute_key --all` would export "
             f"{them}.",
             f"Remove {them} from the policy{' or the robot from the fleet file' if fleet else ''}; "
-            f"or, to create {them} again with a new key and the rights of the policy, name {them} "
-            "with -e: "
-            f"{command(unasked)}.",
+            f"or, to create {them} again with {keys} and the rights of the policy, "
+            f"{'; '.join(steps)}.",
         )
     later = _enclaves_certified_after_backup(change, missing) - {*revoked_before, *named}
     if unasked := [name for name in missing if name in later]:
@@ -446,6 +459,17 @@ def _revoked_before_notes(
             "command.",
         )
     return list(known.revoked_before_notes(revoked_before))
+
+
+def _names_with_keys_made_on_robots(change: KeystoreChange, names: Sequence[str]) -> list[str]:
+    """Return the revoked enclaves in ``names`` whose last key was made on the robot."""
+    entries = change.keystore.ledger_file.with_values("enclave", names).entries
+    serials = {entry.enclave: entry.serial for entry in entries if entry.what == "certificate"}
+    return [
+        name
+        for name in names
+        if name in serials and key_on_robot(change.root / REVOKED / serials[name])
+    ]
 
 
 def _enclaves_certified_after_backup(

@@ -405,7 +405,7 @@ def _reasons_of_revoked(change: KeystoreChange, unknown: Mapping[str, Entry]) ->
 
 def _unknown_note(change: KeystoreChange, unknown: Mapping[str, Entry]) -> Note:
     """Return a note on certificates that are recorded now, or would be without ``dry_run``."""
-    has = "would have" if change.dry_run else "has"
+    root, has = quote(str(change.root)), "would have" if change.dry_run else "has"
     text = (
         f"the keystore issued {counted(len(unknown), 'certificate')} that its ledger lacks: the "
         f"keystore was restored from a backup, or is a copy. The ledger {has} each certificate "
@@ -416,10 +416,12 @@ def _unknown_note(change: KeystoreChange, unknown: Mapping[str, Entry]) -> Note:
     if missing := [name for name in valid if not change.keystore.has_enclave(name)]:
         text += (
             f". The keystore lacks {first_few(missing, _MOST_SHOWN)}, whose certificates stay "
-            "valid. To keep the robot of such an enclave, create its enclaves again with `sros "
-            "generate_artifacts`, then give them new keys: `sros renew "
-            f"{quote(str(change.root))} --robot NAME --new-key --revoke-old`. Otherwise create "
-            "them again and revoke them, or replace the CA with `sros rotate_ca`"
+            "valid. To keep the robot of such an enclave: if the robot made its keys, sign its "
+            f"requests again (`sros sign_request {root} REQUEST --no-answer -p POLICY_FILE --fleet "
+            "FLEET_FILE --enclave ENCLAVE`); otherwise create its enclaves again with `sros "
+            f"generate_artifacts`, then give them new keys: `sros renew {root} --robot NAME "
+            "--new-key --revoke-old`. To revoke such an enclave, create it again first, or replace "
+            "the CA with `sros rotate_ca`"
         )
     return Note("fleet.certificates-restored", f"{text}.")
 
