@@ -91,11 +91,6 @@ class FindingKind(NamedTuple):
     """The DDS vendors that the kind concerns; null for all."""
     prominent: bool = False
 
-    @property
-    def family(self) -> str:
-        """The part of the id before the dot, such as ``enclave``."""
-        return self.id.partition(".")[0]
-
     def found(
         self,
         subject: str,

@@ -100,11 +100,6 @@ class Witness:
         """The enclaves of the uses, in order, without duplicates."""
         return tuple(dict.fromkeys(use.enclave for use in self.uses))
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The names of the uses, in order, without duplicates."""
-        return tuple(dict.fromkeys(use.name for use in self.uses))
-
 
 @dataclass(frozen=True, slots=True)
 class Verdict:

@@ -206,11 +206,6 @@ class Participant:
         finally:
             self._library.api.dds_delete(reader)
 
-    @property
-    def log(self) -> tuple[str, ...]:
-        """The newest warnings and errors that Cyclone DDS logged in this process."""
-        return self._library.log.messages()
-
     def close(self) -> None:
         """Leave the domain, and close the writers and readers of this participant."""
         self._library.api.dds_delete(self.handle)

@@ -139,11 +139,6 @@ class AccessControl:
         """
         return self._expressions(common_name, flow, message, allows=False)
 
-    def keys(self, common_name: str, flow: Flow, message: Message) -> NameSet:
-        """Return the set of all keys on which a message passes."""
-        of = (common_name, flow, message)
-        return names_of(self.passing(*of).all) - names_of(self.denied(*of).all)
-
     def _expressions(
         self, common_name: str, flow: Flow, message: Message, *, allows: bool
     ) -> KeyExpressions:
