@@ -19,7 +19,7 @@ from itertools import count, product
 from typing import NamedTuple, Protocol
 
 from sros_tool.automata import NameSet
-from sros_tool.zenoh.key_expressions import KeyExpressions, includes, names_of
+from sros_tool.zenoh.key_expressions import KeyExpressions, includes
 from sros_tool.zenoh.subtraction import Difference, RuleKeys, keys_of
 
 
