@@ -1257,8 +1257,8 @@ def _write_message(inbox: Path, robot: str, message: bytes) -> None:
             f"{error.strerror or error}.",
             "The agent tries again at its next run."
             + (
-                " If a unit runs it, write the unit again, because `sros agent init` had not run "
-                "then: `sros units KEYSTORE --job agent FOLDER`."
+                " If a systemd unit runs the agent, write the unit again, because it was written "
+                "before `sros agent init`: `sros units KEYSTORE --job agent FOLDER`."
                 if error.errno == errno.EROFS
                 else ""
             ),

@@ -125,7 +125,7 @@ def pin_root(agent_folder: Path, data: bytes, *, now: datetime) -> str:
             FetchProblem.EXPIRED,
             f"the root metadata expired at {iso(root.signed.expires)}",
             "",
-            "Use the current root.json of the publishing folder; or set the clock of this robot.",
+            f"Use the current root.json of the publishing folder; or {_SET_CLOCK}.",
         )
     with Folder(agent_folder) as folder:
         if folder.is_folder(_METADATA):
@@ -363,9 +363,10 @@ def _fetch_error(error: Exception, source: str, now: datetime) -> FetchError:
         f"{why} A file was damaged or changed; or the keystore publishes with other keys than "
         "before, after it was restored from a backup or made again. Nothing was changed.",
         "If the keystore is as before, copy the published files again. If it was restored, and a "
-        "key of publishing was replaced after the backup, add the later root.json and --rotate-key "
-        "to `sros fleet publish`; if all keys were made again, run `sros agent init` with --force "
-        "and the new root.json (docs/howto/keystore_is_lost.md, --rotate-key).",
+        "key of publishing was replaced after the backup, copy the later root metadata into "
+        "PUB/metadata, and add --rotate-key to `sros fleet publish`; if all keys were made "
+        "again, run `sros agent init` with --force and the new root.json "
+        "(docs/howto/keystore_is_lost.md, --rotate-key).",
     )
 
 

@@ -307,7 +307,8 @@ def _check_lists(name: str, files: Mapping[str, bytes], present: Mapping[str, by
             "a backup, first run `sros fleet collect KEYSTORE INBOX`, which takes the list from "
             "the "
             "message of this robot; in a rotation, also `sros crl KEYSTORE --refresh --crl FILE`: "
-            f"FILE is the {IDENTITY_CA_FILE} of this robot, which then has revocation lists, too.",
+            f"FILE is this robot's {IDENTITY_CA_FILE}, because in a rotation this file has "
+            "revocation lists, too.",
         )
 
 

@@ -33,8 +33,8 @@ PROCESS_NOT_CONNECTED = FindingKind(
     "They do not hear each other, and do not log why. Fast DDS gives up if the handshake takes "
     "longer than 14 s, as on a busy machine, and does not try again.",
     "Fast DDS 2.6 to 3.6 (SecurityManager.cpp); tested with 2.14.5.",
-    "If another finding names one of these processes, follow its remedy first. Otherwise, restart "
-    "the process that this finding names.",
+    "If another finding names one of these processes, first do what that finding says. "
+    "Otherwise, restart the process that this finding names.",
     vendors=FAST_DDS,
 )
 _REMEDY_FOR_USERS = (

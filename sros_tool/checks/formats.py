@@ -369,8 +369,8 @@ def keystore_metrics(
         ),
         Metric(
             "sros_earliest_expiry_timestamp_seconds",
-            f"The first expiry of all files of a kind ({_FILE_KINDS_TEXT}), in seconds since 1970, "
-            "without short-lived enclaves, which a person renews when they are needed.",
+            f"The first expiry of all files of a kind ({_FILE_KINDS_TEXT}), in seconds since 1970. "
+            "Short-lived enclaves, which a person renews when they are needed, do not count.",
             tuple(
                 Sample(_timestamp(moment), {**place, "kind": kind})
                 for kind, moment in earliest.items()

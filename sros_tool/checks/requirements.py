@@ -93,8 +93,8 @@ NOT_CROSSING = FindingKind(
     "requirement.not-crossing",
     NOTE,
     "a required right whose data does not pass between Zenoh routers",
-    "The enclave and an enclave at another router have the right, but the routers do not forward "
-    "the name to each other.",
+    "The enclave has the right, and an enclave at another router has the counterpart right, but "
+    "the routers do not forward the name to each other.",
     "The requirements file, and the router.json5 of both routers.",
     "Add the name to `crossing` in the settings, or ignore this if the name is used on one robot "
     "only.",

@@ -44,8 +44,8 @@ UNCLEAR_VULNERABILITIES = FindingKind(
     "runtime.vulnerabilities-unclear",
     NOTE,
     "a DDS without known vulnerabilities, but with advisories that do not mention its release line",
-    "If the history of a release line does not mention a vulnerability, either the line is not "
-    "affected, or the vulnerability is not fixed there.",
+    "If an advisory does not mention a release line, either the line is not affected, or the "
+    "vulnerability is not fixed there.",
     "Advisories in the OSV format, which ship with sros or are in --advisories FILE.",
     "Look the numbers up in the advisories of the product.",
 )

@@ -270,10 +270,7 @@ def _show(robot: LocalRobot, closed: CloseState) -> None:
         )
     if stays := len(closed.denied) - len(closed.newly_denied):
         rights = counted(stays, "right")
-        echo(
-            f"the policy still denies {rights} that the robot used when sros watched (--json "
-            "lists them)"
-        )
+        echo(f"the policy still denies {rights} that the robot used when sros watched (see --json)")
 
 
 def _process_line(process: ClosedProcess, closed: CloseState, policy: Policy) -> str:

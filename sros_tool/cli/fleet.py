@@ -128,7 +128,7 @@ def _report(folder: Path, robot: str, restarted: bool) -> None:
     """On a robot, print a report of its enclaves' files and its DDS, for `fleet confirm`.
 
     The report is JSON. It has the time, and the SHA-256 of each file of the enclaves in DIR except
-    their keys. It also has the loaded and the installed DDS libraries, and the enclaves whose
+    their keys. It also names the loaded and the installed DDS libraries, and the enclaves whose
     processes still run with earlier files. Run the command as root, who can see all processes. The
     report names these problems: enclaves in which no process could start, for example because the
     key does not fit the certificate; files that other users can read or change; and findings of
@@ -906,10 +906,12 @@ def _revocation_list_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
             text += f"; {waiting} more {have} the list, but perhaps not all processes there "
             text += "have loaded it and the current CAs"
         if (until := status.revoked_until) is None:
-            text += "; sros does not know until when robots need it, because the ledger lacks a "
+            text += (
+                "; sros does not know until when robots need the list, because the ledger lacks a "
+            )
             text += "revoked certificate"
         elif until > compared_fleet.at:
-            text += f"; robots need it until {until:%Y-%m-%d}, when "
+            text += f"; robots need the list until {until:%Y-%m-%d}, when "
             text += "the revoked certificates have expired"
         yield text
 

@@ -162,8 +162,8 @@ def view(
     permissions, a Zenoh configuration (router.json5), or the output of `sros generate_policy
     --json`. Two policies are compared as before and after, a policy and a keystore are compared for
     drift, and a Zenoh configuration is compared with the rights that it should allow. --observed
-    compares the rights in SOURCE with those that are used. --focus shows who may use a name, and
-    who can influence those enclaves.
+    compares the rights in SOURCE with those that are used. --focus shows which enclaves may use a
+    name, and who can influence these enclaves.
 
     In a keystore with more than 1,000 enclaves, sros reads only some of the robots that differ only
     in names. For the others, it compares the text of the permissions, and the page says so.

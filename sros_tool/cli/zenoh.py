@@ -262,7 +262,7 @@ def _with_router(network: ZenohNetwork, name: str, endpoint: str) -> ZenohNetwor
             raise UsageError(
                 f"the network has no further router {name}",
                 f"It has {', '.join(known) or 'none'} besides {network.router}.",
-                "Name one of these further routers, or leave the option out.",
+                f"{'Name one of these, or leave' if known else 'Leave'} the option out.",
             )
         return replace(network, routers=tuple(known.values()))
     folder = name.rpartition("/")[0]
@@ -443,9 +443,9 @@ def _notes_on_lost_rules(subjects: Sequence[RightsOfSubject]) -> Iterator[Note]:
     if domains:
         yield Note(
             "zenoh.domains",
-            f"a policy names no domains: the rights of domain {', '.join(domains)} apply in every "
-            "domain of a keystore that is made from it. Write one policy for each domain if their "
-            "rights differ.",
+            "a policy names no domains: a keystore that is made from this policy gives the rights "
+            f"of domain {' and '.join(domains)} in every domain. If the rights differ by domain, "
+            "write one policy for each domain.",
         )
     yield Note(
         "zenoh.node-names",

@@ -206,7 +206,8 @@ class _RemainingProcesses:
             if process.unit and process.enclave in self._secured:
                 yield (
                     f"{self._secured[process.enclave].label} still runs in {process.enclave}: stop "
-                    f"it if {process.unit} did not start it; otherwise take sros out of the unit"
+                    f"it if {process.unit} did not start it; otherwise remove `sros run`, or the "
+                    "variables of the enclave, from the unit"
                 )
 
     def say_how_to_start(self) -> None:
@@ -346,5 +347,5 @@ def _restart_units(
             raise SrosError(
                 f"`{shlex.join(command)}` ended with {status}",
                 "Secured and open processes do not hear each other.",
-                "Correct the failure and run --apply again, or go back with --undo.",
+                "Correct the failure, and run the same `sros close` again, or go back with --undo.",
             )

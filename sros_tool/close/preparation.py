@@ -504,13 +504,14 @@ def _unknown_process_problems(running: RunningRobot, state: CloseState) -> Itera
     """Yield texts on processes without known nodes, and on nodes without a known process."""
     robot, observed = running.robot, state.observed
     close = robot.close_command
-    silent = "nobody would hear them any more (--partial accepts this)"
+    silent = "nobody would hear {} any more (--partial accepts this)"
     if observed.unknown:
+        them, runs = ("it", "it runs") if len(observed.unknown) == 1 else ("them", "they run")
         processes = first_few(observed.unknown, MOST_NAMES)
         remap = "--ros-args -r __node:=NODE -r __ns:=NAMESPACE"
-        advice = f"watch again while they run: {close} --for 1m"
+        advice = f"watch again while {runs}: {close} --for 1m"
         if observed.elsewhere:
-            advice += "; if sros still sees none, first add the name of the node to the command "
+            advice += "; if sros still sees none, first add the name of its node to the command "
             advice += f"of each process ({remap})"
         if state.secured:
             advice = _start_of_unknown_process(running, state)
@@ -523,7 +524,7 @@ def _unknown_process_problems(running: RunningRobot, state: CloseState) -> Itera
                 advice += f"; to give another process its own enclave, {learn}"
         yield (
             f"sros knows no node of {counted(len(observed.unknown), 'process', 'processes')}: "
-            f"{processes}; {advice}; otherwise {silent}"
+            f"{processes}; {advice}; otherwise {silent.format(them)}"
         )
     routers = [process for process in running.open_processes if process.is_router]
     if routers and not any(process.is_router for process in observed.processes):
@@ -548,7 +549,8 @@ def _unknown_process_problems(running: RunningRobot, state: CloseState) -> Itera
             f"sros knows no process of this machine for nodes of {enclaves}. If they run on "
             f"another machine: {close} {options}. If you do not know one of the nodes, it may be "
             f"a stranger's: remove its enclave from '{robot.policy}', and remove "
-            f"'{robot.requirements}', which sros then proposes again. Otherwise, {silent}"
+            f"'{robot.requirements}', which sros then proposes again. Otherwise, "
+            f"{silent.format('them')}"
         )
 
 

@@ -491,9 +491,8 @@ def _why_missing(running: RunningRobot, missing: Sequence[str], observed: Observ
     advice = ""
     if absent:
         log = f"`sros explain {shlex.quote(str(robot.export))} --log ITS_LOG`"
-        advice = (
-            f". Start each as {robot.commands_file} says. If one ended, its log says why: {log}"
-        )
+        advice = f". Start each process as {robot.commands_file} says. If a process ended, its log "
+        advice += f"says why: {log}"
     if may_end := [name for name in absent if name not in {*has_start, *robot.without}]:
         options = ", ".join(f"--without {name}" for name in may_end)
         advice += f". For a process that does not always run, add its option: {options}"
@@ -712,7 +711,7 @@ class _TalkComparison:
             yield f"allowed, but not seen now, and not always seen in the watch: {names}"
         if unused := self._unused_rights():
             names = first_few(unused, MOST_NAMES)
-            yield f"allowed, but not seen on the open robot, and not now: {names}"
+            yield f"allowed, but seen neither on the open robot nor now: {names}"
         if not self._audited["settled"]:
             yield "the ROS graph kept changing meanwhile, or could not be read in time"
         known = {*map(node_name, before.nodes)}

@@ -147,7 +147,8 @@ def _command_lines(
         yield from (f"# {advice}",) if advice else ()
         for process in processes:
             for rule in denied_remappings.get(process.enclave, ()):
-                yield f"# First change its remapping {visible(rule)}: the policy denies this name."
+                rule_text = visible(rule)
+                yield f"# First change the remapping {rule_text}: the policy denies the new name."
         yield command
 
 

@@ -187,9 +187,9 @@ def _write_observation(robot: LocalRobot, document: str, observed: ObservedProce
 def _text_on_nodes_without_enclave(robot: LocalRobot, names: Sequence[str]) -> str:
     """Return a sentence that names the nodes which the graph shows without an enclave."""
     return (
-        f"{first_few(names, MOST_NAMES)}: the participant has the identifier of a secured "
-        f"process, so '{robot.policy}' has no rights for this node. If the node is of the robot, "
-        f"start it open, and watch again: {robot.close_command} --for 1m"
+        f"nodes with the identifier of a secured process: {first_few(names, MOST_NAMES)}. "
+        f"'{robot.policy}' has no rights for such nodes. Start those of the robot open, and watch "
+        f"again: {robot.close_command} --for 1m"
     )
 
 
@@ -269,6 +269,7 @@ def _lacking_text(
     ]
     files = shlex.join((str(robot.policy), str(robot.observed_policy)))
     add = f"sros merge_policy {files} --in-place"
+    these = "this right" if len(rights) == 1 else "these rights"
     restart = (
         f"{first_few(meanings, MOST_NAMES)}; if the node's command is wrong, restart the node with "
         f"the right one, and watch again: {robot.close_command} --for 1m; otherwise, "
@@ -276,8 +277,8 @@ def _lacking_text(
     )
     return (
         f"'{robot.policy}' stays as it is, and lacks {counted(len(rights), 'right')} seen now "
-        f"({first_few(rights, MOST_NAMES)}); {restart}if a process should not have these "
-        f"rights, stop the process, and run `{robot.close_command}`; if it needs them: {add}"
+        f"({first_few(rights, MOST_NAMES)}); {restart}if a process should not have {these}, stop "
+        f"the process, and run `{robot.close_command}`; if it needs {these}: {add}"
     )
 
 

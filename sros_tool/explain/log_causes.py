@@ -377,8 +377,8 @@ class Examiner:
             elsewhere, remedy = self._other_folder_cause(denial, enclave)
             facts += elsewhere
             remedy = remedy or (
-                "The process loaded permissions of another policy. Perhaps it is an earlier "
-                "version of this policy, or an edited one. Or this policy was merged with "
+                "The process loaded permissions of another policy, perhaps of an earlier or "
+                "an edited version of this policy. Or this policy was merged with "
                 "--remap, and the process lacks the remapping. Ask for the robot's policy, and "
                 "name it in place of this one. If this is the robot's policy, sign it, export "
                 "the enclave, and restart the process."

@@ -1130,8 +1130,10 @@ def _notes(answer: ZenohAnswer, stated: Answer, outdated: Sequence[str] | None) 
         if answer.allowed:
             yield _ROUTERS_KEY
     elif answer.allowed is not stated.allowed and not stated.problems:
-        does, other = ("allow", "Zenoh drops") if stated.allowed else ("deny", "Zenoh lets through")
-        text = f"the signed permissions {does} it, but {other} it: the two differ."
+        permissions, rules = (
+            ("allow", "drops it") if stated.allowed else ("deny", "lets it through")
+        )
+        text = f"the signed permissions {permissions} it, but Zenoh {rules}."
         yield Note("explain.zenoh-differs", text)
     if answer.in_part:
         yield Note("explain.in-part", text_of_parts(answer.question, answer.in_part))

@@ -315,7 +315,7 @@ class _System:
             sentence = f"no right states {name} itself, but wildcards match it: {sentence}"
         domains = {self._domains.get(user, "") for user in senders | receivers} - {""}
         if len(domains) > 1:
-            sentence += "; they are in different ROS domains ("
+            sentence += "; these enclaves are in different ROS domains ("
             sentence += (
                 f"{enumerated(sorted(domains))}), and reach only enclaves of their own domain"
             )

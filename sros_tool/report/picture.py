@@ -588,7 +588,8 @@ class Picture:
         likes = first_few([units.like for units in self.unread], _MOST_SHOWN)
         yield (
             f"{counted(number, self.unread[0].what)} with {counted(enclaves, 'enclave')} "
-            f"({first_few(members, _MOST_IN_HEADLINES)}) were only compared: their permissions "
+            f"({first_few(members, _MOST_IN_HEADLINES)}) {'was' if number == 1 else 'were'} only "
+            "compared: their permissions "
             f"have the same text as the permissions of {likes}, except for names. This picture "
             "lacks their signatures, certificates, expiry and findings, and the rights of other "
             "enclaves to their names: --robot NAME reads one, `sros check` checks all"

@@ -294,7 +294,9 @@ def test_a_policy_that_was_changed_stays_and_is_followed(robot: Robot) -> None:
     denied = "start command of /listener remaps to a name that the policy denies (words:=chatter)"
     assert f"{denied}: change the remapping before you start the process\n" in ended.out
     commands = (robot.folder / "robot/start/commands.txt").read_text()
-    change = "First change its remapping words:=chatter: the policy denies this name.\ncd /opt && "
+    change = (
+        "First change the remapping words:=chatter: the policy denies the new name.\ncd /opt && "
+    )
     assert f"\n# /listener\n# {change}" in commands and commands.count("First change") == 1
     robot.units = UNITS
     assert "/listener: the rights that it lost still work until 20" in ended.err
@@ -302,8 +304,8 @@ def test_a_policy_that_was_changed_stays_and_is_followed(robot: Robot) -> None:
     assert policy.read_text() == changed
     assert "/listener subscribe topic /chatter (/listener)" in ended.out
     told_again = robot.close().out
-    still = "the policy still denies 1 right that the robot used when sros watched (--json lists"
-    assert f"{still} them)\n" in told_again
+    still = "the policy still denies 1 right that the robot used when sros watched (see --json)"
+    assert f"{still}\n" in told_again
     assert "/listener subscribe topic /chatter" not in told_again
     again = robot.close("--for", "1s", status=1)
     assert policy.read_text() == changed
@@ -315,7 +317,7 @@ def test_a_policy_that_was_changed_stays_and_is_followed(robot: Robot) -> None:
         "; if the node's command is wrong, restart the node with the right one, and watch again: "
         "sros close robot --for 1m;" in again.out
     )
-    assert " otherwise, if a process should not have these rights, stop the process, " in again.out
+    assert " otherwise, if a process should not have this right, stop the process, " in again.out
     policy.write_text(changed.replace('node="listener"', 'node="hearer"'))
     renamed = robot.close("--for", "1s", status=1).out
     assert "; perhaps /listener is /hearer, started without its name (-r __node:=hearer)" in renamed
@@ -323,7 +325,7 @@ def test_a_policy_that_was_changed_stays_and_is_followed(robot: Robot) -> None:
     policy.write_text(changed)
     robot.close("--for", "1s", status=1)
     add = "sros merge_policy robot/policy.xml robot/seen.xml --in-place"
-    assert f"; if it needs them: {add}\n" in again.out
+    assert f"; if it needs this right: {add}\n" in again.out
     sros(*add.split()[1:], cwd=robot.folder).ok()
     assert "would have" not in robot.close("--for", "1s").out
     policy.write_text(changed)
@@ -334,7 +336,7 @@ def test_a_policy_that_was_changed_stays_and_is_followed(robot: Robot) -> None:
     assert f"{except_for}talk: 2 nodes with 35 endpoints as before (types are not compared)" in said
     alone = "left without a partner: /talker may publish /chatter, but no enclave may subscribe to "
     alone = f"1 right that the robot used: /listener subscribe topic /chatter\n  {alone}it any more"
-    unused = "not seen on the open robot, and not now: /listener subscribe topic /old/chatter"
+    unused = "seen neither on the open robot nor now: /listener subscribe topic /old/chatter"
     assert f"\n  the policy takes away {alone}\n  allowed, but {unused}\n" in said
     (denied,) = json.loads(robot.close("--proof", "--json").out)["denied"]
     assert denied.startswith("/listener subscribe topic /chatter (/listener): ")
@@ -1159,7 +1161,7 @@ def test_processes_that_show_no_id_are_to_be_named(robot: Robot) -> None:
     )
     said = robot.close(status=1).out
     assert "; watch again while they run: sros close" in said
-    assert "first add the name of the node to the command of each process (--ros-args" in said
+    assert "first add the name of its node to the command of each process (--ros-args" in said
     assert "for nodes of /left, /right. If they run on another machine" in said
     assert "from 'robot/policy.xml', and remove 'robot/requirements.toml', which sros then" in said
 
@@ -1172,7 +1174,7 @@ def test_nothing_is_closed_of_what_is_not_understood(robot: Robot) -> None:
         "first:\n  sros knows no node of 1 process: process 5 (other)" in robot.close(status=1).out
     )
     assert (
-        "nobody would hear them any more (--partial accepts this)"
+        "nobody would hear it any more (--partial accepts this)"
         in robot.close("--apply", status=1).out
     )
     assert robot.restarts == []
@@ -1247,7 +1249,7 @@ def test_a_renamed_node_is_compared_and_a_new_one_is_named(
     seen.write_text(json.dumps(value))
     bow_camera = ros_node("nav/bow_camera", of, "publish rt/nav/bow_camera/image")
     robot.remaining = (TALKER, LISTENER, stern_camera, bow_camera)
-    unused, before = "allowed, but not seen on the open robot, and not now: ", said
+    unused, before = "allowed, but seen neither on the open robot nor now: ", said
     said = robot.close("--proof").out
     assert f"\n  {unused}/listener publish topic /plan_b\n  not" in said and unused not in before
     assert (
@@ -1275,7 +1277,7 @@ def test_a_process_that_the_policy_lacks_keeps_its_command(robot: Robot) -> None
     robot.nodes, robot.absent = (TALKER, LISTENER), set()
     said = robot.close("--for", "1s", status=1).out
     add = "sros merge_policy robot/policy.xml robot/seen.xml --in-place"
-    assert "(/talker publish /chatter" in said and f"; if it needs them: {add}\n" in said
+    assert "(/talker publish /chatter" in said and f"; if it needs these rights: {add}\n" in said
     assert "the policy lacks enclaves that sros saw when it watched: /talker\n" in robot.close().out
     sros(*add.split()[1:], cwd=robot.folder).ok()
     said = robot.close().out
@@ -1289,7 +1291,7 @@ def test_a_node_whose_enclave_the_graph_does_not_show_is_named(robot: Robot) -> 
     """Any participant can have an identifier that looks like that of a secured one."""
     robot.nodes += (ros_node("ghost", "8f0f0000681200000000", "publish rt/cmd_vel"),)
     said = robot.close(status=1).out
-    assert "/ghost: the participant has the identifier of a secured process, so 'rob" in said
+    assert "nodes with the identifier of a secured process: /ghost. 'rob" in said
     robot.by_hand = set(PID)
     robot.nodes = (TALKER, LISTENER)
     assert (

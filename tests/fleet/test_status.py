@@ -450,8 +450,8 @@ def test_until_when_a_revocation_is_needed(field: Field, monkeypatch: pytest.Mon
     assert field.status()["revoked_until"] == iso(until), "of the last one, not of the first"
     said = field.run("fleet", "status", "ks", status=1).out
     assert (
-        f"; robots need it until {until:%Y-%m-%d}, when the revoked certificates have expired\n"
-        in said
+        f"; robots need the list until {until:%Y-%m-%d}, when the revoked certificates have "
+        "expired\n" in said
     )
     field.run("update_keystore", "ks", "--set", "certificates.validity=90d")
     field.run("rotate_ca", "ks", "--identity", "--finish", "--allow-unconfirmed")
@@ -472,7 +472,7 @@ def test_until_when_a_revocation_is_needed(field: Field, monkeypatch: pytest.Mon
     (field.root / "ledger.jsonl").unlink()
     assert field.status()["revoked_until"] is None, "nobody knows"
     assert (
-        "sros does not know until when robots need it, because"
+        "sros does not know until when robots need the list, because"
         in field.run("fleet", "status", "ks", status=1).out
     )
 
@@ -938,7 +938,7 @@ def test_a_revocation_list_is_in_force_after_the_restart(field: Field) -> None:
     field.run("revoke", "ks", "/dispatcher")
     assert in_force() == [False, False, False]
     said = field.run("fleet", "status", "ks", status=1).out
-    assert "\nthe revocation list is in force on 0 of 3 robots; robots need it until " in said
+    assert "\nthe revocation list is in force on 0 of 3 robots; robots need the list until " in said
     field.deliver("r1", "r2")
     field.send("r2", running={"/r2/base": RunningFiles.EARLIER, "/r9/base": RunningFiles.EARLIER})
     assert in_force() == [False, False, False], "r1 does not say which processes it has"
@@ -961,9 +961,9 @@ def test_a_revocation_list_is_in_force_after_the_restart(field: Field) -> None:
     field.deliver("r3", restart=[])
     field.send("r2", running={"/r2/base": RunningFiles.CURRENT})
     said = field.run("fleet", "status", "ks").out
-    assert "\nthe revocation list is in force on all 3 robots; robots need it until " in said
+    assert "\nthe revocation list is in force on all 3 robots; robots need the list until " in said
     said = field.run("fleet", "status", "ks", "--robot", "r3").out
-    assert "\nthe revocation list is in force on 1 robot; robots need it until " in said
+    assert "\nthe revocation list is in force on 1 robot; robots need the list until " in said
     rights = {f"/{{robot}}/{name}": publish("/{robot}/x") for name in ("base", "new")}
     (field.folder / "more.xml").write_text(policy_text(rights))
     field.run("generate_artifacts", "-k", "ks", "-p", "more.xml", "--fleet", "fleet.toml")
@@ -987,7 +987,7 @@ def test_a_list_whose_ca_was_replaced_is_missed_until_nothing_trusts_the_ca(fiel
     field.run("revoke", "ks", "--robot", "r3")
     field.run("rotate_ca", "ks", "--identity", "--finish", "--allow-unconfirmed")
     text, values = said()
-    assert "in force on 0 of 2 robots; robots need it until " in text and values == [0, 0]
+    assert "in force on 0 of 2 robots; robots need the list until " in text and values == [0, 0]
     field.deliver("r1", restart=[])
     assert "on 1 of 2 robots" in said()[0] and said()[1] == [1, 0]
     field.deliver("r2", restart=[])

@@ -229,7 +229,7 @@ TOKEN_KEY = FindingKind(
     "enclave.token-key",
     ERROR,
     "a token that does not have the key of an enclave",
-    "No node starts if its token is missing, has another key, or refuses the PIN.",
+    "A node does not start if the token is missing, has another key, or refuses the PIN.",
     "Fast DDS 2.9.1 (Pkcs11Provider.cpp); tested.",
     "Check that the token is there, and check its module and PIN. If its key is lost, make another "
     "key, with `sros create_request` in another folder.",

@@ -256,7 +256,8 @@ PIN_FILE = FindingKind(
     "Anyone who can read the file can use the key while the token is there; a node that cannot "
     "read the file does not start.",
     "RFC 7512, 2.4 and 4; libp11 0.4.12 (eng_parse.c), tested.",
-    "Write only the PIN into the file, with mode 0600, for the user that runs the node.",
+    "Write only the PIN into the file. Make the user that runs the node its owner, and 0600 its "
+    "mode.",
 )
 
 _LONG_VALIDITY = timedelta(days=2 * 366)

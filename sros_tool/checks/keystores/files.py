@@ -145,7 +145,8 @@ FOREIGN_STAGE = FindingKind(
     "Somebody else may have forged it, in the keystore or in the archive that the keystore came "
     "from, to make sros move files with your rights. Verbs that write refuse to continue.",
     "sros: sros_tool/keystore/transaction.py; CWE-59.",
-    "Find out who can write to the keystore, look at what is in the folder, and remove it.",
+    "Find out who can write to the keystore. Look into the folder that the finding names, and "
+    "remove the folder.",
 )
 STRAY_KEY = FindingKind(
     "keystore.stray-key",

@@ -144,7 +144,8 @@ AUTHORITIES_DIFFER = FindingKind(
     "keystore.authorities-differ",
     ERROR,
     "enclaves that do not trust the same CAs",
-    "Their nodes never communicate, and neither Fast DDS nor Cyclone DDS reports why.",
+    "Nodes that trust different CAs never communicate, and neither Fast DDS nor Cyclone DDS "
+    "reports why.",
     "DDS-Security 1.1, 9.3; Fast DDS 2.9.1, Cyclone DDS 0.10.2; tested.",
     "Export the enclave again from the keystore of the other enclaves, or create it again in "
     "that keystore.",
