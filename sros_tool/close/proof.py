@@ -32,7 +32,7 @@ from sros_tool.close.nodes import (
 )
 from sros_tool.close.processes import ObservedProcesses
 from sros_tool.close.rights import ordinary_uses
-from sros_tool.close.robot import MOST_NAMES, OBSERVER, LocalRobot
+from sros_tool.close.robot import MOST_NAMES, OBSERVER, TEMPLATE, LocalRobot
 from sros_tool.close.state import (
     CONNECTED,
     SILENCE,
@@ -301,8 +301,23 @@ def _proof_of_requirements(robot: LocalRobot) -> Proof:
     status = 1 if 1 in statuses else max(statuses)
     reasons = {0: "all of them", 1: "at least one is violated", 2: "sros could not check them"}
     holds = {0: True, 1: False}.get(status)
-    weak = _weak_requirements_text(robot) if holds else ""
-    return Proof(_CLAIM_REQUIRED, holds, f"{reasons[status]}: {robot.requirements}{weak}")
+    more = _unsigned_violation_text(robot, *needed) if holds else ""
+    more += _weak_requirements_text(robot) if holds else ""
+    return Proof(_CLAIM_REQUIRED, holds, f"{reasons[status]}: {robot.requirements}{more}")
+
+
+def _unsigned_violation_text(robot: LocalRobot, *needed: str) -> str:
+    """Return a clause which says that the policy, if it is not signed yet, breaks a requirement.
+
+    ``needed`` are the options of `check` that name the requirements.
+    """
+    if not robot.policy.exists():
+        return ""
+    words = ("check", str(robot.policy), "--template", TEMPLATE, *needed, "--fail-on", "error")
+    status, _, _ = robot.shell.run(words, False)
+    if status != 1 or not _unsigned_policy_text(robot):
+        return ""
+    return f"; '{robot.policy}', which is not signed yet, violates at least one"
 
 
 def _weak_requirements_text(robot: LocalRobot) -> str:
@@ -662,7 +677,7 @@ class _TalkComparison:
         later = sorted({*map(node_name, nodes)} - known)
         return [*later, *_endpoint_texts((node, use) for node, use in uses if node in known)]
 
-    def _unused_rights(self) -> list[str]:
+    def _unused_rights(self) -> list[Right]:
         """Return the rights of the policy to one name that no node used, then or now."""
         policy, robot = self._nodes.policy, self._running.robot
         nodes = [*self._nodes.expected(self.current).nodes, *self.current.nodes]
@@ -676,7 +691,7 @@ class _TalkComparison:
         rights = policy_rights(policy)
         rules, ordinary = Rules(rights), ordinary_uses(policy, robot.folder)
         return [
-            f"{right.enclave} {right.describe()}"
+            right
             for right in sorted(rights, key=order)
             if right.enclave in running
             and not is_expression(right.name)
@@ -710,8 +725,14 @@ class _TalkComparison:
             names = first_few(_endpoint_texts(not_now), MOST_NAMES)
             yield f"allowed, but not seen now, and not always seen in the watch: {names}"
         if unused := self._unused_rights():
-            names = first_few(unused, MOST_NAMES)
-            yield f"allowed, but seen neither on the open robot nor now: {names}"
+            signed = Rules(load_rights(OpenedKeystore(self._running.robot.export)).rights)
+            kinds: dict[str, list[str]] = {}
+            for right in unused:
+                is_signed = signed.allow(right.enclave, right.right, right.name)
+                kind = "allowed, but seen neither on the open robot nor now"
+                kind = kind if is_signed else "in the policy, but not signed yet"
+                kinds.setdefault(kind, []).append(f"{right.enclave} {right.describe()}")
+            yield from (f"{kind}: {first_few(kinds[kind], MOST_NAMES)}" for kind in kinds)
         if not self._audited["settled"]:
             yield "the ROS graph kept changing meanwhile, or could not be read in time"
         known = {*map(node_name, before.nodes)}

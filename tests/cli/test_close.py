@@ -506,6 +506,14 @@ def test_a_robot_is_closed_proved_and_opened_again(robot: Robot) -> None:
         "'robot/start/commands.txt' has the commands of processes that you start by hand" in refused
     )
     (robot.folder / "home").rename(robot.folder / "robot/keystore")
+    more = '<topics publish="ALLOW"><topic>chatter</topic></topics><topics subscribe="ALLOW">'
+    policy.write_text(signed.replace('<topics subscribe="ALLOW">', more, 1))
+    proved = robot.close("--proof").out
+    breaks = "requirements.toml; 'robot/policy.xml', which is not signed yet, violates at least one"
+    assert f"yes: the requirements hold: all of them: robot/{breaks}\n" in proved
+    assert "\n  in the policy, but not signed yet: /listener publish topic /chatter\n" in proved
+    assert "seen neither" not in proved
+    policy.write_text(signed)
     refuse_undo_of_others(robot)
     undone = robot.close("--undo")
     assert [*robot.folder.glob("systemd/*.d/*")] == []
