@@ -893,9 +893,16 @@ def _fleet_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
 
 
 def _revocation_list_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
-    """Yield the number of robots on which the revocation list is in force, if a list exists."""
+    """Yield which robots have the revocation list in force, or lack it, if a list exists."""
     status = compared_fleet.status
-    if numbers := _counts_of_list_in_force(status):
+    numbers = _counts_of_list_in_force(status)
+    if numbers and (trusting := status.trusting_replaced):
+        until_clause = f" (until {until:%Y-%m-%d})" if (until := status.revoked_until) else ""
+        yield (
+            f"no certificate of the present CA is revoked, but {first_few(trusting, 5)} may still "
+            f"trust a replaced CA, and accept its revoked certificates{until_clause}"
+        )
+    elif numbers:
         in_force, robots = numbers
         number = f"{in_force} of " if in_force < robots else "all " if in_force > 1 else ""
         text = f"the revocation list is in force on {number}{counted(robots, 'robot')}"

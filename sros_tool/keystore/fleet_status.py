@@ -570,6 +570,10 @@ class FleetStatus:
     """Whether a certificate is on the revocation list, or was revoked and is of a replaced CA that
     a robot may still trust.
     """
+    trusting_replaced: Sequence[str] = ()
+    """The robots that may trust a replaced CA and so accept certificates that were revoked, if no
+    certificate is on the revocation list.
+    """
     groups: Mapping[str, Sequence[str]] = field(default_factory=dict)
     """The groups of the fleet file, with their robots."""
     awaited: frozenset[str] = frozenset()
@@ -708,10 +712,13 @@ def fleet_status(keystore: OpenedKeystore, names: Sequence[str] = ()) -> FleetSt
     )
     if older := records.age_clause:  # there may be a later list that the keystore lacks
         statuses = tuple(status.without_list() for status in statuses)
-    may_trust_replaced = any(
-        status.crl_in_force is False and (older or status.may_trust_replaced) for status in statuses
-    )
-    is_any_revoked = records.is_any_listed() or (may_trust_replaced and records.is_any_revoked)
+    trusting_replaced = [
+        status.robot
+        for status in statuses
+        if status.crl_in_force is False and (older or status.may_trust_replaced)
+    ]
+    may_trust_replaced, is_any_listed = bool(trusting_replaced), records.is_any_listed()
+    is_any_revoked = is_any_listed or (may_trust_replaced and records.is_any_revoked)
     return FleetStatus(
         keystore.root,
         stages.stage_of_keystore,
@@ -724,6 +731,7 @@ def fleet_status(keystore: OpenedKeystore, names: Sequence[str] = ()) -> FleetSt
         else None,
         publication=records.publication,
         is_any_revoked=is_any_revoked,
+        trusting_replaced=() if is_any_listed else trusting_replaced,
         groups=fleet.groups,
         awaited=stages.awaited,
         recorded=keystore.ledger_file.last_time(),

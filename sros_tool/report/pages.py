@@ -547,10 +547,10 @@ def render_fleet_page(
     trusted = ""
     if list_lacking:
         trusted = (
-            f'<p class="wrong">{_sentence(list_lacking)} Until it is in force on a robot, the '
-            "robot accepts whoever has a revoked key. Deliver the list, restart the processes, and "
-            "confirm by Ansible, <code>sros agent</code> or <code>sros fleet report "
-            "--restarted</code>.</p>"
+            f'<p class="wrong">{_sentence(list_lacking)} Until the current '
+            "revocation list is in force on a robot, the robot accepts whoever has a revoked key. "
+            "Deliver the list, restart the processes, and confirm by Ansible, "
+            "<code>sros agent</code> or <code>sros fleet report --restarted</code>.</p>"
         )
     current, robots = status["counts"].get("current", 0), counted(len(status["robots"]), "robot")
     fact_lines = "".join(f"<br>{_sentence(fact)}" for fact in facts)

@@ -982,14 +982,18 @@ def test_a_list_whose_ca_was_replaced_is_missed_until_nothing_trusts_the_ca(fiel
         ended = sros("fleet", "status", "ks", cwd=field.folder).out
         text = sros("fleet", "status", "ks", "--prometheus", cwd=field.folder).out
         values = [value for _, value in samples(text, "sros_fleet_revocation_list_in_force")]
-        return next((line for line in ended.splitlines() if "in force" in line), ""), values
+        return next((line for line in ended.splitlines() if " CA is revoked" in line), ""), values
 
     field.run("revoke", "ks", "--robot", "r3")
     field.run("rotate_ca", "ks", "--identity", "--finish", "--allow-unconfirmed")
     text, values = said()
-    assert "in force on 0 of 2 robots; robots need the list until " in text and values == [0, 0]
+    assert "but r1, r2 may still trust a replaced CA, and accept its revoked cert" in text
+    assert text.endswith(")") and values == [0, 0]
     field.deliver("r1", restart=[])
-    assert "on 1 of 2 robots" in said()[0] and said()[1] == [1, 0]
+    field.send("r1", running={"/r1/base": RunningFiles.CURRENT})
+    assert "but r2 may still" in said()[0] and said()[1] == [1, 0]
+    field.age("r1", timedelta(days=2))
+    assert "but r2 may still" in said()[0] and said()[1] == [0, 0], "r1 is only offline"
     field.deliver("r2", restart=[])
     assert said() == ("", []) and field.status()["revoked_until"] is None
 

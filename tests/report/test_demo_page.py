@@ -216,7 +216,7 @@ def test_a_fleet_begins_with_how_many_are_current_and_says_it_once() -> None:
     chips = [chip.text_content() for chip in page.cssselect("tbody .chip")]
     assert chips == ["revoked", "an earlier one", "current"]
     (wrong,) = page.cssselect("p.wrong")
-    assert wrong.text_content().startswith(f"On 1 of 2{HOSTILE[0]}. Until it is in force")
+    assert wrong.text_content().startswith(f"On 1 of 2{HOSTILE[0]}. Until the current revocation")
     (library,) = page.cssselect("section > details")
     assert library.cssselect("summary")[0].text_content() == f"{HOSTILE[0]}: 1 known; on r1"
     assert "In '/opt/library" in library.text_content() and "CVE-1-2." in library.text_content()
