@@ -45,6 +45,7 @@ from sros_tool.demo.scenarios.model import (
 from sros_tool.errors import KeystoreError, SrosError
 from sros_tool.faults import Fault
 from sros_tool.keystore.issuing.keyring import Keyring, Secrets, no_secrets
+from sros_tool.keystore.known_keys import revoked_serials
 from sros_tool.keystore.layout import (
     CRL,
     CRL_FILE,
@@ -294,7 +295,7 @@ def _read_enclaves(keystore: OpenedKeystore, now: datetime, domain: int) -> _Enc
     without_list: list[str] = []
     other_domain: list[str] = []
     governances: dict[str, Governance | None] = {}
-    serials = _revoked_serials(keystore)
+    serials = revoked_serials(keystore)
     newest = _content(keystore.root / CRL)
     for name in keystore.names:
         state = keystore.enclave(name, now=now, domain=domain)
@@ -333,13 +334,6 @@ def _read_enclaves(keystore: OpenedKeystore, now: datetime, domain: int) -> _Enc
         other_domain=tuple(other_domain),
         domain=domain,
     )
-
-
-def _revoked_serials(keystore: OpenedKeystore) -> frozenset[int]:
-    """Return the serial numbers that the ledger or the CRL lists as revoked."""
-    entries = (entry for entry in keystore.ledger.entries if entry.what == "revocation")
-    listed = keystore.revocation_list.revoked if keystore.revocation_list else ()
-    return frozenset({*(int(entry.serial, 16) for entry in entries), *(e.serial for e in listed)})
 
 
 def _content(path: Path) -> bytes:

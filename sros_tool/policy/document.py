@@ -57,6 +57,7 @@ from sros_tool.policy.placeholders import (
     sample,
 )
 from sros_tool.values import DryRun, FileChange, FileChanges, Notes
+from sros_tool.wording import shortened
 from sros_tool.xml import parse, read_bytes, tag_of
 
 _NAMESPACES = ("http://www.w3.org/2001/XInclude", "http://www.w3.org/2003/XInclude")
@@ -168,16 +169,17 @@ class Includer:
         href = element.get("href", "")
         path = unquote(href, errors="surrogateescape")
         if "\0" in path or len(href) > _MAX_LENGTH:
-            raise PolicyError(f"{where}: the include of {_short(href)} is not a valid path")
+            raise PolicyError(f"{where}: the include of {shortened(href)} is not a valid path")
         if any(child.get(_XML_BASE) is not None for child in (element, *element.iterancestors())):
             raise PolicyError(
-                f"{where}: the include of {_short(href)} is below an xml:base",
+                f"{where}: the include of {shortened(href)} is below an xml:base",
                 "sros resolves an include from the folder of the file that contains it.",
                 f"Remove the xml:base, and write the path from '{place.file.parent}'.",
             )
         if place.linked and href:
             raise PolicyError(
-                f"{where}: the include of {_short(href)} is in a file that is included by a link",
+                f"{where}: the include of {shortened(href)} is in a file that is included by a "
+                "link",
                 "It is unclear whether the path starts at the link or at the file.",
                 f"Include '{place.file}' itself instead of the link.",
             )
@@ -185,7 +187,7 @@ class Includer:
         up = next((index for index, name in enumerate(names) if name not in ("..", ".")), 0)
         if "#" in href or "?" in href or ".." in names[up:]:
             raise PolicyError(
-                f"{where}: the include of {_short(href)} is not a plain path",
+                f"{where}: the include of {shortened(href)} is not a plain path",
                 "'#', '?', and '..' after the name of a folder can be understood in two ways.",
                 "Write the shortest path to the file, with %23 and %3F for '#' and '?' in names.",
             )
@@ -198,7 +200,7 @@ class Includer:
             file = self._real_paths[folder, path] = Path(os.path.realpath(folder / path))
         if _SCHEME.match(href) or not file.is_relative_to(self.root):
             raise PolicyError(
-                f"{where}: the include of {_short(href)} leaves the folder of the policy",
+                f"{where}: the include of {shortened(href)} leaves the folder of the policy",
                 f"Includes are read only from '{self.root}' and the folders below it.",
                 "Copy the file there, or move the policy to a folder above both files.",
             )
@@ -250,7 +252,7 @@ class Includer:
             return
         step = (file, pointer)
         if step in place.trail:
-            raise PolicyError(f"{where}: the include of {_short(href)} leads back to itself")
+            raise PolicyError(f"{where}: the include of {shortened(href)} leads back to itself")
         try:
             target = self.load(file)
         except DocumentError as error:
@@ -261,7 +263,7 @@ class Includer:
             include = f"{element.prefix}:include" if element.prefix else "include"
             selected = f'xpointer="xpointer(/{tag_of(target)}/*)"'
             raise PolicyError(
-                f"{where}: the include of {_short(href)} lacks {selected}",
+                f"{where}: the include of {shortened(href)} lacks {selected}",
                 f"Without xpointer, a <{tag_of(target)}> would be in a <{tag_of(target)}>.",
                 f'Write <{include} href="{href}" {selected}/>.',
             )
@@ -287,7 +289,7 @@ class Includer:
         steps = list(_XPOINTER_STEP.finditer(path[:_MAX_LENGTH]))
         if f"xpointer({''.join(step[0] for step in steps)})" != pointer or not steps:
             raise PolicyError(
-                f"{where}: the xpointer {_short(pointer)} is not accepted",
+                f"{where}: the xpointer {shortened(pointer)} is not accepted",
                 "It can be a path of elements, each a name or *, with [@attribute] or "
                 "[@attribute='value'] after it.",
                 "Write for example xpointer(/profile/*), xpointer(/policy/enclaves/*) or "
@@ -303,7 +305,7 @@ class Includer:
             selected = [child for child in selected if _matches_step(child[0], step)]
         if not selected:
             raise PolicyError(
-                f"{where}: the xpointer {_short(pointer)} selects nothing",
+                f"{where}: the xpointer {shortened(pointer)} selects nothing",
                 "The included file has no element at this path.",
                 "Write the path from the root element of the included file.",
             )
@@ -372,10 +374,6 @@ def _matches_step(element: etree._Element, step: re.Match[str]) -> bool:
 
 def _line(element: etree._Element, place: IncludedFile) -> str:
     return f"{place.file}:{element.sourceline}"
-
-
-def _short(text: str) -> str:
-    return repr(text if len(text) <= 80 else f"{text[:80]}...")
 
 
 def _too_large_error(where: str, limit: str) -> PolicyError:
@@ -478,7 +476,7 @@ class _Reader:
         version = root.get("version", "")
         if not _VERSION.match(version):
             raise PolicyError(
-                f"{where}: the policy has version {_short(version)}",
+                f"{where}: the policy has version {shortened(version)}",
                 f"sros reads version {VERSION} of the SROS2 policy format.",
                 _REMEDY_FOR_0_1
                 if version == "0.1.0"
@@ -560,8 +558,10 @@ class _Reader:
         remedy = ""
         if written.startswith("{robot"):
             fixes = [written.replace("{robot", "{namespace", 1)] if label == "namespace" else []
-            remedy = f"Write {' or '.join(map(_short, (*fixes, f'/{written}')))}."
-        return PolicyError(f"{where}: {_short(written)} is not a valid {label}", error.why, remedy)
+            remedy = f"Write {' or '.join(map(shortened, (*fixes, f'/{written}')))}."
+        return PolicyError(
+            f"{where}: {shortened(written)} is not a valid {label}", error.why, remedy
+        )
 
     def _read_profiles(self, element: etree._Element, place: IncludedFile) -> Profiles:
         self._check_attributes(element, place, optional=("type",))
@@ -594,7 +594,7 @@ class _Reader:
             raise self._invalid_name_error(error, ns, "namespace", element, place) from error
         if sampled and (problem := node_name_problem(sampled)):
             raise PolicyError(
-                f"{self._place_text(element, place)}: {_short(node)} is not a valid node name",
+                f"{self._place_text(element, place)}: {shortened(node)} is not a valid node name",
                 problem,
             )
         groups = tuple(
@@ -626,7 +626,7 @@ class _Reader:
                 continue
             if value not in _QUALIFIERS:
                 raise PolicyError(
-                    f"{self._place_text(element, place)}: {right}={_short(value)} is not valid",
+                    f"{self._place_text(element, place)}: {right}={shortened(value)} is not valid",
                     "A right is ALLOW or DENY.",
                     f"Write {_meant_attribute(right, value)}.",
                 )
@@ -680,7 +680,7 @@ class _Reader:
         word = (stated["double"] or stated["single"] or "") if stated else ""
         if word not in PROTECT:
             raise PolicyError(
-                f"{where}: <?sros {_short(instruction.text or '')[1:-1]}?> is not a protection",
+                f"{where}: <?sros {shortened(instruction.text or '')[1:-1]}?> is not a protection",
                 "It can be " + " or ".join(f'protect="{known}"' for known in PROTECT) + ".",
                 _PROTECT_EXAMPLE,
             )
@@ -703,7 +703,7 @@ class _Reader:
             meant = [written] if written else [str(value) for value in element.attrib.values()]
             valid = [text for text in meant if text != name and not expression_problem(text)]
             raise PolicyError(
-                f"{where}: {_short(name)} is not a valid {tag} name",
+                f"{where}: {shortened(name)} is not a valid {tag} name",
                 problem,
                 f"Write <{tag}>{valid[0] if valid else 'NAME'}</{tag}>."
                 if valid or not written
@@ -745,11 +745,11 @@ class _Reader:
             else:
                 check_name(parts, self._owner, several=several)
         except ValueError as error:
-            raise PolicyError(f"{where}: {_short(text)} cannot be used", str(error)) from error
+            raise PolicyError(f"{where}: {shortened(text)} cannot be used", str(error)) from error
         if self._placeholders:
             return parts
         raise PolicyError(
-            f"{where}: {_short(text)} has a placeholder for the robots of a fleet",
+            f"{where}: {shortened(text)} has a placeholder for the robots of a fleet",
             "Without a fleet it has no value.",
             NAME_THE_FLEET,
         )
@@ -793,7 +793,7 @@ class _Reader:
                 where = self._place_text(element, place)
                 known = ", ".join(f"{word}=" for word in (*required, *optional))
                 raise PolicyError(
-                    f"{where}: <{tag_of(element)}> has no attribute {_short(name)}",
+                    f"{where}: <{tag_of(element)}> has no attribute {shortened(name)}",
                     "",
                     f"It has {known}." if known else "Remove the attribute: this element has none.",
                 )
