@@ -759,7 +759,9 @@ def test_a_publishing_folder_teaches_nothing_that_the_cas_did_not_sign(publisher
         (folder / f"{hashlib.sha256(data).hexdigest()}.r2.tar.gz").write_bytes(data)
         (folder / f"{number:064x}.r5.tar.gz").write_bytes(b"x")
     before = len(OpenedKeystore(publisher.root).ledger.entries)
-    publisher.publish(restored=True)
+    done = publisher.publish(restored=True)
+    (unread,) = (note.text for note in done.notes if note.id == "fleet.archives-not-read")
+    assert all(f"{number:064x}.r5.tar.gz" in unread for number in range(2)), unread
     added = OpenedKeystore(publisher.root).ledger.entries[before:]
     assert [(entry.what, entry.enclave) for entry in added] == [
         ("restored", ""),

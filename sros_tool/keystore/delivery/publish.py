@@ -742,6 +742,7 @@ class _Publication:
             self.list.superseded.clear()
         self._now = now
         self._dry_run = dry_run
+        self._unread: set[str] = set()
         try:
             self._present = read_present(folder, self.roots)
         except KeystoreError as error:
@@ -832,6 +833,8 @@ class _Publication:
             else:
                 self.notes.append(self._hidden_revocations_note())
             self._restore(forgotten, keyring)
+            if self._unread:
+                self.notes.append(self._unread_note())
             if is_lost and not self._has_later_root:
                 self.notes.append(self._unseen_root_note())
             self._is_restored = True
@@ -917,6 +920,16 @@ class _Publication:
             ".agent/metadata/root_history, keys of publishing were replaced after the backup, and "
             f"robots refuse this publication: copy the later files to '{self._folder}/metadata', "
             f"and run {self._command} with --rotate-key ROLE for each replaced key.",
+        )
+
+    def _unread_note(self) -> Note:
+        """Return a note on archives that may show revocations, but were changed."""
+        revoke = f"sros revoke {quote(str(self.keystore.root))} --robot NAME"
+        return Note(
+            "fleet.archives-not-read",
+            f"archives in '{self._folder}' were changed or renamed, so sros did not read what they "
+            f"revoke: {first_few(sorted(self._unread), _MOST_NAMES)}. Revoke again what was stolen "
+            f"after the backup (`{revoke}`).",
         )
 
     def _not_restored_error(self) -> KeystoreError:
@@ -1205,7 +1218,8 @@ class _Publication:
 
     def _releases(self) -> Iterator[Release]:
         """Yield the releases in all archives, whichever CA sealed them."""
-        return releases_in(self._folder, len(recorded_fleet(self.keystore).robots))
+        robots = recorded_fleet(self.keystore).robots
+        return releases_in(self._folder, len(robots), self._unread)
 
     # ── which robots ───────────────────────────────────────────────────────────────────────
 

@@ -255,12 +255,12 @@ def later_revoked_serials(keystore: OpenedKeystore) -> frozenset[int]:
     return frozenset(serials)
 
 
-def releases_in(folder: Path, robots: int) -> Iterator[Release]:
+def releases_in(folder: Path, robots: int, altered: set[str] | None = None) -> Iterator[Release]:
     """Yield the releases in all archives of a publishing folder, whichever CA sealed them.
 
     Archives that cannot be read are left out, and so are archives whose name does not begin with
-    their SHA-256: their content is not as published.  ``robots`` is the number of robots of the
-    fleet.
+    their SHA-256: their content is not as published.  The names of the latter are added to
+    ``altered``.  ``robots`` is the number of robots of the fleet.
 
     Raises:
         KeystoreError: the folder has more archives, or larger ones, than the fleet can need.
@@ -280,7 +280,9 @@ def releases_in(folder: Path, robots: int) -> Iterator[Release]:
         if size > most * _MEAN_ARCHIVE_BYTES:
             excess = f"more than {most * _MEAN_ARCHIVE_BYTES // 1024**2} MiB, unpacked, of"
             break
-        if not is_altered:
+        if is_altered and altered is not None:
+            altered.add(path.name)
+        elif not is_altered:
             with suppress(SrosError):
                 yield read_release(data)
     if excess:
