@@ -648,7 +648,7 @@ _NODE_BASICS = (
 _START_ACTIONS = {
     NO_ROSOUT: "publish /rosout",
     NO_PARAMETER_EVENTS: "publish /parameter_events",
-    NO_PARAMETER_SERVICES: "offer its parameter services",
+    NO_PARAMETER_SERVICES: "offer parameter services",
     NO_TYPE_DESCRIPTION: "offer ~/get_type_description",
 }
 """Kind of finding → action of a starting node that the policy denies."""
@@ -807,9 +807,11 @@ def _denied_start_actions_sentence(lacking: Sequence[_NodeLackingRight]) -> str:
         for kind, verb in _START_ACTIONS.items()
         if kinds[kind]
     ]
+    *first, last = verbs
+    either = f"{', '.join(first)} or {last}" if first else last
     return (
-        f"{names_text(nodes)} may not {', '.join(verbs)}. A node that is denied this "
-        "exits at its start."
+        f"{names_text(nodes)} may not {either}. A node that is denied any of this exits when it "
+        "starts."
     )
 
 

@@ -169,7 +169,7 @@ def _library_findings(
         by = "".join(f", {clause}" for clause in clauses)
         known = known_vulnerabilities(library.product, library.version, used)
         if known is None:
-            text = f"the name of {place} does not show its version{by}"
+            text = f"the name of {place} does not show the version{by}"
             yield VERSION_UNKNOWN.found(library.product, text)
         elif known.known:
             kind = KNOWN_VULNERABILITIES

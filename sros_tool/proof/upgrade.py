@@ -391,7 +391,7 @@ def changes(files: DecidedFiles, before: Shipped, after: Shipped) -> Iterator[De
         numbers = files.domains(enclave)
         for number in numbers:
             context = JoinContext(number, files.at.now, files.at.zone)
-            where = f"on domain {number}, " if len(numbers) > 1 else ""
+            where = f"in domain {number}, " if len(numbers) > 1 else ""
             sides = [
                 _ReleaseDecision(
                     shipped, files, name, context, fitting_others[shipped.vendor].get(name, ())

@@ -124,6 +124,10 @@ def test_a_revocation_list_that_ends(tmp_path: Path) -> None:
     sros("crl", root, "--refresh").ok()
     ends = [day for day in (0, 12, 16, 22) if ids(root, NOW + timedelta(days=day))]
     assert ends == [16, 22], "nothing is wrong with the list that the remedy makes"
+    for day, text in ((16, "it expires at "), (22, "it expired at ")):
+        at = Circumstances(NOW + timedelta(days=day))
+        found = keystore_findings(OpenedKeystore(root), at)
+        assert any(each.text.startswith(text) and "DDS" in each.text for each in found), text
 
 
 def test_a_ca_with_a_short_validity_expires_soon_in_its_last_third(tmp_path: Path) -> None:

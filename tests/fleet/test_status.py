@@ -1552,7 +1552,7 @@ FOUND = frozenset({NOT_SEEN})
         ({**OLD, "seen": "installed"}, 0, ["r1"], "installed, but not loaded, on r1; in '/a/"),
         (MENDED, 0, [], "17 known vulnerabilities"),
         ({**OLD, "path": "/usr/lib/libfastrtps.so.2.14.5"}, 0, [], "27 known vulnerabilities"),
-        ({**OLD, "version": ""}, 0, [], "does not show its version, loaded by processes of r1"),
+        ({**OLD, "version": ""}, 0, [], "does not show the version, loaded by processes of r1"),
         (None, 0, [], "none seen on r1"),
         (LIBRARY, 7, [], "some processes of r1 could not be examined"),
     ],

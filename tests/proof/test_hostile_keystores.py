@@ -107,8 +107,8 @@ def at_many_times(keystore: Path) -> None:
     def grants(document: bytes) -> bytes:
         grant = re.search(rb"<grant .*?</grant>", document, re.DOTALL)
         assert grant
-        begin = re.compile(rb"(<not_before>)\d{4}-\d\d")
-        later = (begin.sub(b"\\g<1>2030-%02d" % month, grant[0]) for month in range(1, 12))
+        begin = re.compile(rb"(<not_before>)\d{4}-\d\d-\d\d")
+        later = (begin.sub(b"\\g<1>2030-%02d-01" % month, grant[0]) for month in range(1, 12))
         return document.replace(grant[0], grant[0] + b"".join(later))
 
     signed(keystore, WEB, grants)

@@ -591,7 +591,10 @@ def _revocation_list_findings(keystore: CheckedKeystore) -> Iterator[Finding]:
         return
     remedy = _NEXT_LIST if _has_ca_service(keystore) else ""
     if crl.expires_soon_from() < keystore.at.now:
-        text = f"it expires at {iso(crl.next_update)}, and DDS then refuses every participant"
+        end = iso(crl.next_update)
+        text = f"it expires at {end}, and DDS then refuses every participant"
+        if crl.next_update < keystore.at.now:
+            text = f"it expired at {end}, so DDS refuses every participant"
         yield CRL_EXPIRES_SOON.found("revocation list", text, file, remedy=remedy)
     identity = keystore.authorities.get(IDENTITY, ())
     if identity and not any(signed_by(crl.list, certificate) for certificate in identity):

@@ -119,9 +119,12 @@ _IDS_BY_REASON: Mapping[str, frozenset[str]] = {
 
 _OUTCOME_VERBS = {
     Outcome.CRASHES: ("crash on it", "crashes on it"),
-    Outcome.PEER_DENIES: ("start, and its peers refuse it", "starts, and its peers refuse it"),
+    Outcome.PEER_DENIES: (
+        "let it start, and its peers refuse it",
+        "lets it start, and its peers refuse it",
+    ),
 }
-_HIT_PEERS_VERBS = ("start, and their peers crash", "starts, and its peers crash")
+_HIT_PEERS_VERBS = ("let it start, and its peers crash", "lets it start, and its peers crash")
 _REFUSAL_VERBS = ("refuse it", "refuses it")
 
 
@@ -339,7 +342,7 @@ def _different_rights_findings(
     }
     differing = list(_differences(evaluation, answers, _topics_to_ask(enclave, known)))
     if differing:
-        text = f"on domain {domain}, {first_few(differing, _MOST_SHOWN, '; ', '; and ')}"
+        text = f"in domain {domain}, {first_few(differing, _MOST_SHOWN, '; ', '; and ')}"
         yield DIFFER.found(enclave.name, text, enclave.file(PERMISSIONS_FILE))
 
 
@@ -474,7 +477,7 @@ def with_start_finding(
         if not denials or None in denials:
             continue
         longest_denial = max(filter(None, denials), key=lambda denial: len(denial.text))
-        where = f"on domain {domain}, " if len(evaluation.by_domain) > 1 else ""
+        where = f"in domain {domain}, " if len(evaluation.by_domain) > 1 else ""
         if len(running) < len(participants):
             titles = evaluation.titles([participant.vendor for participant in running])
             where += f"on {' and '.join(titles)} "
