@@ -1140,7 +1140,8 @@ HALF_ACTION = FindingKind(
     ERROR,
     "an action that is allowed only in part",
     "An action consists of three services and two topics. The client or server of an action "
-    "creates all five when it starts, and fails if one of them is denied.",
+    "creates all five when it starts, and fails if one of them is denied. (A right to only the "
+    "topics, feedback and status, is not reported: a node that observes an action needs no more.)",
     "ROS 2 design, Actions; rcl_action 9 (rcl_action_client_init, rcl_action_server_init).",
     'Write <actions call="ALLOW"> or <actions execute="ALLOW"> with the name of the action.',
 )

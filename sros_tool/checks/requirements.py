@@ -79,8 +79,8 @@ ASSUMED = FindingKind(
 HOLDS_ALONE = FindingKind(
     "requirement.holds-alone",
     NOTE,
-    "a requirement that holds, but that this policy does not test",
-    "No right in this policy comes close to breaking it. Its names are relative, as in the "
+    "a requirement that no enclave comes close to breaking",
+    "No right here comes close to breaking it. Its names are relative, as in the "
     "requirements of a package, so perhaps only the policies of the package's users have the "
     "enclaves that could break it.",
     "The requirements file.",

@@ -253,29 +253,30 @@ def diff_policy(
 
     "~" marks an enclave that has the same rights under another name, and a name that became
     absolute or relative (cmd, /cmd), so that only users who put the node into another namespace get
-    other rights. A and B are policy files, permissions (.p7s or .xml), folders of enclaves,
-    keystores, exports, or Zenoh configurations such as router.json5. Permissions and Zenoh rules
-    are shown in ROS terms; the signature of permissions is verified if the permissions CA is next
-    to them. "!" marks a right of B whose counterpart, such as the subscriber, only A has. If A or B
-    covers only some enclaves, as an export does, only these are compared. A policy may lack Zenoh
-    routers: if they have only the rights that every node needs, a note names them in place of a
-    difference. Lines that differ only in the robot of a fleet are shown as one. Two policies are
-    also compared by the protection that they demand, two keystores by their governance.
+    other rights. A and B are policies, folders of policies, permissions (.p7s or .xml), folders of
+    enclaves, keystores, exports, or Zenoh configurations such as router.json5. Permissions and
+    Zenoh rules are shown in ROS terms; the signature of permissions is verified if the permissions
+    CA is next to them. "!" marks a right of B whose counterpart, such as the subscriber, only A
+    has. If A or B covers only some enclaves, as an export does, only these are compared. A policy
+    may lack Zenoh routers: if they have only the rights that every node needs, a note names them in
+    place of a difference. Lines that differ only in the robot of a fleet are shown as one. Two
+    policies are also compared by the protection that they demand, two keystores by their
+    governance.
 
     The exit status is 1 if A and B differ (notes name differences that are not in the rights),
     or if DDS would refuse A or B.
 
-    With --no-new-access, A and B can also be folders of policies, or policies at a git revision, as
-    git:REVISION:PATH; the output calls A BASE, and B HEAD. The exit status is 0 only if, for every
-    vendor, domain and name, B gives no enclave any access that A does not give. Also, B must not
-    assign a node to an enclave with more rights, must not protect anything less, and must not give
-    more access to users who put the node into another namespace. The exit status is 2 if sros
-    cannot decide this. sros assumes that a policy is signed with a governance that controls all
-    access. If A is a policy, and B is a keystore that protects less than the template production,
-    this counts as more access. If A is a keystore, and B is a policy, B never counts as less
-    protection. The last line says what is assumed and what is left out, such as dates. "!" marks a
-    DENY of A that B lacks, for names that B does not allow. If only a DENY is missing, nobody gets
-    access, so the exit status is 0, but `sros review` fails.
+    With --no-new-access, A and B can also be policies at a git revision, as git:REVISION:PATH; the
+    output calls A BASE, and B HEAD. The exit status is 0 only if, for every vendor, domain and
+    name, B gives no enclave any access that A does not give. Also, B must not assign a node to an
+    enclave with more rights, must not protect anything less, and must not give more access to users
+    who put the node into another namespace. The exit status is 2 if sros cannot decide this. sros
+    assumes that a policy is signed with a governance that controls all access. If A is a policy,
+    and B is a keystore that protects less than the template production, this counts as more access.
+    If A is a keystore, and B is a policy, B never counts as less protection. The last line says
+    what is assumed and what is left out, such as dates. "!" marks a DENY of A that B lacks, for
+    names that B does not allow. If only a DENY is missing, nobody gets access, so the exit status
+    is 0, but `sros review` fails.
 
     Example:
       $ sros diff_policy robot.xml keystore

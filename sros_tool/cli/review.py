@@ -642,7 +642,17 @@ def _verdict(result: Review) -> str:
     if allowed := sum(step.allowed for step in result.steps):
         words.append(f"{counted(allowed, 'step')} found only allowed changes")
     compared = f" compared with {result.base}" if result.base else ""
-    return f"{result.head}{compared}: {' and '.join(words) or 'nothing found'}"
+    return f"{result.head}{compared}: {' and '.join(words) or _nothing_found(result)}"
+
+
+def _nothing_found(result: Review) -> str:
+    """Return "nothing found", with rights that lost their counterpart, which never fail."""
+    from sros_tool.proof.review import RightsChange
+
+    changes = (step.content for step in result.steps if isinstance(step.content, RightsChange))
+    lost = sum(len(change.compared.unanswered) for change in changes)
+    alone = counted(lost, "right has no counterpart", "rights have no counterpart")
+    return f"nothing found that fails, but {alone} any more" if lost else "nothing found"
 
 
 def _markdown(result: Review, request: ReviewRequest) -> str:
@@ -650,7 +660,7 @@ def _markdown(result: Review, request: ReviewRequest) -> str:
     from sros_tool.markdown import bounded_list, code, plain
 
     allowed = any(step.allowed for step in result.steps)
-    passed = "only allowed changes were found" if allowed else "nothing found"
+    passed = "only allowed changes were found" if allowed else _nothing_found(result)
     verdict = (passed, "something found", "could not be decided")[result.status]
     lines = (
         f"{_SIGN_ALLOWED if step.allowed else _STATUS_SIGNS[step.status]} {_TITLES[step.kind]}"

@@ -199,7 +199,8 @@ def view(
         raise UsageError(
             "--format markdown takes one source, and neither --observed nor --hops",
             "",
-            "`sros diff_policy A B --format markdown` compares two.",
+            "For several policies of a robot or package, name their folder. `sros diff_policy A B "
+            "--format markdown` compares two.",
         )
     if written in ("html", "svg") and not (output or show or dry_run) and _is_on_terminal():
         raise UsageError(

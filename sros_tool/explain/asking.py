@@ -118,6 +118,29 @@ class AskedEnclave(NamedTuple):
             rights |= frozenset(rights_naming(keystore, name))
         return rights
 
+    def wildcard_matches(self, right: str, name: str) -> list[Right] | None:
+        """Return the rights with a wildcard that match ``name``; None if they are not known.
+
+        They are not known in a keystore with more than `_MOST_READ` enclaves.
+        """
+        from sros_tool.policy.model import ALLOW
+        from sros_tool.policy.patterns import matches
+        from sros_tool.policy.rights import split_actions
+
+        keystore = self.enclave.keystore
+        if keystore and len(keystore.names) > _MOST_READ:
+            return None
+        fitting = (
+            stated
+            for stated in split_actions(self.other_rights("/"))
+            if stated.qualifier is ALLOW and stated.right == right and matches(stated.name, name)
+        )
+        return sorted(fitting)
+
+
+_MOST_READ = 200
+"""Number of enclaves up to which all permissions of a keystore are read for a note."""
+
 
 def rights_naming(keystore: OpenedKeystore, name: str) -> Iterator[Right]:
     """Yield the rights in all permissions of a keystore whose text contains a ROS name.

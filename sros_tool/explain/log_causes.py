@@ -406,8 +406,7 @@ class Examiner:
                 better = (
                     f"Perhaps the robot has the policy in {likely} (`--namespace {quote(likely)}` "
                     "of `sros merge_policy`). If so, rcl's line `Found security directory` in the "
-                    f"whole log names an enclave in {likely}. Otherwise, "
-                    f"{_within_sentence(finding.remedy)}"
+                    f"whole log names an enclave in {likely}. {_otherwise(finding.remedy)}"
                 )
             elif not other:
                 better = self._remedy_in_a_namespace(denial, name, better or finding.remedy)
@@ -427,7 +426,7 @@ class Examiner:
             f"Perhaps {space} is the namespace of the node: then write "
             f"{written} in the policy, without a / at its beginning (if the "
             "policy is for this version of the node). Ask for the whole log: rcl's line `Found "
-            f"security directory` shows the namespace. Otherwise: {remedy}"
+            f"security directory` shows the namespace. {_otherwise(remedy)}"
         )
 
     def _namespace_clause(self, enclave: LoadedEnclave) -> str:
@@ -501,13 +500,13 @@ class Examiner:
                 use = f"{question.word} {misspelled}, {nobody}"
                 return [f"the enclave may {use}: perhaps {name} is meant"], (
                     f"If the policy misspells the name, write {name} in place of {misspelled} "
-                    f"there. Otherwise, {_within_sentence(remedy)}"
+                    f"there. {_otherwise(remedy)}"
                 )
             names = tuple(other for other in names if _last_part(other) == _last_part(name))
         own = [right.name for right in named_rights(asked) if right.right == denied.right]
         meant = names[0] if names else own[0] if len(own) == 1 else "NEW"
         rule = Remapping("", name, meant)
-        add, renamed = f", add `--ros-args -r {quote(str(rule))}`.", ""
+        add, renamed, only = f", add `--ros-args -r {quote(str(rule))}`.", "", list[str]()
         new_name = (
             f" If `-r OLD:={quote(name)}` or a parameter gives the node this name, remove it from "
             "the node's command, or give the name to the policy: `sros merge_policy POLICY OTHER "
@@ -516,6 +515,9 @@ class Examiner:
         if question.type == "action" and (not is_used or len(own) == 1):
             add = f": {renamed_action_text(rule)}"
             renamed = f" If the node's command renames the action{add}"
+            if len(own) == 1:
+                only = [f"the enclave may {question.word} only action {meant}"]
+                renamed = f" If the policy means this action by {meant}{add}"
         if names:
             is_meant = f"{' and '.join(names)}: perhaps that is meant"
             facts = [f"the enclave may {question.word} {is_meant}"]
@@ -529,10 +531,9 @@ class Examiner:
             if is_typing_error(name, meant):
                 misspelled = f"If the program misspells the name, write {meant} there. "
             return facts, (
-                f"{misspelled}If the node lacks a remapping{add} If the policy lacks a remapping "
-                f"that the node has, remove it from the node, write {name} in place of {meant} in "
-                f"the policy, or merge the policy with `--remap {quote(meant)}:={quote(name)}`. "
-                f"Otherwise, {_within_sentence(remedy)}"
+                f"{misspelled}If the node lacks a remapping{add} If it has one that the policy "
+                f"lacks, merge the policy with `--remap {quote(meant)}:={quote(name)}`; if this "
+                f"remapping is a mistake, remove it from the node's command. {_otherwise(remedy)}"
             )
         if is_used is False and self._keystore:
             place = self._keystore.kind
@@ -543,17 +544,16 @@ class Examiner:
                 remedy = (
                     "If the enclave at the other end is not in this export (it may be on another "
                     "machine), ask the whole keystore: `sros explain KEYSTORE --log LOG`. "
-                    f"Otherwise, {_within_sentence(remedy)}"
+                    f"{_otherwise(remedy)}"
                 )
             return facts, (
                 "Probably the node lacks a remapping, or has a wrong one: compare its start "
                 "command with the command in the robot's launch files (after `sros close`: "
-                f"start/commands.txt).{renamed or new_name} Otherwise, "
-                f"{_within_sentence(remedy)}"
+                f"start/commands.txt).{renamed or new_name} {_otherwise(remedy)}"
             )
         if renamed and is_used:  # its peers may mean the new name, or the old one
-            return [], f"{remedy}{renamed}{new_name}"
-        return [], f"{remedy}{renamed or new_name}"
+            return only, f"{remedy}{renamed}{new_name}"
+        return only, f"{remedy}{renamed or new_name}"
 
     def _misspelled_in_policy(self, denied: Right, named: Iterable[Right]) -> str:
         """Return an allowed name that is like the denied one, and that no peer may use; or ""."""
@@ -680,6 +680,12 @@ class Examiner:
                 "domain of the keystore", f"domain of the keystore, such as {next(iter(governed))}"
             ),
         )
+
+
+def _otherwise(remedy: str) -> str:
+    """Return a remedy as it follows remedies for other causes."""
+    # Such a remedy often has an "Otherwise" of its own.
+    return f"{'Or' if remedy.startswith('If ') else 'Otherwise'}, {_within_sentence(remedy)}"
 
 
 def _within_sentence(remedy: str) -> str:

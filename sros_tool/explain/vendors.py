@@ -391,11 +391,17 @@ def _other_name_notes(answer: Answer, asked_enclave: AskedEnclave) -> Iterator[N
         kind, does = ("not-used", "needs")
         if question.right in OFFERING_RIGHT:
             kind, does = ("not-offered", "offers")
-        text = (
-            f"no enclave that was read has a right to {needed} exactly {question.name}, but a "
-            f"right with a wildcard may match it. If none does, perhaps no other node {does} "
-            f"{question.name}, and this node lacks a remapping."
-        )
+        text = f"no enclave that was read has a right to {needed} exactly {question.name}"
+        meant = f"perhaps no other node {does} {question.name}, and this node lacks a remapping."
+        match asked_enclave.wildcard_matches(needed, question.name):
+            case None:
+                text += f", but a right with a wildcard may match it. If none does, {meant}"
+            case []:
+                text += f", and no wildcard matches it: {meant}"
+            case [right, *_]:
+                user = right.enclave
+                text += f"; by a wildcard, {user} may {right.describe()}. If {user} does not use "
+                text += f"{question.name}, {meant}"
         yield Note(f"explain.{kind}", text)
 
 

@@ -792,11 +792,13 @@ class _Reader:
             ):
                 where = self._place_text(element, place)
                 known = ", ".join(f"{word}=" for word in (*required, *optional))
-                raise PolicyError(
-                    f"{where}: <{tag_of(element)}> has no attribute {shortened(name)}",
-                    "",
-                    f"It has {known}." if known else "Remove the attribute: this element has none.",
+                remedy = (
+                    f"It has {known}." if known else "Remove the attribute: this element has none."
                 )
+                if etree.QName(name).localname == "protect":
+                    remedy = _PROTECT_EXAMPLE
+                what = f"{where}: <{tag_of(element)}> has no attribute {shortened(name)}"
+                raise PolicyError(what, "", remedy)
         for name in required:
             if name not in present:
                 raise PolicyError(

@@ -327,11 +327,11 @@ def _notes_on_requirements(
             if f"{use.old}/*" in gone or any(matches(name, use.old) for name in gone)
         }
         text = (
-            f"if requirements name {first_few(sorted(gone), _MOST_SHOWN)}, check them with "
-            "the new name, and with the same --namespace, as in `sros check POLICY --requirements "
-            f"FILE {' '.join(f'--remap {quote(option)}' for option in sorted(options))}` (without "
-            "each --remap whose old name no requirement has). Otherwise, they protect only the old "
-            "name."
+            f"requirements that name {first_few(sorted(gone), _MOST_SHOWN)} protect only the old "
+            "name, unless you check them with the same remapping: `sros check POLICY "
+            f"--requirements FILE {' '.join(f'--remap {quote(each)}' for each in sorted(options))}`"
+            ", with the same --namespace, if any. Leave out each --remap whose old name no "
+            "requirement has."
         )
         yield Note("merge.requirements-of-old-names", text)
 

@@ -409,8 +409,9 @@ def decided_findings(
         (UNKNOWN_ENCLAVE, decided.absent),
         (HOLDS_ALONE, decided.holding_alone),
     ):
+        remedy = _ALONE_IN_KEYSTORE if kind is HOLDS_ALONE and system.is_keystore else ""
         findings += [
-            _part_finding(kind, requirement, why)
+            _part_finding(kind, requirement, why, remedy)
             for requirement, why in _without_namespace_repeats(decisions)
         ]
     if decided.unnamed:
@@ -449,7 +450,7 @@ def _violation_text(violation: Violation) -> str:
     if violation.worlds:
         text += f"; with {', '.join(joined_titles(violation.worlds))} only"
     if requirement.why:
-        text += f": {requirement.why}"
+        text += f": {requirement.why.rstrip('.')}"
     return text
 
 
@@ -627,6 +628,10 @@ def _part_finding(
     text = f"{'; '.join(why)}; required: {demand(requirement)}"
     return kind.found(place.file, text, place.file, place.line, remedy)
 
+
+_ALONE_IN_KEYSTORE = (
+    "No enclave of this keystore can break the requirement now: ignore this finding."
+)
 
 _NOBODY_REMEDY = (
     "Correct the name, or its kind (service or action). After `merge_policy --remap`, check with "

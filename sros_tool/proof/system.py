@@ -93,9 +93,10 @@ class System:
     """The worlds of a policy or keystore.
 
     ``file`` is the path, ``rights`` are the allowed rights as stated, and ``places`` finds the
-    places that state rights. ``is_export`` says that the source is an export, which may lack
-    enclaves of its keystore.  ``left_out`` is the reason why there is no Zenoh world, if Zenoh
-    cannot enforce the policy.  ``fleet`` returns the robots of the policy or keystore, or None.
+    places that state rights. ``is_keystore`` says that the source is a keystore or an export, and
+    ``is_export`` that it is an export, which may lack enclaves of its keystore. ``left_out`` is the
+    reason why there is no Zenoh world, if Zenoh cannot enforce the policy. ``fleet`` returns the
+    robots of the policy or keystore, or None.
     """
 
     file: str
@@ -105,6 +106,7 @@ class System:
     left_out: SrosError | None = None
     fleet: Callable[[], Fleet | None] = lambda: None
     is_export: bool = False
+    is_keystore: bool = False
 
 
 def load_system(
@@ -485,6 +487,7 @@ def _keystore_system(keystore: OpenedKeystore, at: Circumstances) -> System:
         rights,
         fleet=partial(checked_fleet, keystore),
         is_export=is_export,
+        is_keystore=True,
     )
 
 

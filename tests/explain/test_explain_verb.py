@@ -21,7 +21,15 @@ from sros_tool.policy.document import read_policy
 from sros_tool.policy.rights import policy_rights
 from tests.explain.broken import BREAKAGES, ENCLAVE, OTHER, Enclave, make_keystore
 from tests.support.children import python, run
-from tests.support.harness import Ended, copy_of, policy_text, publish, sros, with_includes
+from tests.support.harness import (
+    Ended,
+    copy_of,
+    policy_text,
+    publish,
+    sros,
+    subscribe,
+    with_includes,
+)
 from tests.support.long_form import some
 
 POLICY = policies_dir() / "talker_listener.xml"
@@ -767,7 +775,28 @@ def test_a_change_is_for_the_node_that_the_permissions_are_for(whole: Path) -> N
         "[explain.not-used]: no enclave that was read has a right to subscribe exactly /nothing"
     )
     assert unused in found.err and "this node lacks a remapping" in found.err
+    assert "/nothing, and no wildcard matches it: perhaps no other node needs /nothing" in found.err
     assert "not-used" not in explain(whole, ENCLAVE, "publish", "/rosout").err
+
+
+@pytest.mark.parametrize(
+    ("most", "said"),
+    [
+        (200, "; by a wildcard, /b may subscribe topic /map_*. If /b does not use /map_a, perhaps"),
+        (0, ", but a right with a wildcard may match it. If none does, perhaps"),  # not read
+    ],
+)
+def test_a_wildcard_that_matches_a_name_of_nobody_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, most: int, said: str
+) -> None:
+    monkeypatch.setattr("sros_tool.explain.asking._MOST_READ", most)
+    enclaves = {"/a": publish("/x"), "/b": subscribe("/map_*")}
+    (policy := tmp_path / "p.xml").write_text(policy_text(enclaves))
+    sros("create_keystore", tmp_path / "ks").ok()
+    sros("generate_artifacts", "-k", tmp_path / "ks", "-p", policy).ok()
+    assert said in explain(tmp_path / "ks", "/a", "publish", "/map_a").err
+    if most:
+        assert said in explain(policy, "/a", "publish", "/map_a").err
 
 
 def test_a_key_that_stays_on_its_robot(keystore: Path, tmp_path: Path) -> None:

@@ -1172,7 +1172,8 @@ def test_a_node_of_another_version_than_its_policy(tmp_path: Path) -> None:
     log.write_text(f"{denied}. -> check_create_datareader\n")
     said = sros("explain", policy, "/a", "--log", log).out
     assert "remedy    If the policy is for another version of the node, use the policy" in said
-    assert "missing in the policy: add it. If the node's command renames the action: start" in said
+    assert "missing in the policy: add it. If the policy means this action by /grasp: start" in said
+    assert "the enclave may execute only action /grasp\n" in said
 
 
 def test_a_log_without_the_namespace_that_its_names_show(tmp_path: Path) -> None:
@@ -1385,7 +1386,8 @@ def test_a_forgotten_remapping_is_shown(keystore: Path, tmp_path: Path) -> None:
         assert (f"`--ros-args -r /{topic}:=/chatter`" in found) is bool(why)
         assert (typo in found) is (topic == "chater")
         assert (
-            f"lacks a remapping that the node has, remove it from the node, write /{topic}" in found
+            f"has one that the policy lacks, merge the policy with `--remap /chatter:=/{topic}"
+            in found
         ) is bool(why)
         assert (f"`--remap /chatter:=/{topic}`" in found) is bool(why)
         assert f"`sros explain {keystore} {ENCLAVE} publish /{topic}`" in found
@@ -1417,7 +1419,7 @@ def test_the_other_side_of_a_name_tells_whether_a_remapping_may_be_forgotten(
             (
                 "no enclave of the keystore may publish /odometry\n",
                 "Probably the node lacks a remapping, or has a wrong one: compare its ",
-                "Otherwise, if the policy is for another version of the node, use the policy of",
+                "Or, if the policy is for another version of the node, use the policy of",
             ),
         ),
     ):
@@ -1445,8 +1447,8 @@ def test_the_other_side_of_a_name_tells_whether_a_remapping_may_be_forgotten(
     sros("distribute_key", keystore, "/weed", export).ok()
     found = sros("explain", export, "--log", log, "/weed").out
     assert "no enclave of the export may publish /odometry\n" in found
-    assert "ask the whole keystore: `sros explain KEYSTORE --log LOG`. Otherwise, if the" in found
-    assert "Probably the node lacks a remapping" in found and "Otherwise, If" not in found
+    assert "ask the whole keystore: `sros explain KEYSTORE --log LOG`. Or, if the policy" in found
+    assert "Probably the node lacks a remapping" in found and "therwise, If" not in found
     (keystore / "enclaves/camera/permissions.p7s").write_text("damaged")
     found = sros("explain", keystore, "/weed", "--log", log).out
     assert "no enclave" not in found  # nothing follows for the name

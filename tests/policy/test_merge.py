@@ -279,13 +279,17 @@ def test_what_nodes_remap_otherwise_is_noted() -> None:
         (["__node:=x"], ["merge.remapped-nodes"], "name to the nodes hand and n. Choose the node"),
         (["n:__node:=x"], [], ""),
         # All names below a node's name move, also those of no right.
-        (["base:__node:=x"], [OF_REQUIREMENTS], "if requirements name /base/*, check"),
+        (
+            ["base:__node:=x"],
+            [OF_REQUIREMENTS],
+            "requirements that name /base/* protect only the old",
+        ),
         (["__ns:=/left"], [OF_NAMESPACE], "Merge the policy with --namespace /left in place"),
         (["base:__ns:=/l", "~/arm:=/a"], [OF_NAMESPACE, OF_REQUIREMENTS], "follow --remap base:__"),
         (
             ["/plan:=/y"],
             ["merge.remapped-action", OF_REQUIREMENTS],
-            "if requirements name /plan, check",
+            "requirements that name /plan protect only the old",
         ),
     ):
         base = [one(own, node="base")] if "base" in texts[0] else []

@@ -75,8 +75,9 @@ def test_the_schema_and_readers_of_ros2_are_not_disturbed() -> None:
     for other in ('<topic s:protect="encrypt" xmlns:s="urn:s">', '<topic protect="encrypt">'):
         changed = WRITTEN.replace(f"<topic>scan{ENCRYPT}", f"{other}scan")
         assert not schema.validate(etree.fromstring(changed))
-        with pytest.raises(PolicyError, match="has no attribute"):
+        with pytest.raises(PolicyError, match="has no attribute") as refused:
             read(changed)
+        assert '<topic>scan<?sros protect="encrypt"?></topic>' in refused.value.remedy
 
 
 @pytest.mark.parametrize(

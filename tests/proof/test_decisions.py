@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -52,6 +53,12 @@ def texts(rights: Mapping[str, str], required: str) -> list[str]:
     """Return the findings of a policy, each with its subject."""
     found = requirement_findings(parse_requirements(required.encode(), "r.toml"), robot(rights))
     return [f"{each.subject}: {each.text}" for each in found]
+
+
+def test_a_reason_that_ends_with_a_full_stop_is_part_of_a_sentence() -> None:
+    required = '[[nobody]]\npublish = ["/x"]\nwhy = "Only users may."'
+    (text,) = texts({"/a": may("publish", "/x")}, required)
+    assert text.endswith("nobody may publish /x: Only users may"), text
 
 
 GOAL, CANCEL = "/dock/_action/send_goal", "/dock/_action/cancel_goal"
@@ -315,6 +322,9 @@ def test_a_requirement_of_a_package_may_be_about_the_enclaves_of_users(required:
     assert len(found.holding_alone) == 1 and not (found.violations or found.vacuous)
     (finding,) = decided_findings(found, robot(PACKAGE))
     assert {finding.id} == FOUND and "enclave" in finding.text
+    assert "this is the policy of a package" in finding.remedy
+    (finding,) = decided_findings(found, replace(robot(PACKAGE), is_keystore=True))
+    assert finding.remedy.startswith("No enclave of this keystore can break the requirement")
     of_robot = decided(PACKAGE, re.sub(r'"([a-z])', r'"/\1', required))
     assert len(of_robot.vacuous) == 1 and not of_robot.holding_alone
 

@@ -274,6 +274,14 @@ def test_changed_rights_are_named_and_decided_over_all_policies(change: Change) 
     (absolute,) = (line for line in said if line.startswith("  ~"))
     assert "/c subscribe topic /x begins with / now, so that the namespace of" in absolute
     assert absolute.endswith("(second.xml:3)")
+    # A right that lost its counterpart never fails, but the last line has it.
+    answered = policy_text({"/c": reads, "/d": publish("/x")})
+    kept = policy_text({"/b": publish("/y")})
+    change.base = change.commit({"robot.xml": kept, "second.xml": answered})
+    change.commit({"second.xml": policy_text({"/c": reads})})
+    ended = change.review("--policy", "robot.xml\nsecond.xml").ok()
+    lost = ": nothing found that fails, but 1 right has no counterpart any more\n"
+    assert ended.out.endswith(lost), ended
     # Users in /left and /right now share /x: this is new access for them.
     change.base = change.commit({"other": "1", "second.xml": policy_text({"/c": reads})})
     change.commit({"second.xml": policy_text({"/c": reads.replace(">x<", ">/x<")})})

@@ -135,6 +135,8 @@ def test_no_cell_of_the_table_is_empty_where_a_denial_alone_names_something(tmp_
 
 
 def test_a_table_says_which_names_move_with_the_namespace(tmp_path: Path) -> None:
+    two = sros("view", tmp_path / "p.xml", tmp_path / "q.xml", "--format", "markdown")
+    assert two.status == 2 and "For several policies of a robot or package, name their" in two.err
     relative = '<topics publish="ALLOW"><topic>width</topic><topic>/tf</topic></topics>'
     absolute = '<topics subscribe="ALLOW"><topic>/width</topic></topics>'
     action = '<actions execute="ALLOW"><action>grasp</action></actions>'
