@@ -907,7 +907,7 @@ class _Review:
             others = f": there, sros decided only {self.decided_elsewhere}"
         if self.is_relative and not asked.namespaces:
             options = [f"--namespace {quote(name)}" for name in sorted(self.namespaces_to_add)]
-            add = f" (add {first_few(options, 3)})" if options else ""
+            add = f" (add {' '.join(options[:_MOST_NAMESPACES])})" if options else ""
             yield f"requirements with relative names in namespaces other than /{add}{others}"
         if not self.base:
             yield "nothing is compared with an earlier commit, as the options say"

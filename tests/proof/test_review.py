@@ -1414,6 +1414,18 @@ def test_requirements_of_a_package_are_decided_in_a_namespace(
     assert "/a: may publish /x, but only /l/a may" in ended.out and "/l/x" not in ended.out, ended
     ended = change.review(*asked, "--remap", "z:=/z")
     assert (ended.status, "no requirement has the old name" in ended.out) == (2, True), ended
+    # A namespace has to fit all requirements.
+    more = only + only.replace('"x"', '"y"')
+    change.base = change.commit(
+        {
+            "robot.xml": policy_text({"/a": publish("/r/x", "/r/y", "/l/x", "/l/y", "/m/x")}),
+            "robot.toml": more,
+        }
+    )
+    change.commit({"other": "3"})
+    hint = "(add --namespace /l --namespace /r)"
+    assert hint in change.review(*asked).out
+    change.commit({"robot.toml": only})
     # No namespace fits the policy of a package, so that there is no option to add.
     change.base = change.commit({"robot.xml": policy_text({"/a": publish("x", "/m/y")})})
     change.commit({"other": "2"})
