@@ -232,7 +232,8 @@ def _show(robot: LocalRobot, closed: CloseState) -> None:
     for left_open in unguarded(keystore.governance):
         does = f"{left_open.direction} DDS topic {left_open.topic}"
         echo(f"  every enclave may {does}: the governance of the keystore leaves the topic open")
-    echo(f"how to restart each process with security (all files: {robot.start}):")
+    restart = "how to restart each process with security" if closed.pending else "processes"
+    echo(f"{restart} (all files: {robot.start}):")
     for process in closed.observed.processes:
         echo(f"  {_process_line(process, closed, policy)}")
     for why in dict.fromkeys(closed.outdated.values()):
@@ -358,7 +359,7 @@ def _show_end(
         answer = _ANSWERS[proof.holds]
         if proof.holds and proof.denied:
             answer += ", except for what the policy takes away"
-        echo(f"{answer}{accept}: {proof.claim}: {proof.reason}")
+        echo(f"{answer}{accept}: {proof.statement}: {proof.reason}")
         for detail in proof.details:
             echo(f"  {detail}")
         claims = {proof.claim for proof in closed.proofs}

@@ -225,7 +225,7 @@ class _RemainingProcesses:
             names, old_name = nodes.names_in(process.enclave)
             named = node_argument(process.command)
             has_old_name = old_name and (not named or expand("~", *named) == old_name)
-            under = f", under its old name {old_name}" if has_old_name else ""
+            was = f" (its node was {old_name} when sros watched; its new name is right, too)"
             state, start = "does not run; ", "start it"
             if similar := [
                 (len({*process.command}.intersection(other.program[1])), other.label)
@@ -236,7 +236,9 @@ class _RemainingProcesses:
                 state = f"may run open by another command ({label}); if that is not so, "
                 start = f"start {process.enclave}"
             command = process.open_command(self._robot.domain)
-            self._robot.shell.say(f"{process.enclave} {state}{start} open{under}: {command}")
+            self._robot.shell.say(
+                f"{process.enclave} {state}{start} open{was * bool(has_old_name)}: {command}"
+            )
 
     def further_secured_processes(self) -> Iterator[str]:
         """Yield a text for each process in an enclave that was not observed for this enclave."""

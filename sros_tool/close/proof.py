@@ -34,8 +34,12 @@ from sros_tool.close.processes import ObservedProcesses
 from sros_tool.close.rights import ordinary_uses
 from sros_tool.close.robot import MOST_NAMES, OBSERVER, TEMPLATE, LocalRobot
 from sros_tool.close.state import (
+    ACCEPTED,
     CONNECTED,
+    KNOWN,
+    REQUIRED,
     SILENCE,
+    STARTED,
     TALK,
     CloseState,
     Proof,
@@ -79,10 +83,6 @@ from sros_tool.runtime.variables import ENCLAVE
 from sros_tool.validity import iso
 from sros_tool.wording import counted, enumerated, first_few
 
-_CLAIM_STARTED = "every process was started in its enclave"
-_CLAIM_KNOWN = "every process in an enclave belongs there"
-_CLAIM_REQUIRED = "the requirements hold"
-
 _START_SECONDS = 3.0
 """How long processes that were restarted by hand may take until they run in their enclaves."""
 
@@ -115,16 +115,14 @@ def proofs_of(robot: LocalRobot, state: CloseState, patience: float) -> list[Pro
         return [_proof_of_files(robot, expired)]
     expected = {process.enclave for process in state.observed.processes} | {*state.new}
     if not expected:
-        return [Proof(_CLAIM_STARTED, False, "no process of the robot is known")]
+        return [Proof(STARTED, False, "no process of the robot is known")]
     running = wait_until(robot, lambda seen: seen.current_enclaves >= expected, patience)
     missing = sorted(expected - running.current_enclaves)
     running_now = {enclave.name for _, enclave in running.secured}
     needed = {*missing}.difference(robot.without) | running_now.intersection(missing)
     if needed or expected == {*missing}:
         observed = state.observed.with_current_pids(running.processes, robot.export)
-        return [
-            Proof(_CLAIM_STARTED, False, _why_missing(running, sorted(needed) or missing, observed))
-        ]
+        return [Proof(STARTED, False, _why_missing(running, sorted(needed) or missing, observed))]
     nodes, not_here = ObservedNodes(robot), robot.not_here
     # A laptop may be away; a computer whose nodes were seen has to be seen again.
     may_be_away = not_here - {node.enclaves[0] for node in nodes.nodes_to_compare(()).nodes}
@@ -185,7 +183,7 @@ def _proof_of_files(robot: LocalRobot, expired: Sequence[str]) -> Proof:
     unsigned = _unsigned_policy_text(robot) if status == 0 else ""
     examined = f"{robot.export}"
     if robot.keystore.exists() and not expired:
-        examined += f", and {robot.keystore} without its enclaves"
+        examined += f", and the CAs and settings of {robot.keystore}"
         # An expired enclave of another machine does not make this robot less closed.
         words = (str(robot.keystore), "--include", "keystore.*")
         if status_there := robot.shell.check(*words):
@@ -196,7 +194,7 @@ def _proof_of_files(robot: LocalRobot, expired: Sequence[str]) -> Proof:
     if misplaced := _misplaced_keys_text(robot):
         reason = misplaced if holds else f"{reason}; {misplaced}"
         holds = False
-    return Proof("the files are accepted", holds, f"{reason}: {examined}{unsigned}")
+    return Proof(ACCEPTED, holds, f"{reason}: {examined}{unsigned}")
 
 
 def _misplaced_keys_text(robot: LocalRobot) -> str:
@@ -293,7 +291,7 @@ def _proof_of_requirements(robot: LocalRobot) -> Proof:
     """
     if not robot.requirements.exists():
         missing = f"{robot.requirements} is missing; restore it, or run `{robot.close_command}`, "
-        return Proof(_CLAIM_REQUIRED, None, f"{missing}which writes the requirements that hold now")
+        return Proof(REQUIRED, None, f"{missing}which writes the requirements that hold now")
     needed = ("--requirements", str(robot.requirements), "--include", "requirement.*")
     statuses = [robot.shell.check(str(robot.export), *needed)]
     if robot.not_here or (statuses != [2] and _demands_more_enclaves(robot)):
@@ -303,7 +301,7 @@ def _proof_of_requirements(robot: LocalRobot) -> Proof:
     holds = {0: True, 1: False}.get(status)
     more = _unsigned_violation_text(robot, *needed) if holds else ""
     more += _weak_requirements_text(robot) if holds else ""
-    return Proof(_CLAIM_REQUIRED, holds, f"{reasons[status]}: {robot.requirements}{more}")
+    return Proof(REQUIRED, holds, f"{reasons[status]}: {robot.requirements}{more}")
 
 
 def _unsigned_violation_text(robot: LocalRobot, *needed: str) -> str:
@@ -437,14 +435,14 @@ def _proof_of_processes(running: RunningRobot, number: int) -> Proof:
         text = f"{done}{first_few(texts, MOST_NAMES, '; ')}"
     else:
         text += "".join(f"; {guest}" for guest in _unexpected_processes(running))
-    return Proof(_CLAIM_STARTED, False if wrong else None if findings else True, text)
+    return Proof(STARTED, False if wrong else None if findings else True, text)
 
 
 def _proof_of_observed_processes(running: RunningRobot) -> Iterator[Proof]:
     """Yield the proof that the processes in enclaves belong there, if sros does not know some."""
     if more := running.not_observed():
         yield Proof(
-            _CLAIM_KNOWN,
+            KNOWN,
             None,
             f"sros did not see {first_few(more, MOST_NAMES)} when it watched, and each process has "
             "all rights of its enclave: stop what is not yours; if only the command of a process "
@@ -796,9 +794,9 @@ def _renamed(nodes: ObservedNodes, current: Observation | None, *, fails: bool) 
     } - renamed.keys()
     if not_compared and not fails:
         yield (
-            "not compared, as the policy has no profile for them any more: "
-            f"{first_few(sorted(not_compared), MOST_NAMES)} (a renamed node is compared if its "
-            "enclave has no other new or renamed node)"
+            "not compared, because the policy has no profile for them any more: "
+            f"{first_few(sorted(not_compared), MOST_NAMES)} (removed, or renamed together with "
+            "another change of nodes in the enclave)"
         )
 
 

@@ -57,9 +57,22 @@ _LOOK_SECONDS = 0.2
 _TOOLS = ("ros2", "sros", "sros_tool")
 """Programs, and packages of Python modules, with which a person tries an enclave."""
 
+STARTED = "every process was started in its enclave"
+KNOWN = "every process in an enclave belongs there"
+ACCEPTED = "the files are accepted"
+REQUIRED = "the requirements hold"
 TALK = "everything that talked can still talk"
 CONNECTED = "the processes on this machine have connected to each other"
 SILENCE = "an open listener finds nothing"
+_NEGATIONS = {
+    STARTED: "not every process was started in its enclave",
+    KNOWN: "not every process in an enclave belongs there",
+    ACCEPTED: "the files are not accepted",
+    REQUIRED: "the requirements do not all hold",
+    TALK: "not everything that talked can still talk",
+    CONNECTED: "the processes on this machine have not all connected to each other",
+    SILENCE: "an open listener finds something",
+}
 _ACCEPTS_REVOKED = f"a certificate was revoked ({CRL_FILE}), and is still accepted by"
 
 
@@ -370,6 +383,11 @@ class Proof(NamedTuple):
     def fails(self) -> bool:
         """Whether the claim was tested, and does not hold."""
         return self.holds is False
+
+    @property
+    def statement(self) -> str:
+        """The claim, or its negation if the claim fails."""
+        return _NEGATIONS[self.claim] if self.fails else self.claim
 
     @property
     def is_accepted_by_partial(self) -> bool:

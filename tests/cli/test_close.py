@@ -383,7 +383,8 @@ def test_what_is_taken_out_of_the_policy_stays_out(robot: Robot) -> None:
     assert "removed robot/export/enclaves/listener: its enclave was revoked\n" in ended.err
     assert robot.restarts == ["daemon-reload", "restart talker.service"]
     assert (
-        "no: every process was started in its enclave: process 4712 (run): in domain 0" in ended.out
+        "no: not every process was started in its enclave: process 4712 (run): in domain 0"
+        in ended.out
     )
     assert "yes: everything that talked can still talk: 1 node with 18 endpoints" in ended.out
 
@@ -471,8 +472,8 @@ def test_a_robot_is_closed_proved_and_opened_again(robot: Robot) -> None:
     assert closed.out.splitlines()[-6:] == [
         "yes: every process was started in its enclave: 2 enclaves, and no open process in "
         "domain 0",
-        "yes: the files are accepted: sros check finds no error: robot/export, and robot/keystore "
-        "without its enclaves",
+        "yes: the files are accepted: sros check finds no error: robot/export, and the CAs and "
+        "settings of robot/keystore",
         "yes: the requirements hold: all of them: robot/requirements.toml",
         "yes: everything that talked can still talk: 2 nodes with 36 endpoints as before "
         "(types are not compared)",
@@ -495,7 +496,9 @@ def test_a_robot_is_closed_proved_and_opened_again(robot: Robot) -> None:
     signed = policy.read_text()
     policy.write_text(signed.replace("chatter", "old/chatter", 1))
     proved = robot.close("--proof", status=1).out
-    assert "no: everything that talked can still talk: denied: /listener subscribe /ch" in proved
+    assert (
+        "no: not everything that talked can still talk: denied: /listener subscribe /ch" in proved
+    )
     differs = "differs from the signed permissions of /listener, which the processes use: bring"
     assert f"robot/export; 'robot/policy.xml' {differs} the signed" in proved
     policy.write_text(signed)
@@ -558,8 +561,8 @@ def test_what_systemd_does_not_start_is_done_by_hand(
     assert "stop process 4711, and start again with:\n  cd /opt && sros run " in ended.out
     assert ended.err.endswith("next: run these commands, and then sros close robot --proof\n")
     assert (
-        "no: every process was started in its enclave: no secured process of this robot runs in "
-        "/listener (stop process 4712, which is open), /talker (stop process 4711, which is open). "
+        "no: not every process was started in its enclave: no secured process of this robot runs "
+        "in /listener (stop process 4712, which is open), /talker (stop process 4711, which is open"
     ) in robot.close("--proof", status=1).out
     for root in ("robot/keystore", "robot/export"):
         denied = sros("explain", root, "/talker", "publish", "/x", cwd=robot.folder).out
@@ -683,7 +686,8 @@ def test_what_systemd_does_not_start_is_done_by_hand(
     undone = robot.close("--undo")  # with the open process 12
     assert undone.err.startswith(
         "/listener may run open by another command (process 12 (run)); if that is not so, "
-        "start /listener open, under its old name /listener: cd /opt && /opt/run listener\n"
+        "start /listener open (its node was /listener when sros watched; its new name is right, "
+        "too): cd /opt && /opt/run listener\n"
         "/talker does not run; start it open: cd /opt "
     )
     processes = robot.folder / "robot/processes.json"
@@ -787,8 +791,8 @@ def test_a_node_that_does_not_run_always(robot: Robot) -> None:
     robot.by_hand, robot.absent, robot.remaining = {"/talker"}, {"/listener"}, (TALKER,)
     ended = robot.close("--proof", status=1)
     assert (
-        "no: every process was started in its enclave: no secured process of this robot runs in "
-        "/listener. St" in ended.out
+        "no: not every process was started in its enclave: no secured process of this robot runs "
+        "in /listener. St" in ended.out
     )
     assert (
         "For a process that does not always run, add its option: --without /listener\n" in ended.out
@@ -813,7 +817,7 @@ def test_a_node_that_does_not_run_always(robot: Robot) -> None:
     assert "; not counted: /listener (not seen)\n" in ended.out
     robot.unseen = ()
     robot.absent, robot.by_hand = set(), {"/listener", "/talker"}  # it is compared, too
-    assert "no: everything that talked can still t" in robot.close(*without, status=1).out
+    assert "no: not everything that talked can still t" in robot.close(*without, status=1).out
     robot.by_hand = {"/talker"}
     assert "process 4712 (run): in domain 0" in robot.close(*without, status=1).out
     robot.absent = {"/listener", "/talker"}
@@ -866,7 +870,7 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     robot.absent = set()
     ended = robot.close("--proof", status=1)
     assert "; process 6 (spy): in domain 0" in ended.out and " and 1 more\n" in ended.out
-    assert "no: every process was started in its enclave: process 5 (spy)" in ended.out
+    assert "no: not every process was started in its enclave: process 5 (spy)" in ended.out
     assert "ROS_SECURITY_ENABLE. Stop it: another process runs in /talker.\n" in ended.err
     robot.more = ()
     robot.outdated = {"/talker"}
@@ -920,11 +924,11 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     assert f"{guest}not checked (--partial accepts this): {more}" in said
     robot.more = (*robot.more[:2], *robot.more[4:], replace(seven, environment={}))
     said = robot.close("--proof", status=1).out
-    assert "no: every process was started in its enclave: process 5 (guest)" in said
+    assert "no: not every process was started in its enclave: process 5 (guest)" in said
     assert "belongs there" not in said, "only programs of ros2 are left"
     robot.more = ()
     robot.remaining = (TALKER,)
-    lost = "no: everything that talked can still talk: "
+    lost = "no: not everything that talked can still talk: "
     runs = f"process {PID['/listener']} (run) runs: ask again, or restart it; if the node is"
     assert f"{lost}not seen: /listener ({runs} gone" in robot.close("--proof", status=1).out
     with monkeypatch.context() as patched:
@@ -957,7 +961,9 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     robot.remaining = (TALKER, LISTENER)
     robot.nodes = (*robot.nodes, ("/", "/", "spy", "03", ["subscribe rt/chatter"]))
     said = robot.close("--proof", status=1).out
-    assert "no: an open listener finds nothing: it sees /spy; stop what runs open, or start" in said
+    assert (
+        "no: an open listener finds something: it sees /spy; stop what runs open, or start" in said
+    )
     assert "with 36 endpoints as before (types are not compared)\n" in said
     robot.nodes = (TALKER, LISTENER, ("/", "", observe.NOBODY, "03", ["publish rt/cmd_vel"]))
     assert (
@@ -977,8 +983,8 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     for readable in (key, ca_key):
         readable.chmod(0o600)
     named = f"process 4711 (run): the mode of '{key}' is 0644\n"
-    assert f"no: every process was started in its enclave: {named}" in ended.out
-    assert "no: the files are accepted: sros check finds 1 error, the first in rob" in ended.out
+    assert f"no: not every process was started in its enclave: {named}" in ended.out
+    assert "no: the files are not accepted: sros check finds 1 error, the first in rob" in ended.out
     assert "next: correct the problems above, and ask again with sros close robot --pr" in ended.err
     assert (
         "; sros check finds 1 error, the first in robot/keystore/private/identity_ca" in ended.out
@@ -988,11 +994,12 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
             "(?<=replace )[^`]*`sros ", "", ended.out
         )
     assert (
-        "`, and restart all processes: robot/export, and robot/keystore without its enclaves\n"
+        "`, and restart all processes: robot/export, and the CAs and settings of robot/keystore\n"
         in ended.out
     )
     assert (
-        "no: the requirements hold: at least one is violated: robot/requirements.toml" in ended.out
+        "no: the requirements do not all hold: at least one is violated: robot/requirements.toml"
+        in ended.out
     )
     assert "/talker: may publish /chatter" in ended.err
     needed.write_text(kept)
@@ -1000,7 +1007,7 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     sros("crl", "robot/keystore", "--refresh", cwd=robot.folder).ok()
     ended = robot.close("--proof", "--partial", status=1)
     crl = "exporting 'robot/keystore' would change 3 files, such as robot/export/enclaves/"
-    assert f"no: the files are accepted: {crl}" in ended.out, "as in an export that is restored"
+    assert f"no: the files are not accepted: {crl}" in ended.out, "as in an export that is restored"
     again = "distribute_key", "robot/keystore", "--all", "robot/export", "--force"
     sros(*again, cwd=robot.folder).ok()
     sros("create_keystore", "other", cwd=robot.folder).ok()
@@ -1011,7 +1018,7 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     )
     refused = robot.close("--proof", "--partial", status=1).out  # --partial accepts no refusal
     authority.write_bytes(trusted)
-    assert "no: the files are accepted: the keystore does not export them: " in refused
+    assert "no: the files are not accepted: the keystore does not export them: " in refused
     assert (
         "not checked: everything that talked can still talk: there is nothing to audit" in ended.out
     )
@@ -1026,9 +1033,9 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     policy.write_text(policy.read_text().replace("chatter", "old/chatter", 1))
     ended = robot.close("--proof", "--partial")
     assert (
-        ": robot/export, and robot/keystore without its enclaves; 'robot/policy.xml' differs from "
-        "the signed permissions of /listener, which the processes use: `sros close robot` checks "
-        "and signs it\n" in ended.out
+        ": robot/export, and the CAs and settings of robot/keystore; 'robot/policy.xml' differs "
+        "from the signed permissions of /listener, which the processes use: `sros close robot` "
+        "checks and signs it\n" in ended.out
     )
     assert (
         "not checked (accepted by --partial): every process was started in its enclave: true for 2 "
@@ -1042,8 +1049,8 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     said = robot.close("--proof", status=1).out
     advice = "`sros close robot` says how to revoke or keep such an enclave"
     assert (
-        f"no: the files are accepted: the keystore has /rogue, and the policy does not; {advice}"
-        in said
+        "no: the files are not accepted: the keystore has /rogue, and the policy does not; "
+        f"{advice}" in said
     )
     assert f"not seen: any node in /rogue ({advice})" in said and "exports them" not in said
 
@@ -1241,7 +1248,7 @@ def test_a_renamed_node_is_compared_and_a_new_one_is_named(
     robot.close()
     robot.remaining = (TALKER, LISTENER, ros_node("nav/stern_camera", of, *moved))
     said = robot.close("--proof", status=1).out
-    assert f"no: {talk[44:]}not seen this time: /nav/stern_camera publish /cmd_vel; if the" in said
+    assert f"no: not {talk[44:]}not seen this time: /nav/stern_camera publish /cmd_vel; if" in said
     assert f"{renamed}dom" in said
     copied = re.sub(r'( *<profile ns="/nav" node=")stern(.*?</profile>)', r"\1stern\2\n\1bow\2",
                     policy.read_text(), flags=re.DOTALL)  # fmt: skip
@@ -1261,7 +1268,7 @@ def test_a_renamed_node_is_compared_and_a_new_one_is_named(
     said = robot.close("--proof").out
     assert f"\n  {unused}/listener publish topic /plan_b\n  not" in said and unused not in before
     assert (
-        "policy has no profile for them any more: /rear_camera (a renamed node is compared if"
+        "policy has no profile for them any more: /rear_camera (removed, or renamed together "
         in said
     )
     assert (
@@ -1388,7 +1395,7 @@ def test_a_program_that_starts_its_nodes_has_one_enclave(
     )
     robot.remaining = (LISTENER,)
     said = robot.close("--proof", status=1).out
-    assert "no: everything that talked can still talk: not seen: /talker (process" in said
+    assert "no: not everything that talked can still talk: not seen: /talker (process" in said
 
 
 def test_a_program_that_gives_its_processes_their_enclaves(
@@ -1965,7 +1972,9 @@ def test_an_enclave_that_belongs_to_another_machine(robot: Robot) -> None:
     assert "\nnot on this machine: /listener (to " in ended.out
     assert "/operator/look (" not in ended.err, "nobody is to bring its files there"
     proved = robot.close("--proof", status=1).out
-    assert "no: the files are accepted: the keystore has /operator/look, and the policy" in proved
+    assert (
+        "no: the files are not accepted: the keystore has /operator/look, and the policy" in proved
+    )
     assert "(types are not compared), without /operator/look\n" in proved
     sros("revoke", "robot/keystore", "/operator/look", cwd=robot.folder).ok()
     assert "\nnot on this machine: /listener (to " in robot.close().out

@@ -107,6 +107,7 @@ def test_requirements_hold_if_they_hold_here_and_elsewhere(
         requirements=required,
         close_command="sros close robot",
         export=tmp_path,
+        policy=tmp_path / "policy.xml",
         rights_source="keystore",
         not_here=["/laptop"] * (len(statuses) > 1),
         shell=SimpleNamespace(
