@@ -201,6 +201,8 @@ def open_asked_enclave(
         policy_enclave = policy.enclave(enclave.name)
         if policy_enclave is None and not is_enclave(Path(enclave.name)):
             raise not_in_policy_error(policy, enclave.name, policy_file)
+    if policy_file and policy == stated:
+        policy_file = _file_with(enclave.name, policy_file)
     enclave = enclave._replace(
         keystore=keystore,
         policy=policy_enclave,
@@ -209,6 +211,17 @@ def open_asked_enclave(
         or (policy_file is None and keystore is not None and _is_of_robot(keystore, enclave.name)),
     )
     return AskedEnclave(enclave, policy)
+
+
+def _file_with(enclave: str, policy: Path) -> Path:
+    """Return the file that has an enclave, if ``policy`` is a folder; otherwise ``policy``."""
+    if not policy.is_dir():
+        return policy
+    from sros_tool.policy.document import files_of_policies, read_policy
+
+    files = files_of_policies(policy)
+    fitting = (file for file in files if read_policy(file, placeholders=True).enclave(enclave))
+    return next(fitting, policy)
 
 
 def is_policy(path: Path) -> bool:

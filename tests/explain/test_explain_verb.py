@@ -114,6 +114,10 @@ def test_no_with_a_change_that_works(keystore: Path, tmp_path: Path) -> None:
     assert "<service>~/reset</service>" in private.out
     here = sros("explain", policy, ENCLAVE, "serve", "/talker/reset", cwd=tmp_path)
     assert "sros merge_policy robot.xml allow.xml --in-place\n" in here.out
+    shutil.copytree(tmp_path / "common", tmp_path / "folder/common")
+    shutil.copy(policy, tmp_path / "folder")
+    in_folder = sros("explain", "folder", ENCLAVE, "serve", "/talker/reset", cwd=tmp_path)
+    assert "sros merge_policy folder/robot.xml allow.xml --in-place\n" in in_folder.out
 
 
 def test_the_policy_of_a_fleet_is_changed_where_it_is_and_issued_for_all(tmp_path: Path) -> None:
