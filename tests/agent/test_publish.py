@@ -979,6 +979,7 @@ def test_damaged_archives_do_not_count_as_huge(
     timestamp.write_text(json.dumps(forged))
     with pytest.raises(KeystoreError, match="metadata that this keystore did not write") as refused:
         publisher.publish()
+    assert refused.value.remedy.startswith("If the keystore was restored from a backup, first")
     damaged = sorted(archive.name.split(".")[1] for archive in others)
     assert f"Archives are missing or changed, too: {', '.join(damaged)}" in refused.value.why
     shutil.rmtree(publisher.pub / "metadata")

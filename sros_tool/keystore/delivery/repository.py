@@ -294,9 +294,10 @@ def _foreign_folder_error(folder: Path, why: str) -> KeystoreError:
     return KeystoreError(
         f"'{folder}' has metadata that this keystore did not write",
         f"{why[:1].upper()}{why[1:].removesuffix('.')}.",
-        "Name another folder. If the keystore was restored from a backup, first follow "
-        "docs/howto/keystore_is_lost.md. If this keystore published to this folder before, and the "
-        f"metadata is damaged, {_damaged_metadata_remedy(folder)}.",
+        "If the keystore was restored from a backup, first follow docs/howto/keystore_is_lost.md. "
+        "If this keystore published to this folder before, the metadata was changed or damaged: "
+        "find out who else can write to the folder, "
+        f"{_damaged_metadata_remedy(folder)}. Otherwise, name another folder.",
     )
 
 
