@@ -118,7 +118,7 @@ PROCESS_EXPIRED = FindingKind(
     "runtime.process-expired",
     ERROR,
     "a process whose certificate, permissions or CA has expired",
-    "Processes that start or discover this process from now on refuse it.",
+    "A process that starts now, or that discovers this process now, refuses it.",
     "DDS-Security 1.1, 8.3.2.8 and 9.4.1.3.2.2; Fast DDS 2.14.5, Cyclone DDS 0.10.2 (they read "
     "the files when they start).",
     "Renew the enclave (`sros renew KEYSTORE ENCLAVE`), bring it here, and restart the process.",

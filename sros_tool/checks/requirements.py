@@ -80,7 +80,7 @@ HOLDS_ALONE = FindingKind(
     "requirement.holds-alone",
     NOTE,
     "a requirement that no enclave comes close to breaking",
-    "No right here comes close to breaking it. Its names are relative, as in the "
+    "No right here comes close to breaking the requirement. Its names are relative, as in the "
     "requirements of a package, so perhaps only the policies of the package's users have the "
     "enclaves that could break it.",
     "The requirements file.",
@@ -125,8 +125,9 @@ REMAPPING_UNUSED = FindingKind(
     "requirement.remapping-unused",
     NOTE,
     "a remapping that changes no requirement",
-    "The policy has the new name or node, but no requirement has the old name. If the old name "
-    "is misspelled in the remapping, the requirements about it are not applied to the new name.",
+    "The policy has the new name or node, but no requirement has the old name. If the "
+    "remapping misspells the old name, requirements on the correct name do not move to the new "
+    "name.",
     "The requirements file.",
     "Compare the old name with the names in the requirements; ignore this finding if no "
     "requirement "

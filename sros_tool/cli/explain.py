@@ -436,7 +436,8 @@ def _notes_on_past(moment: datetime, keystore: OpenedKeystore | None) -> Iterato
             changes = sum(entry.time > iso(moment) for entry in keystore.ledger.entries)
     text = "the answer uses the current files, not the files of that time"
     if changes:
-        text += f"; {counted(changes, 'entry', 'entries')} of ledger.jsonl are from after that time"
+        entries = counted(changes, "entry of ledger.jsonl is", "entries of ledger.jsonl are")
+        text += f"; {entries} from after that time"
     yield Note("explain.past", text)
 
 

@@ -397,7 +397,8 @@ def rights_markdown(
     title = f"### Rights: {plain(differ)}"
     if lines and drawn is None:
         parts.append(
-            "The picture is too large for a comment: `sros view BEFORE AFTER -o change.html`"
+            "The picture is too large for a comment: draw it with `sros view BEFORE AFTER -o "
+            "change.html`"
         )
     elif lines and drawn:
         parts.append(fenced(drawn, "mermaid"))

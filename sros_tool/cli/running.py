@@ -220,8 +220,10 @@ def env(
         raise UsageError("env takes a keystore and one enclave")
     for option, value in (("--name", container), ("--image", image)):
         if value is not None and (form not in (COMPOSE, KUBERNETES) or not value):
-            fault = f"{option} is empty" if not value else f"the format {form} has no {option}"
-            raise UsageError(fault, "", f"It is for {COMPOSE} and {KUBERNETES}.")
+            if not value:
+                raise UsageError(f"{option} is empty", "", "Give it a value, or leave it out.")
+            fault = f"the format {form} has no {option}"
+            raise UsageError(fault, "", f"Leave it out: it is for {COMPOSE} and {KUBERNETES}.")
     in_container = form in CONTAINER_FORMS
     if target_dir is None and in_container:
         target_dir = INSTALLED

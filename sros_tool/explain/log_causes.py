@@ -801,8 +801,8 @@ def _renaming_advice(nodes: Sequence[str], wrong: str, enclave: str) -> str:
         renamed = (
             f". If the new name is wanted, write {wrong} in the profile of {meant[0]}, or, for the "
             "policy of a package, merge it again, into a policy without the node: `sros "
-            f"merge_policy POLICY OTHER {_merge_options(meant[0], wrong)}`, with the name that "
-            "OTHER has for the node before `:__node`"
+            f"merge_policy POLICY OTHER {_merge_options(meant[0], wrong)}` (before `:__node`, "
+            "write the name that OTHER has for the node)"
         )
     return (
         f"{start}{renamed}. A further node needs a profile with common/node.xml: in the policy of "

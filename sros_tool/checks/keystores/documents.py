@@ -217,9 +217,9 @@ FEWER_DOMAINS = FindingKind(
     "In the other domains no node of the enclave can communicate. This is intended if a fleet file "
     "gives the robot a domain.",
     "DDS-Security 1.1, 9.4.1.2 and 9.4.1.3; tested.",
-    "Nothing to do if the robot is in this domain. Otherwise, sign permissions for the domain "
-    "of the robot, and export the enclave again: `sros create_permission KEYSTORE ENCLAVE "
-    "POLICY_FILE && sros distribute_key KEYSTORE ENCLAVE TARGET --force`.",
+    "Nothing to do if the robot is in a domain of the permissions. Otherwise, sign permissions for "
+    "the domain of the robot, and export the enclave again: `sros create_permission KEYSTORE "
+    "ENCLAVE POLICY_FILE && sros distribute_key KEYSTORE ENCLAVE TARGET --force`.",
 )
 
 _PORTABLE_DATE = re.compile(r"(\d{4})-\d\d-\d\dT\d\d:\d\d:\d\dZ\Z")
