@@ -26,6 +26,7 @@ from sros_tool.faults import NEEDS_CA_KEYS, ORIGINAL_KEYSTORE, Fault, remedy_in_
 from sros_tool.graph.observation import PUBLISH, SUBSCRIBE
 from sros_tool.keystore.layout import (
     KEY_FILE,
+    enclaves_of_closed_robot,
     is_keystore,
     is_original_keystore,
     remedy_in_closed_robot,
@@ -33,11 +34,19 @@ from sros_tool.keystore.layout import (
 from sros_tool.keystore.loading import starts_without_security
 from sros_tool.keystore.participant import JoinContext, LoadedEnclave
 from sros_tool.keystore.selection import likely_names as likely_enclaves
-from sros_tool.names import PARAMETER_SERVICES, action_part, nodes_served, right_to_use, service_of
+from sros_tool.names import (
+    PARAMETER_SERVICES,
+    action_part,
+    expand,
+    nodes_served,
+    right_to_use,
+    service_of,
+)
 from sros_tool.policy.model import PEER_RIGHT
 from sros_tool.policy.patterns import covers
 from sros_tool.policy.remapping import Remapping, renamed_action_text
 from sros_tool.policy.rights import Right
+from sros_tool.runtime.environment import remapping_rules
 from sros_tool.runtime.log_texts import (
     CHANGE_OWNER_REMEDY,
     EXPORT_FOR_USER_REMEDY,
@@ -492,6 +501,10 @@ class Examiner:
         denied = question.needed_right(enclave.name)
         if other := meaning_of_other_kind(denied, named_rights(asked)):
             return [f"{other}, but {name} is {with_article(question.type)}"], ""
+        if rules := self._missing_rules(enclave.name, name, _served_names(asked)):
+            return [f"the process had {enumerated(rules)} in its command when sros watched it"], (
+                "Start the process by its command in start/commands.txt of the robot's folder."
+            )
         is_used = self._keystore.has_other_side(denied) if self._keystore else None
         names = likely_names(asked)
         if is_used:  # a name that peers have a right to is probably no mistake
@@ -554,6 +567,20 @@ class Examiner:
         if renamed and is_used:  # its peers may mean the new name, or the old one
             return only, f"{remedy}{renamed}{new_name}"
         return only, f"{remedy}{renamed or new_name}"
+
+    def _missing_rules(self, enclave: str, name: str, nodes: Iterable[str]) -> list[str]:
+        """Return the remapping rules, in the command of a closed robot's process, of a denied name.
+
+        ``nodes`` are the full names of the nodes of the enclave.
+        """
+        root = Path(self._root)
+        commands = enclaves_of_closed_robot(root).commands if self._root else {}
+        places = [node.rpartition("/") for node in nodes or ("/",)]
+        return [
+            f"`-r {of_node}{':' * bool(of_node)}{old}:={new}`"
+            for of_node, old, new in remapping_rules(commands.get(enclave, ()))
+            if any(name in (old, expand(old, ns or "/", node)) for ns, _, node in places)
+        ]
 
     def _misspelled_in_policy(self, denied: Right, named: Iterable[Right]) -> str:
         """Return an allowed name that is like the denied one, and that no peer may use; or ""."""

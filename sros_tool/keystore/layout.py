@@ -8,7 +8,7 @@ from __future__ import annotations
 import errno
 import os
 import re
-from collections.abc import Container, Iterable, Iterator, Sequence
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from itertools import chain, islice
 from pathlib import Path
@@ -305,6 +305,8 @@ class RobotEnclaves(NamedTuple):
     """The enclaves of the processes on this machine, also of those that do not always run."""
     elsewhere: frozenset[str] = frozenset()
     """The enclaves of other machines, such as laptops."""
+    commands: Mapping[str, Sequence[str]] = {}
+    """The commands of the processes on this machine, by enclave."""
 
 
 def enclaves_of_closed_robot(root: Path) -> RobotEnclaves:
@@ -318,12 +320,15 @@ def enclaves_of_closed_robot(root: Path) -> RobotEnclaves:
         if not file:
             return RobotEnclaves()
         listed = parse_json(file)
-        here = {str(process["enclave"]) for process in listed["processes"]}
-        here |= {*map(str, listed.get("ended", ()))}
+        commands = {
+            str(process["enclave"]): [*map(str, process.get("command", ()))]
+            for process in listed["processes"]
+        }
+        here = commands.keys() | {*map(str, listed.get("ended", ()))}
         elsewhere = frozenset(map(str, listed["not_here"]))
     except (SrosError, ValueError, TypeError, KeyError, AttributeError):
         return RobotEnclaves()
-    return RobotEnclaves(frozenset({CLOSED_OBSERVER, *here}) - elsewhere, elsewhere)
+    return RobotEnclaves(frozenset({CLOSED_OBSERVER, *here}) - elsewhere, elsewhere, commands)
 
 
 def how_to_learn_one_process(robot: Path, domain: int = 0) -> str:

@@ -1449,6 +1449,13 @@ def test_the_other_side_of_a_name_tells_whether_a_remapping_may_be_forgotten(
     assert "no enclave of the export may publish /odometry\n" in found
     assert "ask the whole keystore: `sros explain KEYSTORE --log LOG`. Or, if the policy" in found
     assert "Probably the node lacks a remapping" in found and "therwise, If" not in found
+    command = ["weed", "--ros-args", "-r", "odometry:=front/image"]
+    listed = {"processes": [{"enclave": "/weed", "command": command}], "not_here": []}
+    (tmp_path / "processes.json").write_text(json.dumps(listed))
+    found = sros("explain", export, "--log", log, "/weed").out
+    assert "had `-r odometry:=front/image` in its command when sros watched it\n" in found
+    assert "Start the process by its command in start/commands.txt of" in found
+    (tmp_path / "processes.json").unlink()
     (keystore / "enclaves/camera/permissions.p7s").write_text("damaged")
     found = sros("explain", keystore, "/weed", "--log", log).out
     assert "no enclave" not in found  # nothing follows for the name
