@@ -196,7 +196,7 @@ def loadable_environment(
     return EnclaveEnvironment(variables, notes, needs_pin=not state.token.pin_source)
 
 
-_ACCEPT_ADVICE = " To run it nevertheless, add --accept-readable-key."
+_ACCEPT_ADVICE = " To run the process nevertheless, add --accept-readable-key."
 
 
 def _refuse_key_readable_by_others(

@@ -56,9 +56,9 @@ _REMEDIES_IN_EXPORT = {
 }
 """Remedies for an export, which has no CA keys, that differ from the remedies for a keystore."""
 _REPAIR_GOVERNANCE = (
-    "Every enclave depends on it: restore {root}/enclaves/governance.p7s from a backup, or read "
-    "{root}/enclaves/governance.xml and sign it again: `openssl smime -sign -text -in "
-    "{root}/enclaves/governance.xml -out {root}/enclaves/governance.p7s -signer "
+    "Every enclave depends on the governance. Restore {root}/enclaves/governance.p7s from a "
+    "backup, or read {root}/enclaves/governance.xml and sign it again: `openssl smime -sign -text "
+    "-in {root}/enclaves/governance.xml -out {root}/enclaves/governance.p7s -signer "
     "{root}/public/permissions_ca.cert.pem -inkey {root}/private/permissions_ca.key.pem`."
 )
 _INTACT_IN_KEYSTORE = (_SIGN_PERMISSIONS, _CREATE_MISSING_FILE, REPLACE, _REPAIR_GOVERNANCE)
@@ -293,7 +293,7 @@ class Fault(Enum):
     SIGNATURE = (
         "signature",
         "a document whose signature does not verify",
-        "The document was changed, or another CA signed it: find out who did. The node fails (Fast "
+        "The document was changed, or another CA signed it: find out who. The node fails (Fast "
         "DDS: PKCS7 data verification failed). With a single CA, an enclave may have signed its "
         "own permissions, which DDS accepts.",
         "DDS-Security 1.1, 9.4.1.1; Fast DDS 2.14.5; CVE-2023-24011 for Cyclone DDS 0.10.2.",

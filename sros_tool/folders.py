@@ -480,7 +480,7 @@ def try_lock(handle: int) -> bool:
         raise KeystoreError(
             f"'{Path(f'/proc/self/fd/{handle}').readlink()}' cannot be locked: {error.strerror}",
             "Without locks, two runs of sros at the same time would spoil each other's files.",
-            "Use a folder on a local disk, or let the network file system give locks.",
+            "Use a folder on a local disk, or a network file system with locks.",
         ) from error
     return True
 

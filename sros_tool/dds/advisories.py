@@ -191,7 +191,7 @@ def parse_advisories(data: bytes, label: str) -> tuple[Advisory, ...]:
             raise ValueError(f"it has more than {_MOST_ADVISORIES} advisories")
         merged: dict[tuple[str, str], Advisory] = {}
         for record in records:
-            for advisory in _advisories_of(_object(record)):
+            for advisory in _advisories_of(_object(record, "an advisory")):
                 key = advisory.id, advisory.product
                 earlier = merged.get(key)
                 merged[key] = earlier.with_releases_of(advisory) if earlier else advisory
@@ -216,9 +216,9 @@ def _advisories_of(record: Mapping[str, Any]) -> Iterator[Advisory]:
     is_withdrawn = bool(_text(record.get("withdrawn") or "", "withdrawn"))
     aliases = _list(record.get("aliases", []), "aliases")
     cve = (name for name in aliases if isinstance(name, str) and re.fullmatch(_CVE, name))
-    database_data = _object(record.get("database_specific", {}))
+    database_data = _object(record.get("database_specific", {}), "database_specific")
     by_product: dict[str, list[Mapping[str, Any]]] = {}
-    for part in map(_object, _list(record.get("affected", []), "affected")):
+    for part in _objects(record.get("affected", []), "affected"):
         if product := _product(part):
             by_product.setdefault(product, []).append(part)
     name = identity if identity.startswith("CVE-") else next(cve, identity)
@@ -254,8 +254,8 @@ _CVE = re.compile(r"CVE-\d{4}-\d{4,9}", re.ASCII)
 
 def _product(affected: Mapping[str, Any]) -> str:
     """Return the product of an OSV ``affected`` entry, by package or repository; "" if unknown."""
-    names = [_object(affected.get("package", {})).get("name", "")]
-    names += [_object(part).get("repo", "") for part in _list(affected.get("ranges", []), "ranges")]
+    names = [_object(affected.get("package", {}), "package").get("name", "")]
+    names += [part.get("repo", "") for part in _objects(affected.get("ranges", []), "ranges")]
     for name in names:
         plain = re.sub(r"^https?://|(?:\.git)?/?$", "", str(name)).lower()
         if plain in _REPOSITORIES:
@@ -264,7 +264,7 @@ def _product(affected: Mapping[str, Any]) -> str:
 
 
 def _ranges(affected: Mapping[str, Any], identity: str) -> Iterator[_Range]:
-    for part in map(_object, _list(affected.get("ranges", []), "ranges")):
+    for part in _objects(affected.get("ranges", []), "ranges"):
         kind = part.get("type")
         if kind == "GIT":
             continue  # a range of git commits: the releases are listed in ``versions``
@@ -273,7 +273,7 @@ def _ranges(affected: Mapping[str, Any], identity: str) -> Iterator[_Range]:
                 f"a range of {identity} is not of type GIT, SEMVER or ECOSYSTEM, or has no events"
             )
         introduced: Version | None = None
-        for event in map(_object, _list(part.get("events", []), "events")):
+        for event in _objects(part.get("events", []), "events"):
             for name, version in event.items():
                 if name == "introduced":
                     introduced = introduced or _numbers(version, identity)
@@ -294,10 +294,14 @@ def _numbers(version: object, identity: str) -> Version:
     return int(numbers[1]), int(numbers[2] or 0), int(numbers[3] or 0)
 
 
-def _object(value: object) -> Mapping[str, Any]:
+def _object(value: object, name: str) -> Mapping[str, Any]:
     if not isinstance(value, dict):
-        raise ValueError("a part is not an object")
+        raise ValueError(f"{name} is not an object")
     return value
+
+
+def _objects(value: object, name: str) -> list[Mapping[str, Any]]:
+    return [_object(part, f"an entry of {name}") for part in _list(value, name)]
 
 
 def _list(value: object, name: str) -> list[Any]:

@@ -428,8 +428,8 @@ def portability_problems(
                 kept_from = "subscribing to" if other == "subscribe" else "publishing on"
                 yield (
                     "portable.deny-blocks-topic",
-                    f"denying to {direction} {_topics_text(blocked)} also keeps the enclave from "
-                    f"{kept_from} the same topics",
+                    f"a deny rule to {direction} {_topics_text(blocked)} also keeps the enclave "
+                    f"from {kept_from} the same topics",
                 )
         sets = [t for r in grant.rules for c in (*r.publish, *r.subscribe) for t in c.topics]
         sets = sorted({topic for topic in sets if "[" in topic})

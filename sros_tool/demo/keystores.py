@@ -168,7 +168,7 @@ class KeystoreSet:
             if isinstance(error := self._missing(party), UncastError):
                 return str(error)
         if self.user is not None and (enclave := self.user.permitted_enclave(row)):
-            return f"only {enclave} could play the attacker, but this enclave has the right"
+            return f"only {enclave} could play the attacker, and its permissions allow the attack"
         return ""
 
     def problem(self, row: Row) -> str:

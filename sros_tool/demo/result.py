@@ -303,8 +303,9 @@ def _judge_answers(case: _ClaimRecords) -> _ClaimFinding:
         return _undecided_finding(f"{claim.subject} sent no request during the observation")
     answers = case.messages_heard()
     within = sum(_is_in_window(event, case.record) for event in answers)
-    right = f"{min(within, len(asked))} right answers from the {claim.talker}"
-    return case.result(bool(answers), f"{claim.subject} asked {len(asked)} times and got {right}")
+    right = f"{counted(min(within, len(asked)), 'right answer')} from the {claim.talker}"
+    times = counted(len(asked), "time")
+    return case.result(bool(answers), f"{claim.subject} asked {times} and got {right}")
 
 
 def _judge_execution(case: _ClaimRecords) -> _ClaimFinding:
@@ -330,7 +331,8 @@ def _judge_expiry(case: _ClaimRecords) -> _ClaimFinding:
     if not sent:
         return _undecided_finding(f"{claim.talker} sent nothing after its certificate had expired")
     late = [event for event in heard if event.time > after]
-    before = f"{len(heard) - len(late)} messages of the {claim.talker} until its certificate"
+    early = counted(len(heard) - len(late), "message")
+    before = f"{early} of the {claim.talker} until its certificate"
     return case.result(
         bool(late),
         f"{claim.subject} heard {before} expired, and {len(late)} of {len(sent)} after that",
@@ -368,8 +370,8 @@ def _judge_replay(case: _ClaimRecords) -> _ClaimFinding:
     repeated = sum(event.time >= injected.time for event in case.messages_heard())
     return case.result(
         repeated > 0,
-        f"{claim.subject} heard {repeated} messages when {injected.packets} packets of the "
-        f"{claim.talker} were sent again (twice) after the {claim.talker} had left",
+        f"{claim.subject} heard {counted(repeated, 'message')} when {injected.packets} packets of "
+        f"the {claim.talker} were sent again (twice) after the {claim.talker} had left",
     )
 
 
@@ -385,8 +387,8 @@ def _judge_forgery(case: _ClaimRecords) -> _ClaimFinding:
     )
     return case.result(
         believed > 0,
-        f"{claim.subject} heard {believed} messages that the {claim.talker} never sent, in"
-        f" {injected.packets} changed packets",
+        f"{claim.subject} heard {counted(believed, 'message')} that the {claim.talker} never sent,"
+        f" in {counted(injected.packets, 'changed packet')}",
     )
 
 
@@ -407,8 +409,8 @@ def _judge_view(case: _ClaimRecords) -> _ClaimFinding:
     if not looks:
         return _undecided_finding(f"{claim.subject} made no count during the observation")
     most = max(event.publishers.get(topic, 0) for event in looks)
-    counted = f"{most} {'servers' if serves else 'publishers'} on {topic}"
-    return case.result(most > 0, f"{observer.library} counts {counted} in {len(looks)} polls")
+    seen = f"{counted(most, 'server' if serves else 'publisher')} on {topic}"
+    return case.result(most > 0, f"{observer.library} counts {seen} in {len(looks)} polls")
 
 
 def _judge_loss(case: _ClaimRecords) -> _ClaimFinding:
@@ -424,7 +426,9 @@ def _judge_loss(case: _ClaimRecords) -> _ClaimFinding:
     if not inside:
         return _undecided_finding(f"{claim.subject} made no count during the observation")
     left = inside[-1].publishers.get(topic, 0)
-    detail = f"{case.subject.library} counts {most} publishers on {topic}, and {left} after "
+    detail = (
+        f"{case.subject.library} counts {counted(most, 'publisher')} on {topic}, and {left} after "
+    )
     return case.result(not left, f"{detail}{claim.talker} tried to remove the node")
 
 
@@ -432,7 +436,9 @@ def _judge_wire(case: _ClaimRecords) -> _ClaimFinding:
     claim, record = case.claim, case.record
     if claim.wire is Wire.MEMORY:
         segments = record.memory.get(claim.subject, 0)
-        return case.result(segments > 0, f"{segments} segments of shared memory show the text")
+        return case.result(
+            segments > 0, f"the text is in {counted(segments, 'segment')} of shared memory"
+        )
     count = record.wire.get(claim.subject)
     if count is None:
         return _undecided_finding("no packets were captured")
@@ -441,16 +447,16 @@ def _judge_wire(case: _ClaimRecords) -> _ClaimFinding:
         if not shown and not count.protected:
             return _undecided_finding("no packets of the row were captured")
         packet_kind = f"the {claim.wire}" if claim.wire is Wire.TOPIC else f"a {claim.wire}"
-        return case.result(shown > 0, f"{shown} packets show {packet_kind}")
+        return case.result(shown > 0, f"{packet_kind} is in {counted(shown, 'packet')}")
     if count.plain:
-        return case.result(True, f"{count.plain} packets show the text")
+        return case.result(True, f"the text is in {counted(count.plain, 'packet')}")
     sent = len(case.messages_sent(case.subject))
     # Missing text proves something only if the messages were in the captured packets.
     if count.protected * 2 < max(2, sent):
         return _undecided_finding(
             f"only {count.protected} encrypted packets were captured for {sent} messages"
         )
-    return case.result(False, f"0 packets show the text, {count.protected} are encrypted")
+    return case.result(False, f"the text is in 0 packets, {count.protected} are encrypted")
 
 
 _JUDGES: Mapping[Relation, Callable[[_ClaimRecords], _ClaimFinding]] = {

@@ -497,7 +497,8 @@ class ReceivedConfirmation:
             return ""
         return (
             f"{_TWO_COMPUTERS} seem to send messages in turn: the messages went back to an earlier "
-            f"start or release, last at {iso(alternated)}. Perhaps a disk was copied or restored. "
+            f"start of the computer or an earlier release, last at {iso(alternated)}. Perhaps a "
+            "disk was copied or restored. "
             "sros knows the files of only one of the two computers. Give the robot new keys, and "
             "revoke the earlier keys (docs/howto/one_robot.md: Same name, new hardware)."
         ) + was_restored * (

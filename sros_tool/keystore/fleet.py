@@ -298,8 +298,8 @@ def _moved_robot_error(recorded: Robot, stated: Robot) -> KeystoreError:
     return KeystoreError(
         f"the fleet file has the robot {stated.name} in {place(stated)}, but the keystore's fleet "
         f"has it in {place(recorded)}",
-        "This command would not move the robot's other enclaves, so they could no longer "
-        "communicate with this one.",
+        "This command would move only some enclaves of the robot, which could then no longer "
+        "communicate with the others.",
         f"Sign for the recorded domain, with `--fleet KEYSTORE/{FLEET}`. Then move all enclaves of "
         "the robot with `sros generate_artifacts -k KEYSTORE -p POLICY_FILE --fleet FLEET_FILE`.",
     )

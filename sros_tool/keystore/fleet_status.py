@@ -901,7 +901,7 @@ def _notes_on_clock(received: ReceivedConfirmation) -> Iterator[str]:
     if note := received.clock_note():
         yield note
     if received.confirmation.clock == RobotClock.BEHIND:
-        yield "its clock shows an earlier time than documents that the robot has verified"
+        yield "its clock is behind the dates of documents that the robot has verified"
 
 
 class _KeystoreFile(NamedTuple):
@@ -1419,7 +1419,7 @@ def _robot_status(
     if (is_lost or (state is State.UNKNOWN and not is_ahead)) and records.is_restored:
         lost_note = (
             "the keystore was restored, and lacks what it issued after the backup. If the "
-            "robot sent this: `sros distribute_key "
+            "message is genuine: `sros distribute_key "
             f"{quote(str(records.root))} --robot NAME FOLDER --force`"
         )
         compared_robot = compared_robot._replace(notes=(lost_note, *compared_robot.notes))

@@ -955,7 +955,7 @@ def test_a_forged_timestamp_is_refused_without_unpacking_everything(
     assert not publication.as_seen_at(publisher.now).is_in_order and not read
     ended = sros("fleet", "status", "ks", cwd=publisher.folder)
     assert "the published files do not verify" in ended.out and ended.status == 1
-    with pytest.raises(KeystoreError, match="more than 0 MiB, unpacked, of archives") as refused:
+    with pytest.raises(KeystoreError, match=r"more than 0 MiB \(unpacked\) of archives") as refused:
         publisher.publish()
     assert "move" in refused.value.remedy and "--new-folder" in refused.value.remedy
     publisher.pub.rename(publisher.folder / "away")

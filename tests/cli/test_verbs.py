@@ -686,7 +686,7 @@ def test_no_process_starts_with_a_key_that_others_can_read(mode: int, keystore: 
     refused = sros("run", keystore, "/a", "--", "touch", marker)
     assert refused.status == 2, refused
     assert f"'{key}' is {mode:04o}" in refused.err
-    assert "To run it nevertheless, add --accept-readable-key." in refused.err
+    assert "To run the process nevertheless, add --accept-readable-key." in refused.err
     observer = sros("audit", "p.xml", "--keystore", keystore, "--enclave", "/a")
     assert observer.status == 2 and "Run `chmod 600" in observer.err
     assert "--accept-readable-key" not in observer.err, "this verb has no such option"

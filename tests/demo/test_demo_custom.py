@@ -164,7 +164,7 @@ def test_what_to_write_for_a_party_that_its_own_enclave_refuses(folder: Path) ->
 
 def test_two_parties_whose_logs_would_be_one_file(folder: Path) -> None:
     text = GOOD.replace('"camera"', '"a b"').replace('"viewer"', '"a_b"')
-    with pytest.raises(DocumentError, match="'a_b': 'a b' differs only in blanks"):
+    with pytest.raises(DocumentError, match="'a_b': 'a b' counts as the same name"):
         read_scenario(write(folder, text))
 
 

@@ -284,7 +284,7 @@ class _Node:
         cls, xml: bytes, grammar: Mapping[str, tuple[str, ...]], skipped: tuple[str, ...]
     ) -> _Node:
         if b"\0" in xml:
-            raise UnreadableError("it contains a NUL, at which the signed message ends")
+            raise UnreadableError("it contains a NUL, and Cyclone DDS reads only up to there")
         root = read(xml)
         if root.name.lower() != "dds":
             raise UnreadableError("its root is not <dds>")

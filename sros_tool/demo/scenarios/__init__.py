@@ -225,7 +225,7 @@ def _read_scenario(table: _Table) -> Scenario:
         party = _read_party(party_table, policy)
         file = party.name.replace(" ", "_")
         if twin := next((name for name in parties if name.replace(" ", "_") == file), ""):
-            spelt = "" if twin == party.name else f": {twin!r} differs only in blanks"
+            spelt = "" if twin == party.name else f": {twin!r} counts as the same name"
             raise party_table.error("name", f"there are two parties {party.name!r}{spelt}")
         parties[party.name] = party
     rules = Rules(policy_rights(policy))
@@ -376,7 +376,7 @@ def _check_controls(
         if claim.talker and not talker.identity.enclave:
             remedy = remedy.replace("a permitted", "an unsecured")
         elif claim.talker and not _may_send(talker, rules):
-            problem = f"{talker.identity.enclave} lacks the right to speak, so nobody hears it"
+            problem = f"{talker.identity.enclave} may not send, so nobody hears it"
             remedy = (
                 f'Claim the refusal: {{ party = "{talker.name}", expected = "refused" }}. '
                 "Add a control that something works."

@@ -956,7 +956,7 @@ _PERMISSIONS_ROWS: tuple[Row, ...] = (
             Variant(
                 (Condition.OPEN_JOIN, Condition.UNCONTROLLED),
                 RowStatus.HEARD,
-                "the template controls neither who joins nor who uses the topic",
+                "the template controls neither who joins the domain nor who uses the topic",
                 "switch join_access_control, read_access_control and write_access_control on in the"
                 " template",
             ),

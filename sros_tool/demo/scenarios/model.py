@@ -98,7 +98,7 @@ class Relation(StrEnum):
     HEARS = "hears"
     HEARS_AGAIN = "hears replayed packets of"
     BELIEVES = "believes changed packets of"
-    HEARS_EXPIRED = "still hears, with an expired certificate, the"
+    HEARS_EXPIRED = "still hears, after certificate expiry, the"
     IS_ANSWERED = "is answered by"
     EXECUTES = "executes a call of"
     IS_REFUSED = "is refused"

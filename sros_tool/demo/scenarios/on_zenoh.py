@@ -753,7 +753,7 @@ def _rogue_far_router_row(name: str, keystore: KeystoreChoice, defence_removed: 
     return _attempt_row(
         name,
         RowStatus.HEARD if defence_removed else RowStatus.NOT_HEARD,
-        "the router trusts this router"
+        "the router accepts the attacker as another router"
         if defence_removed
         else "a router accepts a sender as another router only if the sender's certificate has a "
         "router's name",

@@ -278,7 +278,7 @@ def releases_in(folder: Path, robots: int, altered: set[str] | None = None) -> I
         stated = 0 if is_altered else min(stated_size(data), LIMITS_OF_ONE_ROBOT.unpacked)
         size += max(len(data), stated)
         if size > most * _MEAN_ARCHIVE_BYTES:
-            excess = f"more than {most * _MEAN_ARCHIVE_BYTES // 1024**2} MiB, unpacked, of"
+            excess = f"more than {most * _MEAN_ARCHIVE_BYTES // 1024**2} MiB (unpacked) of"
             break
         if is_altered and altered is not None:
             altered.add(path.name)

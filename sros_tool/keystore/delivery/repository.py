@@ -283,8 +283,8 @@ def read_present(folder: Path, roots: Roots) -> PresentMetadata:
         raise KeystoreError(
             f"the metadata in '{folder}' cannot be read",
             f"'{error.filename}': {error.strerror}.",
-            "Give the user who publishes access to the folder and its files. If a file is damaged, "
-            f"{_damaged_metadata_remedy(folder)}.",
+            "Make the folder and its files accessible to the user who publishes. If a file is "
+            f"damaged, {_damaged_metadata_remedy(folder)}.",
         ) from error
     except (RepositoryError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise _foreign_folder_error(folder, str(error)) from error

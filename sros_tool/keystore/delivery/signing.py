@@ -85,7 +85,7 @@ from sros_tool.pki.keys import holds_private_key, load_key
 from sros_tool.policy.model import Enclave, Policy, stated_protections
 from sros_tool.validity import iso
 from sros_tool.values import DryRun, FileChange, FileChanges, NamedKeystore, Notes, Words, shows
-from sros_tool.wording import first_few
+from sros_tool.wording import counted, first_few
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -312,7 +312,8 @@ def _check_requested_enclaves(
     """Raise `KeystoreError` unless the requests are for exactly ``only_enclaves``, in any order."""
     if len(requests) != len(only_enclaves):
         raise KeystoreError(
-            f"there are {len(requests)} requests for {len(only_enclaves)} enclaves",
+            f"the input has {counted(len(requests), 'request')} for "
+            f"{counted(len(only_enclaves), 'enclave')}",
             "",
             "Name the enclaves with --enclave, one for each request.",
         )

@@ -78,6 +78,7 @@ from sros_tool.policy.model import Enclave, Policy
 from sros_tool.policy.rights import nodes_as_text, nodes_not_shown
 from sros_tool.translate import permissions_for
 from sros_tool.validity import Window, iso, window
+from sros_tool.wording import counted
 from sros_tool.xml import read_bytes
 
 Result = TypeVar("Result")
@@ -492,8 +493,8 @@ def _early_expiry_note(
         return None
     return Note(
         "keystore.ends-with-ca",
-        f"New {label} expire with their CA at {iso(end)}, {lost.days} days earlier than the "
-        f"keystore's settings say. Rotate the CA with `sros rotate_ca {quote(str(root))} "
+        f"New {label} expire with their CA at {iso(end)}, {counted(lost.days, 'day')} earlier than "
+        f"the keystore's settings say. Rotate the CA with `sros rotate_ca {quote(str(root))} "
         "--next`.",
     )
 

@@ -382,7 +382,7 @@ class KeystoreChange:
         """
         if revoke_old and self.identity.service:
             raise KeystoreError(
-                "a CA service does not revoke earlier certificates in the same step",
+                "a CA service cannot revoke earlier certificates while it issues new ones",
                 "It signs its revocation list only after the keystore has the new certificates.",
                 "Leave --revoke-old out, revoke the earlier certificates at the service, and give "
                 f"its list: `sros crl {quote(str(self.root))} --refresh --crl FILE`.",
