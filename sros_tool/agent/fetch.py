@@ -268,7 +268,8 @@ def _release_number(target: TargetFile | None, source: str, robot: str) -> int:
         raise FetchError(
             FetchProblem.NOT_FOR_ROBOT,
             f"nothing is published for the robot {robot} in {source}",
-            "The robot is not in the fleet, or all its enclaves were revoked.",
+            "The robot is not in the fleet, or joined it after the last publication, or all its "
+            "enclaves were revoked.",
             "On the keystore machine, run `sros fleet status KEYSTORE`.",
         )
     if target.length > LIMITS_OF_ONE_ROBOT.packed:

@@ -171,7 +171,7 @@ def read_settings(folder: Path, *, to_run: bool = True) -> AgentSettings:
         raise KeystoreError(
             f"'{folder}' has no agent",
             f"'{path}' does not exist.",
-            "Make it with `sros agent init`.",
+            "Run `sros agent init`.",
         )
     if to_run:
         check_owner(folder)

@@ -343,7 +343,8 @@ class ChosenFindings(NamedTuple):
             return f"{', '.join(counts) or 'nothing found'}{unseen}"
         number = counted(len(self.accepted), "weakness", "weaknesses")
         first = f"{', '.join(counts)}, and" if counts else "nothing found but"
-        accepted = f"{number} that the template accepts (--strict makes them count)"
+        them = "it" if len(self.accepted) == 1 else "them"
+        accepted = f"{number} that the template accepts (--strict counts {them})"
         return f"{first} {accepted}{unseen}"
 
     def fails(self, level: Severity) -> bool:

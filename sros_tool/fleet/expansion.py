@@ -163,7 +163,7 @@ class FleetPolicy(Mapping[str, Enclave]):
                     raise PolicyError(
                         f"{profile.source}: the enclave {path} has more than {_MOST_NAMES} names",
                         "",
-                        "Divide it, or name fewer robots, such as a group.",
+                        "Divide the enclave, or name fewer robots, such as those of a group.",
                     )
                 if group.names:
                     groups.append(group)

@@ -408,7 +408,7 @@ def _load_yaml(data: bytes, label: str) -> Any:
             if depth > _MAX_DEPTH or isinstance(event, yaml.AliasEvent):
                 raise DocumentError(
                     f"{label} has an alias (*NAME), or is nested too deeply",
-                    f"It is at {str(event.start_mark).strip()}.",
+                    f"See line {event.start_mark.line + 1}." if event.start_mark else "",
                     _WRITE_INVENTORY,
                 )
         return yaml.load(data, Loader=loader)  # noqa: S506 - a safe loader

@@ -467,7 +467,8 @@ def _unused_rights(edges: Iterable[Edge]) -> tuple[OverlayDifference, ...]:
             differences[edge.mark, right] = ()
     for right, unused in reached.items():
         if any(unused):
-            note = f"{sum(unused)} of the {len(unused)} names that it matches were never observed"
+            were = "was" if sum(unused) == 1 else "were"
+            note = f"{sum(unused)} of the {len(unused)} names that it matches {were} never observed"
             differences[OverlaySide.FIRST, right] = (note,)
     return tuple(
         OverlayDifference(mark, str(right), notes)

@@ -182,7 +182,7 @@ def test_what_a_template_accepts_is_counted_and_fails_in_ci(tmp_path: Path) -> N
     ended = sros("check", tmp_path / "ks")
     assert ended.status == 1
     assert "an enclave that may do everything [keystore.allow-everything]" in ended.out
-    assert "1 warning, and 1 weakness that the template accepts (--strict" in ended.err
+    assert "1 warning, and 1 weakness that the template accepts (--strict counts it" in ended.err
     assert sros("check", tmp_path / "ks", "--strict").status == 1
 
 

@@ -93,7 +93,7 @@ DIAMONDS = {f"g{i}": {"children": [f"g{i + 1}", f"h{i + 1}"]} for i in range(30)
         ("h.json", "[" * 100_000, "nested too deeply"),
         ("h.yml", "[" * 500, "nested too deeply"),
         ("h.yml", "[" * 100_000, "nest"),  # a newer libyaml says so itself
-        ("h.yml", "a: &x {hosts: {}}\nb: *x\n", "alias"),
+        ("h.yml", "a: &x {hosts: {}}\nb: *x\n", "See line 2."),
         ("h.yml", "a: !vault x\n", "text, numbers, lists"),
         ("h.yml", "a: !!python/object/apply:os.system ['id']\n", "text, numbers, lists"),
         ("h.yml", "a: {\n", "text, numbers, lists"),
