@@ -279,8 +279,8 @@ class Fault(Enum):
         "an enclave whose certificate is revoked",
         "Every participant with this crl.pem refuses the enclave; Fast DDS does not report it.",
         "RFC 5280, 5; Fast DDS 2.6 to 3.6; tested.",
-        "This is intended after a revocation. If not, give the enclave a new key and certificate: "
-        "`sros renew {root} {enclave} --new-key`.",
+        "If the enclave should not be revoked, give it a new key and certificate: `sros renew "
+        "{root} {enclave} --new-key`.",
     )
     NOT_SIGNED = (
         "not-signed",

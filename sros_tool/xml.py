@@ -72,9 +72,10 @@ def read_file(
         why = why_unreadable(path, number)
         raise DocumentError(f"the {label} '{path}' cannot be read", why) from error
     if max(state.st_size, len(data)) > max_bytes:
+        limit = f"{max_bytes >> 20} MiB" if max_bytes >> 20 else f"{max_bytes} bytes"
         raise DocumentError(
             f"the {label} '{path}' is too large",
-            f"It has more than {max_bytes // 1024**2} MiB.",
+            f"It has more than {limit}.",
         ) from OSError(errno.EFBIG, os.strerror(errno.EFBIG), str(path))
     log_step("DEBUG", __name__, "read the %s '%s', %d bytes", label, path, len(data))
     return state, data

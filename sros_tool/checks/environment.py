@@ -41,6 +41,7 @@ from sros_tool.runtime.environment import (
 )
 from sros_tool.runtime.rmw import RMW, package_version
 from sros_tool.runtime.variables import DOMAIN, ENABLE, ENCLAVE, KEYSTORE, STRATEGY, domain_from
+from sros_tool.wording import enumerated
 from sros_tool.xml import read_bytes
 from sros_tool.zenoh.document import (
     ENDINGS,
@@ -255,7 +256,7 @@ def _spelling_findings(environment: Mapping[str, str]) -> Iterator[Finding]:
     elif named := set_without_enable(environment):
         yield NOT_ENABLED.found(
             ENABLE,
-            f"{' and '.join(named)} {'is' if len(named) == 1 else 'are'} set, and {ENABLE} is not",
+            f"{enumerated(named)} {'is' if len(named) == 1 else 'are'} set, and {ENABLE} is not",
         )
     if strategy not in (None, "", "Enforce", "Permissive"):
         yield STRATEGY_MISSPELT.found(STRATEGY, value_text(environment, STRATEGY))
@@ -312,7 +313,8 @@ def _enclave_findings(
     findings = keystore_findings(keystore, Circumstances(now, zone, domain), only_enclaves=(name,))
     for finding in findings:
         if finding.id == "enclave.governance-domain":
-            yield DOMAIN_NOT_GOVERNED.found(DOMAIN, finding.text, finding.file)
+            text = f"the governance of {name}: {finding.text}"
+            yield DOMAIN_NOT_GOVERNED.found(DOMAIN, text, finding.file)
         else:
             yield finding
 

@@ -458,7 +458,7 @@ def _local_time_findings(
         iso(datetime.fromtimestamp(moment, UTC)) if isfinite(moment) else "never"
         for moment in (begin, end)
     )
-    text = f"they are valid from {grant.not_before} to {grant.not_after}, "
+    text = f"its permissions are valid from {grant.not_before} to {grant.not_after}, "
     text += f"which the process reads as {read}"
     yield PROCESS_LOCAL_TIME.found(process.label, text)
 
@@ -771,7 +771,7 @@ def _domain_text(process: Process) -> str:
 
 def _daemon_findings(process: Process, environment: Mapping[str, str]) -> Iterator[Finding]:
     if not process.asks_for_security:
-        text = f"{ENABLE} is not 'true' in the environment of {process.label}"
+        text = f"{ENABLE} is not 'true' in its environment"
         yield DAEMON_UNSECURED.found(process.label, text)
         return
     differing = [
@@ -1083,7 +1083,8 @@ def _different_security_findings(
 ) -> Iterator[Finding]:
     for node in nodes:
         if node.network:
-            text = f"{security[node.pid]}, in domain {node.domain} of {node.network}"
+            where = f"in domain {node.domain} of the network namespace {node.network}"
+            text = f"{security[node.pid]}, {where}"
             yield PROCESS_ELSEWHERE.found(node.label, text)
 
 

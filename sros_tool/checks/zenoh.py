@@ -255,7 +255,9 @@ def configuration_findings(path: Path) -> Iterator[Finding]:
 def document_findings(document: ConfigurationDocument) -> Iterator[Finding]:
     """Yield the findings in a configuration."""
     for setting in document.unknown:
-        yield _finding_at(document, UNKNOWN_SETTING, setting, f"Zenoh up to 1.10 has no {setting}")
+        yield _finding_at(
+            document, UNKNOWN_SETTING, setting, f"Zenoh up to 1.10 has no setting {setting}"
+        )
     yield from _link_findings(document)
     yield from _open_feature_findings(document)
     if not document.access.enabled:
@@ -385,7 +387,8 @@ def _subject_findings(document: ConfigurationDocument) -> Iterator[Finding]:
     access = document.access
     open_to_all = _allowing_subjects_of_everybody(document)
     if open_to_all and is_self_limiting(document):
-        text = f"no certificate common name is stated by {_ids_text(open_to_all)}"
+        subjects = "subject" if len(open_to_all) == 1 else "subjects"
+        text = f"no certificate common name in the {subjects} {_ids_text(open_to_all)}"
         yield SELF_LIMITING.found(document.mode.value, text, document.name, open_to_all[0].line)
     else:
         for subject in open_to_all:
@@ -395,7 +398,7 @@ def _subject_findings(document: ConfigurationDocument) -> Iterator[Finding]:
     if pairs:
         first, second = pairs[0]
         least = "at least " if len(pairs) > _MOST_PAIRS else ""
-        further = f", and {least}{counted(len(pairs) - 1, 'more pair')}" if len(pairs) > 1 else ""
+        further = f"; so can {least}{counted(len(pairs) - 1, 'more pair')}" if pairs[1:] else ""
         text = f"subjects {first.id} and {second.id} can match the same process{further}"
         yield OVERLAPPING.found(f"subject {second.id}", text, document.name, second.line)
 

@@ -95,4 +95,4 @@ def test_subjects_that_overlap_by_the_million_are_not_all_counted(tmp_path: Path
     file = tmp_path / "session.json5"
     file.write_text(json.dumps(document))
     texts = [each.text for each in configuration_findings(file)]
-    assert any(each.endswith("and at least 1000 more pairs") for each in texts)
+    assert any(each.endswith("so can at least 1000 more pairs") for each in texts)

@@ -339,7 +339,7 @@ def test_what_happens_to_a_fleet(made: Path, tmp_path: Path) -> None:
     assert fleet and "r9" not in fleet.robots and len(fleet.robots) == len(ROBOTS) - 2
     words = ("--include", "keystore.left-enclaves", "--severity", "note", "--json")
     found = json.loads(sros("check", "ks", *words, cwd=folder).out)["findings"]
-    assert [each["text"] for each in found] == ["r9: /r9/base, /r9/lift"]
+    assert [each["text"] for each in found] == ["enclaves of r9: /r9/base, /r9/lift"]
     refused = sros("revoke", "ks", "--robot", "r9", cwd=folder)
     assert refused.status == 2
     assert "Name the enclaves themselves: --match '/r9/*'" in refused.err

@@ -403,7 +403,7 @@ def _former_robot_findings(keystore: CheckedKeystore, fleet: Fleet) -> Iterator[
         if robot := former_robot_of(fleet, name):
             robots.setdefault(robot, []).append(name)
     for robot, names in list(robots.items())[:_MOST_LEFT]:
-        clause = f"{robot}: {first_few(names, _SHOWN)}"
+        clause = f"enclaves of {robot}: {first_few(names, _SHOWN)}"
         yield LEFT_ENCLAVES.found("fleet", clause, keystore.shown_path(FLEET))
     if (more_robots := len(robots) - _MOST_LEFT) > 0:
         clause = f"enclaves of {counted(more_robots, 'more robot')}"

@@ -260,7 +260,7 @@ def _domain_problems(domains: DomainSet) -> Iterator[str]:
         if part.first is None and part.last is None:
             continue  # the rule has no <domains>, which is an error of its own
         if part.first is None or part.last is None:
-            yield f"{part} has only a minimum or only a maximum"
+            yield f"{part} has no {'minimum' if part.first is None else 'maximum'}"
         elif part.last > MAX_DOMAIN:
             yield f"{part} goes beyond {MAX_DOMAIN}"
 
@@ -475,7 +475,7 @@ def _domain_findings(enclave: CheckedEnclave, grant: Grant, file: str) -> Iterat
     if wanted != governed:
         yield DOMAINS.found(enclave.name, f"{text}its robot is in domain {wanted}", file)
         return
-    text += f"the governance for {governed}"
+    text += f"the governance is for domain {governed}"
     fewer = bool(allowed.ranges) and all(domain in governed for domain in allowed)
     # In an export, fewer domains may be intended, and no node can use a wrong domain.
     kind = FEWER_DOMAINS if fewer and not enclave.keystore.is_original else DOMAINS
