@@ -23,6 +23,7 @@ from sros_tool.cli.common import (
     print_json,
     verb,
 )
+from sros_tool.close.acceptance import Acceptance, Acceptances
 from sros_tool.errors import UsageError
 from sros_tool.terminal import echo
 from sros_tool.validity import iso
@@ -75,12 +76,17 @@ def _run(words: Sequence[str], shows_messages: bool) -> tuple[int, str, str]:
     help="Open the robot again: restart its systemd units without security.",
 )
 @click.option(
-    "--partial",
-    is_flag=True,
-    help="Accept processes whose nodes sros does not know, nodes that belong to no process here, "
-    "processes that sros could not examine, processes in enclaves that sros did not observe, and "
-    "requirements on names that the policy no longer has.",
+    "--accept",
+    "accept",
+    type=click.Choice([word.value for word in Acceptance]),
+    multiple=True,
+    help="nodes: accept processes whose nodes sros does not know, nodes that belong to no process "
+    "here, and processes whose nodes have the same name. unexamined: accept processes that sros "
+    "could not examine, such as those of other users. unobserved: accept processes in enclaves in "
+    "which sros did not observe them. requirements: accept a missing requirements.toml, and "
+    "requirements on names that the policy no longer has.  Can be repeated.",
 )
+@click.option("--partial", is_flag=True, help="Accept everything that --accept can accept.")
 @click.option(
     "--without",
     metavar="ENCLAVE",
@@ -117,6 +123,7 @@ def close(
     apply: bool,
     prove: bool,
     undo: bool,
+    accept: tuple[str, ...],
     partial: bool,
     without: tuple[str, ...],
     elsewhere: tuple[str, ...],
@@ -187,16 +194,17 @@ def close(
             )
         name = shlex.quote(str(folder))
         raise UsageError(f"'{folder}' has no watched robot", "", f"Run `sros close {name}` first.")
+    accepted = set(Acceptance) if partial else {Acceptance(word) for word in accept}
     with nullcontext() if dry_run or prove else robot.locked():
         if undo:
             closed = open_again(robot, dry_run=dry_run)
         elif prove:
             closed = prove_closed(robot)
         else:
-            closed = prepare(robot, duration, partial=partial, dry_run=dry_run)
+            closed = prepare(robot, duration, accepted=accepted, dry_run=dry_run)
             if apply and not closed.problems:
                 closed = apply_security(robot, closed, dry_run=dry_run)
-    holds = closed.is_proved(partial=partial)
+    holds = closed.is_proved(accepted)
     if as_json:
         print_json(closed)
     elif undo:
@@ -204,7 +212,7 @@ def close(
     elif closed.problems or not dry_run:
         if not (apply or prove):
             _show(robot, closed)
-        _show_end(robot, closed, apply=apply, holds=holds, partial=partial)
+        _show_end(robot, closed, apply=apply, holds=holds, accepted=accepted)
     if dry_run:
         return int(bool(closed.problems) and not undo)
     return int(bool(closed.problems) or ((apply or prove) and not holds))
@@ -343,19 +351,27 @@ _NOT_PROVED = (
 
 
 def _show_end(
-    robot: LocalRobot, closed: CloseState, *, apply: bool, holds: bool, partial: bool
+    robot: LocalRobot,
+    closed: CloseState,
+    *,
+    apply: bool,
+    holds: bool,
+    accepted: Acceptances,
 ) -> None:
     """Print whether the robot is closed, the reasons, and what to do next.
 
-    ``holds`` says whether the robot is proved closed; ``apply`` and ``partial`` are options.
+    ``holds`` says whether the robot is proved closed; ``apply`` is the option, and
+    ``accepted`` are the claims that need not have been tested.
     """
     from sros_tool.close.state import CONNECTED, TALK
 
     folder, observed = shlex.quote(str(robot.folder)), closed.observed
     ask, details = f"sros close {folder} --proof", list[str]()
     for proof in closed.proofs:
-        accept = " (--partial accepts this)" if proof.is_accepted_by_partial else ""
-        accept = " (accepted by --partial)" if accept and partial else accept
+        word = proof.acceptance
+        accept = f" (--accept {word} accepts this)" if word else ""
+        if word in accepted:
+            accept = " (accepted)"
         answer = _ANSWERS[proof.holds]
         if proof.holds and proof.denied:
             answer += ", except for what the policy takes away"
@@ -379,7 +395,7 @@ def _show_end(
         if robot.keystore.exists():
             details.append(f"bring {folder}/keystore to another machine: it has the CA keys")
     elif closed.proofs:
-        accept = _ACCEPT_ADVICE if closed.is_proved(partial=True) else ""
+        accept = _ACCEPT_ADVICE if closed.is_proved(set(Acceptance)) else ""
         next_command = (
             f"correct the problems above, and ask again with sros close {folder} --proof, "
         )
@@ -571,4 +587,4 @@ def _shared_start_text(processes: Sequence[ClosedProcess]) -> str:
 _MOST_DENIED = 4
 _ANSWERS = {True: "yes", False: "no", None: "not checked"}
 _NOT_CURRENT = "with earlier files or other settings"
-_ACCEPT_ADVICE = "accept unchecked claims with --partial, or "
+_ACCEPT_ADVICE = "accept unchecked claims with --accept, or "

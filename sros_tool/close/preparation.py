@@ -18,6 +18,7 @@ from typing import NamedTuple
 
 from sros_tool.checks.processes import has_other_files, other_folder_findings
 from sros_tool.checks.requirements import VACUOUS, VIOLATED
+from sros_tool.close.acceptance import Acceptance, Acceptances
 from sros_tool.close.nodes import ObservedNodes
 from sros_tool.close.processes import (
     ClosedProcess,
@@ -99,7 +100,9 @@ class CommandStep(NamedTuple):
         return f"sros {shlex.join(self.words)}{redirected}"
 
 
-def prepare(robot: LocalRobot, duration: str | None, *, partial: bool, dry_run: bool) -> CloseState:
+def prepare(
+    robot: LocalRobot, duration: str | None, *, accepted: Acceptances, dry_run: bool
+) -> CloseState:
     """Run the steps whose results are missing, write how each process is started; return the state.
 
     Raises:
@@ -121,14 +124,14 @@ def prepare(robot: LocalRobot, duration: str | None, *, partial: bool, dry_run: 
     if robot.export.exists() and robot.observation_file.exists():
         with suppress(SrosError):  # the steps report the error
             denied_before = [str(right) for right in _denied_rights(robot)]
-    done, problems, is_stopped = _run_steps(robot, duration, partial=partial, dry_run=dry_run)
+    done, problems, is_stopped = _run_steps(robot, duration, accepted=accepted, dry_run=dry_run)
     ignored = [] if dry_run else _ignore_in_git(robot)
     removed = [] if dry_run or is_stopped else _remove_enclaves(robot)
     if not (dry_run or is_stopped):
         _write_later_processes(robot)
     state = current_state(robot, robot.read_policy())._replace(steps=done, dry_run=dry_run)
     if dry_run and not is_stopped and robot.keystore.exists() and robot.export.exists():
-        problems += _problems_of(robot, state, partial=partial)
+        problems += _problems_of(robot, state, accepted=accepted)
     if dry_run or is_stopped:
         return state._replace(problems=problems, changes=ignored)
     denied_rights = _denied_rights(robot)
@@ -137,7 +140,7 @@ def prepare(robot: LocalRobot, duration: str | None, *, partial: bool, dry_run: 
     changes = [*ignored, *write_start_files(robot, state), *removed]
     denied = [str(right) for right in denied_rights]
     newly_denied = [right for right in denied if right not in denied_before]
-    problems += _problems_of(robot, state, partial=partial)
+    problems += _problems_of(robot, state, accepted=accepted)
     if not state.secured:
         for rmw in robot.rmws_without_security():
             robot.shell.say(
@@ -253,7 +256,7 @@ def denied_remappings(
 
 
 def _run_steps(
-    robot: LocalRobot, duration: str | None, *, partial: bool, dry_run: bool
+    robot: LocalRobot, duration: str | None, *, accepted: Acceptances, dry_run: bool
 ) -> tuple[list[CloseStep], list[str], bool]:
     """Run the steps; return their states, the problems, and whether a problem stopped the rest.
 
@@ -273,13 +276,13 @@ def _run_steps(
                 _, output, messages = robot.shell.run((*step.words, "--dry-run"), False)
                 robot.shell.say_lines(messages if output else "")
         elif state == "open" and not is_stopped:
-            state, step_problems = _run_step(robot, step, partial=partial)
+            state, step_problems = _run_step(robot, step, accepted=accepted)
             problems += step_problems
             is_stopped = step.guards and state == "findings"
         done.append(CloseStep(step.command, state))
         if step.into == robot.observation_file and not (dry_run and state == "open"):
             shared = [*_shared_program_problems(robot)]
-            shared += [] if partial else _shared_node_problems(robot)
+            shared += [] if Acceptance.NODES in accepted else _shared_node_problems(robot)
             problems, is_stopped = [*problems, *shared], bool(shared)
     if dry_run:
         problems = [text.replace(_NOT_SIGNED, "sros would sign nothing") for text in problems]
@@ -316,7 +319,9 @@ def steps(robot: LocalRobot, duration: str | None) -> Iterator[CommandStep]:
     yield CommandStep(("view", policy, *created, "-o", str(robot.page), "--force"))
 
 
-def _run_step(robot: LocalRobot, step: CommandStep, *, partial: bool) -> tuple[str, list[str]]:
+def _run_step(
+    robot: LocalRobot, step: CommandStep, *, accepted: Acceptances
+) -> tuple[str, list[str]]:
     """Run a step; return its state, and the reasons why the robot is not closed yet.
 
     Raises:
@@ -336,7 +341,8 @@ def _run_step(robot: LocalRobot, step: CommandStep, *, partial: bool) -> tuple[s
             if not line.startswith(EARLIER_FILES):  # this run exports, and says what to restart
                 robot.shell.say(line)
     needed = shlex.quote(str(robot.requirements))
-    if step.guards and not (status or partial) and (lost := [*_lost_protection(robot)]):
+    is_asked = step.guards and not status and Acceptance.REQUIREMENTS not in accepted
+    if is_asked and (lost := [*_lost_protection(robot)]):
         return "findings", lost
     if step.guards and VACUOUS.id in output:
         robot.shell.say(
@@ -374,7 +380,7 @@ def _lost_protection(robot: LocalRobot) -> Iterator[str]:
                 f"{robot.requirements}:{requirement.source.line} protects {enumerated(lost)}, "
                 f"which the policy does not name any more; {_NOT_SIGNED}. If the policy "
                 "renamed a name, also rename it in the requirement. If nobody needs a name any "
-                "more, remove it there (or accept this with --partial)"
+                "more, remove it there (or accept this with --accept requirements)"
             )
 
 
@@ -408,7 +414,7 @@ def _remove_enclaves(robot: LocalRobot) -> list[FileChange]:
     return [FileChange("remove", path) for path in paths]
 
 
-def _problems_of(robot: LocalRobot, state: CloseState, *, partial: bool) -> Iterator[str]:
+def _problems_of(robot: LocalRobot, state: CloseState, *, accepted: Acceptances) -> Iterator[str]:
     """Yield the problems that keep the robot from running closed, with their remedies."""
     yield from _keystore_problems(robot)
     for name in sorted(robot.not_here & state.secured.keys()):
@@ -423,7 +429,7 @@ def _problems_of(robot: LocalRobot, state: CloseState, *, partial: bool) -> Iter
     yield from _copy_problems(running)
     yield from _user_problems(robot, state.observed)
     yield from _launch_problems(robot, state.observed)
-    if not partial:
+    if Acceptance.NODES not in accepted:
         yield from _unknown_process_problems(running, state)
 
 
@@ -504,7 +510,7 @@ def _unknown_process_problems(running: RunningRobot, state: CloseState) -> Itera
     """Yield texts on processes without known nodes, and on nodes without a known process."""
     robot, observed = running.robot, state.observed
     close = robot.close_command
-    silent = "nobody would hear {} any more (--partial accepts this)"
+    silent = "nobody would hear {} any more (--accept nodes accepts this)"
     if observed.unknown:
         them, runs = ("it", "it runs") if len(observed.unknown) == 1 else ("them", "they run")
         processes = first_few(observed.unknown, MOST_NAMES)
@@ -531,8 +537,8 @@ def _unknown_process_problems(running: RunningRobot, state: CloseState) -> Itera
         yield (
             f"{routers[0].label} is a Zenoh router that did not run when sros watched, or does not "
             f"belong to the robot. Stop it, or watch again while it runs: {close} --for 1m. "
-            "Otherwise closed nodes do not reach each other through this router (--partial accepts "
-            "this)"
+            "Otherwise closed nodes do not reach each other through this router (--accept nodes "
+            "accepts this)"
         )
     pids = {process.enclave: process.pid for process in observed.processes}
     if twice := sorted(pids.keys() & {*observed.elsewhere}):
@@ -616,7 +622,7 @@ def _shared_node_problems(robot: LocalRobot) -> Iterator[str]:
                 f"{enumerated([*twins.values()])} call themselves {enclave}, and the enclave of "
                 f"this name would have the rights of all; {_NOT_SIGNED}. If one process is "
                 f"not of the robot, stop it, remove '{robot.policy}', and watch again: "
-                f"{robot.close_command} --for 1m. If all are of the robot, add --partial"
+                f"{robot.close_command} --for 1m. If all are of the robot, add --accept nodes"
             )
 
 

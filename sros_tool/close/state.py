@@ -16,6 +16,7 @@ from sros_tool.checks.processes import (
     why_order_is_unknown,
     zenoh_findings,
 )
+from sros_tool.close.acceptance import Acceptance, Acceptances
 from sros_tool.close.processes import (
     ROUTER,
     ClosedProcess,
@@ -72,6 +73,11 @@ _NEGATIONS = {
     TALK: "not everything that talked can still talk",
     CONNECTED: "the processes on this machine have not all connected to each other",
     SILENCE: "an open listener finds something",
+}
+_ACCEPTANCES = {
+    STARTED: Acceptance.UNEXAMINED,
+    KNOWN: Acceptance.UNOBSERVED,
+    REQUIRED: Acceptance.REQUIREMENTS,
 }
 _ACCEPTS_REVOKED = f"a certificate was revoked ({CRL_FILE}), and is still accepted by"
 
@@ -390,12 +396,13 @@ class Proof(NamedTuple):
         return _NEGATIONS[self.claim] if self.fails else self.claim
 
     @property
-    def is_accepted_by_partial(self) -> bool:
-        """Whether ``--partial`` accepts that the claim could not be tested.
+    def acceptance(self) -> Acceptance | None:
+        """What ``--accept`` has to name so that the claim need not be tested.
 
-        ``--partial`` never accepts this for claims that need an observer of the running robot.
+        It is None if the claim was tested, and for claims that need an observer of the running
+        robot.
         """
-        return self.holds is None and self.claim not in (TALK, SILENCE)
+        return _ACCEPTANCES.get(self.claim) if self.holds is None else None
 
 
 @shows(spread=("observed",))
@@ -471,11 +478,9 @@ class CloseState(NamedTuple):
     dry_run: DryRun
     changes: FileChanges
 
-    def is_proved(self, *, partial: bool) -> bool:
-        """Return whether the proof holds; ``partial`` accepts claims that could not be tested."""
-        claims = [
-            proof.holds or (partial and proof.is_accepted_by_partial) for proof in self.proofs
-        ]
+    def is_proved(self, accepted: Acceptances) -> bool:
+        """Return whether the proof holds; ``accepted`` claims need not have been tested."""
+        claims = [proof.holds or proof.acceptance in accepted for proof in self.proofs]
         return bool(claims) and all(claims)
 
     @property

@@ -24,6 +24,7 @@ from sros_tool.api import renew
 from sros_tool.cli import close
 from sros_tool.close import apply, assignment, nodes, preparation, proof, state, watch
 from sros_tool.close import robot as of_robot
+from sros_tool.close.acceptance import Acceptance
 from sros_tool.close.assignment import with_command_of_unit
 from sros_tool.close.preparation import steps
 from sros_tool.close.processes import ClosedProcess, ObservedProcesses, read_processes
@@ -715,7 +716,7 @@ def test_processes_that_started_after_the_watch(robot: Robot) -> None:
     robot.more = (late,)
     said = robot.close(status=1).out
     assert "knows no node of 1 process: process 7 (late): /opt/late --ros-args; watch again" in said
-    robot.close("--partial")
+    robot.close("--accept", "nodes")
     robot.more = ()
     robot.close()
     robot.by_hand = set(PID)
@@ -813,7 +814,8 @@ def test_a_node_that_does_not_run_always(robot: Robot) -> None:
     )
     assert "the robot is closed, without a process of /listener\n  the files are" in ended.err
     robot.unseen = (UnseenProcess(9, (), "/proc hides it", uses_ros=False),)
-    ended = robot.close(*without, "--partial")
+    robot.close(*without, "--accept", "unobserved", status=1)
+    ended = robot.close(*without, "--accept", "unexamined")
     assert "; not counted: /listener (not seen)\n" in ended.out
     robot.unseen = ()
     robot.absent, robot.by_hand = set(), {"/listener", "/talker"}  # it is compared, too
@@ -921,7 +923,7 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     more = f"every process in an enclave belongs there: {more}"
     guest = "in domain 0; process 5 (guest) runs open in domain 7\n"
     said = robot.close("--proof", status=1).out
-    assert f"{guest}not checked (--partial accepts this): {more}" in said
+    assert f"{guest}not checked (--accept unobserved accepts this): {more}" in said
     robot.more = (*robot.more[:2], *robot.more[4:], replace(seven, environment={}))
     said = robot.close("--proof", status=1).out
     assert "no: not every process was started in its enclave: process 5 (guest)" in said
@@ -1023,7 +1025,7 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
         "not checked: everything that talked can still talk: there is nothing to audit" in ended.out
     )
     assert "not checked: an open listener finds nothing: this proves nothing, because" in ended.out
-    assert "accept with --partial" not in ended.err
+    assert "--accept" not in ended.err
     robot.remaining = (TALKER, LISTENER)
     robot.unseen = (
         UnseenProcess(9, (), "/proc hides it", uses_ros=False),
@@ -1038,7 +1040,7 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
         "checks and signs it\n" in ended.out
     )
     assert (
-        "not checked (accepted by --partial): every process was started in its enclave: true for 2 "
+        "not checked (accepted): every process was started in its enclave: true for 2 "
         "enclaves; process 9 (?) (/proc hides it), process 10 (init) (Permission denied) may be "
         "nodes, but cannot be examined\n"
     ) in ended.out
@@ -1189,7 +1191,7 @@ def test_nothing_is_closed_of_what_is_not_understood(robot: Robot) -> None:
         "first:\n  sros knows no node of 1 process: process 5 (other)" in robot.close(status=1).out
     )
     assert (
-        "nobody would hear it any more (--partial accepts this)"
+        "nobody would hear it any more (--accept nodes accepts this)"
         in robot.close("--apply", status=1).out
     )
     assert robot.restarts == []
@@ -1710,7 +1712,7 @@ def test_what_is_exported_without_the_enclaves_of_other_machines(
     assert state_now.needed_elsewhere == {"/b": datetime.fromtimestamp(revoked, UTC)}
     for problems in ((), ("the policy is broken",)):
         close._show_end(
-            robot, state_now._replace(problems=problems), apply=False, holds=False, partial=False
+            robot, state_now._replace(problems=problems), apply=False, holds=False, accepted=set()
         )
         said = capsys.readouterr()
         assert ("fix this first" in said.out) is bool(problems)
@@ -1741,12 +1743,12 @@ def test_a_requirement_that_lost_its_right_is_told_before_a_review_fails(tmp_pat
     for name, told in (("x", False), ("gone", True)):
         needed = f'[[only]]\npublish = ["/{name}"]\nenclaves = ["/a"]\n'
         (tmp_path / "requirements.toml").write_text(needed)
-        preparation._run_step(robot, guard, partial=False)
+        preparation._run_step(robot, guard, accepted=set())
         assert ("`sros review` refuses a requirement" in said[-1]) is told, said
     # A name that is changed only in the policy loses its protection.
     sros("create_keystore", robot.keystore).ok()
     sros("generate_artifacts", "-k", robot.keystore, "-p", robot.policy).ok()
-    assert preparation._run_step(robot, guard, partial=False) == ("done", []), "as before"
+    assert preparation._run_step(robot, guard, accepted=set()) == ("done", []), "as before"
     robot.requirements.write_text(needed.replace("gone", "x"))
     for groups, other, lost in (
         (publish("*"), "", False),  # a wildcard in place of the name
@@ -1754,11 +1756,11 @@ def test_a_requirement_that_lost_its_right_is_told_before_a_review_fails(tmp_pat
         (publish("y"), "", True),
     ):
         robot.policy.write_text(policy_text({"/a": groups, "/b": other}))
-        state_of_step, problems = preparation._run_step(robot, guard, partial=False)
+        state_of_step, problems = preparation._run_step(robot, guard, accepted=set())
         assert state_of_step == ("findings" if lost else "done"), groups
         said_now = "toml:1 protects /x, which the policy does not"
         assert [said_now in problem for problem in problems] == [True] * lost
-    assert preparation._run_step(robot, guard, partial=True) == ("done", [])
+    assert preparation._run_step(robot, guard, accepted={Acceptance.REQUIREMENTS}) == ("done", [])
 
 
 def test_a_process_with_a_new_key_is_restarted_before_others(tmp_path: Path) -> None:

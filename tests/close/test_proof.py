@@ -11,6 +11,7 @@ from typing import Any, cast
 import pytest
 
 from sros_tool.close import proof
+from sros_tool.close.acceptance import Acceptance
 from sros_tool.close.nodes import MovedEndpoint
 from sros_tool.close.proof import (
     _abandoned_names,
@@ -121,7 +122,10 @@ def test_requirements_hold_if_they_hold_here_and_elsewhere(
     assert (f"{weak}: no enclave /x" in said.reason) is bool(holds)
     required.unlink()
     said = _proof_of_requirements(robot)
-    assert said.is_accepted_by_partial and f"{required} is missing; restore it" in said.reason
+    assert (
+        said.acceptance is Acceptance.REQUIREMENTS
+        and f"{required} is missing; restore it" in said.reason
+    )
 
 
 def test_a_demand_for_an_enclave_that_the_export_lacks_is_judged_by_the_keystore(
