@@ -367,7 +367,7 @@ def document_notes(label: str, permissions: Permissions, signed_bytes: int) -> I
 _CONSEQUENCES = {
     "portable.document-size": f"; with {MAX_SIGNED_BYTES} or more, Fast DDS 2.6 and 2.9 may "
     "never finish the handshake. Remove rights that are never used, or use wildcards (`sros "
-    "minimize_policy POLICY --observed OBSERVED` shows both), or split the enclave.",
+    "minimize_policy POLICY --observed OBSERVED` shows how), or split the enclave.",
     "portable.long-name": f"; on Fast DDS no peer matches a topic of more than "
     f"{_LONGEST_TOPIC} bytes. Use shorter namespaces and names.",
     "portable.deny-blocks-topic": " on Cyclone DDS, which refuses the topic as a whole; Fast "

@@ -212,7 +212,7 @@ def open_user_keystore(root: Path, topic: str, scenario: Scenario, now: datetime
             f"no two enclaves of keystore '{root}' may talk on {topic or 'a topic'}",
             "An attack needs an enclave that may publish a topic (named without wildcards), and"
             " another enclave that may subscribe to it." + read.faults_text(),
-            "Name a topic that two enclaves may use with --topic, or attack a keystore that"
+            "With --topic, name a topic that two enclaves may use, or attack a keystore that"
             " `sros demo --keep` made.",
         )
     service = _service(rights, cast) if "server" in cast else ""

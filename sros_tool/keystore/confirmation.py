@@ -502,8 +502,8 @@ class ReceivedConfirmation:
             "sros knows the files of only one of the two computers. Give the robot new keys, and "
             "revoke the earlier keys (docs/howto/one_robot.md: Same name, new hardware)."
         ) + was_restored * (
-            " Because the keystore was restored from a backup, this problem stays after that until "
-            f"a message comes after {iso(alternated + _ALTERNATED_SHOWN)}."
+            " Because the keystore was restored from a backup, this problem stays after new "
+            f"keys, until a message comes after {iso(alternated + _ALTERNATED_SHOWN)}."
         )
 
     def clock_note(self) -> str:

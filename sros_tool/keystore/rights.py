@@ -849,7 +849,7 @@ def without_enclaves_of_sros(source: RightsSource, other: RightsSource) -> Right
     if named := sorted(left_out & routers):
         number = counted(len(named), "Zenoh router")
         text = (
-            f"left out: {number}, not in the policy, and with no other rights than every node needs"
+            f"left out: {number}, not in the policy, and with only the rights that every node needs"
         )
         notes = (*notes, Note("rights.routers", f"{text}: {first_few(named, 5)}."))
     return replace(

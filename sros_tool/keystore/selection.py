@@ -300,8 +300,8 @@ def _enclaves_of_robots(
         raise KeystoreError(
             f"'{root}' is not a keystore with a fleet, so it has no robot {robots[0]!r}",
             "An export for a robot has only the enclaves of that robot, and not the fleet.",
-            "Leave --robot out, choose enclaves with --match, or name the keystore from which it "
-            "was exported.",
+            "Leave --robot out, choose enclaves with --match, or name the keystore from which "
+            "this folder was exported.",
         )
     if fleet is None:
         raise KeystoreError(

@@ -318,8 +318,8 @@ def _read_zenoh_routers(tables: _Table) -> Iterator[ZenohRouter]:
         for pattern in router.enclaves:
             if not pattern.startswith("/") or set(pattern) & set("?[]"):
                 raise _TemplateError(
-                    f"{table.path}.enclaves has {pattern!r}, which is not the name of enclaves, "
-                    "such as /r1/*"
+                    f"{table.path}.enclaves has {pattern!r}, which is neither an enclave nor a "
+                    "pattern such as /r1/*"
                 )
         table.finish()
         yield router

@@ -136,7 +136,7 @@ def check_signer(certificate: x509.Certificate) -> None:
             f"sros cannot sign with the CA {subject_text(certificate.subject)}",
             "Its certificate breaks rules of X.509 (RFC 5280); DDS reads it nevertheless, but "
             "sros cannot issue certificates with it.",
-            "Issue the certificate of the CA again, without the damage or with other extensions.",
+            "Issue the certificate of the CA again, by the rules of X.509.",
         )
 
 

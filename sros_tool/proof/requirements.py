@@ -819,7 +819,7 @@ def _at_most_from(table: _Table) -> AtMost:
     if type(most) is not int or not 0 < most < 2**31:
         raise table.error(
             "enclaves",
-            f"enclaves has {shortened(most)}, which is not a number",
+            f"enclaves has {shortened(most)}, which is not a whole number from 1 on",
             "Write how many enclaves may use one name, at least 1. If none may, write [[nobody]].",
         )
     return AtMost(**common, rights=table.rights(), most=most)

@@ -380,7 +380,7 @@ def _text(path: Path) -> str:
     if set(text) & set(";?") or any("\ud800" <= letter <= "\udfff" for letter in text):
         raise KeystoreError(
             f"the path {text!r} cannot be given to Zenoh",
-            "Zenoh reads a path as UTF-8 text, and does not accept ';' and '?' in it.",
+            "Zenoh reads a path as UTF-8 text, and does not accept ';' or '?' in it.",
             "Move the keystore to a path without such characters.",
         )
     return json.dumps(text, ensure_ascii=False).translate(_LINE_ENDS)

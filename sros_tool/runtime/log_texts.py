@@ -283,7 +283,7 @@ _CYCLONE_PARTICIPANT_TEXTS = (
         "peer-refused", _CYCLONE, r"(?:Begin|Process) handshake (?:request |reply )?failed: "
         r"Certificate not valid: error: (?P<reason>[^;]+)",
         "a PEER was refused, not this process: the peer's certificate is not accepted ({reason}); "
-        "if the two have different CAs, the peer logs the same message or nothing",
+        "if the two processes have different CAs, the peer logs the same message or nothing",
         _SAME_KEYSTORE,
     ),
     _log_text(
@@ -456,7 +456,7 @@ _CYCLONE_START_TEXTS = (
         "participant", _CYCLONE, r"rmw_create_node: failed to create (?:DomainParticipant|domain)",
         "the process could not join its domain, and this line does not say whether DDS Security, "
         "the network interface or the domain is the reason: an earlier line of Cyclone DDS, on "
-        "standard error, says the reason", _EXPLAIN_REMEDY, _ALL_FAULTS, vagueness=2,
+        "standard error, gives the reason", _EXPLAIN_REMEDY, _ALL_FAULTS, vagueness=2,
     ),
 )  # fmt: skip
 
@@ -633,7 +633,7 @@ _FAST_START_TEXTS = (
     _log_text(
         "endpoint-gone", _FAST, r"Cannot find (?:local|remote) (?:reader|writer|participant)\b",
         "a message could not be protected, because its writer, its reader or the peer is not known "
-        "yet or has just gone: seen when a process starts or ends",
+        "yet or has just gone: this happens when a process starts or ends",
         "Do nothing if such messages stop. If they continue, restart the process and its peers.",
         vagueness=1,
     ),

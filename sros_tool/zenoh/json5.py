@@ -129,7 +129,7 @@ def _tokens(text: str, maximum: int) -> Iterator[_Token]:
     while at < len(text):
         count += 1
         if count > 2 * maximum:  # up to half of the tokens may be space
-            raise Json5Error(f"more than {maximum} tokens", line)
+            raise Json5Error(f"the text has more than {maximum} tokens", line)
         match = _TOKEN.match(text, at)
         if match is None:
             raise Json5Error(f"unexpected {text[at : at + 10]!r}", line)
@@ -238,7 +238,7 @@ def _unescaped(text: str, line: int) -> str:
     try:  # two escapes can be the two surrogates of one character
         return text.encode("utf-16", "surrogatepass").decode("utf-16")
     except UnicodeDecodeError:
-        raise Json5Error("a text with half a character (a lone surrogate)", line) from None
+        raise Json5Error("a text has half a character (a lone surrogate)", line) from None
 
 
 def _number_of(token: _Token) -> float:

@@ -86,7 +86,7 @@ def test_a_router_without_rights_of_its_own_does_not_differ_from_the_policy(fold
     assert "+ /router ALLOW publish" in sros(*compare, cwd=folder).out
     sros("zenoh", "ks", cwd=folder).ok()
     ended = sros(*compare, cwd=folder).ok()
-    left_out = "left out: 1 Zenoh router, not in the policy, and with no other rights than every"
+    left_out = "left out: 1 Zenoh router, not in the policy, and with only the rights that every"
     assert (ended.out, f"{left_out} node needs: /router." in ended.err) == ("", True)
     (folder / "known.xml").write_text(policy_text({"/a": "", "/b": "", "/router": ""}))
     known = sros("diff_policy", "known.xml", "ks", cwd=folder)

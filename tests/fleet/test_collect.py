@@ -1208,7 +1208,7 @@ def test_a_publishing_folder_that_lost_its_files_is_not_in_order(
     assert f"metadata/timestamp.json, which robots fetch: {command} says what to check" in found
     refused = sros(*publish, cwd=home.folder)
     assert (
-        "if the keystore was restored, first repeat the revocations after the backup" in refused.err
+        "if the keystore was restored, first repeat the revocations that were made" in refused.err
     )
     collect = ("fleet", "collect", "ks", "inbox", "--publish", str(pub))
     refused = sros(*collect, cwd=home.folder)

@@ -110,7 +110,7 @@ _REASONS = {
     "peer-refuses-participant": "peers do not accept the participant on this domain",
     "no-grant": "no grant names the subject",
     "empty-subject": "a certificate with an empty subject crashes the process",
-    "blank-subject": "a grant whose subject has a part that is only blanks crashes the process",
+    "blank-subject": "a grant whose subject has a part of only blanks crashes the process",
     "not-yet-valid": "the grant of the subject is not valid yet",
     "expired": "the grant of the subject has expired",
     "malformed": "the vendor does not accept a document",

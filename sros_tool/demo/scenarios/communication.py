@@ -227,7 +227,7 @@ def _rows_of(kind: _Interface, pair_meaning: str) -> tuple[Row, ...]:
         Row(
             f"unsecured client of a secured {kind.server}",
             RowStatus.NOT_ANSWERED,
-            "a server ignores a client that cannot authenticate, and would send it no answer",
+            "a server ignores a client that cannot authenticate, and sends it no answer",
             (open_client, server, client),
             (answered(open_client.name, server.name, holds=False),),
             (answered(client.name, server.name),),

@@ -905,7 +905,7 @@ class _Publication:
             f"nothing in '{self._folder}' shows what was revoked, or which rights were taken away, "
             f"after {since}: a robot that was stolen after that gets releases, and is trusted. "
             f"Run `sros fleet collect {where} INBOX` if you have not yet: it revokes again what "
-            "messages of robots show. Revoke again what else was stolen (`sros revoke "
+            "messages of robots show as revoked. Revoke again what else was stolen (`sros revoke "
             f"{where} --robot NAME`), and sign the present policy (`sros generate_artifacts`). "
             "Then publish again.",
         )
@@ -949,7 +949,8 @@ class _Publication:
             "was lost, too, robots that were revoked after the backup would get releases again.",
             "Name the folder in which the keystore publishes. If that folder is lost, or this is "
             f"an additional folder, add --new-folder to {self._command}; if the keystore was "
-            "restored, first repeat the revocations after the backup, and add --restored as well.",
+            "restored, first repeat the revocations that were made after the backup, and add "
+            "--restored as well.",
         )
 
     def _has_later_releases(self, restored: bool) -> bool:
@@ -1195,8 +1196,9 @@ class _Publication:
             f"'{self.keystore.root}' sealed but does not know (up to the number "
             f"{unknown[-1].number})",
             f"run `sros fleet collect {where} INBOX`, which revokes again what messages of robots "
-            f"show. Revoke again what else was revoked (`sros revoke {where} --robot NAME`). Empty "
-            f"'{self._folder / _METADATA}', and add --restored --new-folder to {self._command}: "
+            f"show as revoked. Revoke again what else was revoked (`sros revoke {where} --robot "
+            f"NAME`). Empty '{self._folder / _METADATA}', and add --restored --new-folder to "
+            f"{self._command}: "
             "this also revokes again what these releases revoke. Then renew all certificates, and "
             f"publish again.{end} docs/howto/keystore_is_lost.md has these steps",
         )

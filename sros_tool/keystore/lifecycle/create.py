@@ -799,13 +799,13 @@ def _restart_text(mismatch: Mismatch, *, revoked: bool) -> str:
             "certificates of other processes. Until then, running processes communicate as before."
         )
     if mismatch:
-        which, effect, more = "all processes together", "do not communicate", ""
+        which, where, more = "all processes together", "", ""
         if not mismatch.everything:
             which = f"together the processes that use {', '.join(mismatch.names)}"
-            effect, more = f"{effect} on these names, but do on all others", f" {IF_EXPIRED}"
+            where, more = " on these names, but do on all other names", f" {IF_EXPIRED}"
         return (
-            f"Cyclone DDS and Fast DDS: restart {which}; restarted and other processes "
-            f"{effect}. Until then, running processes communicate as before.{more}"
+            f"Cyclone DDS and Fast DDS: restart {which}; restarted processes do not communicate "
+            f"with others{where}. Until then, running processes communicate as before.{more}"
         )
     return f"All vendors: {ONE_BY_ONE} Until its restart, a process keeps its former files."
 

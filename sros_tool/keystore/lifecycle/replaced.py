@@ -312,7 +312,7 @@ def old_program_text(replaced_rights: Iterable[ReplacedRights]) -> str:
         return ""
     return (
         "a program that still uses a lost right may not start with the new files: start a version "
-        "without this use, or sign the earlier policy again"
+        "that does not use it, or sign the earlier policy again"
     )
 
 

@@ -659,7 +659,7 @@ class RevocationListSigner:
             raise KeystoreError(
                 f"the key of the old identity CA {name} is not available",
                 "Until that CA is retired, Fast DDS accepts its certificates, so the CA also has "
-                f"to sign a revocation list: {error.what}.",
+                f"to sign a revocation list, but {error.what}.",
                 f"First restart all processes and run `sros rotate_ca {quote(str(self._root))} "
                 "--to retire`; or add --until-retired, and retire the CA soon.",
             )

@@ -445,7 +445,9 @@ def _certificate_renewed_by_service(
     """Return a CA service's own new certificate: the same name and key, with later dates."""
     if not (issued and change.keyring.ca_service(change.root, IDENTITY, change.template)):
         raise UsageError(
-            "only a CA service issues its own certificate",
+            "only a CA service issues its own certificate"
+            if issued
+            else "the CA service itself has to issue its new certificate",
             "",
             "Leave --identity-ca out."
             if issued
