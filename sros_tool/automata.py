@@ -474,7 +474,7 @@ def _too_many_error() -> DocumentError:
         "there are too many wildcards to decide which names they match",
         "Too many combinations of names would have to be compared, for example with many '?' after "
         "a '*'.",
-        "Write names instead of wildcards, or fewer wildcards.",
+        "Use fewer wildcards, or names in place of wildcards.",
     )
 
 

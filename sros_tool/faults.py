@@ -110,7 +110,7 @@ class Fault(Enum):
         "a file of an enclave cannot be read",
         "DDS cannot read it either.",
         _SOURCE_RCL,
-        "Give the user that runs the node permission to read the file.",
+        "Allow the user that runs the node to read the file.",
     )
     FILE_NO_FILE = (
         "file-no-file",
@@ -211,7 +211,7 @@ class Fault(Enum):
     )
     KEY_TWICE = (
         "key-twice",
-        "an enclave with a key in a file, and another on a token",
+        "an enclave with two keys, one in a file and one on a token",
         "rmw_fastrtps of ROS 2 Jazzy and later uses the key on the token; every other RMW uses "
         "the file, which can be copied.",
         "rmw_dds_common of ROS 2 Jazzy (security.cpp).",

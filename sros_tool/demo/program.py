@@ -97,6 +97,7 @@ from sros_tool.runtime.netns import (
 from sros_tool.runtime.processes import MappedLibrary, dds_of
 from sros_tool.runtime.vendor_log import plain_text
 from sros_tool.values import versioned
+from sros_tool.wording import counted
 
 _DEFAULT_DOMAIN = 80
 """First ROS domain of the rows; below 102, so that Linux does not assign its ports."""
@@ -216,7 +217,7 @@ def run_demo(options: DemoOptions, now: datetime, progress: Progress) -> DemoRes
                 if not party.other_topic
             )
             progress(
-                f"{scenario.name}: running {len(scenario.rows)} rows on {backend.name}"
+                f"{scenario.name}: running {counted(len(scenario.rows), 'row')} on {backend.name}"
                 f" ({backend.dds}): {backend.why}"
             )
             plan = RunPlan(

@@ -293,7 +293,7 @@ def _judge_hearing(case: _ClaimRecords) -> _ClaimFinding:
     if record.row.meanwhile is not None:  # messages before the change prove nothing
         heard = [event for event in heard if _is_in_window(event, record)]
     arrived = len(sent & {event.text for event in heard})
-    heard_of = f"{arrived} of {len(sent)} messages of the {claim.talker}"
+    heard_of = f"{arrived} of {counted(len(sent), 'message')} of the {claim.talker}"
     return case.result(bool(heard), f"{claim.subject} heard {heard_of} in {record.seconds:.1f} s")
 
 
@@ -314,7 +314,9 @@ def _judge_execution(case: _ClaimRecords) -> _ClaimFinding:
     if not asked:
         return _undecided_finding(f"{claim.talker} sent no request during the observation")
     reached = case.messages_heard()
-    number = f"{min(len(reached), len(asked))} of {len(asked)} requests of the {claim.talker}"
+    number = (
+        f"{min(len(reached), len(asked))} of {counted(len(asked), 'request')} of the {claim.talker}"
+    )
     return case.result(bool(reached), f"{claim.subject} executed {number}")
 
 
@@ -410,7 +412,9 @@ def _judge_view(case: _ClaimRecords) -> _ClaimFinding:
         return _undecided_finding(f"{claim.subject} made no count during the observation")
     most = max(event.publishers.get(topic, 0) for event in looks)
     seen = f"{counted(most, 'server' if serves else 'publisher')} on {topic}"
-    return case.result(most > 0, f"{observer.library} counts {seen} in {len(looks)} polls")
+    return case.result(
+        most > 0, f"{observer.library} counts {seen} in {counted(len(looks), 'poll')}"
+    )
 
 
 def _judge_loss(case: _ClaimRecords) -> _ClaimFinding:
@@ -826,7 +830,7 @@ def _summary(result: DemoResult) -> str:
     wrong = sum(1 for row in rows if not row.as_expected)
     known = sum(1 for row in rows if row.known_open)
     good = len(rows) - wrong - sum(1 for row in rows if row.observed is RowStatus.SKIPPED)
-    parts = [f"{good} of {len(rows)} rows as expected"]
+    parts = [f"{good} of {counted(len(rows), 'row')} as expected"]
     if known:
         parts.append(f"{known} of them known to be open")
     if opened:
@@ -908,7 +912,9 @@ def _summary_cast(members: Sequence[CastMember]) -> list[str]:
 def _verdict(result: DemoResult, wrong: Sequence[RowResult]) -> str:
     known = sum(1 for row in result.rows if row.known_open)
     good = "as expected" if result.as_expected else "as expected in all rows that ran"
-    parts = [f"{len(wrong)} of {len(result.rows)} rows not as expected" if wrong else good]
+    parts = [
+        f"{len(wrong)} of {counted(len(result.rows), 'row')} not as expected" if wrong else good
+    ]
     if known:
         parts.append(f"{counted(known, 'attack')} known to succeed")
     return ", ".join([*parts, *_left_out_clauses(result)]) + "."

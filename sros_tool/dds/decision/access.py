@@ -576,7 +576,7 @@ def _verdict_text(
             word = "ALLOW" if verdict.allowed else "DENY"
             return f"no rule names {asked_access}, and the grant's default is {word}"
         case "open-range":
-            return f"{rule} has domains without <min>, which crashes the process"
+            return f"{rule} has a range of domains without <min>, which crashes the process"
         case "empty-topic":
             return f"{rule} has a <topic> without text, which crashes the process"
         case "empty-default":

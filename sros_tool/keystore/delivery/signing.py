@@ -147,7 +147,7 @@ def sign_request(
     """
     if data.count(_REQUEST_END) > 1:
         raise DocumentError(
-            "there are several requests, and an answer is for one",
+            "there are several requests, but an answer is for one request",
             "",
             "Give the request of one enclave, or add --no-answer.",
         )
@@ -289,7 +289,8 @@ def _check_vouching(keystore: OpenedKeystore, vouching: Mapping[str, Collection[
         if not present or present.serial_number not in serials or not revoked.isdisjoint(serials):
             raise KeystoreError(
                 f"enclave {name} was changed while its request was examined",
-                "What vouches for the request may have been revoked. Nothing was signed.",
+                "The certificate that vouches for the request may have been revoked. Nothing was "
+                "signed.",
                 "Repeat the command: it examines the request again.",
             )
 

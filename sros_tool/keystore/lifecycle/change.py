@@ -819,8 +819,8 @@ def _revoked_name_notes(
     if revoked_again:
         yield Note(
             "zenoh.revoked-name",
-            f"a revoked certificate of {', '.join(revoked_again)} has not expired: "
-            "Zenoh has no revocation list, so anyone who has the certificate gets the rights of "
-            "that enclave. Give the enclave another name, or replace the identity CA with "
+            f"revoked certificates of {', '.join(revoked_again)} have not expired: "
+            "Zenoh has no revocation list, so anyone who has such a certificate gets the rights "
+            "of its enclave. Give the enclave another name, or replace the identity CA with "
             "`sros rotate_ca`.",
         )
