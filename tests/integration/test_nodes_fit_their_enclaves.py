@@ -41,10 +41,12 @@ from tests.integration.test_policies_live import all_dds_endpoints, observed_in,
 from tests.integration.test_policies_live import observe as look
 from tests.support.children import LONG
 from tests.support.long_form import ONLY_LONG, some
+from tests.support.users import as_root
 
 pytestmark = [
     pytest.mark.dds,
     pytest.mark.skipif(importlib.util.find_spec("rclpy") is None, reason="rclpy is not here"),
+    as_root,
 ]
 
 TOPIC = "/chatter"
