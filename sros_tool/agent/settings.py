@@ -205,7 +205,7 @@ def settings_from(value: Mapping[str, Any], label: str) -> AgentSettings:
                 label, f"{key} is not a known key, or its value has the wrong form"
             )
     if missing := [key for key in ("robot", "from", "inbox") if _TEXT_KEYS[key] not in fields]:
-        raise _invalid_settings_error(label, f"it lacks {', '.join(missing)}")
+        raise _invalid_settings_error(label, f"It lacks {', '.join(missing)}")
     settings = AgentSettings(**fields)
     if problem := name_problem(settings.robot):
         raise _invalid_settings_error(
@@ -228,7 +228,7 @@ def settings_from(value: Mapping[str, Any], label: str) -> AgentSettings:
 def _unit_from_table(value: Any, label: str) -> Unit:
     if not isinstance(value, dict) or value.keys() != {"name", "enclaves"}:
         raise _invalid_settings_error(
-            label, "a unit does not have exactly the keys name and enclaves"
+            label, "A unit does not have exactly the keys name and enclaves"
         )
     name, enclaves = value["name"], value["enclaves"]
     if not isinstance(name, str) or not _UNIT_NAME.match(name):
@@ -236,7 +236,7 @@ def _unit_from_table(value: Any, label: str) -> Unit:
             label, f"{name!r} is not the name of a service or target of systemd"
         )
     if not _is_list_of_texts(enclaves):
-        raise _invalid_settings_error(label, f"the enclaves of {name} are not a list of names")
+        raise _invalid_settings_error(label, f"The enclaves of {name} are not a list of names")
     try:
         return Unit(name, tuple(map(check_enclave_name, enclaves)))
     except InvalidNameError as error:

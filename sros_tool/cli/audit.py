@@ -184,7 +184,7 @@ def audit(
             unknown = str(error)
     audited = judge(snapshot.everything)
     if unknown:
-        notes = (*audited.notes, Note("audit.zenoh-unknown", f"a DDS vendor decided. {unknown}"))
+        notes = (*audited.notes, Note("audit.zenoh-unknown", f"a DDS vendor decided: {unknown}"))
         audited = replace(audited, unjudged=(*audited.unjudged, _NO_ZENOH_FILES), notes=notes)
     left_out = [
         text

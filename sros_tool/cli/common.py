@@ -1036,7 +1036,8 @@ def read_log(log: str) -> str:
     except FileNotFoundError as error:
         raise DocumentError(f"the log '{log}' does not exist") from error
     except OSError as error:
-        raise DocumentError(f"the log '{log}' cannot be read", f"{error.strerror}.") from error
+        why = f"{error.strerror or error}."
+        raise DocumentError(f"the log '{log}' cannot be read", why) from error
     except ValueError as error:  # a path with a NUL byte
         raise DocumentError(f"the log '{log}' does not exist") from error
     if len(data) > MAX_LOG:

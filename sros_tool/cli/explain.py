@@ -289,7 +289,7 @@ def explain(
             sros explain keystore /talker --log -
     """
     if sum((who, bool(reach), bool(logs))) > 1:
-        raise UsageError("--who, --reach and --log exclude each other")
+        raise UsageError("--who, --reach and --log exclude each other", "", "Choose one.")
     if len(logs) > 1:
         raise UsageError("--log takes one log", "", "Run the command once for each log.")
     from sros_tool.explain.asking import is_policy

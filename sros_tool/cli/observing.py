@@ -272,7 +272,7 @@ def _observer_error(error: ObserverError, environment: dict[str, str]) -> SrosEr
             f"Run `sros inspect` on the enclave{', or unset ' + ENABLE if by_shell else ''}.",
         )
     last = [line for line in plain_text(error.output).splitlines() if line.strip()][-1:]
-    why = error.reason + (f" Its last message: {last[0].strip()}" if last else "")
+    why = error.reason + (f" The observer's last message: {last[0].strip()}" if last else "")
     return UnavailableError(error.what, why, "`sros doctor` shows what works here.")
 
 

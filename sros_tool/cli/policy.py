@@ -124,7 +124,7 @@ def merge_policy(
     from sros_tool.policy.merge import EditedText, MergedPolicy
 
     if in_place and output:
-        raise UsageError("--in-place and --output exclude each other")
+        raise UsageError("--in-place and --output exclude each other", "", "Choose one.")
     target = policy if in_place else output
     if output:
         check_output(output, force=force)

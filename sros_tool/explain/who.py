@@ -348,8 +348,8 @@ def follow_reach(
     if source.routers and enclave not in source.routers:
         routers = first_few(list(source.routers), 3)
         text = (
-            f"whoever has the key of {routers} can send and read everything that passes through "
-            "the router, whatever the permissions say. This is not followed: `--reach "
+            f"whoever has the key of a router ({routers}) can send and read everything that passes "
+            "through this router, whatever the permissions say. This is not followed: `--reach "
             f"{source.routers[0]}` shows whom the router reaches."
         )
         notes.append(Note("explain.zenoh-router", text))

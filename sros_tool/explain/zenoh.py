@@ -344,13 +344,13 @@ class ZenohEvaluator:
                 f"keystore '{self.root}' has no {ROUTER_FILE}",
                 "sros cannot know what the router enforces without the router's file.",
                 "Ask about the keystore that this one was exported from, or write the files again. "
-                f"{remedy_in_keystore(self.root, '`sros zenoh KEYSTORE`.')}",
+                f"{remedy_in_keystore(self.root, 'Run `sros zenoh KEYSTORE`.')}",
             )
         raise KeystoreError(
             f"keystore '{self.root}' has no Zenoh configurations",
             "Without these files, nodes in its enclaves cannot open a session; with the default "
             "files of rmw_zenoh, nodes run without any access control.",
-            f"Write them. {remedy_in_keystore(self.root, '`sros zenoh KEYSTORE`.')}",
+            remedy_in_keystore(self.root, "Run `sros zenoh KEYSTORE`."),
         )
 
     def _router_of(self, enclave: str) -> ZenohFile:

@@ -376,7 +376,9 @@ def _load_inventory(data: bytes, label: str, *, is_json: bool) -> Mapping[str, A
         try:
             value = parse_json(data)
         except ValueError as error:
-            raise DocumentError(f"{label} is not valid JSON", f"{error}.") from error
+            why = str(error)
+            why = f"{why[:1].upper()}{why[1:]}."
+            raise DocumentError(f"{label} is not valid JSON", why) from error
     else:
         value = _load_yaml(data, label)
     if not isinstance(value, dict):

@@ -168,7 +168,7 @@ def _similar_names_remedy(name: str, known: Iterable[str]) -> str:
     similar = get_close_matches(name[:_MAX_NAME], names, n=3, cutoff=0.5) or names[:3]
     similar.sort(key=natural_sort_key)
     return (
-        f"It has {', '.join(similar)}{', ...' if len(names) > len(similar) else ''}."
+        f"It has {', '.join(similar)}{' and others' if len(names) > len(similar) else ''}."
         if similar
         else ""
     )
