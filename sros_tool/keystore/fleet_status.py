@@ -1639,8 +1639,8 @@ def fleet_metrics(
         ),
         Metric(
             "sros_fleet_expiry_timestamp_seconds",
-            "The first expiry of the files that a robot confirmed, by kind, in seconds since 1970, "
-            "from the ledger.",
+            "When the first of the files that a robot confirmed expires, by kind, from the ledger, "
+            "in seconds since 1970.",
             tuple(
                 Sample(int(end.timestamp()), {**labels, "kind": kind})
                 for labels, robot in robots
@@ -1649,8 +1649,8 @@ def fleet_metrics(
         ),
         Metric(
             "sros_fleet_restarts_due",
-            "Number of enclaves whose processes may still run with earlier files, for robots that "
-            "report it.",
+            "For robots that report restarts: number of enclaves whose processes may still run "
+            "with earlier files.",
             per_robot(lambda robot: None if robot.restart is None else len(robot.restart)),
         ),
         Metric(
@@ -1689,8 +1689,8 @@ def fleet_metrics(
         ),
         Metric(
             "sros_fleet_agent_problems",
-            "Number of problems of a robot that its agent has not mended, for robots that report "
-            "problems.",
+            "For robots that report problems: number of problems that the robot's agent has not "
+            "mended.",
             per_robot(
                 lambda robot: (
                     None
@@ -1701,8 +1701,8 @@ def fleet_metrics(
         ),
         Metric(
             "sros_fleet_agent_mended",
-            "Number of problems of a robot that its agent has mended in the last day, such as a "
-            "file that was changed, for robots that report problems.",
+            "For robots that report problems: number of problems that the robot's agent has mended "
+            "in the last day, such as changed files.",
             per_robot(
                 lambda robot: (
                     None if robot.problems is None else sum(map(is_mended, robot.problems))
@@ -1723,8 +1723,8 @@ def fleet_metrics(
         ),
         Metric(
             "sros_fleet_pending_files",
-            "Number of files by kind to deliver to a robot or to remove there, for robots that "
-            "sent a confirmation.",
+            "For robots that sent a confirmation: number of files, by kind, to deliver to the "
+            "robot or to remove there.",
             tuple(
                 Sample(
                     sum(number for state, number in states.items() if state is not State.CURRENT),

@@ -196,9 +196,9 @@ def edit_remedy(root: Path | str) -> str:
 
 _LONG_ENOUGH = timedelta(days=2)
 LENGTHEN_PERMISSIONS = (
-    "If new permissions are valid for less than a day, first lengthen this time in `sros.toml` of "
-    "the keystore: the validity of the [[enclaves]] entry for the enclave, or, without such an "
-    "entry, of [permissions]. Then run `sros update_keystore KEYSTORE --take-edits "
+    "If new permissions are valid for less than a day, first choose a longer validity in "
+    "`sros.toml` of the keystore: in the [[enclaves]] entry for the enclave or, without such an "
+    "entry, in [permissions]. Then run `sros update_keystore KEYSTORE --take-edits "
     "--allow-looser`."
 )
 """How to lengthen the validity of permissions if the settings of their keystore are not known."""

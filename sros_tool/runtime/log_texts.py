@@ -164,7 +164,7 @@ _RENEW_PARTICIPANT = (
 _OTHER_PERMISSIONS_CA = (
     "its permissions are not signed by a permissions CA that this process has loaded. This process "
     "was not restarted since stage 1 of a rotation (`sros rotate_ca`), or the peer was not "
-    "restarted since stage 2; or the two processes have enclaves of different keystores, or the "
+    "restarted since stage 2. Or the two processes have enclaves of different keystores, or the "
     "peer's permissions.p7s was changed after it was signed"
 )
 _SAME_KEYSTORE = (
@@ -454,9 +454,9 @@ _CYCLONE_START_TEXTS = (
     ),
     _log_text(
         "participant", _CYCLONE, r"rmw_create_node: failed to create (?:DomainParticipant|domain)",
-        "the process could not join its domain, and this line does not say whether DDS Security, "
-        "the network interface or the domain is the reason: an earlier line of Cyclone DDS, on "
-        "standard error, gives the reason", _EXPLAIN_REMEDY, _ALL_FAULTS, vagueness=2,
+        "the process could not join its domain. The reason is DDS Security, the network interface "
+        "or the domain: an earlier line of Cyclone DDS, on standard error, says which",
+        _EXPLAIN_REMEDY, _ALL_FAULTS, vagueness=2,
     ),
 )  # fmt: skip
 

@@ -71,7 +71,7 @@ _LISTENING_TEXTS = (
     _zenoh_text(
         "alert", r"zenoh_link\S*: received fatal alert: (?P<alert>\w{1,40})",
         "a PEER closed the connection: it does not accept the certificate of this process "
-        "({alert}); most often it compares the name of the endpoint with the certificate "
+        "({alert}). Most often the peer compares the name of the endpoint with the certificate "
         "(verify_name_on_connect), but certificates of enclaves name no host",
         f"Look at the configuration of the peer. {_WRITE_AGAIN}",
     ),

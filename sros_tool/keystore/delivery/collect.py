@@ -700,8 +700,8 @@ class _Verifier:
         if signer.serial_number in self._revoked:
             raise _OutdatedCertificateError(
                 f"its certificate, {signer.serial_number:x}, was revoked: perhaps the robot lacks "
-                "its new keys, or another computer, with earlier keys of the robot, sends messages "
-                "in its place",
+                "its new keys, or another computer that has earlier keys of the robot sends "
+                "messages in its place",
                 "its certificate was revoked after this message was accepted",
             )
         if is_of_replaced_ca:

@@ -918,8 +918,9 @@ class _Publication:
             f"the keystore knows the root metadata up to version {version}, and nothing in "
             f"'{self._folder}' shows a later one. If a robot has a later N.root.json in "
             ".agent/metadata/root_history, keys of publishing were replaced after the backup, and "
-            f"robots refuse this publication: copy the later files to '{self._folder}/metadata', "
-            f"and run {self._command} with --rotate-key ROLE for each replaced key.",
+            "robots refuse this publication. Then copy the later files to "
+            f"'{self._folder}/metadata', and run {self._command} with --rotate-key ROLE for each "
+            "replaced key.",
         )
 
     def _unread_note(self) -> Note:

@@ -637,9 +637,9 @@ def _revocation_advice(keystore: OpenedKeystore, name: str) -> str:
     """Return advice, as a clause, on how an enclave gets a key made on its robot."""
     return (
         f"revoke the old key with `sros revoke {quote(str(keystore.root))} {name}` (or, with "
-        f"--robot, all keys of its robot), and then repeat this command with --enclave {name} and "
-        "with the policy, which states the enclave's rights: -p POLICY_FILE, for a fleet also "
-        "--fleet FLEET_FILE"
+        f"--robot, all keys of its robot). Then repeat this command with --enclave {name} and with "
+        "the policy, which states the enclave's rights: -p POLICY_FILE, for a fleet also --fleet "
+        "FLEET_FILE"
     )
 
 
