@@ -801,7 +801,7 @@ def _is_not_shipped(folder: str) -> bool:
 def _denied_start_actions_sentence(lacking: Sequence[_NodeLackingRight]) -> str:
     """Return a sentence on the denied actions that a node takes when it starts."""
     nodes = list(dict.fromkeys(gap.node for gap in lacking))
-    kinds = Counter(gap.finding.kind for gap in lacking)
+    kinds = Counter(kind for kind, _ in {(gap.finding.kind, gap.node) for gap in lacking})
     verbs = [
         verb if kinds[kind] == len(nodes) else f"{verb} ({counted(kinds[kind], 'node')})"
         for kind, verb in _START_ACTIONS.items()

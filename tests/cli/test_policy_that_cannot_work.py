@@ -267,3 +267,12 @@ def test_nothing_is_said_of_enclaves_of_the_shipped_policies(tmp_path: Path) -> 
     found = json.loads(sros("check", tmp_path / "ks", "--json").out)["findings"]
     assert not {each["id"] for each in found} & {"enclave.node-cannot-start"}
     assert "[policy.no" not in signed.err
+
+
+def test_a_node_of_two_enclaves_counts_once(tmp_path: Path) -> None:
+    profile = '<profiles><profile ns="/" node="n"/></profiles>'
+    enclaves = "".join(f'<enclave path="{path}">{profile}</enclave>' for path in ("/a", "/b"))
+    file = tmp_path / "policy.xml"
+    file.write_text(f'<policy version="0.2.0"><enclaves>{enclaves}</enclaves></policy>')
+    said = sros("check", file).out
+    assert "a node lacks rights that nodes need" in said and "nodes)" not in said
