@@ -677,8 +677,8 @@ def _notes(
     if several:
         yield Note(
             "graph.several-nodes",
-            "DDS secures processes, so all nodes of a process share its enclave, which is named "
-            f"after one of these nodes: {first_subjects(sorted(several), '; ')}",
+            "DDS secures processes, so all nodes of a process share one enclave, named after "
+            f"one of the nodes: {first_subjects(sorted(several), '; ')}",
         )
     users: dict[str, dict[str, set[str]]] = {}
     for node in nodes:

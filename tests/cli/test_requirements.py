@@ -241,7 +241,9 @@ def test_two_enclaves_with_a_right_are_proposed_by_name(tmp_path: Path) -> None:
     assert '[[only]]\npublish = ["/cmd_vel"]\nenclaves = ["/a", "/b"]' in suggested
     policy.write_text(policy_text({"/a": drives, "/look": publish("/*")}))
     suggested = sros("check", policy, "--suggest").ok().out
-    assert "\n# not proposed: only some may publish /cmd_vel (stated for 1 enclave, " in suggested
+    assert (
+        "\n# not proposed: that only some may publish /cmd_vel (stated for 1 enclave, " in suggested
+    )
 
 
 @pytest.mark.parametrize(

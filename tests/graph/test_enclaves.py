@@ -55,7 +55,7 @@ def test_names(nodes: list[ObservedNode], enclaves: set[str]) -> None:
         ([unshown("/a"), unshown("/b", participant="p2")], []),
         (
             [unshown("/a"), unshown("/bb")],
-            ["graph.several-nodes: named after one of these nodes: /a has /a, /bb"],
+            ["graph.several-nodes: named after one of the nodes: /a has /a, /bb"],
         ),
         (
             [unshown("/a"), unshown("/a", participant="p2")],

@@ -524,8 +524,8 @@ def test_who_moves_the_robot_is_proposed_for_any_number() -> None:
     assert len(decide_all(proposed, fifth).violations) == 1
     wide = robot({**drivers, **base, "/look": may("publish", "/*")})
     assert suggest(wide.rights, wide.worlds).comments == [
-        "# not proposed: only some may publish /cmd_vel (stated for 5 enclaves, but others may do "
-        "so by a wildcard, or a DENY applies)"
+        "# not proposed: that only some may publish /cmd_vel (stated for 5 enclaves, but others "
+        "may do so by a wildcard, or a DENY applies)"
     ]
 
 

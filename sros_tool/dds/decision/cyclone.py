@@ -99,7 +99,9 @@ class _Reader:
 
     def _element(self, depth: int) -> XmlElement:
         self._skip()
-        if self._text.startswith(_CDATA, self._index) or not self._take("<") or depth > _DEEPEST:
+        if depth > _DEEPEST:
+            raise self._error("its elements are nested too deeply")
+        if self._text.startswith(_CDATA, self._index) or not self._take("<"):
             raise self._error("an element was expected")
         element = XmlElement(self._name())
         self._skip()

@@ -404,7 +404,7 @@ def _refused_enclave_error(
     keystore: OpenedKeystore, name: str, problems: Sequence[str]
 ) -> KeystoreError:
     return KeystoreError(
-        f"enclave {name} would not run on a robot",
+        f"no process would run in enclave {name} on a robot",
         "; ".join(problem.rstrip(".") for problem in problems) + ".",
         f"See `sros inspect {quote(str(keystore.folder(name)))}`.",
     )

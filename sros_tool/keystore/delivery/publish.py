@@ -298,7 +298,7 @@ def publish(
                 raise KeystoreError(
                     f"not all files could be written in '{folder}'",
                     f"{error.strerror}. Robots find either all earlier files or all new files.",
-                    "Repair the cause, and publish again.",
+                    "Remove the cause, and publish again.",
                 ) from error
         return run.result(keys)
 
