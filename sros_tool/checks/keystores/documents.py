@@ -128,9 +128,9 @@ TIME_FORMAT = FindingKind(
     "time, and years from 2263 on.",
     "DDS-Security 1.1, 9.4.1.3.2.2; Fast DDS 2.6 to 3.6 (mktime), Cyclone DDS 0.10 and 11.0; "
     "tested.",
-    "Sign the permissions again: `sros renew KEYSTORE --all` does this for all enclaves, `sros "
-    "create_permission KEYSTORE ENCLAVE POLICY_FILE` for one. In documents that sros does not "
-    "sign, write CCYY-MM-DDThh:mm:ssZ.",
+    "Sign the permissions again: `sros create_permission KEYSTORE ENCLAVE POLICY_FILE` does this "
+    "for one enclave, `renew --all` for all enclaves whose permissions sros has signed. In "
+    "documents that sros does not sign, write CCYY-MM-DDThh:mm:ssZ.",
 )
 _RENEW_IN_TIME = (
     "Let the hosts run in UTC, or renew the enclave at least 14 hours before its permissions "
