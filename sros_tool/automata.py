@@ -972,10 +972,10 @@ class _ParallelAutomata:
         return lambda leaf: any(positions & self._ends[automaton] for automaton in leaf.automata)
 
     def longer_acceptance_test(self, positions: int) -> _Test:
-        """Return a function that says whether an automaton of a set accepts after more letters.
+        """Return a function that says whether the automata of a set accept longer texts.
 
-        The automata are at ``positions``.  The result is True if an automaton accepts every further
-        text from there, False if it accepts none, and None if this depends on the text.
+        The automata are at ``positions``.  The result is True if at least one automaton accepts
+        every longer text, False if none accepts any, and None if this depends on the text.
         """
 
         def ask(leaf: _Union) -> _Truth:

@@ -90,7 +90,7 @@ def echo_lines(*parts: str | Colored, err: bool = False) -> None:
 
 
 def echo_document(document: str | bytes) -> None:
-    """Print a document for another program: unchanged, or on a terminal with visible escapes."""
+    """Print a document for another program: unchanged; on a terminal, with `visible` escapes."""
     import click
 
     if sys.stdout is not None and sys.stdout.isatty():

@@ -1425,8 +1425,8 @@ def _check_zenoh(enclaves: Iterable[Enclave]) -> Iterator[Finding]:
 def _shared_namespaces(fleet: Fleet, enclaves: Iterable[Enclave]) -> Iterator[str]:
     """Yield a clause for each namespace that several robots on one ROS domain share.
 
-    The computers of one robot may share a namespace, because no node runs on two of them: in the
-    fleet, they are a group that contains no other robots.
+    The computers of one robot (in the fleet file, each counts as a robot) may share a namespace if
+    they are exactly one group, and no node runs on two of them.
     """
     robots = {
         namespace: [fleet.robots[name] for name in names]

@@ -1,7 +1,7 @@
-"""Kinds of findings about an update to another ROS 2 distribution; `sros_tool.proof` decides.
+"""Kinds of findings about an update to another ROS 2 distribution; `sros_tool.proof` makes them.
 
-The kinds are also for keystores of several distributions, if these distributions decide
-differently.
+Some kinds are for a keystore of several distributions: an access is allowed on one distribution and
+denied on another.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ NO_NODE = FindingKind(
 BUFFERS = FindingKind(
     "upgrade.zenoh-buffers",
     WARNING,
-    "Zenoh files that lack the keys on which rmw_zenoh sends images after the update",
+    "Zenoh files that lack the Zenoh keys (names) by which rmw_zenoh sends images after the update",
     "rmw_zenoh of Lyrical sends messages with arrays of bytes, such as images and point clouds, on "
     "keys below the key of the topic. With files of an earlier sros, Zenoh drops them without a "
     "log line.",

@@ -209,11 +209,9 @@ def vulnerability_metrics(
     return (
         Metric(
             "sros_dds_known_vulnerabilities",
-            "Number of known vulnerabilities of a DDS that processes have loaded, without regard "
-            "to "
-            "fixes of a package. If several releases are loaded, the number for the most "
-            "vulnerable "
-            "release.",
+            "Number of known vulnerabilities of a DDS that processes have loaded, by its version: "
+            "fixes that its package has without a new version are not known. If several releases "
+            "are loaded, the number for the most vulnerable release.",
             tuple(Sample(number, {"product": name}) for name, number in sorted(most.items())),
         ),
         Metric(

@@ -510,7 +510,7 @@ if TYPE_CHECKING:
 @click.option(
     "--permissions-key",
     metavar="URI",
-    help="Private key of the permissions CA, like --identity-key.",
+    help="Private key of the permissions CA, created if missing: file:PATH or pkcs11:...",
 )
 @click.option(
     "--encrypt-ca-keys", is_flag=True, help="Protect new CA keys in files with a passphrase."
@@ -717,8 +717,8 @@ def _open_rights_notes(root: Path, template: Template) -> list[Note]:
 @click.option(
     "--take-edits",
     is_flag=True,
-    help="Apply the edits in sros.toml (also of [[enclaves]], which has no option) or "
-    "governance.xml.",
+    help="Apply the edits in sros.toml or governance.xml. ([[enclaves]] of sros.toml can be "
+    "changed only by editing the file.)",
 )
 @click.option(
     "--discard-edits", is_flag=True, help="Undo the edits in sros.toml and governance.xml."

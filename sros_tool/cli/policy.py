@@ -65,8 +65,9 @@ if TYPE_CHECKING:
     metavar="[NODE:]FROM:=TO",
     multiple=True,
     help="Remap a name of OTHER, as `--ros-args -r` does for a node; also __node:=NAME, __ns:=NS. "
-    "Applies after --namespace.  If requirements have an old name, a note states the rules for "
-    "`sros check --remap`; in place of __ns, use --namespace in both commands.  Can be repeated.",
+    "Applies after --namespace.  If requirements still have an old name, a note gives the "
+    "options for `sros check`.  `sros check` takes no __ns: use --namespace in both commands.  Can "
+    "be repeated.",
 )
 @click.option(
     "--enclave",

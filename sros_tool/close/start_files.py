@@ -126,7 +126,11 @@ def _commands_text(robot: LocalRobot, state: CloseState) -> str:
     lines += commands_elsewhere(state.observed.moved, folder)
     if shutil.which("ros2", path=robot.shell.environment.get("PATH")):
         launch = shlex.join(launch_words(folder, ("ros2", "launch"), ("PACKAGE", "FILE")))
-        lines += ["", "# Any launch file; each process needs name= in it.", launch]
+        lines += [
+            "",
+            "# This starts a launch file closed, if it gives each process a name=.",
+            launch,
+        ]
     return _text_of_lines(lines).lstrip()
 
 

@@ -557,7 +557,7 @@ class VendorOutcome(NamedTuple):
 
     @property
     def wildcard(self) -> str:
-        """The deciding expression, if it is a wildcard; otherwise null."""
+        """The deciding expression, if it is a wildcard; otherwise empty (null in JSON)."""
         return self.expression if is_expression(self.expression) else ""
 
     @property

@@ -215,7 +215,7 @@ def _key_and_name(expression: str) -> tuple[str, str]:
     An example of the name is "service /add".
     """
     if expression == "*":
-        return "protection.default", "everything without protection of its own"
+        return "protection.default", "every name without a rule of its own"
     service, _ = service_of(expression)
     if "/_action/" in expression:
         action = (service or expression[2:]).partition("/_action/")[0]

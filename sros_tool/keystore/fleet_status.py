@@ -1610,8 +1610,8 @@ def fleet_metrics(
         ),
         Metric(
             "sros_fleet_mended",
-            "Like sros_fleet_complete, but problems that an agent or `sros fleet publish` has "
-            "mended do not count; they are shown for a day.",
+            "Like sros_fleet_complete, but changed files that an agent or `sros fleet publish` has "
+            "replaced do not count. (sros_fleet_complete counts them for a day.)",
             (Sample(int(status.mended), place),),
         ),
         Metric(
@@ -1762,7 +1762,8 @@ def _dds_metrics(
     yield Metric(
         "sros_fleet_dds_known_vulnerabilities",
         "Number of known vulnerabilities of a DDS that processes of a robot have loaded or that is "
-        "only installed; fixes of packages are ignored. If the robot has several releases of the "
+        "only installed, by its version: fixes that its package has without a new version are "
+        "not known. If the robot has several releases of the "
         "DDS, the largest number.",
         tuple(numbers),
     )

@@ -218,6 +218,9 @@ def _curve(link: Link, source: Card, target: Card) -> str:
     return f"M{x1} {link.y1}C{middle} {link.y1} {middle} {link.y2} {x2} {link.y2}"
 
 
+_DIFFERS = "the robots (namespaces, enclaves) that are drawn as one do not have this right"
+
+
 def _link_text(link: Link, overlay: Overlay | None) -> str:
     """Return the tooltip of a link."""
     text = f"{link.qualifier.value} {', '.join(link.rights)}"
@@ -226,7 +229,7 @@ def _link_text(link: Link, overlay: Overlay | None) -> str:
     if link.violates:
         text += ": breaks a requirement"
     if link.differs:
-        text += ": the equal units do not have this right"
+        text += f": {_DIFFERS}"
     if overlay and link.mark is not OverlaySide.BOTH:
         text += f": {overlay.first if link.mark is OverlaySide.FIRST else overlay.second}"
     return f"{text}, {LEVEL_NAMES[link.level]}"
@@ -312,9 +315,7 @@ def _legend(picture: Picture, scene: Scene) -> Iterable[str]:
     if any(link.violates for link in scene.links):
         rows.append(('<path class="link violates" d="M0 -4h40"/>', "breaks a requirement"))
     if any(link.differs for link in scene.links):
-        rows.append(
-            ('<path class="link differs" d="M0 -4h40"/>', "the equal units do not have this right")
-        )
+        rows.append(('<path class="link differs" d="M0 -4h40"/>', _DIFFERS))
     if picture.overlay:
         rows.append(('<path class="link first" d="M0 -4h40"/>', picture.overlay.first))
         rows.append(('<path class="link second" d="M0 -4h40"/>', picture.overlay.second))
@@ -563,7 +564,7 @@ def _link_label(picture: Picture, link: Link) -> str:
     if link.violates:
         text += ": breaks a requirement"
     if link.differs:
-        text += ": the equal units do not have this right"
+        text += f": {_DIFFERS}"
     if picture.overlay and link.mark is not OverlaySide.BOTH:
         side = picture.overlay.first if link.mark is OverlaySide.FIRST else picture.overlay.second
         text += f": {side}"

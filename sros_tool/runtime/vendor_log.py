@@ -98,7 +98,10 @@ def labeled_line(line: str) -> tuple[str, str]:
 
 
 def security_directory(line: str) -> re.Match[str] | None:
-    """Return the folder and the enclave (groups) that a process found at its start, or None."""
+    """Return the match of a log line in which a process names its enclave's folder, or None.
+
+    The groups of the match are ``folder`` and ``enclave``.
+    """
     return _SECURITY_DIRECTORY.match(labeled_line(line)[1])
 
 

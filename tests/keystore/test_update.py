@@ -316,13 +316,13 @@ def test_a_rule_that_would_never_apply_is_refused(root: Path, tmp_path: Path) ->
     ("words", "name"),
     [
         (("--rule", "topic cam/* data=SIGN"), "topic /cam/*"),
-        (("--set", "protection.default.data=SIGN"), "everything without"),
+        (("--set", "protection.default.data=SIGN"), "every name without"),
     ],
 )
 def test_signing_payloads_alone_is_warned_of(words: tuple[str, ...], name: str, root: Path) -> None:
     for dry_run in (("--dry-run",), ("--next",)):
         err = sros("update_keystore", root, *words, "--allow-looser", *dry_run).ok().err
-        assert f"Fast DDS up to 2.14.5 loses messages of {name}" in err
+        assert f"loses messages whose length is not a multiple of four (here: of {name}" in err
     assert "loses" not in sros("update_keystore", root, "--set", "permissions.validity=90d").err
     assert "governance.signed-payload" in found(root)
 
@@ -880,4 +880,4 @@ def test_the_setting_that_limits_permissions_is_the_one_to_lengthen(
 
 def test_without_settings_both_places_of_the_validity_are_named() -> None:
     assert "[[enclaves]]" in lengthening_remedy(None, "/a")
-    assert "of [permissions]" in lengthening_remedy(None, "/a")
+    assert "in [permissions]" in lengthening_remedy(None, "/a")

@@ -281,7 +281,7 @@ def test_the_verb_says_what_is_drawn_as_one(tmp_path: Path) -> None:
         "r5 differs from r1 … r12: it has /r5/base publish /r5/x\n"
     )
     assert "{r1…r12}: each of 11 namespaces, which are equal except for their names" in ended.out
-    assert "the equal units do not have this right" in ended.out
+    assert "that are drawn as one do not have this right" in ended.out
     assert "r1 … r12: 11 equal namespaces are drawn as one" in sros("view", policy).ok().out
     focus = sros("view", policy, "--focus", "/r5/odom", "--format", "svg").ok()
     assert "/r5/nav" in focus.out and "in focus" in focus.out

@@ -44,7 +44,7 @@ export function pathOf(link, cards) {
 export function linkText(link, overlay) {
   const said = `${link.deny ? "DENY" : "ALLOW"} ${link.rights.join(", ")}`;
   const marked = markText(overlay, link.mark);
-  return [said, link.wildcard && "by a wildcard", link.open && "as everybody may", link.violates && "breaks a requirement", link.differs && "the equal ones do not have this right", marked, LEVELS[link.level]]
+  return [said, link.wildcard && "by a wildcard", link.open && "as everybody may", link.violates && "breaks a requirement", link.differs && "the robots (namespaces, enclaves) that are drawn as one do not have this right", marked, LEVELS[link.level]]
     .filter(Boolean)
     .join(", ");
 }
@@ -281,7 +281,7 @@ export function legend(scene, overlay, equal, make) {
   if (allowed.some((link) => link.wildcard)) line("wild", "by a wildcard only");
   if (scene.links.some((link) => link.deny)) line("deny", "denied");
   if (scene.links.some((link) => link.violates)) line("violates", "breaks a requirement");
-  if (scene.links.some((link) => link.differs)) line("differs", "the equal ones do not have this right");
+  if (scene.links.some((link) => link.differs)) line("differs", "the robots (namespaces, enclaves) that are drawn as one do not have this right");
   const box = (kind, text) => add(icon("M1 1h40v12h-40z", `box ${kind}`, true), text);
   if (scene.cards.some((card) => card.chosen)) box("chosen", "in focus");
   if (scene.cards.some((card) => card.lacks)) box("lacking", "nobody may send it, or nobody may receive it");

@@ -55,8 +55,8 @@ from sros_tool.keystore.lifecycle.change import Changed, ChangeOptions, Keystore
 from sros_tool.keystore.lifecycle.create import refuse_less_protected
 from sros_tool.keystore.lifecycle.replaced import (
     EarlierPermissions,
-    earlier_permissions,
     lasting_text,
+    permissions_to_replace,
     replaced_rights,
     with_expiries_in_ledger,
 )
@@ -446,7 +446,7 @@ class _RequestCertifier:
         subject = enclave_subject(name, unique=unique)
         identity = NewIdentity(subject, request.public_key, request=request.pem)
         earlier = (
-            earlier_permissions(change.keystore, name, authority, present) if present else None
+            permissions_to_replace(change.keystore, name, authority, present) if present else None
         )
         issued = self._writer.write(Issuance(name, identity, rights))
         if earlier:

@@ -82,7 +82,7 @@ from sros_tool.keystore.lifecycle.replaced import (
     ReplacedRights,
     SupersededCertificate,
     counterpart_notes,
-    earlier_permissions,
+    permissions_to_replace,
     replaced_rights,
     with_expiries_in_ledger,
 )
@@ -962,7 +962,7 @@ class _EnclaveMaker:
             if not other_files:
                 rights = None
         if rights and PERMISSIONS_FILE in present:
-            earlier = earlier_permissions(
+            earlier = permissions_to_replace(
                 change.keystore, name, change.permissions.certificate, certificate
             )
             if self.revoke_old and certificate:

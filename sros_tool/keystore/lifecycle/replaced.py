@@ -103,13 +103,13 @@ class ReplacedRights:
         return ", ".join(filter(None, texts))
 
 
-def earlier_permissions(
+def permissions_to_replace(
     keystore: OpenedKeystore,
     name: str,
     authority: x509.Certificate,
     certificate: x509.Certificate | None = None,
 ) -> EarlierPermissions | None:
-    """Return the current permissions of an enclave; None if DDS would refuse them.
+    """Return the permissions that an enclave has now; None if DDS would refuse them.
 
     ``authority`` is the permissions CA.  ``certificate`` is the enclave's certificate, if the
     caller has already read it.

@@ -363,7 +363,7 @@ def _signed_payload_notes(before: DomainProtection, after: DomainProtection) -> 
         {
             name
             for name, data in (
-                ("everything without protection of its own", side.default.data),
+                ("every name without a rule of its own", side.default.data),
                 *((str(protection), protection.protection.data) for protection in side.named),
             )
             if data is Level.SIGN
@@ -373,9 +373,9 @@ def _signed_payload_notes(before: DomainProtection, after: DomainProtection) -> 
     if not new - old:
         return []
     text = (
-        f"With data=SIGN, Fast DDS up to 2.14.5 loses messages of {', '.join(sorted(new - old))} "
-        "whose length is not a multiple of four. Use data=NONE with metadata=SIGN, which signs "
-        "the payload with its submessage, or data=ENCRYPT."
+        "With data=SIGN, Fast DDS up to 2.14.5 loses messages whose length is not a multiple of "
+        f"four (here: of {', '.join(sorted(new - old))}). Use data=NONE with metadata=SIGN, which "
+        "signs the payload with its submessage, or data=ENCRYPT."
     )
     return [Note("governance.signed-payload", text)]
 
