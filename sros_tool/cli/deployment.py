@@ -393,12 +393,14 @@ def create_request(
     "only",
     multiple=True,
     metavar="ENCLAVE",
-    help="Accept REQUEST only for this enclave; needed to certify a revoked enclave again."
-    " For several requests, give the option once for each request.",
+    help="Accept REQUEST only for this enclave; needed to certify a revoked enclave again, or"
+    " an earlier key of an enclave. For several requests, give the option once for each request.",
 )
 @allow_refusal_option
 @click.option(
-    "--refuse-revoked", is_flag=True, help="Refuse a revoked enclave even if --enclave names it."
+    "--refuse-revoked",
+    is_flag=True,
+    help="Refuse a revoked enclave, or an earlier key, even if --enclave names the enclave.",
 )
 @dry_run_option
 @json_option

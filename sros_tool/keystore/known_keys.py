@@ -448,6 +448,25 @@ class KnownKeys:
             and (entry.reason == REPORTED or entry.time in times)
         ]
 
+    def later_key(self, name: str, key: str) -> Entry | None:
+        """Return the first certificate for the newest key of an enclave; None if this is ``key``.
+
+        The order of the keys is that in which their validity began, as the ledger has it.  Revoked
+        keys are left out.  The result is None, too, if the ledger does not have ``key``.
+        """
+        first: dict[str, Entry] = {}
+        for entry in self._keystore.ledger_file.with_values("enclave", [name]).entries:
+            if entry.what == "certificate" and entry.enclave == name and entry.key:
+                known = first.setdefault(entry.key, entry)
+                if entry.not_before < known.not_before:
+                    first[entry.key] = entry
+        if key not in first or len(first) == 1:
+            return None
+        kept = [entry for entry in first.values() if not self.is_revoked(entry.key)]
+        # Of keys that became valid at the same time, the later one is later in the ledger, too.
+        newest = max(reversed(kept), key=lambda entry: entry.not_before, default=None)
+        return newest if newest and newest.key != key else None
+
     def missing_key_notes(self) -> Iterator[Note]:
         """Yield a note if the ledger may lack keys that were revoked."""
         if gaps := self._keystore.ledger_with("what", "revocation").gaps:

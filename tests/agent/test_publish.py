@@ -1449,8 +1449,11 @@ def test_a_restored_keystore_makes_no_key_for_a_robot_that_made_its_own(publishe
     assert "r9" in publisher.publish().names("published")
 
 
-def test_a_later_key_of_a_robot_is_certified_again_as_publishing_advises(publisher: Home) -> None:
+def test_a_later_key_of_a_robot_is_certified_again_as_publishing_advises(
+    publisher: Home, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Publishing records the certificate of this key, so that `revoke` would revoke the key."""
+    monkeypatch.setattr("sros_tool.cli.common._clock", lambda: publisher.now)
     root, name = publisher.root, "/r2/base"
     files = [create_request(publisher.folder / each, name).file for each in ("first", "second")]
     first, second = (file.read_bytes() for file in files)
@@ -1466,6 +1469,10 @@ def test_a_later_key_of_a_robot_is_certified_again_as_publishing_advises(publish
         publisher.publish(restored=True)
     mend, _, _ = said.value.remedy.partition(" The keystore was changed already: ")
     commands = re.findall(r"`sros ([^`]+)`", mend)
+    earlier = [command.replace("REQUEST", str(files[0])).split() for command in commands]
+    newest = key_digest(load_request(second, "it").public_key)
+    assert "agent run" in mend and f" is {newest}" in sros(*earlier[0], cwd=publisher.folder).err
+    assert f"made the key {newest} after" in sros(*earlier[1], cwd=publisher.folder).err
     for command in commands:
         publisher.run(*command.replace("REQUEST", str(files[1])).split())
     assert publisher.publish(restored=True).names("published") == ["r1", "r2", "r5"]

@@ -265,7 +265,11 @@ def test_a_request_for_an_existing_enclave_is_refused(
     with pytest.raises(KeystoreError, match=f"{NAME} --revoke-old`"):
         renew(home, [NAME], now=LATER, new_key=True, revoke_old=True)
     ended = validity_of(certificate(home / FOLDER / "cert.pem")).not_after
-    (note,) = sign_request(home, request_of(robot), now=ended, renew=True).notes
+    with pytest.raises(KeystoreError, match=f"is for an earlier key.*add --enclave {NAME}"):
+        sign_request(home, request_of(robot), now=ended, renew=True)
+    (note,) = sign_request(
+        home, request_of(robot), now=ended, renew=True, only_enclaves=[NAME]
+    ).notes
     assert note.text.endswith(f"The certificate of the old key expired at {iso(ended)}.")
 
 

@@ -432,10 +432,12 @@ def refuse_lost_changes(
             steps.append(f"Give new keys: {renew(here, ' --new-key --revoke-old')}.")
         if on_robots:
             steps.append(
-                "For keys that were made on the robot, sign each request again, with `sros "
-                f"sign_request {root} REQUEST --no-answer --renew`, and then run "
-                f"{renew(on_robots, ' --revoke-old')}. If the key of a request was revoked, first "
-                "make a new key on the robot (docs/howto/rotate.md, A key in wrong hands)."
+                "For keys that were made on the robot, first let the robot's agent run once, so "
+                "that it fetches its newest certificate. Then take the request.pem of each of "
+                f"these enclaves from the robot, sign it with `sros sign_request {root} REQUEST "
+                f"--no-answer --renew`, and run {renew(on_robots, ' --revoke-old')}. If the key of "
+                "a request was revoked, first make a new key on the robot (docs/howto/rotate.md, "
+                "A key in wrong hands)."
             )
     if missing := names["missing"]:
         steps.append(_missing_step(root, missing))

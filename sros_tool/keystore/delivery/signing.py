@@ -129,7 +129,8 @@ def sign_request(
         data: the request (PEM).
         only_enclaves: the only enclave for which a request is accepted; empty for any.  A robot can
             write any name into its request.
-        refuse_revoked: refuse a revoked enclave even if ``only_enclaves`` names it.
+        refuse_revoked: refuse a revoked enclave, or an earlier key of an enclave, even if
+            ``only_enclaves`` names the enclave.
         renew: the enclave must exist, and gets a new certificate.
         answer: the path for the answer, which is written after the keystore has changed.
         force: replace ``answer`` if it exists.
@@ -141,9 +142,10 @@ def sign_request(
         KeystoreError: the enclave exists (without ``renew``) or does not exist (with ``renew``);
             the enclave was revoked and ``only_enclaves`` does not name it; the request is for
             another enclave than ``only_enclaves``; the key was revoked or belongs to another
-            enclave; ``answer`` exists; the keystore cannot issue; no vendor would accept the
-            enclave, or a vendor that accepts it today would no longer do so; the fleet of the
-            policy and the keystore's fleet have the enclave's robot in different domains.
+            enclave; the enclave has a later key and ``only_enclaves`` does not name it; ``answer``
+            exists; the keystore cannot issue; no vendor would accept the enclave, or a vendor that
+            accepts it today would no longer do so; the fleet of the policy and the keystore's
+            fleet have the enclave's robot in different domains.
     """
     if data.count(_REQUEST_END) > 1:
         raise DocumentError(
@@ -423,8 +425,10 @@ class _RequestCertifier:
         _check_requested_key(request, known, present)
         if not self._remove_key_other_than(request):
             _check_same_key(change.keystore, request, present)
-        if not renew and not named and known.enclaves_revoked_before([name]):
-            raise self._revoked_error(name)
+        if not named:
+            if not renew and known.enclaves_revoked_before([name]):
+                raise self._revoked_error(name)
+            _refuse_earlier_key(request, known)
         if present:
             note = _new_key_note(root, present, request, change.now)
             change.notes += note or [*known.shared_key_notes([name])]
@@ -612,6 +616,21 @@ def _check_requested_key(
     known_keys.refuse_revoked_key(request.public_key, holder, remedy, certificate)
     if not certificate:
         known_keys.refuse_shared_key(request.public_key, request.name, remedy)
+
+
+def _refuse_earlier_key(request: SigningRequest, known: KnownKeys) -> None:
+    """Raise `KeystoreError` if the enclave of a request has got a later key than the request's."""
+    later = known.later_key(request.name, key_digest(request.public_key))
+    if later:
+        raise KeystoreError(
+            f"the request for {request.name} is for an earlier key",
+            f"It is for the key {key_digest(request.public_key)}; the newest key that the keystore "
+            f"knows for this enclave is {later.key}.",
+            "Let the robot's agent run once (`sros agent run DIR --once`), take request.pem of "
+            "the enclave again, and repeat the command. If the newest key is lost, create a new "
+            "key on the robot, with `sros create_request` in another folder. If the robot is to "
+            f"use the earlier key again, add --enclave {quote(request.name)}.",
+        )
 
 
 def _check_same_key(
