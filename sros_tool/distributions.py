@@ -99,7 +99,8 @@ class Distribution(NamedTuple):
             return ""
         why = "has no releases" if self.stands_for == _ROLLING else "is not supported any more"
         return (
-            f"ROS 2 {self.title} {why}; sros assumes that it decides as {self.name.capitalize()}."
+            f"ROS 2 {self.title} {why}; sros assumes that access is decided as in "
+            f"{self.name.capitalize()}."
         )
 
     def reason_for(self, vendor: Vendor) -> str:

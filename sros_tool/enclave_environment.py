@@ -427,7 +427,7 @@ def _refuse_outdated(keystore: OpenedKeystore, name: str, now: datetime) -> None
         where = quote(str(keystore.root))
         raise KeystoreError(
             f"the Zenoh configuration of enclave {name} does not match the keystore",
-            "It contains rights of other enclaves that differ from their permissions.",
+            "For other enclaves, it has rights that differ from their permissions.",
             f"Run `sros zenoh {where}`, and restart the processes that this command names.",
         )
 
@@ -826,7 +826,7 @@ def _unknown_node_error(
         f"sros cannot know which node the command '{command[0]}' starts",
         f"By the remapping rules, the node is {', '.join(cases)}, {other}.",
         f"Name the enclave: `sros run KEYSTORE {enclave} -- COMMAND`. Or, if the process has only "
-        "one node, write a rule that names no node: `-r __node:=NAME`.",
+        "one node, replace these rules with `-r __node:=NAME`.",
     )
 
 

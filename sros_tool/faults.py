@@ -203,7 +203,7 @@ class Fault(Enum):
     )
     TOKEN_URI = (
         "token-uri",
-        "a key.p11 that does not name a key on a token",
+        "a key.p11 that names no key on a token, or contains the PIN",
         "Either no ROS 2 node finds the key, or whoever can read the file has the PIN.",
         "RFC 7512; rmw_dds_common of ROS 2 Jazzy (security.cpp); libp11 0.4.12 (eng_parse.c).",
         "Write one line into {path}: pkcs11:token=TOKEN;object=LABEL;type=private. If the "
@@ -215,7 +215,7 @@ class Fault(Enum):
         "rmw_fastrtps of ROS 2 Jazzy and later uses the key on the token; every other RMW uses "
         "the file, which can be copied.",
         "rmw_dds_common of ROS 2 Jazzy (security.cpp).",
-        "Keep the key that belongs to cert.pem: delete key.pem, or {path}.",
+        "Keep the key that belongs to cert.pem: delete the other one (key.pem or {path}).",
     )
     CRL_MALFORMED = (
         "crl-malformed",
@@ -268,7 +268,7 @@ class Fault(Enum):
     CRL_LEFT_OUT = (
         "crl-left-out",
         "a folder, a pipe or a broken link in place of a revocation list",
-        "ROS 2 leaves it out: nodes start, and continue to communicate with revoked enclaves. "
+        "ROS 2 ignores it: nodes start, and continue to communicate with revoked enclaves. "
         "`sros run` refuses the enclave. If a file to be mounted into a container does not exist, "
         "some container programs make a folder with its name.",
         "rmw_dds_common of ROS 2 Jazzy (security.cpp).",
@@ -295,7 +295,7 @@ class Fault(Enum):
         "a document whose signature does not verify",
         "The document was changed, or another CA signed it: find out who. The node fails (Fast "
         "DDS: PKCS7 data verification failed). With a single CA, an enclave may have signed its "
-        "own permissions, which DDS accepts.",
+        "own permissions, which some vendors accept.",
         "DDS-Security 1.1, 9.4.1.1; Fast DDS 2.14.5; CVE-2023-24011 for Cyclone DDS 0.10.2.",
         _SIGN_PERMISSIONS,
         {"governance.p7s": _REPAIR_GOVERNANCE},
@@ -307,9 +307,9 @@ class Fault(Enum):
         "permissions CA issued. If that CA also issues identities, each enclave can sign rights "
         "for itself. Someone with the signer's key signed this document.",
         "CVE-2023-24011; Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; tested.",
-        "Unless you signed the document on purpose, treat the signer's key as stolen: `sros revoke "
-        "{root} {enclave}`. If one CA is for identities and documents, use separate CAs, as "
-        "the remedy of keystore.one-authority says.",
+        "Unless you signed the document on purpose, treat the signer's key as stolen, and revoke "
+        "the signer's enclave, as in `sros revoke {root} {enclave}`. If one CA is for identities "
+        "and documents, use separate CAs, as the remedy of keystore.one-authority says.",
         {"governance.p7s": f"Find out who signed the governance. {_REPAIR_GOVERNANCE}"},
     )
     GOVERNANCE_MALFORMED = (
@@ -381,7 +381,7 @@ class Fault(Enum):
         "If the first certificate of a CA file is not signed with SHA-256, Fast DDS (except 2.9.1) "
         "uses memory that it has already freed.",
         "Fast DDS 2.6 to 3.6 (FileProvider.cpp); tested.",
-        "Put a CA that is signed with SHA-256 first in the file.",
+        "Put a CA certificate that is signed with SHA-256 first in the file.",
     )
     CERTIFICATE_CRASH = (
         "certificate-crash",

@@ -139,7 +139,10 @@ def test_an_answer_says_by_which_line_and_until_when(keystore: sros_tool.Keystor
     assert no.outcome == "denied"
     asked = keystore, TALKER, "publish", "/chatter"
     foxy = sros_tool.explain_access(*asked, distribution="foxy")
-    assert "not supported any more; sros assumes that it decides as Humble" in foxy.assumption
+    assert (
+        "not supported any more; sros assumes that access is decided as in Humble"
+        in foxy.assumption
+    )
     lyrical = sros_tool.explain_access(*asked, distribution="lyrical")
     assert (lyrical.allowed, lyrical.vendor) == (True, "fastdds-3.6")
     lyrical = sros_tool.explain_access(*asked, vendor="cyclonedds", distribution="lyrical")

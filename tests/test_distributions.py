@@ -31,7 +31,7 @@ def test_what_is_assumed_of_others_is_said(name: str, like: str) -> None:
     taken = find_distribution(name)
     assert (taken.name, taken.title) == (like, name.capitalize())
     assert taken.vendors == find_distribution(like).vendors
-    assert taken.assumption.endswith(f"assumes that it decides as {like.capitalize()}.")
+    assert taken.assumption.endswith(f"assumes that access is decided as in {like.capitalize()}.")
 
 
 def test_an_unknown_distribution_is_refused_with_all_that_are_known() -> None:

@@ -478,9 +478,9 @@ def name_notes(names: Iterable[str], new: Iterable[str]) -> Iterator[Note]:
         yield Note(
             "portable.enclave-names",
             f"Cyclone DDS 0.10 mistakes {pairs_text(pairs)}, if the first enclave presents the "
-            "permissions of the second one: these are public, and their subject contains all parts "
-            "of the first enclave's name. Rename an enclave so that its path has a part that the "
-            "other path lacks, such as /robot_admin.",
+            "permissions of the second one. These permissions are public, and their subject "
+            "contains all parts of the first enclave's name. Rename an enclave so that its path "
+            "has a part that the other path lacks, such as /robot_admin.",
         )
 
 

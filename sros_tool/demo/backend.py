@@ -205,7 +205,7 @@ def choose_backend(wished_backend: str, probe: ProbeEnclave) -> Backend:
     reason = _why_not(stacks)
     if wished_backend == RCLPY:
         raise UnavailableError(
-            "no RMW under rclpy is known to enforce security here", reason, _NO_RCLPY
+            "rclpy has no RMW here that is known to enforce security", reason, _NO_RCLPY
         )
     return _cyclone(cyclone_stack(probe), reason)
 
@@ -344,8 +344,8 @@ class HandNode:
             )
         if self.type != STRING and (self.role is not Role.TALKER or self.backend != RCLPY):
             raise UsageError(
-                "only a talker on rclpy takes a type",
-                "Only rclpy has the types of your ROS packages, and a listener hears all types.",
+                "--type is only for a talker on rclpy",
+                "Only rclpy has the types of your ROS packages, and a listener needs no --type.",
                 "Use `sros demo talker --backend rclpy` in an environment of ROS 2.",
             )
         if re.fullmatch(r"[A-Za-z]\w*/msg/[A-Za-z]\w*", self.type, re.ASCII) is None:

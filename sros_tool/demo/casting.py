@@ -169,7 +169,12 @@ class UserKeystore(NamedTuple):
         if not all(expressions):
             return row
         wild = next(
-            (f" by {expression}" for expression in expressions if _has_wildcard(expression)), ""
+            (
+                f" (by the wildcard {expression})"
+                for expression in expressions
+                if _has_wildcard(expression)
+            ),
+            "",
         )
         claim = row.claims[0]
         success = OUTCOMES[claim.relation][True]
@@ -183,7 +188,8 @@ class UserKeystore(NamedTuple):
             claims=(claim.expecting(success),),
             controls=(),
             open_because=f"the permissions of {enclave} allow it to {right} {name}{wild}",
-            remedy="give it a policy without this right, or accept the row",
+            remedy="give the enclave a policy without this right, or accept the row "
+            "(--accept-open)",
         )
 
 
@@ -274,7 +280,7 @@ class _Enclaves(NamedTuple):
             yield f"{first_few(sorted(self.without_list), 1)} without the newest revocation list"
         if self.other_governance:
             names = first_few(sorted(self.other_governance), 1)
-            yield f"{names} with another governance than the others"
+            yield f"{names} whose governance differs from the other enclaves'"
         if self.other_domain:
             yield f"{first_few(sorted(self.other_domain), 1)} outside domain {self.domain}"
 

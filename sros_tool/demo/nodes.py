@@ -81,7 +81,7 @@ def parse_options(module: str, roles: Collection[str], arguments: Sequence[str])
     parser.add_argument(
         "--text",
         default=NodeOptions.text,
-        help="text of a talker or server, sent before a number (default: %(default)s)",
+        help="text that a talker or server sends, followed by a number (default: %(default)s)",
     )
     parser.add_argument(
         "--also",

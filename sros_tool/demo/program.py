@@ -415,7 +415,8 @@ def _domains(
     if not 0 <= options.domain <= last:
         raise UsageError(
             f"the demo cannot start at domain {options.domain}",
-            f"The demo uses {len(scenario.rows)} consecutive domains; the highest is {MAX_DOMAIN}.",
+            f"The demo uses {counted(len(scenario.rows), 'consecutive domain')}; the highest "
+            f"possible domain is {MAX_DOMAIN}.",
             f"Choose a domain from 0 to {last}.",
         )
     return tuple(range(options.domain, options.domain + len(scenario.rows)))

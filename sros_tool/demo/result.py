@@ -372,8 +372,9 @@ def _judge_replay(case: _ClaimRecords) -> _ClaimFinding:
     repeated = sum(event.time >= injected.time for event in case.messages_heard())
     return case.result(
         repeated > 0,
-        f"{claim.subject} heard {counted(repeated, 'message')} when {injected.packets} packets of "
-        f"the {claim.talker} were sent again (twice) after the {claim.talker} had left",
+        f"{claim.subject} heard {counted(repeated, 'message')} from "
+        f"{counted(injected.packets, 'packet')} of the {claim.talker}, sent again (twice) after "
+        f"the {claim.talker} had left",
     )
 
 
@@ -457,10 +458,9 @@ def _judge_wire(case: _ClaimRecords) -> _ClaimFinding:
     sent = len(case.messages_sent(case.subject))
     # Missing text proves something only if the messages were in the captured packets.
     if count.protected * 2 < max(2, sent):
-        return _undecided_finding(
-            f"only {count.protected} encrypted packets were captured for {sent} messages"
-        )
-    return case.result(False, f"the text is in 0 packets, {count.protected} are encrypted")
+        captured = counted(count.protected, "encrypted packet")
+        return _undecided_finding(f"only {captured} captured for {counted(sent, 'message')}")
+    return case.result(False, f"the text is in 0 packets; encrypted packets: {count.protected}")
 
 
 _JUDGES: Mapping[Relation, Callable[[_ClaimRecords], _ClaimFinding]] = {
@@ -697,10 +697,11 @@ class UsedLibrary(NamedTuple):
         name = f"{self.product} {version}, which the processes loaded,"
         if self.vulnerabilities is None:
             return f"{name} may have vulnerabilities: {_UNKNOWN}."
-        others = counted(len(self.unclear), "other vulnerability", "other vulnerabilities")
+        other = "other " * bool(self.vulnerabilities)
+        others = counted(len(self.unclear), f"{other}vulnerability", f"{other}vulnerabilities")
         unclear = f"; {others} may affect it" if self.unclear else ""
         if not self.vulnerabilities:
-            return f"{name} has no known vulnerability{unclear}."
+            return f"{name} is not known to have a vulnerability{unclear}."
         number = counted(len(self.vulnerabilities), "known vulnerability", "known vulnerabilities")
         ids = first_few(self.vulnerabilities, maximum)
         pronoun = "it" if len(self.vulnerabilities) == 1 else "them"
@@ -858,7 +859,7 @@ def _left_out_clauses(result: DemoResult) -> Iterator[str]:
             yield f"{scenario.keystore.elsewhere} could not (no key in the keystore)"
         if scenario.not_tried:
             names = "; ".join(scenario.not_tried)
-            yield f"the proof is incomplete, because these tests did not run: {names}"
+            yield f"the proof is incomplete, because these were not tested: {names}"
 
 
 def summary_page(result: DemoResult, now: datetime) -> str:

@@ -887,7 +887,7 @@ def _check(plan: Draft) -> None:
         if plan.least <= written <= plan.most:
             return
         difference = min(written ^ plan.least, key=order)
-        why = f"The written policy and the learned rights would differ in {difference}."
+        why = f"The written policy and the learned rights would differ in {difference.describe()}."
     except DocumentError as error:
         why = f"{error}"
     raise PolicyError(

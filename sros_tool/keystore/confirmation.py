@@ -496,14 +496,14 @@ class ReceivedConfirmation:
         if alternated is None or not self.is_alternation_shown:
             return ""
         return (
-            f"{_TWO_COMPUTERS} seem to send messages in turn: the messages went back to an earlier "
-            f"start of the computer or an earlier release, last at {iso(alternated)}. Perhaps a "
-            "disk was copied or restored. "
+            f"{_TWO_COMPUTERS} seem to send messages in turn: a message came from an earlier start "
+            "of the computer, or showed an earlier release, than the message before it; last at "
+            f"{iso(alternated)}. Perhaps a disk was copied or restored. "
             "sros knows the files of only one of the two computers. Give the robot new keys, and "
             "revoke the earlier keys (docs/howto/one_robot.md: Same name, new hardware)."
         ) + was_restored * (
-            " Because the keystore was restored from a backup, this problem stays after new "
-            f"keys, until a message comes after {iso(alternated + _ALTERNATED_SHOWN)}."
+            " Because the keystore was restored from a backup, this problem is shown even after "
+            f"new keys, until a message comes after {iso(alternated + _ALTERNATED_SHOWN)}."
         )
 
     def clock_note(self) -> str:
@@ -570,8 +570,8 @@ def refuse_older_confirmation(keystore: OpenedKeystore, received: ReceivedConfir
     if previous and received.confirmation.time < min(previous.confirmation.time, previous.time):
         robot, time = received.confirmation.robot, iso(received.confirmation.time)
         raise DocumentError(
-            f"the report of {robot}, made at {time}, is older than its last confirmation, made at "
-            f"{iso(previous.confirmation.time)}",
+            f"the report of {robot}, made at {time}, is older than the robot's last confirmation, "
+            f"made at {iso(previous.confirmation.time)}",
             "It does not show what the robot has now.",
             f"Make it again: `sros fleet report FOLDER --robot {robot}`. If the clock of the robot "
             "is behind, set it first.",

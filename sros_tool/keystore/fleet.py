@@ -44,8 +44,8 @@ _FLEET_COMMENT = """\
 # belongs to which robot. To change them, edit that file and run `sros generate_artifacts --fleet`.
 """
 FLEET_REMEDY = (
-    "Take revoked robots out of the fleet file, and write the copy again from it, with all "
-    "policies of the fleet: `sros generate_artifacts -k KEYSTORE -p POLICY_FILE --fleet "
+    "Take revoked robots out of the fleet file, and write the keystore's copy again from it, with "
+    "all policies of the fleet: `sros generate_artifacts -k KEYSTORE -p POLICY_FILE --fleet "
     "FLEET_FILE`."
 )
 _DAMAGED_LEDGER = "the ledger has lines that are missing or were changed"

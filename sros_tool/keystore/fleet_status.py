@@ -1639,8 +1639,8 @@ def fleet_metrics(
         ),
         Metric(
             "sros_fleet_expiry_timestamp_seconds",
-            "When the first of the files that a robot confirmed expires, by kind, from the ledger, "
-            "in seconds since 1970.",
+            "For each kind of file: when the first file that a robot confirmed expires, as the "
+            "ledger says, in seconds since 1970.",
             tuple(
                 Sample(int(end.timestamp()), {**labels, "kind": kind})
                 for labels, robot in robots
@@ -1689,8 +1689,8 @@ def fleet_metrics(
         ),
         Metric(
             "sros_fleet_agent_problems",
-            "For robots that report problems: number of problems that the robot's agent has not "
-            "mended.",
+            "For robots that report problems: number of problems, without changed files that the "
+            "robot's agent has replaced.",
             per_robot(
                 lambda robot: (
                     None
@@ -1701,8 +1701,8 @@ def fleet_metrics(
         ),
         Metric(
             "sros_fleet_agent_mended",
-            "For robots that report problems: number of problems that the robot's agent has mended "
-            "in the last day, such as changed files.",
+            "For robots that report problems: number of problems of the last day that are over, "
+            "because the robot's agent has replaced the changed files.",
             per_robot(
                 lambda robot: (
                     None if robot.problems is None else sum(map(is_mended, robot.problems))
@@ -1775,6 +1775,6 @@ def _dds_metrics(
     )
     yield Metric(
         "sros_fleet_processes_not_seen",
-        "Number of processes that a robot could not look at; they may use other libraries.",
+        "Number of processes that a robot could not examine; they may use other libraries.",
         tuple(Sample(robot.dds.unseen, labels) for labels, robot in robots if robot.dds),
     )

@@ -54,11 +54,7 @@ def test_requests_of_a_fleet(keystore: Path, tmp_path: Path) -> None:
     assert "leave out -o and --force" in ended.err
     for only in ([B, "/other"], [A], [A, B, B]):  # a robot chooses what its request says
         ended = sros(*words, *(word for each in only for word in ("--enclave", each)))
-        why = (
-            f"number 1 is for enclave {A}, and should be for {B}, /other"
-            if "/other" in only
-            else "for "
-        )
+        why = f"number 1 is for enclave {A}, not for {B}, /other" if "/other" in only else "for "
         assert (ended.status, why in ended.err) == (2, True), ended
     sros(*words, "--dry-run").ok()
     assert snapshot(keystore) == before

@@ -99,8 +99,8 @@ def test_a_node_on_zenoh_says_its_configuration() -> None:
 def test_a_talker_on_rclpy_takes_a_type() -> None:
     assert HandNode(Role.TALKER, "rclpy", "/cmd_vel", "geometry_msgs/msg/Twist").type
     for role, on, kind, said in (
-        (Role.LISTENER, "rclpy", "geometry_msgs/msg/Twist", "only a talker on rclpy takes a type"),
-        (Role.TALKER, "cyclone", "geometry_msgs/msg/Twist", "only a talker on rclpy takes a type"),
+        (Role.LISTENER, "rclpy", "geometry_msgs/msg/Twist", "--type is only for a talker on rclpy"),
+        (Role.TALKER, "cyclone", "geometry_msgs/msg/Twist", "--type is only for a talker on rclpy"),
         (Role.TALKER, "rclpy", "Twist", "is not a message type"),
     ):
         with pytest.raises(UsageError, match=said):

@@ -90,7 +90,7 @@ OLD = MappedLibrary("Fast DDS", "2.14.5", "/opt/ros/jazzy/lib/libfastrtps.so.2.1
         ),
         (
             OLD._replace(version="3.2.5"),
-            "has no known vulnerability; 2 other vulnerabilities may affect it.",
+            "is not known to have a vulnerability; 2 vulnerabilities may affect it.",
         ),
         (OLD._replace(version=""), "of unknown version, which the processes loaded, may have"),
         (None, "Cyclone DDS 0.10.2 may have vulnerabilities: sros does not"),

@@ -388,7 +388,7 @@ def test_two_computers_that_are_alike_are_seen_by_their_starts(home: Home) -> No
     ):
         home.send("r1", boot=boot)
         remarks = home.of("r1").remarks
-        assert any("went back to an earlier start" in text for text in remarks) == (
+        assert any("came from an earlier start" in text for text in remarks) == (
             is_seen and boot != other
         )
         status = fleet_status(OpenedKeystore(home.root), ["r1"])

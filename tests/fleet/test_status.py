@@ -791,7 +791,7 @@ def test_a_report_does_not_replace_a_later_confirmation(field: Field) -> None:
     before = {"time": iso(parse_iso(said["time"]) - hour)}
     earlier.write_text(json.dumps(said | before))
     refused = field.run("fleet", "confirm", "ks", "earlier.json", "--robot", "r1", status=2).err
-    assert "is older than its last confirmation" in refused
+    assert "is older than the robot's last confirmation" in refused
     # The clock of the robot was ahead when it confirmed last.
     field.confirm("r2", time=iso(parse_iso(said["time"]) + 9 * hour))
     field.confirm("r2")

@@ -433,7 +433,7 @@ def test_bad_requests_of_robots_get_no_certificate_and_stop_no_other(tmp_path: P
     program = [sys.executable, "-m", "sros_tool"]
     printed = play(tmp_path, "requests", hosts, sros_keystore=str(keystore), sros_program=program)
     text = " ".join(printed.split())
-    assert "is for enclave /spare, and should be for /r1/own" in text, text
+    assert "is for enclave /spare, not for /r1/own" in text, text
     assert "r3 returned requests for other enclaves" in text, text
     assert "openssl is missing" in text, text
     assert "Left out, because of what they answered (see above): r1, r3, r4." in text, text

@@ -181,7 +181,7 @@ def test_a_secured_node_runs_secured_or_not_at_all(tmp_path: Path) -> None:
     (failed,) = read_events(tmp_path / "talker.jsonl")
     assert (failed.kind, failed.stage) == (EventKind.FAILED, ProcessStage.PARTICIPANT)
     assert "security" in errors
-    with pytest.raises(UnavailableError, match="no RMW under rclpy"):
+    with pytest.raises(UnavailableError, match="rclpy has no RMW here"):
         choose_backend("rclpy", keystores.probe("/chatter", 190))
 
 

@@ -320,7 +320,7 @@ def test_a_robot_with_keys_of_its_own_gets_all_files_after_a_rotation(
     sros("rotate_ca", root, "--finish", "--allow-unconfirmed").ok()
 
     for name, why in (
-        ("/a", "contains enclaves that trust a CA of this keystore that was replaced"),
+        ("/a", "contains enclaves that trust a replaced CA of this keystore"),
         ("/a/own", "Add --keyless"),
     ):
         refused = sros("distribute_key", root, name, robot, "--force")

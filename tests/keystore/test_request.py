@@ -313,12 +313,12 @@ def test_a_revoked_enclave_comes_back_only_if_it_is_named(
         with pytest.raises(KeystoreError, match=f"enclave {NAME} was revoked") as caught:
             attempt(home, request, now=NOW)
         assert f"--enclave {NAME}" in str(caught.value)
-    with pytest.raises(KeystoreError, match="should be for /base"):
+    with pytest.raises(KeystoreError, match="not for /base"):
         sign_request(home, request, now=NOW, only_enclaves=["/base"])
     assert snapshot(home) == before
     both = request + make_request(generate_key(), "/base")
     for revoked, asked in (
-        ((), f"give only requests of them, and add --enclave {NAME}."),
+        ((), f"give only its request, and add --enclave {NAME}."),
         (["/base"], f"add --enclave {NAME} --enclave /base."),
     ):
         if revoked:

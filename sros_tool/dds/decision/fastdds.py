@@ -341,7 +341,7 @@ def _read_value(element: XmlElement, attribute: Attribute) -> Value:
         raise UnreadableError(f"<{element.name}> holds {text!r}, which is not a protection kind")
     if text not in attribute.values:
         raise UnreadableError(
-            f"<{element.name}> holds {text}, but a payload has no origin authentication"
+            f"<{element.name}> holds {text}, but payloads cannot have origin authentication"
         )
     return ProtectionKind(text)
 

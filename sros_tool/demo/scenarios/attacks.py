@@ -819,7 +819,7 @@ _PERMISSIONS_ROWS: tuple[Row, ...] = (
             "permissions signed by the enclave itself",
             Identity(forger.permissions_signed_by_itself, "guest"),
             RowStatus.NOT_LET_IN,
-            "DDS accepts only signers whose certificate is from the permissions CA",
+            "DDS accepts only signers whose certificate the permissions CA issued",
             Variant(
                 (Condition.EXACT_SIGNER,),
                 RowStatus.NOT_LET_IN,
@@ -849,7 +849,7 @@ _PERMISSIONS_ROWS: tuple[Row, ...] = (
             "permissions signed by the enclave itself, one CA",
             Identity(Undefended(forger.permissions_signed_by_itself, forger.one_ca), "guest"),
             RowStatus.HEARD,
-            "Cyclone DDS 0.10 accepts every signer whose certificate comes from the CA",
+            "Cyclone DDS 0.10 accepts every signer whose certificate the CA issued",
             Variant(
                 (Condition.EXACT_SIGNER, Condition.CYCLONE),
                 RowStatus.NOT_LET_IN,
@@ -963,7 +963,8 @@ _PERMISSIONS_ROWS: tuple[Row, ...] = (
             Variant(
                 (Condition.FAST,),
                 RowStatus.NOT_HEARD,
-                mechanism="Fast DDS starts; the attacker's peers find no rule for the domain",
+                mechanism="the attacker's Fast DDS starts, but its peers find no rule for the "
+                "domain",
             ),
             Variant(
                 (Condition.OPEN_JOIN,),
@@ -995,7 +996,8 @@ _PERMISSIONS_ROWS: tuple[Row, ...] = (
             Variant(
                 (Condition.FAST,),
                 RowStatus.NOT_VISIBLE,
-                mechanism="Fast DDS starts; the attacker's peers find no rule for the domain",
+                mechanism="the attacker's Fast DDS starts, but its peers find no rule for the "
+                "domain",
             ),
             Variant(
                 (Condition.UNAUTHENTICATED, Condition.UNAUTHENTICATED_SEE),

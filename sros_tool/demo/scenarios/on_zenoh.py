@@ -158,7 +158,7 @@ def _topic_rows(link_mode: str, keystore: KeystoreChoice, world: str) -> tuple[R
         _attempt_row(
             f"talker to listener, {link_mode}",
             RowStatus.HEARD,
-            "the rules allow the topic to the names in both certificates",
+            "the rules allow both enclaves the topic, by the names in their certificates",
             hears("listener", "talker"),
             pair,
             world=world,
@@ -808,7 +808,7 @@ _WILDCARD_ROWS = (
                 attack,
                 party,
                 denied,
-                "Zenoh passes a wildcard only if a rule allows every key that the wildcard"
+                "Zenoh passes a wildcard only if a rule allows every name that the wildcard"
                 " matches; sros lists the allowed names, and does not rely on deny rules",
                 OWN,
                 _PEERS,
@@ -942,8 +942,8 @@ def _erased_token_row(
     return _attempt_row(
         f"{_ERASING}{name_suffix}",
         RowStatus.ERASED if defence_removed else RowStatus.NOT_ERASED,
-        "when a token ends, the graph removes the node with the same session and name, whatever "
-        "the enclave"
+        "when a token ends, the graph removes the node with the same session and name, even if "
+        "this node runs in another enclave"
         if defence_removed
         else "a token passes only if the policy of its sender names the node",
         Claim(Relation.LOSES, "observer", "eraser"),

@@ -488,10 +488,11 @@ def _older_message_notes(inbox: Path, messages: Iterable[_ReceivedMessage]) -> I
         lies, older = (
             ("lies", "the older message") if len(robots) == 1 else ("lie", "the older messages")
         )
+        newer = "a newer message was" if len(robots) == 1 else "newer messages were"
         yield Note(
             "fleet.older-message",
-            f"{messages_text} of {first_few(robots, _SHOWN)} {lies} in '{inbox}', although a "
-            f"newer message was already collected. Delete {older}, which sros ignores.",
+            f"{messages_text} of {first_few(robots, _SHOWN)} {lies} in '{inbox}', although "
+            f"{newer} already collected. Delete {older}, which sros ignores.",
         )
 
 
@@ -591,8 +592,8 @@ class _Verifier:
             )
         elif is_earlier_start:
             remarks.append(
-                "two computers seem to have its keys: its messages went back to an earlier start "
-                "of the computer (`sros fleet status` says what to do)"
+                "two computers seem to have its keys: a message came from an earlier start of "
+                "the computer than the message before it (`sros fleet status` says what to do)"
             )
         return _ReceivedMessage(
             robot, "kept", verified=verified, received=received, remarks=remarks

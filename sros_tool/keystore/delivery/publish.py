@@ -392,7 +392,8 @@ def unseen_publication_clause(keystore: OpenedKeystore) -> str:
         return ""
     missing = known.first_missing()
     if why := unseen_clause(missing):
-        return f"the folder of the last publication, '{known.folder or 'not recorded'}', {why}"
+        folder = f", '{known.folder}'," if known.folder else " (not recorded)"
+        return f"the folder of the last publication{folder} {why}"
     if missing and missing.startswith("metadata/"):
         return f"'{known.folder}' lacks {missing}"
     return metadata_problem(keystore)
@@ -865,7 +866,9 @@ class _Publication:
                     if (sent.release or 0) > last:
                         return RobotClaim(robot, f"release {sent.release}")
                     if any(OF_SAME_NUMBER in problem for problem in sent.problems or ()):
-                        return RobotClaim(robot, "another release of the same number")
+                        return RobotClaim(
+                            robot, "a release with the published number but other files"
+                        )
         return None
 
     @property

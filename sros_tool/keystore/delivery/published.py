@@ -292,8 +292,8 @@ def releases_in(folder: Path, robots: int, altered: set[str] | None = None) -> I
             "the keystore does not know the metadata in this folder.",
             f"Find out who else can write to the folder. Then move '{folder}' away, and publish "
             "with --new-folder of `sros fleet publish`. But if the keystore was restored from a "
-            "backup, the folder may show what was revoked after it: remove only what no keystore "
-            "published.",
+            "backup, the folder may show what was revoked after the backup: remove only what no "
+            "keystore published.",
         )
 
 

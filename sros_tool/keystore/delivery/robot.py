@@ -255,7 +255,7 @@ def check_same_authority(
         present_authorities = _certificates(ca_file)
         if new_authorities.isdisjoint(map(digest, present_authorities)):
             replaced = any(digest(authority) in earlier for authority in present_authorities)
-            whose = "that trust a CA of this keystore that was replaced"
+            whose = "that trust a replaced CA of this keystore"
             raise KeystoreError(
                 f"'{target}' contains enclaves {whose if replaced else 'of another keystore'}",
                 f"They trust {subject_text(present_authorities[0].subject)}, and could not "

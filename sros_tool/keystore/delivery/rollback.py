@@ -139,7 +139,7 @@ def check_rollback(
             f"'{target / path}' has a later {role} CA than the keystore's",
             f"It trusts {authority_text(authority)}, and the keystore's CA is "
             f"{_first_authority(files, path)}: the robot would trust the earlier CA again, and "
-            "certificates that were revoked since then. Nothing was changed.",
+            "certificates that were revoked since its replacement. Nothing was changed.",
             "The keystore may come from a backup (docs/howto/keystore_is_lost.md says how to go "
             "on), or the files in the folder are of another keystore. If the keystore's CA is "
             f"right, first {_removal_remedy(target, later)}",

@@ -323,7 +323,7 @@ def _check_requested_enclaves(
     for number, request in enumerate(requests, 1):
         if request.name not in only_enclaves:
             raise KeystoreError(
-                f"request number {number} is for enclave {request.name}, and should be for "
+                f"request number {number} is for enclave {request.name}, not for "
                 f"{first_few(only_enclaves, 3)}",
                 "The request asks for the identity of another enclave. Nothing was signed.",
                 "Examine the robot that the request comes from.",
@@ -465,7 +465,8 @@ class _RequestCertifier:
         """Return the error for the requests of ``name`` and all other revoked enclaves."""
         requested = self._stated_rights
         revoked = sorted(self._change.known.enclaves_revoked_before([*requested]))
-        add = "add" if len(revoked) == len(requested) else "give only requests of them, and add"
+        their = "its request" if len(revoked) == 1 else "their requests"
+        add = "add" if len(revoked) == len(requested) else f"give only {their}, and add"
         options = " ".join(f"--enclave {quote(enclave)}" for enclave in revoked)
         these = "the enclave" if len(revoked) == 1 else "these enclaves"
         return KeystoreError(

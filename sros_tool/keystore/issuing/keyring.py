@@ -29,6 +29,7 @@ from sros_tool.pki.token import (
     parse_token_uri,
     refuse_pin,
 )
+from sros_tool.wording import counted
 from sros_tool.xml import read_bytes
 
 _SHORTEST_PASSPHRASE = 12  # in characters; OWASP ASVS 4.0.3, 2.1.1
@@ -201,7 +202,7 @@ class Keyring:
                 f"the template names an existing key for the {role} CA: '{place}'",
                 "Files that the new keystore signs would be valid wherever a CA with that key is "
                 "trusted.",
-                f"If that is intended, name it yourself: --{role}-key {quote(place)}.",
+                f"If that is intended, name the key yourself: --{role}-key {quote(place)}.",
             )
 
     def is_encrypted(self, keystore: OpenedKeystore, role: str, template: Template) -> bool | None:
@@ -257,8 +258,8 @@ class Keyring:
         if length < (1 if self.short_passphrase else _SHORTEST_PASSPHRASE):
             raise UsageError(
                 f"the passphrase of the new {role} CA key is too short",
-                f"It has {length} characters. Whoever copies the key can try passphrases without "
-                "limit, and finds a short one.",
+                f"It has {counted(length, 'character')}. Whoever copies the key can try "
+                "passphrases without limit, and finds a short one.",
                 f"Choose at least {_SHORTEST_PASSPHRASE} characters, or allow a short one with "
                 "SROS_SHORT_PASSPHRASE=1 (in Python, short_passphrase=True).",
             )

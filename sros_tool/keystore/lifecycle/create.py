@@ -735,7 +735,7 @@ def _raise_protection(
     text = (
         f"The governance of the keystore changes, because policies demand it: "
         f"{first_few(demanded, _MOST_SHOWN)}. "
-        f"{'; '.join(dict.fromkeys(change.meaning for change in changes[:_MOST_SHOWN]))}."
+        f"Changes: {'; '.join(dict.fromkeys(change.meaning for change in changes[:_MOST_SHOWN]))}."
     )
     change.restart = change.names
     change.remarks += (
@@ -815,7 +815,7 @@ def exports_note(keystore: OpenedKeystore, names: Sequence[str]) -> Note:
     if published := publish_command(keystore.root):
         text = (
             f"Robots have the former files: publish the new ones ({published}); if nodes run from "
-            "an export, export them again."
+            "an export, export the enclaves again."
         )
         return Note("keystore.export-again", text)
     shown = quote(str(keystore.root))
