@@ -206,6 +206,14 @@ def join_actions(rights: Iterable[Right]) -> frozenset[Right]:
     return frozenset(remaining.union(complete))
 
 
+def goal_right(right: Right) -> Right:
+    """Return the right to the service for goals, for a right to an action; else ``right``."""
+    if right.kind != "actions":
+        return right
+    name = f"{right.name}{GOAL}"
+    return next(part for part in parts(right) if part.name == name)
+
+
 # ── queries ────────────────────────────────────────────────────────────────────────────────
 
 
@@ -529,9 +537,14 @@ def nodes_from_text(text: str) -> tuple[NodeName, ...]:
 
 
 def rights_without_counterpart(
-    first_rights: Collection[Right], second_rights: Collection[Right], difference: RightsDifference
+    first_rights: Collection[Right],
+    second_rights: Collection[Right],
+    difference: RightsDifference,
+    candidates: Collection[Right] | None = None,
 ) -> list[Right]:
-    """Return the ``second_rights`` whose counterpart was in ``first_rights``, and is gone.
+    """Return the ``candidates`` whose counterpart was in ``first_rights``, and is gone.
+
+    By default, the candidates are the ``second_rights``.
 
     An example is a right to subscribe to a topic that no enclave may publish any more, because the
     right to publish it is gone or denied.  Another example is a right to publish a topic to which
@@ -547,7 +560,7 @@ def rights_without_counterpart(
     touched = {word: Names(sorted(names)) for word, names in names_of.items()}
     asked = [
         right
-        for right in second_rights
+        for right in (second_rights if candidates is None else candidates)
         if (other := PEER_RIGHT[right.right]) in touched
         and right.qualifier is not DENY
         and touched[other].overlaps(right.name)

@@ -34,7 +34,7 @@ from sros_tool.names import (
     is_expression,
     right_to_use,
 )
-from sros_tool.policy.model import PEER_RIGHT, RIGHTS, below_namespace
+from sros_tool.policy.model import OFFERING_RIGHT, PEER_RIGHT, RIGHTS, below_namespace
 from sros_tool.policy.patterns import covers
 from sros_tool.policy.rights import KIND_OF, is_of_every_node
 from sros_tool.proof.requirements import (
@@ -874,6 +874,25 @@ def _restricted_names(
         if isinstance(requirement, Nobody | Protected):
             parts = (*_sufficient_parts(PEER_RIGHT[right]), *parts)
         yield from ((right, name, parts) for name in names)
+
+
+def rights_that_need_a_peer(requirement: Requirement) -> Iterator[tuple[str, str]]:
+    """Yield the rights, with names, about which a requirement protects nothing without a peer.
+
+    For example, a limit on who may request a service protects nothing if nobody serves it.  If a
+    name is protected, the right is to receive its messages, or to request.  `Nobody` is left out:
+    its names are compared with all rights before a change.
+    """
+    match requirement:
+        case Nobody():
+            return
+        case Must(rights=rights):
+            yield from ((right, name) for right, names in rights for name in names)
+        case Protected(names=pairs):
+            for kind, name in pairs:
+                yield next(right for right in RIGHTS[kind] if right in OFFERING_RIGHT), name
+        case _:
+            yield from ((right, name) for right, name, _ in _restricted_names(requirement))
 
 
 def _meant_clause(name: str, stated: Iterable[frozenset[str]]) -> str:

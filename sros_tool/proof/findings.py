@@ -707,10 +707,11 @@ def common_namespaces(requirements: Iterable[Requirement], rights: Iterable[Righ
     return common or set()
 
 
-_GONE_REMEDY = (
+GONE_REMEDY = (
     "If the name was changed, change it in the requirement, too. If nobody uses the name any more, "
     "approve this in the review."
 )
+"""Remedy for a requirement about a name that a change removes."""
 
 
 def _unnamed_finding(
@@ -727,7 +728,7 @@ def _unnamed_finding(
     }
     if gone := [name for name in names if name in known_before]:
         why = f"no right is stated for {_listed_names(gone)} any more"
-        return _part_finding(VACUOUS, requirement, [why], _GONE_REMEDY)
+        return _part_finding(VACUOUS, requirement, [why], GONE_REMEDY)
     return _part_finding(UNNAMED, requirement, [f"no right is stated for {_listed_names(names)}"])
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 import re
 from collections import defaultdict
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, tzinfo
@@ -69,17 +69,21 @@ from sros_tool.keystore.rights import (
     without_enclaves_of_sros,
 )
 from sros_tool.keystore.template import Template, load_template, read_template, template_names
-from sros_tool.names import expand
+from sros_tool.names import expand, is_expression
 from sros_tool.policy.document import read_policy
-from sros_tool.policy.model import Enclave, Policy, policy_in_namespace
+from sros_tool.policy.model import ALLOW, PEER_RIGHT, Enclave, Policy, policy_in_namespace
 from sros_tool.policy.patterns import common_name
 from sros_tool.policy.remapping import Remapping
 from sros_tool.policy.rights import (
     NodeName,
     Right,
+    RightsDifference,
+    goal_right,
     nodes_of,
     placed_rights,
     policy_rights,
+    rights_without_counterpart,
+    split_actions,
 )
 from sros_tool.proof.commit_files import (
     ATTRIBUTES_FILE,
@@ -94,8 +98,9 @@ from sros_tool.proof.commit_files import (
     may_be_policy,
     may_match,
 )
-from sros_tool.proof.decide import restricted_enclaves
+from sros_tool.proof.decide import restricted_enclaves, rights_that_need_a_peer
 from sros_tool.proof.findings import (
+    GONE_REMEDY,
     common_namespaces,
     decide_all,
     decided_findings,
@@ -467,9 +472,10 @@ class _Review:
         if of_base:
             earlier[named] = before
         after = cache(partial(load_policies, of_head, _HEAD, head_fleet))
+        later = {path: partial(load_side, folder) for path, folder in keystores.items()}
         both = {named: lambda: (before(), after())} if of_base else {}
         yield from self._requirement_steps(
-            of_head, head_fleet, base_fleet, keystores, earlier, both
+            of_head, head_fleet, base_fleet, keystores, earlier, {**later, named: after}, both
         )
         if self.base:
             yield from self._step_result(
@@ -1033,6 +1039,7 @@ class _Review:
         base_fleet: Fleet | None,
         keystores: Mapping[str, Path],
         earlier_sources: Mapping[str, Callable[[], AccessSource]],
+        later_sources: Mapping[str, Callable[[], AccessSource]],
         moved: Mapping[str, Callable[[], tuple[AccessSource, AccessSource]]],
     ) -> Iterator[ReviewStep]:
         if not self.request.requirements:
@@ -1071,10 +1078,12 @@ class _Review:
             earlier = yield from self._read_requirements(
                 base_files, partial(_without_left_robots, before, system.fleet)
             )
-            rights: frozenset[Right] = frozenset()
+            rights, later_rights = frozenset[Right](), frozenset[Right]()
             with suppress(SrosError, OSError):  # the comparison reports the error
                 if subject in earlier_sources:
-                    rights = earlier_sources[subject]().rights
+                    rights, later_rights = (
+                        sides[subject]().rights for sides in (earlier_sources, later_sources)
+                    )
             sources = moved.get(subject)
             elsewhere = partial(
                 self._failing_elsewhere,
@@ -1095,7 +1104,12 @@ class _Review:
                 and (subject in keystores or self.has_all_policies),
             )
             required_before = [*chain.from_iterable(earlier.values())]
-            decide = partial(self._dropped_step, required_before, wanted, system, sources)
+            unanswered = [
+                *_unanswered_requirement_findings(required_before, wanted, rights, later_rights)
+            ]
+            decide = partial(
+                self._dropped_step, required_before, wanted, system, sources, unanswered
+            )
             yield from self._step_result(
                 "requirements-before", subject, decide, is_wanted=len(read) == len(files)
             )
@@ -1225,6 +1239,7 @@ class _Review:
         wanted_requirements: Sequence[Requirement],
         system: System,
         moved: Callable[[], tuple[AccessSource, AccessSource]] | None,
+        unanswered: Sequence[Finding],
     ) -> tuple[int, Content] | None:
         dropped = [
             requirement.requirement
@@ -1233,9 +1248,9 @@ class _Review:
         sources = None
         with suppress(SrosError, OSError):  # the comparison reports the error
             sources = moved() if moved else None
-        left: list[Finding] = []
+        left = [*unanswered]
         if sources:
-            left = [*_left_requirement_findings(earlier, wanted_requirements, *sources)]
+            left += [*_left_requirement_findings(earlier, wanted_requirements, *sources)]
         if not (dropped or left):
             return None
         assert self.base
@@ -1513,6 +1528,68 @@ def _left_requirement_findings(
                 text += f" for users in namespace {ns}" if ns != "/" else ""
                 remedy = "Let the requirement apply to the enclave, or approve this in the review."
                 yield DROPPED.found(str(requirement), text, place.file, place.line, remedy)
+
+
+def _unanswered_requirement_findings(
+    earlier: Sequence[Requirement],
+    requirements: Sequence[Requirement],
+    before: Collection[Right],
+    after: Collection[Right],
+) -> Iterator[Finding]:
+    """Yield a finding for each kept requirement about a name whose other side HEAD removes.
+
+    For example, HEAD renames a service at its server, and the requirement has the old name.
+    Wildcards that match the name are no other side, such as the wildcard of a recorder, unless
+    HEAD writes a wildcard in place of a removed right.
+    """
+    first, second = split_actions(before), split_actions(after)
+    removed, added = first - second, second - first
+    changed_enclaves = {(right.enclave, right.right) for right in removed}
+    changed_names = {(right.right, right.name) for right in removed}
+    replacing = {
+        right
+        for right in added
+        if (right.enclave, right.right) in changed_enclaves
+        or (right.right, right.name) in changed_names
+    }
+
+    def without_wildcards(rights: Iterable[Right], counting: Collection[Right]) -> set[Right]:
+        return {
+            right
+            for right in rights
+            if right.qualifier is not ALLOW or not is_expression(right.name) or right in counting
+        }
+
+    similar_requirements = similarity_to(earlier)
+    asked = {
+        requirement: {
+            goal_right(Right("", ALLOW, right, name)): Right("", ALLOW, PEER_RIGHT[right], name)
+            for right, name in rights_that_need_a_peer(requirement)
+        }
+        for requirement in (requirements if removed or added else ())
+        if similar_requirements(requirement)
+    }
+    difference = RightsDifference(tuple(removed), tuple(added), {})
+    candidates = {right for peers in asked.values() for right in peers}
+    unanswered = {
+        *rights_without_counterpart(
+            without_wildcards(first, removed),
+            without_wildcards(second, replacing),
+            difference,
+            candidates,
+        )
+    }
+    for requirement, peers in asked.items():
+        lost = [
+            f"{peer.right} {peer.kind.removesuffix('s')} {peer.name}"
+            for right, peer in peers.items()
+            if right in unanswered
+        ]
+        if lost:
+            place = requirement.source
+            text = f"HEAD removes the last stated right to {first_few(lost, 3)}, without which "
+            text += "the requirement protects nothing"
+            yield DROPPED.found(str(requirement), text, place.file, place.line, GONE_REMEDY)
 
 
 def _namespaces_of_patterns(requirement: Requirement) -> list[str]:

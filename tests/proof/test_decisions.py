@@ -26,18 +26,10 @@ from sros_tool.proof.findings import (
 from sros_tool.proof.requirements import Nobody, Only, Protected, Widest, parse_requirements
 from sros_tool.proof.suggestions import render_requirements, suggest
 from sros_tool.proof.system import System, load_system, policy_system
-from tests.support.harness import policy_text, sros
+from tests.support.harness import may, policy_text, sros
 
 NOW = datetime(2027, 1, 1, tzinfo=UTC)
 NOW_SIGNED = datetime.now(UTC)
-
-
-def may(right: str, *names: str) -> str:
-    """Return a group of a policy that allows a right."""
-    kind = {"publish": "topic", "subscribe": "topic", "request": "service", "reply": "service"}
-    item = kind.get(right, "action")
-    inside = "".join(f"<{item}>{each}</{item}>" for each in names)
-    return f'<{item}s {right}="ALLOW">{inside}</{item}s>'
 
 
 def robot(rights: Mapping[str, str]) -> System:

@@ -28,7 +28,7 @@ from sros_tool.proof.commit_files import CommitFiles
 from sros_tool.proof.repository import Repository
 from tests.support.code_host import NODE, PROJECT
 from tests.support.code_host import policy as policy_text
-from tests.support.harness import Ended, copy_of, publish, sros
+from tests.support.harness import Ended, copy_of, may, publish, sros
 from tests.support.long_form import some
 
 ROBOT = {"/a": publish("/x"), "/b": publish("/y")}
@@ -985,6 +985,44 @@ def test_a_change_renames_nothing_out_of_a_requirement(change: Change) -> None:
     change.base = change.commit({"README": "x"})
     change.commit({"README": "y"})
     assert "any more" not in change.review(*words).out
+
+
+_SERVED = may("reply", "/driver/open")
+_EVERYTHING = {"/recorder": may("subscribe", "/*")}
+
+
+@pytest.mark.parametrize(
+    ("required", "before", "after", "lost"),
+    [
+        # The server, or the receiver, has another name, which a new enclave uses.
+        ("request", _SERVED, may("reply", "/driver/open_gate"), "reply service /driver/open"),
+        ("request", _SERVED, may("reply", "/clear"), "reply service /driver/open"),
+        ("request", may("reply", "/driver/*"), may("reply", "/x"), "reply service /driver/open"),
+        ("call", may("execute", "/driver/open"), may("execute", "/lift"), "execute action /d"),
+        ("publish", may("subscribe", "/driver/open"), may("subscribe", "/d"), "subscribe topic /d"),
+        ("subscribe", may("publish", "/driver/open"), may("publish", "/d"), "publish topic /d"),
+        ("request", _SERVED, _SERVED + _SERVED.replace("ALLOW", "DENY"), "reply service /driver"),
+        # The name keeps its server, perhaps by a new wildcard.
+        ("request", _SERVED, may("reply", "/driver/*"), ""),
+        ("request", _SERVED, may("reply", "/driver/open", "/clear"), ""),
+        ("request", may("reply", "/other"), may("reply", "/clear"), ""),
+    ],
+)
+def test_a_requirement_about_a_name_that_loses_its_other_side(
+    change: Change, required: str, before: str, after: str, lost: str
+) -> None:
+    """Twin: neither the server's enclave nor a recorder that matches every name matters."""
+    panel = _EVERYTHING | {"/panel": may(required, "/driver/open")}
+    toml = f'[[only]]\n{required} = ["/driver/open"]\nenclaves = ["/panel", "/recorder"]\n'
+    robot = policy_text(panel | {"/driver": before})
+    change.base = change.commit({"robot.xml": robot, "robot.toml": toml})
+    words = ("--policy", "robot.xml", "--requirements", "robot.toml", "--new-access", "allow")
+    change.commit({"robot.xml": policy_text(panel | {"/driver": after})})
+    ended = change.review(*words)
+    assert (f"HEAD removes the last stated right to {lost}" in ended.out) == bool(lost), ended
+    assert "requirements-before" in ended.out or not lost, ended
+    change.commit({"robot.xml": policy_text(panel | {"/moved/driver": before})})
+    assert "HEAD removes" not in change.review(*words).out
 
 
 def test_a_name_that_nobody_may_use_may_lose_its_denial_and_its_right(change: Change) -> None:

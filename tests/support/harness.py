@@ -409,6 +409,14 @@ def policy_text(enclaves: Mapping[str, str]) -> str:
     return f'<policy version="0.2.0"><enclaves>{bodies}</enclaves></policy>'
 
 
+def may(right: str, *names: str) -> str:
+    """Return a group of a policy that allows a right."""
+    kind = {"publish": "topic", "subscribe": "topic", "request": "service", "reply": "service"}
+    item = kind.get(right, "action")
+    inside = "".join(f"<{item}>{each}</{item}>" for each in names)
+    return f'<{item}s {right}="ALLOW">{inside}</{item}s>'
+
+
 def publish(*names: str) -> str:
     """Return a group of topics to publish, as XML."""
     topics = "".join(f"<topic>{name}</topic>" for name in names)
