@@ -675,7 +675,7 @@ class _Round:
             return Installation()
         for name, why in installation.kept.items():
             remedy = _BRING_KEY.format(settings.robot) if concerns_key(why) else ""
-            self._problems.append(f"{name} keeps its files: {why}.{remedy}")
+            self._problems.append(f"{name} does not get the files of the release: {why}.{remedy}")
         for name in installation.removed:
             self._problems.append(
                 f"{name} was removed: release {release.number} lacks this enclave. Stop its "
@@ -1019,14 +1019,14 @@ class _Round:
             return None
         if len(text) > LONGEST_LIST:
             self._problems.append(
-                "The revocation list here is too long for the message of this robot."
+                "The message of this robot lacks the revocation list, which is too long for it."
             )
             return None
         return text
 
     def _note_unreadable_enclave(self, name: str, error: Exception) -> None:
         text = self._write_error_text(error) if isinstance(error, OSError) else str(error)
-        self._problems.append(f"the confirmation leaves out {name}: {text}")
+        self._problems.append(f"The message of this robot leaves out {name}: {text}")
 
     def _signed_message(self, confirmation: Confirmation, names: Sequence[str]) -> bytes:
         """Return the message, signed by the enclave whose certificate is valid longest.
@@ -1257,8 +1257,9 @@ def _write_message(inbox: Path, robot: str, message: bytes) -> None:
             f"{error.strerror or error}.",
             "The agent tries again at its next run."
             + (
-                " If a systemd unit runs the agent, write the unit again, because it was written "
-                "before `sros agent init`: `sros units KEYSTORE --job agent FOLDER`."
+                " If a systemd unit runs the agent, the unit was written before `sros agent "
+                "init`, and forbids this: write it again with `sros units KEYSTORE --job agent "
+                "FOLDER`."
                 if error.errno == errno.EROFS
                 else ""
             ),

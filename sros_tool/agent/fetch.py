@@ -337,7 +337,7 @@ def _fetch_error(error: Exception, source: str, now: datetime) -> FetchError:
         )
     if isinstance(error, exceptions.DownloadLengthMismatchError):
         return FetchError(
-            FetchProblem.TOO_LARGE, f"{source} sends more than is allowed", why, "Nothing was kept."
+            FetchProblem.TOO_LARGE, f"a file from {source} is too large", why, "Nothing was kept."
         )
     status = error.status_code if isinstance(error, exceptions.DownloadHTTPError) else 0
     if status in REFUSALS or is_tls_ended_by_server(error.__cause__):
@@ -363,10 +363,10 @@ def _fetch_error(error: Exception, source: str, now: datetime) -> FetchError:
         f"the files in {source} are damaged, or not signed with the trusted keys",
         f"{why} A file was damaged or changed; or the keystore publishes with other keys than "
         "before, after it was restored from a backup or made again. Nothing was changed.",
-        "If the keystore is as before, copy the published files again. If it was restored, and a "
-        "key of publishing was replaced after the backup, copy the later root metadata into "
-        "PUB/metadata, and add --rotate-key to `sros fleet publish`; if all keys were made "
-        "again, run `sros agent init` with --force and the new root.json "
+        "If the keystore was neither restored nor made again, copy the published files again. If "
+        "it was restored, and a key for publishing was replaced after the backup, copy the later "
+        "root metadata into PUB/metadata, and add --rotate-key to `sros fleet publish`; if all "
+        "keys were made again, run `sros agent init` with --force and the new root.json "
         "(docs/howto/keystore_is_lost.md, --rotate-key).",
     )
 

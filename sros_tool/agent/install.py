@@ -303,11 +303,9 @@ def _check_lists(name: str, files: Mapping[str, bytes], present: Mapping[str, by
             "enclaves would be trusted again. Either the server has an old copy, or the "
             "keystore comes from a backup. Nothing was changed.",
             "Check the files on the server, and publish there again. Only if the keystore comes "
-            "from "
-            "a backup, first run `sros fleet collect KEYSTORE INBOX`, which takes the list from "
-            "the "
-            "message of this robot; in a rotation, also `sros crl KEYSTORE --refresh --crl FILE`: "
-            f"FILE is this robot's {IDENTITY_CA_FILE}, because in a rotation this file has "
+            "from a backup, run `sros fleet collect KEYSTORE INBOX` before you publish: it takes "
+            "the list from the message of this robot. In a CA rotation, also run `sros crl "
+            f"KEYSTORE --refresh --crl FILE` with this robot's {IDENTITY_CA_FILE}, which then has "
             "revocation lists, too.",
         )
 

@@ -402,10 +402,8 @@ def restart_units(
             )
         except (OSError, subprocess.SubprocessError) as error:
             why = plain(str(error), 120)
-            return Restarts(
-                (),
-                (f"No unit is restarted, because the command `restart_if` gave no answer: {why}.",),
-            )
+            text = "No unit is restarted, because the command in `restart_if` did not start or end"
+            return Restarts((), (f"{text}: {why}.",))
         if allowed.returncode:
             return Restarts()
     try:

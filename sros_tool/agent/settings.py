@@ -118,7 +118,7 @@ def write_settings(folder: Path, settings: AgentSettings) -> None:
 def render_settings(settings: AgentSettings) -> bytes:
     """Return settings as a TOML document, which `read_settings` reads."""
     lines = [
-        "# The agent of this robot (`sros agent`); docs/fetching.md describes each key.",
+        "# The agent of this robot (`sros agent`); docs/fetching.md describes each setting.",
         f"robot = {_toml_text(settings.robot)}",
         f"from = {_toml_text(settings.source)}",
         f"inbox = {_toml_text(settings.inbox)}",
@@ -228,7 +228,7 @@ def settings_from(value: Mapping[str, Any], label: str) -> AgentSettings:
 def _unit_from_table(value: Any, label: str) -> Unit:
     if not isinstance(value, dict) or value.keys() != {"name", "enclaves"}:
         raise _invalid_settings_error(
-            label, "A unit does not have exactly the keys name and enclaves"
+            label, "An entry of `unit` has other keys than name and enclaves, or lacks one of them"
         )
     name, enclaves = value["name"], value["enclaves"]
     if not isinstance(name, str) or not _UNIT_NAME.match(name):

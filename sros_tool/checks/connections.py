@@ -140,7 +140,9 @@ def missing_text(missing: Sequence[tuple[Process, Process]]) -> str:
     remedy = next(filter(None, (_remedy(process, peers) for process, peers in to_restart)), "")
     if not remedy:
         names = enumerated([_process_name(process) for process, _ in to_restart])
-        remedy = f"restart {names}{', one after the other' * (len(to_restart) > 1)}, and ask again"
+        remedy = (
+            f"restart {names}{', one after the other' * (len(to_restart) > 1)}, and check again"
+        )
     return f"{first} and {second}{more} do not hear each other; {remedy[0].lower()}{remedy[1:]}"
 
 

@@ -809,7 +809,10 @@ def _denied_start_actions_sentence(lacking: Sequence[_NodeLackingRight]) -> str:
     ]
     *first, last = verbs
     either = f"{', '.join(first)} or {last}" if first else last
-    return f"{names_text(nodes)} may not {either}. A node denied any of this exits at its start."
+    return (
+        f"{names_text(nodes)} may not {either}. A node that is denied any of this exits when it "
+        "starts."
+    )
 
 
 def _different_common_part_cause(folder: str, lacking: Sequence[_NodeLackingRight]) -> Cause:
@@ -819,8 +822,8 @@ def _different_common_part_cause(folder: str, lacking: Sequence[_NodeLackingRigh
         f"the included '{folder}/node.xml' lacks rights that the file in this version of sros has",
         _denied_start_actions_sentence(lacking),
         f"'{folder}/node.xml' is included and differs from the file in this version of sros. "
-        f"Replace it: `mv {new} {old} && sros policies --copy {new}`. Files and changes of your "
-        f"own are then in {old} only: copy them back.",
+        f"Replace it: `mv {new} {old} && sros policies --copy {new}`. Your own files and changes "
+        f"are then only in {old}: copy them back.",
         len(lacking),
     )
 
@@ -939,7 +942,7 @@ CHARACTER_SET = FindingKind(
     "portable.character-set",
     NOTE,
     "a [set] of characters in a name",
-    "Vendors agree on sets such as [ab], but only * and ? are part of the portable profile.",
+    "Vendors agree on sets such as [ab], but not on all sets. On * and ?, they always agree.",
     "Fast DDS 2.6 to 3.6 (fnmatch), Cyclone DDS 0.10 and 11.0 (its own matching); tested.",
     "Use * or ?, or write the names out.",
 )
@@ -1109,8 +1112,8 @@ UNREACHABLE = FindingKind(
     "policy.unreachable-rule",
     WARNING,
     "an ALLOW that a DENY covers completely",
-    "A DENY of the same enclave, perhaps of another node in it, covers every name of the rule, "
-    "so the permission never allows anything.",
+    "A DENY of the same enclave, perhaps of another node in it, covers every name of the ALLOW, "
+    "so the ALLOW has no effect.",
     _RULE_ORDER_SOURCE,
     "Remove the ALLOW, or narrow the DENY.",
 )
@@ -1228,8 +1231,8 @@ IN_TWO_FILES = FindingKind(
     "policy.enclave-in-two-files",
     WARNING,
     "an enclave that two policies define",
-    "The two policies count as policies of one robot, and verbs that take rights from both refuse "
-    "them.",
+    "The two policies count as policies of one robot. Verbs that take rights from both policies "
+    "fail.",
     "sros.",
     "Define the enclave in one of the two policies. If they are for different robots, check the "
     "policies of each robot with a separate command.",
@@ -1256,7 +1259,7 @@ REDUNDANT_INCLUDE = FindingKind(
     "policy.redundant-include",
     NOTE,
     "an include that adds nothing",
-    "The same profile includes the file again, directly or through another file.",
+    "The profile already includes the file, directly or through another file.",
     "XInclude 1.0.",
     "Remove the include.",
 )

@@ -409,7 +409,10 @@ class _Ledgers:
         user = min(user, _FIRST_OF_RANGES)
         if self._read[user] + size > _MOST_LEDGERS:
             most = _MOST_LEDGERS // 1024**2
-            return (), f"sros reads at most {most} MiB of ledgers for the processes of a user"
+            return (), (
+                f"the ledger of its keystore was not read, because sros reads at most {most} MiB "
+                "of ledgers for the processes of a user"
+            )
         self._read[user] += size
         try:
             entries = (

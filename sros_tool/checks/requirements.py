@@ -17,8 +17,8 @@ VACUOUS = FindingKind(
     "requirement.vacuous",
     WARNING,
     "a requirement that protects less than it states",
-    "The named part protects nothing: perhaps a name is misspelled or was changed, or the "
-    "exceptions cover every enclave.",
+    "The part that the finding names protects nothing: perhaps a name is misspelled or was "
+    "changed, or the exceptions cover every enclave.",
     "The requirements file.",
     "Correct the name, its kind (service or action) or the exceptions. After `merge_policy "
     "--remap`, check with the same --remap. For a name that is to stay unused, write [[nobody]].",
@@ -79,10 +79,10 @@ ASSUMED = FindingKind(
 HOLDS_ALONE = FindingKind(
     "requirement.holds-alone",
     NOTE,
-    "a requirement that no enclave comes close to breaking",
-    "No right here comes close to breaking the requirement. Its names are relative, as in the "
-    "requirements of a package, so perhaps only the policies of the package's users have the "
-    "enclaves that could break it.",
+    "a requirement that only further enclaves could break",
+    "With the enclaves here, the requirement, or a part of it, cannot fail. Its names are "
+    "relative, as in the requirements of a package, so perhaps only the policies of the "
+    "package's users have the enclaves that could break it.",
     "The requirements file.",
     "If this is the policy of a package, also check a policy that has other enclaves: `sros check "
     "ROBOT_POLICY --requirements FILE --namespace NS`. If it is the policy of a whole robot, "
@@ -96,8 +96,8 @@ NOT_CROSSING = FindingKind(
     "The enclave has the right, and an enclave at another router has the counterpart right, but "
     "the routers do not forward the name to each other.",
     "The requirements file, and the router.json5 of both routers.",
-    "Add the name to `crossing` in the settings, or ignore this if the name is used on one robot "
-    "only.",
+    "Add the name to `crossing` in the keystore's settings, or ignore this if the name is used "
+    "on one robot only.",
     prominent=True,
 )
 OF_EXPORT = FindingKind(

@@ -59,8 +59,8 @@ NO_NODE = FindingKind(
     "upgrade.node-cannot-start",
     ERROR,
     "permissions with which no ordinary node starts after the update",
-    "A node creates these endpoints when it starts, and exits if one of them is denied. Nodes of "
-    "Iron and later also offer ~/get_type_description.",
+    "When a node starts, it creates the endpoints that the finding names, and exits if one of "
+    "them is denied. Nodes of Iron and later also offer ~/get_type_description.",
     "ROS 2 Jazzy, rcl 9, rclcpp 28, rclpy 7 and rmw_dds_common; REP-2016.",
     "Include common/node.xml in the profiles of the enclave's nodes (`sros check POLICY_FILE` says "
     "how), and sign the policy with `sros generate_artifacts -k KEYSTORE -p POLICY_FILE`.",
@@ -69,9 +69,9 @@ BUFFERS = FindingKind(
     "upgrade.zenoh-buffers",
     WARNING,
     "Zenoh files that lack the Zenoh keys (names) by which rmw_zenoh sends images after the update",
-    "rmw_zenoh of Lyrical sends messages with arrays of bytes, such as images and point clouds, on "
-    "keys below the key of the topic. With files of an earlier sros, Zenoh drops them without a "
-    "log line.",
+    "rmw_zenoh of Lyrical sends messages with arrays of bytes, such as images and point clouds, "
+    "on Zenoh keys (names) below the key of the topic. With files of an earlier sros, Zenoh "
+    "drops these messages without a log line.",
     "ros2/rmw_zenoh, rmw_publisher_data.cpp.",
     "Write the files again with `sros zenoh KEYSTORE`, and deliver them before the update.",
 )

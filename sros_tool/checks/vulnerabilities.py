@@ -54,7 +54,7 @@ VERSION_UNKNOWN = FindingKind(
     NOTE,
     "a DDS of unknown version",
     "sros cannot tell which known vulnerabilities it has.",
-    "The name of the library that a process has mapped.",
+    "The name of the library that a process has loaded.",
     "Look for the version in the package that the library belongs to; if the library was replaced, "
     "restart the processes.",
     prominent=True,

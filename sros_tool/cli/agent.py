@@ -90,7 +90,8 @@ def agent() -> None:
     is_flag=True,
     help=(
         "Make a new key for each renewal. The robot then asks for renewal before `sros renew "
-        "--all-expiring soon` would renew the present key. [default: the key stays]"
+        "--all-expiring soon` would renew the certificate of the present key. [default: the key "
+        "stays]"
     ),
 )
 @click.option(
@@ -331,8 +332,7 @@ def _round_lines(folder: Path, finished_round: Round, *, restarted: bool) -> Ite
     yield f"{release}: {', '.join(changes) or no_change}"
     if restarted and finished_round.unseen:
         yield (
-            "--restarted does not count for files that came in this round after the restart: files "
-            "of "
+            "--restarted does not count for files that this round installed: files of "
             f"{first_few(finished_round.unseen, _MOST_SHOWN)}"
         )
     yield from _due_lines(folder, finished_round.restart, finished_round.unseen)
@@ -364,7 +364,7 @@ def _due_lines(folder: Path, due_enclaves: Sequence[str], unseen: Sequence[str])
 def _status(folder: Path, max_age: str, as_json: bool) -> int:
     """Show the result of the agent's last round in FOLDER, what is due, and what is wrong now.
 
-    sros examines the files now, as `sros verify` does; it shows the processes of the last round.
+    sros examines the files now, as `sros verify` does; the processes are those of the last round.
 
     Example:
       $ sros agent status /etc/sros/keystore

@@ -184,7 +184,13 @@ def audit(
             unknown = str(error)
     audited = judge(snapshot.everything)
     if unknown:
-        notes = (*audited.notes, Note("audit.zenoh-unknown", f"a DDS vendor decided: {unknown}"))
+        notes = (
+            *audited.notes,
+            Note(
+                "audit.zenoh-unknown",
+                f"the rules of a DDS vendor decided, not the keystore's files for Zenoh: {unknown}",
+            ),
+        )
         audited = replace(audited, unjudged=(*audited.unjudged, _NO_ZENOH_FILES), notes=notes)
     left_out = [
         text

@@ -111,8 +111,10 @@ def _run(words: Sequence[str], shows_messages: bool) -> tuple[int, str, str]:
     "--brought",
     metavar="ENCLAVE",
     multiple=True,
-    help="Remember that the machine of ENCLAVE has the keystore's present files, and runs with "
-    "them; sros asks again when these files change. Can be repeated.",
+    help=(
+        "Remember that the other machine has the present files of ENCLAVE, and that the process "
+        "there runs with them. Use the option again after these files change. Can be repeated."
+    ),
 )
 @dry_run_option
 @json_option
@@ -145,7 +147,7 @@ def close(
     Nothing is closed before --apply, which restarts the processes that are systemd units, and shows
     the commands for all others. --proof checks that every process was started in its enclave, that
     the files have no error, that the requirements hold, that everything that talked may still talk,
-    that the processes of Fast DDS have connected to each other, and that an open listener finds
+    that processes on Fast DDS have connected to each other, and that an open listener finds
     nothing. --apply also proves this, if nothing is left to do by hand. --undo makes the robot open
     again.
 
@@ -393,12 +395,10 @@ def _show_end(
             exceptions += f", without a process of {', '.join(missing)}"
         answer, details = f"the robot is closed{exceptions}", _validity_lines(robot, closed)
         if robot.keystore.exists():
-            details.append(f"bring {folder}/keystore to another machine: it has the CA keys")
+            details.append(f"bring {folder}/keystore, which has the CA keys, to another machine")
     elif closed.proofs:
         accept = _ACCEPT_ADVICE if closed.is_proved(set(Acceptance)) else ""
-        next_command = (
-            f"correct the problems above, and ask again with sros close {folder} --proof, "
-        )
+        next_command = f"correct the problems above, and then run sros close {folder} --proof, "
         next_command += "or go back with --undo"
         answer = f"the robot is not proved closed; next: {accept}{next_command}"
     elif apply:
@@ -467,7 +467,7 @@ def _show_undone(robot: LocalRobot, closed: CloseState) -> None:
     if closed.dry_run:
         return
     if closed.problems:
-        ask = f"ask again with sros close {shlex.quote(str(robot.folder))} --undo"
+        ask = f"run sros close {shlex.quote(str(robot.folder))} --undo again"
         echo(f"the robot is not open yet; next: do what each line says, and {ask}", err=True)
     else:
         more = ""
@@ -534,9 +534,9 @@ def _other_machines_lines(robot: LocalRobot, closed: CloseState) -> list[str]:
         )
     if earlier := closed.earlier_elsewhere:
         lines.append(
-            "whoever kept earlier files has the rights until they expire: "
-            f"{_times_text(earlier)}; to end this, run "
-            f"`sros renew {keystore} {' '.join(earlier)} --revoke-old`"
+            "whoever kept earlier files has their rights until the files expire: "
+            f"{_times_text(earlier)}; to end this, run `sros renew {keystore} {' '.join(earlier)} "
+            "--revoke-old`"
         )
     return lines
 
@@ -559,7 +559,7 @@ def _validity_lines(robot: LocalRobot, closed: CloseState) -> list[str]:
     from sros_tool.keystore.expiry import enclaves_renewed_by_name, renewal_command
     from sros_tool.keystore.reader import OpenedKeystore
 
-    advice = "have them renewed before then (docs/howto/close.md, Renewal without hands)"
+    advice = "have them renewed before then (docs/howto/close.md, Automatic renewal)"
     if closed.expires_soon:
         by_name = []
         if robot.keystore.exists():

@@ -154,7 +154,7 @@ def test_what_is_said_restarted_has_no_files_of_the_same_round(world: World) -> 
     world.run("renew", "ks", "/r1/a").ok()
     world.run("fleet", "publish", "ks", "pub").ok()
     early = world.agent("--restarted").ok().out
-    assert "came in this round after the restart: files of /r1/a\nrestart due: /r1/a\n" in early
+    assert "that this round installed: files of /r1/a\nrestart due: /r1/a\n" in early
     assert "restart" not in world.agent("--restarted").ok().out
 
 

@@ -108,7 +108,7 @@ def test_a_summary_names_a_pair_and_all_restarts() -> None:
     missing = connections_between(robot(*range(2, 15), deaf=[(2, 12), (3, 6), (3, 12)])).missing
     assert missing_text(missing) == (
         "process 2 (node2) and process 12 (node12) and 2 other pairs do not hear each other; "
-        "restart process 12 (node12) and process 3 (node3), one after the other, and ask again"
+        "restart process 12 (node12) and process 3 (node3), one after the other, and check again"
     )
     different = [(first, replace(second, user=1000)) for first, second in missing]
     assert "; run these processes as one user" in missing_text(different)

@@ -485,8 +485,8 @@ def test_a_robot_is_closed_proved_and_opened_again(robot: Robot) -> None:
     ]
     assert re.search(
         r"\nthe robot is closed\n  the files are valid until 20.*Z; have them renewed before then "
-        r"\(docs/howto/close.md, Renewal without hands\)\n"
-        "  bring robot/keystore to another machine: it has the CA keys\n$",
+        r"\(docs/howto/close.md, Automatic renewal\)\n"
+        "  bring robot/keystore, which has the CA keys, to another machine\n$",
         closed.err,
     )
     robot.close("--apply")
@@ -623,7 +623,7 @@ def test_what_systemd_does_not_start_is_done_by_hand(
     )
     robot.more, robot.absent = (), set()
     for words in ("--apply", "--proof"):
-        assert "\n  bring robot/keystore to another machine" in robot.close(words).err
+        assert "\n  bring robot/keystore, which has the CA keys" in robot.close(words).err
     robot.by_hand, robot.absent = {"/talker"}, {"/listener"}
     (robot.folder / "link").symlink_to("robot")
     robot.spelled = "link/export"
@@ -663,8 +663,8 @@ def test_what_systemd_does_not_start_is_done_by_hand(
     undone = robot.close("--undo", status=1)
     assert would.out == undone.out and not would.err
     assert undone.err == (
-        "the robot is not open yet; next: do what each line says, and ask again with sros close "
-        "robot --undo\n"
+        "the robot is not open yet; next: do what each line says, and run sros close "
+        "robot --undo again\n"
     )
     robot.by_hand = set()
     # Of files that are not those of the folder, nobody knows whether they are a copy of them.
@@ -801,7 +801,7 @@ def test_a_node_that_does_not_run_always(robot: Robot) -> None:
     assert ended.out == robot.close("--proof", "--partial", status=1).out
     assert "has no enclave /x. It has /l" in robot.close("--proof", "--without", "/x", status=2).err
     without = "--proof", "--without", "/listener"
-    assert robot.close("--apply", *without[1:]).err.endswith("it has the CA keys\n")
+    assert robot.close("--apply", *without[1:]).err.endswith("to another machine\n")
     ended = robot.close(*without)
     assert (
         "yes: every process was started in its enclave: 1 enclave, and no open process in "
@@ -987,7 +987,7 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     named = f"process 4711 (run): the mode of '{key}' is 0644\n"
     assert f"no: not every process was started in its enclave: {named}" in ended.out
     assert "no: the files are not accepted: sros check finds 1 error, the first in rob" in ended.out
-    assert "next: correct the problems above, and ask again with sros close robot --pr" in ended.err
+    assert "next: correct the problems above, and then run sros close robot" in ended.err
     assert (
         "; sros check finds 1 error, the first in robot/keystore/private/identity_ca" in ended.out
     )
@@ -1836,7 +1836,9 @@ def test_a_robot_whose_files_expire_soon(keystore: Path, tmp_path: Path) -> None
     assert close._validity_lines(robot_at(later), state_at(later)) == [ended]
     assert ended.startswith("the files of /a, /b have expired; run `sros renew "), ended
     assert timedelta(days=3) < until - expired < timedelta(days=5)
-    assert f"the rights until they expire: /operator/look ({iso(until)}); to end this" in said
+    assert (
+        f"their rights until the files expire: /operator/look ({iso(until)}); to end this" in said
+    )
     (tmp_path / "export/enclaves/b/permissions.p7s").write_bytes(b"damaged")
     assert state_at(datetime.now(UTC)).valid_until is None, "nobody knows until when /b works"
 

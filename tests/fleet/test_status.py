@@ -1330,7 +1330,8 @@ def test_what_is_to_be_done_for_robots_that_do_not_fetch_what_is_published(field
     assert rows["r3"][0] == "deliver"
     metrics = field.run("fleet", "status", "ks", "--prometheus", status=1).out
     assert re.search(r'agent_problems\{.*robot="r2"\} 1', metrics)
-    gone = "/r2/base keeps its files: the key of enclave /r2/base is not on this robot."
+    gone = "/r2/base does not get the files of the release: the key of enclave /r2/base is not on "
+    gone += "this robot."
     field.send("r2", release=0, problems=(gone,))
     assert said()["r2"][0] == "deliver"
 

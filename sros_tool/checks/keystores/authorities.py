@@ -231,8 +231,9 @@ CA_KEY_PLAIN = FindingKind(
     "a CA key without a passphrase",
     "Anyone who copies the file can create any enclave, with any rights.",
     "ros2/sros2 issue 282; NIST SP 800-57 part 1, 6 (protection of keys).",
-    "Create keystores with --encrypt-ca-keys or with keys on a token, or keep the key offline. To "
-    "encrypt it, run `openssl pkcs8 -topk8 -scrypt -in KEY -out KEY.new && mv KEY.new KEY`.",
+    "Create keystores with --encrypt-ca-keys or with keys on a token, or keep the key offline. "
+    "To encrypt this key, run `openssl pkcs8 -topk8 -scrypt -in KEY -out KEY.new && mv KEY.new "
+    "KEY`.",
 )
 CA_KEY_FEW_ROUNDS = FindingKind(
     "keystore.ca-key-few-rounds",
@@ -257,8 +258,8 @@ SETTINGS_EDITED = FindingKind(
     "keystore.settings-edited",
     WARNING,
     "settings that were edited by hand and not applied",
-    "Files that are issued after the edit may follow it; earlier files do not. sros has not shown "
-    "which protection the edit weakens.",
+    "Files that are issued after the edit may follow it; earlier files do not. sros has not yet "
+    "shown whether the edit weakens a protection.",
     "sros: the ledger has the settings as sros wrote them.",
     edit_remedy("KEYSTORE"),
 )
@@ -285,7 +286,7 @@ NOT_AS_SETTINGS = FindingKind(
     "governance.not-as-settings",
     WARNING,
     "a signed governance that differs from the settings",
-    "DDS loads the signed governance. The [protection] in sros.toml has no effect.",
+    "DDS loads the signed governance. The section [protection] of sros.toml has no effect.",
     "sros: sros.toml holds the settings of a keystore; DDS-Security 1.1, 9.4.1.2.",
     edit_remedy("KEYSTORE"),
 )

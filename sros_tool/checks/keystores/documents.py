@@ -47,10 +47,10 @@ SEVERAL_GRANTS = FindingKind(
     "portable.several-grants",
     WARNING,
     "several grants in one document",
-    "Fast DDS uses the subject's first grant that is valid now. Cyclone DDS uses the subject's "
-    "first grant, valid or not, and also accepts a grant whose subject only contains the subject "
-    "of the certificate. Permissions are not secret: an enclave can also use a grant for its "
-    "subject in the permissions of another enclave.",
+    "Of the grants for a certificate's subject, Fast DDS uses the first that is valid now, and "
+    "Cyclone DDS uses the first, valid or not. Cyclone DDS also accepts a grant whose subject "
+    "has all parts of the certificate's subject, and more. Permissions are not secret: an "
+    "enclave can also use a grant for its subject in the permissions of another enclave.",
     "Fast DDS 2.6 to 3.6 (Permissions.cpp), Cyclone DDS 0.10 and 11.0; tested.",
     "Write one document with one grant for each enclave.",
 )
@@ -160,7 +160,7 @@ LOCAL_TIME = FindingKind(
 CHARACTER_CLASS = FindingKind(
     "portable.character-class",
     WARNING,
-    "a [class] of characters that vendors read differently",
+    "a [set] of characters that vendors read differently",
     "Cyclone DDS reads [^...] and [[:class:]] as plain characters; Fast DDS supports negation and "
     "classes.",
     "Fast DDS 2.6 to 3.6 (fnmatch), Cyclone DDS 0.10 and 11.0; tested.",
@@ -494,8 +494,8 @@ UNAUTHENTICATED = FindingKind(
     "participants without an identity may join",
     "On Fast DDS, they can read and write each topic that has neither access control nor "
     "protection; on Cyclone DDS, each topic that has no protection, even if it has access "
-    "control. If the governance also protects RTPS messages, Fast DDS refuses the governance; "
-    "only Fast DDS 2.9 accepts it, and ignores allow_unauthenticated_participants.",
+    "control. If the governance also protects RTPS messages, Fast DDS refuses the governance. "
+    "(Fast DDS 2.9 accepts it, and ignores allow_unauthenticated_participants.)",
     f"{_GOVERNANCE_SOURCE} (allow_unauthenticated_participants); Fast DDS 2.9.1 and 2.14.5, "
     "Cyclone DDS 0.10 and 11.0; tested.",
     f"Run {REFUSE_STRANGERS}.",
@@ -745,7 +745,7 @@ def _clause_on_topics_of_unauthenticated(rule: DomainRule, vendor: Vendor) -> st
         if is_open_to_unauthenticated(rule, topic_rule, vendor)
     ]
     if not opened:
-        return "they reach no topic, because all topics are controlled or protected"
+        return "they reach no topic, because every topic has access control or protection"
     return f"anybody can read and write {names_text(opened)}"
 
 

@@ -215,7 +215,7 @@ XML_DIFFERS = FindingKind(
     "DDS-Security 1.1, 9.4.1.3; rcl 9 (security.c).",
     "Sign the intended permissions with `sros create_permission KEYSTORE ENCLAVE POLICY_FILE`.",
 )
-_NOT_IN_EXPORTS = "Delete permissions.xml: no export has this file."
+_NOT_IN_EXPORTS = "Delete permissions.xml: exports do not have this file, and DDS does not read it."
 CRL_MISSING = FindingKind(
     "enclave.crl-missing",
     ERROR,

@@ -76,8 +76,8 @@ REPLACEABLE = FindingKind(
     "keystore.replaceable",
     ERROR,
     "a folder above the keystore that other users can change",
-    "These users can put another keystore there, and so decide whom a node trusts. sros does not "
-    "check access control lists.",
+    "These users can put another keystore in place of this one, and so decide whom a node "
+    "trusts. sros does not check access control lists.",
     "POSIX owners and modes; CWE-732; rcl 9 checks neither.",
     "Run `chmod go-w` on the folder, or move the keystore to a folder that only its owner and root "
     "can change.",

@@ -222,7 +222,7 @@ class CheckedKeystore:
         for name in template_names():
             if accepts_weakness(_load_shipped(name)):
                 return f"template {name}"
-        return "" if kind.severity is ERROR else "keystore whose CA signed it"
+        return "" if kind.severity is ERROR else "keystore whose CA signed the file"
 
     def shown_path(self, path: str | Path) -> str:
         """Return the path of a file below the root in the form that findings show."""

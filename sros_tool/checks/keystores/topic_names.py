@@ -146,7 +146,7 @@ def _character_problem(name: str) -> str:
     shown = " ".join("a blank" if letter.isspace() else letter for letter in letters)
     advice = ""
     if "{" in name or "$(" in name:
-        advice = ": fill in the template"
+        advice = ": write the value in place of the placeholder"
     elif "," in letters or ";" in letters or any(map(str.isspace, letters)):
         advice = ": write a <topic> for every name"
     elif "~" in letters:

@@ -72,8 +72,8 @@ DIFFER = FindingKind(
     "vendors that decide differently on the same permissions",
     "An access that works with one RMW is denied, or open to everybody, with another.",
     _ENGINE_SOURCE,
-    "Use only the portable profile; `sros explain --all-vendors` shows the decision of each "
-    "vendor.",
+    "Sign the rights in the form that sros writes: `sros create_permission KEYSTORE ENCLAVE "
+    "POLICY_FILE`. `sros explain --all-vendors` shows the decision of each vendor.",
 )
 
 _IDS_BY_REASON: Mapping[str, frozenset[str]] = {
@@ -404,9 +404,9 @@ NO_NODE = FindingKind(
     "enclave.node-cannot-start",
     ERROR,
     "permissions with which no ordinary ROS 2 node can start",
-    "A node of rclpy or rclcpp creates these endpoints when it starts, and exits if one of them is "
-    "denied. Nodes that were created without these endpoints do not need them, but every process "
-    "needs ros_discovery_info.",
+    "When a node of rclpy or rclcpp starts, it creates the endpoints that the finding names, and "
+    "exits if one of them is denied. Nodes that were created without these endpoints do not need "
+    "them, but every process needs ros_discovery_info.",
     "ROS 2 Jazzy, rcl 9, rclcpp 28, rclpy 7 and rmw_dds_common; ~/get_type_description since Iron "
     "(REP-2016).",
     "Include common/node.xml in the profiles of the enclave's nodes (`sros check POLICY_FILE` says "
@@ -438,7 +438,7 @@ class _Denial(NamedTuple):
         """Return the clause with its reason."""
         if self.by:
             return f"{self.text}, as {self.by}"
-        where = f", unless in partition {self.partition}, which ROS 2 does not use"
+        where = f", except in partition {self.partition}, which ROS 2 does not use"
         return f"{self.text}{where if self.partition else ''}"
 
     def explains(self, finding: Finding) -> bool:
