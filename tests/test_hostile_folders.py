@@ -391,7 +391,7 @@ def test_what_a_killed_run_of_root_left_is_said_and_ended_by_root(
     else:
         path.mkdir(mode=0o700)
     said = in_process_of(OWNER, lambda: create_enclaves(keystore, ["/new"], now=NOW))
-    assert f"'{path}' is in the way" in said and "Run the command once as root" in said
+    assert f"'{path}' is in the way" in said and "run the command once as root" in said
     assert "It belongs to user root, whose run" in said
     create_enclaves(keystore, ["/new"], now=NOW)
     assert in_process_of(OWNER, lambda: create_enclaves(keystore, ["/other"], now=NOW)) == ""

@@ -255,7 +255,7 @@ def _vendor_faults(
         yield from _signature_problems(traits, file, state, trust.signers, moment)
     largest = traits.largest_document
     if largest is not None and state.permissions_bytes > largest:
-        text = f"it has {state.permissions_bytes} bytes, and from {largest + 1} on the "
+        text = f"it has {state.permissions_bytes} bytes: with {largest + 1} or more, the "
         yield Problem(PERMISSIONS_FILE, f"{text}handshake may never finish", Fault.DOCUMENT_SIZE)
 
 
@@ -387,7 +387,7 @@ def _signer_fault(
     for signature in signed.signatures:
         signer = signature.signer_among(trusted if listed else signed.certificates)
         if signer is None:
-            where = "in the file of the permissions CA" if listed else "in the message"
+            where = "in the file of the permissions CA" if listed else "in the document"
             return f"the certificate of its signer is not {where}"
         if not signature.is_intact(signed.content, signer):
             return "its signature does not match its content"

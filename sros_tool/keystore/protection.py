@@ -179,7 +179,8 @@ class _RaisedProtection:
         return PolicyError(
             f'{protection.source}: {protection} has protect="{protection.word}", but the '
             f"settings of the keystore already protect {other}",
-            "Some names match both wildcards, and it is unclear which of the two decides.",
+            "Some names match both wildcards, and it is unclear which of the two applies to "
+            "these names.",
             "In the policy, protect names that only one of the wildcards matches, or change the "
             "settings: `sros update_keystore --help` describes --rule and --drop-rule.",
         )

@@ -903,7 +903,7 @@ class _EnclaveFiles:
         ``key`` is the content of ``key.pem``, or None. Faults are recorded.
         """
         if key is not None:
-            text = f"{KEY_FILE} is there, too"
+            text = f"the folder also has {KEY_FILE}"
             self._add(KEY_URI_FILE, text, Fault.KEY_TWICE)
         if not data:  # already reported
             return None
@@ -950,7 +950,7 @@ class _EnclaveFiles:
                 f"but by {other_issuer_text(certificate, ca)}"
             )
             if refusal := self._chain_problem(certificate, authorities or b""):
-                text += f"; also with all CAs of {IDENTITY_CA_FILE}, {refusal}"
+                text += f"; {IDENTITY_CA_FILE} also has its issuer, but {refusal}"
             self._add(CERTIFICATE_FILE, text, Fault.CERTIFICATE_ISSUER)
         elif certificate and ca and authorities and not self._problems:
             self._check_chain(certificate, authorities)
@@ -1004,7 +1004,7 @@ class _EnclaveFiles:
             return None
         if not path.is_file():
             text = "it is a folder" if path.is_dir() else "it is no file, or a broken link"
-            self._add(CRL_FILE, f"{text}, which ROS 2 leaves out", Fault.CRL_LEFT_OUT)
+            self._add(CRL_FILE, f"{text}, so ROS 2 ignores it", Fault.CRL_LEFT_OUT)
             return None
         data = self._content(path, "revocation list")
         if data is None:

@@ -395,18 +395,20 @@ def _zenoh_rights(path: Path, document: ConfigurationDocument) -> RightsSource:
             text = "it allows everything that no rule denies, to everybody."
         notes.append(Note("rights.zenoh-open", f"{path}: {text}"))
     if any(subject.cert_common_names is None for subject in access.subjects):
-        text = "its rules for subjects without certificate common names are left out"
+        text = "this answer leaves out its rules for subjects without certificate common names"
         notes.append(Note("rights.zenoh-nameless", f"{path}: {text}; `sros check` shows them."))
     if unclear := document.open_link_clause():
         text = (
-            f"{path}: {unclear}: a process that connects there has no name that a rule could "
-            "require."
+            f"{path}: {unclear}: a process that connects there shows no certificate, so no rule "
+            "can name it."
         )
         notes.append(Note("rights.zenoh-strangers", text))
     if unclear := access.unclear_reason():
         notes.append(Note("rights.zenoh-conditions", f"{path}: {unclear}."))
     if document.namespace:
-        text = f"{path}: it puts a namespace before the keys; this answer ignores the namespace."
+        text = (
+            f"{path}: it puts a namespace before all Zenoh keys; this answer ignores the namespace."
+        )
         notes.append(Note("rights.zenoh-namespace", text))
     if rules.left_out:
         number = counted(len(rules.left_out), "key expression")
@@ -464,12 +466,12 @@ def _keystore_rights(
         rights |= granted
         enclaves.update(scope)
         if foreign := sorted(set(scope) - {name}):
-            verdict = (
-                "which can use these permissions, too"
+            also, verdict = (
+                ("also ", "which can use them")
                 if name in scope
-                else "and DDS refuses these permissions"
+                else ("", "so DDS refuses them here")
             )
-            text = f"{name}: its permissions are for {', '.join(foreign)}, {verdict}."
+            text = f"{name}: its permissions are {also}for {', '.join(foreign)}, {verdict}."
             reader.sound = False
             reader.notes.append(Note(FOREIGN_GRANT, text))
     if not hidden and only_enclaves is None and (left_out := notes_on_hidden_enclaves(root)):
@@ -583,8 +585,8 @@ def _left_out_notes(grants: Iterable[Grant]) -> Iterator[Note]:
             yield Note("rights.partitions", "this answer ignores its partitions.")
         if any(rule.relay for rule in grant.rules):
             text = (
-                "this answer ignores its <relay>: if a process does not apply its own permissions, "
-                "peers on Fast DDS let it subscribe by this rule."
+                "this answer ignores its <relay>: by this rule, peers on Fast DDS let a process "
+                "subscribe that does not apply its own permissions."
             )
             yield Note(RELAY, text)
         if len({rule.domains for rule in grant.rules}) > 1:
@@ -849,7 +851,7 @@ def without_enclaves_of_sros(source: RightsSource, other: RightsSource) -> Right
     if named := sorted(left_out & routers):
         number = counted(len(named), "Zenoh router")
         text = (
-            f"left out: {number}, not in the policy, and with only the rights that every node needs"
+            f"left out: {number} with only the rights that every node needs, and not in the policy"
         )
         notes = (*notes, Note("rights.routers", f"{text}: {first_few(named, 5)}."))
     return replace(
@@ -1082,7 +1084,7 @@ class RecordedRights:
         else:
             return last.policy if last else ""
         raise KeystoreError(
-            f"it is not certain that the permissions of enclave {name} are its latest",
+            f"it is not certain that enclave {name} has its latest permissions",
             why,
             f"State its rights with `sros create_permission {quote(str(self._root))} {name} "
             "POLICY_FILE`, and "

@@ -307,8 +307,8 @@ def _enclaves_of_robots(
         raise KeystoreError(
             f"keystore '{root}' has no fleet, so it has no robot {robots[0]!r}",
             "",
-            f"Name the fleet's file with `sros generate_artifacts -k {quote(str(root))} -p "
-            "POLICY_FILE --fleet FILE`, or the enclaves with --match.",
+            f"Give the keystore its fleet file with `sros generate_artifacts -k {quote(str(root))} "
+            "-p POLICY_FILE --fleet FILE`, or choose enclaves with --match.",
         )
     enclaves: list[str] = []
     for name in robots:
@@ -321,7 +321,7 @@ def _enclaves_of_robots(
                 raise KeystoreError(
                     f"the fleet in keystore '{root}' gives no enclave to a robot {name}",
                     f"The keystore has {_names_text(left)}: perhaps the robot left the fleet or a "
-                    "group, or the path is written without {robot}.",
+                    "group, or the policy writes the path without {robot}.",
                     f"Name the enclaves themselves: {arguments_for(keystore, left)}.",
                 )
             fleet.robot(name)
@@ -399,7 +399,7 @@ def missing_enclave_error(
             return KeystoreError(
                 missing,
                 f"'{robot / CLOSED_KEYSTORE}' has the enclave, but this export does not: perhaps "
-                "it belongs to another machine (--elsewhere of `sros close`).",
+                "the enclave belongs to another machine (--elsewhere of `sros close`).",
                 f"Start its process on that machine, or run `sros close {folder} --here "
                 f"{quote(name)}`.",
             )
@@ -472,7 +472,7 @@ def _revoked_enclave_error(
     remedy = f"To use it again, with another key: `{again}`."
     if not may_create:
         remedy = (
-            "If the revocation list may lack it, sign the list again: `sros crl "
+            "If the revocation list may lack its certificate, sign the list again: `sros crl "
             f"{quote(str(root))} --refresh`."
         )
     reason = "" if entry.reason in ("", "unspecified") else f" ({entry.reason})"

@@ -117,9 +117,9 @@ class PresentSettings(NamedTuple):
         if self.without_settings and protection_for(self.governance) is None:
             raise KeystoreError(
                 "the governance of the keystore has rules that settings cannot express",
-                "It has several domain rules, no rule for * at its end, or a rule for a DDS topic "
-                "that is not a topic, service or action of ROS. Changing one setting would replace "
-                "these rules.",
+                "It has several domain rules, its last rule is not for *, or it has a rule for a "
+                "DDS topic that is not a topic, service or action of ROS. Changing one setting "
+                "would replace these rules.",
                 "Replace all settings with --template; --dry-run shows the changes.",
             )
         return self.settings

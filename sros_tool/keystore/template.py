@@ -401,9 +401,9 @@ def with_values(
         left = [entry for entry in entries if not _match_same_names(entry["names"][0], name)]
         if (kind, name) in dropped and len(left) == len(entries):
             raise UsageError(
-                f"the {kind} {name} has no protection of its own",
-                "Only names with a `[[protection...]]` table in the settings can be dropped.",
-                "See sros.toml of the keystore.",
+                f"no rule of the settings is for the {kind} {name}",
+                "--drop-rule removes a `[[protection...]]` table of the settings.",
+                "See the tables in sros.toml of the keystore.",
             )
         protection[kind] = left
     for rule in rules:
@@ -417,7 +417,7 @@ def with_values(
             inner = inner.get(part) if isinstance(inner, dict) else None
         if path == ["zenoh"] and inner is None:
             raise UsageError(
-                "the keystore has no files for Zenoh yet, and so no settings of Zenoh",
+                "the keystore has no Zenoh files yet, and therefore no settings for Zenoh",
                 "",
                 "Write them first, for example with `sros zenoh KEYSTORE --mode peer`.",
             )
@@ -428,7 +428,8 @@ def with_values(
             raise UsageError(
                 f"{key!r} is not a setting of a keystore",
                 "",
-                "Name one such as protection.rtps, permissions.validity or permissions.default.",
+                "Name a setting, such as protection.rtps, permissions.validity or "
+                "permissions.default.",
             )
         inner[last] = _typed_value(key, value)
     try:

@@ -1135,8 +1135,8 @@ def _left_by_other_user_error(path: Path) -> KeystoreError:
     return KeystoreError(
         f"'{path}' is in the way, and this user cannot open it",
         f"It belongs to {user}, whose run of sros is not finished, or was killed.",
-        "Wait until no such run is at work. Run the command once as root if the file stays: it "
-        "completes or undoes what was interrupted.",
+        "Wait until sros no longer runs for that user. If the file stays, run the command once "
+        "as root: sros then completes or undoes the interrupted change.",
     )
 
 

@@ -180,7 +180,10 @@ def open_zenoh(folder: Path, name: str, state: OpenedEnclave) -> OpenedZenoh:
         ):
             problems.append(ZenohProblem(file, text, ZenohFault.OUT_OF_DATE))
     if configurations and certified != name:
-        text = f"Zenoh identifies the process by its common name, which is {certified or '(none)'}"
+        text = (
+            f"Zenoh identifies the process by the common name here, {certified or '(none)'}, not "
+            f"{name}"
+        )
         problems.append(ZenohProblem(CERTIFICATE_FILE, text, ZenohFault.OTHER_NAME))
     return OpenedZenoh(present, configurations, tuple(problems))
 
@@ -305,7 +308,7 @@ _MOST_DOMAINS = 16
 
 
 Result = TypeVar("Result")
-OTHER_DOMAINS = "its permissions are for no domain of the network"
+OTHER_DOMAINS = "its permissions are for no domain of the Zenoh network"
 """Why an enclave gets no configuration if the network's domains are stated in the settings."""
 
 
@@ -497,17 +500,17 @@ def zenoh_documents(
         if router not in names:
             raise KeystoreError(
                 f"keystore '{root}' has no enclave {router}, and the Zenoh router needs it",
-                "Its certificate shows to all others that the process is the router.",
+                "By the certificate of this enclave, all other processes recognize the router.",
                 f"Create it with `sros create_enclave {quote(str(root))} {router}`, name another "
-                "enclave with `sros zenoh --router NAME`, or end the network with `sros zenoh "
-                f"{quote(str(root))} --off`.",
+                "enclave with `sros zenoh --router NAME`, or remove the Zenoh files with `sros "
+                f"zenoh {quote(str(root))} --off`.",
             )
         if change.stated.get(router):
             raise UsageError(
                 f"a policy has rights for {router}, the enclave of the Zenoh router",
-                "The router forwards all messages, so an enclave in both roles would have the "
+                "The router forwards all messages, so a node in this enclave would have the "
                 "rights of all enclaves.",
-                "Give the node an enclave of its own.",
+                f"In the policy, give the nodes of {router} another enclave.",
             )
         names.remove(router)
     unread = frozenset(names).difference(among) if among else frozenset[str]()
@@ -561,7 +564,8 @@ def zenoh_documents(
     if direct and size > _MOST_BYTES:
         raise UsageError(
             f"the files of {len(rules)} enclaves would be larger than {_MOST_BYTES >> 20} MB",
-            "In peer mode each file has the rights of all enclaves that its own enclave may reach.",
+            "In peer mode, a file has the rights of all enclaves that the file's enclave may "
+            "reach.",
             f"Use client mode: `sros zenoh {quote(str(root))} --mode client`.",
         )
     enclaves = {_router_path(name): name for name in network.router_names()}
@@ -605,8 +609,8 @@ def _rights_for_peers(
     except TooManyExpressions:
         raise PolicyError(
             f"the common rights of {name} and another enclave cannot be expressed in Zenoh",
-            "In peer mode, each session has the rights that both enclaves have. The wildcards in "
-            "these rights combine into too many key expressions.",
+            "In peer mode, a file states the common rights for each other enclave. The wildcards "
+            "in these rights combine into too many key expressions.",
             "Use fewer wildcards, or client mode: `sros zenoh --mode client`.",
         ) from None
     rendered.append(router)
@@ -681,7 +685,7 @@ def _domains(
         raise UsageError(
             f"keystore '{root}' is for {len(chosen)} domains, but a Zenoh network can have at most "
             f"{_MOST_DOMAINS}",
-            "Its rules state every right once for each domain.",
+            "The rules of the network state every right once for each domain.",
             "Name the domains that run on Zenoh with `sros zenoh --domain`.",
         )
     return chosen
@@ -833,8 +837,8 @@ class _RightsReader:
             raise KeystoreError("its certificate is revoked")
         if (certified := common_name_of(certificate.subject)) != name:
             raise KeystoreError(
-                f"Zenoh identifies a process by the common name of its certificate, which is "
-                f"{certified or '(none)'!r}"
+                f"Zenoh identifies a process by the common name of its certificate: here, this is "
+                f"{certified or '(none)'!r}, not the name of the enclave"
             )
         return certificate
 

@@ -595,7 +595,7 @@ def other_issuer_text(certificate: x509.Certificate, authority: x509.Certificate
             f"a CA that has the same name, {name}, and the same key identifier, but not the same "
             "key or serial number"
         )
-    return f"another CA named {name} (key identifier {named}; the CA here: {here})"
+    return f"another CA named {name} (key identifier {named}, not {here})"
 
 
 def subject_text(name: x509.Name) -> str:

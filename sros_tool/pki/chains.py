@@ -483,7 +483,10 @@ def _signature_faults(chain: Sequence[x509.Certificate], checks: Checks) -> Iter
             yield f"the keyUsage of {subject_text(issuer.subject)} lacks keyCertSign"
         elif not signature_matches(below, issuer):
             name = subject_text(issuer.subject)
-            yield f"the signature of {subject_text(below.subject)} is not by the key of {name}"
+            yield (
+                f"the signature of {subject_text(below.subject)} was not made with the key of "
+                f"{name}"
+            )
 
 
 _DEMANDING_EXTENSIONS = {ExtensionOID.CERTIFICATE_POLICIES, ExtensionOID.POLICY_CONSTRAINTS}

@@ -51,7 +51,7 @@ def _module_to_load(parsed: TokenUri, *, is_from_user: bool) -> str:
         raise UsageError(
             f"the PKCS#11 module '{parsed.module}' is not loaded",
             "Its path comes only from the keystore, and users other than root can change the "
-            "file. Its code would run in this process.",
+            "module. Its code would run in this process.",
             f"If you trust it, set {MODULE_VARIABLE} to its path.",
         )
     raise UsageError(
@@ -460,7 +460,8 @@ def parse_enclave_uri(uri: str, name: str) -> TokenUri:
         raise UsageError(
             "the PKCS#11 URI cannot name the key of an enclave",
             f"The token name may have at most {_LONGEST_TOKEN} bytes, the object name at most "
-            f"{_LONGEST_OBJECT}, and no control characters. A stated type has to be private.",
+            f"{_LONGEST_OBJECT}, and no control characters. If the URI states a type, it has to be "
+            "private.",
             "Write pkcs11:token=NAME;object=LABEL?pin-source=FILE.",
         )
     return parsed
@@ -597,8 +598,9 @@ def pin_line_break_clause(place: TokenUri) -> str:
     if not pin.endswith((b"\n", b"\r")):
         return ""
     return (
-        f"the file with the PIN, '{place.pin_source}', ends with a line break, which libp11 before "
-        "0.4.17 takes for a part of the PIN, so that no node starts: write it with `printf %s PIN`"
+        f"the file with the PIN, '{place.pin_source}', ends with a line break. libp11 before "
+        "0.4.17 takes it for a part of the PIN, and no node starts: write the file with `printf "
+        "%s PIN`"
     )
 
 

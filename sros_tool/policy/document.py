@@ -442,7 +442,7 @@ def refuse_fallbacks(policy: Policy) -> None:
     for source, file in policy.fallbacks:
         raise PolicyError(
             f"{source}: the fallback of the include is used, because '{file}' is absent",
-            "On a machine that has the file, decisions on this policy would be wrong.",
+            "On a machine that has the file, the policy may give other rights.",
             "Add the file, or put the rights of the fallback in the place of the include.",
         )
 

@@ -463,7 +463,7 @@ def merge_all(path: Path, policies: Iterable[Policy]) -> Merged:
     several = (
         f"{enclave} has the node {node} in {first_few([profile.ns for profile in profiles], 3)}: "
         "each process in this enclave has the rights of the node in all these namespaces. Put the "
-        "namespace into path=, too, to give each instance an enclave of its own."
+        "namespace into path=, too, to give each instance of the node its own enclave."
         for (enclave, node), profiles in nodes_in_several_namespaces(before.enclaves).items()
         if first_nodes.get((enclave, node), ()) != profiles
     )

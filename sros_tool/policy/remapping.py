@@ -358,7 +358,7 @@ def _notes_on_old_names(
             if not rules.cover(right._replace(name=new)):
                 text = (
                     f"{right} at {denied.source} does not change, and does not apply to {new}, "
-                    f"the new name of {old}. If the new name is meant, too, add it there."
+                    f"the new name of {old}. To deny the new name, too, add it there."
                 )
                 yield Note("merge.old-name-denied", text)
 

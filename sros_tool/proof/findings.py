@@ -425,7 +425,10 @@ def decided_findings(
     if system.is_export:
         text = "only the enclaves in this export were judged: its keystore may have other enclaves"
         if decided.unjudged:
-            text += f", such as {first_few(decided.unjudged, _MOST_SHOWN)}, which must have rights"
+            text += (
+                f", such as {first_few(decided.unjudged, _MOST_SHOWN)}, for which requirements "
+                "demand rights"
+            )
         if away := sorted({name for world in system.worlds for name in world.away}):
             text += f"; left out on purpose, for other machines: {first_few(away, _MOST_SHOWN)}"
         findings.append(OF_EXPORT.found(system.file, text, system.file))
@@ -511,7 +514,7 @@ def _edit_text(violation: Violation) -> str:
         return ""
     space = requirement.namespace.rstrip("/")
     if not all(name.startswith(f"{space}/") for name in enclaves):
-        effect += "; an enclave that begins with * is the same in every namespace"
+        effect += "; the name of an enclave that begins with * counts in every namespace"
     written = {
         name.removeprefix(space) if name.startswith(f"{space}/") else f"*{name}"
         for name in enclaves
@@ -671,14 +674,16 @@ def _namespace_remedy(requirement: Requirement, rights: Iterable[Right]) -> str:
         space = requirement.namespace
         if was_moved and (own := name.removeprefix(space.rstrip("/"))) in stated:
             return (
-                f"The rights have {own}, as the policy of a package does: leave out `--namespace "
-                f"{quote(space)}`, or name the policy of a robot that was merged with it."
+                f"The policy names {own} without the namespace, as the policy of a package does: "
+                f"leave out `--namespace {quote(space)}`, or check the policy of a robot into "
+                "which the policy of the package was merged."
             )
         if not was_moved and (namespaces := sorted(_namespaces_with(name, stated))):
             options = " ".join(f"--namespace {quote(ns)}" for ns in namespaces[:_MOST_SHOWN])
             return (
-                f"The rights have {namespaces[0]}{name}: check the requirements of a package with "
-                f"its namespace: `{options}`. Otherwise, correct the name, here or in the policy."
+                f"The policy names {namespaces[0]}{name}. If these are the requirements of a "
+                f"package, check them with its namespace on the robot: `{options}`. Otherwise, "
+                "correct the name, here or in the policy."
             )
     return ""
 

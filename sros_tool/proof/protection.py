@@ -145,7 +145,7 @@ def less_protection(
         text = "nothing enforces any more what these files enforced"
         yield _looser_change("Zenoh files", "present", "missing", text)
     if old.routers and not {*new.routers} <= {*old.routers}:
-        text = "anyone who poses as the router can read and change everything that passes"
+        text = "anyone who poses as the router can read and change everything that it forwards"
         before, after = (", ".join(side.routers) for side in (old, new))
         yield _looser_change("Zenoh router", before, after, text)
     if new.zenoh_files:

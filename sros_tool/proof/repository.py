@@ -226,7 +226,7 @@ class Repository:
             raise DocumentError(
                 f"the commit of '{name}' is not in the repository",
                 "" if digits == name else f"It is {digits}.",
-                "In a shallow clone, such as on a server for tests, fetch it first: `git fetch "
+                "In a shallow clone, as in CI, fetch it first: `git fetch "
                 "origin`, or `--fetch origin` of sros review.",
             )
         raise DocumentError(f"'{name}' is not a commit", f"It is a {kind}.")
@@ -622,8 +622,8 @@ def _unknown_revision_error(name: str) -> DocumentError:
     return DocumentError(
         f"git finds no revision '{name}'",
         "",
-        "`git log --oneline` and `git branch` list revisions. In a shallow clone, such as "
-        "on a server for tests, fetch it first.",
+        "`git log --oneline` and `git branch` list revisions. In a shallow clone, as "
+        "in CI, fetch it first.",
     )
 
 

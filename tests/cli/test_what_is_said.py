@@ -43,7 +43,7 @@ TAKES_AWAY = {
     "create_permission": "create_permission ks /robot narrow.xml",
     "generate_artifacts": "generate_artifacts -k ks -p narrow.xml",
 }
-OLD_PROGRAM = "a program that still uses a lost right may not start with the new files"
+OLD_PROGRAM = "a program that still uses a lost right may fail to start with the new files"
 
 
 @pytest.mark.parametrize("verb", TAKES_AWAY)

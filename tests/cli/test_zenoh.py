@@ -86,8 +86,11 @@ def test_a_router_without_rights_of_its_own_does_not_differ_from_the_policy(fold
     assert "+ /router ALLOW publish" in sros(*compare, cwd=folder).out
     sros("zenoh", "ks", cwd=folder).ok()
     ended = sros(*compare, cwd=folder).ok()
-    left_out = "left out: 1 Zenoh router, not in the policy, and with only the rights that every"
-    assert (ended.out, f"{left_out} node needs: /router." in ended.err) == ("", True)
+    left_out = "left out: 1 Zenoh router with only the rights that every"
+    assert (ended.out, f"{left_out} node needs, and not in the policy: /router." in ended.err) == (
+        "",
+        True,
+    )
     (folder / "known.xml").write_text(policy_text({"/a": "", "/b": "", "/router": ""}))
     known = sros("diff_policy", "known.xml", "ks", cwd=folder)
     assert "left out" not in known.err and "+ /router ALLOW publish topic /rosout" in known.out
@@ -207,7 +210,7 @@ def test_the_enclave_of_the_router_is_made_with_what_every_node_needs(folder: Pa
 @pytest.mark.parametrize(
     ("words", "text"),
     [
-        (("ks", "--router", "/a"), "the enclave /a has rights of its own"),
+        (("ks", "--router", "/a"), "a policy gave enclave /a rights"),
         (("ks", "--router", "way"), "zenoh.router"),
         (("ks", "--endpoint", "tcp/localhost:1"), "is not HOST:PORT"),
         (("ks", "--endpoint", "localhost:70000"), "is not HOST:PORT"),
@@ -263,7 +266,7 @@ def test_enclaves_outside_the_domains_of_the_network_lack_no_file(tmp_path: Path
         "zenoh ks --check",
     ):
         ended = sros(*line.split(), cwd=tmp_path).ok()
-    said = "no file: enclave /d1: its permissions are for no domain of the network\n"
+    said = "no file: enclave /d1: its permissions are for no domain of the Zenoh network\n"
     assert ended.out == said
     for name, notes in (("d1", 1), ("z1", 0)):
         found = sros("check", f"ks/enclaves/{name}", "--severity", "note", cwd=tmp_path).out

@@ -236,7 +236,7 @@ def test_a_list_that_ros_leaves_out_stops_only_sros_run(
     assert "continue to communicate with revoked enclaves" in found.err
     refused = sros("run", keystore, ENCLAVE, "--", "true")
     assert refused.status == 2
-    assert "which ROS 2 leaves out" in refused.err
+    assert "so ROS 2 ignores it" in refused.err
 
 
 def test_expired_at_a_moment_to_come(whole: Path) -> None:

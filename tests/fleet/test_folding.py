@@ -169,7 +169,7 @@ def test_what_a_change_takes_away_is_folded(made: Path) -> None:
         "/{robot}/base would gain: publish topic {namespace}/odometry  (all 3 robots)",
     }
     assert "would replace ks/enclaves/{robot}/base/permissions.p7s  (all 3 robots)" in ended.out
-    assert "a program that still uses a lost right may not start" in said[4]
+    assert "a program that still uses a lost right may fail to start" in said[4]
     assert "base and 1 more: the rights that they lost still" in said[5]
     assert "`sros renew ks ENCLAVE... --revoke-old`" in said[5]
 

@@ -1294,7 +1294,7 @@ def test_what_is_to_be_done_for_robots_that_do_not_fetch_what_is_published(field
     assert bring in field.run("renew", "ks", "/r1/base", "--new-key").err
     field.run("renew", "ks", "/r2/base")
     err = field.run("renew", "ks", "/r3/base", "--revoke-old").err
-    assert "Only then give the list to a web server" in err and bring not in err
+    assert "Only then give the revocation list to the web server" in err and bring not in err
     field.run("fleet", "publish", "ks", "pub")
     rows = said()
     assert rows["r1"][0] == "deliver" and "lacks the key of /r1/base: releases" in rows["r1"][1]

@@ -315,7 +315,7 @@ def test_a_later_certificate_of_the_service_for_the_same_key(site: Path, tmp_pat
     assert sros("rotate_ca", site, "--identity-ca", tmp_path / "later.pem", "--next").status == 2
     own = tmp_path / "own"
     create_keystore(own, template=TEMPLATE, now=now())
-    with pytest.raises(UsageError, match="only a CA service"):
+    with pytest.raises(UsageError, match="sros issues the certificate of this"):
         renew_identity_ca(own, now=now(), issued=later)
 
 

@@ -496,7 +496,7 @@ def test_a_new_key_that_is_protected_less_is_said(tmp_path: Path) -> None:
     new = replace(locked, places={"identity": f"file:{plain}"})
     step = rotate_ca(root, now=NOW, keyring=locked, new_keys=new, dry_run=True)
     (told,) = (note.text for note in step.notes if note.id == "keystore.new-key-plain")
-    assert "has no passphrase, and the current key has one" in told
+    assert "has no passphrase, but the current key has one" in told
     (tmp_path / "old").rename(tmp_path / "away")
     new = Keyring(locked.secrets, {"identity": f"file:{tmp_path}/new"})
     step = rotate_ca(root, now=NOW, keyring=locked, new_keys=new, roles=["identity"])

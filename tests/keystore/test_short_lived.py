@@ -132,7 +132,7 @@ def test_a_short_lived_enclave_is_renewed_by_its_name_alone(tmp_path: Path) -> N
     assert (due.status, SHORT in due.out, LONG in due.out) == (1, False, True)
     renewed = sros("renew", root, "--all-expiring", "99y").ok()
     assert renewed.out == f"renewed enclave {LONG}\n"
-    assert f"[renew.short-lived]: not renewed: {SHORT} (short-lived enclaves are" in renewed.err
+    assert f"[renew.short-lived]: not renewed: {SHORT} (enclaves in [[enclaves]]" in renewed.err
     renewed = sros("renew", root, SHORT, "--all-expiring", "30d").ok()
     assert renewed.out == f"renewed enclave {SHORT}\n"
 

@@ -350,7 +350,7 @@ def test_rights_that_were_put_back_are_not_signed_again(root: Path) -> None:
     renew(root, ["/robot"], now=NOW)
     file.write_bytes(before)
     state = snapshot(root)
-    with pytest.raises(KeystoreError, match="not certain that the permissions of enclave /robot"):
+    with pytest.raises(KeystoreError, match="not certain that enclave /robot has its"):
         update_keystore(root, load_template("production"), now=LATER)
     assert snapshot(root) == state
 

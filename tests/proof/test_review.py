@@ -1472,7 +1472,10 @@ def test_requirements_of_a_package_are_decided_in_a_namespace(
     moved = sros(
         "check", "robot.xml", "--requirements", "robot.toml", "--namespace", "/m", cwd=change.folder
     )
-    assert "/x, as the policy of a package does: leave out `--namespace /m`" in moved.out, moved
+    assert (
+        "/x without the namespace, as the policy of a package does: leave out `--namespace /m`"
+        in moved.out
+    ), moved
 
 
 def test_a_name_that_breaks_requirements_of_users_in_a_namespace(change: Change) -> None:

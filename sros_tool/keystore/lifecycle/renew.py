@@ -78,9 +78,9 @@ def renew(
     """
     if key and (expiring or new_key):
         raise UsageError(
-            "--key needs the names of enclaves, and excludes --new-key and --expiring",
+            "--key needs the names of enclaves, and excludes --new-key and --all-expiring",
             "It gives the named enclaves new keys on a token.",
-            "Name the enclaves, and leave the other options out.",
+            "Name the enclaves, and leave out --new-key and --all-expiring.",
         )
     places = token_places(key, names) if key else {}
     change = KeystoreChange(root, **options)
@@ -97,7 +97,10 @@ def renew(
             )
             if short_lived:
                 names_text = first_few(short_lived, 3)
-                text = f"not renewed: {names_text} (short-lived enclaves are renewed only by name)"
+                text = (
+                    f"not renewed: {names_text} (enclaves in [[enclaves]] of sros.toml are "
+                    "renewed only by name)"
+                )
                 change.notes.append(Note("renew.short-lived", text))
         if not wanted:  # then no CA key is opened
             # Raises an error for an export, which is never renewed.
@@ -121,9 +124,12 @@ def renew(
         change.notes += (*writer.notes, *renewer.notes) if replaced else ()
         left = writer.expiry - change.now
         if replaced and expiring and expiring.remaining and left <= expiring.remaining:
-            text = f"the new files expire within {duration_text(expiring.remaining)}, too "
-            text += f"(on {iso(writer.expiry)}), so each run renews them again: choose a shorter "
-            change.notes.append(Note("renew.due-again", f"{text}time, or a longer validity."))
+            text = (
+                f"the new files expire within {duration_text(expiring.remaining)}, too (on "
+                f"{iso(writer.expiry)}), so the same command would renew them every time: give "
+                "--all-expiring a shorter time, or choose a longer validity."
+            )
+            change.notes.append(Note("renew.due-again", text))
         with suppress(SrosError):  # the governance is not part of a renewal
             change.notes += change.edit_notes()
         if not (new_key or places):
@@ -289,7 +295,7 @@ def checked_rights(
             f"the certificate of enclave {state.name} was not issued by the identity CA of this "
             "keystore",
             f"Its issuer is {other_issuer_text(state.certificate, authority)}.",
-            "Restore the certificate, or remove the enclave's folder and create it again.",
+            "Restore the certificate, or remove the enclave's folder and create the enclave again.",
         )
     state.signed.verify(authorities.permissions.certificate)
     return recorded.rights_to_sign(state.name, state.digest, state.grant)

@@ -311,8 +311,8 @@ def old_program_text(replaced_rights: Iterable[ReplacedRights]) -> str:
     if not any(rights.lost_text() for rights in replaced_rights):
         return ""
     return (
-        "a program that still uses a lost right may not start with the new files: start a version "
-        "that does not use it, or sign the earlier policy again"
+        "a program that still uses a lost right may fail to start with the new files: start a "
+        "version that does not use the right, or sign the earlier policy again"
     )
 
 

@@ -339,8 +339,8 @@ class RevocationListSigner:
             text = (
                 f"publish ({published}), and wait until `sros fleet status "
                 f"{quote(str(self._root))}` shows that the robots have fetched. Only then give "
-                "the list to a web server of these robots: before, the server would refuse a "
-                "robot whose certificates are all replaced"
+                "the revocation list to the web server from which they fetch: otherwise, the "
+                "server would refuse a robot whose certificates are all replaced"
             )
             self.remarks.append(Note("crl.web-server", text))
         return entries
@@ -408,8 +408,8 @@ class RevocationListSigner:
         if why:
             text = (
                 f"The ledger of '{self._root}' may lack earlier certificates: {'; '.join(why)}. "
-                "Missing certificates stay valid until they expire or their CA is replaced: see "
-                "`sros rotate_ca`."
+                "Certificates that the ledger lacks are not revoked: they stay valid until they "
+                "expire or their CA is replaced (`sros rotate_ca`)."
             )
             self.remarks.append(Note("ledger.may-lack-certificates", text))
 
@@ -462,8 +462,8 @@ class RevocationListSigner:
             new_entries = [*new_entries, *lost]
             text = (
                 "The revocation list was not the last list that this keystore signed: "
-                f"{counted(len(lost), 'revocation')} {'was' if len(lost) == 1 else 'were'} "
-                "restored."
+                f"{counted(len(lost), 'revocation')} that it lacked "
+                f"{'was' if len(lost) == 1 else 'were'} added again."
             )
             self.remarks.append(Note("crl.put-back", text))
         signed = self._sign(self._authority, self.present, new_entries, expiries, least)
@@ -663,7 +663,7 @@ class RevocationListSigner:
                 f"First restart all processes and run `sros rotate_ca {quote(str(self._root))} "
                 "--to retire`; or add --until-retired, and retire the CA soon.",
             )
-        text = f"The list of the old identity CA {name} was not signed again"
+        text = f"The revocation list of the old identity CA {name} was not signed again"
         if new_entries:
             text += (
                 "; until the CA is retired, Fast DDS accepts the revoked certificates that the CA "

@@ -159,9 +159,9 @@ def _later_keys_notes(
         would = "would be" if change.dry_run else "are"
         yield Note(
             "revoke.later-keys",
-            f"the keystore was restored from a backup, and only then learned later keys of "
+            "the keystore was restored from a backup, and learned only afterwards of newer keys of "
             f"{first_few(sorted(names), _MOST_SHOWN)} (for example of new hardware). These keys "
-            f"{would} revoked, too, and are not certified again: create new keys on "
+            f"{would} revoked, too, and get no certificates again: create new keys on "
             "the robot. docs/howto/keystore_is_lost.md says how to revoke only the earlier keys.",
         )
 
@@ -409,16 +409,16 @@ def _unknown_note(change: KeystoreChange, unknown: Mapping[str, Entry]) -> Note:
     text = (
         f"the keystore issued {counted(len(unknown), 'certificate')} that its ledger lacks: the "
         f"keystore was restored from a backup, or is a copy. The ledger {has} each certificate "
-        "again, so that `sros revoke` revokes it"
+        "again, so that `sros revoke` can revoke it"
     )
     revoked = {entry.serial for entry in change.entries if entry.what == "revocation"}
     valid = sorted({entry.enclave for entry in unknown.values() if entry.serial not in revoked})
     if missing := [name for name in valid if not change.keystore.has_enclave(name)]:
         text += (
             f". The keystore lacks {first_few(missing, _MOST_SHOWN)}, whose certificates stay "
-            "valid. To keep the robot of such an enclave: if the robot made its keys, sign its "
+            "valid. If the robot of such an enclave stays in use: if it made its keys, sign its "
             f"requests again (`sros sign_request {root} REQUEST --no-answer -p POLICY_FILE --fleet "
-            "FLEET_FILE --enclave ENCLAVE`); otherwise create its enclaves again with `sros "
+            "FLEET_FILE --enclave ENCLAVE`); if not, create its enclaves again with `sros "
             f"generate_artifacts`, then give them new keys: `sros renew {root} --robot NAME "
             "--new-key --revoke-old`. To revoke such an enclave, create it again first, or replace "
             "the CA with `sros rotate_ca`"
@@ -504,9 +504,13 @@ def _drop_routers(change: KeystoreChange, revoked: Collection[str]) -> None:
         left = tuple(router for router in network.routers if router not in dropped)
         change.set_network(replace(network, routers=left))
         names = ", ".join(router.name for router in dropped)
-        is_or_are = "is no longer a router" if len(dropped) == 1 else "are no longer routers"
+        is_or_are, them = (
+            ("is no longer a router", "it")
+            if len(dropped) == 1
+            else ("are no longer routers", "them")
+        )
         text = (
-            f"{names} {is_or_are}. The new files of the enclaves that connected there "
+            f"{names} {is_or_are}. The enclaves that connected to {them} have new files, which "
             "name another router."
         )
         change.notes.append(Note("zenoh.router-revoked", text))
@@ -516,7 +520,7 @@ def _router_error(change: KeystoreChange, router: str) -> KeystoreError:
     where = quote(str(change.root))
     other = next(n for at in count(2) if (n := f"{router}{at}") not in change.names)
     return KeystoreError(
-        f"{router} is the enclave of the Zenoh router",
+        f"{router} is the enclave of the Zenoh router, and cannot be revoked yet",
         "Without a router, no node on Zenoh finds the other nodes; and every session trusts the "
         "router's key.",
         f"Move the router first: `sros zenoh {where} --router {other}`. Stop the router in "

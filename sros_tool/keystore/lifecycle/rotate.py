@@ -204,8 +204,8 @@ def rotate_ca(
 def _stage_changed_error(root: Path, stage: RotationStage) -> KeystoreError:
     return KeystoreError(
         f"the CA rotation of '{root}' has just reached the stage {stage}",
-        "Another command began this stage, or an interrupted one was completed. The next stage "
-        "would cut off processes that lack the files of this stage.",
+        "Another command began this stage, or sros completed an interrupted command. The next "
+        "stage would cut off processes that lack the files of this stage.",
         f"`sros rotate_ca {quote(str(root))}` shows what to do before the next stage.",
     )
 
@@ -266,8 +266,8 @@ def _refuse_late_deletion(keystore: OpenedKeystore, stage: RotationStage) -> Non
         raise UsageError(
             f"the keystore is already at the stage {stage}, so no key is deleted",
             "`sros revoke` may need the key of the old identity CA until the stage retire.",
-            f"Run `sros rotate_ca {quote(str(keystore.root))} --next --delete-old-key` for that "
-            "stage.",
+            f"Use --delete-old-key with the command that begins the stage retire: `sros rotate_ca "
+            f"{quote(str(keystore.root))} --to retire --delete-old-key`.",
         )
     if kept:
         raise UsageError(
@@ -406,7 +406,7 @@ def renew_identity_ca(
             raise KeystoreError(
                 f"a rotation of the CAs of keystore '{root}' is under way",
                 "",
-                f"Finish it first with `sros rotate_ca {quote(str(root))} --next`.",
+                f"Finish it first: `sros rotate_ca {quote(str(root))} --next` for each stage.",
             )
         old, *above = change.keystore.certificates_of("identity_ca")
         if issued or change.keyring.ca_service(root, IDENTITY, change.template):
@@ -445,7 +445,7 @@ def _certificate_renewed_by_service(
     """Return a CA service's own new certificate: the same name and key, with later dates."""
     if not (issued and change.keyring.ca_service(change.root, IDENTITY, change.template)):
         raise UsageError(
-            "only a CA service issues its own certificate"
+            "sros issues the certificate of this identity CA itself"
             if issued
             else "the CA service itself has to issue its new certificate",
             "",
@@ -458,7 +458,7 @@ def _certificate_renewed_by_service(
     if (old.subject, old.public_key()) != (new.subject, new.public_key()):
         raise KeystoreError(
             "the certificate has another name or key than the identity CA",
-            "All enclaves would need other certificates, and both CAs a revocation list.",
+            "All enclaves would need new certificates, and each of the two CAs a revocation list.",
             "Make a new keystore for another CA.",
         )
     change.notes += renewed.notes
@@ -868,8 +868,8 @@ def _issuance(
         key: PublicKey = kept.public_key()  # type: ignore[assignment]
         where = f"{quote(str(root))} {name}"
         remedy = (
-            f"Revoke the enclave again, with `sros revoke {where}` (with --robot: all enclaves "
-            f"of its robot); to keep it, renew it with `sros renew {where} --new-key --revoke-old`."
+            f"Revoke the enclave again: `sros revoke {where}`, or --robot for all enclaves of its "
+            f"robot. To keep the enclave instead: `sros renew {where} --new-key --revoke-old`."
         )
         change.known.refuse_revoked_key(key, f"enclave {name}", remedy, kept, publish_first=False)
         certificate = NewIdentity(kept.subject, key)
@@ -1016,11 +1016,11 @@ def _make_successor(
     is_plain = given is False or not (given or new_keys.encrypt or is_token_uri(place))
     if is_plain and encrypted is not False:
         path = quote(str(key_path(change.root, place or at)))
-        why = "the current key has one"
+        why = "but the current key has one"
         if not encrypted:
-            why = "sros cannot see whether the current key has one"
+            why = "and sros cannot see whether the current key has one"
         text = (
-            f"the new key of the {_ca_name(roles)} has no passphrase, and {why}. To encrypt it: "
+            f"the new key of the {_ca_name(roles)} has no passphrase, {why}. To encrypt it: "
             f"`openssl pkcs8 -topk8 -scrypt -in {path} -out {path}.new && mv {path}.new {path}`."
         )
         change.notes.append(Note("keystore.new-key-plain", text))

@@ -288,7 +288,7 @@ def _restart_remarks(keystore: OpenedKeystore, rotation: Rotation) -> list[str]:
         if hindrance
         else f"Fast DDS: {ONE_BY_ONE} Continue when all have been restarted.",
         "Cyclone DDS: it trusts one CA at a time, so restart all processes together; restarted "
-        "processes do not communicate with others.",
+        "processes do not communicate with processes that were not restarted.",
     ]
     with suppress(SrosError):  # `check` reports settings that cannot be read
         if keystore.template.zenoh:

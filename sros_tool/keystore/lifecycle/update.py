@@ -179,9 +179,8 @@ def edited_settings(
         raise KeystoreError(
             f"{SETTINGS} of keystore '{root}' has no table [zenoh] any more",
             "The Zenoh files would stay, and no command would update them.",
-            f"Remove the Zenoh files with `sros zenoh {quote(str(root))} --off`, after `sros "
-            "update_keystore "
-            f"{quote(str(root))} --discard-edits`.",
+            f"First run `sros update_keystore {quote(str(root))} --discard-edits`. To remove the "
+            f"Zenoh files, then run `sros zenoh {quote(str(root))} --off`.",
         )
     if not edits.governance:
         return written, present_settings.domains
@@ -191,8 +190,8 @@ def edited_settings(
     if protection is None:
         raise KeystoreError(
             f"'{path}' has rules that the settings of a keystore cannot express",
-            "It has several domain rules, no rule for * at its end, or a rule for a DDS topic that "
-            "is not a topic, service or action of ROS.",
+            "It has several domain rules, its last rule is not for *, or it has a rule for a DDS "
+            "topic that is not a topic, service or action of ROS.",
             f"State the protection in {SETTINGS} instead: "
             f"`sros update_keystore {quote(str(root))} --discard-edits` restores the file.",
         )
@@ -221,8 +220,8 @@ def _checked_target(
                 f"the new settings put a CA key at '{wanted}', but the key is at "
                 f"'{place or PRIVATE}'",
                 "update_keystore does not move CA keys.",
-                f"Leave authorities.{name} out; `sros rotate_ca --{name.replace('_', '-')}` makes "
-                "a CA with a key elsewhere.",
+                f"Leave authorities.{name} out; `sros rotate_ca --{name.replace('_', '-')} URI` "
+                "replaces the CA by a CA whose key is at URI.",
             )
     if not target.separate_authorities and len(keystore.authority_files) > 1:
         raise UsageError(
@@ -647,7 +646,8 @@ class _Updater:
             raise KeystoreError(
                 f"a rotation of the CA of keystore '{self._root}' is under way",
                 "It replaces the CA in both roles.",
-                f"Finish it first with `sros rotate_ca {quote(str(self._root))} --next`.",
+                f"Finish it first: `sros rotate_ca {quote(str(self._root))} --next` for each "
+                "stage.",
             )
         (file,) = files
         for path, private, path_of in (
@@ -776,7 +776,7 @@ def _moved_router_note(old: str, new: str) -> Note:
     return Note(
         "zenoh.router-moved",
         f"the router is now in enclave {new}: stop the router that runs in {old}, and start it "
-        f"in {new}. Only sessions that were not restarted still accept {old} as the router.",
+        f"in {new}. Processes accept {old} as the router until they are restarted.",
     )
 
 
@@ -810,8 +810,8 @@ def _check_router(change: KeystoreChange, router: str) -> None:
     }
     if change.recorded_rights.policy(router, digest) not in ("", *usual):
         raise UsageError(
-            f"the enclave {router} has rights of its own",
+            f"a policy gave enclave {router} rights, so it is not for the router alone",
             "The router forwards all messages, so a node in its enclave would have the rights of "
             "all enclaves.",
-            "Name an enclave of the router's own with --router.",
+            "With --router, name an enclave that only the router uses.",
         )
