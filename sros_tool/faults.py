@@ -26,8 +26,8 @@ _SET_CLOCK_FOR_CRL = (
 _SIGN_PERMISSIONS = "Sign the permissions again: `sros create_permission {root} {enclave} POLICY`."
 _CREATE_MISSING_FILE = "Create the missing file: `sros create_enclave {root} {enclave}`."
 REPLACE = (
-    "Replace the file: `rm {path} && sros create_enclave {root} {enclave}` links the keystore's "
-    "file, or issues the file again."
+    "Replace the file with `rm {path} && sros create_enclave {root} {enclave}`: this links the "
+    "keystore's file, or issues the file again."
 )
 _SET_DOMAIN = (
     "Set ROS_DOMAIN_ID to a domain of the keystore: `sros env {root} {enclave} --domain ID` prints "
@@ -89,8 +89,8 @@ class Fault(Enum):
     FILE_MISSING = (
         "file-missing",
         "a file that an enclave needs is missing",
-        "With Enforce the node fails; without Enforce it runs unsecured. Fast DDS says \"couldn't "
-        "find all "
+        "With ROS_SECURITY_STRATEGY=Enforce the node fails; otherwise it runs unsecured. Fast DDS "
+        "says \"couldn't find all "
         'security files!" and never names the file.',
         _SOURCE_RCL,
         _CREATE_MISSING_FILE,
@@ -166,7 +166,7 @@ class Fault(Enum):
         "ca-expired",
         "a CA that an enclave trusts has expired",
         "Nothing that it issued or signed is accepted any more (Fast DDS: Error '10' verifying "
-        "CA certificate), but Cyclone DDS 11 still accepts documents of a permissions CA.",
+        "CA certificate), but Cyclone DDS 11 still accepts documents of an expired permissions CA.",
         _SOURCE_TESTS,
         _REPLACE_CA,
     )
@@ -305,7 +305,7 @@ class Fault(Enum):
         "a document that no CA signed, but some vendors accept",
         "Cyclone DDS 0.10 and Fast DDS 2.9.1 accept every signer whose certificate the "
         "permissions CA issued. If that CA also issues identities, each enclave can sign rights "
-        "for itself. Someone with the signer's key signed this document.",
+        "for itself.",
         "CVE-2023-24011; Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; tested.",
         "Unless you signed the document on purpose, treat the signer's key as stolen, and revoke "
         "the signer's enclave, as in `sros revoke {root} {enclave}`. If one CA is for identities "

@@ -479,7 +479,7 @@ def try_lock(handle: int) -> bool:
             raise
         raise KeystoreError(
             f"'{Path(f'/proc/self/fd/{handle}').readlink()}' cannot be locked: {error.strerror}",
-            "Without locks, two runs of sros at the same time would spoil each other's files.",
+            "Without locks, two runs of sros at the same time would damage each other's files.",
             "Use a folder on a local disk, or a network file system with locks.",
         ) from error
     return True

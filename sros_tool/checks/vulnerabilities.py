@@ -31,7 +31,7 @@ KNOWN_VULNERABILITIES = FindingKind(
 PACKAGE_VULNERABILITIES = FindingKind(
     "runtime.package-vulnerabilities",
     NOTE,
-    "a DDS with known vulnerabilities, unless its package fixes them",
+    "a DDS with known vulnerabilities, unless the installed package fixes them",
     "Packages of Debian and Ubuntu can have fixes of later releases under an earlier version "
     "number, so the version does not show whether the library is vulnerable.",
     "Advisories in the OSV format; Debian's changelog of fastdds 2.9.1+ds-1+deb12u2, which names "

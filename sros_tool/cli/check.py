@@ -890,10 +890,10 @@ def doctor(report: Path | None, force: bool, advisories: Path | None, as_json: b
       $ sros doctor
       DDS Security can be enforced here, by Cyclone DDS (libddsc), but NOT by ROS
       nodes: rmw_fastrtps_cpp does not enforce it. The ROS 2 packages of ...
-      rclpy with rmw_fastrtps_cpp  does not enforce   Fast DDS 2.14.5
+      rclpy with rmw_fastrtps_cpp  does not enforce it  Fast DDS 2.14.5
           a secured participant fails: RCLError: error creating node: This Fast
           DDS version doesn't have the security libraries
-      Cyclone DDS (libddsc)        enforces security  Cyclone DDS 0.10.2
+      Cyclone DDS (libddsc)        enforces security    Cyclone DDS 0.10.2
           with an enclave made by sros, it created the allowed writer on /chatter
           and refused the denied writer and reader on /sros_not_allowed: ...
       $ sros doctor --report support.md
@@ -942,7 +942,7 @@ def _report_sections(
     diagnosis: Diagnosis, provider: SecurityProvider | None, findings: Sequence[Finding]
 ) -> dict[str, list[str]]:
     """Return the lines of a support report; findings are counted by kind, without names."""
-    words = {True: "enforces security", False: "does not enforce", None: "could not be tried"}
+    words = {True: "enforces security", False: "does not enforce it", None: "could not be tried"}
     stacks = [
         f"{stack.name}: {words[stack.enforces]}. {stack.dds} {stack.version}. {stack.evidence}"
         for stack in diagnosis.stacks

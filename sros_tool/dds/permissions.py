@@ -373,8 +373,8 @@ _CONSEQUENCES = {
     "portable.deny-blocks-topic": " on Cyclone DDS, which refuses the topic as a whole; Fast "
     "DDS denies only the named direction. What no rule allows is denied anyway, so perhaps the "
     "deny rule can be removed.",
-    "portable.character-set": ". Vendors agree on sets such as [ab], but only * and ? are part of "
-    "the portable profile.",
+    "portable.character-set": ". Vendors agree on sets such as [ab], but not on all sets. On * and "
+    "?, they always agree.",
 }
 
 

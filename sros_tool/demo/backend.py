@@ -569,7 +569,7 @@ def _report(
             if text := _line(event, node.type):
                 say(text)
     raise SrosError(
-        "a node reported too long a message", f"It is over {_MAX_EVENT_BYTES} bytes long."
+        "a node reported a message that is too long", f"It is over {_MAX_EVENT_BYTES} bytes long."
     )
 
 

@@ -133,7 +133,7 @@ def _answer(stack: Stack) -> str:
         return "not installed"
     if stack.enforces is None:
         return "could not be tried"
-    return "enforces security" if stack.enforces else "does not enforce"
+    return "enforces security" if stack.enforces else "does not enforce it"
 
 
 def _indented_lines(texts: Sequence[str]) -> list[str]:

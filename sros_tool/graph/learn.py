@@ -696,7 +696,7 @@ def _notes(
             "several processes share an enclave, because of the names of their nodes: "
             f"{first_subjects(shared)}. Each enclave gets the rights of all its processes. Unless "
             "they are one process that was restarted, give the nodes different names (-r "
-            "__node:=NAME), or start each process with --ros-args --enclave",
+            "__node:=NAME), or start each process with --ros-args --enclave /NAME",
         )
     yield from name_notes(users, set(names.values()))
 

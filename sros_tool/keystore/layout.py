@@ -664,7 +664,8 @@ def refuse_flat_keystore(root: Path) -> None:
     if any((root / file).is_file() for file in _EARLIER_CA):
         raise KeystoreError(
             f"'{root}' is not a valid keystore",
-            "It is a keystore of ROS 2 Eloquent or earlier, which reached its end of life in 2020.",
+            "It is a keystore of ROS 2 Eloquent or earlier: these distributions are not supported "
+            "any more.",
             "Create a keystore, and generate artifacts from the policy: `sros create_keystore NEW` "
             "and `sros generate_artifacts -k NEW -p POLICY`.",
         )

@@ -936,7 +936,7 @@ def test_a_forged_timestamp_is_refused_without_unpacking_everything(
     earlier = timestamp.read_bytes()
     publisher.publish()
     last = timestamp.read_bytes()
-    for data, why in ((last, ""), (earlier, "an older copy"), (last, "")):
+    for data, why in ((last, ""), (earlier, "has older metadata"), (last, "")):
         timestamp.write_bytes(data)
         publication = fleet_status(OpenedKeystore(publisher.root)).publication
         assert publication and why in publication.refused and bool(why) == bool(publication.refused)

@@ -83,10 +83,13 @@ OLD = MappedLibrary("Fast DDS", "2.14.5", "/opt/ros/jazzy/lib/libfastrtps.so.2.1
             OLD,
             "27 known vulnerabilities: CVE-2025-62599, CVE-2025-62600, CVE-2025-62601 and 24",
         ),
-        (OLD._replace(path="/usr/lib/x.so"), "vulnerabilities, unless its package fixes them: CVE"),
+        (
+            OLD._replace(path="/usr/lib/x.so"),
+            "vulnerabilities, unless the installed package fixes them: CVE",
+        ),
         (
             MappedLibrary("Cyclone DDS", "0.10.2", "/usr/lib/libddsc.so.0.10.2"),
-            "1 known vulnerability, unless its package fixes it: CVE-2023-24011.",
+            "1 known vulnerability, unless the installed package fixes it: CVE-2023-24011.",
         ),
         (
             OLD._replace(version="3.2.5"),

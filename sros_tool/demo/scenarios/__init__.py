@@ -269,7 +269,7 @@ def _read_identity(table: _Table, policy: Policy) -> Identity:
     if not enclave:
         for key in ("keystore", "variables"):
             if key in table.data:
-                problem = f"{key} needs an enclave, but this party is unsecured"
+                problem = f"the key {key} needs an enclave, but this party is unsecured"
                 raise table.error(key, problem, "Give the party an enclave.")
         return UNSECURED
     if policy.enclave(enclave) is None:

@@ -306,7 +306,9 @@ _ACTION = _Interface(
 ACTIONS = Scenario(
     "actions",
     "Fibonacci: who may call an action and who may execute it",
-    _rows_of(_ACTION, "goal, feedback, status and result arrive: three services and two topics"),
+    _rows_of(
+        _ACTION, "goal, feedback, status and result arrive, over three services and two topics"
+    ),
     {"server": f"{ACTION}/server", "client": f"{ACTION}/client"},
     shipped_action_policy,
 )

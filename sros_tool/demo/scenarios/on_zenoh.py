@@ -257,7 +257,7 @@ _SERVICES = _scenario(
     _attempt_row(
         "client of an action",
         RowStatus.ANSWERED,
-        "goal, feedback, status and result arrive: three services and two topics",
+        "goal, feedback, status and result arrive, over three services and two topics",
         answered("action client", "action server"),
         _action_pair(),
         world=_PEERS,

@@ -346,7 +346,11 @@ def metadata_problem(keystore: OpenedKeystore) -> str:
     except KeystoreError as error:
         return f"{error.what}: {error.why.removesuffix('.')}"
     last = known.versions.get("timestamp", 0)
-    return f"'{folder}' has an older copy of the metadata" if version and version < last else ""
+    return (
+        f"'{folder}' has older metadata than the keystore published last"
+        if version and version < last
+        else ""
+    )
 
 
 def _roots(keystore: OpenedKeystore) -> Roots:

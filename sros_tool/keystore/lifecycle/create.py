@@ -823,8 +823,8 @@ def exports_note(keystore: OpenedKeystore, names: Sequence[str]) -> Note:
     text += f"{shown} ENCLAVE TARGET --force`)"
     remote = [name for name in names if key_on_robot(keystore.folder(name))]
     if remote:
-        text += f"; for {', '.join(remote)}, answer the request again (`sros sign_request "
-        text += f"{shown} REQUEST --renew`)"
+        text += "; if the key was made on the robot, answer the request again (`sros sign_request "
+        text += f"{shown} REQUEST --renew`), here for {', '.join(remote)}"
     return Note("keystore.export-again", remedy_in_closed_robot(keystore.root, f"{text}."))
 
 
