@@ -298,7 +298,9 @@ class Examiner:
                     remedies.append(_OLDER_FILES.format(peer=name))
         if peers and rotating and finding.id in _ROTATION_IDS:
             of = f" of enclave {finding.enclave}" if finding.enclave else ""
-            known.append("the CAs of this keystore are being replaced, and stage 2 is done")
+            known.append(
+                "the CAs of this keystore are being replaced, and the stage reissue is done"
+            )
             remedies = [_NOT_RESTARTED[finding.dds or Vendor.FAST].format(of=of)]
         text = " ".join(dict.fromkeys(remedies)) or finding.remedy
         only = next(iter(peers)) if len(peers) == 1 else ""
@@ -763,10 +765,10 @@ _MAX_PEERS = 5
 """Maximum number of peers that are examined for one message."""
 _ROTATION_IDS = ("peer-signature", "peer-permissions-ca")
 _NOT_RESTARTED = {
-    Vendor.FAST: "Restart this process{of}: it was not restarted since stage 1, and so does not "
-    "know the new CA.",
+    Vendor.FAST: "Restart this process{of}: it was not restarted since the stage distribute, and "
+    "so does not know the new CA.",
     Vendor.CYCLONE: "Restart this process{of} and the peer: one of them was not restarted since "
-    "stage 2, and Cyclone DDS trusts one CA at a time.",
+    "the stage reissue, and Cyclone DDS trusts one CA at a time.",
 }
 _OLDER_FILES = (
     "Restart the processes of {peer}, and then this process: one of them loaded older files."

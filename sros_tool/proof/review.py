@@ -153,7 +153,7 @@ _NOT_USED_TEXT = (
     "changes and is not reviewed: no reviewed policy uses it. Name it with --policy, leave it out "
     "with"
 )
-_BOTH_NAMES_REMEDY = "give --policy the folder that has both files"
+_BOTH_NAMES_REMEDY = "give --policy the folder that has the file under its old and its new name"
 _PRIVATE_KEY = re.compile(rb"-----BEGIN (?:[A-Z0-9]+ )*PRIVATE KEY-----(?:\s|\\[nr])+[\w+/]")
 """A private key in PEM; a text that only mentions the first line does not match."""
 _UNSIGNED_POLICY_IDS = tuple(
@@ -1608,7 +1608,7 @@ def _namespaces_of_patterns(requirement: Requirement) -> list[str]:
             f"the enclaves of a requirement name more than {_MOST_NAMESPACES} namespaces: "
             f"{requirement}",
             "So it is not known whether a node moves out of the requirement in one of them.",
-            "Name fewer, or name the namespaces of the robots with --namespace.",
+            "Name fewer namespaces there, or name the namespaces of the robots with --namespace.",
         )
     return [*namespaces]
 

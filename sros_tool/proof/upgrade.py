@@ -508,10 +508,9 @@ def _untested_findings(before: Shipped, after: Shipped) -> Iterator[Finding]:
     for shipped in dict.fromkeys((before, after)):
         if not shipped.tested:
             same_vendor = before.vendor is after.vendor
-            consequence = (
-                ", so sros sees no difference between the two releases" if same_vendor else ""
-            )
-            text = f"{shipped}{consequence}"
+            text = f"sros was not tested with {shipped}"
+            if same_vendor:
+                text += ", so it sees no difference between the two releases"
             yield NOT_MEASURED.found(f"ROS 2 {shipped.distribution.title}", text)
 
 

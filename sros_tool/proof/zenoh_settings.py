@@ -97,7 +97,7 @@ _TWO_VALUED_SETTINGS: tuple[tuple[str, Callable[[ConfigurationDocument], bool], 
         "access_control/default_permission",
         lambda document: document.access.allows_by_default,
         True,
-        "it allows by default",
+        "it allows what no rule denies",
     ),
 )
 """Settings with two values: path, function that reads the value, value that permits more, clause.

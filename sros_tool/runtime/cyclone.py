@@ -267,9 +267,9 @@ class Participant:
 
 _MORE_PARTICIPANTS = (
     "Without multicast, Cyclone DDS has room for ten participants of a domain on each host. Allow "
-    "more, with CYCLONEDDS_URI='<CycloneDDS><Domain><Discovery><MaxAutoParticipantIndex>100"
-    "</MaxAutoParticipantIndex></Discovery></Domain></CycloneDDS>', or add --backend rclpy to a "
-    "node of `sros demo`."
+    "more with CYCLONEDDS_URI='<CycloneDDS><Domain><Discovery><MaxAutoParticipantIndex>100"
+    "</MaxAutoParticipantIndex></Discovery></Domain></CycloneDDS>', or, for "
+    "`sros demo talker` and `listener`, add --backend rclpy."
 )
 
 

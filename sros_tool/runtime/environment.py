@@ -134,8 +134,8 @@ def render_environment(variables: Mapping[str, str], form: str) -> str:
     for name, value in variables.items():
         if form in _INEXPRESSIBLE_IN and _INEXPRESSIBLE_IN[form](value):
             raise UsageError(
-                f"{name} cannot be written in the form {form}: {value!r}",
-                "A program that reads this form would get another value, or several values.",
+                f"{name} cannot be written in the format {form}: {value!r}",
+                "A program that reads this format would get another value, or several values.",
                 "Move the keystore to a path of letters, digits and /._- only, or use `sros run`.",
             )
     if form == "json":
@@ -512,7 +512,7 @@ def render_container(container: Container, form: str) -> str:
     for value in (container.folder, container.image, *container.variables.values()):
         if not value.isprintable() or (form == KUBERNETES and ":" in container.folder):
             raise UsageError(
-                f"{value!r} cannot be written in the form {form}",
+                f"{value!r} cannot be written in the format {form}",
                 "",
                 "Use a path of letters, digits and /._- only.",
             )

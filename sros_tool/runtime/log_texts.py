@@ -109,11 +109,11 @@ _ALL_FAULTS = (
 )  # fmt: skip
 
 _EXPLAIN_REMEDY = "`sros explain KEYSTORE ENCLAVE --log LOG` finds the cause in the enclave."
-_LOG_FILE_REMEDY = "If ROS_SECURITY_LOG_FILE names a file, run `sros explain --log FILE` with it."
+_LOG_FILE_REMEDY = "If ROS_SECURITY_LOG_FILE names a FILE, run `sros explain --log FILE`."
 _EXPLAIN_OR_LOG_FILE = f"{_EXPLAIN_REMEDY} {_LOG_FILE_REMEDY}"
 _RESTORE_FILE = (
-    "`sros explain KEYSTORE ENCLAVE join` names the file and the command that restores it. For an "
-    "enclave on a robot, export it from its keystore again."
+    "`sros explain KEYSTORE ENCLAVE join` names the file and the command that restores the file. "
+    "If the enclave is on a robot, export the enclave from its keystore again."
 )
 _RENEW_ENCLAVE = "Renew the enclave: `sros renew KEYSTORE ENCLAVE`."
 _SIGN_PERMISSIONS = "Sign the permissions again: `sros create_permission KEYSTORE ENCLAVE POLICY`."
@@ -163,9 +163,9 @@ _RENEW_PARTICIPANT = (
 )
 _OTHER_PERMISSIONS_CA = (
     "its permissions are not signed by a permissions CA that this process has loaded. This process "
-    "was not restarted since stage 1 of a rotation (`sros rotate_ca`), or the peer was not "
-    "restarted since stage 2. Or the two processes have enclaves of different keystores, or the "
-    "peer's permissions.p7s was changed after it was signed"
+    "was not restarted since the stage distribute of a rotation (`sros rotate_ca`), or the peer "
+    "was not restarted since the stage reissue. Or the two processes have enclaves of different "
+    "keystores, or the peer's permissions.p7s was changed after it was signed"
 )
 _SAME_KEYSTORE = (
     "Give both sides enclaves of the same keystore; `sros inspect` shows the CA of an enclave."
@@ -311,15 +311,15 @@ _CYCLONE_PARTICIPANT_TEXTS = (
     _log_text(
         "peer-permissions", _CYCLONE, rf"{_CYCLONE_PARTICIPANT} permissions from plugin: "
         r"Permissions validity period (?:expired|has not started)",
-        "a PEER was refused: by the clock of this host its permissions have expired or are not "
+        "a PEER was refused: by the clock of this host, its permissions have expired or are not "
         "valid yet", _RENEW_PARTICIPANT,
     ),
     _log_text(
         "peer-signature", _CYCLONE,
         rf"{_CYCLONE_PARTICIPANT} permissions from plugin: .*(?:PKCS7|SMIME)",
         f"a PEER was refused: {_OTHER_PERMISSIONS_CA}",
-        "Restart all processes together after stage 2 of `sros rotate_ca`. If this continues: "
-        f"{_SAME_KEYSTORE}",
+        "Restart all processes together after the stage reissue of `sros rotate_ca`. If this "
+        f"continues: {_SAME_KEYSTORE}",
     ),
     _log_text(
         "peer-refused", _CYCLONE,
@@ -478,7 +478,7 @@ _FAST_PARTICIPANT_TEXTS = (
     _log_text(
         "peer-permissions", _FAST,
         rf"{_REFUSED_PARTICIPANT}Remote participant doesn't found in its permissions file",
-        "a PEER was refused: by the clock and the time zone of this host its permissions have "
+        "a PEER was refused: by the clock and the time zone of this host, its permissions have "
         "expired or are not valid yet, or the permissions have no grant for its certificate",
         "Compare clocks and time zones of both hosts: Fast DDS reads dates in local time. "
         f"{_RENEW_PARTICIPANT}",
@@ -501,8 +501,8 @@ _FAST_PARTICIPANT_TEXTS = (
         r"|Not found a rule allowing to use the domain_id.*check_remote_participant"
         r"|check_remote_participant.*Not found a rule allowing to use the domain_id",
         "a PEER was refused: its permissions are not for this domain",
-        "Sign the peer's permissions again, with this domain: `sros create_permission KEYSTORE "
-        "PEER POLICY` takes the domains of the keystore.",
+        "Sign the peer's permissions again: `sros create_permission KEYSTORE PEER POLICY` signs "
+        "them for all domains of the keystore.",
     ),
     _log_text(
         "peer-refused", _FAST, r"Error validating remote permissions for"
@@ -536,9 +536,9 @@ _FAST_START_TEXTS = (
     _log_text(
         "identity", _FAST, r"SECURITY\s*Error\]\s*->\s*Function validate_local_identity"
         r"|PKIDH::validate_local_identity :\s*\Z",
-        "the identity is refused, and the message gives no reason. Either the certificate or its "
-        "CA is out of date, from another CA, damaged or revoked, or crl.pem is out of date or "
-        "damaged",
+        "the identity is refused, and the message gives no reason. The certificate, its CA or "
+        "crl.pem has expired, is not valid yet or is damaged; or the certificate is revoked, or "
+        "from another CA",
         _EXPLAIN_REMEDY,
         (*_CERTIFICATE_FAULTS, Fault.CERTIFICATE_MALFORMED, *_CA_FAULTS, *_CRL_FAULTS),
     ),

@@ -169,7 +169,7 @@ def built_without_security(rmw: str, environment: Mapping[str, str]) -> bool:
 
 def no_security_text(rmw: str) -> str:
     """Return a sentence on an RMW that `built_without_security` names."""
-    return f"{rmw} is built without security here: no node starts in an enclave with it"
+    return f"{rmw} is built without security here: with it, no node starts in an enclave"
 
 
 _MOST_BYTES = 16 * 1024 * 1024

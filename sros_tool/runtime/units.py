@@ -435,7 +435,7 @@ RestrictAddressFamilies=AF_UNIX AF_INET AF_INET6
 Description={description}
 
 [Timer]
-# Not by the calendar: the clock of a robot may be wrong, or jump.
+# The timer ignores the date, because the clock of a robot may be wrong, or jump.
 OnBootSec=1min
 OnUnitInactiveSec=5min
 RandomizedDelaySec=1min

@@ -380,7 +380,7 @@ def _untranslatable_name_error(name: str, place: Source) -> PolicyError:
     return PolicyError(
         f"{place}: the name {name} cannot be expressed in Zenoh",
         "A key of Zenoh has no '#' and no '$', and no empty part.",
-        "Name it as ROS does.",
+        "Use a name that is valid in ROS.",
     )
 
 
@@ -773,7 +773,7 @@ def _keys_of(domain: str, name: str) -> tuple[str, ...]:
         raise DocumentError(
             f"the Zenoh rules for {name} cannot be compared",
             f"Its wildcards stand for more than {_MOST_NAMES} key expressions.",
-            "Name it with fewer wildcards.",
+            "Use fewer wildcards in this name.",
         )
     return tuple(canonical((domain, *chunks, *_UNTYPED)) for chunks in chunks_of(name))
 

@@ -587,7 +587,10 @@ class Enforcement:
             return "it has deny rules, which do not apply to messages with wildcards"
         for subject in self.subjects:
             if key := self._history_only_key(subject.id):
-                return f"its subject {subject.id[:80]!r} gets only the history of {key[:80]!r}"
+                return (
+                    f"its subject {subject.id[:80]!r} gets only earlier messages (the history) of "
+                    f"{key[:80]!r}"
+                )
         return ""
 
     def _history_only_key(self, subject: str) -> str:

@@ -1048,7 +1048,10 @@ def test_the_peer_whose_permissions_expired_is_named(
     ("vendor", "remedy"),
     [
         (FAST_14, "Restart this process of enclave /talker_listener/talker: it was not restarted"),
-        (CYCLONE, "Restart this process and the peer: one of them was not restarted since stage 2"),
+        (
+            CYCLONE,
+            "Restart this process and the peer: one of them was not restarted since the stage ",
+        ),
     ],
 )
 def test_a_process_that_was_not_restarted_in_a_rotation_is_named(
@@ -1058,11 +1061,11 @@ def test_a_process_that_was_not_restarted_in_a_rotation_is_named(
         sros("rotate_ca", keystore, "--permissions", "--next").ok()
     log = log_about(Enclave(keystore, OTHER).folder, f"{vendor}.peer_after_stage_2.log", tmp_path)
     found = sros("explain", keystore, "--log", log).out
-    assert "the CAs of this keystore are being replaced, and stage 2 is done" in found
+    assert "the CAs of this keystore are being replaced, and the stage reissue is done" in found
     assert f"  remedy    {remedy}" in found
     # After the rotation, or about a peer that this keystore does not know, it is not certain.
     stranger = sros("explain", keystore, "--log", LOGS / f"{vendor}.peer_after_stage_2.log").out
-    assert "was not restarted since stage 1 of a rotation" in stranger
+    assert "was not restarted since the stage distribute of a rotation" in stranger
     assert "  found " not in stranger
     sros("rotate_ca", keystore, "--next").ok()
     after = sros("explain", keystore, "--log", log).out

@@ -527,7 +527,7 @@ def test_settings_of_zenoh_are_compared(sound: Path, path: str, value: object, s
         (a_link_without_tls, 2, "without TLS"),
         (no_certificate_asked_for, 2, "it asks for no certificate"),
         (a_subject_with_a_condition, 2, "conditions besides the name: interfaces"),
-        (the_history_of_a_topic, 2, "gets only the history of '0/cmd_vel/*/*'"),
+        (the_history_of_a_topic, 2, "gets only earlier messages (the history) of '0/cmd_vel/*/*'"),
         (a_denial, 2, "it has deny rules"),
         (a_namespace, 2, "puts a namespace before all Zenoh keys"),
         (in_a_relay, 2, "/web: this answer ignores its <relay>"),

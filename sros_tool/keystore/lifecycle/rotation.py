@@ -295,8 +295,7 @@ def _restart_remarks(keystore: OpenedKeystore, rotation: Rotation) -> list[str]:
             remarks.append(f"Zenoh: {ONE_BY_ONE} Continue when all have been restarted.")
     if any(file != "permissions_ca" for file in files):
         remarks.append(
-            "Revocations at this stage are signed by both CAs, if the key of the old CA is "
-            "available."
+            "At this stage, both CAs sign revocation lists, if the key of the old CA is available."
         )
     return remarks
 
