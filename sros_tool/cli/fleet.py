@@ -551,7 +551,8 @@ def _published_lines(published: PublishedFleet, moment: datetime) -> Iterator[st
     yield f"{releases} in '{published.folder}'{unchanged}"
     if removed := published.names("removed"):
         took = "would remove" if published.dry_run else "removed"
-        yield f"{took} the releases of robots without enclaves: {first_few(removed, _MOST_GROUPS)}"
+        which = f"robots that left the fleet or were revoked: {first_few(removed, _MOST_GROUPS)}"
+        yield f"{took} the releases of {which}"
     for robot in published.robots:
         if robot.outcome == "refused":
             keeps = "keeps its earlier release" if robot.number else "has no release"
@@ -890,6 +891,12 @@ def _fleet_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
         whose = counted(status.unassigned, "enclave belongs", "enclaves belong")
         covered = "it" if status.unassigned == 1 else "them"
         yield f"{whose} to no robot, so no confirmation covers {covered}"
+    if status.left:
+        whose = counted(len(status.left), "enclave", "enclaves")
+        yield (
+            f"{whose} of robots that left the fleet, not revoked: {first_few(status.left, 5)} "
+            "(`sros fleet publish` names the command that revokes them)"
+        )
 
 
 def _revocation_list_facts(compared_fleet: ComparedFleet) -> Iterator[str]:

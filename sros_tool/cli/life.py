@@ -90,12 +90,15 @@ def renew(
     allow_refusal: tuple[Vendor, ...],
     dry_run: bool,
     as_json: bool,
-) -> None:
+) -> int:
     """Issue new certificates for ENCLAVE..., and sign their permissions again.
 
     The rights stay the same.  Running processes keep the files that they have loaded: restart the
     processes before these files expire. If some of these files have expired, restart all processes
     together.
+
+    With --all-expiring, the enclaves of robots that left the fleet are not renewed: the command
+    names those that are due, and exits with 1, until they are revoked or have expired.
 
     Anyone who has copies of a replaced certificate, of its key and of the permissions can use these
     copies until the certificate or the permissions expire. With --revoke-old, processes that load
@@ -111,6 +114,7 @@ def renew(
     """
     from sros_tool.keystore.delivery.restored import refuse_unpublished_restore
     from sros_tool.keystore.expiry import parse_threshold
+    from sros_tool.keystore.lifecycle.renew import NOT_RENEWED
     from sros_tool.keystore.lifecycle.renew import renew as work
     from sros_tool.keystore.reader import OpenedKeystore
 
@@ -140,6 +144,7 @@ def renew(
         enclave_lines(tuple(result.outcomes), "renewed enclave {}"),
         first=_replaced_lines(result, has_new_keys=new_key),
     )
+    return 1 if any(note.id == NOT_RENEWED for note in result.notes) else 0
 
 
 def _replaced_lines(result: Changed, *, has_new_keys: bool) -> Iterator[str]:

@@ -44,7 +44,7 @@ from sros_tool.keystore.layout import (
     revoked_certificates,
     search_enclaves,
 )
-from sros_tool.keystore.ledger import GAP, RESTORED, SEALED, Entry
+from sros_tool.keystore.ledger import GAP, LEFT, RESTORED, SEALED, Entry
 from sros_tool.keystore.participant import EvaluatedEnclave, evaluate_enclave
 from sros_tool.keystore.reader import FilesReadOnce, OpenedEnclave, OpenedKeystore, open_enclave
 from sros_tool.keystore.zenoh_files import OpenedZenoh, ZenohFault, open_zenoh
@@ -1073,6 +1073,8 @@ def history(keystore: OpenedKeystore, *, now: datetime) -> History:
             return HistoryStatus.SEALED
         if entry.what in ("answer", "release"):
             return HistoryStatus.SENT
+        if entry.what == LEFT:
+            return HistoryStatus.CURRENT
         if entry.what in ("settings", "fleet"):
             return HistoryStatus.CURRENT if entry.sha256 in settings else HistoryStatus.REPLACED
         if entry.what == "revocation" or entry.serial in revoked or entry.sha256 in revoked_files:

@@ -28,9 +28,10 @@ from sros_tool.fleet.robots import (
     unrecorded_enclaves,
 )
 from sros_tool.keystore.layout import FLEET, FLEET_ROOT, remedy_in_closed_robot
-from sros_tool.keystore.ledger import LEDGER_REMEDY, Entry, Ledger
+from sros_tool.keystore.ledger import LEDGER_REMEDY, LEFT, Entry, Ledger
 from sros_tool.keystore.reader import OpenedKeystore
-from sros_tool.pki.certificates import subject_text
+from sros_tool.pki.certificates import subject_text, validity_of
+from sros_tool.pki.crl import SUPERSEDED
 from sros_tool.policy.placeholders import has_placeholder
 from sros_tool.validity import iso
 from sros_tool.wording import first_few
@@ -442,12 +443,16 @@ def _signed_domains(keystore: OpenedKeystore, name: str) -> DomainSet | None:
     return None
 
 
-def notes_on_lost_enclaves(keystore: OpenedKeystore, before: Fleet, after: Fleet) -> Iterator[Note]:
-    """Yield a note on each robot that loses enclaves or a router which the keystore still has.
+def lost_enclaves(
+    keystore: OpenedKeystore, before: Fleet, after: Fleet, now: datetime
+) -> tuple[list[Note], list[Entry]]:
+    """Return notes and ledger entries on enclaves and routers that robots lose, but keystores keep.
 
-    No two robots of ``after`` may have an enclave in common, which `write_fleet` checks.
+    The notes include enclaves that robots lost earlier.  No two robots of ``after`` may have an
+    enclave in common, which `write_fleet` checks.
     """
-    left_enclaves: dict[str, set[str]] = {}
+    notes: list[Note] = []
+    lost: dict[str, set[str]] = {}
     for robot in before.robots.values():
         same_robot = after.robots.get(robot.name)
         kept = set(enclaves_of(after, same_robot) if same_robot else ())
@@ -455,22 +460,73 @@ def notes_on_lost_enclaves(keystore: OpenedKeystore, before: Fleet, after: Fleet
             router = router_enclave_of(before, robot)
             kept.add(router)
             if keystore.has_enclave(router):
-                yield _lost_router_note(keystore, robot.name, router)
+                notes.append(_lost_router_note(keystore, robot.name, router))
         names = (name for name in enclaves_of(before, robot) if name not in kept)
-        if left_names := {name for name in names if keystore.has_enclave(name)}:
-            left_enclaves[robot.name] = left_names
+        if lost_names := {name for name in names if keystore.has_enclave(name)}:
+            lost[robot.name] = lost_names
     # Enclaves that an earlier change of the fleet left without a robot count, too.
-    earlier = unrecorded_enclaves(before, keystore.names, left_enclaves) if left_enclaves else {}
-    for name, enclaves in left_enclaves.items():
+    earlier = unrecorded_enclaves(before, keystore.names, lost) if lost else {}
+    for name, enclaves in lost.items():
         enclaves.update(enclave for enclave in earlier[name].below if not robot_of(after, enclave))
-        why = "has other enclave paths now" if name in after.robots else "is no longer in the fleet"
-        stay, them = ("stays", "it") if len(enclaves) == 1 else ("stay", "them")
-        shown = first_few(sorted(enclaves), _MOST_SHOWN)
+    robots = {enclave: name for name, enclaves in lost.items() for enclave in enclaves}
+    entries = [
+        Entry(iso(now), LEFT, enclave=enclave, reason=name)
+        for enclave, name in sorted(robots.items())
+    ]
+    notes += left_enclaves_notes(keystore, after, left_enclaves(keystore, after, now) | robots)
+    return notes, entries
+
+
+def left_enclaves(
+    keystore: OpenedKeystore, fleet: Fleet, now: datetime | None = None
+) -> dict[str, str]:
+    """Map the enclaves of robots that left the fleet or their group to these robots.
+
+    Only enclaves that the ledger records as left are known.  With ``now``, enclaves whose
+    certificates have expired are left out.
+    """
+    names = {
+        entry.enclave
+        for entry in keystore.ledger_file.with_values("what", (LEFT,)).entries
+        if entry.what == LEFT and keystore.has_enclave(entry.enclave)
+    }
+    robots: dict[str, str] = {}
+    for entry in keystore.ledger_file.with_values("enclave", names).entries if names else ():
+        if entry.what == LEFT:
+            robots[entry.enclave] = entry.reason
+        elif entry.what == "revocation" and entry.reason != SUPERSEDED:
+            robots.pop(entry.enclave, None)  # it was made again, not for the robot
+    left: dict[str, str] = {}
+    for name, robot in sorted(robots.items()):
+        with suppress(SrosError):  # without a certificate, nobody can use the enclave
+            until = validity_of(keystore.certificate_of(name)).not_after
+            if (now is None or until > now) and not robot_of(fleet, name):
+                left[name] = robot
+    return left
+
+
+def left_enclaves_notes(
+    keystore: OpenedKeystore, fleet: Fleet, left: Mapping[str, str]
+) -> Iterator[Note]:
+    """Yield a note for each robot that ``left`` (as of `left_enclaves`) names."""
+    enclaves: dict[str, list[str]] = {}
+    for name, robot in sorted(left.items()):
+        enclaves.setdefault(robot, []).append(name)
+    for robot, names in enclaves.items():
+        why = (
+            "has other enclave paths now" if robot in fleet.robots else "is no longer in the fleet"
+        )
+        stay, them = ("stays", "it") if len(names) == 1 else ("stay", "them")
         yield Note(
             "fleet.left-enclaves",
-            f"the robot {name} {why}: {shown} {stay} valid. To revoke {them}, run `sros revoke "
-            f"{quote(str(keystore.root))} {arguments_for(keystore, sorted(enclaves))}`.",
+            f"the robot {robot} {why}: {first_few(names, _MOST_SHOWN)} {stay} valid. To revoke "
+            f"{them}, run {revoke_command(keystore, names)}.",
         )
+
+
+def revoke_command(keystore: OpenedKeystore, names: Sequence[str]) -> str:
+    """Return the command, in backticks, that revokes the enclaves ``names``, which are sorted."""
+    return f"`sros revoke {quote(str(keystore.root))} {arguments_for(keystore, names)}`"
 
 
 def _lost_router_note(keystore: OpenedKeystore, robot: str, router: str) -> Note:

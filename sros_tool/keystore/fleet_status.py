@@ -51,7 +51,12 @@ from sros_tool.keystore.confirmation import (
     shows_old_copy,
 )
 from sros_tool.keystore.delivery.published import altered_lately, read_published, unseen_clause
-from sros_tool.keystore.fleet import enclaves_of_robot, fleet_edits_clause, recorded_fleet
+from sros_tool.keystore.fleet import (
+    enclaves_of_robot,
+    fleet_edits_clause,
+    left_enclaves,
+    recorded_fleet,
+)
 from sros_tool.keystore.known_keys import restored_at
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
@@ -522,6 +527,7 @@ class PublishedMetadata:
         "stage",
         "counts",
         "unassigned",
+        "left",
         "overdue",
         "older",
         "clock",
@@ -541,6 +547,10 @@ class FleetStatus:
     unassigned: int
     """Number of enclaves that belong to no robot, so that no confirmation includes them; 0 with
     ``--robot``.
+    """
+    left: tuple[str, ...] = ()
+    """The enclaves, not revoked, of robots that left the fleet or their group, sorted by name;
+    empty with ``--robot``.
     """
     overdue: frozenset[str] = frozenset()
     """The robots whose last confirmation is older than ``--max-age``, sorted by name; without that
@@ -724,6 +734,7 @@ def fleet_status(keystore: OpenedKeystore, names: Sequence[str] = ()) -> FleetSt
         stages.stage_of_keystore,
         statuses,
         unassigned,
+        () if names else tuple(left_enclaves(keystore, fleet)),
         older=older,
         edited=fleet_edits_clause(keystore, keystore.ledger_with("what", "fleet")),
         revoked_until=records.revoked_until(may_trust_replaced=may_trust_replaced)

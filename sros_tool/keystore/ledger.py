@@ -73,6 +73,8 @@ LEDGER_REMEDY = (
 """What to do about a ledger with missing or changed lines."""
 SEALED = "sealed"
 RESTORED = "restored"
+LEFT = "left"
+"""The ``what`` of a line on an enclave whose robot (the ``reason``) left the fleet or its group."""
 REPORTED = "reported"
 """The ``reason`` of a certificate that is known only from a robot's message.
 
@@ -113,7 +115,8 @@ class Entry(NamedTuple):
     ``revocation``, ``answer`` (the signed list of the files sent to a robot), ``settings`` (of the
     keystore), ``fleet``, ``release`` (the list of the robots' releases that were published
     together), ``sealed`` (the part of the ledger before this line), ``restored`` (the keystore came
-    from a backup, so that entries are missing), or ``gap`` (lines before this one were missing or
+    from a backup, so that entries are missing), ``left`` (the robot of the enclave left the fleet,
+    or the group of the enclave), or ``gap`` (lines before this one were missing or
     changed).
     """
     enclave: str = ""
@@ -133,7 +136,8 @@ class Entry(NamedTuple):
     policy: str = ""
     """SHA-256 of the policy, with its includes, from which the permissions were made."""
     reason: str = ""
-    """The reason of a revocation; the fault that a gap records; what showed a restore; why a
+    """The reason of a revocation; the fault that a gap records; what showed a restore; the robot
+    that left; why a
     document was signed again; or, if the keystore did not issue the certificate with this line, how
     the certificate became known.
     """

@@ -564,6 +564,15 @@ def _(bench: Bench) -> None:
     ledger.write_text("\n".join([*lines, json.dumps(restored)]) + "\n")
 
 
+@case("keystore.robot-left")
+def _(bench: Bench) -> None:
+    bench.path("fleet.toml").write_text('enclaves = ["/{robot}"]\n[robots.r1]\n')
+    ledger = bench.path("ledger.jsonl")
+    left = {"time": json.loads(ledger.read_text().splitlines()[-1])["time"], "what": "left"}
+    with ledger.open("a") as file:
+        file.write(json.dumps(left | {"enclave": "/base", "reason": "base"}) + "\n")
+
+
 @case("keystore.publication-unseen")
 def _(bench: Bench) -> None:
     bench.path("published.json").write_text("damaged")

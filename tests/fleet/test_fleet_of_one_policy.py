@@ -333,17 +333,26 @@ def test_what_happens_to_a_fleet(made: Path, tmp_path: Path) -> None:
     assert "the robot r9 is no longer in the fleet: /r9/base, /r9/lift stay" in ended.err
     assert "sros revoke ks --match '/r9/*'" in ended.err
     assert "r7" not in ended.err.replace("/r7", "")
+    assert "the robot r9 is no longer in the fleet" in sros(*write_again, cwd=folder).ok().err
+    timer = ("renew", "ks", "--all-expiring", "9000d")
+    renewed = sros(*timer, cwd=folder)
+    assert (renewed.status, "renewed 21 enclaves" in renewed.out) == (1, True), renewed
+    assert "not renewed: /r9/base, /r9/lift (of robots that left the fleet: r9)" in renewed.err
+    assert (
+        "2 enclaves of robots that left the fleet" in sros("fleet", "status", "ks", cwd=folder).out
+    )
     assert "/hall/r9/base/cmd" not in str(permissions(folder / "ks", "/dispatcher"))
     assert "/hall/r11/base/cmd" in str(permissions(folder / "ks", "/dispatcher"))
     fleet = load_fleet(OpenedKeystore(folder / "ks"))
     assert fleet and "r9" not in fleet.robots and len(fleet.robots) == len(ROBOTS) - 2
-    words = ("--include", "keystore.left-enclaves", "--severity", "note", "--json")
+    words = ("--include", "keystore.robot-left", "--json")
     found = json.loads(sros("check", "ks", *words, cwd=folder).out)["findings"]
     assert [each["text"] for each in found] == ["enclaves of r9: /r9/base, /r9/lift"]
     refused = sros("revoke", "ks", "--robot", "r9", cwd=folder)
     assert refused.status == 2
     assert "Name the enclaves themselves: --match '/r9/*'" in refused.err
     sros("revoke", "ks", "--match", "/r9/*", cwd=folder).ok()
+    assert "/r9" not in sros(*timer, "--dry-run", cwd=folder).ok().err
 
     # Another domain is in all permissions, or refused.
     (folder / "fleet.toml").write_text(fleet_file([r for r in ROBOTS if r not in ("r7", "r9")], 6))

@@ -13,9 +13,10 @@ from typing import Any
 
 import pytest
 
+from sros_tool.cli.common import now
 from sros_tool.fleet import robots
 from sros_tool.fleet.robots import Fleet, Robot
-from sros_tool.keystore.fleet import notes_on_lost_enclaves, recorded_fleet
+from sros_tool.keystore.fleet import lost_enclaves, recorded_fleet
 from sros_tool.keystore.layout import list_enclaves
 from sros_tool.keystore.reader import OpenedKeystore
 from tests.support.harness import Ended, copy_of, policy_text, publish, snapshot, sros
@@ -126,10 +127,11 @@ def test_enclaves_that_are_left_are_found_in_one_pass(
     monkeypatch.setattr(robots, "_possible_robots", counted)
     paths = [f"/e{number}/{{robot}}" for number in range(30)]
     before = Fleet.of([Robot("a", "/a"), Robot("b", "/b")], enclaves=["/{robot}", *paths])
-    assert not list(notes_on_lost_enclaves(OpenedKeystore(made / "ks"), before, before))
+    assert lost_enclaves(OpenedKeystore(made / "ks"), before, before, now()) == ([], [])
     after = Fleet.of([Robot("b", "/b")], enclaves=paths)
-    (note,) = notes_on_lost_enclaves(OpenedKeystore(made / "ks"), before, after)
+    (note,), (entry,) = lost_enclaves(OpenedKeystore(made / "ks"), before, after, now())
     assert "the robot a is no longer in the fleet: /a stay" in note.text
+    assert (entry.what, entry.enclave, entry.reason) == ("left", "/a", "a")
     assert looked <= 2 * len(before.enclaves)
 
 
@@ -155,7 +157,7 @@ def of_robot(root: Path, robot: str) -> dict[str, Any]:
 def test_what_an_earlier_change_left_is_named_when_a_robot_leaves(unknown: Path) -> None:
     before = recorded_fleet(OpenedKeystore(unknown / "ks"))
     after = Fleet.of([Robot("r30", "/r30")], enclaves=before.enclaves)
-    (note,) = notes_on_lost_enclaves(OpenedKeystore(unknown / "ks"), before, after)
+    (note,), _ = lost_enclaves(OpenedKeystore(unknown / "ks"), before, after, now())
     assert "is no longer in the fleet: /r3, /r3/a, /r3/deep/er stay valid" in note.text
 
 

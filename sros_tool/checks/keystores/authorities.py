@@ -275,12 +275,22 @@ FLEET_EDITED = FindingKind(
 LEFT_ENCLAVES = FindingKind(
     "keystore.left-enclaves",
     NOTE,
-    "enclaves of robots that left the fleet, or left the group of these enclaves",
+    "enclaves that may be of robots that left the fleet, or left the group of these enclaves",
     "Anyone who has the files of such an enclave has its rights until the files expire, and "
     "`--robot` no longer chooses the enclave.",
     "sros: the paths have the form of a robot's enclaves, and no robot has these enclaves.",
     "Revoke the enclaves with `sros revoke KEYSTORE ENCLAVE...` if the robots are gone. Keep an "
     "enclave that never belonged to a robot.",
+)
+ROBOT_LEFT = FindingKind(
+    "keystore.robot-left",
+    WARNING,
+    "valid enclaves of robots that left the fleet, or left the group of these enclaves",
+    "Other robots still accept these enclaves, although no robot of the fleet has them. `sros "
+    "renew --all-expiring` does not renew them.",
+    "sros: ledger.jsonl has the enclaves of each robot that left.",
+    "Revoke the enclaves with `sros revoke KEYSTORE ENCLAVE...`. If the robot is to keep them, add "
+    "it to the fleet file again, and run `sros generate_artifacts`.",
 )
 NOT_AS_SETTINGS = FindingKind(
     "governance.not-as-settings",
@@ -398,17 +408,21 @@ _SHOWN, _MOST_LEFT = 5, 20
 
 def _former_robot_findings(keystore: CheckedKeystore, fleet: Fleet) -> Iterator[Finding]:
     from sros_tool.fleet.robots import former_robot_of
+    from sros_tool.keystore.fleet import left_enclaves
 
-    robots: dict[str, list[str]] = {}
-    for name in keystore.names:
-        if robot := former_robot_of(fleet, name):
-            robots.setdefault(robot, []).append(name)
-    for robot, names in list(robots.items())[:_MOST_LEFT]:
-        clause = f"enclaves of {robot}: {first_few(names, _SHOWN)}"
-        yield LEFT_ENCLAVES.found("fleet", clause, keystore.shown_path(FLEET))
-    if (more_robots := len(robots) - _MOST_LEFT) > 0:
-        clause = f"enclaves of {counted(more_robots, 'more robot')}"
-        yield LEFT_ENCLAVES.found("fleet", clause, keystore.shown_path(FLEET))
+    left = left_enclaves(keystore.opened, fleet, keystore.at.now)
+    former = {name: former_robot_of(fleet, name) for name in keystore.names if name not in left}
+    for kind, enclaves in ((ROBOT_LEFT, left), (LEFT_ENCLAVES, former)):
+        robots: dict[str, list[str]] = {}
+        for name, robot in enclaves.items():
+            if robot:
+                robots.setdefault(robot, []).append(name)
+        for robot, names in list(robots.items())[:_MOST_LEFT]:
+            clause = f"enclaves of {robot}: {first_few(names, _SHOWN)}"
+            yield kind.found("fleet", clause, keystore.shown_path(FLEET))
+        if (more_robots := len(robots) - _MOST_LEFT) > 0:
+            clause = f"enclaves of {counted(more_robots, 'more robot')}"
+            yield kind.found("fleet", clause, keystore.shown_path(FLEET))
 
 
 _NEXT_CA = "Make a new keystore with the certificate of the next CA of the CA service."

@@ -68,7 +68,13 @@ from sros_tool.keystore.delivery.restored import (
     restores_after_last_release,
     without_agreed_changes,
 )
-from sros_tool.keystore.fleet import checked_fleet, enclaves_of_robot, recorded_fleet
+from sros_tool.keystore.fleet import (
+    checked_fleet,
+    enclaves_of_robot,
+    left_enclaves,
+    left_enclaves_notes,
+    recorded_fleet,
+)
 from sros_tool.keystore.issuing.keyring import IN_KEYSTORE, Keyring
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
@@ -273,6 +279,7 @@ def publish(
             lock.acquire()
         run = _Publication(keystore, folder, now, expiry or MetadataExpiry(), dry_run)
         run.notes += similar_names_notes(fleet)
+        run.notes += left_enclaves_notes(keystore, fleet, left_enclaves(keystore, fleet, now))
         stack.enter_context(run.reporting_restore())
         run.check_restored(restored, new_folder, keyring)
         keys = _RoleKeys(run.roots, root, root_key)

@@ -34,7 +34,7 @@ from sros_tool.keystore.fleet import (
     enclaves_of_robot,
     fleet_before_change,
     load_fleet,
-    notes_on_lost_enclaves,
+    lost_enclaves,
     publish_command,
     refuse_stale_domains,
     unrecorded_notes,
@@ -576,7 +576,10 @@ def _prepare_change(
         refuse_stale_domains(
             change.keystore, EnclaveDomains(change.domains, before), recorded, stated
         )
-        change.notes += notes_on_lost_enclaves(change.keystore, before, recorded) if before else ()
+        if before:
+            notes, entries = lost_enclaves(change.keystore, before, recorded, change.now)
+            change.notes += notes
+            change.entries += entries
     if protections:
         _raise_protection(change, protections)
 

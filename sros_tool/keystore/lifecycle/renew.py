@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable, Iterator, Sequence
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,6 +19,7 @@ from sros_tool.keystore.expiry import (
     refuse_unreadable,
     survey,
 )
+from sros_tool.keystore.fleet import left_enclaves, load_fleet, revoke_command
 from sros_tool.keystore.issuing.authority import Authorities
 from sros_tool.keystore.issuing.ca_service import CaServiceError
 from sros_tool.keystore.issuing.enclave import (
@@ -35,6 +36,7 @@ from sros_tool.keystore.lifecycle.replaced import (
     certificates_until,
     may_lack_entries,
 )
+from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.rights import RecordedRights, SignedRights
 from sros_tool.keystore.selection import missing_enclave_error
 from sros_tool.names import check_enclave_name
@@ -50,6 +52,9 @@ from sros_tool.pki.keys import PrivateKey, generate_key
 from sros_tool.pki.token import token_notes, token_places
 from sros_tool.validity import duration_text, iso
 from sros_tool.wording import first_few
+
+NOT_RENEWED = "renew.left-enclaves"
+"""The id of the note on due enclaves that were not renewed, because their robot left the fleet."""
 
 
 def renew(
@@ -92,9 +97,14 @@ def renew(
         if expiring is not None:
             others = [name for name in change.names if name not in wanted]
             short_lived = enclaves_renewed_by_name(change.keystore, change.template, others)
-            wanted |= dict.fromkeys(
-                _due_enclave_names(change, {*others}.difference(short_lived), expiring)
-            )
+            left: dict[str, str] = {}
+            with suppress(SrosError):  # a fleet file that cannot be read stops no renewal
+                if fleet := load_fleet(change.keystore):
+                    left = left_enclaves(change.keystore, fleet, change.now)
+            due = [*_due_enclave_names(change, {*others}.difference(short_lived), expiring)]
+            wanted |= dict.fromkeys(name for name in due if name not in left)
+            if not_renewed := {name: left[name] for name in due if name in left}:
+                change.notes.append(_left_note(change.keystore, not_renewed))
             if short_lived:
                 names_text = first_few(short_lived, 3)
                 text = (
@@ -122,8 +132,8 @@ def renew(
         replaced = renewer.renew(tuple(wanted), progress)
         renewed = tuple(certificate.name for certificate in replaced)
         change.notes += (*writer.notes, *renewer.notes) if replaced else ()
-        left = writer.expiry - change.now
-        if replaced and expiring and expiring.remaining and left <= expiring.remaining:
+        remaining = writer.expiry - change.now
+        if replaced and expiring and expiring.remaining and remaining <= expiring.remaining:
             text = (
                 f"the new files expire within {duration_text(expiring.remaining)}, too (on "
                 f"{iso(writer.expiry)}), so the same command would renew them every time: give "
@@ -186,6 +196,17 @@ def _with_consent_marks(
     for entry in entries:
         is_named = entry.what == "permissions" and entry.enclave in named
         yield entry._replace(reason=RENEWED_BY_NAME) if is_named else entry
+
+
+def _left_note(keystore: OpenedKeystore, left: Mapping[str, str]) -> Note:
+    """Return the note on due enclaves of robots that left the fleet (as of `left_enclaves`)."""
+    text = (
+        f"not renewed: {first_few([*left], 3)} (of robots that left the fleet: "
+        f"{first_few(sorted({*left.values()}), 3)}). Revoke these enclaves, with "
+        f"{revoke_command(keystore, sorted(left))}; if a robot is to keep its enclaves, add it to "
+        "the fleet file again, and run `sros generate_artifacts`"
+    )
+    return Note(NOT_RENEWED, text)
 
 
 def _due_enclave_names(
