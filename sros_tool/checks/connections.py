@@ -18,8 +18,9 @@ from datetime import datetime, timedelta
 from itertools import combinations
 from typing import NamedTuple
 
-from sros_tool.checks.kind import WARNING, Finding, FindingKind
+from sros_tool.checks.kind import ERROR, WARNING, Finding, FindingKind
 from sros_tool.dds.decision.vendors import FAST_DDS
+from sros_tool.runtime.logind import login_users
 from sros_tool.runtime.processes import MemoryPort, Process, plain
 from sros_tool.wording import counted, enumerated, first_few
 
@@ -37,6 +38,17 @@ PROCESS_NOT_CONNECTED = FindingKind(
     "Otherwise, restart the process that this finding names.",
     vendors=FAST_DDS,
 )
+PROCESS_LOST_MEMORY = FindingKind(
+    "runtime.process-lost-memory",
+    ERROR,
+    "a process whose shared memory was removed",
+    "It neither hears the other processes nor reaches them, and does not log why. By default, "
+    "systemd removes the shared memory of a user at the end of the user's last session, also the "
+    "memory that units of this user use.",
+    "logind.conf(5) (RemoveIPC); Fast DDS 2.6 to 3.6 (SharedMemGlobal.hpp); tested with 2.14.5.",
+    "Stop all processes that this finding names, and then start them again.",
+    vendors=FAST_DDS,
+)
 _REMEDY_FOR_USERS = (
     "Run these processes as one user, or start the processes of one of the users with "
     "FASTDDS_BUILTIN_TRANSPORTS=UDPv4 (ROS 2 Jazzy and newer): Fast DDS cannot use the shared "
@@ -52,14 +64,20 @@ _FIRST_PORT, _PORTS_OF_DOMAIN, _FIRST_OF_PARTICIPANT = 7400, 250, 11
 class Connections(NamedTuple):
     """The connections between processes of one machine.
 
-    ``missing`` are the pairs of processes that do not hear each other. ``compared`` are the
-    processes that sros can compare with each other; ``unknown`` are processes whose connections
-    sros cannot see.
+    ``deaf`` are the processes that lost their shared memory, and ``missing`` the pairs of other
+    processes that do not hear each other. ``compared`` are the processes that sros can compare with
+    each other; ``unknown`` are processes whose connections sros cannot see.
     """
 
+    deaf: Sequence[Process]
     missing: Sequence[tuple[Process, Process]]
     compared: Sequence[Process]
     unknown: Sequence[Process]
+
+    @property
+    def are_settled(self) -> bool:
+        """Whether waiting changes nothing: a process is deaf for good, or all have connected."""
+        return bool(self.deaf) or not (self.missing or (self.compared and self.unknown))
 
 
 class _Place(NamedTuple):
@@ -72,7 +90,7 @@ class _Place(NamedTuple):
 
 def connections_between(processes: Iterable[Process]) -> Connections:
     """Return the connections between processes that run the nodes of one robot."""
-    processes = [*processes]
+    deaf, processes = _divided_by_memory(processes)
     ports = {process.pid: _ports_by_place(process) for process in processes}
     number = Counter(place for by_place in ports.values() for place in by_place)
     main = max(number, key=lambda place: number[place], default=None)
@@ -86,9 +104,19 @@ def connections_between(processes: Iterable[Process]) -> Connections:
         )
     ]
     return Connections(
+        deaf,
         missing,
         compared=[process for process in processes if main in ports[process.pid]],
         unknown=[process for process in processes if main not in ports[process.pid]],
+    )
+
+
+def _divided_by_memory(processes: Iterable[Process]) -> tuple[list[Process], list[Process]]:
+    """Return the processes that lost their shared memory, and the others."""
+    processes = [*processes]
+    return (
+        [process for process in processes if process.lost_memory],
+        [process for process in processes if not process.lost_memory],
     )
 
 
@@ -132,8 +160,46 @@ def connection_findings(missing: Sequence[tuple[Process, Process]]) -> Iterator[
         )
 
 
-def missing_text(missing: Sequence[tuple[Process, Process]]) -> str:
-    """Return text on pairs of processes that do not hear each other, with the remedy."""
+def lost_memory_findings(processes: Iterable[Process]) -> Iterator[Finding]:
+    """Yield a finding for each process that lost its shared memory."""
+    text = "files of its shared memory (/dev/shm) were removed while it runs: it hears nothing"
+    for process in processes:
+        if process.lost_memory:
+            remedy = f"{_linger_advice([process])}{PROCESS_LOST_MEMORY.remedy}"
+            yield PROCESS_LOST_MEMORY.found(_process_name(process), text, remedy=remedy)
+
+
+def _linger_advice(deaf: Iterable[Process]) -> str:
+    """Return a sentence on keeping the shared memory of users who log in; "" for system users."""
+    names = login_users(process.user for process in deaf)
+    if not names:
+        return ""
+    linger = enumerated([f"`loginctl enable-linger {name}`" for name in names])
+    return (
+        f"If {enumerated(names)} also log{'s' * (len(names) == 1)} in, first run {linger}, "
+        "because systemd removes the shared memory of a user who logs out. "
+    )
+
+
+def not_connected_text(connections: Connections) -> str:
+    """Return text on processes that do not hear each other, with the remedy.
+
+    Processes that lost their shared memory come first; "" if all have connected.
+    """
+    missing = connections.missing
+    if deaf := connections.deaf:
+        names = first_few([*map(_process_name, deaf)], _MOST_NAMES)
+        is_one = len(deaf) == 1
+        lost, hear = ("has lost its", "hears") if is_one else ("have lost their", "hear")
+        restart = "Stop it, and start it again"
+        if not is_one:
+            restart = "Stop all of them before you start the first one again"
+        return (
+            f"{names} {lost} shared memory (its files in /dev/shm were removed), and {hear} "
+            f"nothing. {_linger_advice(deaf)}{restart}"
+        )
+    if not missing:
+        return ""
     first, second = map(_process_name, missing[0])
     more = f" and {counted(len(missing) - 1, 'other pair')}" if missing[1:] else ""
     to_restart = [*restarts(missing)]

@@ -20,6 +20,7 @@ from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 from sros_tool.checks.connections import (
     connection_findings,
     connections_between,
+    lost_memory_findings,
     with_time_to_connect,
 )
 from sros_tool.checks.environment import (
@@ -730,6 +731,7 @@ def process_findings(
                 yield from _daemon_findings(process, environment)
             continue
         yield from zenoh_findings(process)
+        yield from lost_memory_findings([process])
         if process.asks_for_security:
             yield from _file_findings(process, ledgers, now=now, zone=zone)
             yield from _unsecured_findings(process)

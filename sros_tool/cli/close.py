@@ -84,7 +84,9 @@ def _run(words: Sequence[str], shows_messages: bool) -> tuple[int, str, str]:
     "here, and processes whose nodes have the same name. unexamined: accept processes that sros "
     "could not examine, such as those of other users. unobserved: accept processes in enclaves in "
     "which sros did not observe them. requirements: accept a missing requirements.toml, and "
-    "requirements on names that the policy no longer has.  Can be repeated.",
+    "requirements on names that the policy no longer has. connections: accept processes of which "
+    "sros cannot see whether they hear the others, such as processes that use UDP.  Can be "
+    "repeated.",
 )
 @click.option("--partial", is_flag=True, help="Accept everything that --accept can accept.")
 @click.option(
@@ -346,12 +348,6 @@ def _renaming_advice(closed: CloseState, policy: Policy) -> str:
     )
 
 
-_NOT_PROVED = (
-    "  sros cannot see whether two nodes hear each other: look at what the nodes receive now, and "
-    "restart a node that receives nothing"
-)
-
-
 def _show_end(
     robot: LocalRobot,
     closed: CloseState,
@@ -365,8 +361,6 @@ def _show_end(
     ``holds`` says whether the robot is proved closed; ``apply`` is the option, and
     ``accepted`` are the claims that need not have been tested.
     """
-    from sros_tool.close.state import CONNECTED, TALK
-
     folder, observed = shlex.quote(str(robot.folder)), closed.observed
     ask, details = f"sros close {folder} --proof", list[str]()
     for proof in closed.proofs:
@@ -380,9 +374,6 @@ def _show_end(
         echo(f"{answer}{accept}: {proof.statement}: {proof.reason}")
         for detail in proof.details:
             echo(f"  {detail}")
-        claims = {proof.claim for proof in closed.proofs}
-        if proof.holds and proof.claim == TALK and CONNECTED not in claims:
-            echo(_NOT_PROVED)
     if closed.problems:
         echo(f"{_state_text(closed, apply=apply)}; fix this first:")
         for problem in closed.problems:

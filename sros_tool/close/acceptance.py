@@ -13,6 +13,7 @@ class Acceptance(StrEnum):
     UNEXAMINED = "unexamined"
     UNOBSERVED = "unobserved"
     REQUIREMENTS = "requirements"
+    CONNECTIONS = "connections"
 
 
 Acceptances = Set[Acceptance]

@@ -30,6 +30,7 @@ from sros_tool.files import remove_file
 from sros_tool.names import expand
 from sros_tool.policy.model import Policy
 from sros_tool.runtime.environment import node_argument
+from sros_tool.runtime.logind import users_without_linger
 from sros_tool.runtime.processes import Process, program_of, user_text
 from sros_tool.runtime.units import unit_changes, write_units
 from sros_tool.values import FileChange
@@ -84,6 +85,13 @@ def _write_drop_ins(
     paths = [f"{unit}.d/{DROP_IN}" for unit in sorted(observed.units)]
     files = {path: read_bytes(robot.start / "units" / path, "unit").decode() for path in paths}
     _drop_ins_of(robot, observed)
+    if names := users_without_linger(each.user for each in observed.processes if each.unit):
+        linger = enumerated([f"`loginctl enable-linger {name}`" for name in names])
+        robot.shell.say(
+            f"WARNING: when {enumerated(names)} logs in and out again, systemd removes the shared "
+            "memory of this user, and the nodes of the units hear nothing any more (RemoveIPC in "
+            f"logind.conf(5)). First run {linger}, or give the units a system user"
+        )
     changes = unit_changes(_SYSTEMD_FOLDER, files, force=True)
     for path, action in changes.items():
         robot.shell.say(f"{'would ' if dry_run else ''}{action} {_SYSTEMD_FOLDER / path}")

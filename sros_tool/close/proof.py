@@ -13,10 +13,11 @@ from typing import Any
 
 from sros_tool.checks.connections import (
     CONNECTING_TIME,
+    PROCESS_LOST_MEMORY,
     PROCESS_NOT_CONNECTED,
     Connections,
     connections_between,
-    missing_text,
+    not_connected_text,
 )
 from sros_tool.checks.keystores.issued import STALE
 from sros_tool.checks.kind import NOTE, Finding
@@ -83,6 +84,11 @@ from sros_tool.runtime.variables import ENCLAVE
 from sros_tool.validity import iso
 from sros_tool.wording import counted, enumerated, first_few
 
+_NOT_PROVED = (
+    "sros cannot see whether two nodes hear each other: look at what the nodes receive now, and "
+    "restart a node that receives nothing"
+)
+
 _START_SECONDS = 3.0
 """How long processes that were restarted by hand may take until they run in their enclaves."""
 
@@ -91,6 +97,9 @@ _OTHERS_SEEN = {
     "graph.stray": "writers or readers that belong to no ROS node, of topics",
 }
 """The notes of `generate_policy` on what it sees besides nodes with endpoints, as words."""
+
+_KINDS_OF_CONNECTIONS = (PROCESS_LOST_MEMORY, PROCESS_NOT_CONNECTED)
+"""The findings on processes that only concern the proof of connections."""
 
 _MOST_TRIES = 3
 """Maximum number of looks of the observer, until the nodes do what they did on the open robot."""
@@ -140,13 +149,16 @@ def proofs_of(robot: LocalRobot, state: CloseState, patience: float) -> list[Pro
         away_text = f"if the other machines may be away, add {options}"
         talk = talk._replace(reason=f"{talk.reason}; {away_text}")
     silence = _proof_of_silence(robot, nodes.nodes_to_compare(away), hears=talk.holds is not None)
+    connected = [*_proof_of_connections(robot)]
+    if talk.holds and not connected:
+        talk = talk._replace(details=[*talk.details, _NOT_PROVED])
     return [
         proof,
         *_proof_of_observed_processes(running),
         _proof_of_files(robot, expired),
         _proof_of_requirements(robot),
         talk,
-        *_proof_of_connections(robot),
+        *connected,
         silence,
     ]
 
@@ -343,7 +355,7 @@ def _demands_more_enclaves(robot: LocalRobot) -> bool:
 
 
 def _proof_of_connections(robot: LocalRobot) -> Iterator[Proof]:
-    """Yield the proof that processes have connected to each other, if sros can compare several.
+    """Yield the proof that processes have connected to each other, if sros sees ports of some.
 
     Waits until all have connected, or had enough time.
     """
@@ -351,17 +363,26 @@ def _proof_of_connections(robot: LocalRobot) -> Iterator[Proof]:
     now = robot.shell.now()
     patience = min(max(started, default=now) + CONNECTING_TIME - now, CONNECTING_TIME)
     running = wait_until(
-        robot, lambda seen: not _connections(seen).missing, patience.total_seconds()
+        robot, lambda seen: _connections(seen).are_settled, patience.total_seconds()
     )
     connections = _connections(running)
-    if connections.missing:
-        yield Proof(CONNECTED, False, missing_text(connections.missing))
+    if text := not_connected_text(connections):
+        yield Proof(CONNECTED, False, text)
+    elif connections.compared and (unknown := connections.unknown):
+        names = first_few([process.label for process in unknown], MOST_NAMES)
+        one = len(unknown) == 1
+        hear, they, share = ("hears", "it", "shares") if one else ("hear", "they", "share")
+        yield Proof(
+            CONNECTED,
+            None,
+            f"sros cannot see whether {names} {hear} the others, because {they} {share} no memory "
+            "of Fast DDS with them: look at what each process receives now, and restart a process "
+            "that receives nothing",
+        )
     elif len(connections.compared) > 1:
         number = counted(len(connections.compared), "process", "processes")
         reason = f"{number} of Fast DDS, each with all others"
-        unknown = [process.label for process in connections.unknown]
-        if unknown := [*["other machines"] * bool(robot.not_here), *unknown]:
-            reason += f"; sros cannot see the connections of {first_few(unknown, MOST_NAMES)}"
+        reason += "; sros cannot see those of other machines" * bool(robot.not_here)
         yield Proof(CONNECTED, True, reason)
 
 
@@ -463,7 +484,7 @@ def _process_findings(running: RunningRobot) -> list[Finding]:
     return [
         finding
         for finding in findings
-        if finding.severity > NOTE and finding.kind is not PROCESS_NOT_CONNECTED
+        if finding.severity > NOTE and finding.kind not in _KINDS_OF_CONNECTIONS
     ]
 
 

@@ -78,6 +78,7 @@ _ACCEPTANCES = {
     STARTED: Acceptance.UNEXAMINED,
     KNOWN: Acceptance.UNOBSERVED,
     REQUIRED: Acceptance.REQUIREMENTS,
+    CONNECTED: Acceptance.CONNECTIONS,
 }
 _ACCEPTS_REVOKED = f"a certificate was revoked ({CRL_FILE}), and is still accepted by"
 

@@ -59,8 +59,12 @@ _MEMORY_PORTS = re.compile(
     rb"^\S+ \S+ \S+ (\S+) (\d+) +/[^\n]*/fast(?:rtps|dds)_port(\d{1,5})$", re.MULTILINE
 )
 """Matches a port of Fast DDS in shared memory that is mapped, and not deleted."""
-_OWN_PORT = re.compile(r"/fast(?:rtps|dds)_port(\d{1,5})_el\Z", re.ASCII)
-"""Matches the file that a process keeps locked while only it reads a port of Fast DDS."""
+_DELETED_MEMORY = re.compile(
+    rb"/fast(?:rtps|dds)_(port\d{1,5}|[0-9a-f]{16}) \(deleted\)$", re.MULTILINE
+)
+"""Matches a port, or a segment with messages, of Fast DDS that is mapped and was deleted."""
+_OWN_MEMORY = re.compile(r"/fast(?:rtps|dds)_(port\d{1,5}|[0-9a-f]{16})_el(?: \(deleted\))?\Z")
+"""Matches the file that a process keeps locked while only it uses a port or segment."""
 _PRODUCTS = {b"fastrtps": "Fast DDS", b"fastdds": "Fast DDS", b"ddsc": "Cyclone DDS"}
 _THREE_NUMBERS = re.compile(r"\.so\.(\d+\.\d+\.\d+)(?:\.\d+)?\Z", re.ASCII)
 _MOST_ENTRIES = 10_000
@@ -140,7 +144,8 @@ class Process:
     in a container, this id differs from ``pid``. ``user`` is the id of the user who runs the
     process; for a set-user-ID program, of the user who started it; `SEVERAL_USERS` if several users
     can control the process. ``own_ports`` are the ports of Fast DDS that only this process reads,
-    and ``mapped_ports`` also those to which it has sent.
+    and ``mapped_ports`` also those to which it has sent. ``lost_memory`` says that files of its own
+    shared memory were deleted, so that no other process of Fast DDS can open them.
     """
 
     pid: int
@@ -158,6 +163,7 @@ class Process:
     clock_advance: timedelta = timedelta()
     own_ports: frozenset[MemoryPort] = frozenset()
     mapped_ports: frozenset[MemoryPort] = frozenset()
+    lost_memory: bool = False
 
     @property
     def program(self) -> tuple[int, tuple[str, ...]]:
@@ -593,7 +599,8 @@ def _examine(pid: int, folder: int, command: tuple[str, ...], started: datetime)
         MemoryPort(int(number), memory.decode("utf-8", "replace"), int(file))
         for memory, file, number in _MEMORY_PORTS.findall(maps)
     )
-    own = _own_port_numbers(folder) if ports else set()
+    deleted = {name.decode() for name in _DELETED_MEMORY.findall(maps)}
+    own = _own_memory(folder) if ports or deleted else set()
     return Process(
         pid,
         command,
@@ -605,21 +612,22 @@ def _examine(pid: int, folder: int, command: tuple[str, ...], started: datetime)
         dds=_mapped_dds(maps),
         forked_by=_forked_by(folder, command),
         own_pid=_number(_OWN_PID, status) or pid,
-        own_ports=frozenset(port for port in ports if port.number in own),
+        own_ports=frozenset(port for port in ports if f"port{port.number}" in own),
         mapped_ports=ports,
+        lost_memory=not own.isdisjoint(deleted),
     )
 
 
-def _own_port_numbers(folder: int) -> set[int]:
-    """Return the numbers of the ports of Fast DDS that only this process reads."""
+def _own_memory(folder: int) -> set[str]:
+    """Return the names of the ports and segments of Fast DDS that only this process uses."""
     handle = os.open("fd", os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC, dir_fd=folder)
     try:
-        numbers = set[int]()
+        names = set[str]()
         for name in os.listdir(handle)[:_MOST_ENTRIES]:
             with suppress(FileNotFoundError):  # closed since
-                match = _OWN_PORT.search(os.readlink(name, dir_fd=handle))
-                numbers |= {int(match[1])} if match else set()
-        return numbers
+                match = _OWN_MEMORY.search(os.readlink(name, dir_fd=handle))
+                names |= {match[1]} if match else set()
+        return names
     finally:
         os.close(handle)
 

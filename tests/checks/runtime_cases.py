@@ -281,6 +281,7 @@ CASES: dict[str, Change] = {
     "runtime.process-rmw-unknown": changed(0, libraries=frozenset({"librmw_email_cpp", "librcl"})),
     "runtime.process-other-keystore": _among_strangers,
     "runtime.process-not-connected": _not_connected,
+    "runtime.process-lost-memory": changed(0, lost_memory=True),
     "runtime.process-other-folder": _from_an_older_copy,
     "runtime.process-local-time": lambda state, bench: _at_the_end(state, bench, TZ="Asia/Tokyo"),
     "runtime.process-files-replaceable": _others_can_write,

@@ -12,7 +12,8 @@ import pytest
 from sros_tool.checks.connections import (
     connection_findings,
     connections_between,
-    missing_text,
+    lost_memory_findings,
+    not_connected_text,
     restarts,
 )
 from sros_tool.runtime.processes import MemoryPort, Process
@@ -105,10 +106,32 @@ def test_processes_of_two_users_need_one_user_rather_than_a_restart() -> None:
 
 
 def test_a_summary_names_a_pair_and_all_restarts() -> None:
-    missing = connections_between(robot(*range(2, 15), deaf=[(2, 12), (3, 6), (3, 12)])).missing
-    assert missing_text(missing) == (
+    connections = connections_between(robot(*range(2, 15), deaf=[(2, 12), (3, 6), (3, 12)]))
+    assert not_connected_text(connections) == (
         "process 2 (node2) and process 12 (node12) and 2 other pairs do not hear each other; "
         "restart process 12 (node12) and process 3 (node3), one after the other, and check again"
     )
-    different = [(first, replace(second, user=1000)) for first, second in missing]
-    assert "; run these processes as one user" in missing_text(different)
+    different = [(first, replace(second, user=1000)) for first, second in connections.missing]
+    connections = connections._replace(missing=different)
+    assert "; run these processes as one user" in not_connected_text(connections)
+
+
+def test_processes_that_lost_their_shared_memory_are_deaf_to_all() -> None:
+    """They still map what was deleted, and their peers may map their ports of before."""
+    heard, *lost = robot(1, 2, 3)
+    system, login = (replace(process, lost_memory=True) for process in lost)
+    connections = connections_between([heard, system])
+    assert (connections.deaf, connections.missing, connections.unknown) == ([system], [], [])
+    assert not_connected_text(connections) == (
+        "process 2 (node2) has lost its shared memory (its files in /dev/shm were removed), and "
+        "hears nothing. Stop it, and start it again"
+    )
+    users = [replace(login, user=user) for user in (4711, 4712)]
+    several = not_connected_text(connections_between([heard, *users]))
+    assert (
+        "If 4711 and 4712 also log in, first run `loginctl enable-linger 4711` and `loginctl "
+        "enable-linger 4712`, because systemd removes the shared memory of a user who logs out. "
+        "Stop all of them before you start the first one again"
+    ) in several
+    (finding,) = lost_memory_findings([heard, users[0]])
+    assert finding.remedy.startswith("If 4711 also logs in, first run `loginctl enable-linger 4711")

@@ -461,7 +461,10 @@ def renew_without_hands(robot: Robot) -> None:
     log.write_text("".join(log.read_text().splitlines(keepends=True)[:2]))
 
 
-def test_a_robot_is_closed_proved_and_opened_again(robot: Robot) -> None:
+def test_a_robot_is_closed_proved_and_opened_again(
+    robot: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(apply, "users_without_linger", lambda users: ["robo"] * bool([*users]))
     robot.units, robot.spelled = UNITS, "systemd/../robot/export"
     robot.close()
     seen = robot.folder / "robot/observed.json"
@@ -470,6 +473,7 @@ def test_a_robot_is_closed_proved_and_opened_again(robot: Robot) -> None:
     seen.write_text(json.dumps(twice))
     closed = robot.close("--apply")
     assert robot.restarts == ["daemon-reload", "restart listener.service talker.service"]
+    assert "First run `loginctl enable-linger robo`, or give the units a sys" in closed.err
     assert closed.out.splitlines()[-6:] == [
         "yes: every process was started in its enclave: 2 enclaves, and no open process in "
         "domain 0",

@@ -153,19 +153,36 @@ STRANGER = replace(robot(9)[0], user=4711)
     ("processes", "not_here", "holds", "says"),
     [
         (robot(1, 2, 3), (), True, "3 processes of Fast DDS, each with all others"),
-        (robot(1, 2, 3), ("/laptop",), True, "; sros cannot see the connections of other machines"),
+        (robot(1, 2, 3), ("/laptop",), True, "; sros cannot see those of other machines"),
         (robot(1, 2, 3, deaf=[(1, 2)]), (), False, "do not hear each other; restart process 1"),
-        ([*robot(1, 2), replace(robot(3)[0], own_ports=frozenset())], (), True, "of process 3 ("),
+        (
+            [*robot(1, 2), replace(robot(3)[0], own_ports=frozenset())],
+            (),
+            None,
+            "sros cannot see whether process 3 (node3) hears the others, because it shares no",
+        ),
+        (
+            [*robot(1, 2), replace(robot(3)[0], lost_memory=True)],
+            (),
+            False,
+            "process 3 (node3) has lost its shared memory",
+        ),
+        (
+            [replace(process, lost_memory=True) for process in robot(1, 2)],
+            (),
+            False,
+            "process 1 (node1), process 2 (node2) have lost their shared memory",
+        ),
         ([*robot(1, 2), STRANGER], (), True, "2 processes"),
-        ([replace(process, own_ports=frozenset()) for process in robot(1, 2)], (), None, ""),
-        (robot(1), (), None, ""),
+        ([replace(process, own_ports=frozenset()) for process in robot(1, 2)], (), None, None),
+        (robot(1), (), None, None),
     ],
 )
 def test_processes_that_have_not_connected_fail_the_proof(
     processes: list[Process],
     not_here: tuple[str, ...],
     holds: bool | None,
-    says: str,
+    says: str | None,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Where sros sees no connections, it proves nothing, and `close` says so.
@@ -181,8 +198,11 @@ def test_processes_that_have_not_connected_fail_the_proof(
     shell = SimpleNamespace(now=lambda: datetime.now(UTC))
     closed: Any = SimpleNamespace(shell=shell, not_here=not_here)
     proofs = [*_proof_of_connections(closed)]
-    assert [said.holds for said in proofs] == [holds] * (holds is not None)
-    assert says in "".join(said.reason for said in proofs)
+    assert [said.holds for said in proofs] == [holds] * (says is not None)
+    assert (says or "") in "".join(said.reason for said in proofs)
+    for said in proofs:
+        is_unseen = said.holds is None
+        assert said.acceptance == (Acceptance.CONNECTIONS if is_unseen else None)
 
 
 def test_a_node_that_others_do_not_see_on_zenoh_needs_its_enclave_in_its_command() -> None:

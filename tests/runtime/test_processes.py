@@ -114,6 +114,32 @@ def test_the_rmw_is_that_of_the_mapped_libraries(
     assert [process.rmw for process in proc.look().processes] == [rmw]
 
 
+@pytest.mark.parametrize(
+    ("mapped", "locked", "ports", "lost"),
+    [
+        (["port7411", "port7413"], ["port7411_el"], {7411}, False),
+        (["port7411", "port7413 (deleted)"], ["port7411_el"], {7411}, False),  # of an ended peer
+        (["port7411 (deleted)"], ["port7411_el (deleted)"], set(), True),
+        (["port7411 (deleted)"], ["port7411_el"], set(), True),  # the port is of a later process
+        (["port7411", "0123456789abcdef (deleted)"], ["0123456789abcdef_el"], set(), True),
+        ([], ["port7411_el (deleted)"], set(), False),  # the parent of the process left it open
+    ],
+)
+def test_the_ports_in_shared_memory_that_only_this_process_reads(
+    mapped: list[str], locked: list[str], ports: set[int], lost: bool, proc: Proc
+) -> None:
+    """Without its files in /dev/shm, no other process reaches it, and nothing logs that."""
+    folder = proc.add(7, *ROS)
+    lines = [f"7f00-7f01 rw-s 00 00:1b {n} /dev/shm/fastrtps_{m}" for n, m in enumerate(mapped)]
+    (folder / "maps").write_text("".join(f"{line}\n" for line in lines))
+    (folder / "fd").mkdir()
+    for number, name in enumerate(locked):
+        (folder / "fd" / str(number)).symlink_to(f"/dev/shm/fastrtps_{name}")
+    (process,) = proc.look().processes
+    assert {port.number for port in process.own_ports} == ports
+    assert process.lost_memory is lost
+
+
 def test_kernel_threads_and_processes_that_wait_for_a_node_are_none(proc: Proc) -> None:
     proc.add(5, *ROS, flags=0x00200000)
     proc.add(7, "timeout", "60", "sros", "run", "ks", "/a", "--", *ROS)

@@ -1,0 +1,40 @@
+"""Whose shared memory systemd-logind removes at the end of the user's last session.
+
+Sources: logind.conf(5) (RemoveIPC, on by default), loginctl(1) (enable-linger) of systemd 252.
+"""
+
+from __future__ import annotations
+
+import subprocess
+from collections.abc import Iterable
+from pathlib import Path
+
+from sros_tool.owners import user_name
+
+_FIRST_LOGIN_USER = 1000
+"""The first user id whose shared memory logind removes; lower ids are of system users."""
+
+_LINGER_FOLDER = Path("/var/lib/systemd/linger")
+_LOGIND = ("org.freedesktop.login1", "/org/freedesktop/login1", "org.freedesktop.login1.Manager")
+
+
+def login_users(users: Iterable[int]) -> list[str]:
+    """Return the names (or ids) of those of ``users`` that are no system users."""
+    chosen = sorted({user for user in users if user >= _FIRST_LOGIN_USER})
+    return [user_name(user).removeprefix("user ") for user in chosen]
+
+
+def users_without_linger(users: Iterable[int]) -> list[str]:
+    """Return the names of those of ``users`` whose shared memory logind removes at logout."""
+    names = [name for name in login_users(users) if not (_LINGER_FOLDER / name).exists()]
+    return names if names and _removes_memory() else []
+
+
+def _removes_memory() -> bool:
+    """Return whether logind removes shared memory; if it cannot be asked, it does by default."""
+    command = ["busctl", "get-property", *_LOGIND, "RemoveIPC"]
+    try:
+        shown = subprocess.run(command, capture_output=True, check=False).stdout
+    except OSError:
+        return True
+    return shown.split() != [b"b", b"false"]
