@@ -580,12 +580,13 @@ class _Round:
         readable = exposed_keys(self._folder, now)
         if closed := {key.path: key.at for key in exposed if key.path not in readable}:
             self._problems.append(
-                f"Until {iso(max(closed.values()))}{READABLE_KEYS}"
-                f"{counted(len(closed), 'private key')}: {first_few(sorted(closed), 2)}. The mode "
-                "is correct now, but somebody may have copied a key: run `sros renew KEYSTORE "
-                "ENCLAVE --new-key --revoke-old`, and bring the new key. If the key was made on "
-                "this robot, revoke the enclave, and make a new key here "
-                "(docs/howto/one_robot.md: Keys that are made on the robot)."
+                "Until "
+                f"{iso(max(closed.values()))}{READABLE_KEYS}{counted(len(closed), 'private key')}: "
+                f"{first_few(sorted(closed), 2)}. File modes are correct now, but somebody may "
+                "have copied a key: run `sros renew KEYSTORE ENCLAVE --new-key --revoke-old`, "
+                "and bring the new key. If the key was made on this robot, revoke the enclave, "
+                "and make a new key here (docs/howto/one_robot.md: Keys that are made on the "
+                "robot)."
             )
 
     def _copied_key(self, path: str) -> CopiedKey:

@@ -248,9 +248,9 @@ def agent_lock(folder: Path) -> Iterator[None]:
                 fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
                 raise KeystoreError(
-                    f"another agent is at work in '{folder}'",
+                    f"another agent is running in '{folder}'",
                     "",
-                    "Wait for it, or see `systemctl status sros-agent`.",
+                    "Wait until its round ends, or see `systemctl status sros-agent`.",
                 ) from None
             yield
         finally:

@@ -376,7 +376,7 @@ TOO_OLD = FindingKind(
     "No session opens in an enclave: such an rmw_zenoh does not read ZENOH_CONFIG_OVERRIDE, and "
     "its Zenoh does not accept all settings in the files.",
     "Changelogs of rmw_zenoh_cpp; Zenoh wheels, tested.",
-    "Install a later version of the same distribution.",
+    "Install a later version of rmw_zenoh for the same distribution.",
 )
 OVERRIDDEN = FindingKind(
     "runtime.zenoh-overridden",

@@ -633,8 +633,8 @@ OTHER_NODES_PARAMETERS = FindingKind(
     "policy.other-nodes-parameters",
     WARNING,
     "a right to serve the parameters of a node that the enclave does not have",
-    "A process in the enclave could pose as that node: it reads and answers requests that set its "
-    "parameters.",
+    "A process in the enclave could pose as that node, and read and answer the requests that set "
+    "the node's parameters.",
     "rcl_interfaces; rclcpp and rclpy (parameter services of a node).",
     "Remove the right. If the node runs in this enclave, add a profile for the node.",
 )
@@ -838,7 +838,7 @@ def _missing_common_part_cause(lacking: Sequence[_NodeLackingRight]) -> Cause:
     target = quote(str(file.parent / COMMON))
     copy = "" if copied else f"Run `sros policies --copy {target}`, and "
     at = f"line{'s' * (len(lines) > 1)} {names_text([str(line) for line in lines])}"
-    place = "the <profile> of every node" if plural else "its <profile>"
+    place = "the <profile> of every node" if plural else "the <profile> of the node"
     if plural and len(lines) == len(nodes):  # sed edits only the first match in a line
         addresses = "".join(f"{line}ba;" for line in lines)
         # libxml2 gives a <profile> the line where its start tag ends; the tag may begin earlier.
@@ -1244,8 +1244,8 @@ NODE_IN_TWO_ENCLAVES = FindingKind(
     "Names of nodes are unique in ROS, and a process runs in one enclave: `sros run --policy` "
     "and `ros2 launch --secured` refuse to choose an enclave for the node.",
     "rcl (node names are unique); sros.",
-    "Leave the profile in the enclave of the node's process. If these are nodes of several robots, "
-    "check the policy of each robot by itself, or write the policy for a fleet.",
+    "Keep the profile only in the enclave of the node's process. If these are nodes of several "
+    "robots, check the policy of each robot by itself, or write the policy for a fleet.",
 )
 FALLBACK = FindingKind(
     "policy.include-fallback",

@@ -594,8 +594,8 @@ PROCESS_OTHER_KEYSTORE = FindingKind(
     WARNING,
     "a secured process among processes of another keystore",
     (
-        "The process trusts other CAs than its neighbors, so they do not communicate, and do not "
-        "report it."
+        "The process trusts other CAs than the other processes of its domain, so it does not "
+        "communicate with them, and neither side reports this."
     ),
     "DDS-Security 1.1, 8.3.2.8; Fast DDS 2.14.5 and Cyclone DDS 0.10.2, tested.",
     "Start all processes of a domain with one keystore, or give each keystore its own domain.",

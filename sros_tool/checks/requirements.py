@@ -69,8 +69,8 @@ ASSUMED = FindingKind(
     "requirement.assumed",
     NOTE,
     "a protection that the policy does not state",
-    "The governance of the keystore protects topics, and a policy has no governance. A keystore's "
-    "template can protect less than the default template.",
+    "The requirement holds only with the protection of the default template. A policy has no "
+    "governance, and a keystore's template can protect less.",
     "The requirements file.",
     "Name the keystore's template with --template, write protect= in the policy, or check the "
     "keystore.",

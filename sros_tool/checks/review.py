@@ -17,8 +17,8 @@ DROPPED_DENIAL = FindingKind(
     "review.dropped-denial",
     ERROR,
     "a DENY that the change drops",
-    "The dropped DENY gives no access by itself, but other policies that are merged with this one "
-    "may now allow the names.",
+    "The dropped DENY gives no access by itself, but other policies that are merged with this "
+    "one may now allow what it denied.",
     "The policies of both commits.",
     "Restore the DENY, or let a reviewer allow it: `--new-access allow`.",
 )

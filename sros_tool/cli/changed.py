@@ -191,7 +191,7 @@ def print_closed_and_adopted(
     if closed:
         where = quote(str(keystore or root))
         echo(
-            "files closed to other users, who could open them until now: "
+            "files that other users could open until now, and cannot open any more: "
             f"{first_few(closed, _CLOSED_SHOWN)}. Run the nodes as the owner of the keystore, or "
             "give other users exports (`sros distribute_key`). Replace keys that somebody may "
             f"have copied: keys of enclaves with `sros renew {where} ENCLAVE --new-key "

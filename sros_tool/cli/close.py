@@ -288,7 +288,7 @@ def _show(robot: LocalRobot, closed: CloseState) -> None:
 
 def _process_line(process: ClosedProcess, closed: CloseState, policy: Policy) -> str:
     """Return the enclave of a process, how sros knows the process, and how it is restarted."""
-    restart = "by hand, with its launch" if process.launch else "by hand"
+    restart = "by hand, with its launch file" if process.launch else "by hand"
     restart = "by hand, with Docker Compose" if process.container else restart
     does = "restarts" if process.pid else "adds a drop-in to"
     restart = f"--apply {does} {process.unit}" if process.unit else restart
@@ -303,9 +303,9 @@ def _process_line(process: ClosedProcess, closed: CloseState, policy: Policy) ->
         state = "not running"
     elif process.pid:
         # A process first seen in its enclave, but now elsewhere, was recognized by its command.
-        signs = {"elimination": "elimination", "enclave": "its command"}
-        sign = signs.get(process.known_by, f"its {process.known_by}")
-        state = f"process {process.pid}" + ("" if runs else f", known by {sign}")
+        signs = {"elimination": "as the only process left", "enclave": "by its command"}
+        sign = signs.get(process.known_by, f"by its {process.known_by}")
+        state = f"process {process.pid}" + ("" if runs else f", known {sign}")
     elif runs:
         state = "runs by a new command; sros keeps the observed command (to replace the observed "
         state += "command, watch the open robot again)"

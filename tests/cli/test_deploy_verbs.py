@@ -95,9 +95,7 @@ def test_a_key_that_an_export_closes_to_others_is_named(keystore: Path, tmp_path
     (robot / "enclaves/a" / "governance.p7s").write_text("x")
     said = sros("distribute_key", keystore, "/a", robot, "--force").ok().err
     assert stat.S_IMODE((robot / "enclaves/a" / "key.pem").stat().st_mode) == 0o600
-    assert (
-        f"closed to other users, who could open them until now: {robot}/enclaves/a/key.pem" in said
-    )
+    assert f"could open until now, and cannot open any more: {robot}/enclaves/a/key.pem" in said
     assert f"sros renew {keystore} ENCLAVE --new-key" in said
 
 

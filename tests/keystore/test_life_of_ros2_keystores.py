@@ -117,7 +117,7 @@ def test_writing_closes_the_keys_to_other_users_and_says_so(
     assert open_to_others(root) == {"private", "enclaves", *kept}, "a dry run changed modes"
     ended = sros(*words).ok()
     assert open_to_others(root) == set()
-    assert f"closed to other users, who could open them until now: {root}/private" in ended.err
+    assert f"could open until now, and cannot open any more: {root}/private" in ended.err
     assert "closed to" not in sros("renew", root, "/a").ok().err
 
 
@@ -144,7 +144,7 @@ def test_a_commit_that_fails_leaves_the_modes(root: Path, monkeypatch: pytest.Mo
     assert snapshot(root) == before
     assert open_to_others(root) == opened
     renewed = sros("renew", root, "/a").ok()
-    assert f"closed to other users, who could open them until now: {root}" in renewed.err
+    assert f"could open until now, and cannot open any more: {root}" in renewed.err
     assert open_to_others(root) == set()
 
 

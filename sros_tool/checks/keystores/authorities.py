@@ -427,8 +427,7 @@ def _former_robot_findings(keystore: CheckedKeystore, fleet: Fleet) -> Iterator[
 
 _NEXT_CA = "Make a new keystore with the certificate of the next CA of the CA service."
 _NEXT_LIST = (
-    "Have the CA service sign a later list, and run `sros crl KEYSTORE --refresh --crl FILE` with "
-    "it."
+    "Have the CA service sign a later list, FILE, and run `sros crl KEYSTORE --refresh --crl FILE`."
 )
 
 

@@ -542,8 +542,8 @@ SIGNED_PAYLOAD = FindingKind(
     "If the payload is only signed, Fast DDS leaves its padding out of the signature: the reader "
     "rejects every message whose serialized length is not a multiple of four.",
     "Fast DDS 2.14.5, tested; fixed in its source in August 2026 (pull request 6498).",
-    "Sign the submessage, with the payload in it (data NONE, metadata SIGN), or encrypt (data "
-    "ENCRYPT).",
+    "Sign the submessage, with the payload in it (data NONE, metadata SIGN), or encrypt the "
+    "payload (data ENCRYPT).",
 )
 NOT_AUTHENTIC = FindingKind(
     "governance.no-authenticity",

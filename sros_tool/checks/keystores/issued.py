@@ -290,7 +290,7 @@ def check_issued(
         if len({certificates[name] for name in names}) > 1:
             text, remedy = "their certificates have the same public key", ""
         else:
-            text = "they have the same certificate: the files of one were copied to the others"
+            text = "they have the same certificate: the files of one enclave were copied"
             remedy = (
                 _RESTORE_REMEDY if keystore.looks_like_original else "Export these enclaves again."
             )
@@ -453,7 +453,7 @@ def _ledger_findings(
     for summary in summaries:
         place = f"{keystore.root}/{enclave_folder(summary.name)}"
         if f"{summary.serial:x}" in revoked:
-            text = "the ledger has its revocation, but the revocation list does not"
+            text = "the ledger says that the enclave is revoked, but the revocation list does not"
             yield REVOKED_BY_NEWER_LIST.found(summary.name, text, place)
         for file, sha256 in (
             ("cert.pem", summary.certificate_digest),

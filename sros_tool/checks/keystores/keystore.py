@@ -360,7 +360,7 @@ def _with_cause_of_ros2(findings: Sequence[Finding], keystore: OpenedKeystore) -
             "a keystore that ros2/sros2 made",
             text,
             f"Run `sros update_keystore {quote(str(root))} --template sros2`, which takes it over "
-            "with its CA, keys and rights, closes the keys to other users, and signs the "
+            "with its CA, keys and rights, lets only their owner read the keys, and signs the "
             "permissions again.",
         )
     unknown = {finding.subject for finding in findings if finding.kind is UNEXPLAINED}

@@ -88,8 +88,8 @@ SHARED_NODE = FindingKind(
     WARNING,
     "a node that several enclaves may announce in the graph",
     "rmw_zenoh does not check which enclave removes a node from the graph: a process of one of "
-    "these enclaves can remove or imitate the node of another enclave. The topics and services of "
-    "that node are then not found, although its data pass.",
+    "these enclaves can remove or imitate the node of another enclave. The topics and services "
+    "of that node are then not found, although its data still arrive.",
     "rmw_zenoh (graph_cache.cpp); sros (docs/zenoh.md).",
     "Name each node in the policy of one enclave. If a wildcard gives an enclave the services of "
     "all nodes, deny the services of other enclaves' nodes, such as `/camera/*`.",
@@ -203,12 +203,10 @@ def _drift_findings(keystore: CheckedKeystore, drifted: DriftedConfiguration) ->
 
     file = keystore.shown_path(drifted.path)
     if drifted.kind is Drift.STALE:
-        yield LEFT_OVER.found(
-            drifted.enclave, "the keystore has no such file for the enclave", file
-        )
+        yield LEFT_OVER.found(drifted.enclave, "sros writes no such file for this enclave", file)
         return
     if drifted.kind is Drift.FOREIGN:
-        text = "the keystore has no such file for the enclave"
+        text = "sros writes no such file for this enclave"
         yield UNSIGNED.found(drifted.enclave, text, file, remedy="Remove the file.")
         return
     if drifted.kind is Drift.MISSING:
