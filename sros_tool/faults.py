@@ -17,7 +17,8 @@ _RESTORE_FILE = "Restore {path} from a backup."
 _RENEW_ENCLAVE = "Renew the enclave: `sros renew {root} {enclave}`."
 _NEW_KEY = "Give the enclave another key: `sros renew {root} {enclave} --new-key`."
 _SET_CLOCK = (
-    "Set the clock of this host; if the clock is right, sign again: `sros renew {root} {enclave}`."
+    "Set the clock of this host; if the clock is right, renew the enclave: `sros renew {root} "
+    "{enclave}`."
 )
 _SET_CLOCK_FOR_CRL = (
     "Set the clock of this host; if the clock is right, sign the list again: `sros crl {root} "
@@ -45,8 +46,8 @@ REFUSE_STRANGERS = (
 """The command after which a keystore admits no process without an identity."""
 
 _REMEDIES_IN_EXPORT = {
-    _SET_CLOCK: "Set the clock of this host; if the clock is right, sign again in the keystore "
-    "that has the CA keys: `sros renew {root} {enclave}`. Then export the enclave again.",
+    _SET_CLOCK: "Set the clock of this host; if the clock is right, renew the enclave in the "
+    "keystore that has the CA keys: `sros renew {root} {enclave}`. Then export the enclave again.",
     _SET_CLOCK_FOR_CRL: "Set the clock of this host; if the clock is right, sign the list again "
     "in the keystore that has the CA keys: `sros crl {root} --refresh`. Then export the enclave "
     "again.",

@@ -473,7 +473,7 @@ class KnownKeys:
             yield Note(
                 "ledger.may-lack-revocations",
                 f"The ledger of '{self._keystore.root}' may lack revocations: {'; '.join(gaps)}. "
-                "A key that was revoked may be certified again.",
+                "A revoked key may get a certificate again.",
             )
 
     def revoked_enclaves(self) -> list[str]:

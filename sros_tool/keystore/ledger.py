@@ -821,7 +821,7 @@ class LedgerFile:
     def _later_part_error(self, name: str) -> KeystoreError:
         return KeystoreError(
             f"'{self.root / name}' is a later part of the ledger than {LEDGER}",
-            "An earlier ledger was put back. It lacks what the keystore issued and revoked since.",
+            "An earlier ledger was put back. It lacks what the keystore issued and revoked later.",
             f"Restore {LEDGER}, its parts and {LEDGER_HEAD} from the latest backup; or, if they "
             "are lost, move the later parts to an archive.",
         )

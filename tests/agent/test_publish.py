@@ -1438,7 +1438,10 @@ def test_a_restored_keystore_makes_no_key_for_a_robot_that_made_its_own(publishe
         in (notes["fleet.certificates-restored"])
     )
     refused = sros(*generate, cwd=publisher.folder)
-    assert refused.status == 2 and "lacks /r9/base, certified after the last backup" in refused.err
+    assert (
+        refused.status == 2
+        and "lacks /r9/base, which got certificates after the last backup" in refused.err
+    )
     assert "`sros sign_request ks REQUEST --no-answer -p POLICY_FILE --fleet" in refused.err
     copy = copy_of(root, publisher.folder / "copy")
     publisher.run("generate_artifacts", "-k", copy, "-e", "/r9/base", *policy)

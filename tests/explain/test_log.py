@@ -249,8 +249,8 @@ def test_a_clock_is_set_on_the_robot_and_not_at_home(keystore: Path) -> None:
     verified = sros("verify", keystore).out
     for said in (found, verified):
         assert (
-            "Set the clock of this host; if the clock is right, sign again in the keystore that "
-            f"has the CA keys: `sros renew KEYSTORE {ENCLAVE}`. Then export the enclave again."
+            "Set the clock of this host; if the clock is right, renew the enclave in the keystore "
+            f"that has the CA keys: `sros renew KEYSTORE {ENCLAVE}`. Then export the enclave again."
             in said
         )
         assert "CA keys: Set the clock" not in said

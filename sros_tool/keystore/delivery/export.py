@@ -87,7 +87,8 @@ from sros_tool.xml import read_bytes
 _MOST_SHOWN = 5
 _ADD_KEYLESS = (
     "Add --keyless to export the other files, which belong next to the key on the robot. If the "
-    "robot has made another key since, first sign its request.pem with `sros sign_request --renew`."
+    "robot has made a new key that has no certificate yet, first sign its request.pem with `sros "
+    "sign_request --renew`."
 )
 
 

@@ -585,7 +585,8 @@ class _RoleKeys:
             if os.path.lexists(path):
                 raise KeystoreError(
                     f"'{path}' is in the way",
-                    "sros writes the new root key to this path before the keystore names the key.",
+                    "sros writes the new root key to this path before it records the key in the "
+                    "keystore.",
                     "Move this file away.",
                 )
             with staged_file(path, self._new_elsewhere) as put_in_place:

@@ -561,7 +561,8 @@ def _check_enclave_key(folder: Path, answer: RequestAnswer, key: PublicKey) -> N
         if revoked.serial == present.serial_number and revoked.reason != SUPERSEDED:
             raise KeystoreError(
                 f"the key of enclave {answer.name} was revoked",
-                f"The answer certifies this key again, but its revocation list revokes '{path}'.",
+                "The answer has a certificate for this key, but its revocation list revokes "
+                f"'{path}'.",
                 remedy,
             )
 
@@ -577,7 +578,8 @@ def _check_known_authority(
         raise KeystoreError(
             f"the answer for enclave {answer.name} is not from a CA that this robot trusts",
             f"The permissions CA that '{folder}' trusts has not signed it: {problem.rstrip('.')}. "
-            "Either the CA was replaced since, or the answer comes from another keystore.",
+            "Either the CA was replaced after the last answer, or this answer is from another "
+            "keystore.",
             "If the CA was replaced, export all enclaves of the robot: `sros distribute_key "
             "KEYSTORE --robot NAME FOLDER --force` (without a fleet: ENCLAVE... and --keyless in "
             "place of --robot NAME). To move this robot to another keystore, add --force.",
@@ -607,8 +609,8 @@ def _check_newer(place: Path, answer: RequestAnswer, certificate: x509.Certifica
             raise KeystoreError(
                 f"the answer for enclave {answer.name} goes back to an earlier {role} CA",
                 f"It trusts {authority_text(retired[0])}, which is older than a CA here: the "
-                "keystore may come from a backup. With a CA that was replaced, what was revoked "
-                "since would be trusted again.",
+                "keystore may come from a backup. The robot would trust again what was revoked "
+                "after this CA was replaced.",
                 "If the keystore comes from a backup, replace its CA there again: "
                 "docs/howto/keystore_is_lost.md says how. If this CA is right, because `sros "
                 "rotate_ca --identity-ca` or --permissions-ca named it, add --force.",

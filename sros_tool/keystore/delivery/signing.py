@@ -671,7 +671,7 @@ def _check_answer_usable(answer: RequestAnswer, request: SigningRequest, now: da
         raise KeystoreError(
             f"the robot would reject the answer for {answer.name}: {error.what}",
             error.why,
-            "Nothing was changed. Run `sros inspect` on the keystore to find the fault.",
+            "Nothing was changed. To find the fault, run `sros inspect KEYSTORE`.",
         ) from error
 
 

@@ -156,7 +156,7 @@ def refuse_stopping_nodes(
     if revoked:
         text = (
             f"the folder of {_names_text(revoked)} is in the keystore again with a certificate "
-            "that was revoked: whoever gets the new revocation list refuses this certificate"
+            "that was revoked: every process with the new revocation list refuses this certificate"
         )
         notes.append(Note("keystore.revoked-put-back", text))
     if unseen := transaction.files_not_kept():

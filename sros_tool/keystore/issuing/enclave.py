@@ -204,7 +204,7 @@ class IssuedEnclave:
             yield Note(
                 "enclave.short-lived",
                 f"{name} expires at {iso(end)}, because of [[enclaves]] in the keystore's "
-                "sros.toml. `sros renew` issues it again.",
+                f"sros.toml. `sros renew KEYSTORE {quote(name)}` renews it.",
             )
         if self.document:
             yield from document_notes(name, self.permissions, len(self.document))

@@ -91,7 +91,7 @@ class Keyring:
         check_ca_service(place)
         if role != IDENTITY or not template.separate_authorities:
             raise UsageError(
-                "a CA service can only be the identity CA",
+                "a CA service can be only the identity CA",
                 "sros itself signs permissions and governance, so the permissions CA needs a key "
                 "of its own.",
                 "Use --ca-layout separate, and issuer:NAME only for --identity-key.",

@@ -363,9 +363,9 @@ def _expired_enclaves(change: KeystoreChange, names: Iterable[str]) -> Iterator[
         end = validity_of(change.keystore.certificate(path)).not_after
         if end < change.now:
             text = (
-                f"{name} does not change: it is short-lived, and expired at {iso(end)}. `sros "
-                f"renew {quote(str(change.root))} {quote(name)}` issues it again; then repeat this "
-                "command."
+                f"{name} does not change: it is short-lived ([[enclaves]] in sros.toml), and "
+                f"expired at {iso(end)}. First renew it with `sros renew "
+                f"{quote(str(change.root))} {quote(name)}`, then repeat this command."
             )
             yield name, Note("enclave.expired-short-lived", text)
 
@@ -450,7 +450,8 @@ def _revoked_before_notes(
     later = _enclaves_certified_after_backup(change, missing) - {*revoked_before, *named}
     if unasked := [name for name in missing if name in later]:
         raise KeystoreError(
-            f"the keystore '{root}' lacks {first_few(unasked, 3)}, certified after the last backup",
+            f"the keystore '{root}' lacks {first_few(unasked, 3)}, which got certificates after "
+            "the last backup",
             "If a robot made its own key for such an enclave, a new key from here would not fit.",
             "For keys that robots made, sign the requests again, with `sros sign_request "
             f"{quote(str(root))} REQUEST --no-answer -p POLICY_FILE"
@@ -808,7 +809,8 @@ def _restart_text(mismatch: Mismatch, *, revoked: bool) -> str:
             where, more = " on these names, but do on all other names", f" {IF_EXPIRED}"
         return (
             f"Cyclone DDS and Fast DDS: restart {which}; restarted processes do not communicate "
-            f"with others{where}. Until then, running processes communicate as before.{more}"
+            f"with processes that were not restarted{where}. Until then, running processes "
+            f"communicate as before.{more}"
         )
     return f"All vendors: {ONE_BY_ONE} Until its restart, a process keeps its former files."
 
@@ -1172,8 +1174,8 @@ class _EnclaveMaker:
                 "keystore",
                 f"The issuer of '{path}' is {other_issuer_text(certificate, authority)}; other "
                 "nodes of this keystore would refuse the enclave.",
-                "Restore the right certificate, or remove the enclave's folder and create it "
-                "again.",
+                "Restore the right certificate, or remove the enclave's folder and create the "
+                "enclave again.",
             )
         if not validity_of(certificate).contains(self.change.now):
             raise self._not_valid_error()
