@@ -213,7 +213,7 @@ def test_an_older_revocation_list_brings_nothing_back(put_back: bool, root: Path
     assert refresh_crl(root, now=NOW).remarks == ()
     file.write_bytes(older) if put_back else file.unlink()
     (remark,) = refresh_crl(root, now=NOW).remarks
-    assert "2 revocations were restored" in remark.text
+    assert "2 revocations that it lacked were added again" in remark.text
     assert revoked(root) == wanted
 
 
