@@ -173,10 +173,10 @@ def demo(
 
     Creates keystores, starts nodes with and without enclaves, and compares expected and observed
     results. The scenario `isolation` takes about 10 s on Cyclone DDS and 20 s on rclpy. The
-    scenario `attacks` tries all attacks that sros knows, also without the defenses that stop them;
-    it takes about 30 s on Cyclone DDS and 60 s on rclpy. On Zenoh (--backend zenoh), the demo has
-    scenarios of its own, and runs all of them by default, in about 25 s. A scenario file of yours
-    and --keystore work only on a DDS.
+    scenario `attacks` tries all attacks that sros knows, and repeats each attack without the
+    defense that stops it; this takes about 30 s on Cyclone DDS and 60 s on rclpy. On Zenoh
+    (--backend zenoh), the demo has scenarios of its own, and runs all of them by default, in about
+    25 s. A scenario file of yours and --keystore work only on a DDS.
 
     With talker, listener or router, run only this node until Ctrl-C (or --for DURATION), with the
     current environment variables, so that you can see who hears whom. The node runs on Cyclone DDS,

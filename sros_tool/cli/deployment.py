@@ -534,8 +534,8 @@ def _policy(file: Path | None, fleet_file: Path | None) -> Policy | FleetPolicy 
     "--ca",
     "pin",
     metavar="FILE|SHA-256",
-    help="Accept ANSWER only from this permissions CA: its certificate, or the SHA-256 that "
-    "sign_request and create_keystore print.",
+    help="Accept ANSWER only from this permissions CA, given by its certificate or by the SHA-256 "
+    "that sign_request and create_keystore print.",
 )
 @allow_refusal_option
 @dry_run_option

@@ -436,8 +436,7 @@ def _notes_on_past(moment: datetime, keystore: OpenedKeystore | None) -> Iterato
             changes = sum(entry.time > iso(moment) for entry in keystore.ledger.entries)
     text = "the answer uses the current files, not the files of that time"
     if changes:
-        entries = counted(changes, "entry of ledger.jsonl is", "entries of ledger.jsonl are")
-        text += f"; {entries} from after that time"
+        text += f"; ledger.jsonl has {counted(changes, 'later entry', 'later entries')}"
     yield Note("explain.past", text)
 
 
@@ -505,8 +504,8 @@ def _notes_on_policy_alone(
     if not default or keystore is not None or asked_enclave.enclave.signed or policy is None:
         return []
     text = (
-        f"this is decided by the policy '{policy}'. For the signed permissions, name the "
-        f"keystore: `sros explain {quote(default)} {asked_enclave.enclave.name} ...`."
+        f"the policy '{policy}' decides here. For an answer from the signed permissions, name "
+        f"the keystore: `sros explain {quote(default)} {asked_enclave.enclave.name} ...`."
     )
     return [Note("explain.policy-alone", text)]
 
@@ -616,7 +615,7 @@ def _answer_lines(answer: Answer, why: str) -> Iterator[str]:
         default = template_default(digest)
         yield _labeled_row(
             "from",
-            f"the default of the keystore's template, {default}: no policy file has been signed"
+            f"the default of the keystore's template, {default}, not a policy file"
             if default
             else f"a policy file: add --policy FILE to see its line (digest {digest[:12]})",
         )
@@ -751,10 +750,10 @@ def _table_lines(compared: Comparison) -> Iterator[str]:
 # ── the answer of Zenoh as text ────────────────────────────────────────────────────────────
 
 _RECEIVER_WORDS = {
-    "publish": ("heard by", "a put to this wildcard is heard by"),
+    "publish": ("heard by", "a message sent to the wildcard itself is heard by"),
     "subscribe": ("hears", ""),
-    "call": ("served by", "a query on this wildcard is executed by"),
-    "request": ("served by", "a query on this wildcard is executed by"),
+    "call": ("served by", "a request sent to the wildcard itself is executed by"),
+    "request": ("served by", "a request sent to the wildcard itself is executed by"),
     "serve": ("serves", ""),
     "reply": ("serves", ""),
     "execute": ("serves", ""),
@@ -1162,8 +1161,8 @@ def _lines_without_findings(log: str, count: int) -> Iterator[str]:
     elif match := next(filter(None, map(security_directory, log_lines(plain_text(log)))), None):
         yield f"{not_found}; a node found its enclave '{match['folder']}'"
         yield (
-            "not shown: whether peers drop the node's messages (explain their logs, or compare "
-            f"both keystores: `sros check FOLDER OTHER`); {_SILENT_ON_ZENOH}"
+            "not shown: whether peers drop the node's messages (explain the peers' logs, or "
+            f"compare keystores: `sros check FOLDER OTHER`); {_SILENT_ON_ZENOH}"
         )
     else:
         yield f"{not_found}, and no line 'Found security directory'"
@@ -1175,7 +1174,7 @@ def _lines_without_findings(log: str, count: int) -> Iterator[str]:
 
 _ZENOH_TESTS = "caching permissions for `"
 _ONLY_TESTS = (
-    "the log has only Zenoh's tests of declared keys, which do not show which message was "
+    "the log only says how Zenoh tested declared names; this does not show which message was "
     "dropped. `sros explain KEYSTORE ENCLAVE publish|subscribe|call|serve NAME --vendor zenoh` "
     "shows whether a message is denied."
 )

@@ -568,8 +568,8 @@ def _published_lines(published: PublishedFleet, moment: datetime) -> Iterator[st
     if published.refused_by:
         accepting = "robots that trust this CA accept"
         yield (
-            "these robots refuse the files, because by their last messages they do not trust the "
-            f"permissions CA: {first_few(published.refused_by, _MOST_GROUPS)}. Bring their files "
+            "these robots refuse the files, because they do not trust the permissions CA (as their "
+            f"last messages say): {first_few(published.refused_by, _MOST_GROUPS)}. Bring the files "
             f"by hand: `sros distribute_key {quote(str(published.keystore))} --robot NAME FOLDER "
             "--force`"
         )
@@ -855,8 +855,8 @@ def _fleet_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
     elif any(robot.state == "later" for robot in status.robots):
         yield f"the keystore may be older than its robots: if it was restored, {restored}"
     elif publication and publication.lacks:
-        decide = " says what to check first" if publication.lacks.startswith("metadata/") else ""
-        yield f"'{folder}' lacks {publication.lacks}, which robots fetch: `{publish}`{decide}"
+        decide = ", which says what to check" if publication.lacks.startswith("metadata/") else ""
+        yield f"'{folder}' lacks {publication.lacks}, which robots fetch: run `{publish}`{decide}"
     elif publication and publication.refused:
         why = publication.refused
         yield f"the published files do not verify: {why}. Run `{publish}`, which prints the remedy"
@@ -959,8 +959,8 @@ def _remedies(status: FleetStatus, to_dos: Collection[str]) -> Mapping[str, str]
         "may have a wrong name, or a copied disk. If it has files of another robot, it can act "
         f"as that robot until you run `sros renew {where} --robot OTHER --new-key --revoke-old`; "
         "then deliver to both robots",
-        "check its clock": "set the clock of the robot; the next round of its agent then "
-        "continues. If the clock is right, somebody held the robot's message back",
+        "check its clock": "set the clock of the robot; its agent then continues at the next "
+        "round. If the clock is right, somebody held the robot's message back",
         "deliver": by_hand,
         "publish": publish_command(root),
         "renew": f"`{renewal_command(root)}`, then {_delivery_advice(root, to_renew)}",
@@ -1304,7 +1304,7 @@ def _summary(robot: RobotStatus, stage: str, moment: datetime) -> Iterator[str]:
     revoked = [file for file in robot.pending if file.state == "revoked"]
     if waiting := sum(not file.surplus for file in revoked):
         new = "one waits" if waiting == 1 else "ones wait"
-        yield f"{counted(waiting, 'replaced certificate')} revoked: the new {new} for the robot"
+        yield f"{counted(waiting, 'revoked certificate')}: the new {new} for the robot"
     if surplus := len(revoked) - waiting:
         yield counted(surplus, "revoked file")
     if robot.fetches and robot.lacks_key:
@@ -1313,7 +1313,7 @@ def _summary(robot: RobotStatus, stage: str, moment: datetime) -> Iterator[str]:
     elif robot.lacks_ca:
         yield "does not trust the CA that seals releases: fetching does not change this"
     elif robot.is_locked_out(moment):
-        yield "a web server with the current CA and list refuses its certificates"
+        yield "a web server with the current CA and revocation list refuses the robot"
     if not (early or late):
         yield from robot.notes
     groups: dict[tuple[str, str], Counter[str]] = {}
@@ -1345,7 +1345,7 @@ def _summary(robot: RobotStatus, stage: str, moment: datetime) -> Iterator[str]:
         names = first_few(unseen, _MOST_GROUPS)
         yield f"not known whether processes of {names} have loaded the installed files"
     if robot.enclaves and robot.stage not in ("", "unknown", stage):
-        yield f"its CA files are of the stage '{robot.stage}'"
+        yield f"its CA files are from the stage '{robot.stage}' of the rotation"
     if late:
         yield from robot.notes
 

@@ -302,7 +302,7 @@ def _certificate_file_lines(certificates: DescribedCertificates) -> Iterator[str
     yield f"{'CA certificate' if file.first.is_ca else 'certificate'} {certificates.path}"
     yield from _indented_lines(_certificate_lines(file.first))
     for further in file.further or ():
-        yield "next to it, in the same file"
+        yield "another certificate in the same file"
         yield from _indented_lines(_certificate_lines(further))
     if file.crl:
         yield _list_text(file.crl)
@@ -398,7 +398,7 @@ def _remote_lines(remote: RemoteFacts) -> Iterator[str]:
         for kind, rights in sorted(remote.may.items())
         for right, names in rights.items()
     ]
-    yield f"processes of {remote.enclave} may {', '.join(counts) or 'only see the graph'}"
+    yield f"processes of {remote.enclave} may {', '.join(counts) or 'only see the ROS graph'}"
 
 
 def _right_lines(table: RightNames) -> Iterator[str]:

@@ -790,7 +790,7 @@ def update_keystore(
         command = f"sros update_keystore {quote(str(root))} --template production --next"
         raise UsageError(
             "no change is named",
-            "The keystore does not record which settings the next stage has to make."
+            "The keystore does not record which settings the next stage has to change."
             if next_stage
             else "",
             f"Repeat the options of the first stage, for example `{command}`."
@@ -957,7 +957,7 @@ def _replaced_lines(update: KeystoreUpdate) -> Iterator[str]:
         shown = " ".join(map(quote, names)) if len(names) <= _NAMES_SHOWN else "ENCLAVE..."
         ends = f"run `sros renew {quote(str(update.root))} {shown} --revoke-old`"
         if update.left:
-            ends = f"add --revoke-old to the stage {update.left[-1]}, or {ends}"
+            ends = f"add --revoke-old to the command of the stage {update.left[-1]}, or {ends}"
         yield (
             "the replaced certificates and permissions, with their earlier rights, work until "
             f"{iso(update.works_until)} for anyone who kept copies of these files and of the key. "

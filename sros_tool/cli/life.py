@@ -586,7 +586,7 @@ def rotate_ca(
     cannot = "could not" if dry_run else "cannot"
     cut_off = (
         f"cut off until they have the files of this stage: {', '.join(step.cut_off)}. Robots with "
-        f"and without these files {cannot} talk to each other"
+        f"these files {cannot} talk to robots without them"
     )
     is_published = bool(publish_command(root))
     if is_published and step.stage == "retire" and step.replaces_identity:

@@ -400,7 +400,7 @@ def generate_policy(
     Example:
       $ sros generate_policy robot.xml
       wrote 'robot.xml': 2 enclaves, 2 nodes, 20 rights
-      copied common/node/logging.xml, common/node/types.xml, ... next to it
+      copied common/node/logging.xml, common/node/types.xml, ... next to 'robot.xml'
       $ sros generate_policy robot.xml --watch 10m
       watching for 600 s, or until Ctrl-C; then the policy is written
       seen: /talker (/talker_listener/talker)
@@ -513,7 +513,7 @@ def generate_policy(
     if why := snapshot.unsettled:
         advice = "--watch collects nodes that come and go"
         advice = "watch again for longer" if snapshot.grew else advice
-        echo(f"{why}, so others may be missing; {advice}.", err=True)
+        echo(f"{why}, so more may be missing; {advice}.", err=True)
     return 0
 
 
@@ -590,7 +590,7 @@ def _show(plan: Draft, learned: Learned, *, written: bool) -> None:
         for right in plan.added:
             echo(f"  {right}")
     if plan.copies:
-        echo(f"{would}copied {', '.join(sorted(plan.copies))} next to it")
+        echo(f"{would}copied {', '.join(sorted(plan.copies))} next to '{plan.path}'")
     print_notes((*merge_notes(plan.contradictions), *learned.notes))
 
 
@@ -652,7 +652,7 @@ def _show_lines(lines: Sequence[DenialLine], *, err: bool = False) -> None:
     if lines:
         echo("these log lines ask for the rights; a process can print any line:", err=err)
     for line in lines:
-        by = line.process or "a process without a label"
+        by = line.process or "a process without a name in the log"
         denial = f"{line.direction} {line.topic} in {line.enclave}"
         echo(f"  {line.log}:{line.line}: {by}: {denial}", err=err)
 

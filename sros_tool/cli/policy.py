@@ -426,7 +426,7 @@ def enclave_lines(difference: SourcesDifference, fleet: Fleet | None) -> list[st
         ]
         for side in "-+"
     ]
-    unclear = "may be allowed or denied something else, as the notes say"
+    unclear = "may have other rights in B than in A, as the notes say"
     sides.append([(name, f"? {name} {unclear}") for name in difference.unclear])
     return [text for lines in sides for text in folded_lines(fleet, lines)]
 
@@ -964,7 +964,7 @@ def dropped_lines(head: AccessSource, growth: Growth) -> list[str]:
 def _dropped_text(dropped: DroppedDenial) -> str:
     right, name, moved_from = dropped
     if moved_from:
-        text = f"has a node of {moved_from}, but lacks its DENY {right.describe()}"
+        text = f"has a node of {moved_from}, but not the DENY {right.describe()} of that enclave"
     else:
         text = f"DENY {right.describe()} is gone"
     text += f" for names such as {name}" if name else ""

@@ -239,8 +239,8 @@ def review(
 
     Example:
       $ sros review --base refs/remotes/origin/main --policy robot/robot.xml
-      policy robot/robot.xml: nothing found
-      new-access robot/robot.xml: 1 right is new
+      [ok] policy robot/robot.xml: nothing found
+      [FAILED] new-access robot/robot.xml: 1 right is new
         + /arm publish topic /cmd_vel  (robot/robot.xml:12)
       ...
       $ sros review --base 5d1c0a41c3ec2f2a9d2d1b3c63ff7b6e0aa1d9f4 \
@@ -465,7 +465,7 @@ def _sentence(result: Review, step: ReviewStep) -> str:
             return ", ".join(clauses)
         case DroppedRequirements(count=count, chosen=chosen):
             kind = f"{counted(count, 'requirement')} dropped or changed"
-            return f"{kind}, checked as before the change: {chosen.summary()}{place}"
+            return f"{kind}, checked as they were before the change: {chosen.summary()}{place}"
         case ExpiryCheck(due=due, unreadable=unreadable, lasting=count) as expiry:
             unread = f", {len(unreadable)} cannot be read" if unreadable else ""
             left_out = expiry.short_lived_text()
@@ -562,7 +562,7 @@ def _access_findings(change: AccessChange, path: str) -> Iterator[Finding]:
         line = (place.file, place.line) if place and place.file else (path, 0)
         at.setdefault((is_denial, *line), []).append((subject, text))
     for (is_denial, file, number), [(subject, text), *more] in at.items():
-        text += f"; and {counted(len(more), 'more change')} by this line" if more else ""
+        text += f"; this line makes {counted(len(more), 'more change')}" if more else ""
         kind = DROPPED_DENIAL if is_denial else NEW_ACCESS
         yield kind.found(subject, text, file, number)
 

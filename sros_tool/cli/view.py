@@ -160,8 +160,8 @@ def view(
 
     A SOURCE is a policy file, a keystore (its signed permissions), the folder of an enclave, its
     permissions, a Zenoh configuration (router.json5), or the output of `sros generate_policy
-    --json`. Two policies are compared as before and after, a policy and a keystore are compared for
-    drift, and a Zenoh configuration is compared with the rights that it should allow. --observed
+    --json`. Two policies are compared as before and after, a policy and a keystore as intended and
+    signed rights, and a Zenoh configuration with the rights that it should allow. --observed
     compares the rights in SOURCE with those that are used. --focus shows which enclaves may use a
     name, and who can influence these enclaves.
 

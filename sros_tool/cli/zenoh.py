@@ -63,7 +63,7 @@ _FOUND_WORDS = {"create": "missing", "replace": "out of date", "remove": "no lon
     "--listen",
     multiple=True,
     metavar="HOST:PORT",
-    help="Where the router listens, if not at the endpoints. May be repeated.",
+    help="Where the router listens, if not at --endpoint. May be repeated.",
 )
 @click.option(
     "--cross",

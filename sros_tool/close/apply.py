@@ -233,7 +233,7 @@ class _RemainingProcesses:
             names, old_name = nodes.names_in(process.enclave)
             named = node_argument(process.command)
             has_old_name = old_name and (not named or expand("~", *named) == old_name)
-            was = f" (its node was {old_name} when sros watched; its new name is right, too)"
+            was = f" (its node was {old_name} when sros watched; the new name is also right)"
             state, start = "does not run; ", "start it"
             if similar := [
                 (len({*process.command}.intersection(other.program[1])), other.label)
@@ -255,7 +255,7 @@ class _RemainingProcesses:
             process = self._secured[enclave]
             remedy = f"restart process {process.pid} open: {process_text(process)}"
             remedy = self._end_of_guest(process) or remedy
-            yield f"a process runs in the enclave {enclave}, too; {remedy}"
+            yield f"a process that sros did not observe runs in the enclave {enclave}; {remedy}"
         for process, enclave in self._further:
             command = secured_process(process, enclave).open_command(self._robot.domain)
             remedy = f"stop it, if it is not yours; otherwise restart it open: {command}"
@@ -321,8 +321,7 @@ def _drop_ins_of(robot: LocalRobot, observed: ObservedProcesses) -> list[Path]:
             raise SrosError(
                 f"'{path}' is not the drop-in of this folder",
                 "Its first line names another folder, or was edited. sros changed nothing.",
-                "Use the folder that its first line names, spelled as there, or remove the "
-                "drop-in.",
+                "Write the folder exactly as its first line names it, or remove the drop-in.",
             )
     return drop_ins
 

@@ -164,7 +164,7 @@ def _check_folder(robot: LocalRobot) -> None:
         )
     results = (robot.observation_file, robot.policy, robot.keystore, robot.export)
     if robot.folder.is_dir() and [*robot.folder.iterdir()] and not any(map(Path.exists, results)):
-        robot.shell.say(f"'{robot.folder}' has files of yours: sros adds its own to them")
+        robot.shell.say(f"'{robot.folder}' already has files: sros adds its own")
 
 
 def _ignore_in_git(robot: LocalRobot) -> list[FileChange]:
@@ -214,7 +214,7 @@ def _with_renamed_enclaves(robot: LocalRobot, observed: ObservedProcesses) -> Ob
     for process in observed.processes:
         name, *others = moved.get(process.enclave, {process.enclave})
         if not others and origins[name] == 1 and name not in taken and not process.shares:
-            robot.shell.say(f"{name} was {process.enclave} before the policy moved its nodes")
+            robot.shell.say(f"{process.enclave} is now {name}, because the policy moved its nodes")
             process = process._replace(enclave=name)
         renamed.append(process)
     return observed._replace(processes=renamed)
@@ -418,7 +418,7 @@ def _problems_of(robot: LocalRobot, state: CloseState, *, accepted: Acceptances)
     """Yield the problems that keep the robot from running closed, with their remedies."""
     yield from _keystore_problems(robot)
     for name in sorted(robot.not_here & state.secured.keys()):
-        yield f"{name} belongs to another machine, and a process runs in it here: stop it"
+        yield f"{name} belongs to another machine, but a process runs in it here: stop the process"
     for name in _enclaves_without_origin(robot, revoked=False):
         remove = f"rm -r {shlex.quote(str(enclave_path(robot.export, name)))}"
         yield (
@@ -444,7 +444,7 @@ def _copy_problems(running: RunningRobot) -> Iterator[str]:
     for finding in other_folder_findings(copies, export):
         yield (
             f"{finding.subject}: {finding.text}: stop it; if it belongs to the robot, start it "
-            f"from '{export}'"
+            f"with the files in '{export}'"
         )
 
 
@@ -478,7 +478,10 @@ def _user_problems(robot: LocalRobot, observed: ObservedProcesses) -> Iterator[s
             continue
         barred = [path for path in export.parents if not _may_enter(user, path.stat())]
         if barred and user:
-            yield f"user {user}, who runs processes, cannot enter '{barred[-1]}'"
+            yield (
+                f"user {user}, who runs processes, cannot enter '{barred[-1]}': let this user "
+                "enter it"
+            )
         if user not in (0, owner):
             yield (
                 f"processes run as user {user}, and only user {owner} can read the enclaves: "
@@ -517,8 +520,8 @@ def _unknown_process_problems(running: RunningRobot, state: CloseState) -> Itera
         remap = "--ros-args -r __node:=NODE -r __ns:=NAMESPACE"
         advice = f"watch again while {runs}: {close} --for 1m"
         if observed.elsewhere:
-            advice += "; if sros still sees none, first add the name of its node to the command "
-            advice += f"of each process ({remap})"
+            advice += "; if sros still sees no node, first add the node's name to the command of "
+            advice += f"each process ({remap})"
         if state.secured:
             advice = _start_of_unknown_process(running, state)
             advice += (
@@ -577,7 +580,8 @@ def _start_of_unknown_process(running: RunningRobot, state: CloseState) -> str:
             if is_unknown and running.may_use_files(process) and not known.unit:
                 start = known.secured_command(export.parent)
     names = first_few(idle, MOST_NAMES)
-    return f"if one belongs in {names}, stop it, and start it in its enclave: {start}; "
+    which = "the process" if len(observed.unknown) == 1 else "one of them"
+    return f"if {which} belongs in {names}, stop it, and start it in its enclave: {start}; "
 
 
 def _shared_program_problems(robot: LocalRobot) -> Iterator[str]:
@@ -592,9 +596,9 @@ def _shared_program_problems(robot: LocalRobot) -> Iterator[str]:
             yield (
                 f"{shlex.join(processes[0].command)} starts the processes of "
                 f"{enumerated(enclaves)}, and all of them would run in one enclave; "
-                f"{_NOT_SIGNED}. In '{robot.policy}', move their profiles into one of these "
-                "enclaves, which then has the rights of all, and remove the other "
-                "enclaves. Or let the program start each process with the method spawn after "
+                f"{_NOT_SIGNED}. In '{robot.policy}', move the profiles of these enclaves into one "
+                "of them, which then has the rights of all, and remove the others. Or let the "
+                "program start each process with the method spawn after "
                 f"setting {ENCLAVE} in os.environ, and watch again: "
                 f"{robot.close_command} --for 1m"
             )
@@ -619,8 +623,8 @@ def _shared_node_problems(robot: LocalRobot) -> Iterator[str]:
     for enclave, twins in by_enclave.items():
         if len(twins) > 1:
             yield (
-                f"{enumerated([*twins.values()])} call themselves {enclave}, and the enclave of "
-                f"this name would have the rights of all; {_NOT_SIGNED}. If one process is "
+                f"{enumerated([*twins.values()])} have nodes of the same name, and the enclave "
+                f"{enclave} would have the rights of all; {_NOT_SIGNED}. If one process is "
                 f"not of the robot, stop it, remove '{robot.policy}', and watch again: "
                 f"{robot.close_command} --for 1m. If all are of the robot, add --accept nodes"
             )

@@ -327,7 +327,7 @@ def _unsigned_violation_text(robot: LocalRobot, *needed: str) -> str:
     status, _, _ = robot.shell.run(words, False)
     if status != 1 or not _unsigned_policy_text(robot):
         return ""
-    return f"; '{robot.policy}', which is not signed yet, violates at least one"
+    return f"; '{robot.policy}', which is not signed yet, violates at least one requirement"
 
 
 def _weak_requirements_text(robot: LocalRobot) -> str:
@@ -418,14 +418,14 @@ def _proof_of_silence(robot: LocalRobot, before: Observation, *, hears: bool) ->
         text = f"it sees {enumerated(found)}; stop what runs open, or start it in its enclave"
         return Proof(SILENCE, False, text)
     if not value["settled"]:
-        why = "the ROS graph kept changing, or could not be read in time, so the observer may have "
-        why += "missed nodes; ask again"
+        why = "the ROS graph kept changing, or could not be read in time, so the listener may have "
+        why += "missed nodes; run the proof again"
         return Proof(SILENCE, None, why)
     if not hears:
         why = "this proves nothing, because the observer in its enclave does not see the robot now"
         return Proof(SILENCE, None, why)
     seen = nodes_text(before.nodes)
-    return Proof(SILENCE, True, f"the observer, which saw {seen} before, now sees none")
+    return Proof(SILENCE, True, f"the listener saw {seen} before, and sees none now")
 
 
 def _proof_of_processes(running: RunningRobot, number: int) -> Proof:
@@ -600,10 +600,10 @@ def _remedy(robot: LocalRobot, difference: str) -> str:
         "denied": "if a node needs this right, add the right to the node's profile in "
         f"{policy}, and {restart}; if you changed a name only in the policy, also start the node "
         "with the new name",
-        "not seen this time": "if the node does not always use the name, ask again while it does; "
-        f"if it uses another name now, replace the old name in {policy}, in the profiles of the "
-        "node and of the nodes that it talks to (this takes away the right to the old name), and "
-        f"{restart}; otherwise, start the node as before ({robot.commands_file})",
+        "not seen this time": "if the node does not always use the name, prove again while it "
+        f"does; if it uses another name now, replace the old name in {policy}, in the profiles of "
+        "the node and of the nodes that it talks to (this takes away the right to the old name), "
+        f"and {restart}; otherwise, start the node as before ({robot.commands_file})",
         "left alone": f"give both sides one name, in {policy} and in their programs, and {restart}",
         "refused": f"ask `sros check {shlex.quote(str(robot.export))}`",
     }
@@ -739,10 +739,10 @@ class _TalkComparison:
             yield f"the policy takes away {number} that the robot used: {rights}"
             lost = _without_counterpart(self._running.robot, [right.right for right in denied])
             if lost:
-                yield f"left without a partner: {first_few(lost, MOST_NAMES, '; ')}"
+                yield f"left without a counterpart: {first_few(lost, MOST_NAMES, '; ')}"
         if not_now := self._lost_endpoints(as_now.nodes):
             names = first_few(_endpoint_texts(not_now), MOST_NAMES)
-            yield f"allowed, but not seen now, and not always seen in the watch: {names}"
+            yield f"allowed, but not seen now, and not always seen during the watch: {names}"
         if unused := self._unused_rights():
             signed = Rules(load_rights(OpenedKeystore(self._running.robot.export)).rights)
             kinds: dict[str, list[str]] = {}
@@ -849,7 +849,7 @@ def _unseen_text(running: RunningRobot, node: str, enclave: str) -> str:
     if not node or is_expression(node):
         return f"any node in {enclave}"
     label = next((process.label for process, of in running.secured if of.name == enclave), "")
-    asking = f"{label} runs: ask again, or restart it; " if label else ""
+    asking = f"{label} runs: run the proof again, or restart the process; " if label else ""
     gone = f"if the node is gone for good, remove its profile from '{running.robot.policy}'"
     return f"{node} ({asking}{gone})"
 

@@ -104,7 +104,7 @@ def _commands_text(robot: LocalRobot, state: CloseState) -> str:
     folder, due = robot.folder.absolute(), state.pending_by_hand
     commands = state.observed.commands_by_hand(folder)
     rest = {command: commands[command] for command in commands if command not in due}
-    place = "by its command, in the place that starts it today."
+    place = "by its command below, where it is started today."
     together = "# Start them one second apart: processes that start together may miss each other."
     lines = [
         "# Stop all of these processes: secured and open ones do not hear each other. Then",
@@ -136,7 +136,9 @@ def _commands_text(robot: LocalRobot, state: CloseState) -> str:
 
 def _warning_of_rmw(rmw: str) -> str:
     """Return the comment that keeps a reader from stopping a robot that would not start again."""
-    return f"# NOT YET: {no_security_text(rmw)}. First find an RMW that enforces it: sros doctor"
+    return (
+        f"# NOT YET: {no_security_text(rmw)}. First find an RMW that enforces security: sros doctor"
+    )
 
 
 def _command_lines(

@@ -187,9 +187,9 @@ def _write_observation(robot: LocalRobot, document: str, observed: ObservedProce
 def _text_on_nodes_without_enclave(robot: LocalRobot, names: Sequence[str]) -> str:
     """Return a sentence that names the nodes which the graph shows without an enclave."""
     return (
-        f"nodes with the identifier of a secured process: {first_few(names, MOST_NAMES)}. "
-        f"'{robot.policy}' has no rights for such nodes. Start those of the robot open, and watch "
-        f"again: {robot.close_command} --for 1m"
+        f"the identifiers of these nodes belong to secured processes: "
+        f"{first_few(names, MOST_NAMES)}. '{robot.policy}' has no rights for these nodes. Start "
+        f"the nodes that belong to the robot open, and watch again: {robot.close_command} --for 1m"
     )
 
 

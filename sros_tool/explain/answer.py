@@ -222,7 +222,9 @@ def acting_parts(question: Question) -> dict[str, Question]:
 def text_of_parts(question: Question, parts: Iterable[str]) -> str:
     """Return a sentence on what an enclave can do by ``parts`` of an action."""
     does = "command the server" if question.right == "call" else "inform the clients"
-    return f"it may do a part of the action, which is enough to {does}: {', '.join(parts)}."
+    return (
+        f"the enclave may do a part of the action, which is enough to {does}: {', '.join(parts)}."
+    )
 
 
 def _checked_name(name: str, word: str, kind: str) -> str:

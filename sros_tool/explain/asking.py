@@ -386,7 +386,7 @@ def note_on_action(
         whole, parts = decide(action)
         if whole or parts:
             does = action if whole else f"do a part of '{action}'"
-            text = f"it may {does}: add --type action if {question.name} is an action."
+            text = f"the enclave may {does}: add --type action if {question.name} is an action."
             yield Note("explain.an-action", text)
 
 

@@ -536,12 +536,12 @@ def _unjudged_notes(observation: Observation) -> list[tuple[Note, str]]:
         ),
         (
             _note_on_subjects("silent", _SILENT_TEXT, silent_nodes),
-            f"{counted(len(silent_nodes), 'node')} without endpoint",
+            f"{counted(len(silent_nodes), 'node')} without endpoints",
             silent_nodes,
         ),
         (
             _note_on_subjects("stray", _STRAYS_TEXT, strays),
-            f"{counted(len(strays), 'topic')} of no node",
+            f"{counted(len(strays), 'topic')} without a node",
             strays,
         ),
     ]

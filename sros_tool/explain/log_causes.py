@@ -196,7 +196,9 @@ class Examiner:
             advice = self._with_names(_with_name(text, "KEYSTORE", str(place)), named, first)
             if meaning.id != _FOLDER_IDS[0]:
                 advice = f"{advice} {remedy_of}"
-            return replace(plain, found=("the folder is here",), checked=True, remedy=advice)
+            return replace(
+                plain, found=("the folder exists on this machine",), checked=True, remedy=advice
+            )
         if better := self._other_folder_remedy(path, remedy_of):
             return replace(plain, remedy=better)
         examined = meaning.faults or meaning.id == "service"
@@ -404,8 +406,8 @@ class Examiner:
             facts = [answer.decision.text, f"the enclave may {right} {ns}{name}"]
             remedy = (
                 f"All names that are denied to the process lack the namespace {ns}: start it with "
-                f"`--ros-args -r __ns:={quote(ns)}`, or with `namespace=` in its launch file. If "
-                f"{name} is right, {_within_sentence(finding.remedy)}"
+                f"`--ros-args -r __ns:={quote(ns)}`, or with `namespace=` in its launch file. "
+                f"{_otherwise(finding.remedy)}"
             )
         else:
             other, better = self._other_node_cause(denial, answer)
@@ -783,8 +785,8 @@ def _nodes_clause(answer: Answer) -> tuple[str, ...]:
     """Return a tuple with a clause on the nodes that an enclave's permissions name; or ()."""
     nodes = _served_names(answer)
     if nodes:
-        return (f"its permissions are for {_listed_nodes(nodes)}",)
-    return (f"its permissions lack {_EVERY_NODE}",)
+        return (f"the permissions are for {_listed_nodes(nodes)}",)
+    return (f"the permissions lack {_EVERY_NODE}",)
 
 
 def _parameter_client_hint(denial: Denial, name: str) -> str:

@@ -432,9 +432,9 @@ def _note_on_fitting_permissions(evaluator: Evaluator, answer: Answer) -> Iterat
     if holders:
         text = (
             f"whoever has the key of {evaluator.enclave.name} may do it with the permissions of "
-            f"{first_few(holders, 3)}, which are not secret and fit its certificate. Choose names "
-            "that do not consist of parts of another name, or unique subjects (template "
-            "production)."
+            f"{first_few(holders, 3)}: they fit the certificate of this enclave, and are not "
+            "secret. Choose names that do not consist of parts of another name, or unique "
+            "subjects (template production)."
         )
         yield Note("explain.fitting-permissions", text)
 

@@ -613,7 +613,7 @@ class ZenohEvaluator:
                 if brief:
                     break
         if not believing:
-            text = "it forwards the messages of others, and no session allows it to do that"
+            text = "a router only forwards messages, and no session accepts such a message from it"
             return replace(answer, outcome=_Outcome.DROPPED, text=text)
         checks = tuple(
             check

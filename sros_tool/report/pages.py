@@ -452,7 +452,7 @@ def _demo_scenario(scenario: Json, *, is_only: bool) -> str:
         parts.append(f'<p class="soft">Cast: {"; ".join(members)}.</p>')
     if keystore := scenario.get("keystore"):
         used = len({member["enclave"] for member in scenario["cast"]})
-        played = f"Parts are played by {used} of {keystore['enclaves']} enclaves"
+        played = f"The demo used {used} of the keystore's {keystore['enclaves']} enclaves"
         elsewhere = keystore["elsewhere"]
         played += f"; the keys of {elsewhere} are elsewhere" if elsewhere else ""
         parts.append(f'<p class="soft">{played}.</p>')

@@ -252,7 +252,7 @@ def test_everything_is_prepared_and_nothing_is_closed(robot: Robot) -> None:
     assert "\nWARNING: rmw_fastrtps_cpp is built without security here: " in ended.err
     lacking.unlink()
     mine.unlink()
-    assert ended.err.startswith("'robot' has files of yours: sros adds its own to them\n")
+    assert ended.err.startswith("'robot' already has files: sros adds its own\n")
     assert made(robot.folder) == MADE
     git = partial(subprocess.run, cwd=robot.folder / "robot", check=True, capture_output=True)
     git(["git", "init", "-q"])
@@ -335,7 +335,9 @@ def test_a_policy_that_was_changed_stays_and_is_followed(robot: Robot) -> None:
     said = robot.close("--apply").out
     except_for = "yes, except for what the policy takes away: everything that talked can still "
     assert f"{except_for}talk: 2 nodes with 35 endpoints as before (types are not compared)" in said
-    alone = "left without a partner: /talker may publish /chatter, but no enclave may subscribe to "
+    alone = (
+        "left without a counterpart: /talker may publish /chatter, but no enclave may subscribe to "
+    )
     alone = f"1 right that the robot used: /listener subscribe topic /chatter\n  {alone}it any more"
     unused = "seen neither on the open robot nor now: /listener subscribe topic /old/chatter"
     assert f"\n  the policy takes away {alone}\n  allowed, but {unused}\n" in said
@@ -484,8 +486,7 @@ def test_a_robot_is_closed_proved_and_opened_again(
         "(types are not compared)",
         "  sros cannot see whether two nodes hear each other: look at what the nodes receive now, "
         "and restart a node that receives nothing",
-        "yes: an open listener finds nothing: "
-        "the observer, which saw 2 nodes before, now sees none",
+        "yes: an open listener finds nothing: the listener saw 2 nodes before, and sees none now",
     ]
     assert re.search(
         r"\nthe robot is closed\n  the files are valid until 20.*Z; have them renewed before then "
@@ -517,8 +518,8 @@ def test_a_robot_is_closed_proved_and_opened_again(
     more = '<topics publish="ALLOW"><topic>chatter</topic></topics><topics subscribe="ALLOW">'
     policy.write_text(signed.replace('<topics subscribe="ALLOW">', more, 1))
     proved = robot.close("--proof").out
-    breaks = "requirements.toml; 'robot/policy.xml', which is not signed yet, violates at least one"
-    assert f"yes: the requirements hold: all of them: robot/{breaks}\n" in proved
+    breaks = "'robot/policy.xml', which is not signed yet, violates at least one requirement"
+    assert f"yes: the requirements hold: all of them: robot/requirements.toml; {breaks}\n" in proved
     assert "\n  in the policy, but not signed yet: /listener publish topic /chatter\n" in proved
     assert "seen neither" not in proved
     policy.write_text(signed)
@@ -691,7 +692,7 @@ def test_what_systemd_does_not_start_is_done_by_hand(
     undone = robot.close("--undo")  # with the open process 12
     assert undone.err.startswith(
         "/listener may run open by another command (process 12 (run)); if that is not so, "
-        "start /listener open (its node was /listener when sros watched; its new name is right, "
+        "start /listener open (its node was /listener when sros watched; the new name is also "
         "too): cd /opt && /opt/run listener\n"
         "/talker does not run; start it open: cd /opt "
     )
@@ -750,7 +751,7 @@ def test_processes_that_started_after_the_watch(robot: Robot) -> None:
     export = robot.folder / "robot/export"
     start = f"cd /opt && sros run {export} /late -- /opt/late --ros-args"
     assert (
-        f"; if one belongs in /late, stop it, and start it in its enclave: {start}; stop pro"
+        f"; if the process belongs in /late, stop it, and start it in its enclave: {start}; stop"
         in said
     )
     assert "such as your own `sros demo listener`; otherwise nobody would hear" in said
@@ -935,8 +936,11 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     robot.more = ()
     robot.remaining = (TALKER,)
     lost = "no: not everything that talked can still talk: "
-    runs = f"process {PID['/listener']} (run) runs: ask again, or restart it; if the node is"
-    assert f"{lost}not seen: /listener ({runs} gone" in robot.close("--proof", status=1).out
+    runs = f"process {PID['/listener']} (run) runs: run the proof again, or restart the process;"
+    assert (
+        f"{lost}not seen: /listener ({runs} if the node is gone"
+        in robot.close("--proof", status=1).out
+    )
     with monkeypatch.context() as patched:
         patched.setattr(close, "_run", ended_before_the_audit(robot, "/listener"))
         stopped = "/listener (process 4712 (run); start it again, or, if it does not always run, "
@@ -948,7 +952,7 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
         patched.setattr(close, "_run", beside_a_graph_that_changes)
         said = robot.close("--proof", status=1).out
         unseen = f"{lost}not seen this time: /listener subscribe /chatter; if the node does not "
-        assert f"{unseen}always use the name, ask again while it does; if it uses anot" in said
+        assert f"{unseen}always use the name, prove again while it does; if it uses an" in said
         assert "in 'robot/policy.xml', in the profiles of the node and of the nodes that" in said
         assert "(this takes away the right to the old name)" in said
         assert "start the node as before (robot/start/commands.txt)" in said
@@ -957,7 +961,7 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     assert (
         "talk: 2 nodes with 35 endpoints as before (types are not compared)\n  allowed, but" in said
     )
-    not_now = "allowed, but not seen now, and not always seen in the watch: "
+    not_now = "allowed, but not seen now, and not always seen during the watch: "
     not_now += "/listener subscribe /chatter\n  "
     assert f"{not_now}the ROS graph kept changing meanwhile, or could not be read in time\n" in said
     robot.remaining = (TALKER, ros_node("guest", "05"))
@@ -1182,7 +1186,7 @@ def test_processes_that_show_no_id_are_to_be_named(robot: Robot) -> None:
     )
     said = robot.close(status=1).out
     assert "; watch again while they run: sros close" in said
-    assert "first add the name of its node to the command of each process (--ros-args" in said
+    assert "first add the node's name to the command of each process (--ros-args" in said
     assert "for nodes of /left, /right. If they run on another machine" in said
     assert "from 'robot/policy.xml', and remove 'robot/requirements.toml', which sros then" in said
 
@@ -1312,7 +1316,7 @@ def test_a_node_whose_enclave_the_graph_does_not_show_is_named(robot: Robot) -> 
     """Any participant can have an identifier that looks like that of a secured one."""
     robot.nodes += (ros_node("ghost", "8f0f0000681200000000", "publish rt/cmd_vel"),)
     said = robot.close(status=1).out
-    assert "nodes with the identifier of a secured process: /ghost. 'rob" in said
+    assert "these nodes belong to secured processes: /ghost. 'rob" in said
     robot.by_hand = set(PID)
     robot.nodes = (TALKER, LISTENER)
     assert (
@@ -1339,12 +1343,12 @@ def test_a_process_with_the_name_of_another_is_not_signed(robot: Robot) -> None:
     command, library = ("/tmp/evil", "a b"), frozenset({"libfastrtps", "librcl"})
     robot.more = (Process(7, command, {}, datetime.now(UTC), libraries=library),)
     said = robot.close(status=1).out
-    both = "process 7 (/tmp/evil 'a b') and process 4711 (/opt/run talker) call themselves /talker,"
+    both = "process 7 (/tmp/evil 'a b') and process 4711 (/opt/run talker) have nodes of the same"
     assert both in said
     assert not (robot.folder / "robot/keystore").exists()
     assert both in robot.close("--apply", status=1).out
     robot.more, robot.absent = (), {"/talker"}
-    both = "a process that ended (/tmp/evil 'a b') and a process that ended (/opt/run talker) call"
+    both = "a process that ended (/tmp/evil 'a b') and a process that ended (/opt/run talker) have"
     assert both in robot.close(status=1).out, "the policy has the rights of both"
     robot.absent = set()
     talker = ClosedProcess("/talker", 7, ("talk",), "/opt", 0, "a.service", "program")
@@ -1363,7 +1367,7 @@ def test_a_process_with_the_name_of_another_is_not_signed(robot: Robot) -> None:
         content = json.dumps(as_plain(twins))
         (robot.folder / "robot/processes.json").write_text(content)
         said = robot.close().out
-        assert "call themselves" not in said, "one has ended, or ran in the enclave"
+        assert "have nodes of the same name" not in said, "one has ended, or ran in the enclave"
         assert "known by its enclave" not in said, "it runs open now"
 
 
@@ -2010,7 +2014,7 @@ def test_an_enclave_that_gets_another_name_keeps_its_process(robot: Robot) -> No
     for file in (policy, robot.folder / "robot/requirements.toml"):
         file.write_text(file.read_text().replace('"/logger"', '"/mission"'))
     said = robot.close(status=1)
-    assert "/mission was /logger before the policy moved its nodes\n" in said.err
+    assert "/logger is now /mission, because the policy moved its nodes\n" in said.err
     known = "/mission: process 4711, known by its process id, for the nodes /logger and /talker: "
     assert f"{known}--apply restarts talker.service\n" in said.out
     assert "named after" not in said.out

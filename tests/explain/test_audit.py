@@ -229,7 +229,7 @@ def test_tools_and_strays_are_said(tmp_path: Path) -> None:
     assert ids(found) == ["audit.tool", "audit.stray"]
     assert found.unjudged == (
         "1 node with a tool's name (/_ros2cli_12)",
-        "1 topic of no node (Square)",
+        "1 topic without a node (Square)",
     )
     assert [each.fqn for each in found.observation.nodes] == ["/talker"]
 
@@ -244,7 +244,7 @@ def test_a_node_without_an_endpoint_is_not_judged(tmp_path: Path) -> None:
     seen = make_observation([talks()], silent=[("/", "/", "mute"), ("/", "/", "_ros2cli_9")])
     found = audited(tmp_path, TALKER, seen)
     assert ids(found) == ["audit.tool", "audit.silent"]
-    assert found.unjudged == ("1 node without endpoint (/mute)",)
+    assert found.unjudged == ("1 node without endpoints (/mute)",)
     assert found.allowed and found.unjudged
 
 

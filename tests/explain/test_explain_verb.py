@@ -645,7 +645,7 @@ def test_permissions_of_another_enclave_that_fit_are_said(tmp_path: Path) -> Non
             )
             assert explain(keystore, "--who", *words, "--match", "/mux").status == 1 - fits
             single = explain(keystore, "/mux", *words)
-            assert ("with the permissions of /robot/mux, which are not" in single.err) is fits
+            assert ("with the permissions of /robot/mux: they fit the" in single.err) is fits
         reach = explain(keystore, "--reach", "/mux").ok().err
         assert ("can also use the permissions of /robot/mux" in reach) is (template == "sros2")
         shutil.move(keystore / "enclaves/robot/mux/key.pem", tmp_path / "key.pem")

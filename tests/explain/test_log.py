@@ -640,10 +640,10 @@ def test_tests_of_declared_keys_are_not_called_nothing(tmp_path: Path) -> None:
         f"to Declare/Undeclare Subscriber {where}\n"
     )
     ended = sros("explain", "--log", tmp_path / "router.log").ok()
-    assert "which do not show which message was dropped" in ended.err
+    assert "this does not show which message was dropped" in ended.err
     (tmp_path / "other.log").write_text("one\n")
     assert (
-        "Zenoh's tests of declared keys"
+        "how Zenoh tested declared names"
         not in sros("explain", "--log", tmp_path / "other.log").ok().err
     )
 
@@ -678,7 +678,7 @@ def test_nothing_found_is_said_of_what_was_read(tmp_path: Path) -> None:
         ended = sros("explain", "--log", tmp_path / "robot.log").ok()
         first, second = ended.err.splitlines()
         assert first == f"{none} 1 line; a node found its enclave '/k/enclaves/talker'"
-        assert second.startswith("not shown: whether peers drop the node's messages (explain their")
+        assert second.startswith("not shown: whether peers drop the node's messages (explain the")
         assert "`sros check FOLDER OTHER`" in second
         assert len(second) < 200
 
@@ -878,7 +878,7 @@ def test_rcl_alone_makes_one_look_at_the_name(keystore: Path, tmp_path: Path) ->
     log.write_text("RCLError: failed to create service: create_service() failed to create ...\n")
     found = sros("explain", keystore, ENCLAVE, "--log", log).out
     assert "another name or namespace than in the policy" in found
-    assert "its permissions are for the node /talker" in found
+    assert "the permissions are for the node /talker" in found
 
 
 def test_a_missing_common_part_is_told(keystore: Path, tmp_path: Path) -> None:
@@ -1362,7 +1362,7 @@ def test_a_folder_that_is_there_has_the_right_name(keystore: Path, tmp_path: Pat
             gives = f"`sudo chown -R USER {export}`" in found
             assert gives is (place == exported), "nobody gets the CA keys"
             assert ("This keystore has the CA keys" in found) is not gives
-            assert "the folder is here\n" in found and "restart the node" in found
+            assert "the folder exists on this machine\n" in found and "restart the node" in found
             assert "Correct the name" not in found and "has to be" not in found
             assert ("RUNS UNSECURED" in found) is ("with `sros run`" in found) is unsecured
     (other := tmp_path / "other/enclaves/a").mkdir(parents=True)

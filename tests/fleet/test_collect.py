@@ -1193,7 +1193,7 @@ def test_a_publishing_folder_that_lost_its_files_is_not_in_order(
     command = f"`sros {' '.join(publish)}`"
     (pub / archive).unlink()
     ended = sros(*status, cwd=home.folder)
-    assert f"'{pub}' lacks {archive}, which robots fetch: {command}\n" in ended.out
+    assert f"'{pub}' lacks {archive}, which robots fetch: run {command}\n" in ended.out
     assert ended.status == 1
     ended = sros("fleet", "collect", "ks", "inbox", "--publish", pub, cwd=home.folder)
     assert ended.status == 1 and f"archives in '{pub}' were missing or changed: r2." in ended.err
@@ -1205,7 +1205,7 @@ def test_a_publishing_folder_that_lost_its_files_is_not_in_order(
     assert re.search(r"^sros_fleet_publication_altered\{.*\} 1$", metrics, re.MULTILINE)
     (pub / "metadata/timestamp.json").unlink()
     found = sros(*status, cwd=home.folder).out
-    assert f"metadata/timestamp.json, which robots fetch: {command} says what to check" in found
+    assert f"metadata/timestamp.json, which robots fetch: run {command}, which says what" in found
     refused = sros(*publish, cwd=home.folder)
     assert (
         "if the keystore was restored, first repeat the revocations that were made" in refused.err

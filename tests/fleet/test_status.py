@@ -557,12 +557,12 @@ def test_a_rotation_goes_on_without_robots_if_that_is_chosen(field: Field) -> No
     field.deliver("r1", "r3")
     words = ("rotate_ca", "ks", "--to", "reissue", "--allow-unconfirmed")
     assert (
-        "files of this stage: r2. Robots with and without these files could not"
+        "files of this stage: r2. Robots with these files could not talk to"
         in field.run(*words, "--dry-run").err
     )
     ended = field.run(*words, "--json")
     assert json.loads(ended.out)["cut_off"] == ["r2"]
-    assert "files of this stage: r2. Robots with and without these files cannot" in ended.err
+    assert "files of this stage: r2. Robots with these files cannot talk to" in ended.err
     (field.root / "fleet.toml").write_text("[robots.r1]\n")
     assert "is not the file that sros wrote" in field.run("rotate_ca", "ks", "--next", status=2).err
     told = field.run("rotate_ca", "ks", "--status").out
@@ -598,7 +598,7 @@ def test_a_robot_that_missed_a_stage_gets_its_files_by_hand(field: Field) -> Non
     places = [said.index(text) for text in ("first publish", "cut off", "all processes together")]
     assert places == sorted(places), "what comes first is said first"
     told = field.run("fleet", "publish", "ks", "pub").out
-    assert "they do not trust the permissions CA: r2, r3. Bring their" in told
+    assert "the permissions CA (as their last messages say): r2, r3. Bring" in told
     assert "\nrobots that trust this CA accept these files until" in told
     assert to_do() == "deliver"
     refused = "Release 3 is not sealed by a CA that this robot trusts: it is not."
@@ -646,7 +646,7 @@ def test_a_robot_that_was_off_during_a_rotation_has_missed_it(field: Field) -> N
     field.age("r2", timedelta(hours=1))
     assert shown() == ("earlier", "deliver")
     said = field.run("fleet", "status", "ks", "--robot", "r2", status=1).out
-    assert "a web server with the current CA and list refuses its certificates; " in said
+    assert "a web server with the current CA and revocation list refuses the robot; " in said
     field.deliver("r2")
     assert field.states()["r2"] == "current"
 
@@ -1299,8 +1299,8 @@ def test_what_is_to_be_done_for_robots_that_do_not_fetch_what_is_published(field
     rows = said()
     assert rows["r1"][0] == "deliver" and "lacks the key of /r1/base: releases" in rows["r1"][1]
     assert "is published" not in rows["r1"][1], "no other enclave waits for it"
-    refused = "a web server with the current CA and list refuses its certificates"
-    waits = "1 replaced certificate revoked: the new one waits for the robot"
+    refused = "a web server with the current CA and revocation list refuses the robot"
+    waits = "1 revoked certificate: the new one waits for the robot"
     assert rows["r3"] == ("wait, else deliver", f"{waits}; {refused}; more: --robot r3")
     assert rows["r2"][0] == "wait: it fetches"
     kept = field.root / "confirmed/r2.json"

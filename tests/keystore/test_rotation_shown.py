@@ -196,7 +196,7 @@ def test_inspect_shows_all_that_a_ca_file_holds(root: Path) -> None:
     for each in (old, new):
         assert f"serial {each.serial_number:x}\n" in said
         assert digest(each) in said
-    assert said.count("next to it, in the same file") == 1
+    assert said.count("another certificate in the same file") == 1
     assert "revocation list 2 of " in said
     described = json.loads(sros("inspect", path, "--json").ok().out)
     assert described["sha256"] == digest(old)

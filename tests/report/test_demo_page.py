@@ -78,7 +78,7 @@ def test_what_was_not_tried_is_said_and_nothing_of_it_is_green() -> None:
     text = page.text_content()
     assert f"Not tried, and needed for a proof: a; {HOSTILE[0]}." in text
     assert f"guest /a (why {HOSTILE[0]})" in text
-    assert "Parts are played by 1 of 7 enclaves; the keys of 1 are elsewhere." in text
+    assert "The demo used 1 of the keystore's 7 enclaves; the keys of 1 are elsewhere." in text
     assert not page.cssselect("script")
 
 

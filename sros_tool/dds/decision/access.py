@@ -65,9 +65,9 @@ class Outcome(StrEnum):
 
 OutcomeWord = Annotated[
     Outcome,
-    "What happens: the endpoint is not created (`denied`), peers do not match the endpoint (`peer "
-    "denies`), the process does not start (`refused`), or the process or its peers crash "
-    "(`crashes`).",
+    "What happens: nothing stops the access (`allowed`), the endpoint is not created (`denied`), "
+    "peers do not match the endpoint (`peer denies`), the process does not start (`refused`), or "
+    "the process or its peers crash (`crashes`).",
 ]
 ReasonWord = Annotated[str, "Reason of the decision, as a stable word such as `no-rule`."]
 
