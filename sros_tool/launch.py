@@ -166,7 +166,9 @@ class SecuredOption:
     def prestart(self, args: Namespace) -> None:
         """Raise `RuntimeError` if a prefix of the command line would replace the prefix of sros."""
         if args.secured and (args.launch_prefix or args.launch_prefix_filter):
-            raise RuntimeError("--secured cannot be used with --launch-prefix or its filter.")
+            raise RuntimeError(
+                "--secured cannot be used with --launch-prefix or --launch-prefix-filter."
+            )
 
     def prelaunch(self, description: LaunchDescription, args: Namespace) -> tuple[Any]:
         """Return the launch description, with `SecuredNodes` in front if the option was given."""

@@ -609,8 +609,9 @@ def _rights_for_peers(
     except TooManyExpressions:
         raise PolicyError(
             f"the common rights of {name} and another enclave cannot be expressed in Zenoh",
-            "In peer mode, a file states the common rights for each other enclave. The wildcards "
-            "in these rights combine into too many key expressions.",
+            "In peer mode, the file of an enclave states, for each other enclave, the rights that "
+            "the two have in common. The wildcards in these rights combine into too many key "
+            "expressions.",
             "Use fewer wildcards, or client mode: `sros zenoh --mode client`.",
         ) from None
     rendered.append(router)

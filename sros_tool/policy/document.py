@@ -1077,7 +1077,7 @@ def _files_below(folder: Path) -> Iterator[Path]:
         for subfolder in (Path(parent, name) for name in folders):
             if subfolder.is_symlink():
                 raise DocumentError(
-                    f"'{subfolder}' is a link to a folder, and not followed",
+                    f"'{subfolder}' is a link to a folder, which sros does not follow",
                     "The policies in it would not count.",
                     "Name that folder itself, or remove the link.",
                 )

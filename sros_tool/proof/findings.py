@@ -354,7 +354,7 @@ def left_out_robot_findings(system: System, namespaces: Sequence[str]) -> list[F
     others = sorted(robot.name for robot in robots if robot.namespace not in above)
     if not others:
         return []
-    text = f"robots outside the named namespaces: {first_few(others, _MOST_SHOWN)}"
+    text = f"not checked for robots outside the named namespaces: {first_few(others, _MOST_SHOWN)}"
     return [ROBOTS_LEFT_OUT.found(system.file, text, system.file)]
 
 
@@ -464,7 +464,8 @@ def _subject(violation: Violation) -> str:
 
 
 _CLOSE_GOVERNANCE = (
-    f"Run {REFUSE_STRANGERS} (for a policy: change its template), and check the requirement again."
+    f"Run {REFUSE_STRANGERS} (for a policy: choose another --template), and check the requirement "
+    "again."
 )
 
 

@@ -397,7 +397,7 @@ def _moved_enclaves(
                     f"router of {enclave}",
                     f"{old_router}, which passes on {crossing}",
                     new_router,
-                    f"{name} may pass between this enclave and enclaves that were at {old_place}",
+                    f"{name} may pass between this enclave and the enclaves of router {old_place}",
                 )
                 break
 
@@ -411,7 +411,7 @@ def looser_router_rules(
     """
     if new.routers and not (states_routers(old) and states_routers(new)):
         for router in sorted({*old.passing} - {*new.routers}):
-            meaning = "enclaves of this router may now be at the same router as other enclaves"
+            meaning = "enclaves of this router may now connect to the same router as other enclaves"
             yield _looser_change(f"router {router} of Zenoh", "present", "missing", meaning)
     routers: dict[tuple[str, str], list[str]] = defaultdict(list)
     for router in sorted(old.passing.keys() & new.passing.keys()):

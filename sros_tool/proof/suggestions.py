@@ -110,8 +110,8 @@ def _comment_on_unmet(requirement: Requirement) -> str:
     assert isinstance(requirement, Only)
     (right, (name,)), users = requirement.rights[0], counted(len(requirement.enclaves), "enclave")
     return (
-        f"# not proposed: that only some may {right} {name} (stated for {users}, but others may do "
-        "so by a wildcard, or a DENY applies)"
+        f"# not proposed: that only some enclaves may {right} {name} (stated for {users}, but "
+        "others may do so by a wildcard, or a DENY applies)"
     )
 
 

@@ -561,7 +561,8 @@ def _zenoh_findings(
         return
     text = (
         f"ROS 2 {before.title} has rmw_zenoh {version_text(old.begin)} or later, {after.title} "
-        f"{version_text(new.begin)} or later; the files need at least {version_text(new.least)}"
+        f"{version_text(new.begin)} or later; the keystore's Zenoh files need at least "
+        f"{version_text(new.least)}"
     )
     yield ZENOH.found(files.file, text)
     more = [key for key in new.below_topics if key not in (*old.below_topics, _SUBSCRIPTION_KEYS)]

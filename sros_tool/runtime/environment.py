@@ -409,11 +409,16 @@ def replaced_notes(environment: Mapping[str, str], variables: Mapping[str, str])
         if not before or before == variables.get(name):
             continue
         if name != OVERRIDE:
-            yield Note("zenoh.replaced", f"{name} was {_shortened_text(before)}, and is replaced.")
+            yield Note(
+                "zenoh.replaced",
+                f"sros replaces the value of {name}, which was {_shortened_text(before)}.",
+            )
             continue
         keys = [key.strip().strip("/") for key, _ in override_pairs(before)]
         shown = first_few([_shortened_text(key) for key in keys], _MOST_KEYS) or "nothing"
-        yield Note("zenoh.replaced", f"{OVERRIDE} changed {shown}, and is replaced.")
+        yield Note(
+            "zenoh.replaced", f"sros replaces the value of {OVERRIDE}, which changed {shown}."
+        )
         if any(key.partition("/")[0] == "access_control" for key in keys):
             yield Note(
                 "zenoh.access-control-override",

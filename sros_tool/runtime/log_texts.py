@@ -204,8 +204,9 @@ _ROS_TEXTS = (
         r"rcl: SECURITY ERROR: directory '(?P<path>[^']*)' does not exist",
         f"{_NO_FOLDER}: {_WHY_NO_FOLDER}",
         "Correct the name: `sros list_enclaves KEYSTORE` shows all names. If the folder is there: "
-        f"{_SHOW_MODES} Give an export to the user of the node; if the folder is next to the CA "
-        "keys, which no node should be able to read, export the enclave into a folder of the user.",
+        f"{_SHOW_MODES} If it is in an export, give the export to the user of the node; if it is "
+        "next to the CA keys, which no node should be able to read, export the enclave into a "
+        "folder of the user.",
     ),
     _log_text(
         "runs-unsecured", _ROS, r"SECURITY ERROR: directory '(?P<path>[^']*)' does not exist",

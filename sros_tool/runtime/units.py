@@ -128,7 +128,7 @@ def _check_path(path: str, kind: str, option: str = "") -> str:
     """
     if not _PLAIN_PATH.match(path):
         raise UsageError(
-            f"{kind} {path!r} cannot be written in a unit",
+            f"{kind} {path!r} cannot be written in a systemd unit",
             "systemd reads spaces, '%', '$', ':' and quotes in paths in several ways.",
             f"{f'With {option}, name' if option else 'Name'} an absolute path of letters, digits "
             "and /._+- only, without '.' and '..' as parts.",
@@ -209,7 +209,7 @@ def node_settings(
             verification.
 
     Raises:
-        UsageError: a path, a word of the command or a variable cannot be written in a unit.
+        UsageError: a path, a word of the command or a variable cannot be written in a systemd unit.
     """
     folder = _check_path(keystore, "the keystore") + "/enclaves"
     place = folder + enclave.rstrip("/")
@@ -277,7 +277,7 @@ def job_units(
             `Job.STATUS`; None for the default of `sros fleet status`.
 
     Raises:
-        UsageError: a path cannot be written in a unit.
+        UsageError: a path cannot be written in a systemd unit.
     """
     if job is Job.GUARD:
         return {f"sros-{job}.service": _guard_service(keystore, sros, domain)}
@@ -460,7 +460,7 @@ def unit_words(command: Sequence[str]) -> Iterable[str]:
     for word in command:
         if not word.isprintable():
             raise UsageError(
-                f"the word {word!r} cannot be written in a unit",
+                f"the word {word!r} cannot be written in a systemd unit",
                 "systemd ends a line at some characters that cannot be printed.",
                 f"Put the command into a program, such as {_NODES_FOLDER}/NAME.",
             )

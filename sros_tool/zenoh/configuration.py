@@ -472,7 +472,7 @@ def check_network(network: ZenohNetwork) -> None:
             f"the router cannot listen at {' and '.join(sorted(hosts))}",
             "Without --listen the router listens at each endpoint, and does not start if one of "
             "them is on another host.",
-            f"Name where it listens, for example with `--listen [::]:{min(connect)[1]}`.",
+            f"State where the router listens, for example with `--listen [::]:{min(connect)[1]}`.",
         )
     if not listen:
         return

@@ -244,7 +244,8 @@ def test_two_enclaves_with_a_right_are_proposed_by_name(tmp_path: Path) -> None:
     policy.write_text(policy_text({"/a": drives, "/look": publish("/*")}))
     suggested = sros("check", policy, "--suggest").ok().out
     assert (
-        "\n# not proposed: that only some may publish /cmd_vel (stated for 1 enclave, " in suggested
+        "\n# not proposed: that only some enclaves may publish /cmd_vel (stated for 1 enclave, "
+        in suggested
     )
 
 
@@ -497,7 +498,7 @@ def test_a_robot_in_no_namespace_that_was_named_is_told(tmp_path: Path) -> None:
     (tmp_path / "r.toml").write_text('[[only]]\npublish = ["cmd_vel"]\nenclaves = ["/mux"]\n')
     asked = ("check", "p.xml", "--fleet", "fleet.toml", "--requirements", "r.toml")
     ended = sros(*asked, "--namespace", "/red", cwd=tmp_path)
-    assert "robots outside the named namespaces: blue, reddish" in ended.out
+    assert "not checked for robots outside the named namespaces: blue, reddish" in ended.out
     every = ("/red/left", "/reddish", "/hall/blue")
     named = [word for namespace in every for word in ("--namespace", namespace)]
     assert "robots-left-out" not in sros(*asked, *named, cwd=tmp_path).out

@@ -480,7 +480,7 @@ def test_the_namespace_of_a_package_that_requirements_lack_is_named(
     text = f'[[only]]\npublish = ["{name}"]\nenclaves = ["/a"]'.encode()
     required = parse_requirements(text, "r.toml", namespaces=namespaces)
     (finding,) = (e for e in requirement_findings(required, robot(rights)) if e.id == VACUOUS)
-    told = "its namespace: `--namespace /left --namespace /right`."
+    told = "its namespace on the robot: `--namespace /left --namespace /right`."
     assert (told in finding.remedy) is is_told
 
 
@@ -516,8 +516,8 @@ def test_who_moves_the_robot_is_proposed_for_any_number() -> None:
     assert len(decide_all(proposed, fifth).violations) == 1
     wide = robot({**drivers, **base, "/look": may("publish", "/*")})
     assert suggest(wide.rights, wide.worlds).comments == [
-        "# not proposed: that only some may publish /cmd_vel (stated for 5 enclaves, but others "
-        "may do so by a wildcard, or a DENY applies)"
+        "# not proposed: that only some enclaves may publish /cmd_vel (stated for 5 enclaves, "
+        "but others may do so by a wildcard, or a DENY applies)"
     ]
 
 

@@ -433,7 +433,7 @@ def restored_list_note(restored: Changed, holders: str) -> Note:
     """
     verb = "would be revoked again" if restored.dry_run else "is revoked again"
     text = (
-        f"{holders} a revocation list that the keystore signed but does not know: the keystore "
+        f"{holders} a revocation list that the keystore signed but no longer has: the keystore "
         f"was restored from a backup, or is a copy. Everything on the list {verb}"
     )
     if again_revoked := restored.names("revoked"):

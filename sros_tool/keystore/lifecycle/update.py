@@ -236,7 +236,7 @@ def _checked_target(
         if (hidden, by) not in known:
             raise UsageError(
                 f"the settings would protect {hidden} twice, and the second rule would never apply",
-                f"The rule for {by} decides on the same names.",
+                f"The rule for {by} applies to the same names.",
                 "State one rule for these names.",
             )
     return with_key_places(with_values(target), present_settings.settings)
@@ -671,8 +671,8 @@ class _Updater:
         text = (
             f"Still open: {', '.join(self._kept_open)} may do everything, as before. The new "
             f"default replaces only rights that equal the old default; the rights of {which} "
-            f"differ from it. State them with `sros create_permission {quote(str(self._root))} "
-            f"{' '.join(map(quote, self._kept_open))} POLICY_FILE`."
+            "differ from it. State these rights with `sros create_permission "
+            f"{quote(str(self._root))} {' '.join(map(quote, self._kept_open))} POLICY_FILE`."
         )
         return [Note("keystore.kept-open", text)]
 
