@@ -1233,7 +1233,7 @@ def send(
         raise kind(
             failure,
             f"{why[:1].upper()}{why[1:].removesuffix('.')}.",
-            "The agent tries again at its next run.",
+            "The agent tries again in its next round.",
         ) from error
     if not 200 <= reply.status < 300:
         kind = RefusedError if reply.status in REFUSALS else UnavailableError
@@ -1256,7 +1256,7 @@ def _write_message(inbox: Path, robot: str, message: bytes) -> None:
         raise UnavailableError(
             f"the message cannot be written into '{inbox}'",
             f"{error.strerror or error}.",
-            "The agent tries again at its next run."
+            "The agent tries again in its next round."
             + (
                 " If a systemd unit runs the agent, the unit was written before `sros agent "
                 "init`, and forbids this: write it again with `sros units KEYSTORE --job agent "

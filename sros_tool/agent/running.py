@@ -413,7 +413,7 @@ def restart_units(
         problems.append(str(error))
     for unit, enclaves in _due_units(settings, due_enclaves, routers, active):
         if broken := [name for name in enclaves if name in unusable]:
-            why = f"{broken[0]} could not start: {unusable[broken[0]]}"
+            why = f"no process could start in {broken[0]}: {unusable[broken[0]]}"
             problems.append(f"{unit} is not restarted: {why}.")
             continue
         try:

@@ -106,8 +106,8 @@ KEYSTORE_UNSET = FindingKind(
     "runtime.keystore-unset",
     ERROR,
     "security is enabled, but ROS_SECURITY_KEYSTORE is not set",
-    'With Enforce no node starts (rcl says "error not set"); without Enforce every node runs '
-    "unsecured.",
+    'With ROS_SECURITY_STRATEGY=Enforce, no node starts (rcl says "error not set"); otherwise, '
+    "every node runs unsecured.",
     _RCL_SOURCE,
     f"Set ROS_SECURITY_KEYSTORE. {_ENV_REMEDY}",
 )
@@ -115,7 +115,7 @@ KEYSTORE_NOT_FOUND = FindingKind(
     "runtime.keystore-not-found",
     ERROR,
     "ROS_SECURITY_KEYSTORE is not a keystore",
-    "With Enforce no node starts; without Enforce every node runs unsecured.",
+    "With ROS_SECURITY_STRATEGY=Enforce, no node starts; otherwise, every node runs unsecured.",
     _RCL_SOURCE,
     f"Correct the path. {_ENV_REMEDY}",
 )
@@ -143,8 +143,8 @@ ENCLAVE_NOT_FOUND = FindingKind(
     "runtime.enclave-not-found",
     ERROR,
     "the enclave is not in the keystore",
-    "With Enforce the node does not start; without Enforce it runs unsecured. Names are "
-    "case-sensitive.",
+    "With ROS_SECURITY_STRATEGY=Enforce, the node does not start; otherwise, it runs unsecured. "
+    "Names are case-sensitive.",
     _RCL_SOURCE,
     "Correct the name, or create the enclave with `sros create_enclave KEYSTORE ENCLAVE`.",
 )
@@ -346,8 +346,9 @@ NO_SESSION_FILE = FindingKind(
     "runtime.zenoh-open",
     ERROR,
     "rmw_zenoh runs open although security is enabled",
-    "rmw_zenoh ignores the ROS_SECURITY_* variables. Without a session file, every node uses "
-    "the default of rmw_zenoh_cpp: no TLS, no access control.",
+    "rmw_zenoh ignores the ROS_SECURITY_* variables. Without a configuration in "
+    "ZENOH_SESSION_CONFIG_URI, every node uses the default of rmw_zenoh_cpp: no TLS, no access "
+    "control.",
     _ZENOH_SOURCE,
     f"Set ZENOH_SESSION_CONFIG_URI to the session.json5 of the enclave. {OWN_CONFIGURATION}",
 )
@@ -355,8 +356,8 @@ FILE_NOT_FOUND = FindingKind(
     "runtime.zenoh-file-not-found",
     ERROR,
     "a variable of rmw_zenoh names no file that Zenoh can read",
-    "With ZENOH_SESSION_CONFIG_URI, no node starts; with ZENOH_ROUTER_CONFIG_URI, no router "
-    "starts.",
+    "If the variable is ZENOH_SESSION_CONFIG_URI, no node starts; if it is "
+    "ZENOH_ROUTER_CONFIG_URI, no router starts.",
     _ZENOH_SOURCE,
     f"Correct the path. {OWN_CONFIGURATION}",
 )
@@ -400,9 +401,8 @@ PROCESS_OPEN = FindingKind(
     "runtime.zenoh-process-open",
     ERROR,
     "a process of rmw_zenoh that runs open although security is enabled",
-    "The process runs without a session file, or with one that has no access control: whoever "
-    "connects to the process, or impersonates its router, can read everything from it and send it "
-    "anything.",
+    "The process has no Zenoh configuration, or one without access control: whoever connects to "
+    "the process, or impersonates its router, can read everything from it and send it anything.",
     _ZENOH_SOURCE,
     f"Stop it, and start it again. {OWN_CONFIGURATION}",
 )

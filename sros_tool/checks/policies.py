@@ -1267,8 +1267,8 @@ SHARED_NAMESPACE = FindingKind(
     "policy.shared-namespace",
     WARNING,
     "robots with the same namespace, or with one namespace inside the other",
-    "In one namespace, both robots publish and subscribe to the same names. A wildcard in an "
-    "outer namespace also matches the names in the inner namespace.",
+    "In the same namespace, both robots publish and subscribe to the same names. A wildcard in "
+    "an outer namespace also matches the names in the inner namespace.",
     "rcl (puts the node's namespace before relative names); sros (placeholder {namespace}).",
     "Give each robot a namespace of its own in the fleet file, or a ROS domain of its own. "
     "Computers of one robot may share its namespace: put them, and no other robot, into one group, "

@@ -72,13 +72,15 @@ if TYPE_CHECKING:
 @click.option(
     "--partial",
     is_flag=True,
-    help="Do not exit with 1 because some nodes were not seen.",
+    help="Accept that some nodes were not seen (otherwise, exit with 1).",
 )
 @click.option(
     "--unjudged",
     is_flag=True,
-    help="Do not exit with 1 because sros could not judge a part of the graph, or because the "
-    "graph kept changing.",
+    help=(
+        "Accept that sros could not judge a part of the graph, or that the graph kept changing "
+        "(otherwise, exit with 1)."
+    ),
 )
 @fleet_option("The robots that the placeholders of POLICY stand for.")
 @force_option

@@ -209,7 +209,8 @@ HIDDEN_ENCLAVE = FindingKind(
     ERROR,
     "an enclave in a hidden folder",
     "DDS loads the enclave, and a node that names the enclave has its rights. No verb of sros "
-    "lists, renews, revokes or exports the enclave, and the check of enclaves leaves it out.",
+    "lists, renews, revokes or exports the enclave, and `sros check` does not examine its "
+    "certificate and permissions.",
     "rcl 9 (rcl/src/rcl/security.c) takes a folder of any name; sros keystore layout.",
     "Remove the folder. If you need the enclave, create one without a dot in its name (`sros "
     "create_enclave`). If others had access to the folder, replace the CA (`sros rotate_ca`), "
