@@ -5,8 +5,10 @@ from __future__ import annotations
 import os
 import shlex
 import subprocess
+import time
 from collections import Counter
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from contextlib import suppress
 from datetime import timedelta
 from itertools import chain
 from pathlib import Path
@@ -42,6 +44,10 @@ _SYSTEMD_FOLDER = Path("/etc/systemd/system")
 _RESTART_SECONDS = 30.0
 """How long processes that sros restarted may take until they run in their enclaves, or open."""
 
+_SECONDS_BETWEEN = 1.0
+"""Seconds between units that are closed: processes of Fast DDS that start together may miss each
+other."""
+
 _STABLE_FOR = timedelta(seconds=2)
 """How long a process that sros restarted open has to run: many end while they start."""
 
@@ -56,7 +62,13 @@ def apply(robot: LocalRobot, prepared: CloseState, *, dry_run: bool) -> CloseSta
     changes = _write_drop_ins(robot, observed, dry_run=dry_run)
     unsecured = [process for process in observed.processes if not secured.get(process.enclave)]
     open_units = observed._replace(processes=unsecured).units
-    _restart_units(robot, observed, open_units, changed=bool(changes), dry_run=dry_run)
+    idle = {process.unit for process in observed.processes if not (process.pid or process.alike)}
+    restarts = [
+        ["try-restart" if unit in idle else "restart", unit]
+        # A Zenoh router comes first: nodes wait for it.
+        for unit in sorted(open_units, key=lambda unit: (unit not in _router_units(observed), unit))
+    ]
+    _restart_units(robot, restarts, changed=bool(changes), dry_run=dry_run)
     state = prepared._replace(changes=[*prepared.changes, *changes])
     by_hand = dry_run or prepared.pending_by_hand
     proofs = () if by_hand else proofs_of(robot, prepared, _RESTART_SECONDS)
@@ -115,18 +127,26 @@ def undo(robot: LocalRobot, *, dry_run: bool) -> CloseState:
     units = {path.parent.name.removesuffix(".d") for path in drop_ins}
     # A unit without a drop-in still runs closed if an earlier --undo was killed before the restart.
     units |= {process.unit for process in observed.processes if not running.is_open(process)} - {""}
-    _restart_units(robot, observed, units, dry_run=dry_run)
+    policy = _readable_policy(robot)
+    expected = observed.limited_to(policy) if policy else observed
+    units -= (stopped := _stopped_units(units))
+    if stopped := stopped & expected.units:
+        start = shlex.join(["systemctl", "start", *sorted(stopped)])
+        robot.shell.say(
+            f"{enumerated(sorted(stopped))} did not run, and --undo starts no stopped unit; to "
+            f"start open: {start}"
+        )
+    # Open processes of Fast DDS find each other also if they start together.
+    restarts = [["restart", *sorted(units)]] if units else []
+    _restart_units(robot, restarts, changed=bool(drop_ins), dry_run=dry_run)
     started = [process for process in observed.processes if process.unit in units and process.pid]
     if started and not dry_run:
         running = wait_until(
             robot, lambda seen: not [*_processes_not_open(seen, started)], _RESTART_SECONDS
         )
     changes = [FileChange("remove", str(path)) for path in drop_ins]
-    policy = _readable_policy(robot)
     state = current_state(robot, policy)._replace(dry_run=dry_run, changes=changes)
-    remaining = _RemainingProcesses(
-        RunningRobot(robot), observed.limited_to(policy) if policy else observed
-    )
+    remaining = _RemainingProcesses(RunningRobot(robot), expected)
     remaining.say_how_to_start()
     problems = [
         *remaining.commands_to_open(),
@@ -326,28 +346,40 @@ def _drop_ins_of(robot: LocalRobot, observed: ObservedProcesses) -> list[Path]:
     return drop_ins
 
 
-def _restart_units(
-    robot: LocalRobot,
-    observed: ObservedProcesses,
-    units: set[str],
-    *,
-    changed: bool = False,
-    dry_run: bool,
-) -> None:
-    """Restart ``units``, after systemd has read its units again.
+def _router_units(observed: ObservedProcesses) -> set[str]:
+    return {process.unit for process in observed.processes if process.is_router}
 
-    Units whose processes ended by themselves are restarted only if they run. With ``changed``,
-    systemd reads its units again even if no unit is restarted.
+
+def _stopped_units(units: Iterable[str]) -> set[str]:
+    """Return the units that do not run: somebody may have stopped them for a reason.
+
+    The state "failed" does not show that nobody did: many nodes fail when they are stopped.
+    """
+    stopped = set[str]()
+    for unit in units:
+        command = ["systemctl", "show", "--property=ActiveState", "--value", unit]
+        with suppress(OSError):  # the restart reports it
+            state = subprocess.run(command, capture_output=True, check=False).stdout.strip()
+            stopped |= {unit} if state in (b"inactive", b"failed") else set()
+    return stopped
+
+
+def _restart_units(
+    robot: LocalRobot, restarts: Sequence[Sequence[str]], *, changed: bool, dry_run: bool
+) -> None:
+    """Run systemctl with each list of words in ``restarts``, after systemd has read its units.
+
+    Waits a second between two of them. With ``changed``, systemd reads its units again even if no
+    unit is restarted.
 
     Raises:
         SrosError: systemctl cannot be run, or fails.
     """
-    idle = {process.unit for process in observed.processes if not (process.pid or process.alike)}
-    verbs = {"restart": units - idle, "try-restart": units & idle}
-    restarts = [[verb, *sorted(names)] for verb, names in verbs.items() if names]
-    for words in [["daemon-reload"], *restarts] if units or changed else []:
+    for number, words in enumerate([["daemon-reload"], *restarts] if restarts or changed else []):
         command = ["systemctl", *words]
         robot.shell.say(f"{'would run:' if dry_run else '+'} {shlex.join(command)}")
+        if number > 1 and not dry_run:
+            time.sleep(_SECONDS_BETWEEN)
         try:
             status = 0 if dry_run else subprocess.run(command, check=False).returncode
         except OSError as error:

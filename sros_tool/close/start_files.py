@@ -49,16 +49,22 @@ def write_start_files(robot: LocalRobot, state: CloseState) -> list[FileChange]:
     changes = unit_changes(robot.start, files, force=True)
     write_units(robot.start, files, changes)
     written = [FileChange(action, str(robot.start / path)) for path, action in changes.items()]
-    return [*written, *_remove_environments(robot, files)]
+    return [*written, *_remove_earlier_files(robot, files)]
 
 
-def _remove_environments(robot: LocalRobot, kept: Collection[str]) -> list[FileChange]:
-    """Remove the environments that were written here for enclaves without a known process."""
+def _remove_earlier_files(robot: LocalRobot, kept: Collection[str]) -> list[FileChange]:
+    """Remove environments and drop-ins written here for enclaves without a known process."""
     keystore = f"{KEYSTORE}={robot.export.absolute()}\n".encode()
     unneeded = [
         path
         for path in sorted(robot.start.glob("*.env"))
         if path.name not in kept and keystore in read_bytes(path, "environment file")
+    ]
+    unneeded += [
+        path
+        for path in sorted(robot.start.glob(f"units/*.d/{DROP_IN}"))
+        if str(path.relative_to(robot.start)) not in kept
+        and read_bytes(path, "unit").startswith(drop_in_heading(robot).encode())
     ]
     for path in unneeded:
         remove_file(path)

@@ -77,7 +77,11 @@ def ros_node(name: str, participant: str, *endpoints: str) -> Any:
 EVENTS = ("publish rt/parameter_events", "subscribe rt/parameter_events")
 TALKER = ros_node("talker", "010f0000671200000000", "publish rt/chatter")
 LISTENER = ros_node("listener", "010f0000681200000000", "subscribe rt/chatter")
-SYSTEMCTL = '#!/bin/sh\necho "$@" >> {log}\nexit $(cat {status})\n'
+SYSTEMCTL = """#!/bin/sh
+[ $1 = show ] && exec cat {states}/$4 2> /dev/null
+echo "$@" >> {log}
+exit $(cat {status})
+"""
 
 
 def secured(*nodes: tuple[str, str, str, str, list[str]]) -> list[Any]:
@@ -201,6 +205,7 @@ def robot(beside_graph: Beside, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(apply, "_SYSTEMD_FOLDER", tmp_path / "systemd")
     monkeypatch.setattr(apply, "_RESTART_SECONDS", 0.1)
     monkeypatch.setattr(apply, "_STABLE_FOR", timedelta())
+    monkeypatch.setattr(apply, "_SECONDS_BETWEEN", 0)
     monkeypatch.setattr(proof, "_START_SECONDS", 0.1)
     monkeypatch.setattr(state, "_LOOK_SECONDS", 0.01)
     monkeypatch.setattr(proof, "_MOST_TRIES", 1)
@@ -210,7 +215,8 @@ def robot(beside_graph: Beside, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     (tmp_path / "bin").mkdir()
     (tmp_path / "status").write_text("0")
     script = tmp_path / "bin/systemctl"
-    text = SYSTEMCTL.format(log=tmp_path / "systemctl.log", status=tmp_path / "status")
+    files = {"log": "systemctl.log", "status": "status", "states": "."}
+    text = SYSTEMCTL.format_map({name: tmp_path / file for name, file in files.items()})
     script.write_text(text)
     script.chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path / 'bin'}:{os.environ['PATH']}")
@@ -218,6 +224,7 @@ def robot(beside_graph: Beside, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 
 
 UNITS = {"/talker": "talker.service", "/listener": "listener.service"}
+RESTARTS = ("restart listener.service", "restart talker.service")
 
 
 def made(folder: Path) -> list[str]:
@@ -359,6 +366,8 @@ def test_what_is_taken_out_of_the_policy_stays_out(robot: Robot) -> None:
     revoke = "sros revoke robot/keystore /listener"
     mine = robot.folder / "robot/start/mine.env"
     mine.write_text("A=1\n")
+    drop_in = robot.folder / "robot/start/units/listener.service.d/sros-close.conf"
+    assert drop_in.exists()
     first = robot.close("--apply", status=1)
     assert "the keystore has /listener, and the policy does not, so /listener keeps" in first.out
     assert f"{revoke} (then restart all closed processes, " in first.out
@@ -366,6 +375,7 @@ def test_what_is_taken_out_of_the_policy_stays_out(robot: Robot) -> None:
     assert (
         "removed robot/start/listener.env: it was for an enclave without a " in first.err
         and mine.exists()
+        and not drop_in.exists()
     )
     # An enclave that the keystore lost, and did not revoke, keeps its key.
     shutil.copytree(robot.folder / "robot/export/enclaves/talker", robot.folder / LOST)
@@ -410,7 +420,7 @@ def refuse_undo_of_others(robot: Robot) -> None:
     would = robot.close("--apply", "--dry-run").err
     assert f"would replace {drop_in}" in would and would.endswith(": systemctl daemon-reload\n")
     drop_in.write_text(text)
-    assert len(robot.restarts) == 2
+    assert len(robot.restarts) == 3
 
 
 def renew_without_systemd(robot: Robot) -> None:
@@ -444,7 +454,7 @@ def renew_without_hands(robot: Robot) -> None:
 
     class UntilRestarted(set[str]):
         def __contains__(self, enclave: object) -> bool:
-            return len(robot.restarts) == 2
+            return len(robot.restarts) == 3
 
     robot.outdated = UntilRestarted()
     sros("renew", "robot/keystore", "--all-expiring", "400d", cwd=robot.folder).ok()
@@ -456,11 +466,11 @@ def renew_without_hands(robot: Robot) -> None:
     renew_without_systemd(robot)
     said = robot.close("--apply")
     assert keystore.read_bytes() == export.read_bytes()
-    assert robot.restarts[2:] == ["daemon-reload", "restart listener.service talker.service"]
+    assert robot.restarts[3:] == ["daemon-reload", *RESTARTS]
     assert "\nthe robot is closed\n  the files are valid until" in said.err
     robot.outdated = set()
     log = robot.folder / "systemctl.log"
-    log.write_text("".join(log.read_text().splitlines(keepends=True)[:2]))
+    log.write_text("".join(log.read_text().splitlines(keepends=True)[:3]))
 
 
 def test_a_robot_is_closed_proved_and_opened_again(
@@ -474,7 +484,7 @@ def test_a_robot_is_closed_proved_and_opened_again(
     twice["nodes"].append({**twice["nodes"][0], "participant": "of an earlier start"})
     seen.write_text(json.dumps(twice))
     closed = robot.close("--apply")
-    assert robot.restarts == ["daemon-reload", "restart listener.service talker.service"]
+    assert robot.restarts == ["daemon-reload", *RESTARTS]
     assert "First run `loginctl enable-linger robo`, or give the units a sys" in closed.err
     assert closed.out.splitlines()[-6:] == [
         "yes: every process was started in its enclave: 2 enclaves, and no open process in "
@@ -495,7 +505,7 @@ def test_a_robot_is_closed_proved_and_opened_again(
         closed.err,
     )
     robot.close("--apply")
-    assert len(robot.restarts) == 2  # they run in their enclaves already
+    assert len(robot.restarts) == 3  # they run in their enclaves already
     renew_without_hands(robot)
     (robot.folder / "robot/keystore").rename(robot.folder / "home")
     policy = robot.folder / "robot/policy.xml"
@@ -526,21 +536,30 @@ def test_a_robot_is_closed_proved_and_opened_again(
     refuse_undo_of_others(robot)
     undone = robot.close("--undo")
     assert [*robot.folder.glob("systemd/*.d/*")] == []
-    assert robot.restarts[2:] == ["daemon-reload", "restart listener.service talker.service"]
+    assert robot.restarts[3:] == ["daemon-reload", "restart listener.service talker.service"]
     assert undone.err.count("removed ") == 2
     robot.close("--undo")
-    assert len(robot.restarts) == 4, "they run open already"
+    assert len(robot.restarts) == 5, "they run open already"
     robot.absent = {"/talker"}
     robot.more = (replace(robot.process("/talker", is_secured=False), pid=12, user=12),)
+    policy.write_text(signed.replace('"/talker"', '"/other"'))
+    for stopped in ("inactive", "failed"):
+        (robot.folder / "talker.service").write_text(f"{stopped}\n")
+        assert "talker.service" not in robot.close("--undo").err, "its enclave was taken away"
+    policy.write_text(signed)
+    stays = "did not run, and --undo starts no stopped unit; to start open: systemctl start talk"
+    assert stays in robot.close("--undo").err
+    assert len(robot.restarts) == 5
+    (robot.folder / "talker.service").unlink()
     ended = "/talker does not run open, though talker.service was restarted: systemctl status talk"
     assert ended in robot.close("--undo", status=1).out
-    assert robot.restarts[4:] == ["daemon-reload", "restart talker.service"]
+    assert robot.restarts[5:] == ["daemon-reload", "restart talker.service"]
     robot.absent, robot.more = set(), ()
-    (robot.folder / "systemctl.log").write_text("before\n" * 4)
+    (robot.folder / "systemctl.log").write_text("before\n" * 5)
     robot.by_hand = {"/talker"}
     still = "process 4711 (run) still runs in /talker: stop it if talker.service did not start it"
     assert still in robot.close("--undo", status=1).out
-    assert robot.restarts[4:] == ["daemon-reload", "restart talker.service"]
+    assert robot.restarts[5:] == ["daemon-reload", "restart talker.service"]
     processes = robot.folder / "robot/processes.json"
     processes.rename(robot.folder / "processes.json")  # as if it was broken, and removed
     assert "the robot runs closed" in robot.close("--for", "1s", status=2).err
@@ -1644,7 +1663,7 @@ def test_a_dry_run_changes_nothing(robot: Robot) -> None:
     ended = robot.close("--apply", "--dry-run")
     assert "kept: sros create_keystore" in ended.err
     assert "/listener would lose: subscribe topic /chatter\n" in ended.err
-    assert "would run: systemctl restart listener.service talker.service" in ended.err
+    assert "would run: systemctl restart listener.service\nwould run: systemctl rest" in ended.err
     assert snapshot(robot.folder) == before
     stops_as_the_run_stops(robot, policy, signed)
     policy.write_text(signed)
