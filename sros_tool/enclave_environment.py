@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 from sros_tool.errors import KeystoreError, Note, UsageError
 from sros_tool.keystore.layout import PERMISSIONS_FILE, remedy_in_keystore
 from sros_tool.keystore.reader import read_consistently
-from sros_tool.owners import other_writers
+from sros_tool.owners import closing_command, other_writers
 from sros_tool.wording import first_few
 
 if TYPE_CHECKING:
@@ -224,7 +224,7 @@ def _refuse_folders_writable_by_others(
             raise KeystoreError(
                 f"others can replace the files of enclave {name}",
                 f"'{path}': {why}. Whoever replaces files decides whom the process trusts.",
-                f"Run `chmod go-w {quote(str(path))}`, then `sros verify "
+                f"Run `{closing_command(path, trusted)}`, then `sros verify "
                 f"{quote(str(keystore.root))}`.{how_to_accept}",
             )
         if path == keystore.root:

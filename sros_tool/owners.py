@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
+from shlex import quote
 
 from sros_tool.errors import KeystoreError
 
@@ -36,6 +37,16 @@ def other_writers(state: os.stat_result, trusted_users: frozenset[int]) -> str:
     if state.st_mode & stat.S_IWGRP and not _is_private_group(state.st_gid, trusted_users):
         return f"{mode}, so the group {_group_name(state.st_gid)} can write"
     return ""
+
+
+def closing_command(path: Path, trusted_users: frozenset[int]) -> str:
+    """Return the command that takes the right to change ``path`` from other users.
+
+    If one of them owns ``path``, the command makes the present user its owner.
+    """
+    if path.lstat().st_uid not in trusted_users:
+        return f"sudo chown -h {user_name(os.geteuid()).split()[-1]} {quote(str(path))}"
+    return f"chmod go-w {quote(str(path))}"
 
 
 def is_for_root_alone(mode: int) -> bool:

@@ -50,9 +50,13 @@ from sros_tool.agent.running import (
 from sros_tool.agent.settings import AgentSettings, agent_folder
 from sros_tool.agent.state import (
     CopiedKey,
+    enclave_digests,
     mark_outdated,
     read_seal,
     read_state,
+    revoked_serials,
+    robot_in_seal,
+    sha256_of,
     write_seal,
     write_state,
 )
@@ -67,7 +71,6 @@ from sros_tool.errors import SrosError, UnavailableError
 from sros_tool.files import remove_file, replace_file, staged_file
 from sros_tool.folders import Folder
 from sros_tool.keystore.confirmation import (
-    CONFIRMED_FILES,
     LONGEST_LIST,
     LONGEST_SEAL,
     MESSAGE_FILE,
@@ -99,7 +102,6 @@ from sros_tool.keystore.layout import (
     KEY_FILE,
     KEY_URI_FILE,
     PERMISSIONS_CA_FILE,
-    PERMISSIONS_FILE,
     ROUTER_FILE,
     enclave_folder,
     enclave_path,
@@ -116,7 +118,7 @@ from sros_tool.pki.certificates import (
     pem,
     validity_of,
 )
-from sros_tool.pki.crl import list_number, load_crls, newest_list, read_lists
+from sros_tool.pki.crl import list_number, newest_list
 from sros_tool.pki.keys import PrivateKey, generate_key, key_pem, load_key
 from sros_tool.pki.token import Secrets, open_enclave_key, place_in_file
 from sros_tool.runtime.processes import RunningProcesses, boot_id
@@ -126,12 +128,6 @@ from sros_tool.xml import read_bytes
 
 _CLOCK_TOLERANCE = timedelta(minutes=2)
 _LOOK_SECONDS = 0.2
-_TRUST_FILES = tuple(
-    file
-    for file in CONFIRMED_FILES
-    if file not in (CERTIFICATE_FILE, PERMISSIONS_FILE, GOVERNANCE_FILE)
-)
-"""Files of an enclave that decide whom it trusts: CAs and revocation list."""
 _GRAVEST_FILES = (CRL_FILE, IDENTITY_CA_FILE, PERMISSIONS_CA_FILE, GOVERNANCE_FILE)
 """The files that are named first if they were changed: they decide for all other enclaves, too."""
 _MOST_COPIED = 4000
@@ -479,7 +475,7 @@ class _Round:
             with Folder(self._folder) as opened:
                 newer = self._newer_enclaves()
                 others = (_certificate_path(name) for name in self._enclaves() if name not in newer)
-                present = {path: _sha256(opened, path) for path in (*released, *others)}
+                present = {path: sha256_of(opened, path) for path in (*released, *others)}
         except (SrosError, OSError):
             return None
         return {path: sha256 for path, sha256 in present.items() if sha256 != released.get(path)}
@@ -620,7 +616,7 @@ class _Round:
         if not keys:
             return []
         now, latest = self._machine.now, self._state.latest
-        revoked = _revoked_serials(self._revocation_lists(self._enclaves()) or "")
+        revoked = revoked_serials(self._revocation_lists(self._enclaves()) or "")
         return [
             key
             for key in keys
@@ -642,6 +638,14 @@ class _Round:
     def _install(self, release: Release, certain_time: datetime) -> Installation:
         settings, state = self._settings, self._state
         if release.number == state.accepted and self._differs_from_accepted_release(release):
+            installed_robot = robot_in_seal(self._folder)
+            if installed_robot not in ("", release.robot):
+                self._problems.append(
+                    f"'{self._folder}' has the files of robot {installed_robot}, and its agent is "
+                    f"set up for {release.robot}. Nothing was changed. Check whether this robot "
+                    "has the right name (`sros agent init --robot`)."
+                )
+                return Installation()
             self._problems.append(
                 f"The published release has the number {release.number} {OF_SAME_NUMBER}: the "
                 "keystore comes from a backup, or somebody else publishes. Nothing was changed. On "
@@ -748,7 +752,7 @@ class _Round:
         ``changed`` are the enclaves whose files the agent changed.  Changes that other programs
         made are found by the digests of the files.
         """
-        before, files = self._state.files, self._digests(names)
+        before, files = self._state.files, enclave_digests(self._folder, names)
         changed = {*changed}
         new_files, moment = {*changed}, _since_boot()
         due = {*self._state.due, *changed} & files.keys()
@@ -776,30 +780,6 @@ class _Round:
             list_since={name: list_since[name] for name in files if name in list_since},
             files=files,
         )
-
-    def _digests(self, names: Iterable[str]) -> dict[str, str]:
-        """Map each enclave to two digests: of its files without the key, and of its trust files.
-
-        Both are in one text, with a space between them. The trust files decide which other enclaves
-        the enclave accepts. Of a revocation list, only the revoked certificates count: a list that
-        was only signed again makes no restart due.
-        """
-        with Folder(self._folder) as opened:
-            return {
-                name: " ".join(
-                    hashlib.sha256(
-                        " ".join(
-                            read_digest(opened, f"{enclave_folder(name)}/{file}") or "-"
-                            for file in files
-                        ).encode()
-                    ).hexdigest()
-                    for files, read_digest in (
-                        (CONFIRMED_FILES, _sha256),
-                        (_TRUST_FILES, _trust_digest),
-                    )
-                )
-                for name in names
-            }
 
     def _enclaves(self) -> tuple[str, ...]:
         """Return the enclaves with a certificate, in which processes can run."""
@@ -996,7 +976,7 @@ class _Round:
     def _drop_replaced_list(self, names: Iterable[str]) -> None:
         """Remove the kept revocation list if the current list revokes all of its certificates."""
         kept, present = self._replaced_list(), self._revocation_lists(names)
-        if kept and present and _revoked_serials(kept) <= _revoked_serials(present):
+        if kept and present and revoked_serials(kept) <= revoked_serials(present):
             with suppress(OSError):
                 remove_file(agent_folder(self._folder) / _REPLACED_LIST)
 
@@ -1136,39 +1116,6 @@ def _repaired_rank(path: str) -> int:
 
 def _certificate_path(name: str) -> str:
     return f"{enclave_folder(name)}/{CERTIFICATE_FILE}"
-
-
-def _sha256(folder: Folder, path: str) -> str:
-    """Return the SHA-256 of a file; "" if it is missing or cannot be read."""
-    with suppress(SrosError, OSError):
-        return hashlib.sha256(folder.read_inside(path)).hexdigest()
-    return ""
-
-
-def _trust_digest(folder: Folder, path: str) -> str:
-    """Return the digest by which a change of a trust file is noticed.
-
-    For a revocation list that a CA of the enclave signed, the digest is only of the revoked serial
-    numbers; otherwise it is of the whole file.
-    """
-    place, _, file = path.rpartition("/")
-    with suppress(SrosError, OSError):
-        data = folder.read_inside(path) if file == CRL_FILE else b""
-        signed = newest_list(data, folder.read_inside(f"{place}/{IDENTITY_CA_FILE}"))
-        if signed is not None and len(read_lists(data, "here")) == 1:
-            revoked = sorted(_revoked_serials(data.decode()))
-            return hashlib.sha256(
-                f"{signed.issuer.public_bytes()!r} {revoked}".encode()
-            ).hexdigest()
-    return _sha256(folder, path)
-
-
-def _revoked_serials(text: str) -> frozenset[int]:
-    """Return the serial numbers in revocation lists (PEM); none if one cannot be read."""
-    with suppress(SrosError):
-        lists = load_crls(text.encode(), "here")
-        return frozenset(entry.serial for crl in lists for entry in crl.revoked)
-    return frozenset()
 
 
 def _enclave_expiry(enclave: InstalledEnclave | None) -> EnclaveExpiry:

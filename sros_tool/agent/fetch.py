@@ -9,6 +9,7 @@ Whether the permissions CA sealed the release is verified where it is installed.
 from __future__ import annotations
 
 import hashlib
+import ssl
 import stat
 from contextlib import suppress
 from datetime import datetime
@@ -310,6 +311,8 @@ def _read_archive(path: Path, robot: str, number: int) -> Release:
     return release
 
 
+_DATE_ERRORS = (9, 10)
+"""Errors of OpenSSL for a certificate that is not yet valid, or has expired (x509_vfy.h)."""
 _SET_CLOCK = "set the clock of this robot, if it is wrong"
 
 
@@ -350,7 +353,14 @@ def _fetch_error(error: Exception, source: str, now: datetime) -> FetchError:
             "`sros distribute_key KEYSTORE --robot ROBOT FOLDER --force`.",
         )
     if isinstance(error, exceptions.DownloadError):
-        return FetchError(FetchProblem.UNREACHABLE, f"{source} cannot be fetched from", why)
+        what = f"{source} cannot be fetched from"
+        cause = error.__cause__
+        if isinstance(cause, ssl.SSLCertVerificationError) and cause.verify_code in _DATE_ERRORS:
+            why = f"{why} The clock here shows {iso(now)}."
+            remedy = f"{_SET_CLOCK[:1].upper()}{_SET_CLOCK[1:]}. If it is correct, renew the "
+            remedy += "certificate of the server."
+            return FetchError(FetchProblem.UNREACHABLE, what, why, remedy)
+        return FetchError(FetchProblem.UNREACHABLE, what, why)
     if isinstance(error, OSError):
         return FetchError(
             FetchProblem.NOT_KEPT,

@@ -20,7 +20,7 @@ from sros_tool.fleet.robots import name_problem
 from sros_tool.folders import Folder
 from sros_tool.keystore.layout import AGENT
 from sros_tool.names import check_enclave_name
-from sros_tool.owners import other_writers, replaceable_on_the_way, user_name
+from sros_tool.owners import closing_command, other_writers, replaceable_on_the_way, user_name
 from sros_tool.xml import read_bytes
 
 SETTINGS_FILE = "agent.toml"
@@ -95,7 +95,8 @@ def check_owner(folder: Path) -> None:
                 f"others can change '{path}'",
                 f"{why[:1].upper()}{why[1:]}. Such users could choose whom the agent trusts, and "
                 "which commands it runs.",
-                f"Remove their right to write: `chmod go-w {path}`.",
+                f"Run `{closing_command(path, trusted)}`, or set up the agent in a folder that "
+                "only this user and root can change.",
             )
 
 

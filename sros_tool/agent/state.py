@@ -7,13 +7,15 @@ numbers of messages follow the clock.
 from __future__ import annotations
 
 import fcntl
+import hashlib
 import json
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, fields, replace
 from datetime import datetime, timedelta
 from pathlib import Path
+from shlex import quote
 from typing import Any, NamedTuple
 
 from sros_tool.agent.settings import agent_folder, read_settings
@@ -21,23 +23,37 @@ from sros_tool.checks.keystores.arrival import installed_sentences
 from sros_tool.errors import KeystoreError, SrosError
 from sros_tool.files import staged_file
 from sros_tool.folders import Folder
-from sros_tool.keystore.confirmation import COULD_NOT_START
+from sros_tool.keystore.confirmation import CONFIRMED_FILES, COULD_NOT_START
 from sros_tool.keystore.delivery.published import MOST_NUMBER
 from sros_tool.keystore.delivery.release import sealed_robot
 from sros_tool.keystore.layout import (
+    CERTIFICATE_FILE,
+    CRL_FILE,
+    GOVERNANCE_FILE,
+    IDENTITY_CA_FILE,
+    PERMISSIONS_FILE,
     RELEASE_SEAL,
+    enclave_folder,
     enclave_names,
     enclave_path,
     waits_for_answer,
 )
 from sros_tool.names import check_enclave_name
+from sros_tool.pki.crl import load_crls, newest_list, read_lists
 from sros_tool.validity import parse_iso
 from sros_tool.values import DryRun, FileChanges, Notes, as_plain, parse_json
+from sros_tool.wording import first_few
 from sros_tool.xml import read_bytes
 
 _STATE_FILE = "state.json"
 _LOCK_FILE = "lock"
 _FORMAT = 1
+_TRUST_FILES = tuple(
+    file
+    for file in CONFIRMED_FILES
+    if file not in (CERTIFICATE_FILE, PERMISSIONS_FILE, GOVERNANCE_FILE)
+)
+"""Files of an enclave that decide whom it trusts: CAs and revocation list."""
 _LONGEST_UPTIME = 1e10  # seconds
 
 
@@ -223,6 +239,31 @@ def read_seal(folder: Path) -> bytes:
     return b""
 
 
+def robot_in_seal(folder: Path) -> str:
+    """Return the robot of the release that was accepted last; "" if it is not known."""
+    with suppress(SrosError):
+        return sealed_robot(read_seal(folder)).robot
+    return ""
+
+
+def refuse_files_of_other_robot(folder: Path, robot: str) -> None:
+    """Raise `KeystoreError` if a folder has the enclaves of another robot than ``robot``.
+
+    The seal of the last release has the robot's name.  A robot that got another name keeps the
+    enclaves whose paths do not have its former name.
+    """
+    before = robot_in_seal(folder)
+    named = {part for name in enclave_names(folder) for part in name.split("/")}
+    if before and before != robot and before in named and robot not in named:
+        raise KeystoreError(
+            f"'{folder}' has the enclaves of robot {before}, not of {robot}",
+            f"An agent for {robot} could not install anything there. Nothing was changed.",
+            f"Give --robot {before}. If this computer is {robot} now, choose an empty folder, and "
+            f"bring the enclaves of {robot} there (`sros distribute_key KEYSTORE --robot {robot} "
+            "FOLDER`).",
+        )
+
+
 def write_seal(folder: Path, seal: bytes) -> None:
     """Write the seal of the accepted release into the folder.
 
@@ -232,6 +273,64 @@ def write_seal(folder: Path, seal: bytes) -> None:
     if read_seal(folder) != seal:
         with staged_file(agent_folder(folder) / RELEASE_SEAL, seal, mode=0o644) as put_in_place:
             put_in_place()
+
+
+def enclave_digests(folder: Path, names: Iterable[str]) -> dict[str, str]:
+    """Map each enclave to two digests: of its files without the key, and of its trust files.
+
+    Both are in one text, with a space between them. The trust files decide which other enclaves
+    the enclave accepts. Of a revocation list, only the revoked certificates count: a list that
+    was only signed again makes no restart due.
+    """
+    with Folder(folder) as opened:
+        return {
+            name: " ".join(
+                hashlib.sha256(
+                    " ".join(
+                        read_digest(opened, f"{enclave_folder(name)}/{file}") or "-"
+                        for file in files
+                    ).encode()
+                ).hexdigest()
+                for files, read_digest in (
+                    (CONFIRMED_FILES, sha256_of),
+                    (_TRUST_FILES, _trust_digest),
+                )
+            )
+            for name in names
+        }
+
+
+def sha256_of(folder: Folder, path: str) -> str:
+    """Return the SHA-256 of a file; "" if it is missing or cannot be read."""
+    with suppress(SrosError, OSError):
+        return hashlib.sha256(folder.read_inside(path)).hexdigest()
+    return ""
+
+
+def _trust_digest(folder: Folder, path: str) -> str:
+    """Return the digest by which a change of a trust file is noticed.
+
+    For a revocation list that a CA of the enclave signed, the digest is only of the revoked serial
+    numbers; otherwise it is of the whole file.
+    """
+    place, _, file = path.rpartition("/")
+    with suppress(SrosError, OSError):
+        data = folder.read_inside(path) if file == CRL_FILE else b""
+        signed = newest_list(data, folder.read_inside(f"{place}/{IDENTITY_CA_FILE}"))
+        if signed is not None and len(read_lists(data, "here")) == 1:
+            revoked = sorted(revoked_serials(data.decode()))
+            return hashlib.sha256(
+                f"{signed.issuer.public_bytes()!r} {revoked}".encode()
+            ).hexdigest()
+    return sha256_of(folder, path)
+
+
+def revoked_serials(text: str) -> frozenset[int]:
+    """Return the serial numbers in revocation lists (PEM); none if one cannot be read."""
+    with suppress(SrosError):
+        lists = load_crls(text.encode(), "here")
+        return frozenset(entry.serial for crl in lists for entry in crl.revoked)
+    return frozenset()
 
 
 @contextmanager
@@ -344,8 +443,17 @@ def _present_problems(folder: Path, state: AgentState, now: datetime) -> Iterato
     names = [n for n in enclave_names(folder) if not waits_for_answer(enclave_path(folder, n))]
     for name in sorted(state.files.keys() - {*names}):
         yield f"{name} had a certificate in the last round of the agent, and has none now."
+    digests = enclave_digests(folder, names)
+    changed = {name for name in names if digests[name] != state.files.get(name, digests[name])}
     known = {*state.problems}
     subjects = {text.partition(COULD_NOT_START)[0] for text in known if COULD_NOT_START in text}
     for sentence in installed_sentences(folder, names, now):
         if sentence not in known and sentence.partition(COULD_NOT_START)[0] not in subjects:
             yield sentence
+            changed -= {name for name in changed if name in sentence}
+    if changed:
+        yield (
+            f"Files of {first_few(sorted(changed), 3)} were changed after the last round of the "
+            f"agent. Run `sros agent run {quote(str(folder))} --once`: the agent then restores the "
+            "files of the release, or reports what differs."
+        )

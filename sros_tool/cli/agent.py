@@ -161,7 +161,12 @@ def _init(
         settings_from,
         write_settings,
     )
-    from sros_tool.agent.state import InitializedAgent, read_state, write_state
+    from sros_tool.agent.state import (
+        InitializedAgent,
+        read_state,
+        refuse_files_of_other_robot,
+        write_state,
+    )
     from sros_tool.files import parse_toml
     from sros_tool.keystore.delivery.robot import read_pinned_cas
 
@@ -172,6 +177,7 @@ def _init(
             "Name the folder that the enclaves of this robot are in, or will be in.",
         )
     check_owner(folder)
+    refuse_files_of_other_robot(folder, robot)
     if not authorities and not has_permissions_ca(folder):
         raise UsageError(
             f"'{folder}' has no permissions CA, so this robot could trust no release",

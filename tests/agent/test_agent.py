@@ -247,6 +247,13 @@ def test_rounds_follow_what_home_publishes(home: Home, r1: Robot) -> None:
     (readable,) = agent_status(r1.folder, now=moment(), oldest=timedelta(days=1)).problems
     assert "enclaves/r1/a/key.pem" in readable
     (folder / "key.pem").chmod(0o600)
+    crl = (folder / "crl.pem").read_bytes()
+    (folder / "crl.pem").unlink()
+    (changed,) = agent_status(r1.folder, now=moment(), oldest=timedelta(days=1)).problems
+    assert changed.startswith("Files of /r1/a were changed after the last round"), (
+        "as with an older list"
+    )
+    (folder / "crl.pem").write_bytes(crl)
     (folder / "request.pem").touch()
     for remove, path in ((os.remove, folder / "cert.pem"), (shutil.rmtree, folder)):
         remove(path)
@@ -1307,7 +1314,7 @@ def test_wrong_settings_are_refused(text: str, r1: Robot) -> None:
 @pytest.mark.parametrize("of_others", ["", ".agent", ".agent/agent.toml"])
 def test_settings_that_others_can_change_are_not_used(of_others: str, r1: Robot) -> None:
     os.chown(r1.folder / of_others, 1000, 1000)
-    with pytest.raises(KeystoreError, match=r"belongs to|can change"):
+    with pytest.raises(KeystoreError, match=r"belongs to|can change.*`sudo chown -h root "):
         read_settings(r1.folder)
 
 

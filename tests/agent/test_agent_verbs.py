@@ -225,6 +225,22 @@ def test_a_release_of_which_an_enclave_lacks_its_key(world: World) -> None:
     )
 
 
+def test_a_folder_of_another_robot_gets_no_agent(world: World) -> None:
+    """Nor advice to publish with --restored, because both releases have the same number."""
+    world.run(*INIT).ok()
+    world.agent("--restarted").ok()
+    other = [word if word != "r1" else "r2" for word in INIT]
+    before = snapshot(world.folder / "robot/.agent")
+    refused = world.run(*other, "--force")
+    assert refused.status == 2 and "has the enclaves of robot r1, not of r2" in refused.err
+    assert snapshot(world.folder / "robot/.agent") == before
+    settings = world.folder / "robot/.agent/agent.toml"
+    settings.write_text(settings.read_text().replace('"r1"', '"r2"'))
+    ended = world.agent()
+    assert "has the files of robot r1, and its agent is set up for r2" in ended.err
+    assert "--restored" not in ended.err
+
+
 def test_a_keystore_with_its_cas_gets_no_release(world: World) -> None:
     words = [word if word != "robot" else "ks" for word in INIT]
     world.run(*words).ok()

@@ -14,14 +14,22 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from datetime import UTC, datetime
 from functools import partial
 from http.server import BaseHTTPRequestHandler, SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import pytest
+from tuf.api import exceptions
 
 from sros_tool.agent import connection
-from sros_tool.agent.fetch import ClientCertificate, FetchError, FetchProblem, pin_root
+from sros_tool.agent.fetch import (
+    ClientCertificate,
+    FetchError,
+    FetchProblem,
+    _fetch_error,
+    pin_root,
+)
 from sros_tool.errors import UnavailableError, UsageError
 from sros_tool.keystore.delivery.release import (
     Release,
@@ -383,6 +391,18 @@ def test_tls_with_the_certificate_of_an_enclave(publisher: Home, tmp_path: Path)
         assert "certificate" in error.why
         missing = own._replace(key=tmp_path / "none")
         robot.refuses(FetchProblem.UNREACHABLE, address, client_certificate=missing)
+
+
+def test_a_wrong_clock_and_the_certificate_of_the_server() -> None:
+    """Only for a date that is wrong, the clock may be the cause."""
+    for code, clock_is_named in ((9, True), (10, True), (20, False)):
+        cause = ssl.SSLCertVerificationError()
+        cause.verify_code, cause.verify_message = code, "certificate is not valid"
+        error = exceptions.DownloadError("its certificate is not valid")
+        error.__cause__ = cause
+        found = str(_fetch_error(error, "https://home/pub", datetime(2027, 1, 1, tzinfo=UTC)))
+        assert ("The clock here shows 2027-01-01" in found) == clock_is_named, found
+        assert ("Set the clock of this robot" in found) == clock_is_named, found
 
 
 # ── on the robot ───────────────────────────────────────────────────────────────────────────

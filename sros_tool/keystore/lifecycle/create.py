@@ -93,7 +93,7 @@ from sros_tool.keystore.settings import edit_remedy, find_edits, with_key_places
 from sros_tool.keystore.template import NODE_BASICS, Template, template_names
 from sros_tool.keystore.transaction import recover_keystore
 from sros_tool.names import check_enclave_name
-from sros_tool.owners import other_writers, replaceable_on_the_way
+from sros_tool.owners import closing_command, other_writers, replaceable_on_the_way
 from sros_tool.parallel import Progress
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import (
@@ -653,7 +653,7 @@ def _folder_owner_notes(root: Path) -> Iterator[Note]:
         yield Note(
             "keystore.replaceable",
             f"other users can put another keystore in the place of '{root}', because they can "
-            f"change '{folder}': {why}. Run `chmod go-w {quote(str(folder))}`, or move the "
+            f"change '{folder}': {why}. Run `{closing_command(folder, trusted)}`, or move the "
             "keystore to a folder that only you and root can change.",
         )
 
