@@ -757,7 +757,7 @@ def enclave_of_node(file: Path, command: Sequence[str]) -> str:
     ns, name = nodes[""]
     full = _full_name(ns, name)
     why = "A process runs in one enclave."
-    remedy = f'Give the node a profile in one enclave: `<profile ns="{ns}" node="{name}">`.'
+    remedy = f'Give the node a profile in exactly one enclave: `<profile ns="{ns}" node="{name}">`.'
     if enclaves:
         where = f"in {len(enclaves)} enclaves: {first_few(enclaves, 3)}"
     else:

@@ -109,7 +109,7 @@ class Fault(Enum):
     FILE_UNREADABLE = (
         "file-unreadable",
         "a file of an enclave cannot be read",
-        "DDS cannot read it either.",
+        "A node of the same user cannot read it either.",
         _SOURCE_RCL,
         "Allow the user that runs the node to read the file.",
     )
@@ -294,7 +294,8 @@ class Fault(Enum):
     SIGNATURE = (
         "signature",
         "a document whose signature does not verify",
-        "The document was changed, or another CA signed it: find out who. The node fails (Fast "
+        "The document was changed, or another CA signed it: find out who did this. The node fails "
+        "(Fast "
         "DDS: PKCS7 data verification failed). With a single CA, an enclave may have signed its "
         "own permissions, which some vendors accept.",
         "DDS-Security 1.1, 9.4.1.1; Fast DDS 2.14.5; CVE-2023-24011 for Cyclone DDS 0.10.2.",
@@ -437,7 +438,7 @@ class Fault(Enum):
         "The node starts, and the handshake with its peers never finishes, if the permissions and "
         "the certificate do not fit into one message of 64 KB.",
         "Fast DDS 2.9.1; tested.",
-        "Make the permissions smaller (use wildcards), or split the enclave into several.",
+        "Make the permissions smaller (use wildcards), or split the enclave into several enclaves.",
     )
 
     def __new__(cls, identifier: str, *_: object) -> Fault:

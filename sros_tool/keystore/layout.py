@@ -403,7 +403,7 @@ class UnreadPath(NamedTuple):
         return (
             "Run sros as the owner of the file. If you may only look, ask the owner for a copy "
             "without private keys (docs/keystores.md). If files belong to several users, give all "
-            f"to one: `sudo chown -R USER {quote(str(root))}`."
+            f"files to one user: `sudo chown -R USER {quote(str(root))}`."
         )
 
 

@@ -461,7 +461,7 @@ def refuse_lost_changes(
             )
     if what:
         raise KeystoreError(
-            f"'{folder}' cannot be published yet: after the backup, {'; '.join(what)}",
+            f"nothing can be published in '{folder}' yet: after the backup, {'; '.join(what)}",
             "Publishing would undo this.",
             f"{' '.join(steps)} Then repeat this command, with --restored.",
         )
@@ -525,7 +525,7 @@ def check_authorities(keystore: OpenedKeystore, folder: Path, last: Release) -> 
     raise KeystoreError(
         f"{names} {'was' if len(roles) == 1 else 'were'} replaced after the backup of the "
         f"keystore '{keystore.root}'",
-        f"The last release in '{folder}' trusts {later_ones}. Publishing would put "
+        f"With the last release in '{folder}', robots trust {later_ones}. Publishing would put "
         "robots back on an earlier CA, whose key somebody may have copied.",
         "Restore a backup from after the rotation. If there is none, repeat later "
         f"revocations, repeat the rotation (`sros rotate_ca {where}{flag} --finish "

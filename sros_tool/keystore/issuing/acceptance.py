@@ -245,11 +245,12 @@ def _refused_change_error(
     }
     whose = "its" if len(names) == 1 else "their"
     options = " ".join(f"--allow-refusal {word}" for word in words_of(refused))
+    titles = enumerated(joined_titles(vendor.title for vendor in refused))
     return KeystoreError(
-        f"after this change, no node could start in {_names_text(names)} of '{root}'",
+        f"after this change, nodes on {titles} could not start in {_names_text(names)} of '{root}'",
         f"{_refusal_clauses(why, f'{whose} new files')}. Nothing was changed.",
         f"{remedy or 'Replace the file that the error names.'} If no node runs on "
-        f"{enumerated(joined_titles(vendor.title for vendor in refused))}, add {options}.",
+        f"{titles}, add {options}.",
     )
 
 
