@@ -685,7 +685,7 @@ def test_revoking_after_a_restore_covers_certificates_of_after_the_backup(
     if not revoked_first:
         said = publisher.run(*revoke).err
         assert "may lack earlier certificates: the keystore was restored from a backup" in said
-        assert "see `sros rotate_ca`" in said
+        assert "their CA is replaced (`sros rotate_ca`)" in said
     publisher.run("renew", "ks", "--all")
     publisher.publish()
     release = publisher.robot("r1").gets()
@@ -1434,7 +1434,7 @@ def test_a_restored_keystore_makes_no_key_for_a_robot_that_made_its_own(publishe
     backup.rename(root)
     notes = {note.id: note.text for note in publisher.publish(restored=True).notes}
     assert (
-        "if the robot made its keys, sign its requests again (`sros sign_request "
+        "if it made its keys, sign its requests again (`sros sign_request "
         in (notes["fleet.certificates-restored"])
     )
     refused = sros(*generate, cwd=publisher.folder)
