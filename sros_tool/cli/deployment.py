@@ -552,10 +552,10 @@ def import_verb(
     """On a robot: install the answer of `sign_request` next to the key in DIR.
 
     ANSWER is the file with the answer, or - for standard input.  sros first checks the
-    certificate's key and chain, the signatures and the validity, and that the archive has no other
-    files.  If a check fails, nothing changes.  The first answer sets the CAs that the robot trusts:
-    give --ca, or an attacker could replace this answer on its way.  Later answers must come from
-    the same CAs.
+    certificate's key and chain, the signatures and the validity, and that the archive has no
+    unexpected files.  If a check fails, nothing changes.  The first answer sets the CAs that the
+    robot trusts: give --ca, or an attacker could replace this answer on its way.  Later answers
+    must come from the same CAs.
 
     Example:
       $ sros import request.answer.tar.gz robot

@@ -296,9 +296,9 @@ def _collect(
     INBOX is a folder with ROBOT/confirmation.p7s of each robot that runs `sros agent`. sros reads
     only the messages of robots in the fleet of KEYSTORE. sros accepts the message of a robot if an
     enclave of that robot signed it, with a certificate that this keystore issued and did not
-    revoke. The message must be later than the robot's last message. sros signs requests for renewal
-    if the fleet file has renewal = "allowed" for the robot; rights do not change. A refused message
-    does not stop the others.
+    revoke. The message must be later than the last one that sros accepted. sros signs requests for
+    renewal if the fleet file has renewal = "allowed" for the robot; rights do not change. A refused
+    message does not stop the others.
 
     Example:
       $ sros fleet collect keystore inbox

@@ -1012,7 +1012,7 @@ def access_summary(growth: Growth) -> str:
         pairs = len(growth.reach)
         text = "1 enclave can influence another one"
         parts.append(
-            (text if pairs == 1 else f"in {pairs} pairs, an enclave can influence the other")
+            (text if pairs == 1 else f"in {pairs} pairs of enclaves, one can influence the other")
             + " now"
         )
     if growth.added and growth.reach_unknown:

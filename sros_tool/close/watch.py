@@ -239,7 +239,7 @@ def _show_variables(running: RunningRobot, observed: ObservedProcesses) -> None:
         robot.shell.say(
             f"{enumerated(labels)} {'run' if len(labels) > 1 else 'runs'} with variables that this "
             f"shell does not have, and that the start commands in {robot.commands_file} do not "
-            f"set: {first_few(names, MOST_NAMES)}"
+            f"set: {first_few(names, MOST_NAMES)}; before you start a process, set what it needs"
         )
 
 

@@ -533,7 +533,7 @@ class Examiner:
             add = f": {renamed_action_text(rule)}"
             renamed = f" If the node's command renames the action{add}"
             if len(own) == 1:
-                only = [f"the enclave may {question.word} only action {meant}"]
+                only = [f"by exact name, the enclave may {question.word} only action {meant}"]
                 renamed = f" If the policy means this action by {meant}{add}"
         if names:
             is_meant = f"{' and '.join(names)}: perhaps that is meant"
@@ -556,7 +556,7 @@ class Examiner:
             place = self._keystore.kind
             facts = [f"no enclave of the {place} may {PEER_RIGHT[denied.right]} {name}"]
             if len(own) == 1:
-                facts.append(f"the enclave may {question.word} only {own[0]}")
+                facts.append(f"by exact name, the enclave may {question.word} only {own[0]}")
             if place == "export":
                 remedy = (
                     "If the enclave at the other end is not in this export (it may be on another "

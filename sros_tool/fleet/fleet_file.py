@@ -467,7 +467,7 @@ class _Inventory:
         """Read a group; it inherits ``variables`` from the ``parent_groups`` that contain it."""
         self._count_step()
         if name in parent_groups or len(parent_groups) > _MAX_DEPTH:
-            raise self._error(f"the group {name} contains itself, or is in too many other groups")
+            raise self._error(f"the group {name} contains itself, or is nested too deeply")
         if not isinstance(group, dict):
             group = (
                 {"hosts": group} if isinstance(group, list) else self._checked_mapping(group, name)

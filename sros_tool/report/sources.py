@@ -164,9 +164,9 @@ def draw(request: PictureRequest) -> tuple[Picture, Folding]:
     governed = [source.governance for source in read if source.governance]
     if len(governed) == 2 and governed[0] != governed[1]:
         text = (
-            "the sources differ in governance, and the governance of the second source is drawn: "
+            "the sources differ in governance: the picture has the governance of the second one, "
+            "and `sros inspect` shows each."
         )
-        text += "`sros inspect` shows each governance."
         finding = PicturedFinding("view.governance-differs", "warning", text)
         picture = replace(picture, findings=(*picture.findings, finding))
     if len(domains := {enclave.domains for enclave in picture.enclaves} - {""}) > 1:

@@ -1176,7 +1176,7 @@ def test_a_node_of_another_version_than_its_policy(tmp_path: Path) -> None:
     said = sros("explain", policy, "/a", "--log", log).out
     assert "remedy    If the policy is for another version of the node, use the policy" in said
     assert "missing in the policy: add it. If the policy means this action by /grasp: start" in said
-    assert "the enclave may execute only action /grasp\n" in said
+    assert "by exact name, the enclave may execute only action /grasp\n" in said
 
 
 def test_a_log_without_the_namespace_that_its_names_show(tmp_path: Path) -> None:
