@@ -733,6 +733,7 @@ def enclave_of_node(file: Path, command: Sequence[str]) -> str:
     """
     from sros_tool.names import check_namespace, is_expression
     from sros_tool.policy.document import read_policy
+    from sros_tool.policy.patterns import matches
     from sros_tool.runtime.environment import possible_nodes
 
     nodes = possible_nodes(command)
@@ -762,11 +763,12 @@ def enclave_of_node(file: Path, command: Sequence[str]) -> str:
         where = f"in {len(enclaves)} enclaves: {first_few(enclaves, 3)}"
     else:
         where = "in no enclave"
-        every = {known for nodes in policy.nodes().values() for known in nodes}
-        similar_names = sorted(
-            known for known in every if known.endswith(f"/{name}") and not is_expression(known)
-        )
-        if similar_names:
+        stated = {known for nodes in policy.nodes().values() for known in nodes}
+        every = {known for known in stated if not is_expression(known)}
+        similar_names = sorted(known for known in every if known.endswith(f"/{name}"))
+        if patterns := sorted(known for known in stated - every if matches(known, full)):
+            why = f"Wildcards, as in {patterns[0]}, count only for the node of `ros2 launch`."
+        elif similar_names:
             why = f"Similar nodes in the policy: {first_few(similar_names, 3)}."
             other = quote(similar_names[0].rpartition("/")[0] or "/")
             remedy = (

@@ -465,6 +465,9 @@ def test_a_moment_of_another_zone_is_as_good(keystore: sros_tool.Keystore) -> No
     assert sros_tool.check(keystore, now=then)
 
 
+READS = publish("/left/x").replace("publish", "subscribe")
+
+
 def test_requirements_are_decided(tmp_path: Path) -> None:
     policy, required = tmp_path / "robot.xml", tmp_path / "required.toml"
     policy.write_text(policy_text({"/a": publish("/x*"), "/b": publish("/y")}))
@@ -486,7 +489,9 @@ def test_requirements_are_decided(tmp_path: Path) -> None:
     assert known.subject == "/r1/a"
     with pytest.raises(UsageError, match="unknown vendor"):
         sros_tool.check_requirements(policy, required, vendor="none")
-    policy.write_text(policy_text({"/left/a": publish("/left/x"), "/b": publish("/right/x")}))
+    policy.write_text(
+        policy_text({"/left/a": publish("/left/x"), "/b": publish("/right/x") + READS})
+    )
     required.write_text('[[only]]\nname = "x"\nwhy = "x"\npublish = ["x"]\nenclaves = ["/a"]\n')
     assert not sros_tool.check_requirements(policy, required, namespaces=["/left"])
     found = sros_tool.check_requirements(policy, required, namespaces=["/left", "/right"])

@@ -263,7 +263,7 @@ def explain(
     call and serve are about services, execute is about actions. If the rights name an action NAME
     but no service NAME, call and serve are about the action; use --type to choose. KEYSTORE is a
     keystore, or an export on a robot; ENCLAVE can also be an enclave's folder. With a policy and no
-    keystore, sros decides by the permissions that the policy would give.
+    keystore, sros decides by the permissions that the policy would give; this is for DDS only.
 
     The exit status is 0 if the operation is allowed (with --who: to at least one enclave), and 1 if
     it is denied. With --log, it is 1 if the log reports a fault, or if no line says that a node

@@ -1100,8 +1100,10 @@ def explain_on_zenoh(
     if keystore is None or enclave.state is None or not is_keystore(keystore.root):
         raise UsageError(
             "Zenoh needs a keystore with the enclave",
-            "It decides by the files of the router and of other enclaves.",
-            "Name the keystore before the enclave.",
+            "It decides by the files of the router and of other enclaves, which a policy does not "
+            "have.",
+            "Name the keystore before the enclave, after `sros generate_artifacts -k KEYSTORE -p "
+            "POLICY` and `sros zenoh KEYSTORE`.",
         )
     stated = Evaluator(Vendor.STANDARD, enclave, context)
     question, taken = question_meant(stated, asked_enclave, question, kind)

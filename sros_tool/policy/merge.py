@@ -684,8 +684,11 @@ class _Editor:
             self._put_into_empty(parent, new)
 
     def _put_after(self, sibling: PlacedElement, new: _NewElement) -> None:
-        indent = self._text.indent_of(sibling)
-        self._text.insert(self._text.position_after(sibling), self._rendered(new, indent))
+        text = self._text
+        indent = text.indent_of(sibling)
+        if indent is None and sibling.tag == "enclave" and "\n" in text.text[text.root.start :]:
+            indent = text.unit  # otherwise, many new enclaves would be on one line
+        text.insert(text.position_after(sibling), self._rendered(new, indent))
 
     def _put_first(self, parent: PlacedElement, new: _NewElement) -> None:
         """Insert an element as the first child, after text or a comment at the beginning."""

@@ -27,7 +27,7 @@ from sros_tool.names import (
     expression_problem,
     is_expression,
 )
-from sros_tool.policy.model import ALLOW, DENY, Group, Policy, Profile
+from sros_tool.policy.model import ALLOW, DENY, PEER_RIGHT, Group, Policy, Profile
 from sros_tool.policy.patterns import Names, literal_prefix, matches, renamed_matches
 from sros_tool.policy.rights import (
     NodeName,
@@ -305,14 +305,15 @@ def _notes_on_requirements(
     remapped = [remapped_policy(policy, of_names) for policy in policies]
     before, after = (
         {
-            (right.kind, right.name)
+            (right.kind, right.right, right.name)
             for policy in side
             for right in policy_rights(policy)
             if right.qualifier is not DENY
         }
         for side in (policies, [policy for policy, _ in remapped])
     )
-    moved = {name for _, name in before - after}
+    kept = {(kind, name) for kind, _, name in after}
+    moved = {name for kind, _, name in before if (kind, name) not in kept}
     nodes = {use.old for _, uses in remapped for use in uses if not use.kind}
     # A requirement may also name what is below a node's name, but is in no right.
     gone = {
@@ -334,6 +335,19 @@ def _notes_on_requirements(
             "requirement has."
         )
         yield Note("merge.requirements-of-old-names", text)
+    split = [
+        f"{name} ({right})"
+        for kind, right, name in sorted(before - after)
+        if (kind, PEER_RIGHT[right], name) in after
+    ]
+    if split:
+        text = (
+            f"the last right to {first_few(split, _MOST_SHOWN)} moves to the new name, but other "
+            "nodes keep the old name, so requirements that name it may protect nothing. If these "
+            "nodes are to use the new name, add a --remap for them, too. Otherwise, write both "
+            "names into a copy of the requirements."
+        )
+        yield Note("merge.requirements-of-split-names", text)
 
 
 def _notes_on_old_names(

@@ -25,6 +25,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from itertools import product
 from string import ascii_letters
+from typing import NamedTuple
 
 from sros_tool.automata import NameSet, SearchLimit
 from sros_tool.names import (
@@ -112,7 +113,9 @@ class Verdict:
     that says why the requirement cannot fail whatever rights enclaves get, or "".  ``assumed`` is a
     name whose protection is assumed because the policy does not state it, or "".  ``blocked`` is a
     demanded use whose messages do not pass between Zenoh routers, or None. ``unnamed`` are names in
-    the requirement that no right states, and that only wildcards match.
+    the requirement that no right states, and that only wildcards match. ``unserved`` are clauses on
+    services and actions that an enclave may use, and that nobody serves; ``unheard`` are clauses on
+    topics of which enclaves have only the right in the requirement.
     """
 
     requirement: Requirement
@@ -124,6 +127,8 @@ class Verdict:
     blocked: BlockedUse | None = None
     unnamed: tuple[str, ...] = ()
     absent: tuple[str, ...] = ()
+    unserved: tuple[str, ...] = ()
+    unheard: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,14 +197,14 @@ def decide(requirement: Requirement, world: World, limit: SearchLimit | None = N
             raise AssertionError(requirement)
     if witness:
         _confirm(requirement, witness, world)
-    unused, waiting, unnamed = _unused_names(requirement, world, limit)
+    found = _unused_names(requirement, world, limit)
     missing, exceptions = _missing_enclaves(requirement, world)
     meant = (
         (name, similar_enclave_clause(name, world.enclaves))
         for name in missing
         if name not in world.away
     )
-    empty = (*(f"there is no enclave {name}{clause}" for name, clause in meant), *unused)
+    empty = (*(f"there is no enclave {name}{clause}" for name, clause in meant), *found.unused)
     always = "" if witness or empty or missing else _why_never_fails(requirement, world)
     assumed = "" if witness else _assumed_protection(requirement, world, limit)
     blocked = None
@@ -209,12 +214,14 @@ def decide(requirement: Requirement, world: World, limit: SearchLimit | None = N
         requirement,
         witness,
         empty,
-        tuple(waiting),
+        tuple(found.waiting),
         always,
         assumed,
         blocked,
-        tuple(unnamed),
+        tuple(found.unnamed),
         absent=tuple(name for name in exceptions if name.removeprefix(EXCEPT) not in world.away),
+        unserved=tuple(found.unserved),
+        unheard=tuple(found.unheard),
     )
 
 
@@ -738,6 +745,14 @@ def _uses_of_hop(hop: TopicHop) -> Iterator[Use]:
 # ── requirements that cannot fail ──────────────────────────────────────────────────────────
 
 
+_CLAUSES_WITHOUT_PEER = {
+    "publish": "no enclave may subscribe to",
+    "subscribe": "no enclave may publish",
+    "request": "no enclave may serve",
+    "call": "no enclave may serve",
+}
+"""Right in a requirement → clause for a name that lacks the peer of the right."""
+
 _RIGHT_OF_OTHER_KIND = {
     "call": "request",
     "request": "call",
@@ -784,10 +799,18 @@ def similar_enclave_clause(pattern: str, enclaves: Iterable[str]) -> str:
     return _meant_clause(pattern.removeprefix(EXCEPT), [frozenset(enclaves)])
 
 
-def _unused_names(
-    requirement: Requirement, world: World, limit: SearchLimit
-) -> tuple[list[str], list[str], list[str]]:
-    """Return clauses on unused names, clauses on names that wait for users, and unstated names.
+class _UnusedNames(NamedTuple):
+    """Names, or clauses on names, that the fields of `Verdict` with the same names describe."""
+
+    unused: list[str]
+    waiting: list[str]
+    unnamed: list[str]
+    unserved: list[str]
+    unheard: list[str]
+
+
+def _unused_names(requirement: Requirement, world: World, limit: SearchLimit) -> _UnusedNames:
+    """Return the names of a requirement that nobody uses, or of which one side is missing.
 
     A name waits for users if an enclave has its other side, such as the server of a service.
 
@@ -796,7 +819,8 @@ def _unused_names(
     one typing error, as in ``/cmd_vle``, or if the name is in use as another kind (service or
     action).
     """
-    clauses, waiting, unnamed = [], [], []
+    found = _UnusedNames([], [], [], [], [])
+    clauses, unnamed = found.unused, found.unnamed
     for right, name, parts in _restricted_names(requirement):
         verb = "use" if isinstance(requirement, Nobody | Protected) else right
         peer = PEER_RIGHT[right]
@@ -815,28 +839,36 @@ def _unused_names(
             elif not _is_used_by_anybody(world, _sufficient_parts(peer), name, limit):
                 clauses.append(f"no enclave may {verb} or {peer} {named}")
             elif known:
-                waiting.append(f"no enclave may {verb} {named}")
+                found.waiting.append(f"no enclave may {verb} {named}")
             else:
                 clauses.append(f"no enclave may {verb} {named}")
         elif meant:
             clauses.append(f"only wildcards match {named}{meant}")
-        elif not known:
-            unnamed.append(named)
-        elif verb in ("request", "call") and (served := _served_instead(world, peer, name, limit)):
+        elif verb not in _CLAUSES_WITHOUT_PEER or (
+            _is_used_by_anybody(world, _sufficient_parts(peer), name, limit)
+        ):
+            if not known:
+                unnamed.append(named)
+        elif KIND_OF[right] == "topics":
+            if known:
+                found.unheard.append(f"{_CLAUSES_WITHOUT_PEER[verb]} {named}")
+            else:
+                unnamed.append(named)
+        elif known and (served := _served_instead(world, peer, name, limit)):
             clauses.append(f"no enclave may {peer} {named} (perhaps {served} is meant)")
-    return clauses, waiting, unnamed
+        else:
+            found.unserved.append(f"{_CLAUSES_WITHOUT_PEER[verb]} {named}")
+    return found
 
 
 def _served_instead(world: World, right: str, name: str, limit: SearchLimit) -> str | None:
-    """Return the only name like ``name`` that is served, if nobody serves ``name``, or None.
+    """Return the only name that is served and like ``name``, which nobody serves, or None.
 
     The two names differ in the part before the last, which is often the name of the server's node:
     it was perhaps renamed, and enclaves keep the right to request the earlier name.
     """
     parts = _sufficient_parts(right)
     if is_expression(name) or is_of_every_node(name):
-        return None
-    if _is_used_by_anybody(world, parts, name, limit):
         return None
     served = {
         other

@@ -179,7 +179,9 @@ class Decisions:
     lacks.  ``holding_alone`` are requirements with relative names that only further enclaves could
     break, with the reasons.  ``absent`` are requirements with exceptions for enclaves that do not
     exist, with clauses on these exceptions. ``misspelled`` are the same, if an enclave with a
-    similar name exists.
+    similar name exists. ``unanswered`` are requirements about names of which enclaves have only one
+    side, with clauses on these names; ``unanswered_alone`` are the same, if perhaps only users of a
+    package have the other side.
     """
 
     violations: tuple[Violation, ...]
@@ -191,6 +193,8 @@ class Decisions:
     holding_alone: tuple[tuple[Requirement, tuple[str, ...]], ...] = ()
     absent: tuple[tuple[Requirement, tuple[str, ...]], ...] = ()
     misspelled: tuple[tuple[Requirement, tuple[str, ...]], ...] = ()
+    unanswered: tuple[tuple[Requirement, tuple[str, ...]], ...] = ()
+    unanswered_alone: tuple[tuple[Requirement, tuple[str, ...]], ...] = ()
 
 
 def decide_all(requirements: Sequence[Requirement], system: System) -> Decisions:
@@ -204,11 +208,14 @@ def decide_all(requirements: Sequence[Requirement], system: System) -> Decisions
     holding_alone: list[tuple[Requirement, tuple[str, ...]]] = []
     absent: list[tuple[Requirement, tuple[str, ...]]] = []
     misspelled: list[tuple[Requirement, tuple[str, ...]]] = []
+    unanswered: list[tuple[Requirement, tuple[str, ...]]] = []
+    unanswered_alone: list[tuple[Requirement, tuple[str, ...]]] = []
     limit = SearchLimit(MOST_STEPS)
     worlds = Worlds(system.worlds)
     known = {enclave for world in system.worlds for enclave in world.enclaves}
     demanded = [r.enclave for r in requirements if isinstance(r, Must) and r.enclave not in known]
     unjudged = tuple(dict.fromkeys(demanded)) if system.is_export else ()
+    lacks_enclaves = system.is_export or any(world.away for world in system.worlds)
     for requirement in requirements:
         if isinstance(requirement, Must) and requirement.enclave in unjudged:
             continue
@@ -238,6 +245,12 @@ def decide_all(requirements: Sequence[Requirement], system: System) -> Decisions
                 vacuous.append((requirement, (*empty, *reasons)))
             elif not broken:
                 holding_alone.append((requirement, tuple(reasons)))
+        if not broken and not lacks_enclaves:
+            failing, alone = _unanswered_clauses(requirement, system, [v for _, v in verdicts])
+            if failing:
+                unanswered.append((requirement, failing))
+            if alone:
+                unanswered_alone.append((requirement, alone))
         exceptions = _texts_in_all(verdict.absent for _, verdict in verdicts)
         meant = {name: similar_enclave_clause(name, known) for name in exceptions}
         if misspelled_names := [f"{name}{clause}" for name, clause in meant.items() if clause]:
@@ -263,7 +276,36 @@ def decide_all(requirements: Sequence[Requirement], system: System) -> Decisions
         holding_alone=tuple(holding_alone),
         absent=tuple(absent),
         misspelled=tuple(misspelled),
+        unanswered=tuple(unanswered),
+        unanswered_alone=tuple(unanswered_alone),
     )
+
+
+def _unanswered_clauses(
+    requirement: Requirement, system: System, verdicts: Sequence[Verdict]
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return clauses on names without another side: for a warning, and for a note.
+
+    A note is enough if the other side may be in the policies of users: for topics with relative
+    names, and for services with relative names in the policy of a package.
+    """
+    unserved, unheard = (
+        [_listed_clauses(clauses)] if clauses else []
+        for clauses in (
+            _texts_in_all(verdict.unserved for verdict in verdicts),
+            _texts_in_all(verdict.unheard for verdict in verdicts),
+        )
+    )
+    if not requirement.is_relative:
+        return (*unserved, *unheard), ()
+    if system.is_keystore or _is_for_robot(requirement, system):
+        return tuple(unserved), tuple(unheard)
+    return (), (*unserved, *unheard)
+
+
+def _is_for_robot(requirement: Requirement, system: System) -> bool:
+    """Return whether a requirement is checked in a namespace, as users of a package check it."""
+    return requirement.elsewhere is None and not system.is_package
 
 
 def _users_may_break(requirement: Requirement) -> bool:
@@ -404,12 +446,13 @@ def decided_findings(
         _part_finding(VACUOUS, requirement, why, _vacuous_remedy(requirement, system.rights))
         for requirement, why in _without_namespace_repeats(decided.vacuous)
     ]
-    for kind, decisions in (
-        (MISSPELLED_ENCLAVE, decided.misspelled),
-        (UNKNOWN_ENCLAVE, decided.absent),
-        (HOLDS_ALONE, decided.holding_alone),
+    for kind, decisions, remedy in (
+        (VACUOUS, decided.unanswered, _UNANSWERED_REMEDY),
+        (MISSPELLED_ENCLAVE, decided.misspelled, ""),
+        (UNKNOWN_ENCLAVE, decided.absent, ""),
+        (HOLDS_ALONE, decided.holding_alone, _alone_remedy(decided.holding_alone, system)),
+        (HOLDS_ALONE, decided.unanswered_alone, _UNANSWERED_ALONE_REMEDY),
     ):
-        remedy = _ALONE_IN_KEYSTORE if kind is HOLDS_ALONE and system.is_keystore else ""
         findings += [
             _part_finding(kind, requirement, why, remedy)
             for requirement, why in _without_namespace_repeats(decisions)
@@ -633,13 +676,31 @@ def _part_finding(
     return kind.found(place.file, text, place.file, place.line, remedy)
 
 
-_ALONE_IN_KEYSTORE = (
-    "No enclave of this keystore can break the requirement now: ignore this finding."
-)
+def _alone_remedy(
+    holding_alone: Iterable[tuple[Requirement, tuple[str, ...]]], system: System
+) -> str:
+    for_robot = any(_is_for_robot(requirement, system) for requirement, _ in holding_alone)
+    if not (system.is_keystore or for_robot):
+        return ""
+    what = "keystore" if system.is_keystore else "robot"
+    return f"No enclave of this {what} can break the requirement now: ignore this finding."
+
 
 _NOBODY_REMEDY = (
     "Correct the name, or its kind (service or action). After `merge_policy --remap`, check with "
     "the same --remap."
+)
+
+_UNANSWERED_REMEDY = (
+    "If the name was changed, change it in the requirement, too; after `merge_policy --remap`, "
+    "check with the same --remap. If another policy of the robot has the other side of the name, "
+    "name all policies in one command."
+)
+
+_UNANSWERED_ALONE_REMEDY = (
+    "If only nodes of the package's users have the other side of the name, ignore this finding. If "
+    "the name was changed, change it in the requirement, too; after `merge_policy --remap`, check "
+    "with the same --remap."
 )
 
 _ENCLAVES_REMEDY = (

@@ -523,7 +523,9 @@ class Repository:
         error_text = done.stderr[:500].decode(errors="replace").strip()
         if done.returncode and (error_text or not quiet):
             why = error_text.removeprefix("fatal: ") or f"exit status {done.returncode}"
-            raise DocumentError(f"git failed: {why}")
+            outside = why.startswith("not a git repository")
+            remedy = "Start sros in a folder of the repository." if outside else ""
+            raise DocumentError(f"git failed: {why}", "", remedy)
         if error_text and not done.returncode and environment is None:
             raise DocumentError(f"git warns: {error_text}", "Its answer may be incomplete.")
         return done.stdout

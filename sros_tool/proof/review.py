@@ -32,6 +32,7 @@ from sros_tool.checks.kind import WARNING, ChosenFindings, Finding, FindingFilte
 from sros_tool.checks.policies import is_mended_by
 from sros_tool.checks.requirements import (
     DROPPED,
+    HOLDS_ALONE,
     MISSPELLED_ENCLAVE,
     UNKNOWN_ENCLAVE,
     VACUOUS,
@@ -910,7 +911,7 @@ class _Review:
             yield "requirements: none are named"
         others = ""
         if self.decided_elsewhere:
-            others = f": there, sros decided only {self.decided_elsewhere}"
+            others = f": there, sros decided only {self.decided_elsewhere}, not whether all hold"
         if self.is_relative and not asked.namespaces:
             options = [f"--namespace {quote(name)}" for name in sorted(self.namespaces_to_add)]
             add = f" (add {' '.join(options[:_MOST_NAMESPACES])})" if options else ""
@@ -1181,7 +1182,8 @@ class _Review:
 
         def system_in(ns: str, source: AccessSource) -> System:
             policy = policy_in_namespace(Policy(tuple(source.enclaves.values())), ns)
-            return policy_system(policy, self._circumstances(), self._template())
+            system = policy_system(policy, self._circumstances(), self._template())
+            return replace(system, is_package=True)
 
         for ns in namespaces[:_MOST_NAMESPACES]:
             moved, earlier = (
@@ -1392,7 +1394,9 @@ def _namespaces_to_try(before: AccessSource, after: AccessSource) -> list[str]:
     return [*dict.fromkeys([ordinary, *_namespaces_in(names)])]
 
 
-_NOT_OF_DROPPED = tuple(kind.id for kind in (VACUOUS, MISSPELLED_ENCLAVE, UNKNOWN_ENCLAVE))
+_NOT_OF_DROPPED = tuple(
+    kind.id for kind in (VACUOUS, HOLDS_ALONE, MISSPELLED_ENCLAVE, UNKNOWN_ENCLAVE)
+)
 """Findings that a dropped requirement does not need."""
 
 

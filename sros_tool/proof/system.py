@@ -96,7 +96,8 @@ class System:
     places that state rights. ``is_keystore`` says that the source is a keystore or an export, and
     ``is_export`` that it is an export, which may lack enclaves of its keystore. ``left_out`` is the
     reason why there is no Zenoh world, if Zenoh cannot enforce the policy. ``fleet`` returns the
-    robots of the policy or keystore, or None.
+    robots of the policy or keystore, or None. ``is_package`` says that a review tries the policy of
+    a package in a namespace that users could choose.
     """
 
     file: str
@@ -107,6 +108,7 @@ class System:
     fleet: Callable[[], Fleet | None] = lambda: None
     is_export: bool = False
     is_keystore: bool = False
+    is_package: bool = False
 
 
 def load_system(

@@ -506,6 +506,7 @@ def test_a_robot_in_no_namespace_that_was_named_is_told(tmp_path: Path) -> None:
 
 def test_requirements_of_a_package_in_two_namespaces(tmp_path: Path) -> None:
     rights = {f"/{side}/mux": publish(f"/{side}/cmd") for side in ("left", "right")}
+    rights["/base"] = subscribe("/left/cmd", "/right/cmd")
     (tmp_path / "p.xml").write_text(policy_text(rights | {"/right/evil": publish("/right/cmd")}))
     (tmp_path / "r.toml").write_text('[[only]]\npublish = ["cmd"]\nenclaves = ["/mux"]\n')
     asked = ("check", "p.xml", *ONLY[2:], "--requirements", "r.toml")
@@ -528,7 +529,7 @@ def test_requirements_of_a_package_in_two_namespaces(tmp_path: Path) -> None:
 
 
 def test_requirements_are_remapped_as_the_policy(tmp_path: Path) -> None:
-    """A requirement on the old name holds, whoever may request the new one."""
+    """A requirement on the old name would hold, whoever may request the new one."""
     served = '<services reply="ALLOW"><service>~/close</service></services>'
     asks = '<services request="ALLOW"><service>{}</service></services>'
     gripper = policy_text({"/gripper": served}).replace('node="n"', 'node="gripper"')
@@ -546,7 +547,9 @@ def test_requirements_are_remapped_as_the_policy(tmp_path: Path) -> None:
     said = "`sros check POLICY --requirements FILE --remap 'gripper:~/close:=/g'`"
     assert said in sros(*merge, cwd=tmp_path).ok().err
     asked = ("check", "robot.xml", *ONLY[2:], "--requirements", "r.toml", *places)
-    sros(*asked, cwd=tmp_path).ok()
+    ended = sros(*asked, cwd=tmp_path)
+    assert ended.status == 1
+    assert "no enclave may serve service /left/gripper/close; required: only" in ended.out
     ended = sros(*asked, *rule, cwd=tmp_path)
     assert ended.status == 1
     assert "/base: may request /g, but only /left/planner may request /g" in ended.out

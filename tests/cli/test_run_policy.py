@@ -29,6 +29,9 @@ POLICY = """<policy version="0.2.0"><enclaves>
 <enclave path="/line/other"><profiles>
   <profile ns="/" node="both"><topics subscribe="ALLOW"><topic>/a</topic></topics></profile>
 </profiles></enclave>
+<enclave path="/wild"><profiles>
+  <profile ns="/" node="wild_*"><topics subscribe="ALLOW"><topic>/a</topic></topics></profile>
+</profiles></enclave>
 </enclaves></policy>"""
 
 
@@ -113,6 +116,11 @@ def test_the_keystore_may_come_from_the_environment(made: Path) -> None:
             "in the policy: /left/hidden. Name the namespace: `-r __ns:=/left`",
         ),
         (("-r", "__node:=taker"), "Perhaps you mean /talker"),
+        (("-r", "__node:=wild_7"), "as in /wild_*, count only for the node of `ros2 launch`."),
+        (
+            ("-r", "__node:=wilde"),
+            'Give the node a profile in one enclave: `<profile ns="/" node="wilde">`',
+        ),
         (("-r", "__node:=both"), "in 2 enclaves: /line/listener, /line/other"),
         (("-r", "__node:=\x1b[2Jtalker"), "\\x1b[2Jtalker in no enclave"),
     ],

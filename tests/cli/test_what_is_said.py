@@ -223,6 +223,12 @@ def test_what_is_asked_in_vain_names_what_to_ask(tmp_path: Path) -> None:
     for verb in ("diff_policy", "view"):
         revision = sros(verb, "git:HEAD:p.xml", policy)
         assert revision.status == 2 and "works only with `sros diff_policy --no-new" in revision.err
+    asked = ("/a", "publish", "/x", "--vendor", "zenoh")
+    assert "after `sros generate_artifacts" in sros("explain", policy, *asked).err
+    compared = ("diff_policy", "--no-new-access", "git:HEAD:p.xml", policy)
+    outside = {"GIT_CEILING_DIRECTORIES": str(tmp_path.parent)}
+    ended = sros(*compared, cwd=tmp_path, env=outside)
+    assert "Start sros in a folder of the repository." in ended.err, ended
     for words, able in (("fleet status", "show the fleet"), ("agent run", "run the agent")):
         assert sros(*words.split(), tmp_path).err.startswith(f"Unable to {able}: ")
     policy.write_text("<policy><enclaves/></policy>")

@@ -230,6 +230,14 @@ def test_everything_else_survives(file: Path, form: str, asked: int) -> None:
     assert merge_into(file, ASKED[asked]).document == merged.document
 
 
+def test_new_enclaves_of_a_dense_policy_have_lines_of_their_own(file: Path) -> None:
+    """Otherwise, each finding about them would have the same line. Twin: the form "one line"."""
+    dense = re.sub(r"\n\s*", "", POLICY).replace("</policy>", "\n</policy>")
+    file.write_text(dense)
+    merged = merge_into(file, asking(topics("a", "b"), path="/new")).document.decode()
+    assert '\n  <enclave path="/new">\n' in merged and "\n          <topic>a</topic>\n" in merged
+
+
 def test_nothing_to_add_is_the_file_itself(file: Path) -> None:
     merged = merge_into(file, asking(topics("b", "d", "/rosout")))
     assert merged.document == POLICY.encode()

@@ -256,6 +256,32 @@ def test_the_note_on_requirements_names_rules_that_they_take() -> None:
         assert all(map(parse_remapping_of_names, rules))
 
 
+@pytest.mark.parametrize(
+    ("rules", "split"),
+    [
+        ("~/reset:=clear", "/driver/reset (reply)"),
+        ("driver:~/reset:=clear", "/driver/reset (reply)"),
+        ("viewer:z:=/u", "/z (subscribe)"),
+        ("~/reset:=clear driver/reset:=clear", ""),
+        ("viewer:driver/reset:=clear driver:~/reset:=clear", ""),
+    ],
+)
+def test_a_name_that_only_one_side_remaps_is_noted(rules: str, split: str) -> None:
+    """A requirement for the old name would hold, regardless of who uses the new name."""
+    driver = one(group("services", "~/reset", reply="ALLOW"), node="driver")
+    driver_of_topic = one(group("topics", "z", publish="ALLOW"), node="sensor")
+    viewer = one(
+        group("topics", "z", subscribe="ALLOW"),
+        group("services", "driver/reset", request="ALLOW"),
+        node="viewer",
+    )
+    _, notes = remapped_policies([driver, driver_of_topic, viewer], rules.split())
+    texts = [note.text for note in notes if note.id == "merge.requirements-of-split-names"]
+    assert [text.startswith(f"the last right to {split} moves") for text in texts] == [True] * bool(
+        split
+    )
+
+
 def test_names_that_are_exchanged_are_denied_as_before() -> None:
     both = one(group("topics", "x", publish="DENY"), group("topics", "y", publish="ALLOW"))
     (exchanged,), _ = remapped_policies([both], ["x:=y", "y:=x"])

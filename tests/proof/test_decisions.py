@@ -102,6 +102,7 @@ HOLDERS = {
 @pytest.mark.parametrize("case", HOLDERS)
 def test_whoever_has_a_part_of_an_action_holds_the_right_to_it(case: str) -> None:
     rights, required, text = HOLDERS[case]
+    rights = rights | {"/server": may("execute", "/dock")} if "call" in required else rights
     assert texts(rights, required) == ([text] if text else [])
 
 
@@ -317,6 +318,9 @@ def test_a_requirement_of_a_package_may_be_about_the_enclaves_of_users(required:
     assert "this is the policy of a package" in finding.remedy
     (finding,) = decided_findings(found, replace(robot(PACKAGE), is_keystore=True))
     assert finding.remedy.startswith("No enclave of this keystore can break the requirement")
+    users = (replace(found.holding_alone[0][0], elsewhere=None), found.holding_alone[0][1])
+    (finding,) = decided_findings(replace(found, holding_alone=(users,)), robot(PACKAGE))
+    assert finding.remedy.startswith("No enclave of this robot can break the requirement")
     of_robot = decided(PACKAGE, re.sub(r'"([a-z])', r'"/\1', required))
     assert len(of_robot.vacuous) == 1 and not of_robot.holding_alone
 
@@ -467,6 +471,55 @@ def test_a_renamed_server_leaves_a_right_that_nobody_serves(served: str, meant: 
     found = decided(rights, '[[only]]\nrequest = ["/left/driver/open"]\nenclaves = ["/panel"]')
     reason = f"no enclave may reply service /left/driver/open (perhaps {meant} is meant)"
     assert [each for _, reasons in found.vacuous for each in reasons] == [reason] * bool(meant)
+
+
+_ONLY_A = '[[only]]\n{} = ["{}"]\nenclaves = ["/a"]'
+_NO_SERVER = "no enclave may serve {} {}; "
+
+
+@pytest.mark.parametrize(
+    ("right", "peer", "said"),
+    [
+        ("request", "reply", _NO_SERVER.format("service", "{}")),
+        ("call", "execute", _NO_SERVER.format("action", "{}")),
+        ("publish", "subscribe", "no enclave may subscribe to topic {}; "),
+        ("subscribe", "publish", "no enclave may publish topic {}; "),
+        ("reply", "request", ""),
+    ],
+)
+@pytest.mark.parametrize("other", ["/n/open_it", "/clear"])
+@pytest.mark.parametrize("allowed", ["/n/open", "/n/*"])
+def test_a_requirement_about_a_name_without_another_side(
+    right: str, peer: str, said: str, other: str, allowed: str
+) -> None:
+    """Twin: the name has its other side, perhaps by a wildcard."""
+    rights = {"/a": may(right, allowed), "/web": may(right, other), "/n": may(peer, other)}
+    is_topic = right in ("publish", "subscribe")
+
+    def found(name: str, system: System, *namespaces: str) -> list[str]:
+        toml = _ONLY_A.format(right, name).encode()
+        required = parse_requirements(toml, "r.toml", namespaces=namespaces)
+        findings = requirement_findings(required, system)
+        text = said.format(f"{''.join(namespaces)}/n/open")
+        return [each.id for each in findings if said and each.text.startswith(text)]
+
+    expected = [VACUOUS] if said and not (is_topic and allowed == "/n/*") else []
+    assert found("/n/open", robot(rights)) == expected
+    # Users of a package may have the other side. In a keystore or a robot, they lack no server.
+    alone = [*FOUND] * len(expected)
+    assert found("n/open", robot(rights)) == alone
+    complete = alone if is_topic else expected
+    assert found("n/open", replace(robot(rights), is_keystore=True)) == complete
+    moved = {
+        f"/l{path}": text.replace(f">{name}<", f">/l{name}<")
+        for (path, text), name in zip(rights.items(), (allowed, other, other), strict=True)
+    }
+    assert found("n/open", robot(moved), "/l") == complete
+    assert found("n/open", replace(robot(moved), is_package=True), "/l") == alone
+    # An export may lack the enclave.
+    assert not found("/n/open", replace(robot(rights), is_export=True))
+    for served in ("/n/open", "/n/o*"):
+        assert not found("/n/open", robot(rights | {"/n": may(peer, served)}))
 
 
 @pytest.mark.parametrize(

@@ -25,6 +25,7 @@ from tests.support.harness import copy_of, sros
 POLICY = """<policy version="0.2.0"><enclaves>
 <enclave path="/web"><profiles><profile ns="/" node="web">
 <topics publish="ALLOW"><topic>/status</topic></topics>
+<topics subscribe="ALLOW"><topic>/cmd_vel</topic></topics>
 </profile></profiles></enclave>
 <enclave path="/mux"><profiles><profile ns="/" node="mux">
 <topics publish="ALLOW"><topic>/cmd_vel</topic></topics>

@@ -28,11 +28,11 @@ from sros_tool.proof.commit_files import CommitFiles
 from sros_tool.proof.repository import Repository
 from tests.support.code_host import NODE, PROJECT
 from tests.support.code_host import policy as policy_text
-from tests.support.harness import Ended, copy_of, may, publish, sros
+from tests.support.harness import Ended, copy_of, may, publish, sros, subscribe
 from tests.support.long_form import some
 
-ROBOT = {"/a": publish("/x"), "/b": publish("/y")}
-WIDER = {"/a": publish("/x"), "/b": publish("/y", "/x")}
+ROBOT = {"/a": publish("/x"), "/b": subscribe("/x") + publish("/y")}
+WIDER = {"/a": publish("/x"), "/b": subscribe("/x") + publish("/y", "/x")}
 ONLY = '[[only]]\npublish = ["/x"]\nenclaves = ["/a"]\n'
 PERSON = {
     f"GIT_{who}_{what}": "a@example.org"
@@ -1045,7 +1045,11 @@ _NOTHING_BUT = (
 )
 _ONLY_OPERATORS = '[[only]]\npublish = ["/cmd"]\nenclaves = ["/drive", "*/operator/*"]\n'
 _ADDED = "# added\n"
-_NODES = {"/eyes/eye": publish("/image"), "/drive": publish("/cmd"), "/eyes/ear": publish("/x")}
+_NODES = {
+    "/eyes/eye": publish("/image"),
+    "/drive": publish("/cmd"),
+    "/eyes/ear": publish("/x") + subscribe("/cmd"),
+}
 _EYE = f'</profile><profile ns="/" node="eye">{NODE}{publish("/image")}'
 
 
@@ -1079,7 +1083,7 @@ def _moved(node: str, path: str, enclaves: dict[str, str] = _NODES) -> dict[str,
             (
                 _NODES,
                 _ONLY_OPERATORS,
-                {"/drive": publish("/cmd") + _EYE, "/eyes/ear": publish("/x")},
+                {"/drive": publish("/cmd") + _EYE, "/eyes/ear": _NODES["/eyes/ear"]},
                 "node /eye moves to enclave /drive",
             ),
             (
@@ -1446,7 +1450,7 @@ def test_requirements_of_a_package_are_decided_in_a_namespace(
     )
     ended = change.review(*asked, "--namespace", "/l", "--namespace", "/")
     assert ended.status == 1 and "decided only" not in ended.out, ended
-    assert "requirements robot.xml: 1 error, 1 note in /l and /" in ended.out, ended
+    assert "requirements robot.xml: 1 error, 2 notes in /l and /" in ended.out, ended
     assert "/b: may publish /l/x, but only /l/a may publish /l/x" in ended.out
     ended = change.review(*asked, "--namespace", "/l", "--remap", "x:=/x")
     assert "/a: may publish /x, but only /l/a may" in ended.out and "/l/x" not in ended.out, ended

@@ -19,7 +19,7 @@ from typing import Any
 
 import yaml
 
-from tests.support.harness import publish
+from tests.support.harness import publish, subscribe
 
 PROJECT = Path(__file__).parents[2]
 NODE = '<xi:include href="common/node.xml" xpointer="xpointer(/profile/*)"/>'
@@ -52,8 +52,12 @@ def policy(enclaves: Mapping[str, str]) -> str:
     )
 
 
-BEFORE = {"/mux": publish("/cmd_vel"), "/web": publish("/status")}
-WIDER = {"/mux": publish("/cmd_vel"), "/web": publish("/status", "/cmd_vel")}
+BEFORE = {
+    "/mux": publish("/cmd_vel"),
+    "/web": publish("/status"),
+    "/base": subscribe("/cmd_vel"),
+}
+WIDER = {**BEFORE, "/web": publish("/status", "/cmd_vel")}
 
 
 class Origin:
