@@ -346,7 +346,7 @@ def _run_step(
         return "findings", lost
     if step.guards and VACUOUS.id in output:
         robot.shell.say(
-            f"`sros review` refuses a requirement that nothing can break: edit {needed}"
+            f"`sros review` refuses a requirement that protects less than it states: edit {needed}"
         )
     if status:
         remedy = f"; {_NOT_SIGNED}" if step.guards else ""

@@ -54,7 +54,7 @@ from sros_tool.values import as_plain
 from tests.cli.test_json import Seen
 from tests.graph.fake_graph import Beside, graph
 from tests.runtime.test_origins import made_up
-from tests.support.harness import Ended, policy_text, publish, snapshot, sros
+from tests.support.harness import Ended, policy_text, publish, snapshot, sros, subscribe
 from tests.support.long_form import some, sometimes
 
 pytest_plugins = ["tests.graph.beside"]
@@ -1757,7 +1757,8 @@ def test_what_is_exported_without_the_enclaves_of_other_machines(
 
 
 def test_a_requirement_that_lost_its_right_is_told_before_a_review_fails(tmp_path: Path) -> None:
-    (tmp_path / "policy.xml").write_text(policy_text({"/a": publish("x")}))
+    reader = subscribe("x")
+    (tmp_path / "policy.xml").write_text(policy_text({"/a": publish("x"), "/r": reader}))
     said: list[str] = []
 
     def run(words: Any, live: bool) -> tuple[int, str, str]:
@@ -1782,7 +1783,8 @@ def test_a_requirement_that_lost_its_right_is_told_before_a_review_fails(tmp_pat
         (publish("y"), publish("*"), True),  # a wildcard that another enclave has
         (publish("y"), "", True),
     ):
-        robot.policy.write_text(policy_text({"/a": groups, "/b": other}))
+        reads = subscribe("y") if lost else reader
+        robot.policy.write_text(policy_text({"/a": groups, "/b": other, "/r": reads}))
         state_of_step, problems = preparation._run_step(robot, guard, accepted=set())
         assert state_of_step == ("findings" if lost else "done"), groups
         said_now = "toml:1 protects /x, which the policy does not"
