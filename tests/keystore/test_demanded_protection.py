@@ -67,7 +67,7 @@ def test_an_existing_keystore_gets_a_governance_that_keeps_to_it(folder: Path) -
     for ended in (planned, done):
         assert "restart the processes of 1 enclave for the change to take effect: /old" in ended.err
         assert f"topic /cmd_vel encrypt ({policy}:6)" in ended.err
-        assert "export them again" in ended.err
+        assert "export the enclaves again" in ended.err
     check_whole(ks)
     assert missing(ks, policy) == []
     named = {str(each): each.protection for each in OpenedKeystore(ks).template.protection.named}

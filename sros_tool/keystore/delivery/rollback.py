@@ -137,7 +137,7 @@ def check_rollback(
         role = ROLES_OF_FILES[path.rpartition("/")[2]]
         raise KeystoreError(
             f"'{target / path}' has a later {role} CA than the keystore's",
-            f"It trusts {authority_text(authority)}, and the keystore's CA is "
+            f"Its CA is {authority_text(authority)}, and the keystore's CA is "
             f"{_first_authority(files, path)}: the robot would trust the earlier CA again, and "
             "certificates that were revoked since its replacement. Nothing was changed.",
             "The keystore may come from a backup (docs/howto/keystore_is_lost.md says how to go "
@@ -148,7 +148,7 @@ def check_rollback(
         path, authority = next(iter(foreign.items()))
         raise KeystoreError(
             f"'{target / path}' has only CAs that are neither in the keystore nor in its ledger",
-            f"It trusts {authority_text(authority)}, and the keystore's CA is "
+            f"Its CA is {authority_text(authority)}, and the keystore's CA is "
             f"{_first_authority(files, path)}: the robot could no longer communicate with "
             "other robots of its keystore, and would lose its revocation list. Nothing was "
             "changed.",

@@ -362,8 +362,8 @@ def imported_ca_notes(
     listed = refusals(_EXAMPLE_ENCLAVE, files | {CRL_FILE: crl}, now)
     if later := {vendor: why for vendor, why in listed.items() if vendor not in refused}:
         text = (
-            f"with a revocation list of this identity CA, no enclave would work any more: "
-            f"{_refusal_clauses(later, 'every enclave')}. So `sros revoke` signs no list. "
+            "once this identity CA has a revocation list, "
+            f"{_refusal_clauses(later, 'every enclave')}, so `sros revoke` signs no list. "
             "To revoke enclaves, have the CA's certificate issued again with keyUsage cRLSign, or "
             "let sros make the identity CA."
         )

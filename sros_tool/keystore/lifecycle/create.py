@@ -824,7 +824,7 @@ def exports_note(keystore: OpenedKeystore, names: Sequence[str]) -> Note:
         )
         return Note("keystore.export-again", text)
     shown = quote(str(keystore.root))
-    text = "Robots have the former files: export them again (`sros distribute_key "
+    text = "Robots have the former files: export the enclaves again (`sros distribute_key "
     text += f"{shown} ENCLAVE TARGET --force`)"
     remote = [name for name in names if key_on_robot(keystore.folder(name))]
     if remote:
