@@ -268,9 +268,9 @@ def _difference_clauses(old: Template, new: Template) -> Iterator[str]:
         return
     before, after = settings_values(old), settings_values(new)
     for key in dict.fromkeys((*before, *after)):
-        old_value, new_value = before.get(key, "nothing"), after.get(key, "nothing")
+        old_value, new_value = before.get(key, "not set"), after.get(key, "not set")
         if old_value != new_value and key not in ("name", "description"):
-            yield f"{key} in {SETTINGS} is {new_value}, but sros wrote {old_value}"
+            yield f"{key} in {SETTINGS} is {new_value}, but was {old_value} when sros wrote it"
 
 
 def _governance_edit(keystore: OpenedKeystore) -> str:

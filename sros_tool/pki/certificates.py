@@ -180,7 +180,7 @@ def _builder(
         raise PkiError(
             f"no certificate can have the subject {subject_text(subject)}",
             "Its text types (ASN.1) do not allow some of its characters.",
-            "Create the enclave again, with another subject.",
+            "Create the enclave again, so that it gets a new subject.",
         )
     return x509.CertificateBuilder(
         issuer_name=issuer,

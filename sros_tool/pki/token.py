@@ -287,7 +287,7 @@ def _open_key(parsed: TokenUri, secrets: Secrets, *, create: bool) -> TokenKey:
     if not isinstance(loaded, ec.EllipticCurvePublicKey) or loaded.curve.name != "secp256r1":
         raise PkiError(
             f"the key {parsed.object!r} on the token {parsed.token!r} is not an EC prime256v1 key",
-            "Not every DDS vendor accepts other keys.",
+            "Some DDS vendors do not accept keys of other kinds.",
             "Name an EC prime256v1 key of the token (object=LABEL).",
         )
     return TokenKey(private, loaded, parsed)

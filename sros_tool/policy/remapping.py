@@ -331,7 +331,7 @@ def _notes_on_requirements(
             f"requirements that name {first_few(sorted(gone), _MOST_SHOWN)} protect only the old "
             "name, unless you check them with the same remapping: `sros check POLICY "
             f"--requirements FILE {' '.join(f'--remap {quote(each)}' for each in sorted(options))}`"
-            ", with the same --namespace, if any. Leave out each --remap whose old name no "
+            ", with --namespace as in the merge. Leave out each --remap whose old name no "
             "requirement has."
         )
         yield Note("merge.requirements-of-old-names", text)

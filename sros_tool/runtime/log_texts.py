@@ -835,8 +835,8 @@ RAN_OPEN = _log_text(
 """The meaning of rcl's line about an enclave that lacks a file, without an error after it."""
 UNNOTICED_FAULT = _log_text(
     "unnoticed-fault", _ROS, _AFTER_START,
-    "the enclave has a fault, yet this log shows no refusal that sros knows: the fault came after "
-    "the start, only the peers of the node notice the fault, or the DDS of the node accepts it",
+    "the enclave has a fault, yet this log shows no refusal that sros knows. Either the fault came "
+    "after the start, or only the node's peers notice it, or the node's DDS accepts it",
     "Correct the fault, and start the node again.", _ALL_FAULTS, vagueness=4,
 )  # fmt: skip
 """The meaning of rcl's line about an enclave with another fault, without an error after it."""

@@ -1043,7 +1043,7 @@ def _make_successor(
                 )
             text = (
                 f"{older}, so robots take it for a CA that was replaced: the first `sros import` "
-                "on each robot needs --force, and the play `deliver` needs "
+                "on each robot needs --force, and the Ansible play `deliver` needs "
                 "sros_replace_authorities."
             )
             change.notes.append(Note("rotation.older-ca", text))
