@@ -347,8 +347,8 @@ def _fetch_error(error: Exception, source: str, now: datetime) -> FetchError:
         return FetchError(
             FetchProblem.REFUSED,
             f"{source} refuses this robot",
-            f"{why} Perhaps the certificates of its enclaves were revoked or have expired, or the "
-            "server has an old copy of the CA or of its revocation list.",
+            f"{why} Perhaps the certificates of this robot's enclaves were revoked or have "
+            "expired, or the server has an old copy of the CA or of the revocation list.",
             "See the log of the server. If the certificates are the reason, bring new files with "
             "`sros distribute_key KEYSTORE --robot ROBOT FOLDER --force`.",
         )

@@ -1098,7 +1098,7 @@ def _unseen_process_findings(running: RunningProcesses) -> Iterator[Finding]:
     remedy = ROOT_IS_NOT_ENOUGH if running.is_run_by_root else ""
     for process in running.unseen:
         if process.uses_ros:
-            text = f"it speaks ROS 2, but cannot be examined: {process.why}"
+            text = f"it uses ROS 2, but cannot be examined: {process.why}"
             yield PROCESS_NOT_SEEN.found(process.label, text, remedy=remedy)
     doubtful = [process for process in running.unseen if not process.uses_ros]
     reasons = [running.hidden] if running.hidden else []
@@ -1109,7 +1109,7 @@ def _unseen_process_findings(running: RunningProcesses) -> Iterator[Finding]:
     if running.is_in_container:
         text = (
             f"{len(running.processes)} of them "
-            f"{'speaks' if len(running.processes) == 1 else 'speak'} ROS 2"
+            f"{'uses' if len(running.processes) == 1 else 'use'} ROS 2"
         )
         yield CONTAINER_ALONE.found("processes", text)
     if reasons:
@@ -1137,7 +1137,7 @@ def runtime_metrics(
     return (
         Metric(
             "sros_processes",
-            "Number of processes that speak ROS 2, by security (secured, open or unknown).",
+            "Number of processes that use ROS 2, by security (secured, open or unknown).",
             tuple(Sample(security[level], {"security": level.value}) for level in Security),
         ),
         Metric(

@@ -262,8 +262,8 @@ def _run(folder: Path, once: bool, interval: str, restarted: bool, as_json: bool
     A round fetches the robot's release, verifies it, and installs it whole or not at all. It
     restarts units, or reports the restarts that are due, and checks the running processes. It asks
     for renewal in the last third of a certificate's validity, and sends a signed report to the
-    keystore machine. After `sros agent init --new-key`, it asks when 60 % of the validity of the
-    certificate or of the permissions is over, whichever is first.
+    keystore machine. After `sros agent init --new-key`, it asks for renewal when 60 % of the
+    validity of the certificate or of the permissions is over, whichever is first.
     If one step fails, the other steps still run, and the next round tries the failed step again.
 
     Example:
@@ -363,8 +363,8 @@ def _due_lines(folder: Path, due_enclaves: Sequence[str], unseen: Sequence[str])
 @click.option(
     "--max-age", metavar="DURATION", default="1d", show_default=True,
     help=(
-        "Exit with 1 if the agent has not reached the source or the inbox for longer than "
-        "DURATION."),
+        "Exit with 1 if the agent has not reached the publishing folder or the inbox for longer "
+        "than DURATION."),
 )  # fmt: skip
 @json_option
 def _status(folder: Path, max_age: str, as_json: bool) -> int:

@@ -143,8 +143,10 @@ _VENDORS = (*(vendor.value for vendor in TESTED), ZENOH)
     type=PATH,
     multiple=True,
     metavar="FILE",
-    help="An earlier version of the --requirements file: report requirements that the current file "
-    "lacks. Can be repeated.",
+    help=(
+        "An earlier version of the --requirements file: report requirements that the current "
+        "file lacks or weakens. Can be repeated."
+    ),
 )
 @click.option(
     "--namespace",

@@ -308,7 +308,7 @@ class _RemainingProcesses:
         for unseen in unseen_processes:
             if unseen.uses_ros:
                 yield (
-                    f"{unseen.label} speaks ROS 2, and cannot be examined ({unseen.why}): if it "
+                    f"{unseen.label} uses ROS 2, and cannot be examined ({unseen.why}): if it "
                     "runs secured, stop it, or restart it open"
                 )
         if running.processes.hidden or any(not unseen.uses_ros for unseen in unseen_processes):

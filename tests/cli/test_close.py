@@ -700,7 +700,7 @@ def test_what_systemd_does_not_start_is_done_by_hand(
     assert f"{secured} this folder, and open processes do not hear it: stop it, or " in undone.out
     robot.more = ()
     robot.unseen = (UnseenProcess(9, ("talker", "--ros-args"), "/proc hides it", uses_ros=True),)
-    assert "process 9 (talker) speaks ROS 2, and ca" in robot.close("--undo", status=1).out
+    assert "process 9 (talker) uses ROS 2, and ca" in robot.close("--undo", status=1).out
     robot.unseen, robot.named = (UnseenProcess(9, (), "/proc hides it", uses_ros=False),), True
     robot.more = (replace(robot.process("/listener", is_secured=False), pid=12),)
     other_run = ("/other/run", *robot.more[0].command[2:])
@@ -712,7 +712,7 @@ def test_what_systemd_does_not_start_is_done_by_hand(
     assert undone.err.startswith(
         "/listener may run open by another command (process 12 (run)); if that is not so, "
         "start /listener open (its node was /listener when sros watched; the new name is also "
-        "too): cd /opt && /opt/run listener\n"
+        "right): cd /opt && /opt/run listener\n"
         "/talker does not run; start it open: cd /opt "
     )
     processes = robot.folder / "robot/processes.json"
