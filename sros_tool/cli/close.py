@@ -257,6 +257,11 @@ def _show(robot: LocalRobot, closed: CloseState) -> None:
         why = "has ended" if name in closed.observed.ended else "new"
         start = closed.observed.command_of_new_process(robot.export.absolute(), name)
         echo(f"  {name}: {why}, start it with: {start}")
+    if closed.secured and {*closed.new}.difference(closed.observed.ended):
+        echo(
+            "  if a systemd unit starts a new process, start the unit open, and run "
+            f"`{robot.close_command}` again: --apply then gives the unit its enclave"
+        )
     if naming := _renaming_advice(closed, policy):
         echo(naming)
     if not_here := sorted({*closed.observed.not_here}.difference(outside)):

@@ -23,6 +23,7 @@ from sros_tool.close.processes import (
     ObservedProcesses,
     command_without_enclave,
     is_in_domain,
+    process_text,
 )
 from sros_tool.close.robot import MOST_NAMES, OBSERVER, LocalRobot, check_enclaves
 from sros_tool.keystore.expiry import Threshold, survey
@@ -34,7 +35,9 @@ from sros_tool.keystore.layout import (
     list_enclaves,
 )
 from sros_tool.keystore.reader import FilesReadOnce, OpenedKeystore, open_enclave
+from sros_tool.names import expand
 from sros_tool.policy.model import Policy
+from sros_tool.runtime.environment import node_argument
 from sros_tool.runtime.processes import (
     Process,
     ProcessEnclave,
@@ -296,6 +299,36 @@ class RunningRobot:
         ]
         return observed._replace(processes=[*as_started, *later])
 
+    def with_new_units(
+        self, observed: ObservedProcesses, new: Mapping[str, Collection[str]]
+    ) -> ObservedProcesses:
+        """Return the observed processes, and the open processes of units for new enclaves.
+
+        ``new`` maps these enclaves to the full names of their nodes. As in the other cases, only
+        processes of users who can read the enclaves count, and units that start one process.
+        """
+        unknown = [each for each in self.open_processes if process_text(each) in observed.unknown]
+        programs = {process.program[0] for process in self.in_domain}
+        started = Counter(process_origin(pid).unit for pid in programs)
+        claims: dict[str, list[tuple[Process, str]]] = {}
+        for process in filter(self.may_use_files, unknown):
+            enclaves, known_by = _enclaves_of(process, new)
+            if known_by == "program" and not enclaves and len(unknown) == 1:
+                enclaves, known_by = [*new], "elimination"
+            if len(enclaves) == 1:
+                claims.setdefault(enclaves[0], []).append((process, known_by))
+        found = {
+            process_text(process): known._replace(known_by=known_by)
+            for enclave, ((process, known_by), *others) in claims.items()
+            if not others
+            and (known := secured_process(process, enclave)).unit
+            and started[known.unit] == 1
+        }
+        return observed._replace(
+            processes=[*observed.processes, *found.values()],
+            unknown=[text for text in observed.unknown if text not in found],
+        )
+
     def other_domains_text(self) -> str:
         """Return the processes of other ROS domains, with the commands that close them, or ""."""
         robot, domains = self.robot, dict[str, list[str]]()
@@ -330,6 +363,26 @@ def secured_process(process: Process, enclave: str) -> ClosedProcess:
     """Return a process that runs in an enclave, with the command that starts it open."""
     known = ClosedProcess.from_process(process, enclave, process_origin(process.pid), "enclave")
     return known._replace(command=command_without_enclave(known.command, enclave))
+
+
+def _enclaves_of(
+    process: Process, nodes: Mapping[str, Collection[str]]
+) -> tuple[Sequence[str], str]:
+    """Return the enclaves with a node of a process's name, and what shows the name.
+
+    ``nodes`` maps enclaves to the full names of their nodes. The name is the node's in the command,
+    or otherwise the name of the program.
+    """
+    if named := node_argument(process.command):
+        full_name = expand("~", *named)
+        return [enclave for enclave, names in nodes.items() if full_name in names], "node name"
+    program = program_of(process.command).removesuffix(".py")
+    fitting = [
+        enclave
+        for enclave, names in nodes.items()
+        if program in {name.rpartition("/")[2] for name in names}
+    ]
+    return fitting, "program"
 
 
 def _with_running_command(observed: ClosedProcess, running: Sequence[Process]) -> ClosedProcess:
@@ -536,14 +589,12 @@ def current_state(robot: LocalRobot, policy: Policy | None) -> CloseState:
         observed = running.with_later_processes(robot.observed)
         observed = observed.with_current_pids(running.processes, robot.export)
     observed = observed.limited_to(policy) if policy else observed
+    if secured and policy:
+        observed = running.with_new_units(observed, _new_enclaves(robot, policy, observed, secured))
     absent = {
         process.enclave for process in observed.processes if process.is_absent(running.processes)
     }
-    known = {process.enclave for process in observed.processes} | secured.keys()
-    new = set[str]()
-    if policy and robot.observed:
-        new = {enclave.path for enclave in policy.enclaves} - known - {*observed.elsewhere}
-        new -= robot.not_here | {OBSERVER}
+    new = _new_enclaves(robot, policy, observed, secured) if policy else {}
     outdated = {
         name: processes
         for name, processes in sorted(
@@ -552,7 +603,8 @@ def current_state(robot: LocalRobot, policy: Policy | None) -> CloseState:
         )
         if name in secured
     }
-    check_enclaves(robot.without, known | new | robot.not_here, "--without")
+    known = {process.enclave for process in observed.processes} | secured.keys()
+    check_enclaves(robot.without, known | new.keys() | robot.not_here, "--without")
     outside = robot.enclaves_outside_policy() if policy else ()  # the policy may be broken
     changed_at = {
         name: changed
@@ -595,6 +647,22 @@ def current_state(robot: LocalRobot, policy: Policy | None) -> CloseState:
         dry_run=False,
         changes=(),
     )
+
+
+def _new_enclaves(
+    robot: LocalRobot, policy: Policy, observed: ObservedProcesses, secured: Collection[str]
+) -> Mapping[str, Collection[str]]:
+    """Map the enclaves of the policy without a known process to the full names of their nodes.
+
+    Processes run in the enclaves ``secured``. Before a watch, the result is empty.
+    """
+    known = {process.enclave for process in observed.processes}
+    known |= {*secured, *observed.elsewhere, *robot.not_here, OBSERVER}
+    return {
+        enclave.path: {profile.full_name for profile in enclave.all_profiles()}
+        for enclave in policy.enclaves
+        if robot.observed and enclave.path not in known
+    }
 
 
 def _valid_until(robot: LocalRobot) -> datetime | None:

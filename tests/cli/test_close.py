@@ -196,7 +196,7 @@ def robot(beside_graph: Beside, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     find_origins(
         monkeypatch,
         lambda pid: ProcessOrigin(
-            robot.units.get(units.get(pid, ""), ""), "/opt", robot.launch, robot.container
+            robot.units.get(units.get(pid, f"{pid}"), ""), "/opt", robot.launch, robot.container
         ),
     )
     # The RMWs of this machine may lack security.
@@ -732,6 +732,30 @@ def test_what_systemd_does_not_start_is_done_by_hand(
     assert "\nsome processes cannot be examined. Being root is not enough here: " in undone.err
 
 
+def a_unit_that_started_after_the_watch(robot: Robot, late: Process) -> None:
+    """It runs open next to the closed robot, and gets a drop-in, or it is open at the next boot."""
+    drop_in = robot.folder / "robot/start/units/late.service.d/sros-close.conf"
+    other = replace(late, command=("/opt/other", "--ros-args"))
+    robot.units["7"] = "late.service"
+    for process, known in ((late, "by its program"), (other, "as the only process left")):
+        robot.more = (process,)
+        ended = robot.close()
+        assert f"  /late: process 7, known {known}: --apply restarts late.service" in ended.out
+        assert "next: sros close robot --apply" in ended.err
+        assert "ROS_SECURITY_ENCLAVE_OVERRIDE=/late" in drop_in.read_text()
+    named = replace(late, command=(*late.command, "-r", "__node:=other"))
+    by_another_user = replace(late, user=os.geteuid() + 1)
+    for more in (
+        (named,),
+        (by_another_user,),
+        (late, replace(other, pid=8)),  # the unit starts two
+    ):
+        robot.units["8"], robot.more = "late.service", more
+        assert "sros knows no node of" in robot.close(status=1).out
+        assert not drop_in.exists()
+    del robot.units["7"], robot.units["8"]
+
+
 @sometimes("processes_that_started_after_the_watch", 1 / 2)
 def test_processes_that_started_after_the_watch(robot: Robot) -> None:
     """Open ones have no enclave; secured ones are asked for, named, and restarted by --undo."""
@@ -764,6 +788,7 @@ def test_processes_that_started_after_the_watch(robot: Robot) -> None:
     (robot.folder / "robot/requirements.toml").unlink()
     ended = robot.close()
     assert "  /late: new, start it with: sros run " in ended.out
+    assert "  if a systemd unit starts a new process, start the unit open, and run " in ended.out
     robot.more = (late,)
     said = robot.close(status=1).out
     assert "enclaves, except for /late (no known process); fix this first:\n" in said
@@ -774,6 +799,7 @@ def test_processes_that_started_after_the_watch(robot: Robot) -> None:
         in said
     )
     assert "such as your own `sros demo listener`; otherwise nobody would hear" in said
+    a_unit_that_started_after_the_watch(robot, late)
     robot.more = (late, replace(late, pid=8, command=("/opt/more", "--ros-args")))
     said = robot.close(status=1).out
     assert f"in its enclave: sros run {export} ENCLAVE -- COMMAND; stop processes that " in said
