@@ -371,13 +371,12 @@ def _fetch_error(error: Exception, source: str, now: datetime) -> FetchError:
     return FetchError(
         FetchProblem.NOT_SIGNED,
         f"the files in {source} are damaged, or not signed with the trusted keys",
-        f"{why} A file was damaged or changed; or the keystore publishes with other keys than "
-        "before, after it was restored from a backup or made again. Nothing was changed.",
-        "If the keystore was neither restored nor made again, copy the published files again. If "
-        "it was restored, and a key for publishing was replaced after the backup, copy the later "
-        "root metadata into PUB/metadata, and add --rotate-key to `sros fleet publish`; if all "
-        "keys were made again, run `sros agent init` with --force and the new root.json "
-        "(docs/howto/keystore_is_lost.md, --rotate-key).",
+        f"{why} Probably a published file was damaged or altered. This robot keeps its files.",
+        "On the keystore machine, run `sros fleet publish KEYSTORE PUB`, which publishes altered "
+        "files again; if robots fetch from a copy of PUB, copy it again. If the keystore was "
+        "restored or made again, its keys for publishing may be others: see "
+        "docs/howto/keystore_is_lost.md (--rotate-key; or `sros agent init` with --force and the "
+        "new root.json).",
     )
 
 

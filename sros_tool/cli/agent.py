@@ -375,7 +375,7 @@ def _status(folder: Path, max_age: str, as_json: bool) -> int:
     Example:
       $ sros agent status /etc/sros/keystore
       robot r1: release 12
-      fetched 4 min ago from https://fleet.example/pub
+      source reached 4 min ago: https://fleet.example/pub
       confirmed 4 min ago to https://fleet.example/inbox
       restart due: /r1/camera
 
@@ -399,7 +399,7 @@ def _status_lines(status: AgentStatus, moment: datetime) -> Iterator[str]:
     release = f"release {status.accepted}" if status.accepted else "no release"
     release += ", not yet complete" * (status.accepted > status.release)
     yield f"robot {status.robot}: {release}"
-    yield f"fetched {_time_ago(status.fetched, moment)} from {status.source}"
+    yield f"source reached {_time_ago(status.fetched, moment)}: {status.source}"
     yield f"confirmed {_time_ago(status.sent, moment)} to {status.inbox}"
     yield from _due_lines(status.folder, status.restart, status.unseen)
     yield from status.problems

@@ -308,8 +308,8 @@ def _collect(
       $ sros fleet collect keystore inbox --publish pub
 
     The exit status is 0 if nothing was refused, 1 if a message, request or release was refused, the
-    fleet file does not allow a request, or published files were altered, and 2 if the CAs cannot
-    sign, or the releases cannot be published.
+    fleet file does not allow a request, two computers seem to have the keys of a robot, or
+    published files were altered, and 2 if the CAs cannot sign, or the releases cannot be published.
     """
     from sros_tool.keystore.delivery.collect import PublishedAnswers, collect
 
@@ -925,8 +925,8 @@ def _revocation_list_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
             )
             text += "revoked certificate"
         elif until > compared_fleet.at:
-            text += f"; robots need the list until {until:%Y-%m-%d}, when "
-            text += "the revoked certificates have expired"
+            text += f"; no robot needs the list after {until:%Y-%m-%d}, when the "
+            text += "revoked certificates have expired"
         yield text
 
 

@@ -169,7 +169,7 @@ def test_a_bin_that_a_key_signs_which_is_not_delegated(publisher: Home) -> None:
     thief.signers["targets"] = thief.signers["snapshot"]
     thief.put("r1", archive, number)
     error = publisher.robot().refuses(FetchProblem.NOT_SIGNED)
-    assert "run `sros agent init` with --force and the new root.json" in error.remedy
+    assert "`sros agent init` with --force and the new root.json" in error.remedy
     thief.signers["targets"] = own
     thief.put("r1", archive, number)
     publisher.robot().gets()

@@ -450,7 +450,7 @@ def test_until_when_a_revocation_is_needed(field: Field, monkeypatch: pytest.Mon
     assert field.status()["revoked_until"] == iso(until), "of the last one, not of the first"
     said = field.run("fleet", "status", "ks", status=1).out
     assert (
-        f"; robots need the list until {until:%Y-%m-%d}, when the revoked certificates have "
+        f"; no robot needs the list after {until:%Y-%m-%d}, when the revoked certificates have "
         "expired\n" in said
     )
     field.run("update_keystore", "ks", "--set", "certificates.validity=90d")
@@ -938,7 +938,9 @@ def test_a_revocation_list_is_in_force_after_the_restart(field: Field) -> None:
     field.run("revoke", "ks", "/dispatcher")
     assert in_force() == [False, False, False]
     said = field.run("fleet", "status", "ks", status=1).out
-    assert "\nthe revocation list is in force on 0 of 3 robots; robots need the list until " in said
+    assert (
+        "\nthe revocation list is in force on 0 of 3 robots; no robot needs the list after " in said
+    )
     field.deliver("r1", "r2")
     field.send("r2", running={"/r2/base": RunningFiles.EARLIER, "/r9/base": RunningFiles.EARLIER})
     assert in_force() == [False, False, False], "r1 does not say which processes it has"
@@ -961,9 +963,11 @@ def test_a_revocation_list_is_in_force_after_the_restart(field: Field) -> None:
     field.deliver("r3", restart=[])
     field.send("r2", running={"/r2/base": RunningFiles.CURRENT})
     said = field.run("fleet", "status", "ks").out
-    assert "\nthe revocation list is in force on all 3 robots; robots need the list until " in said
+    assert (
+        "\nthe revocation list is in force on all 3 robots; no robot needs the list after " in said
+    )
     said = field.run("fleet", "status", "ks", "--robot", "r3").out
-    assert "\nthe revocation list is in force on 1 robot; robots need the list until " in said
+    assert "\nthe revocation list is in force on 1 robot; no robot needs the list after " in said
     rights = {f"/{{robot}}/{name}": publish("/{robot}/x") for name in ("base", "new")}
     (field.folder / "more.xml").write_text(policy_text(rights))
     field.run("generate_artifacts", "-k", "ks", "-p", "more.xml", "--fleet", "fleet.toml")

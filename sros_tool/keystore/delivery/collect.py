@@ -138,6 +138,10 @@ class CollectedMessage(NamedTuple):
     """Remarks (clauses), for example about the robot's clock or an expired certificate."""
     requests: Sequence[CollectedRequest]
     """The requests for renewal in the message."""
+    shared_keys: bool
+    """Whether two computers seem to have the robot's keys: the message came from an earlier start
+    of the computer than the message before it. The exit status is then 1.
+    """
 
 
 class PublishedAnswers(NamedTuple):
@@ -182,13 +186,14 @@ class CollectedInbox(NamedTuple):
 
     @property
     def complete(self) -> bool:
-        """Whether nothing was refused, and every request that may be signed was signed."""
+        """Whether nothing was refused, every request that may be signed was signed, and no two
+        computers seem to have the keys of a robot.
+        """
         if self.published and self.published.refused:
             return False
         requests = (request for robot in self.robots for request in robot.requests)
-        return all(robot.outcome != "refused" for robot in self.robots) and all(
-            request.outcome in _GOOD for request in requests
-        )
+        is_suspect = any(robot.outcome == "refused" or robot.shared_keys for robot in self.robots)
+        return not is_suspect and all(request.outcome in _GOOD for request in requests)
 
 
 def collect(
@@ -343,6 +348,7 @@ class _ReceivedMessage:
     """The signer's certificate, if the message itself is not accepted."""
     remarks: list[str] = field(default_factory=list)
     requests: list[_DecidedRequest] = field(default_factory=list)
+    shared_keys: bool = False
 
     def without_confirmation(self) -> _ReceivedMessage:
         """Return a copy without the verified content, to save memory."""
@@ -368,6 +374,7 @@ class _ReceivedMessage:
             self.sequence,
             self.remarks,
             [request.result for request in self.requests],
+            self.shared_keys,
         )
 
 
@@ -596,7 +603,12 @@ class _Verifier:
                 "the computer than the message before it (`sros fleet status` says what to do)"
             )
         return _ReceivedMessage(
-            robot, "kept", verified=verified, received=received, remarks=remarks
+            robot,
+            "kept",
+            verified=verified,
+            received=received,
+            remarks=remarks,
+            shared_keys=is_earlier_start,
         )
 
     def _has_new_keys(self, robot: Robot, last: ReceivedConfirmation) -> bool:

@@ -402,7 +402,7 @@ class _RequestCertifier:
                     "fleet.unrecorded-enclaves",
                     f"the keystore does not know which robot has {first_few(unrecorded, 3)}: "
                     f"{lacks}. So `--robot`, as in `sros renew KEYSTORE --robot ROBOT`, does not "
-                    "choose such an enclave until you run `sros generate_artifacts -k "
+                    "choose such an enclave until the next step: `sros generate_artifacts -k "
                     f"{quote(str(root))} -p POLICY_FILE --fleet FLEET_FILE`.",
                 )
             )
