@@ -334,7 +334,7 @@ def _judge_expiry(case: _ClaimRecords) -> _ClaimFinding:
         return _undecided_finding(f"{claim.talker} sent nothing after its certificate had expired")
     late = [event for event in heard if event.time > after]
     early = counted(len(heard) - len(late), "message")
-    before = f"{early} of the {claim.talker} until its certificate"
+    before = f"{early} of the {claim.talker} until the {claim.talker}'s certificate"
     return case.result(
         bool(late),
         f"{claim.subject} heard {before} expired, and {len(late)} of {len(sent)} after that",

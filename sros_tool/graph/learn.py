@@ -887,7 +887,8 @@ def _check(plan: Draft) -> None:
         if plan.least <= written <= plan.most:
             return
         difference = min(written ^ plan.least, key=order)
-        why = f"The written policy and the learned rights would differ in {difference.describe()}."
+        right = f"the right of enclave {difference.enclave} to {difference.describe()}"
+        why = f"The written policy and the learned rights would differ in {right}."
     except DocumentError as error:
         why = f"{error}"
     raise PolicyError(
