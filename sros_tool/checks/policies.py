@@ -851,9 +851,9 @@ def _missing_common_part_cause(lacking: Sequence[_NodeLackingRight]) -> Cause:
     if any(_is_any_node(node) for node in nodes):
         remedy = f"{_NAME_NODE_FIRST_REMEDY} {remedy}"
     return Cause(
-        f"{counted(len(nodes), 'node')} lack rights that nodes need"
+        f"{counted(len(nodes), 'node')} lack rights that every node needs"
         if plural
-        else "a node lacks rights that nodes need",
+        else "a node lacks rights that every node needs",
         _denied_start_actions_sentence(lacking),
         remedy,
         len(lacking),

@@ -86,7 +86,7 @@ def test_nodes_without_the_common_part_are_one_paragraph_with_one_mend(tmp_path:
     assert ended.status == 1
     lines = ended.out.splitlines()
     assert len(lines) <= 12, ended.out
-    assert "6 nodes lack rights that nodes need" in lines[0]
+    assert "6 nodes lack rights that every node needs" in lines[0]
     assert "24 errors" in ended.err
     kinds = ("no-rosout", "no-parameter-events", "no-parameter-services", "no-type-description")
     assert all(f"policy.{kind}" in ended.out for kind in kinds)
@@ -107,7 +107,7 @@ def test_nodes_without_the_common_part_are_one_paragraph_with_one_mend(tmp_path:
         assert policy.read_text() == by_hand.replace(" node=", f"{between}node=")
     policy.write_text(before.replace("\n", ""))  # sed would edit the first profile alone, each time
     said = sros("check", "robot.xml", cwd=tmp_path).out
-    assert "6 nodes lack rights that nodes need" in said and "`sed " not in said
+    assert "6 nodes lack rights that every node needs" in said and "`sed " not in said
 
 
 def test_an_older_common_part_that_is_included_is_replaced(tmp_path: Path) -> None:
@@ -128,7 +128,7 @@ def test_an_older_common_part_that_is_included_is_replaced(tmp_path: Path) -> No
 def test_a_cause_of_which_a_finding_is_left_out_is_not_one_paragraph(tmp_path: Path) -> None:
     write_policy(tmp_path / "robot.xml", ("arm",))
     whole = sros("check", "robot.xml", cwd=tmp_path)
-    assert "a node lacks rights that nodes need" in whole.out
+    assert "a node lacks rights that every node needs" in whole.out
     part = sros("check", "robot.xml", "--exclude", "policy.no-rosout", cwd=tmp_path)
     assert "common part [" not in part.out
     assert len(part.out.splitlines()) == 9
@@ -186,11 +186,11 @@ def test_a_policy_that_cannot_work_is_said_when_it_is_signed(tmp_path: Path, dry
     planned = ["--dry-run"] if dry_run else []
     for words in signing("robot.xml"):
         ended = sros(*words, *planned, cwd=tmp_path).ok()
-        assert ended.err.count("2 nodes lack rights that nodes need") == 1
+        assert ended.err.count("2 nodes lack rights that every node needs") == 1
         assert "lack" not in ended.out
         document = json.loads(sros(*words, "--json", *planned, cwd=tmp_path).ok().out)
         notes = [each["text"] for each in document["notes"] if each["id"].startswith("policy.")]
-        assert len(notes) == 1 and "2 nodes lack rights that nodes need" in notes[0]
+        assert len(notes) == 1 and "2 nodes lack rights that every node needs" in notes[0]
     fixed(tmp_path / "robot.xml", ended.err)
     for words in signing("robot.xml"):
         assert "lack" not in sros(*words, *planned, cwd=tmp_path).ok().err
@@ -200,7 +200,7 @@ def test_only_what_is_signed_is_said(tmp_path: Path) -> None:
     write_policy(tmp_path / "robot.xml", ("arm", "base"))
     sros("generate_artifacts", "-k", "ks", "-e", "/arm", cwd=tmp_path).ok()
     ended = sros("create_permission", "ks", "/arm", "robot.xml", cwd=tmp_path).ok()
-    assert "a node lacks rights that nodes need" in ended.err
+    assert "a node lacks rights that every node needs" in ended.err
     assert "/arm may not" in ended.err and "/base" not in ended.err
 
 
@@ -210,7 +210,7 @@ def test_a_policy_for_a_fleet_is_said_once_when_it_is_signed(tmp_path: Path) -> 
     (tmp_path / "fleet.toml").write_text("[robots]\n" + "".join(f"r{n} = {{}}\n" for n in range(9)))
     words = ("generate_artifacts", "-k", "ks", "-p", "robot.xml", "--fleet", "fleet.toml")
     ended = sros(*words, cwd=tmp_path).ok()
-    assert "a node lacks rights that nodes need" in ended.err
+    assert "a node lacks rights that every node needs" in ended.err
 
 
 def test_more_than_a_few_kinds_of_findings_are_counted(tmp_path: Path) -> None:
@@ -237,11 +237,11 @@ def test_a_keystore_is_checked_with_its_policy_and_without(tmp_path: Path) -> No
         assert len(alone.out.splitlines()) <= 10
         both = sros("check", "ks", "--policy", "robot.xml", *strict, cwd=tmp_path)
         assert both.status == 1
-        assert "6 nodes lack rights that nodes need" in both.out
+        assert "6 nodes lack rights that every node needs" in both.out
         assert "ordinary node" not in both.out
         assert len(both.out.splitlines()) <= 10
     one = sros("check", "ks/enclaves/arm", "--policy", "robot.xml", cwd=tmp_path)
-    assert "a node lacks rights that nodes need" in one.out
+    assert "a node lacks rights that every node needs" in one.out
     fixed(policy, both.out)
     sros(*sign, cwd=tmp_path).ok()
     sros("check", "ks", cwd=tmp_path).ok()
@@ -275,4 +275,4 @@ def test_a_node_of_two_enclaves_counts_once(tmp_path: Path) -> None:
     file = tmp_path / "policy.xml"
     file.write_text(f'<policy version="0.2.0"><enclaves>{enclaves}</enclaves></policy>')
     said = sros("check", file).out
-    assert "a node lacks rights that nodes need" in said and "nodes)" not in said
+    assert "a node lacks rights that every node needs" in said and "nodes)" not in said

@@ -229,7 +229,7 @@ def test_the_rights_of_every_node_are_not_next_to_the_policy(made: Path, tmp_pat
 def test_findings_that_are_the_same_for_many_robots_are_said_once(made: Path) -> None:
     fleet = FLEET
     folded = sros("check", "robot.xml", *fleet, cwd=made).out
-    assert f"{COUNT} nodes lack rights that nodes need" in folded
+    assert f"{COUNT} nodes lack rights that every node needs" in folded
     ended = sros("check", "robot.xml", *fleet, "--exclude", "policy.no-parameter-events", cwd=made)
     lines = ended.out.splitlines()
     rosout = [at for at, each in enumerate(lines) if each.endswith("[policy.no-rosout]")]

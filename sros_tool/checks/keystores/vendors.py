@@ -404,9 +404,9 @@ NO_NODE = FindingKind(
     "enclave.node-cannot-start",
     ERROR,
     "permissions with which no ordinary ROS 2 node can start",
-    "When a node of rclpy or rclcpp starts, it creates the endpoints that the finding names, and "
-    "exits if one of them is denied. Nodes that were created without these endpoints do not need "
-    "them, but every process needs ros_discovery_info.",
+    "A node of rclpy or rclcpp exits when it starts if an endpoint that the finding names is "
+    "denied. Nodes that were created without these endpoints do not need them, but every process "
+    "needs ros_discovery_info.",
     "ROS 2 Jazzy, rcl 9, rclcpp 28, rclpy 7 and rmw_dds_common; ~/get_type_description since Iron "
     "(REP-2016).",
     "Include common/node.xml in the profiles of the enclave's nodes (`sros check POLICY_FILE` says "
