@@ -408,7 +408,7 @@ def _collected_lines(collected: CollectedInbox) -> Iterator[str]:
         yield f"and {counted(more, 'more request')}, see --json"
 
 
-_OUTCOME_WORDS = {"missing": "by hand or without a message"}
+_OUTCOME_WORDS = {"missing": "without a message (or delivered by hand)"}
 
 
 def _outcomes_text(numbers: Mapping[str, int], outcomes: Sequence[str], verb_form: str) -> str:

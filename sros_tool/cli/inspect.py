@@ -254,8 +254,8 @@ def _authority_lines(role: str, authority: AuthorityFile | UnreadableFile) -> It
     )
     for further in authority.file.further or ():
         yield (
-            f"    next to it {_authority_name(further.subject, further.sha256)}, {further.key}, "
-            f"valid until {iso(further.not_after)}, serial {further.serial}"
+            f"    in the same file: {_authority_name(further.subject, further.sha256)}, "
+            f"{further.key}, valid until {iso(further.not_after)}, serial {further.serial}"
         )
     if crl := authority.file.crl:
         yield f"    {_list_text(crl)}"

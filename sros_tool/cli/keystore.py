@@ -177,7 +177,7 @@ def create_permission(
 
 
 _ORDER_REMEDY = (
-    "Write them in this order: `sros create_permission KEYSTORE ENCLAVE... POLICY_FILE`."
+    "Write the arguments in this order: `sros create_permission KEYSTORE ENCLAVE... POLICY_FILE`."
 )
 
 

@@ -278,7 +278,7 @@ def _format(form: str | None, output: Path | None, graphviz: bool) -> str:
         raise UsageError(
             f"view writes no {ending} files",
             "",
-            f"Let the name end with {', '.join(f'.{known}' for known in _FORMATS)}, or name the "
+            f"Use one of the endings {', '.join(f'.{known}' for known in _FORMATS)}, or name the "
             "format with --format.",
         )
     chosen = chosen or "html"

@@ -149,7 +149,7 @@ def test_a_robot_writes_its_own_message_alone(server: Server) -> None:
     assert server.ask("r1", "PUT", f"/inbox/r1/{MESSAGE_FILE}", bytes(MAX_BYTES + 1)) == 413
     assert (place / "r1" / MESSAGE_FILE).read_bytes() == message
     ended = sros("fleet", "collect", "ks", "srv/inbox", cwd=server.folder).ok()
-    assert ended.out.startswith("3 robots: 2 kept, 1 by hand or without a message")
+    assert ended.out.startswith("3 robots: 2 kept, 1 without a message (or delivered by hand)")
 
 
 def test_a_robot_reads_what_is_published_and_writes_nothing_there(

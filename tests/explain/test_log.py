@@ -1168,9 +1168,8 @@ def test_a_topic_of_cyclone_dds_that_one_direction_would_create(
 def test_a_node_of_another_version_than_its_policy(tmp_path: Path) -> None:
     """A name unlike all others is seldom a renamed one, so that this is said last."""
     policy, log = tmp_path / "p.xml", tmp_path / "robot.log"
-    policy.write_text(
-        policy_text({"/a": '<actions execute="ALLOW"><action>/grasp</action></actions>'})
-    )
+    names = "<action>/grasp</action><action>/lift*</action>"
+    policy.write_text(policy_text({"/a": f'<actions execute="ALLOW">{names}</actions>'}))
     denied = "[SECURITY Error] rq/calibrate/_action/send_goalRequest topic not found in allow rule"
     log.write_text(f"{denied}. -> check_create_datareader\n")
     said = sros("explain", policy, "/a", "--log", log).out

@@ -529,7 +529,7 @@ def test_a_message_that_was_accepted_before_its_certificate_was_revoked(home: Ho
     home.run("renew", "ks", "--robot", "r1", "--revoke-old")
     ended = sros("fleet", "collect", "ks", "inbox", cwd=home.folder).ok()
     assert ended.out.splitlines() == [
-        "3 robots: 2 unchanged, 1 by hand or without a message",
+        "3 robots: 2 unchanged, 1 without a message (or delivered by hand)",
         "r1: its certificate was revoked after this message was accepted",
     ]
     home.send("r1")
@@ -1225,7 +1225,7 @@ def test_messages_that_show_later_releases_refuse_a_new_folder(home: Home) -> No
     later = read_published(OpenedKeystore(home.root)).number + 1
     home.send("r1", datetime.now(UTC), release=later)
     ended = sros("fleet", "collect", "ks", "inbox", cwd=home.folder).ok()
-    assert ended.out == "3 robots: 1 kept, 2 by hand or without a message\n"
+    assert ended.out == "3 robots: 1 kept, 2 without a message (or delivered by hand)\n"
     (home.folder / "pub").rename(home.folder / "lost")
     for folder in ("pub", "stick"):
         publish = ("fleet", "publish", "ks", folder, "--new-folder")
