@@ -120,9 +120,11 @@ class Question(NamedTuple):
         if self.only or not self.right:
             return self.only
         names = dds_names(self.right, self.name)
-        published = (
-            Part(AccessVerb.PUBLISH, topic, _role(topic, self.type)) for topic in names.publish
+        # A reader expects the goal of an action first.
+        written = sorted(
+            names.publish, key=lambda topic: f"{ACTION_SEPARATOR}send_goal" not in topic
         )
+        published = (Part(AccessVerb.PUBLISH, topic, _role(topic, self.type)) for topic in written)
         read = (
             Part(AccessVerb.SUBSCRIBE, topic, _role(topic, self.type)) for topic in names.subscribe
         )
