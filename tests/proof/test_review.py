@@ -1048,7 +1048,7 @@ _ADDED = "# added\n"
 _NODES = {
     "/eyes/eye": publish("/image"),
     "/drive": publish("/cmd"),
-    "/eyes/ear": publish("/x") + subscribe("/cmd"),
+    "/eyes/ear": publish("/x") + subscribe("/cmd", "/x"),
 }
 _EYE = f'</profile><profile ns="/" node="eye">{NODE}{publish("/image")}'
 
