@@ -160,7 +160,7 @@ PROCESS_NOT_SEEN = FindingKind(
     "processes that sros could not examine",
     "Such processes may be nodes, even open or revoked ones. The other findings do not cover them.",
     "proc(5), ptrace(2) (PTRACE_MODE_READ_FSCREDS).",
-    "Run the check as root, outside of containers: `sudo sros check runtime`.",
+    'Run the check as root, outside of containers: `sudo "$(command -v sros)" check runtime`.',
 )
 ROOT_IS_NOT_ENOUGH = (
     "Being root is not enough here: the processes are in another container or user namespace, or "

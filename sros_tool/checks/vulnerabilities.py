@@ -60,8 +60,8 @@ VERSION_UNKNOWN = FindingKind(
     prominent=True,
 )
 _UNSEEN_REMEDY = (
-    "Run `sudo sros check runtime` on the robot: it names the processes that even root cannot "
-    "examine, and the reason."
+    'Run `sudo "$(command -v sros)" check runtime` on the robot: it names the processes that '
+    "even root cannot examine, and the reason."
 )
 ROBOTS_UNKNOWN = FindingKind(
     "runtime.robots-dds-unknown",

@@ -281,14 +281,20 @@ def _show(robot: LocalRobot, closed: CloseState) -> None:
             "  if this is a mistake, change the policy; otherwise, expect that a node without such "
             "a right may end when it starts"
         )
-    for name, rules in closed.denied_remappings.items():
-        echo(
-            f"the start command of {name} remaps to a name that the policy denies "
-            f"({enumerated(rules)}): change the remapping before you start the process"
-        )
+    for name in closed.denied_remappings:
+        echo(_remapping_text(closed, name))
     if stays := len(closed.denied) - len(closed.newly_denied):
         rights = counted(stays, "right")
         echo(f"the policy still denies {rights} that the robot used when sros watched (see --json)")
+
+
+def _remapping_text(closed: CloseState, enclave: str) -> str:
+    """Return what to change in a start command that gives a node a denied name."""
+    return (
+        f"the start command of {enclave} remaps to a name that the policy denies "
+        f"({enumerated(closed.denied_remappings[enclave])}): change the remapping before you start "
+        "the process"
+    )
 
 
 def _process_line(process: ClosedProcess, closed: CloseState, policy: Policy) -> str:
@@ -366,6 +372,8 @@ def _show_end(
     ``holds`` says whether the robot is proved closed; ``apply`` is the option, and
     ``accepted`` are the claims that need not have been tested.
     """
+    from sros_tool.close.state import starting_units
+
     folder, observed = shlex.quote(str(robot.folder)), closed.observed
     ask, details = f"sros close {folder} --proof", list[str]()
     for proof in closed.proofs:
@@ -380,7 +388,7 @@ def _show_end(
         for detail in proof.details:
             echo(f"  {detail}")
     if closed.problems:
-        echo(f"{_state_text(closed, apply=apply)}; fix this first:")
+        echo(f"{_state_text(closed, apply=apply)}; but fix this first:")
         for problem in closed.problems:
             echo(f"  {problem}")
         answer = f"next: sros close {folder}{' --apply' if apply else ''}"
@@ -404,6 +412,11 @@ def _show_end(
             echo(f"  {command}")
             if advice := processes[0].launch_advice(robot.folder.absolute()):
                 echo(f"  {advice}")
+            for process in processes:
+                if process.enclave in closed.denied_remappings:
+                    echo(f"  {_remapping_text(closed, process.enclave)}")
+            for unit in starting_units(processes):
+                echo(f"  {unit} starts it: also put this command into the script of the unit")
         answer = f"next: run these commands, and then {ask}"
         details = _idle_lines(closed, ask)
         if not_starting := _advice_without_security(robot, closed):

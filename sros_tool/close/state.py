@@ -365,6 +365,12 @@ def secured_process(process: Process, enclave: str) -> ClosedProcess:
     return known._replace(command=command_without_enclave(known.command, enclave))
 
 
+def starting_units(processes: Iterable[ClosedProcess]) -> Sequence[str]:
+    """Return the units whose scripts started processes that run now."""
+    pids = {process.pid for process in processes} - {0}
+    return sorted({process_origin(pid).unit for pid in pids} - {""})
+
+
 def _enclaves_of(
     process: Process, nodes: Mapping[str, Collection[str]]
 ) -> tuple[Sequence[str], str]:

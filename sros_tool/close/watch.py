@@ -44,6 +44,7 @@ _SHELL_VARIABLES = re.compile(
     r"_|SHLVL|PWD|OLDPWD|COLUMNS|LINES|PS[0-4]|PROMPT_COMMAND|HIST\w+|TERM\w*|COLORTERM|LS_COLORS"
     r"|LESS(OPEN|CLOSE)|debian_chroot|VIRTUAL_ENV_PROMPT"
     rf"|INVOCATION_ID|JOURNAL_STREAM|SYSTEMD_EXEC_PID|MEMORY_PRESSURE_\w+|{DOMAIN}"
+    r"|DBUS_SESSION_BUS_ADDRESS|XDG_(RUNTIME_DIR|SESSION_\w+|SEAT|VTNR)|SSH_\w+|SUDO_\w+|MAIL"
 )
 """Matches variables that differ between shells, that interactive shells, systemd or the start
 commands set.

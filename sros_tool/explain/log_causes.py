@@ -540,17 +540,16 @@ class Examiner:
             facts = [f"the enclave may {question.word} {is_meant}"]
             if is_used:
                 return facts, (
-                    f"{remedy} Or, if the node lacks a remapping that its policy has{add} If the "
-                    f"node has a remapping to {name} that its policy lacks (or a parameter with "
-                    "this name), remove it."
+                    f"{remedy} Or, if the node lacks a remapping that its policy has{add} "
+                    f"{_remapping_advice(name, meant)}"
                 )
             misspelled = ""
             if is_typing_error(name, meant):
                 misspelled = f"If the program misspells the name, write {meant} there. "
             return facts, (
-                f"{misspelled}If the node lacks a remapping{add} If it has one that the policy "
-                f"lacks, merge the policy with `--remap {quote(meant)}:={quote(name)}`; if this "
-                f"remapping is a mistake, remove it from the node's command. {_otherwise(remedy)}"
+                f"{misspelled}If the node lacks a remapping{add} {_remapping_advice(name, meant)} "
+                f"If only the policy lacks this remapping, merge the policy with `--remap "
+                f"{quote(meant)}:={quote(name)}`. {_otherwise(remedy)}"
             )
         if is_used is False and self._keystore:
             place = self._keystore.kind
@@ -711,6 +710,14 @@ class Examiner:
                 "domain of the keystore", f"domain of the keystore, such as {next(iter(governed))}"
             ),
         )
+
+
+def _remapping_advice(name: str, meant: str) -> str:
+    """Return what to change in a command that remaps to ``name`` in place of ``meant``."""
+    return (
+        f"If its command already has `-r OLD:={quote(name)}` (or a parameter with this name), "
+        f"write {meant} in place of {name} there: ROS applies only one rule to a name."
+    )
 
 
 def _otherwise(remedy: str) -> str:

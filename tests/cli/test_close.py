@@ -306,6 +306,9 @@ def test_a_policy_that_was_changed_stays_and_is_followed(robot: Robot) -> None:
         "First change the remapping words:=chatter: the policy denies the new name.\ncd /opt && "
     )
     assert f"\n# /listener\n# {change}" in commands and commands.count("First change") == 1
+    assert (
+        f" words:=chatter\n  the {denied}: change the remap" in robot.close("--apply", status=1).out
+    )
     robot.units = UNITS
     assert "/listener: the rights that it lost still work until 20" in ended.err
     assert sros("diff_policy", "robot/keystore", "robot/policy.xml", cwd=robot.folder).ok()
@@ -317,7 +320,9 @@ def test_a_policy_that_was_changed_stays_and_is_followed(robot: Robot) -> None:
     assert "/listener subscribe topic /chatter" not in told_again
     again = robot.close("--for", "1s", status=1)
     assert policy.read_text() == changed
-    assert "nothing is closed yet; fix this first:\n  'robot/policy.xml' stays as it " in again.out
+    assert (
+        "nothing is closed yet; but fix this first:\n  'robot/policy.xml' stays as it " in again.out
+    )
     remapped = "perhaps the policy means /old/chatter (the node may lack the remapping -r "
     assert f"lacks 1 right seen now (/listener subscribe /chatter); {remapped}" in again.out
     assert "-r /chatter:=/old/chatter, or the policy may lack --remap /old/chatter:=" in again.out
@@ -580,9 +585,12 @@ def test_a_robot_is_closed_proved_and_opened_again(
 def test_what_systemd_does_not_start_is_done_by_hand(
     robot: Robot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    robot.units = dict.fromkeys(PID, "both.service")  # its script starts both
     robot.close()
     ended = robot.close("--apply", status=1)
     assert robot.restarts == []
+    assert ended.out.count("  both.service starts it: also put this command into the script") == 2
+    robot.units = {}
     assert "stop process 4711, and start again with:\n  cd /opt && sros run " in ended.out
     assert ended.err.endswith("next: run these commands, and then sros close robot --proof\n")
     assert (
@@ -791,7 +799,7 @@ def test_processes_that_started_after_the_watch(robot: Robot) -> None:
     assert "  if a systemd unit starts a new process, start the unit open, and run " in ended.out
     robot.more = (late,)
     said = robot.close(status=1).out
-    assert "enclaves, except for /late (no known process); fix this first:\n" in said
+    assert "enclaves, except for /late (no known process); but fix this first:\n" in said
     export = robot.folder / "robot/export"
     start = f"cd /opt && sros run {export} /late -- /opt/late --ros-args"
     assert (
@@ -1674,7 +1682,7 @@ def stops_as_the_run_stops(robot: Robot, policy: Path, signed: str) -> None:
         assert ("would run: sros generate_artifacts" in dry.err) is signs, dry
         assert ("sros would sign nothing" in dry.out) is not signs, dry
         for ended in (dry, robot.close(status=1)):
-            assert "; fix this first:\n  " in ended.out and reason in ended.out, ended
+            assert "; but fix this first:\n  " in ended.out and reason in ended.out, ended
 
 
 def test_a_dry_run_changes_nothing(robot: Robot) -> None:
@@ -1911,7 +1919,7 @@ def test_a_process_with_older_files_of_an_enclave_is_no_closed_process(robot: Ro
         robot.spelled = "robot/export"
         robot.absent = {"/talker"} if status else set()
         ended = robot.close(status=status)
-        runs = "enclaves, except for /talker (secured with other files); fix this first:\n"
+        runs = "enclaves, except for /talker (secured with other files); but fix this first:\n"
         assert (runs in ended.out) == bool(status), ended
         said = f"  process 13 (run): it runs in /talker from '{copy}', not from '{robot.folder}"
         assert (f"{said}/robot/export': stop it; if it belongs to the robot" in ended.out) == bool(

@@ -10,12 +10,13 @@ from sros_tool.close import watch
 from sros_tool.close.processes import ClosedProcess, ObservedProcesses
 from sros_tool.runtime.processes import Process, ProcessOrigin, RunningProcesses
 
+OF_A_LOGIN = {"PS1": "$ ", "INVOCATION_ID": "1", "XDG_RUNTIME_DIR": "/run/user/1", "MAIL": "m"}
+
 
 def test_variables_that_a_command_does_not_set_are_named() -> None:
     variables = {"HOME": "/", "RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp", "GAIN": "2"}
     talkers = tuple(
-        Process(pid, ("talk",), {**variables, "PS1": "$ ", "INVOCATION_ID": "1"}, datetime.now(UTC))
-        for pid in (1, 2, 3)
+        Process(pid, ("talk",), {**variables, **OF_A_LOGIN}, datetime.now(UTC)) for pid in (1, 2, 3)
     )
     origins = [
         ProcessOrigin("", "/opt"),
@@ -33,4 +34,4 @@ def test_variables_that_a_command_does_not_set_are_named() -> None:
     watch._show_variables(running, ObservedProcesses(0, closed))
     processes = "process 1 (talk) and process 2 (talk) run with variables that this shell does not"
     assert len(shown) == 1 and shown[0].startswith(processes)
-    assert shown[0].endswith("do not set: GAIN")
+    assert "do not set: GAIN; before" in shown[0]

@@ -1388,8 +1388,7 @@ def test_a_forgotten_remapping_is_shown(keystore: Path, tmp_path: Path) -> None:
         assert (f"`--ros-args -r /{topic}:=/chatter`" in found) is bool(why)
         assert (typo in found) is (topic == "chater")
         assert (
-            f"has one that the policy lacks, merge the policy with `--remap /chatter:=/{topic}"
-            in found
+            f"lacks this remapping, merge the policy with `--remap /chatter:=/{topic}" in found
         ) is bool(why)
         assert (f"`--remap /chatter:=/{topic}`" in found) is bool(why)
         assert f"`sros explain {keystore} {ENCLAVE} publish /{topic}`" in found
@@ -1413,9 +1412,20 @@ def test_the_other_side_of_a_name_tells_whether_a_remapping_may_be_forgotten(
     sros("generate_artifacts", "-k", keystore, "-p", policy).ok()
     rear = "Or, if the node lacks a remapping that its policy has, add `--ros-args -r /rear/image:="
     for topic, facts in (
-        ("/rear/image", (rear, "has a remapping to /rear/image that its policy lacks (or a para")),
+        (
+            "/rear/image",
+            (rear, "has `-r OLD:=/rear/image` (or a parameter with this name), write "),
+        ),
         ("/map_a", ("If `-r OLD:=/map_a` or a parameter gives the node this name, remove it",)),
-        ("/frnt/image", ("-r /frnt/image:=/front/image",)),
+        (
+            "/frnt/image",
+            (
+                "-r /frnt/image:=/front/image",
+                "already has `-r OLD:=/frnt/image` (or a parameter with this name), write "
+                "/front/image in place of /frnt/image there: ROS applies only one rule to a name.",
+                "lacks this remapping, merge the policy with `--remap /front/image:=/frnt/image`.",
+            ),
+        ),
         (
             "/odometry",
             (
