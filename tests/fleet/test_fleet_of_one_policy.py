@@ -14,7 +14,7 @@ import pytest
 
 from sros_tool.dds.permissions import Permissions, parse_permissions
 from sros_tool.fleet.expansion import FleetPolicy
-from sros_tool.keystore.fleet import load_fleet
+from sros_tool.keystore.fleet import left_enclaves, load_fleet, recorded_fleet
 from sros_tool.keystore.layout import enclave_names
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.pki import smime
@@ -327,6 +327,7 @@ def test_what_happens_to_a_fleet(made: Path, tmp_path: Path) -> None:
     assert "/r8/base" in enclave_names(folder / "ks")
 
     # A robot that leaves keeps its enclaves until they are revoked, as the note says.
+    earlier = recorded_fleet(OpenedKeystore(folder / "ks"))
     (folder / "fleet.toml").write_text(fleet_file([r for r in ROBOTS if r not in ("r7", "r9")]))
     ended = sros(*write_again, cwd=folder).ok()
     assert "created" not in ended.out
@@ -348,6 +349,12 @@ def test_what_happens_to_a_fleet(made: Path, tmp_path: Path) -> None:
     words = ("--include", "keystore.robot-left", "--json")
     found = json.loads(sros("check", "ks", *words, cwd=folder).out)["findings"]
     assert [each["text"] for each in found] == ["enclaves of r9: /r9/base, /r9/lift"]
+    assert left_enclaves(OpenedKeystore(folder / "ks"), fleet) == dict.fromkeys(
+        ("/r9/base", "/r9/lift"), "r9"
+    )
+    assert not left_enclaves(OpenedKeystore(folder / "ks"), earlier), "it may come back"
+    rotated = sros("rotate_ca", "ks", "--next", "--dry-run", cwd=folder).ok().err
+    assert "the robot r9 is no longer in the fleet" in rotated
     refused = sros("revoke", "ks", "--robot", "r9", cwd=folder)
     assert refused.status == 2
     assert "Name the enclaves themselves: --match '/r9/*'" in refused.err

@@ -23,7 +23,13 @@ from sros_tool.dds.governance import parse_governance
 from sros_tool.errors import KeystoreError, Note, SrosError, UsageError
 from sros_tool.faults import WAIT_FOR_CA
 from sros_tool.fleet.robots import robot_of
-from sros_tool.keystore.fleet import checked_fleet, load_fleet, publish_command
+from sros_tool.keystore.fleet import (
+    checked_fleet,
+    left_enclaves,
+    left_enclaves_notes,
+    load_fleet,
+    publish_command,
+)
 from sros_tool.keystore.fleet_status import fleet_status
 from sros_tool.keystore.issuing.authority import (
     Authority,
@@ -188,7 +194,7 @@ def rotate_ca(
             wanted = _WantedAuthorities(roles, new_keys, existing, validity)
             stage = rotator.go_to(stage, wanted, progress)
             if stage in (RotationStage.DISTRIBUTE, RotationStage.REISSUE):
-                change.notes += _no_robot_notes(change.keystore, change.names)
+                change.notes += _no_robot_notes(change.keystore, change.names, change.now)
             change.finish()
         elif delete_old_key:
             _refuse_late_deletion(change.keystore, rotation.stage)
@@ -246,10 +252,16 @@ def _leaves_out_stages(rotation: Rotation, to: RotationStage) -> bool:
     return stages.index(to) - stages.index(rotation.stage) > 1
 
 
-def _no_robot_notes(keystore: OpenedKeystore, names: Iterable[str]) -> Iterator[Note]:
-    """Yield a note on enclaves without a robot, whose state no confirmation shows."""
+def _no_robot_notes(
+    keystore: OpenedKeystore, names: Iterable[str], now: datetime
+) -> Iterator[Note]:
+    """Yield notes on enclaves without a robot, whose state no confirmation shows."""
     fleet = load_fleet(keystore)
-    without = [name for name in names if robot_of(fleet, name) is None] if fleet else []
+    if not fleet:
+        return
+    left = left_enclaves(keystore, fleet, now)
+    yield from left_enclaves_notes(keystore, fleet, left)
+    without = [name for name in names if name not in left and robot_of(fleet, name) is None]
     if without:
         verb, its = ("belongs", "its") if len(without) == 1 else ("belong", "their")
         yield Note(
