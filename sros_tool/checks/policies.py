@@ -809,10 +809,7 @@ def _denied_start_actions_sentence(lacking: Sequence[_NodeLackingRight]) -> str:
     ]
     *first, last = verbs
     either = f"{', '.join(first)} or {last}" if first else last
-    return (
-        f"{names_text(nodes)} may not {either}. A node that is denied any of this exits when it "
-        "starts."
-    )
+    return f"{names_text(nodes)} may not {either}. A node needs all these rights to start."
 
 
 def _different_common_part_cause(folder: str, lacking: Sequence[_NodeLackingRight]) -> Cause:
