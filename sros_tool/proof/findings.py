@@ -286,8 +286,8 @@ def _unanswered_clauses(
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return clauses on names without another side: for a warning, and for a note.
 
-    A note is enough if the other side may be in the policies of users: for topics with relative
-    names, and for services with relative names in the policy of a package.
+    A note is enough if the other side may be in the policies of users: in a policy, for topics and
+    for services with relative names; in a keystore, for topics with relative names.
     """
     unserved, unheard = (
         [_listed_clauses(clauses)] if clauses else []
@@ -296,9 +296,10 @@ def _unanswered_clauses(
             _texts_in_all(verdict.unheard for verdict in verdicts),
         )
     )
-    if not requirement.is_relative:
+    is_complete = system.is_keystore or _is_for_robot(requirement, system)
+    if is_complete and not requirement.is_relative:
         return (*unserved, *unheard), ()
-    if system.is_keystore or _is_for_robot(requirement, system):
+    if is_complete or not requirement.is_relative:
         return tuple(unserved), tuple(unheard)
     return (), (*unserved, *unheard)
 
