@@ -231,9 +231,8 @@ CA_KEY_PLAIN = FindingKind(
     "a CA key without a passphrase",
     "Anyone who copies the file can create any enclave, with any rights.",
     "ros2/sros2 issue 282; NIST SP 800-57 part 1, 6 (protection of keys).",
-    "Create keystores with --encrypt-ca-keys or with keys on a token, or keep the key offline. "
-    "To encrypt this key, run `openssl pkcs8 -topk8 -scrypt -in KEY -out KEY.new && mv KEY.new "
-    "KEY`.",
+    "Encrypt the key with `openssl pkcs8 -topk8 -scrypt -in KEY -out KEY.new && mv KEY.new KEY`, "
+    "or keep it offline. Create later keystores with --encrypt-ca-keys, or with keys on a token.",
 )
 CA_KEY_FEW_ROUNDS = FindingKind(
     "keystore.ca-key-few-rounds",
