@@ -311,6 +311,8 @@ _VERB_PHRASES = {
     "doctor": "examine this machine",
     "audit": "audit the robot",
     "close": "close the robot",
+    "close --proof": "prove that the robot is closed",
+    "close --undo": "open the robot",
     "metrics": "give the metrics",
     "review": "review the change",
     "agent init": "set up the agent",
@@ -368,7 +370,8 @@ def _with_usage_prefix(text: str, arguments: Sequence[str]) -> str:
     if verb is None:
         return f"sros: {text}"
     words = " ".join([word for word in arguments if not word.startswith("-")][:2])
-    phrase = _VERB_PHRASES.get(words) or _VERB_PHRASES.get(verb, verb.replace("_", " "))
+    named = [words, *(f"{verb} {word}" for word in arguments if word.startswith("--")), verb]
+    phrase = next(filter(None, map(_VERB_PHRASES.get, named)), verb.replace("_", " "))
     return f"Unable to {phrase}: {text}"
 
 

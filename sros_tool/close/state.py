@@ -443,7 +443,9 @@ class Proof(NamedTuple):
     """The rights, as sentences, that the robot used when sros watched, and that the keystore now
     denies. The claim holds except for these."""
     details: Sequence[str] = ()
-    """What else was seen, as clauses, such as rights that no node used, and new nodes."""
+    """What else was seen, as clauses, such as rights that no node used, and new nodes; also what
+    sros cannot see, such as whether two nodes hear each other.
+    """
 
     @property
     def fails(self) -> bool:

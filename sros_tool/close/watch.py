@@ -290,6 +290,7 @@ def _likely_meanings(
 
     ``used`` are the rights that the nodes use, and ``policy`` the rights in the policy.
     """
+    meanings = dict[str, None]()  # several enclaves may use the same name
     for right in lacking:
         allowed = (
             other
@@ -297,8 +298,8 @@ def _likely_meanings(
             if (other.enclave, other.qualifier) == (right.enclave, ALLOW)
             and not is_expression(other.name)
         )
-        if meaning := likely_meaning(right, used, allowed):
-            yield meaning
+        meanings[likely_meaning(right, used, allowed)] = None
+    yield from filter(None, meanings)
 
 
 def _lost_namespaces(nodes: Sequence[ObservedNode], policy: Policy) -> Iterator[str]:

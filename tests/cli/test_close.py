@@ -1571,8 +1571,8 @@ def test_root_reads_any_export(tmp_path: Path) -> None:
         ("--apply --for 1s", "--for is for watching"),
         ("--proof --dry-run", "--proof changes nothing. Leave --dry-run out."),
         ("--apply", "there is no folder 'robot' here. This is '/"),
-        ("--proof", "there is no folder 'robot' here. This is '/"),
-        ("--undo", "there is no folder 'robot' here. This is '/"),
+        ("--proof", "Unable to prove that the robot is closed: there is no folder 'robot' here. "),
+        ("--undo", "Unable to open the robot: there is no folder 'robot' here. This is '/"),
     ],
 )
 def test_what_is_refused(robot: Robot, words: str, said: str) -> None:

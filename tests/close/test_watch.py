@@ -8,6 +8,8 @@ from typing import Any
 
 from sros_tool.close import watch
 from sros_tool.close.processes import ClosedProcess, ObservedProcesses
+from sros_tool.policy.model import ALLOW
+from sros_tool.policy.rights import Right
 from sros_tool.runtime.processes import Process, ProcessOrigin, RunningProcesses
 
 OF_A_LOGIN = {"PS1": "$ ", "INVOCATION_ID": "1", "XDG_RUNTIME_DIR": "/run/user/1", "MAIL": "m"}
@@ -35,3 +37,12 @@ def test_variables_that_a_command_does_not_set_are_named() -> None:
     processes = "process 1 (talk) and process 2 (talk) run with variables that this shell does not"
     assert len(shown) == 1 and shown[0].startswith(processes)
     assert "do not set: GAIN; before" in shown[0]
+
+
+def test_a_name_that_several_enclaves_use_is_explained_once() -> None:
+    lacking, policy = (
+        [Right(f"/{enclave}", ALLOW, "subscribe", name) for enclave in "abc"]
+        for name in ("/gas", "/air/gas")
+    )
+    (meaning,) = watch._likely_meanings(lacking, frozenset(lacking), frozenset(policy))
+    assert meaning.startswith("perhaps the policy means /air/gas (")
