@@ -400,7 +400,7 @@ def generate_policy(
     Example:
       $ sros generate_policy robot.xml
       wrote 'robot.xml': 2 enclaves, 2 nodes, 20 rights
-      copied common/node/logging.xml, common/node/types.xml, ... next to 'robot.xml'
+      copied common/node/logging.xml, ... next to 'robot.xml'
       $ sros generate_policy robot.xml --watch 10m
       watching for 600 s, or until Ctrl-C; then the policy is written
       seen: /talker (/talker_listener/talker)
