@@ -1430,7 +1430,7 @@ def _robot_status(
     if (is_lost or (state is State.UNKNOWN and not is_ahead)) and records.is_restored:
         lost_note = (
             "the keystore was restored, and lacks what it issued after the backup. If the "
-            "message is genuine, deliver again: `sros distribute_key "
+            "message is genuine, run `sros distribute_key "
             f"{quote(str(records.root))} --robot NAME FOLDER --force`"
         )
         compared_robot = compared_robot._replace(notes=(lost_note, *compared_robot.notes))
