@@ -262,9 +262,9 @@ def _unclear_text(advisories: Sequence[Advisory]) -> str:
 
 
 def _remedy(kind: FindingKind, library: MappedLibrary) -> str:
-    """Return a remedy that names the library to upgrade, and its package if the path shows it.
+    """Return a remedy that names the ROS package to upgrade, or "" for the remedy of ``kind``.
 
-    "" stands for the remedy of the kind.
+    "" if the path of the library does not show the package, or for `PACKAGE_VULNERABILITIES`.
     """
     if kind is PACKAGE_VULNERABILITIES or not library.path.startswith(_ROS_PACKAGES):
         return ""

@@ -141,7 +141,7 @@ def _paths_option(name: str, help_text: str) -> Callable[[Decorated], Decorated]
     "--template",
     default="",
     metavar="TEMPLATE",
-    help="Keystore template whose protection the policies get: the name of one that ships with "
+    help="Assume the protection of this keystore template: the name of one that ships with "
     "sros, or a PATH.",
 )
 @_paths_option("keystore", "A keystore, or its public part.")

@@ -355,9 +355,10 @@ def _demands_more_enclaves(robot: LocalRobot) -> bool:
 
 
 def _proof_of_connections(robot: LocalRobot) -> Iterator[Proof]:
-    """Yield the proof that processes have connected to each other, if sros sees ports of some.
+    """Yield a proof whether all processes have connected to each other (None: not known).
 
-    Waits until all have connected, or had enough time.
+    Yields nothing if at most one process has shared memory ports of Fast DDS that sros sees.
+    Waits until all processes have connected, or had enough time.
     """
     started = [process.started for process, _ in RunningRobot(robot).secured]
     now = robot.shell.now()

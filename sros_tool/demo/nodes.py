@@ -110,7 +110,7 @@ def parse_options(module: str, roles: Collection[str], arguments: Sequence[str])
     parser.add_argument(
         "--type",
         default=NodeOptions.type,
-        help="ROS type of a talker on rclpy (default: %(default)s)",
+        help="ROS type of the messages that a talker sends; only on rclpy (default: %(default)s)",
     )
     parser.add_argument(
         "--report", type=Path, metavar="FILE", help="append the events to FILE as JSON lines"

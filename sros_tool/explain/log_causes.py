@@ -443,7 +443,10 @@ class Examiner:
         )
 
     def _namespace_clause(self, enclave: LoadedEnclave) -> str:
-        """Return a clause that names the policy's enclave for an enclave in a namespace, or ""."""
+        """Return a clause with the name that the policy has for an enclave, or "".
+
+        "" unless the policy was put into a namespace, so that the names differ.
+        """
         space, path = self._policy.place(enclave.name) if self._policy else ("", "")
         return f" to {path}, which is {enclave.name} in namespace {space}" if space else ""
 

@@ -609,13 +609,13 @@ def _title_with_reason(vendor: Vendor, why: str) -> str:
     return f"{vendor.title} ({why}{documented})"
 
 
-def _outcome(evaluator: Evaluator, name: str, question: Question) -> VendorOutcome:
+def _outcome(evaluator: Evaluator, enclave: str, question: Question) -> VendorOutcome:
     answer = evaluator.answer(question)
     others = evaluator.for_other_certificates()
     of_others = answer if others is evaluator else others.answer(question)
     expression = answer.decision.expression or ""
     return VendorOutcome(
-        name,
+        enclave,
         answer.outcome,
         answer.reason,
         answer.text,

@@ -326,7 +326,7 @@ def _permits_use(trust_settings: bytes, settings_use: TrustSettingsUse) -> bool:
     (value,) = der.children(der.normalized(trust_settings))
     if value.tag != der.SEQUENCE:
         raise ValueError("not settings of a certificate")
-    parts = {part.tag: _purposes(part) for part in der.children(value.content)}
+    parts = {part.tag: _listed_uses(part) for part in der.children(value.content)}
     if settings_use is TrustSettingsUse.READ:
         return True
     uses = (
@@ -342,10 +342,11 @@ _OID_ANY_USE = ExtendedKeyUsageOID.ANY_EXTENDED_KEY_USAGE.dotted_string
 _OID_S_MIME = ExtendedKeyUsageOID.EMAIL_PROTECTION.dotted_string
 
 
-def _purposes(part: der.Value) -> set[str]:
-    if part.tag not in (der.SEQUENCE, der.CONTEXT_0):
+def _listed_uses(uses: der.Value) -> set[str]:
+    """Return the OIDs in a list of trusted or rejected uses; empty for any other value."""
+    if uses.tag not in (der.SEQUENCE, der.CONTEXT_0):
         return set()
-    return {der.decode_oid(purpose) for purpose in der.children(part.content)}
+    return {der.decode_oid(use) for use in der.children(uses.content)}
 
 
 def _as_sentence(clause: str) -> str:

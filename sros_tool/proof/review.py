@@ -1528,8 +1528,9 @@ def _left_requirement_findings(
                 reported[node] |= outside
                 place = requirement.source
                 name, to = expand("~", *node), first_few(sorted(outside), 3)
-                text = f"node {name} moves to enclave {to}, outside of the requirement"
-                text += f" for users in namespace {ns}" if ns != "/" else ""
+                text = f"node {name} moves to enclave {to}; "
+                text += f"for users in namespace {ns}, " if ns != "/" else ""
+                text += "the requirement does not apply to this enclave"
                 remedy = "Let the requirement apply to the enclave, or approve this in the review."
                 yield DROPPED.found(str(requirement), text, place.file, place.line, remedy)
 

@@ -252,7 +252,7 @@ def _access_of_source(path: Path, source: RightsSource) -> AccessSource:
         has_one = (path / GOVERNANCE_FILE).exists()
         governance = _read_governance(path / GOVERNANCE_FILE) if has_one else None
         files = path / IDENTITY_CA_FILE, path / CRL_FILE
-        trusts = _trusts(dict.fromkeys(source.scope or (), files), {})
+        trusts = _trust_by_enclave(dict.fromkeys(source.scope or (), files), {})
         certified = _certified_enclaves(dict.fromkeys(source.scope or (), path))
         return replace(
             side,
@@ -276,7 +276,7 @@ def _access_of_source(path: Path, source: RightsSource) -> AccessSource:
         side,
         governance=governance,
         authorities=_authorities(folders.values()),
-        trusts=_trusts(trusting, _expiries(path)),
+        trusts=_trust_by_enclave(trusting, _expiries(path)),
         later=keystore.template if keystore.has_all_enclaves else None,
         certified=_certified_enclaves(folders),
     )
@@ -425,7 +425,7 @@ def _expiries(root: Path) -> dict[int, str]:
     return expiries
 
 
-def _trusts(
+def _trust_by_enclave(
     files: Mapping[str, tuple[Path, Path]], expiries: Mapping[int, str]
 ) -> dict[str, Trust]:
     """Map enclaves to the CAs that they trust and the certificates that they refuse.

@@ -278,7 +278,11 @@ def _with_placeholders_for_robots(
 
 
 def _robots_in(name: str, fleet: Fleet) -> set[str]:
-    """Return the robots whose name is a part of ``name``, or whose namespace begins ``name``."""
+    """Return the robots that the ROS name ``name`` names.
+
+    It names a robot by a component that is the robot's name, or by a namespace at the beginning
+    that only this robot has.
+    """
     parts = name.split("/")
     robots = fleet.robots.keys() & set(parts)
     for end in range(2, len(parts)):

@@ -519,7 +519,10 @@ def _picture_title(picture: Picture) -> str:
 
 
 def _node_cards(scene: Scene) -> Mapping[str, Card]:
-    """Map node ids to cards; both cards of an enclave become one node."""
+    """Map the ids of graph nodes to cards; an enclave that has two cards becomes one graph node.
+
+    A graph node is a box in the graph of Graphviz or Mermaid.
+    """
     cards: dict[str, Card] = {}
     for card in sorted(scene.cards, key=lambda card: (card.role, card.members, card.column)):
         cards.setdefault(_node_key(card.id), card)
@@ -527,7 +530,7 @@ def _node_cards(scene: Scene) -> Mapping[str, Card]:
 
 
 def _clusters(cards: Mapping[str, Card]) -> dict[str, list[str]]:
-    """Map groups to the node ids of their enclaves; empty for a single group."""
+    """Map groups to the graph nodes of their enclaves, by id; empty for a single group."""
     groups: dict[str, list[str]] = defaultdict(list)
     for key, card in cards.items():
         if card.role == "enclave":
@@ -536,7 +539,7 @@ def _clusters(cards: Mapping[str, Card]) -> dict[str, list[str]]:
 
 
 def _node_key(card: str) -> str:
-    """Return the node id for a card: "e" and the enclave, or "n" and the card's number."""
+    """Return the id of a card's graph node: "e" and the enclave, or "n" and the card's number."""
     return card if card[0] == "n" else f"e{card[1:]}"
 
 

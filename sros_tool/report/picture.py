@@ -367,8 +367,8 @@ class Focus:
     receivers: tuple[str, ...]
     """Enclaves that may subscribe to, serve, execute or read the name."""
     influencing: tuple[Influence, ...]
-    """Enclaves that influence the senders of the name, or the enclave in the focus; `hops` is 2 if
-    they do so directly.
+    """Enclaves that influence a sender of the name, or that influence the enclave in the focus.
+    The sender, or the enclave in the focus, counts as hop 1, so `hops` is 2 for a direct influence.
     """
     influenced: tuple[Influence, ...] = ()
     """Enclaves that the enclave in the focus influences; `hops` is 1 if it does so directly."""

@@ -80,10 +80,9 @@ def announced_nodes(rules: Iterable[AccessRule], enclave: str) -> AnnouncedNodes
 def announced_names(
     rules: Iterable[AclRule], enclave: str, domain: int, right: str
 ) -> dict[bool, tuple[str, ...]]:
-    """Return the names that rules of `graph_rules` allow (True) and deny (False) to an enclave.
+    """Map True and False to the names that rules of `graph_rules` allow and deny to an enclave.
 
-    The names are names of topics or services to which the enclave has the ``right`` in a
-    ``domain``.
+    The names are names of topics or services, for one ``right`` in one ``domain``.
     """
     names: dict[bool, dict[str, None]] = {True: {}, False: {}}
     begin, of_right = [GRAPH, str(domain)], [_ENTITY_KIND_OF_RIGHT[right], _token_form(enclave)]

@@ -1102,8 +1102,8 @@ def _moved(node: str, path: str, enclaves: dict[str, str] = _NODES) -> dict[str,
                 _NODES,
                 '[[only]]\npublish = ["cmd"]\nenclaves = ["/drive", "*/arm/operator/*"]\n',
                 _moved("eye", "/operator/eye"),
-                "node /eye moves to enclave /operator/eye, outside of the requirement for users in "
-                "namespace /arm",
+                "node /eye moves to enclave /operator/eye; for users in namespace /arm, the "
+                "requirement does not apply to this enclave",
             ),
             # Each node moves out in another namespace.
             (
@@ -1111,8 +1111,8 @@ def _moved(node: str, path: str, enclaves: dict[str, str] = _NODES) -> dict[str,
                 '[[only]]\npublish = ["cmd"]\n'
                 'enclaves = ["/drive", "*/arm/operator/*", "*/leg/helper/*"]\n',
                 _moved("eye", "/operator/eye", _moved("ear", "/helper/ear")),
-                "node /ear moves to enclave /helper/ear, outside of the requirement for users in "
-                "namespace /leg",
+                "node /ear moves to enclave /helper/ear; for users in namespace /leg, the "
+                "requirement does not apply to this enclave",
             ),
             # Both enclaves are bound, or both are exempt; or the node is new.
             (_NODES, _ONLY_OPERATORS, _moved("eye", "/lens/eye"), ""),
@@ -1145,7 +1145,7 @@ def test_a_node_moves_out_of_no_requirement(
     change.commit({"robot.xml": policy_text(after), "robot.toml": required})
     ended = change.review(*words)
     assert said in ended.out, ended
-    assert ("outside of the requirement" in ended.out) == bool(said), ended
+    assert ("requirement does not apply to this enclave" in ended.out) == bool(said), ended
     assert ended.status == bool(said), ended
     assert change.review(*words, "--dropped-requirements", "allow").status == 0
 

@@ -362,7 +362,7 @@ def _utc_text(seconds: float) -> str:
     return iso(datetime.fromtimestamp(seconds, UTC)) if isfinite(seconds) else "never"
 
 
-def _order_findings(grant: Grant, name: str, file: str) -> Iterator[Finding]:
+def _order_findings(grant: Grant, enclave: str, file: str) -> Iterator[Finding]:
     limit = ComparisonLimit()
     stated = {
         (direction, allow): _Topics(grant, direction, allow, limit)
@@ -371,7 +371,7 @@ def _order_findings(grant: Grant, name: str, file: str) -> Iterator[Finding]:
     }
     for index, rule in enumerate(grant.rules):
         if rule.allow:
-            yield from _unreachable_rule_findings(stated, rule, index, name, file)
+            yield from _unreachable_rule_findings(stated, rule, index, enclave, file)
             continue
         for direction in _DIRECTIONS:
             allowed = stated[direction, True]
@@ -383,11 +383,11 @@ def _order_findings(grant: Grant, name: str, file: str) -> Iterator[Finding]:
                 text = (
                     f"rule {index + 1} denies {direction} {names_text(topics)} after a rule that "
                 )
-                yield NO_EFFECT.found(name, f"{text}allows {met}", file)
+                yield NO_EFFECT.found(enclave, f"{text}allows {met}", file)
 
 
 def _unreachable_rule_findings(
-    stated: Mapping[tuple[str, bool], _Topics], rule: Rule, index: int, name: str, file: str
+    stated: Mapping[tuple[str, bool], _Topics], rule: Rule, index: int, enclave: str, file: str
 ) -> Iterator[Finding]:
     """Yield a finding if earlier deny rules deny topics that a rule allows.
 
@@ -403,14 +403,14 @@ def _unreachable_rule_findings(
                 left += 1
     if hidden and not left:
         text = f"rule {index + 1} allows nothing, as an earlier rule denies {names_text([*hidden])}"
-        yield UNREACHABLE.found(name, text, file)
+        yield UNREACHABLE.found(enclave, text, file)
         return
     for by, topics in hidden.items():
         described_topics = " and ".join(
             f"{direction} {names_text(topic)}" for direction, topic in topics.items()
         )
         text = f"rule {index + 1} allows {described_topics} after a rule that denies {by}"
-        yield UNREACHABLE.found(name, text, file)
+        yield UNREACHABLE.found(enclave, text, file)
 
 
 class _Topics:

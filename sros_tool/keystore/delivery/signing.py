@@ -402,7 +402,7 @@ class _RequestCertifier:
                     "fleet.unrecorded-enclaves",
                     f"the keystore does not know which robot has {first_few(unrecorded, 3)}: "
                     f"{lacks}. So `--robot`, as in `sros renew KEYSTORE --robot ROBOT`, does not "
-                    "choose such an enclave until the next step: `sros generate_artifacts -k "
+                    "choose such an enclave until you run `sros generate_artifacts -k "
                     f"{quote(str(root))} -p POLICY_FILE --fleet FLEET_FILE`.",
                 )
             )
@@ -472,7 +472,7 @@ class _RequestCertifier:
         return KeystoreError(
             f"enclave {name} was revoked in keystore '{self._root}'",
             "Whoever has the revoked key could have made this request to get access again.",
-            f"If you have the robot back and it may have {these}, {add} {options}.",
+            f"If you have the robot back, and want it to have {these} again, {add} {options}.",
         )
 
     def _all_domains_notes(self, name: str) -> Iterator[Note]:
