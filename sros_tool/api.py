@@ -652,8 +652,9 @@ def fleet_status(
     from sros_tool.keystore import fleet_status as status
     from sros_tool.keystore.reader import OpenedKeystore
 
-    fleet = status.fleet_status(OpenedKeystore(Path(keystore)), tuple(robots))
-    return fleet.with_overdue(_time_or_now(now), max_age)
+    moment = _time_or_now(now)
+    fleet = status.fleet_status(OpenedKeystore(Path(keystore)), tuple(robots), moment)
+    return fleet.with_overdue(moment, max_age)
 
 
 @_with_checked_arguments

@@ -719,7 +719,7 @@ def _status(
         check_output(output, force=True)
     known = advisories_of(advisories)
     with progress("comparing"):
-        status = fleet_status(OpenedKeystore(root), robots)
+        status = fleet_status(OpenedKeystore(root), robots, moment)
     status = status.with_overdue(moment, oldest)
     reported = {
         robot.robot: robot.dds
@@ -892,10 +892,10 @@ def _fleet_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
         covered = "it" if status.unassigned == 1 else "them"
         yield f"{whose} to no robot, so no confirmation covers {covered}"
     if status.left:
-        whose = counted(len(status.left), "enclave", "enclaves")
+        whose = counted(len(status.left), "valid enclave")
         yield (
-            f"{whose} of robots that left the fleet, not revoked: {first_few(status.left, 5)} "
-            "(`sros fleet publish` names the command that revokes them)"
+            f"{whose} of robots that left the fleet: {first_few(status.left, 5)}. Revoke with "
+            f"`sros revoke {quote(str(status.keystore))} ENCLAVE...`"
         )
 
 

@@ -717,9 +717,10 @@ def _agent_inbox(root: Path) -> tuple[list[str], list[Note]]:
 
     if not os.access(agent_folder(root) / SETTINGS_FILE, os.R_OK):
         text = (
-            f"`sros agent init` has not run in '{root}': if the agent's inbox will be a folder "
-            "(not a URL), write the units again afterwards, because the unit lets the agent write "
-            "only into folders that it names"
+            f"sros cannot read the settings of an agent in '{root}' (`sros agent init` writes "
+            "them, for the owner alone). If the agent's inbox is a folder, not a URL, write the "
+            "units again as the owner once they exist: the unit lets the agent write only into "
+            "folders that it names"
         )
         return [], [Note("units.no-agent", text)]
     inbox = read_settings(root, to_run=False).inbox

@@ -549,8 +549,8 @@ class FleetStatus:
     ``--robot``.
     """
     left: tuple[str, ...] = ()
-    """The enclaves, not revoked, of robots that left the fleet or their group, sorted by name;
-    empty with ``--robot``.
+    """The valid enclaves of robots that left the fleet or their group, sorted by name; empty with
+    ``--robot``.
     """
     overdue: frozenset[str] = frozenset()
     """The robots whose last confirmation is older than ``--max-age``, sorted by name; without that
@@ -702,8 +702,12 @@ class FleetStatus:
         return replace(self, robots=to_do, overdue=overdue, clock=clock, publication=publication)
 
 
-def fleet_status(keystore: OpenedKeystore, names: Sequence[str] = ()) -> FleetStatus:
+def fleet_status(
+    keystore: OpenedKeystore, names: Sequence[str] = (), now: datetime | None = None
+) -> FleetStatus:
     """Return the deployment status of the named robots, or of the whole fleet.
+
+    With ``now``, enclaves of robots that left the fleet are left out if they have expired.
 
     Raises:
         KeystoreError: the keystore has no fleet, or some of its enclaves may be missing.
@@ -734,7 +738,7 @@ def fleet_status(keystore: OpenedKeystore, names: Sequence[str] = ()) -> FleetSt
         stages.stage_of_keystore,
         statuses,
         unassigned,
-        () if names else tuple(left_enclaves(keystore, fleet)),
+        () if names else tuple(left_enclaves(keystore, fleet, now)),
         older=older,
         edited=fleet_edits_clause(keystore, keystore.ledger_with("what", "fleet")),
         revoked_until=records.revoked_until(may_trust_replaced=may_trust_replaced)

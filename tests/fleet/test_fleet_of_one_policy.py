@@ -8,10 +8,12 @@ The policy that is compared with is made by this file's own text, with the names
 from __future__ import annotations
 
 import json
+from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
 
+from sros_tool.api import fleet_status
 from sros_tool.dds.permissions import Permissions, parse_permissions
 from sros_tool.fleet.expansion import FleetPolicy
 from sros_tool.keystore.fleet import left_enclaves, load_fleet, recorded_fleet
@@ -339,9 +341,9 @@ def test_what_happens_to_a_fleet(made: Path, tmp_path: Path) -> None:
     renewed = sros(*timer, cwd=folder)
     assert (renewed.status, "renewed 21 enclaves" in renewed.out) == (1, True), renewed
     assert "not renewed: /r9/base, /r9/lift (of robots that left the fleet: r9)" in renewed.err
-    assert (
-        "2 enclaves of robots that left the fleet" in sros("fleet", "status", "ks", cwd=folder).out
-    )
+    left = "2 valid enclaves of robots that left the fleet: /r9/base, /r9/lift. Revoke with `sros "
+    assert left in sros("fleet", "status", "ks", cwd=folder).out
+    assert not fleet_status(folder / "ks", now=datetime(2999, 1, 1, tzinfo=UTC)).left, "expired"
     assert "/hall/r9/base/cmd" not in str(permissions(folder / "ks", "/dispatcher"))
     assert "/hall/r11/base/cmd" in str(permissions(folder / "ks", "/dispatcher"))
     fleet = load_fleet(OpenedKeystore(folder / "ks"))
