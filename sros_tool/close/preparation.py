@@ -77,6 +77,7 @@ _GITIGNORE_TEXT = """\
 """
 
 _NOT_SIGNED = "nothing was signed"
+_REMAP = "--ros-args -r __node:=NODE -r __ns:=NAMESPACE"
 
 
 class CommandStep(NamedTuple):
@@ -517,11 +518,10 @@ def _unknown_process_problems(running: RunningRobot, state: CloseState) -> Itera
     if observed.unknown:
         them, runs = ("it", "it runs") if len(observed.unknown) == 1 else ("them", "they run")
         processes = first_few(observed.unknown, MOST_NAMES)
-        remap = "--ros-args -r __node:=NODE -r __ns:=NAMESPACE"
         advice = f"watch again while {runs}: {close} --for 1m"
         if observed.elsewhere:
             advice += "; if sros still sees no node, first add the node's name to the command of "
-            advice += f"each process ({remap})"
+            advice += f"each process ({_REMAP})"
         if state.secured:
             advice = _start_of_unknown_process(running, state)
             advice += (
@@ -573,15 +573,24 @@ def _start_of_unknown_process(running: RunningRobot, state: CloseState) -> str:
     if not (idle := sorted(state.stopped)):
         return ""
     start = observed.command_of_new_process(export, "ENCLAVE")
-    if len(observed.unknown) == len(idle) == 1:
-        for process in running.open_processes:
-            known = secured_process(process, idle[0])
-            is_unknown = process_text(process) in observed.unknown
-            if is_unknown and running.may_use_files(process) and not known.unit:
-                start = known.secured_command(export.parent)
+    unknown = [
+        secured_process(process, idle[0])
+        for process in filter(running.may_use_files, running.open_processes)
+        if process_text(process) in observed.unknown
+    ]
+    units = sorted({process.unit for process in unknown} - {""})
+    if len(observed.unknown) == len(idle) == len(unknown) == 1 and not units:
+        start = unknown[0].secured_command(export.parent)
     names = first_few(idle, MOST_NAMES)
     which = "the process" if len(observed.unknown) == 1 else "one of them"
-    return f"if {which} belongs in {names}, stop it, and start it in its enclave: {start}; "
+    advice = f"if {which} belongs in {names}, stop it, and start it in its enclave: {start}; "
+    if units and state.new:
+        advice += (
+            f"or, if {first_few(units, MOST_NAMES)} starts it, add the name of its node to the "
+            f"command in the unit ({_REMAP}), restart the unit, and run "
+            f"`{running.robot.close_command}`; "
+        )
+    return advice
 
 
 def _shared_program_problems(robot: LocalRobot) -> Iterator[str]:

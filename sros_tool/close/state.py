@@ -17,6 +17,7 @@ from sros_tool.checks.processes import (
     zenoh_findings,
 )
 from sros_tool.close.acceptance import Acceptance, Acceptances
+from sros_tool.close.assignment import with_command_of_unit
 from sros_tool.close.processes import (
     ROUTER,
     ClosedProcess,
@@ -305,23 +306,21 @@ class RunningRobot:
         """Return the observed processes, and the open processes of units for new enclaves.
 
         ``new`` maps these enclaves to the full names of their nodes. As in the other cases, only
-        processes of users who can read the enclaves count, and units that start one process.
+        processes of users who can read the enclaves count, and units that start one process. Only
+        a name shows the enclave: the last process left may be any program, and may not get rights.
         """
-        unknown = [each for each in self.open_processes if process_text(each) in observed.unknown]
         programs = {process.program[0] for process in self.in_domain}
         started = Counter(process_origin(pid).unit for pid in programs)
         claims: dict[str, list[tuple[Process, str]]] = {}
-        for process in filter(self.may_use_files, unknown):
+        for process in filter(self.may_use_files, self.open_processes):
             enclaves, known_by = _enclaves_of(process, new)
-            if known_by == "program" and not enclaves and len(unknown) == 1:
-                enclaves, known_by = [*new], "elimination"
-            if len(enclaves) == 1:
+            if len(enclaves) == 1 and process_text(process) in observed.unknown:
                 claims.setdefault(enclaves[0], []).append((process, known_by))
         found = {
             process_text(process): known._replace(known_by=known_by)
             for enclave, ((process, known_by), *others) in claims.items()
             if not others
-            and (known := secured_process(process, enclave)).unit
+            and (known := with_command_of_unit(secured_process(process, enclave))).unit
             and started[known.unit] == 1
         }
         return observed._replace(

@@ -745,22 +745,28 @@ def a_unit_that_started_after_the_watch(robot: Robot, late: Process) -> None:
     drop_in = robot.folder / "robot/start/units/late.service.d/sros-close.conf"
     other = replace(late, command=("/opt/other", "--ros-args"))
     robot.units["7"] = "late.service"
-    for process, known in ((late, "by its program"), (other, "as the only process left")):
+    named = replace(late, command=(*other.command, "-r", "__node:=late"))
+    for process, known in ((late, "by its program"), (named, "by its node name")):
         robot.more = (process,)
         ended = robot.close()
         assert f"  /late: process 7, known {known}: --apply restarts late.service" in ended.out
         assert "next: sros close robot --apply" in ended.err
         assert "ROS_SECURITY_ENCLAVE_OVERRIDE=/late" in drop_in.read_text()
     named = replace(late, command=(*late.command, "-r", "__node:=other"))
+    zenoh = replace(late, libraries=frozenset({"libzenohc"}))
     by_another_user = replace(late, user=os.geteuid() + 1)
     for more in (
+        (other,),  # the last process left may be any program
         (named,),
+        (zenoh,),  # the unit starts another command, to which sros cannot add --enclave
         (by_another_user,),
         (late, replace(other, pid=8)),  # the unit starts two
     ):
         robot.units["8"], robot.more = "late.service", more
-        assert "sros knows no node of" in robot.close(status=1).out
-        assert not drop_in.exists()
+        said = robot.close(status=1).out
+        assert "sros knows no node of" in said and not drop_in.exists()
+        by_unit = "or, if late.service starts it, add the name of its node to the command in the"
+        assert (by_unit in said) is (more != (by_another_user,))
     del robot.units["7"], robot.units["8"]
 
 
