@@ -119,7 +119,7 @@ def test_the_keystore_may_come_from_the_environment(made: Path) -> None:
         (("-r", "__node:=wild_7"), "as in /wild_*, count only for the node of `ros2 launch`."),
         (
             ("-r", "__node:=wilde"),
-            'Give the node a profile in one enclave: `<profile ns="/" node="wilde">`',
+            'Give the node a profile in exactly one enclave: `<profile ns="/" node="wilde">`',
         ),
         (("-r", "__node:=both"), "in 2 enclaves: /line/listener, /line/other"),
         (("-r", "__node:=\x1b[2Jtalker"), "\\x1b[2Jtalker in no enclave"),

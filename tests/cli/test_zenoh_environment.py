@@ -279,7 +279,8 @@ def test_run_replaces_what_was_inherited_and_says_so(keystore: Path) -> None:
     done = forked(*words, env=environment).ok()
     seen, _ = json.loads(done.out)
     assert {name: seen[name] for name in wanted} == wanted
-    assert "note [zenoh.replaced]: ZENOH_ROUTER_CONFIG_URI was '/etc/r.json5'" in done.err
+    replaced = "sros replaces the value of ZENOH_ROUTER_CONFIG_URI, which was '/etc/r.json5'"
+    assert f"note [zenoh.replaced]: {replaced}" in done.err
     assert "WARNING: the replaced ZENOH_CONFIG_OVERRIDE changed access_control" in done.err
     assert "note [zenoh.enclave-argument]" in done.err
 

@@ -199,7 +199,7 @@ def test_permissions_with_another_effect_are_not_the_same(
         file.write_text(DOCUMENT.format(text))
     ended = sros("diff_policy", *files)
     assert ended.status == is_unclear
-    assert ("? /a may be allowed" in ended.out) == is_unclear
+    assert ("? /a may have other rights" in ended.out) == is_unclear
     assert ("the rights are the same" in ended.err) != is_unclear
 
 
