@@ -752,12 +752,13 @@ def test_a_publishing_folder_teaches_nothing_that_the_cas_did_not_sign(publisher
     certificate = (publisher.folder / "other/enclaves/r2/base/cert.pem").read_bytes()
     own = (publisher.root / "enclaves/r5/base/cert.pem").read_bytes()
     folder = publisher.pub / "targets/robots"
-    for number, content in enumerate((certificate, own)):
+    for content in (certificate, own):
         files = {"enclaves/r2/base/cert.pem": content}
         (seal,) = seal_releases([("r2", 1, files)], publisher.permissions_ca())
         data = pack_release(Release("r2", 1, files, seal))
         (folder / f"{hashlib.sha256(data).hexdigest()}.r2.tar.gz").write_bytes(data)
-        (folder / f"{number:064x}.r5.tar.gz").write_bytes(b"x")
+    (folder / f"{0:064x}.r5.tar.gz").write_bytes(b"x")
+    (folder / f"{1:064x}.r5.tar.gz").mkdir()
     before = len(OpenedKeystore(publisher.root).ledger.entries)
     done = publisher.publish(restored=True)
     (unread,) = (note.text for note in done.notes if note.id == "fleet.archives-not-read")

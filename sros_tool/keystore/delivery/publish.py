@@ -939,13 +939,13 @@ class _Publication:
         )
 
     def _unread_note(self) -> Note:
-        """Return a note on archives that may show revocations, but were changed."""
+        """Return a note on archives that may show revocations, but were not read."""
         revoke = f"sros revoke {quote(str(self.keystore.root))} --robot NAME"
         return Note(
             "fleet.archives-not-read",
-            f"archives in '{self._folder}' were changed or renamed, so sros did not read what they "
-            f"revoke: {first_few(sorted(self._unread), _MOST_NAMES)}. Revoke again what was stolen "
-            f"after the backup (`{revoke}`).",
+            f"archives in '{self._folder}' were changed or renamed, or cannot be read, so sros did "
+            f"not see what they revoke: {first_few(sorted(self._unread), _MOST_NAMES)}. Revoke "
+            f"again what was stolen after the backup (`{revoke}`).",
         )
 
     def _not_restored_error(self) -> KeystoreError:

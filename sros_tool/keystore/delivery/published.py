@@ -259,8 +259,8 @@ def releases_in(folder: Path, robots: int, altered: set[str] | None = None) -> I
     """Yield the releases in all archives of a publishing folder, whichever CA sealed them.
 
     Archives that cannot be read are left out, and so are archives whose name does not begin with
-    their SHA-256: their content is not as published.  The names of the latter are added to
-    ``altered``.  ``robots`` is the number of robots of the fleet.
+    their SHA-256: their content is not as published.  The names of both are added to ``altered``.
+    ``robots`` is the number of robots of the fleet.
 
     Raises:
         KeystoreError: the folder has more archives, or larger ones, than the fleet can need.
@@ -273,6 +273,8 @@ def releases_in(folder: Path, robots: int, altered: set[str] | None = None) -> I
         try:
             data = read_bytes(path, "archive", max_bytes=LIMITS_OF_ONE_ROBOT.packed)
         except (SrosError, OSError):
+            if altered is not None:
+                altered.add(path.name)
             continue
         is_altered = hashlib.sha256(data).hexdigest() != path.name.partition(".")[0]
         stated = 0 if is_altered else min(stated_size(data), LIMITS_OF_ONE_ROBOT.unpacked)
