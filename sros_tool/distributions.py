@@ -180,9 +180,11 @@ def shipped_title(vendor: Vendor, distributions: Sequence[Distribution]) -> str:
 
 
 def selected_vendors(vendor: str, distributions: Sequence[Distribution]) -> tuple[str, ...]:
-    """Return the vendor of this name, or the vendors of distributions; () if neither is given.
+    """Return the name of the chosen vendor, or the names of the vendors of distributions.
 
-    If both are given, the result is the releases of the vendor that the distributions ship.
+    The result is () if ``vendor`` is "" and there are no distributions.
+
+    If there are both, the result is the releases of the vendor that the distributions ship.
 
     Raises:
         UsageError: a distribution does not ship the vendor.

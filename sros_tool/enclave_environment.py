@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 from sros_tool.errors import KeystoreError, Note, UsageError
 from sros_tool.keystore.layout import PERMISSIONS_FILE, remedy_in_keystore
 from sros_tool.keystore.reader import read_consistently
-from sros_tool.owners import closing_command, other_writers
+from sros_tool.owners import closing_command, other_writers_clause
 from sros_tool.wording import first_few
 
 if TYPE_CHECKING:
@@ -220,7 +220,7 @@ def _refuse_folders_writable_by_others(
     """Raise `KeystoreError` if other users can write to the enclave's folders."""
     trusted = frozenset({0, os.geteuid(), keystore.root.stat().st_uid})
     for path in (folder, *folder.parents):
-        if why := other_writers(path.stat(), trusted):
+        if why := other_writers_clause(path.stat(), trusted):
             raise KeystoreError(
                 f"others can replace the files of enclave {name}",
                 f"'{path}': {why}. Whoever replaces files decides whom the process trusts.",

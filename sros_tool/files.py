@@ -44,9 +44,10 @@ def staged_file(
 
     Args:
         target: the path of the file.
-        data: its content.
-        mode: its permission bits from the first byte on, before the umask.
-        ignores_umask: give it these bits whatever the umask is, because others have to read it.
+        data: the content of the file.
+        mode: the permission bits of the file from its first byte on, before the umask.
+        ignores_umask: give the file these bits whatever the umask is, because others have to read
+            the file.
         like: a file to copy the permission bits and, if permitted, the owner from.
         for_owner: whether a file that root makes belongs to the owner of its folder.
 

@@ -74,7 +74,10 @@ class Folder:
         return self._owner
 
     def forget(self, folder: str = "") -> None:
-        """Close cached descriptors of ``folder`` and its subfolders, whose paths have changed."""
+        """Close cached descriptors of ``folder`` and its subfolders, whose paths have changed.
+
+        "" stands for all folders below this one.
+        """
         below = f"{folder}/" if folder else ""
         for path in [path for path in self._handles if path and f"{path}/".startswith(below)]:
             os.close(self._handles.pop(path))

@@ -38,8 +38,8 @@ def fenced(text: str, language: str = "text") -> str:
 def bounded_list(items: Iterable[str], maximum: int, shown_by: str) -> str:
     """Return ``items`` as a Markdown list of at most ``maximum`` characters.
 
-    If some items do not fit, a last item has their number, followed by ``shown_by``, a clause that
-    says where all items are shown.
+    If some items do not fit, a further item has their number, followed by ``shown_by``, a clause
+    that says where all items are shown. The further item may exceed the maximum.
     """
     lines: list[str] = []
     left, out = maximum, 0

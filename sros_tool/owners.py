@@ -21,7 +21,7 @@ _ROOT = frozenset({0})
 _MOST_LINKS = 40
 
 
-def other_writers(state: os.stat_result, trusted_users: frozenset[int]) -> str:
+def other_writers_clause(state: os.stat_result, trusted_users: frozenset[int]) -> str:
     """Return why other users than ``trusted_users`` (user ids) can change a file or folder, or "".
 
     The members of the group count as other users, unless it is the private group of a trusted user.
@@ -62,7 +62,7 @@ def replaceable_on_the_way(path: Path, trusted_users: frozenset[int]) -> Iterato
     """
     for step, state in _path_states(path):
         kept = state.st_mode & stat.S_ISVTX and state.st_uid in trusted_users
-        if not kept and (why := other_writers(state, trusted_users)):
+        if not kept and (why := other_writers_clause(state, trusted_users)):
             yield step, why
 
 
@@ -100,8 +100,10 @@ def file_of_root(path: Path) -> Path | None:
     except (OSError, RuntimeError, ValueError):  # a loop of links, or a NUL byte
         return None
     ways = [state, *(status for _, status in _path_states(real))]
-    ours = stat.S_ISREG(state.st_mode) and not any(other_writers(status, _ROOT) for status in ways)
-    return real if ours else None
+    is_ours = stat.S_ISREG(state.st_mode) and not any(
+        other_writers_clause(status, _ROOT) for status in ways
+    )
+    return real if is_ours else None
 
 
 def _path_states(path: Path) -> Iterator[tuple[Path, os.stat_result]]:

@@ -53,7 +53,7 @@ class Unguarded:
     join_needs_right: bool = False
 
 
-def unguarded(governance: Governance) -> Iterator[Unguarded]:
+def unguarded_topics(governance: Governance) -> Iterator[Unguarded]:
     """Yield the topics without access control in some domain; the first matching rule counts.
 
     Source: DDS-Security 1.1, 9.4.1.2.6 (topic rules, and enable_read/write_access_control).
@@ -134,7 +134,7 @@ def path_text(path: HopPath) -> str:
 class Reach:
     """The enclaves that an enclave can influence and learn from, each with a shortest path.
 
-    Paths of ``influences`` start at the enclave, paths of ``learns_from`` lead to it.
+    Paths of ``influences`` start at the enclave; paths of ``learns_from`` lead to the enclave.
     """
 
     enclave: str

@@ -318,7 +318,7 @@ _EVERY_TOPIC = frozenset({"*", "rt/*"})
 
 
 def allows_everything(grant: Grant) -> bool:
-    """Return whether a grant allows to publish and to subscribe every ROS topic.
+    """Return whether a grant allows publishing and subscribing to every ROS topic.
 
     Denials are ignored, unless everything is allowed only by default.
     """

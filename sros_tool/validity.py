@@ -32,7 +32,8 @@ _LONGEST_DURATION = 100 * _SECONDS_PER_UNIT["y"]
 def time_of_file(seconds: float) -> datetime:
     """Return the time of a file in UTC.
 
-    A time that `datetime` cannot express becomes its last moment, or 1970 if it is negative.
+    A time that `datetime` cannot express becomes the end of the year 9999, or 1970 if
+    ``seconds`` is negative.
     """
     try:
         return datetime.fromtimestamp(seconds, UTC)

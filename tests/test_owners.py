@@ -7,7 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from sros_tool.owners import closing_command, file_of_root, other_writers, replaceable_on_the_way
+from sros_tool.owners import (
+    closing_command,
+    file_of_root,
+    other_writers_clause,
+    replaceable_on_the_way,
+)
 from tests.support.users import as_root
 
 STRANGER = 65532
@@ -74,14 +79,14 @@ def test_a_file_of_root(file: Path) -> None:
 
 @as_root
 def test_who_can_write_a_file(file: Path) -> None:
-    assert other_writers(file.stat(), US) == ""
+    assert other_writers_clause(file.stat(), US) == ""
     file.chmod(0o666)
-    assert other_writers(file.stat(), US) == "its mode is 0666, so everybody can write"
+    assert other_writers_clause(file.stat(), US) == "its mode is 0666, so everybody can write"
     assert closing_command(file, US) == f"chmod go-w {file}"
     os.chown(file, STRANGER, -1)
-    assert other_writers(file.stat(), US) == f"it belongs to user {STRANGER}"
+    assert other_writers_clause(file.stat(), US) == f"it belongs to user {STRANGER}"
     assert closing_command(file, US) == f"sudo chown -h root {file}"
-    assert other_writers(file.stat(), US | {STRANGER}).startswith("its mode is 0666")
+    assert other_writers_clause(file.stat(), US | {STRANGER}).startswith("its mode is 0666")
 
 
 def test_a_loop_of_links_ends(tmp_path: Path) -> None:

@@ -20,7 +20,12 @@ from sros_tool.fleet.robots import name_problem
 from sros_tool.folders import Folder
 from sros_tool.keystore.layout import AGENT
 from sros_tool.names import check_enclave_name
-from sros_tool.owners import closing_command, other_writers, replaceable_on_the_way, user_name
+from sros_tool.owners import (
+    closing_command,
+    other_writers_clause,
+    replaceable_on_the_way,
+    user_name,
+)
 from sros_tool.xml import read_bytes
 
 SETTINGS_FILE = "agent.toml"
@@ -85,7 +90,7 @@ def check_owner(folder: Path) -> None:
         (step, why) for step, why in replaceable_on_the_way(agents_folder / "x", trusted) if why
     ]
     places += [
-        (path, other_writers(path.lstat(), trusted))
+        (path, other_writers_clause(path.lstat(), trusted))
         for path in (agents_folder, agents_folder / SETTINGS_FILE)
         if os.path.lexists(path)
     ]

@@ -228,7 +228,7 @@ def _show(robot: LocalRobot, closed: CloseState) -> None:
     from sros_tool.keystore.reader import OpenedKeystore
     from sros_tool.keystore.rights import load_rights
     from sros_tool.policy.document import read_policy
-    from sros_tool.reach import unguarded
+    from sros_tool.reach import unguarded_topics
 
     policy = read_policy(robot.policy)
     if not closed.is_signed:
@@ -241,7 +241,7 @@ def _show(robot: LocalRobot, closed: CloseState) -> None:
     if outside:
         signed = ", ".join(outside)
         echo(f"  enclaves that the policy lacks, and that keep their signed rights: {signed}")
-    for left_open in unguarded(keystore.governance):
+    for left_open in unguarded_topics(keystore.governance):
         does = f"{left_open.direction} DDS topic {left_open.topic}"
         echo(f"  every enclave may {does}: the governance of the keystore leaves the topic open")
     restart = "how to restart each process with security" if closed.pending else "processes"

@@ -768,7 +768,7 @@ def _zenoh_lines(explanation: ZenohExplanation) -> Iterator[str]:
     yield f"{may} {answer.question}, on {_ZENOH_TITLE}{mode} ({explanation.vendor_why})"
     yield _labeled_row("why", answer.text)
     yield from _link_lines(answer)
-    if dropped := answer.dropped:
+    if dropped := answer.dropping_check:
         dropper = (
             f"{dropped.enforcer}, which drops the message silently: {answer.enclave} gets no error"
         )
@@ -1000,9 +1000,9 @@ def _who_lines(
         wildcard = f"  by the wildcard {outcome.wildcard}" if outcome.wildcard else ""
         where = f"  in domain {outcome.domains}" if by_domains else ""
         lines.append((outcome.enclave, f"{outcome.enclave}{wildcard}{where}"))
-    stopped = [outcome for outcome in answer.outcomes if outcome.stopped]
+    stopped = [outcome for outcome in answer.outcomes if outcome.why_stopped]
     for outcome in stopped[:_MOST_SHOWN]:
-        lines.append((outcome.enclave, f"  cannot start: {outcome.enclave}  {outcome.stopped}"))
+        lines.append((outcome.enclave, f"  cannot start: {outcome.enclave}  {outcome.why_stopped}"))
     yield from folded_lines(fleet, lines)
     if more := stopped[_MOST_SHOWN:]:
         yield f"  cannot start: {counted(len(more), 'more enclave')}"

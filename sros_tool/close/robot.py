@@ -28,7 +28,7 @@ from sros_tool.keystore.layout import (
     list_enclaves,
 )
 from sros_tool.keystore.reader import OpenedKeystore
-from sros_tool.owners import other_writers, replaceable_on_the_way
+from sros_tool.owners import other_writers_clause, replaceable_on_the_way
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import Policy
 from sros_tool.runtime.environment import RMW_ZENOH
@@ -146,7 +146,7 @@ class LocalRobot:
         files = (*policies, self.observation_file, self.processes_file)
         for path in (self.folder, self.start, self.start / "units", *files):
             ways = [*replaceable_on_the_way(path, trusted)]
-            if path.exists() and (why := other_writers(path.stat(), trusted)):
+            if path.exists() and (why := other_writers_clause(path.stat(), trusted)):
                 ways.insert(0, (path, why))
             for place, why in ways:
                 raise SrosError(

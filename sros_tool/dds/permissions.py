@@ -42,7 +42,8 @@ TOPIC_LINE_BYTES = len("            <topic></topic>\r\n")
 class Criteria(NamedTuple):
     """The topics and partitions of a ``<publish>`` or ``<subscribe>`` in a rule.
 
-    Without partitions, the default partition is meant.  ``data_tags`` are pairs of name and value.
+    Without partitions, the default partition is meant; in a deny rule, the vendor decides
+    (`sros_tool.dds.decision.vendors.DenyPartitions`).  ``data_tags`` are pairs of name and value.
     """
 
     topics: tuple[str, ...]

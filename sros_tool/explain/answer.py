@@ -81,7 +81,7 @@ class Part(NamedTuple):
     topic: str
     """DDS topic of the endpoint."""
     role: str = ""
-    """Role of the endpoint in ROS terms, such as ``requests``, or null."""
+    """Role of the endpoint in ROS terms, such as ``requests``; empty (null in JSON) for a topic."""
 
     def __str__(self) -> str:
         """Return text like ``publish its requests (rq/addRequest)``."""
@@ -107,11 +107,11 @@ class Question(NamedTuple):
     word: str
     """The operation, such as `publish`."""
     type: str = ""
-    """`topic`, `service` or `action`, or null."""
+    """`topic`, `service` or `action`; empty (null in JSON) for ``join``."""
     right: str = ""
-    """The right of the policy language, or null."""
+    """The right of the policy language; empty (null in JSON) for ``join``."""
     name: str = ""
-    """The ROS name, or null."""
+    """The ROS name; empty (null in JSON) for ``join``."""
     only: tuple[Part, ...] = ()
 
     @property
@@ -342,7 +342,9 @@ class PolicyChange(NamedTuple):
     lift: tuple[Right, ...]
     """Denials to remove."""
     document: str
-    """A policy with the rights to add, for ``sros merge_policy``, or null."""
+    """A policy with the rights to add, for ``sros merge_policy``; empty (null in JSON) if there are
+    none.
+    """
     edits: tuple[GroupEdit, ...]
     """Elements of the policy to replace or remove, such as ``<topics publish="ALLOW">``."""
 
@@ -448,15 +450,17 @@ class Answer(NamedTuple):
     until: datetime | None = None
     """The earliest expiry of the enclave's files, in UTC, or null."""
     until_file: str = ""
-    """The file that expires first, or null."""
+    """The file that expires first; empty (null in JSON) if no expiry is known."""
     lines: tuple[PolicyLine, ...] = ()
     provenance: Provenance | None = None
     policy_sha256: str = ""
-    """SHA-256 of the policy that the permissions were made from, or null."""
+    """SHA-256 of the policy that the permissions were made from; empty (null in JSON) if it is
+    unknown.
+    """
     change: PolicyChange | None = None
     """The smallest change of the policy that would allow the access, or null."""
     remedy: str = ""
-    """What to do if no change of the policy helps, or null."""
+    """What to do if no change of the policy helps; otherwise empty (null in JSON)."""
     sign: bool = False
 
     @property
@@ -496,7 +500,9 @@ class Answer(NamedTuple):
 
     @property
     def denied_by(self) -> str:
-        """What denies the access: DDS in the process, peers, or a crash; null if it is allowed.
+        """What denies the access: DDS in the process, peers, or a crash.
+
+        If the access is allowed, the text is empty (null in JSON).
 
         For a crash, the text begins with "nobody".
         """
@@ -529,7 +535,7 @@ class Answer(NamedTuple):
 
     @property
     def wildcard(self) -> str:
-        """The expression that matched, if it is a wildcard; otherwise null."""
+        """The expression that matched, if it is a wildcard; otherwise empty (null in JSON)."""
         expression = self.decision.expression or ""
         return expression if is_expression(expression) else ""
 

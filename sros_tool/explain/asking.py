@@ -234,7 +234,10 @@ def is_policy(path: Path) -> bool:
 
 
 def policy_to_ask(file: Path, fleet: Fleet | None) -> tuple[Policy, Policy]:
-    """Return a policy as its file states it, and with its placeholders filled in for a fleet."""
+    """Return a policy as its file states it, and with its placeholders filled in for a fleet.
+
+    Without a fleet, both are the same policy.
+    """
     from sros_tool.fleet.expansion import FleetPolicy
     from sros_tool.policy.document import read_policy
 
@@ -439,7 +442,7 @@ class ZenohInBrief(NamedTuple):
     allowed: bool
     """Whether data can flow."""
     mode: Annotated[str, Words(("client", "peer", "router"))] | None
-    """Mode of the process, such as ``client`` or ``peer``, or null."""
+    """Mode of the process, such as ``client`` or ``peer``; null if its file cannot be used."""
     text: str
     """Reason of the decision, as a clause."""
     outcome: str

@@ -258,7 +258,7 @@ class DeniedRight:
     """A right that nodes of an enclave use, and that DDS would deny.
 
     ``nodes`` are the full names of the nodes.  ``right.name`` is a DDS topic if the topic has no
-    ROS name. ``endpoints`` are the endpoints that the nodes need.  With ``by_rule``, a deny rule
+    ROS name.  With ``by_rule``, a deny rule
     denies the right, so that a new allow rule would not help.  With ``new_enclave``, the node has
     no enclave yet, and the enclave of ``right`` is a proposal.
     """
@@ -615,7 +615,7 @@ def _judge(process: Sequence[ObservedNode], enclave: str, enclaves: AuditedEncla
     join = evaluator.answer(Question("join"))
     refused = "" if join.allowed else join.decision.clause
     if zenoh:
-        refused = zenoh.answer(enclave, Question("join"), reach=False, brief=True).stopped
+        refused = zenoh.answer(enclave, Question("join"), reach=False, brief=True).why_stopped
     if refused:
         return _Judgement((), refused)
     denied = [

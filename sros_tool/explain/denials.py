@@ -344,7 +344,7 @@ def as_learned(
     other_nodes, parts_by_profile = dict[str, str](), dict[str, str]()
     parameter_clients = dict[str, str]()
     for path, rights in sorted(_rights_by_enclave(missing_rights, enclave).items()):
-        present = _profiles(policy, path)
+        present = _stated_rights_by_profile(policy, path)
         for profile, denied in sorted(_rights_by_profile(rights, node, present).items()):
             if present and node is None and profile not in (_ANY_NODE, *present):
                 profile_names = ", ".join(sorted(map(_full_name, present)))
@@ -477,7 +477,9 @@ def _missing_common_part(
     return ()
 
 
-def _profiles(policy: Policy | None, path: str) -> dict[tuple[str, str], frozenset[NodeRight]]:
+def _stated_rights_by_profile(
+    policy: Policy | None, path: str
+) -> dict[tuple[str, str], frozenset[NodeRight]]:
     """Return the rights of each profile of an enclave, by namespace and node name."""
     enclave = policy.enclave(path) if policy else None
     profiles: dict[tuple[str, str], frozenset[NodeRight]] = {}

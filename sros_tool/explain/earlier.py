@@ -263,7 +263,7 @@ def _allows(
     vendor: Vendor | None,
     asking: AskingContext,
 ) -> bool:
-    """Return whether signed permissions give a right, or an acting part of it, to a certificate."""
+    """Return whether signed permissions give a certificate a right or one of its `acting_parts`."""
     governance, document = keystore.governance, keystore.files.signed_document(permissions).document
     grant = parse_permissions(document).grant_of(certificate.subject)
     if vendor is None and grant:

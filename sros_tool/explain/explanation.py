@@ -420,7 +420,7 @@ def likely_meaning(right: Right, used: Collection[Right], named: Iterable[Right]
 
 
 def remapping_clause(name: str, meant: str) -> str:
-    """Return why the node may use another name than its policy states, as a clause."""
+    """Return why a node may use ``name`` in place of ``meant``, the policy's name, as a clause."""
     return (
         f"the node may lack the remapping -r {name}:={meant}, or the policy may lack "
         f"--remap {meant}:={name}, or a remapping or parameter gives the node the wrong name {name}"

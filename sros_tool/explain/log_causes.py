@@ -97,9 +97,9 @@ class LogFinding:
     text: str
     """Text of the first line."""
     process: str
-    """The process that printed the message, or null."""
+    """The process that printed the message; empty (null in JSON) if it is unknown."""
     enclave: str
-    """The enclave of the process, or null."""
+    """The enclave of the process; empty (null in JSON) if it is unknown."""
     cause: str
     """Meaning of the message."""
     remedy: str
@@ -191,7 +191,7 @@ class Examiner:
         if meaning.id.startswith("peer-"):
             return self._with_peer_causes(plain, hits)
         path = first.fields.get("path", "")
-        if meaning.id in _FOLDER_IDS and (place := _keystore_with(path)):
+        if meaning.id in _FOLDER_IDS and (place := _keystore_of_file(path)):
             text = EXPORT_FOR_USER_REMEDY if is_original_keystore(place) else CHANGE_OWNER_REMEDY
             advice = self._with_names(_with_name(text, "KEYSTORE", str(place)), named, first)
             if meaning.id != _FOLDER_IDS[0]:
@@ -734,7 +734,7 @@ def _within_sentence(remedy: str) -> str:
     return f"{remedy[:1].lower()}{remedy[1:]}"
 
 
-def _keystore_with(path: str) -> Path | None:
+def _keystore_of_file(path: str) -> Path | None:
     """Return the keystore that has the enclave folder ``path`` of a log, or None.
 
     The check is strict, because the log chooses the path, and the remedy changes the owner of the

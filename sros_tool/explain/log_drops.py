@@ -38,13 +38,15 @@ _GRAPH_RIGHTS: Mapping[tuple[str, bool], str] = {
 
 
 def dropped_message_findings(
-    lines: Iterable[str], root: str, own_name: str, keystore: SearchedKeystore | None
+    lines: Iterable[str], root: str, own_enclave: str, keystore: SearchedKeystore | None
 ) -> Iterator[LogFinding]:
     """Yield a finding for each missing right for which Zenoh dropped messages.
 
-    ``own_name`` is the enclave of the process that wrote the log, "" if unknown. If the process
-    drops a message to or from its router, the process itself lacks the right: its configuration
-    allows the router only what the process's own rights need.
+    ``own_enclave`` is the enclave of the process that wrote the log, "" if unknown. ``root`` is the
+    path of the keystore for remedies, or "".
+
+    If the process drops a message to or from its router, the process itself lacks the right: its
+    configuration allows the router only what the process's own rights need.
     """
     numbered = ((n, *labeled_line(line[:MAX_LINE_LENGTH])) for n, line in enumerate(lines, 1))
     groups: dict[tuple[str, str, bool, str], list[DroppedMessage]] = {}
@@ -52,7 +54,7 @@ def dropped_message_findings(
     routers = keystore.zenoh_routers if keystore and dropped else frozenset[str]()
     for message in dropped:
         # Routers check each other, too: a process without a known name may be a router.
-        is_node = own_name not in routers if own_name else len(routers) == 1
+        is_node = own_enclave not in routers if own_enclave else len(routers) == 1
         lacks_own = message.name in routers and is_node
         kind = message.message, message.ingress is not lacks_own
         _, name = name_of_key(message.key)
@@ -64,7 +66,7 @@ def dropped_message_findings(
     for (process, who, lacks_own, dropped_right), messages in groups.items():
         first = messages[0]
         if lacks_own:
-            enclave, lacking = own_name, own_name or "the process that wrote this log"
+            enclave, lacking = own_enclave, own_enclave or "the process that wrote this log"
         else:
             enclave = first.name
             lacking = enclave or f"the process with the zid {who}"

@@ -185,7 +185,7 @@ DdsExplanation = VendorExplanation | Comparison
 
 
 class ComparedDecisions(Enum):
-    """Whose decisions are compared: those of all vendors, or of all distributions."""
+    """The deciders whose decisions are compared: all vendors, or all distributions."""
 
     VENDORS = auto()
     DISTRIBUTIONS = auto()
@@ -529,9 +529,12 @@ class VendorOutcome(NamedTuple):
     reason: ReasonWord
     text: str
     expression: str
-    """The expression that decided, or null."""
+    """The expression that decided; empty (null in JSON) if none did."""
     domains: str = ""
-    """The ROS domains in which the enclave has the right, such as ``10`` or ``10,20``, or null."""
+    """The ROS domains in which the enclave has the right, such as ``10`` or ``10,20``.
+
+    Empty (null in JSON) if the enclave has the right in no domain, or if no keystore was asked.
+    """
     opened: AccessWithoutIdentity = AccessWithoutIdentity()
     """The rights that the enclave's governance gives to processes without an identity."""
     in_part: Sequence[str] = ()
@@ -543,7 +546,9 @@ class VendorOutcome(NamedTuple):
     access. So a process with the key of this enclave has the right, too.
     """
     subject: str = ""
+    """Subject of the enclave's certificate; empty if the vendor does not accept the certificate."""
     granted: str = ""
+    """Subject of a grant that would allow the access to another certificate; empty without one."""
 
     @property
     def allowed(self) -> bool:
@@ -561,7 +566,7 @@ class VendorOutcome(NamedTuple):
         return self.expression if is_expression(self.expression) else ""
 
     @property
-    def stopped(self) -> str:
+    def why_stopped(self) -> str:
         """The reason that no process can run in the enclave with its current files, or ""."""
         return self.text.partition(": ")[2] if _is_stopped(self.outcome) else ""
 
@@ -678,7 +683,7 @@ class VendorOfPolicy(NamedTuple):
         return _title_with_reason(self.vendor, self.why)
 
     def rights_naming(self, name: str) -> Iterator[Right]:
-        """Return the rights of the policy to a ROS name."""
+        """Return the rights of the policy to names that contain ``name``."""
         return (right for right in policy_rights(self.policy) if name in right.name)
 
     def outcomes(self, question: Question) -> tuple[VendorOutcome, ...]:
@@ -736,7 +741,7 @@ class VendorOfKeystore(NamedTuple):
         )
 
     def rights_naming(self, name: str) -> Iterator[Right]:
-        """Return the rights to a ROS name in the permissions of all enclaves."""
+        """Return the rights in all permissions whose text contains ``name``."""
         return rights_naming(self.keystore, name)
 
     def outcomes(self, question: Question) -> tuple[VendorOutcome, ...]:
@@ -800,10 +805,9 @@ class VendorOfKeystore(NamedTuple):
         )
 
     def notes(self, question: Question, outcomes: Sequence[VendorOutcome]) -> Iterator[Note]:
-        """Yield notes on enclaves that may be left out, and on others that may have the right.
+        """Yield notes on enclaves that may be left out, and on processes that may have the right.
 
-        These are processes without an identity, and enclaves with earlier permissions or revoked
-        certificates.
+        These processes have no identity, or have earlier permissions or a revoked certificate.
         """
         # As in `outcomes`.
         from sros_tool.explain.earlier import note_on_earlier_permissions, note_on_revoked_enclaves
@@ -813,7 +817,7 @@ class VendorOfKeystore(NamedTuple):
         refuse = remedy_in_keystore(self.keystore.root, f"Run {REFUSE_STRANGERS}.")
         yield from _note_on_anybody((outcome.opened for outcome in outcomes), refuse)
         denied = {outcome.enclave for outcome in outcomes if not outcome.allowed}
-        stopped = {outcome.enclave for outcome in outcomes if outcome.stopped}
+        stopped = {outcome.enclave for outcome in outcomes if outcome.why_stopped}
         yield from note_on_earlier_permissions(
             self.keystore, denied, stopped, question, self.vendor, self.asking
         )
@@ -822,5 +826,5 @@ class VendorOfKeystore(NamedTuple):
             yield from note_on_revoked_enclaves(
                 self.keystore, question, self.vendor, self.asking, allowed
             )
-        if not all(outcome.stopped for outcome in outcomes):
+        if not all(outcome.why_stopped for outcome in outcomes):
             yield from note_on_lacking_keys(self.keystore)

@@ -42,7 +42,7 @@ from sros_tool.reach import (
     Network,
     Reach,
     Unguarded,
-    unguarded,
+    unguarded_topics,
 )
 from sros_tool.values import shows
 from sros_tool.wording import first_few
@@ -69,7 +69,7 @@ class EnclaveOutcome(Protocol):
         """The expression that allows the access, if it is a wildcard, or ""."""
 
     @property
-    def stopped(self) -> str:
+    def why_stopped(self) -> str:
         """The reason that no process can run in the enclave with its current files, or ""."""
 
     @property
@@ -78,7 +78,7 @@ class EnclaveOutcome(Protocol):
 
     @property
     def in_part(self) -> Sequence[str]:
-        """The acting parts of an action that the enclave may use without the whole right."""
+        """The `acting_parts` of an action that the enclave may use without the whole right."""
 
     @property
     def by_permissions_of(self) -> Sequence[str]:
@@ -310,7 +310,7 @@ def follow_reach(
         for domains, some in rights_by_domains(source).items()
         if domain is None or domains is None or domain in domains
     }
-    opened = tuple(unguarded(OpenedKeystore(source.path).governance)) if of_keystore else ()
+    opened = tuple(unguarded_topics(OpenedKeystore(source.path).governance)) if of_keystore else ()
     network = Network(
         rights,
         excluded=without,

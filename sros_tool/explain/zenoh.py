@@ -131,7 +131,7 @@ class ReachableEnclave(NamedTuple):
     """The enclave."""
     deliveries: tuple[Delivery, ...]
     problem: str
-    """Why the process of the enclave opens no session, or null."""
+    """Why the process of the enclave opens no session; empty (null in JSON) if it opens one."""
 
 
 class DecidingWildcard(NamedTuple):
@@ -221,7 +221,7 @@ class ZenohAnswer:
         return self.wildcards[0].expression if self.wildcards else ""
 
     @property
-    def stopped(self) -> str:
+    def why_stopped(self) -> str:
         """The reason that the enclave's process opens no session, or ""."""
         return self.text if self.outcome is _Outcome.REFUSED else ""
 
@@ -231,14 +231,14 @@ class ZenohAnswer:
         return self.mode is Mode.ROUTER
 
     @property
-    def dropped(self) -> Check | None:
+    def dropping_check(self) -> Check | None:
         """The check that drops a message, or None; `_check_to_report` chooses from several."""
         return _check_to_report((check for check in self.checks if not check.allowed), self.enclave)
 
     @property
     def deciding(self) -> Check | None:
         """The check whose rule decides the answer; None without checks."""
-        return self.dropped or _check_to_report(self.checks, self.enclave)
+        return self.dropping_check or _check_to_report(self.checks, self.enclave)
 
     @property
     def links(self) -> tuple[CheckedLink, ...]:
@@ -266,9 +266,14 @@ class ZenohEnclaveOutcome(NamedTuple):
     in_brief: ZenohInBrief
     outcome: _OutcomeWord
     wildcard: str
-    """The key expression that allows the right, if it is a wildcard; otherwise null."""
+    """The key expression that allows the right, if it is a wildcard; otherwise empty (null in
+    JSON).
+    """
     domains: str
-    """The ROS domains in which the enclave has the right, such as ``10`` or ``10,20``, or null."""
+    """The ROS domains in which the enclave has the right, such as ``10`` or ``10,20``.
+
+    Empty (null in JSON) if the enclave has the right in no domain.
+    """
     in_part: Sequence[str] = ()
     """If the enclave has only a part of a right to an action: the parts, such as ``send_goal``,
     with which it can command the server (for ``call``) or inform the clients (for ``execute``).
@@ -401,7 +406,7 @@ class ZenohEvaluator:
         checks = self._deciding_checks(own_file.process, router.process, wanted, brief=brief)
         answer = replace(answer, checks=checks)
         text = self._reason_text(answer.deciding)
-        if answer.dropped:
+        if answer.dropping_check:
             return replace(answer, outcome=_Outcome.DROPPED, text=text)
         reached = tuple(self._reached_enclaves(own_file, wanted)) if reach else ()
         return replace(
@@ -413,7 +418,9 @@ class ZenohEvaluator:
         )
 
     def with_parts(self, answer: ZenohAnswer, *, brief: bool) -> ZenohAnswer:
-        """Return an answer with the parts of a denied action that the enclave may do.
+        """Return a denial with the parts of the action that the enclave may use.
+
+        Other answers are returned unchanged.
 
         For ``brief``, see `ZenohEvaluator.answer`.
         """
@@ -939,7 +946,7 @@ class ZenohOfKeystore:
         return decide_each(self._names, answer)
 
     def rights_naming(self, name: str) -> Iterator[Right]:
-        """Return the rights to a ROS name in the permissions of all enclaves."""
+        """Return the rights in all permissions whose text contains ``name``."""
         return rights_naming(self._keystore, name)
 
     def printed(self, question: Question, outcomes: Sequence[ZenohAnswer]) -> WhoOnZenoh:
@@ -1048,7 +1055,7 @@ class ZenohExplanation(NamedTuple):
 
     @property
     def remedy(self) -> str:
-        """What to do if no change of the policy helps, or null."""
+        """What to do if no change of the policy helps; otherwise empty (null in JSON)."""
         return self.files_remedy or (self.stated.remedy if self.wants_rights else "")
 
     @property

@@ -1068,7 +1068,10 @@ def _allowed_rights(rights: Iterable[Right]) -> frozenset[NodeRight]:
 
 
 def _groups_not_given(given_rights: frozenset[NodeRight], profile: Profile) -> tuple[Group, ...]:
-    """Return the groups of a profile, without names whose rights are all in ``given_rights``."""
+    """Return the groups of a profile, without names whose rights are all in ``given_rights``.
+
+    Names with a denial stay.
+    """
     groups = []
     for group in profile.groups:
         names = tuple(

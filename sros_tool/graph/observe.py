@@ -56,7 +56,7 @@ class Readings(NamedTuple):
     """The moments at which complete readings of the graph began.
 
     ``last`` is the begin of the last reading, ``gap`` the longest time between the begins of two
-    readings.
+    successive readings, both in seconds.
     """
 
     last: float = float("-inf")

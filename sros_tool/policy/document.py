@@ -97,7 +97,7 @@ class IncludedFile(NamedTuple):
 
 
 class MissingFileError(DocumentError):
-    """The policy file does not exist where policies are read."""
+    """The policy, or a file that a policy includes, does not exist."""
 
 
 PolicyFiles = Callable[[Path], bytes]

@@ -199,7 +199,7 @@ class _Pattern:
         return 1 | (self.stars & 1) << 1
 
     def _covering_positions(self, piece: frozenset[str]) -> int:
-        """Return the positions whose pieces match all characters of ``piece``."""
+        """Return the positions whose pieces match all characters of ``piece``, as bits."""
         if piece not in self._covering:
             all_covered = ~0
             for letter in piece:

@@ -380,9 +380,9 @@ def _notes_on_old_names(
 def _notes_on_earlier_names(
     file: Policy, remapped: Iterable[Policy], moved_names: Iterable[UsedRule]
 ) -> Iterator[Note]:
-    """Yield a note for each node that gets a new name, and that has others in ``file``.
+    """Yield a note for each node with a right that gets new names, but has other names in ``file``.
 
-    An earlier merge with other rules perhaps added these: a merge takes no name away.
+    An earlier merge with other rules perhaps added the other names: a merge removes no name.
     """
     before, after = (_rights_by_node(side) for side in ([file], remapped))
     new_names = {(use.kind, use.new) for use in moved_names}

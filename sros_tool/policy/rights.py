@@ -451,7 +451,7 @@ def nodes_of_rights(rights: Iterable[Right]) -> tuple[NodeName, ...]:
 
 
 def denied_nodes(rights: Iterable[Right]) -> tuple[NodeName, ...]:
-    """Return the nodes whose standard services are allowed by rules, and all denied by others.
+    """Return the nodes for which rules allow standard services, and other rules deny all of them.
 
     Nodes that may offer any of their standard services are left out.  If a denial matches some of
     the nodes that a wildcard allows, the result has all nodes that the denial matches.

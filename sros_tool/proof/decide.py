@@ -854,18 +854,19 @@ def _unused_names(requirement: Requirement, world: World, limit: SearchLimit) ->
                 found.unheard.append(f"{_CLAUSES_WITHOUT_PEER[verb]} {named}")
             else:
                 unnamed.append(named)
-        elif known and (served := _served_instead(world, peer, name, limit)):
+        elif known and (served := _similar_served_name(world, peer, name, limit)):
             clauses.append(f"no enclave may {peer} {named} (perhaps {served} is meant)")
         else:
             found.unserved.append(f"{_CLAUSES_WITHOUT_PEER[verb]} {named}")
     return found
 
 
-def _served_instead(world: World, right: str, name: str, limit: SearchLimit) -> str | None:
-    """Return the only name that is served and like ``name``, which nobody serves, or None.
+def _similar_served_name(world: World, right: str, name: str, limit: SearchLimit) -> str | None:
+    """Return the only served name that is similar to ``name``, which nobody serves.
 
-    The two names differ in the part before the last, which is often the name of the server's node:
-    it was perhaps renamed, and enclaves keep the right to request the earlier name.
+    The result is None if there is no such name, or if there are several. The two names differ in
+    the part before the last, which is often the name of the server's node: the node was perhaps
+    renamed, and enclaves keep the right to request the earlier name.
     """
     parts = _sufficient_parts(right)
     if is_expression(name) or is_of_every_node(name):

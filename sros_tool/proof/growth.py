@@ -82,7 +82,7 @@ from sros_tool.proof.worlds import (
     valid_topics,
 )
 from sros_tool.proof.zenoh_settings import unknown_settings
-from sros_tool.reach import OF_EVERY_NODE, QUESTIONS, Hop, HopPath, Network, unguarded
+from sros_tool.reach import OF_EVERY_NODE, QUESTIONS, Hop, HopPath, Network, unguarded_topics
 from sros_tool.translate import governance_for, grant_rights
 from sros_tool.values import Words, shows
 from sros_tool.zenoh.configuration import Mode
@@ -616,7 +616,10 @@ def _access_on_vendor(vendor: Vendor, fitting_others: _FittingOthers) -> _Access
 
 
 def _access_on_zenoh(base: AccessSource, head: AccessSource) -> _AccessOf:
-    """Return a function for access on Zenoh: by the rules of a side, or else by its rights."""
+    """Return a function that returns the access of an enclave on Zenoh.
+
+    The rules in the Zenoh files of a side decide; for a side without such files, its rights.
+    """
     stated = {
         id(side): _access_by_rights(side, _domains_of_robots(side, other))
         for side, other in ((base, head), (head, base))
@@ -1139,7 +1142,7 @@ def _hops_between_enclaves(
         usable,
         excluded=OF_EVERY_NODE,
         questions=QUESTIONS,
-        unguarded=unguarded(side.governance) if side.governance else (),
+        unguarded=unguarded_topics(side.governance) if side.governance else (),
         everybody=sorted(side.permissions),
     )
     edges: dict[str, dict[str, Callable[[], Hop]]] = defaultdict(dict)

@@ -370,13 +370,16 @@ def added_crossing(
                 _crossing_text(new_crossing),
                 meaning,
             )
-    yield from _moved_enclaves(before, after, {*new.permissions, *new.certified, *kept}, limit)
+    yield from _looser_router_moves(before, after, {*new.permissions, *new.certified, *kept}, limit)
 
 
-def _moved_enclaves(
+def _looser_router_moves(
     before: ZenohNetwork, after: ZenohNetwork, enclaves: set[str], limit: SearchLimit
 ) -> Iterator[SettingChange]:
-    """Yield moves of enclaves to other routers that let more names of these enclaves pass."""
+    """Yield a change for each move to another router that lets more names of an enclave pass.
+
+    Enclaves that move from the same router to the same router count once.
+    """
     places: dict[tuple[str, str], str] = {}
     for enclave in sorted(enclaves):
         places.setdefault(

@@ -184,8 +184,8 @@ class ReviewRequest:
     fail.  With ``allow_dropped_requirements``, requirements that HEAD drops or weakens do not make
     the review fail. The review fails if an enclave expires within ``renew_within``.  ``left_out``
     are files and folders of policies that are not reviewed.  ``template`` is the keystore template
-    whose protection the policies get: a path, the name of a shipped template, or "".  ``at`` is the
-    time of the review, and ``zone`` the time zone of the robots.
+    whose protection is assumed for the policies: a path, the name of a shipped template, or "".
+    ``at`` is the time of the review, and ``zone`` the time zone of the robots.
     """
 
     repository: Repository
@@ -817,8 +817,8 @@ class _Review:
     def _unreviewed_policies_including(self, changed: Iterable[tuple[str, TreeEntry]]) -> list[str]:
         """Return policies that are not reviewed and include a file that changes.
 
-        A policy includes only files in its own folder and below.  Where no reviewed policy has the
-        file, only policies whose names end with ``.xml`` are found.
+        A policy includes only files in its own folder and below.  If no
+        reviewed policy includes the file, only policies whose names end with ``.xml`` are found.
         """
         repository, files = self.request.repository, self.head.files
         parts = [
@@ -959,7 +959,7 @@ class _Review:
     def _unreviewed_keystores(self, entries: Iterable[tuple[str, TreeEntry]]) -> list[str]:
         """Return keystores and exports with ``entries`` that are neither reviewed nor left out."""
         known = (*self.request.keystores, *self.request.left_out)
-        folders = {_keystore_with(path) for path, _ in entries if not _is_below(path, known)}
+        folders = {_keystore_of_file(path) for path, _ in entries if not _is_below(path, known)}
         return sorted(folder or "." for folder in folders if folder is not None)
 
     def _changed_settings(self) -> list[str]:
@@ -1252,7 +1252,7 @@ class _Review:
             sources = moved() if moved else None
         left = [*unanswered]
         if sources:
-            left += [*_left_requirement_findings(earlier, wanted_requirements, *sources)]
+            left += [*_findings_on_lost_restrictions(earlier, wanted_requirements, *sources)]
         if not (dropped or left):
             return None
         assert self.base
@@ -1354,7 +1354,7 @@ _TRUSTED_FILES = (CRL, *map(ca_certificate, ROLES))
 """The files of a keystore that all enclaves trust."""
 
 
-def _keystore_with(path: str) -> str | None:
+def _keystore_of_file(path: str) -> str | None:
     """Return the keystore or export that a file belongs to, by its path; None for other files."""
     keystore, enclaves, file = f"/{path}".partition(f"/{ENCLAVES}/")
     if enclaves and Path(file).name in _FILES_OF_ENCLAVES:
@@ -1485,7 +1485,7 @@ def _status_of_findings(chosen_findings: ChosenFindings) -> int:
     return _FOUND if chosen_findings.fails(WARNING) else _OK
 
 
-def _left_requirement_findings(
+def _findings_on_lost_restrictions(
     earlier: Sequence[Requirement],
     requirements: Sequence[Requirement],
     before: AccessSource,

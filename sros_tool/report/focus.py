@@ -26,7 +26,7 @@ from sros_tool.names import ACTION_SEPARATOR, dds_names, is_expression
 from sros_tool.policy.model import ALLOW, DENY, PEER_RIGHT
 from sros_tool.policy.patterns import matches, overlap
 from sros_tool.policy.rights import Right
-from sros_tool.reach import OF_EVERY_NODE, QUESTIONS, HopPath, Network, path_text, unguarded
+from sros_tool.reach import OF_EVERY_NODE, QUESTIONS, HopPath, Network, path_text, unguarded_topics
 from sros_tool.report.compose import PictureSource, edge_order, namespace_of, protection_of
 from sros_tool.report.layout import (
     MARGIN,
@@ -242,7 +242,7 @@ class _System:
             (source.governance for source in reversed(sources) if source.governance), None
         )
         everybody = sorted(enclaves)
-        opened = tuple(unguarded(self._governance)) if self._governance else ()
+        opened = tuple(unguarded_topics(self._governance)) if self._governance else ()
         self._by_permissions = Network(in_domains)
         self._direct = Network(in_domains, unguarded=opened, everybody=everybody)
         self._network = Network(

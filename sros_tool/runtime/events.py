@@ -36,7 +36,7 @@ _MESSAGES = (EventKind.SENT, EventKind.HEARD)
 
 
 class ProcessStage(StrEnum):
-    """The stage of a process before it was refused or failed."""
+    """The stage of a process to which an event belongs, such as a refusal."""
 
     IMPORT = "import"
     PARTICIPANT = "participant"
@@ -125,7 +125,7 @@ class EventReader:
 
 
 def read_events(path: Path) -> list[Event]:
-    """Return all events in a file, oldest first.
+    """Return the events of all complete lines in a file, oldest first; [] without the file.
 
     Raises:
         DocumentError: A line is not an event.

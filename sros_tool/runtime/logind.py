@@ -31,7 +31,7 @@ def users_without_linger(users: Iterable[int]) -> list[str]:
 
 
 def _removes_memory() -> bool:
-    """Return whether logind removes shared memory; if it cannot be asked, it does by default."""
+    """Return whether logind removes shared memory; True, the default, if logind cannot be asked."""
     command = ["busctl", "get-property", *_LOGIND, "RemoveIPC"]
     try:
         shown = subprocess.run(command, capture_output=True, check=False).stdout

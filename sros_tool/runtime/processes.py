@@ -32,7 +32,7 @@ from itertools import pairwise, takewhile
 from pathlib import Path
 from typing import NamedTuple
 
-from sros_tool.owners import other_writers
+from sros_tool.owners import other_writers_clause
 from sros_tool.runtime.cyclone import ENCLAVE_FILES
 from sros_tool.runtime.environment import (
     NO_CONFIGURATION,
@@ -344,7 +344,10 @@ def plain(text: str, longest: int = _LONGEST_TEXT) -> str:
 
 
 def program_of(command: tuple[str, ...]) -> str:
-    """Return the name of a command's program, or of the script or module that the program runs."""
+    """Return the name of a command's program, or of the script or module that the program runs.
+
+    The result is "?" for an empty command.
+    """
     name, *words = (Path(command[0]).name, *command[1:]) if command else ("",)
     if _INTERPRETER.match(name):
         while words and _PYTHON_FLAGS.match(words[0]):
@@ -633,7 +636,10 @@ def _own_memory(folder: int) -> set[str]:
 
 
 def _forked_by(folder: int, command: tuple[str, ...]) -> tuple[int, tuple[str, ...]]:
-    """Return the id and command of the first process of a program; (0, ()) if it is this process.
+    """Return the id and command of the process from which the process in ``folder`` was forked.
+
+    After several forks, this is the first process of the program.  The result is (0, ()) if the
+    process in ``folder`` itself is the first one.  ``command`` is the command of this process.
 
     A fork has the command of its parent.  A child of Python's ``multiprocessing`` has a command
     that only its parent can start (CPython, ``multiprocessing/spawn.py`` and ``forkserver.py``).
@@ -898,7 +904,9 @@ def _clock_advance(folder: int, started: datetime) -> timedelta:
 
 
 def _user(folder: int, status: bytes) -> int:
-    """Return the only user other than root who can control a process, or 0, or `SEVERAL_USERS`.
+    """Return the id of the only user other than root who can control a process.
+
+    The result is 0 if only root can, and `SEVERAL_USERS` for several users or an unknown user.
 
     The user who starts a set-user-ID program chooses its command and environment, whatever user ids
     the program takes later.  A process can replace its auxiliary vector, but not its ids in
@@ -1264,7 +1272,7 @@ def _writable_folder_clause(folders: list[tuple[str, os.stat_result]], user: int
     """
     trusted = frozenset({0, user, folders[0][1].st_uid})
     for path, state in folders:
-        if why := other_writers(state, trusted):
+        if why := other_writers_clause(state, trusted):
             return f"'{path}': {why}"
     return ""
 

@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 from sros_tool.errors import UsageError
 from sros_tool.files import new_files, replace_file, write_new_folder
-from sros_tool.owners import other_writers, replaceable_on_the_way
+from sros_tool.owners import other_writers_clause, replaceable_on_the_way
 from sros_tool.runtime.environment import render_environment
 from sros_tool.runtime.variables import DOMAIN, ENABLE, KEYSTORE, STRATEGY
 from sros_tool.validity import duration_text
@@ -500,7 +500,7 @@ def _refuse_folders_of_others(folder: Path, files: Iterable[str]) -> None:
     for place in dict.fromkeys((folder, *((folder / path).parent for path in files))):
         replaceable = [*replaceable_on_the_way(place, trusted)]
         if os.path.lexists(place):
-            replaceable.append((place, other_writers(place.lstat(), trusted)))
+            replaceable.append((place, other_writers_clause(place.lstat(), trusted)))
         for place, why in replaceable:
             if why:
                 raise UsageError(

@@ -49,7 +49,7 @@ RELEASES = (
 
 
 def release_of(version: Version) -> RmwZenohRelease:
-    """Return the latest release that begins at or before a version."""
+    """Return the latest release that begins at or before a version; otherwise the first release."""
     begun = (release for release in reversed(RELEASES) if release.begin <= version)
     return next(begun, RELEASES[0])
 

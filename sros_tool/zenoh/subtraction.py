@@ -395,6 +395,9 @@ class _LetterSearch:
 
     The search reads names from the start until no denied chunk can match any more.  If all
     wildcards in denied chunks are stars at the start, a second search reads backwards from the end.
+
+    ``kept`` has the chunks that were found; ``effort_left`` is the number of characters that may
+    still be compared.
     """
 
     backwards: bool = False

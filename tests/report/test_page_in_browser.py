@@ -18,7 +18,7 @@ from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.rights import load_rights
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.rights import policy_rights
-from sros_tool.reach import OF_EVERY_NODE, QUESTIONS, Network, unguarded
+from sros_tool.reach import OF_EVERY_NODE, QUESTIONS, Network, unguarded_topics
 from sros_tool.report.compose import PictureSource, compose
 from sros_tool.report.layout import scenes_of
 from sros_tool.report.pages import render_page
@@ -240,7 +240,7 @@ def test_the_flow_agrees_with_the_one_that_explain_follows(
             load_rights(root).rights,
             excluded=OF_EVERY_NODE,
             questions=QUESTIONS,
-            unguarded=unguarded(OpenedKeystore(root).governance),
+            unguarded=unguarded_topics(OpenedKeystore(root).governance),
             everybody=enclave_names(root),
         )
         path = tmp_path / "open.html"

@@ -39,7 +39,12 @@ from sros_tool.keystore.layout import (
     hidden_enclaves,
     is_layout_path,
 )
-from sros_tool.owners import is_for_root_alone, other_writers, replaceable_on_the_way, user_name
+from sros_tool.owners import (
+    is_for_root_alone,
+    other_writers_clause,
+    replaceable_on_the_way,
+    user_name,
+)
 from sros_tool.pki.keys import holds_private_key
 
 KEY_READABLE = FindingKind(
@@ -413,7 +418,7 @@ def _write_access_findings(
         text = f"its mode is {stat.S_IMODE(info.st_mode):04o}"
         remedy = f"Run `chmod o-w {quote(path)}`."
         yield WORLD_WRITABLE.found(path, text, path, remedy=remedy)
-    elif why := other_writers(info, trusted_users):
+    elif why := other_writers_clause(info, trusted_users):
         yield OTHERS_WRITE.found(path, why, path)
 
 

@@ -93,7 +93,7 @@ from sros_tool.keystore.settings import edit_remedy, find_edits, with_key_places
 from sros_tool.keystore.template import NODE_BASICS, Template, template_names
 from sros_tool.keystore.transaction import recover_keystore
 from sros_tool.names import check_enclave_name
-from sros_tool.owners import closing_command, other_writers, replaceable_on_the_way
+from sros_tool.owners import closing_command, other_writers_clause, replaceable_on_the_way
 from sros_tool.parallel import Progress
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import (
@@ -647,7 +647,7 @@ def _folder_owner_notes(root: Path) -> Iterator[Note]:
     """Yield a note if users other than the present one and root can replace a new keystore."""
     trusted = frozenset({0, os.geteuid()})
     replaceable = list(replaceable_on_the_way(root, trusted))
-    if root.exists() and (why := other_writers(root.stat(), trusted)):
+    if root.exists() and (why := other_writers_clause(root.stat(), trusted)):
         replaceable.append((root, why))
     for folder, why in replaceable[-1:]:
         yield Note(
