@@ -397,7 +397,7 @@ def _other_name_notes(answer: Answer, asked_enclave: AskedEnclave) -> Iterator[N
             case None:
                 text += f", but a right with a wildcard may match it. If none does, {meant}"
             case []:
-                text += f", and no wildcard matches it: {meant}"
+                text += f", nor a wildcard that matches it: {meant}"
             case [right, *_]:
                 user = right.enclave
                 text += f"; by a wildcard, {user} may {right.describe()}. If {user} does not use "

@@ -1105,9 +1105,9 @@ class _Review:
                 and (subject in keystores or self.has_all_policies),
             )
             required_before = [*chain.from_iterable(earlier.values())]
-            unanswered = [
-                *_unanswered_requirement_findings(required_before, wanted, rights, later_rights)
-            ]
+            unanswered = partial(
+                _unanswered_requirement_findings, required_before, wanted, rights, later_rights
+            )
             decide = partial(
                 self._dropped_step, required_before, wanted, system, sources, unanswered
             )
@@ -1241,7 +1241,7 @@ class _Review:
         wanted_requirements: Sequence[Requirement],
         system: System,
         moved: Callable[[], tuple[AccessSource, AccessSource]] | None,
-        unanswered: Sequence[Finding],
+        unanswered: Callable[[], Iterable[Finding]],
     ) -> tuple[int, Content] | None:
         dropped = [
             requirement.requirement
@@ -1250,7 +1250,7 @@ class _Review:
         sources = None
         with suppress(SrosError, OSError):  # the comparison reports the error
             sources = moved() if moved else None
-        left = [*unanswered]
+        left = [*unanswered()]
         if sources:
             left += [*_findings_on_lost_restrictions(earlier, wanted_requirements, *sources)]
         if not (dropped or left):

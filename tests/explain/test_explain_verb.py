@@ -779,7 +779,7 @@ def test_a_change_is_for_the_node_that_the_permissions_are_for(whole: Path) -> N
         "[explain.not-used]: no enclave that was read has a right to subscribe exactly /nothing"
     )
     assert unused in found.err and "this node lacks a remapping" in found.err
-    assert "/nothing, and no wildcard matches it: perhaps no other node needs /nothing" in found.err
+    assert "/nothing, nor a wildcard that matches it: perhaps no other node needs" in found.err
     assert "not-used" not in explain(whole, ENCLAVE, "publish", "/rosout").err
 
 

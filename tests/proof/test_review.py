@@ -13,6 +13,7 @@ import tarfile
 from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from unittest.mock import Mock
 
 import pytest
 
@@ -1023,6 +1024,20 @@ def test_a_requirement_about_a_name_that_loses_its_other_side(
     assert "requirements-before" in ended.out or not lost, ended
     change.commit({"robot.xml": policy_text(panel | {"/moved/driver": before})})
     assert "HEAD removes" not in change.review(*words).out
+
+
+def test_names_that_are_too_many_to_compare_leave_the_other_steps(
+    change: Change, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before, after = (policy_text({"/a": publish("/x"), "/b": subscribe(n)}) for n in ("/x", "/y"))
+    change.base = change.commit({"robot.xml": before, "robot.toml": ONLY})
+    change.commit({"robot.xml": after})
+    with monkeypatch.context() as patched:
+        error = DocumentError("there are too many similar names")
+        patched.setattr(review, "rights_without_counterpart", Mock(side_effect=error))
+        ended = change.review("--policy", "robot.xml", "--requirements", "robot.toml")
+    assert ended.status == 2 and "requirements-before robot.xml: there are too" in ended.out, ended
+    assert "+ /b subscribe topic /y" in ended.out, ended
 
 
 def test_a_name_that_nobody_may_use_may_lose_its_denial_and_its_right(change: Change) -> None:
