@@ -891,9 +891,9 @@ class _Round:
         opened_enclaves: Mapping[str, InstalledEnclave],
         processes: EnclaveProcesses,
         clock: RobotClock,
-        asked: Renewals,
+        renewals: Renewals,
     ) -> bool:
-        """Send the message with the confirmation and the requests; return whether it arrived."""
+        """Send the message with the confirmation and ``renewals``; return whether it arrived."""
         now = self._machine.now.replace(microsecond=0)
         sequence = self._state.next_sequence(now)
         self._state = replace(self._state, sequence=sequence)
@@ -920,11 +920,12 @@ class _Round:
             running=processes.loaded_from_any_folder(),
             clock=clock,
             problems=shortened_problems(self._problems),
-            requests=asked.requests,
+            requests=renewals.requests,
             crl=self._list_to_send(names),
             seal=self._seal_to_send(),
         )
-        message = self._signed_message(confirmation, (asked.signer,) if asked.signer else names)
+        signers = (renewals.signer,) if renewals.signer else names
+        message = self._signed_message(confirmation, signers)
         if not message:
             return False
         settings = self._settings
@@ -955,7 +956,10 @@ class _Round:
         return None
 
     def _replaced_list(self) -> str | None:
-        """Return the kept revocation list that a release replaced by a shorter one, or None."""
+        """Return the kept revocation list (PEM) that a release may have replaced by a shorter one.
+
+        The result is None if no list is kept, or if the list was kept for long enough.
+        """
         with suppress(SrosError, OSError):
             path = agent_folder(self._folder) / _REPLACED_LIST
             since = time_of_file(path.stat().st_mtime)
@@ -1037,16 +1041,17 @@ class _Round:
         return b""
 
     def _ask_as_enclave(
-        self, place: str, ask: Callable[[ClientCertificate | None], _ServerAnswer]
+        self, address: str, ask: Callable[[ClientCertificate | None], _ServerAnswer]
     ) -> _ServerAnswer:
         """Return the answer of a server to the first enclave whose certificate it accepts.
 
+        ``address`` is the URL of the server, or the path of a folder, which needs no certificate.
         Some certificates may already be revoked while their successors wait to be fetched.
 
         Raises:
             SrosError, OSError: the error of ``ask``, for the last enclave if all were refused.
         """
-        secure = place.startswith("https://")
+        secure = address.startswith("https://")
         certificates = self._client_certificates() if secure else []
         for certificate in certificates[:-1]:
             try:
@@ -1060,7 +1065,7 @@ class _Round:
             if certificates or not secure or not _is_refusal(error):
                 raise
             raise UnavailableError(
-                f"{place} refuses this robot, which has no certificate to identify itself with",
+                f"{address} refuses this robot, which has no certificate to identify itself with",
                 "No enclave here has a certificate and its key in files (a key on a token cannot "
                 "be used for this).",
                 "On the keystore machine, run `sros distribute_key KEYSTORE --robot "

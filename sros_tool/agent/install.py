@@ -387,8 +387,9 @@ def _enclave_change(
 
 
 def _check_not_older(folder: Folder, place: str, sent: OpenedEnclave, now: datetime) -> None:
-    """Raise `KeystoreError` if the enclave has newer files, from `sros import` or an Ansible play.
+    """Raise `KeystoreError` if an enclave has newer files, from `sros import` or an Ansible play.
 
+    ``place`` is the enclave's folder, and ``sent`` the enclave in the release.
     Only files that a process could load count: the owner of the folder can write anything into it.
     """
     if folder.state(f"{place}/{CERTIFICATE_FILE}") is None:

@@ -129,7 +129,11 @@ _STATE_KEYS = frozenset(key.name for key in fields(AgentState))
 
 
 def read_state(folder: Path) -> AgentState:
-    """Return the state of the agent of ``folder``; a damaged file is read as far as possible."""
+    """Return the state of the agent of ``folder``.
+
+    If the file of the state is missing or damaged, this is a new state.  The seal of the accepted
+    release gives ``accepted``, if its number is higher.
+    """
     state = AgentState()
     with suppress(SrosError, OSError, ValueError, TypeError, KeyError):
         path = agent_folder(folder) / _STATE_FILE
@@ -265,7 +269,7 @@ def refuse_files_of_other_robot(folder: Path, robot: str) -> None:
 
 
 def write_seal(folder: Path, seal: bytes) -> None:
-    """Write the seal of the accepted release into the folder.
+    """Write the seal of the accepted release into the agent's folder in ``folder``.
 
     Raises:
         OSError: the seal cannot be written; the earlier seal stays.

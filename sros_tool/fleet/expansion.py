@@ -307,7 +307,7 @@ _NAMESPACE_PLACEHOLDER = "{namespace"
 def with_absolute_names(policy: Policy) -> Policy:
     """Return the policy with "/" before each name that begins with ``{namespace}``.
 
-    A namespace begins with "/", so such names are absolute; with the "/" they also look so.
+    A namespace begins with "/", so such names are absolute; the added "/" shows it.
     """
     return _with_changed_names(
         policy, lambda name: f"/{name}" if name.startswith(_NAMESPACE_PLACEHOLDER) else name

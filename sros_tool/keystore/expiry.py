@@ -225,7 +225,7 @@ def enclaves_renewed_by_name(
 ) -> list[str]:
     """Return the short-lived enclaves among ``names``, except those of a closed robot's processes.
 
-    An enclave of a person ends unless somebody renews it by name; a robot has to go on.
+    The enclave of a person expires unless somebody renews it by name; a robot must keep running.
     """
     short_lived = [name for name in names if settings.longest_validity(name) is not None]
     own = enclaves_of_closed_robot(keystore.root).here if short_lived else ()

@@ -254,7 +254,10 @@ class EnclaveDomains(NamedTuple):
         return self.fleet.robots.values() if self.fleet else ()
 
     def robot_of(self, enclave: str) -> Robot | None:
-        """Return the robot of an enclave, as the keystore's fleet has it if it has the robot."""
+        """Return the robot of an enclave; None if the enclave belongs to no robot.
+
+        The values of the robot come from the keystore's fleet, or else from ``stated_robots``.
+        """
         stated = self.stated_robots.get(enclave)
         robot = robot_of(self.fleet, enclave) if self.fleet else None
         if self.fleet and stated and robot is None:
@@ -446,7 +449,7 @@ def _signed_domains(keystore: OpenedKeystore, name: str) -> DomainSet | None:
 def lost_enclaves(
     keystore: OpenedKeystore, before: Fleet, after: Fleet, now: datetime
 ) -> tuple[list[Note], list[Entry]]:
-    """Return notes and ledger entries on enclaves and routers that robots lose, but keystores keep.
+    """Return notes and ledger entries on enclaves and routers that robots lose.
 
     The notes include enclaves that robots lost earlier.  No two robots of ``after`` may have an
     enclave in common, which `write_fleet` checks.

@@ -1351,7 +1351,8 @@ class _KeystoreRecords:
     def _identify(self, difference: _Difference, kind: str, name: str) -> tuple[State, str, str]:
         """Return a file's state, the time when it was issued, and the enclave to which it belongs.
 
-        The time is "" if it is not known.  The enclave is "" if it is ``name``.
+        The time is "" if it is not known.  The enclave is "" if it is ``name``, in whose folder the
+        file is.
         """
         if difference.exported is None or self._is_edited(difference, kind):
             return State.BROKEN, "", ""

@@ -449,10 +449,10 @@ class KnownKeys:
         ]
 
     def later_key(self, name: str, key: str) -> Entry | None:
-        """Return the first certificate for the newest key of an enclave; None if this is ``key``.
+        """Return the ledger entry of the first certificate for the newest key of an enclave.
 
-        The order of the keys is that in which their validity began, as the ledger has it.  Revoked
-        keys are left out.  The result is None, too, if the ledger does not have ``key``.
+        The newest key is the one whose validity began last, by the ledger; revoked keys do not
+        count.  The result is None if ``key`` is the newest key, or is not in the ledger.
         """
         first: dict[str, Entry] = {}
         for entry in self._keystore.ledger_file.with_values("enclave", [name]).entries:

@@ -107,7 +107,7 @@ class IndexedEntry(Protocol):
 
     @property
     def number(self) -> int:
-        """Number of an answer, or 0."""
+        """Number of the entry, as in `Entry.number`, or 0."""
 
 
 def is_indexed(name: str, value: str) -> bool:

@@ -192,6 +192,8 @@ class _Trust(NamedTuple):
 
     ``authorities`` are the certificates in the file of the identity CA, in order.  ``signers`` are
     the certificates in the file of the permissions CA.  Either is empty if the file cannot be read.
+    ``unreadable`` are the problems of files that the vendor cannot read, and ``refused`` the
+    problems of files that it reads but refuses.
     """
 
     authorities: Certificates

@@ -928,13 +928,13 @@ class _EnclaveFiles:
         self._check_validity(name, validity_of(certificate), faults)
         return certificate
 
-    def _check_validity(self, name: str, validity: Window, faults: tuple[Fault, Fault]) -> None:
+    def _check_validity(self, file: str, validity: Window, faults: tuple[Fault, Fault]) -> None:
         """Add the first of ``faults`` if ``validity`` is over, the second if it has not begun."""
         expired, not_yet_valid = faults
         if self._now > validity.not_after:
-            self._add(name, f"it expired at {iso(validity.not_after)}", expired)
+            self._add(file, f"it expired at {iso(validity.not_after)}", expired)
         elif self._now < validity.not_before:
-            self._add(name, f"it is not valid before {iso(validity.not_before)}", not_yet_valid)
+            self._add(file, f"it is not valid before {iso(validity.not_before)}", not_yet_valid)
 
     def _checked_public_key(
         self,

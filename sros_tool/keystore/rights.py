@@ -611,7 +611,7 @@ def _discovery_notes(permissions: Permissions) -> Iterator[Note]:
 
 
 def _missing_discovery(grant: Grant) -> list[str]:
-    """Return which of "publish" and "subscribe" the rules do not allow on every node's topic.
+    """Return which of "publish" and "subscribe" a grant does not allow on the discovery topic.
 
     The first rule that matches the topic decides.
     """

@@ -503,7 +503,10 @@ def likely_names(name: str, existing_enclaves: Collection[str]) -> tuple[str, ..
 
 
 def _similar_enclaves(text: str, texts: Mapping[str, str], least: float) -> list[str]:
-    """Return the enclaves (keys of ``texts``) whose value is similar to ``text``."""
+    """Return the enclaves (keys of ``texts``) whose value is similar to ``text``.
+
+    ``least`` is the lowest similarity that counts, from 0 to 1.
+    """
     import difflib
 
     similar_texts = difflib.get_close_matches(text, set(texts.values()), n=3, cutoff=least)

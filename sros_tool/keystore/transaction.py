@@ -651,7 +651,7 @@ class Transaction:
         self._moves.append(Move(path, before, None))
 
     def move_folder(self, folder: str, to: str, files: Sequence[str], links: Sequence[str]) -> None:
-        """Stage the move of an enclave's folder, with its ``files`` and without its ``links``.
+        """Stage the move of the enclave folder ``folder`` to ``to``, without its ``links``.
 
         The commit removes the certificate, without which no node starts in the enclave.  The rest
         of the folder is moved after the commit.

@@ -368,7 +368,7 @@ class Drift(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class DriftedConfiguration:
-    """A configuration with a `Drift`; ``path`` is relative to the keystore."""
+    """A configuration that differs from the needed one; ``path`` is relative to the keystore."""
 
     enclave: str
     path: str

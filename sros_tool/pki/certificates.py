@@ -214,12 +214,12 @@ class TrustSettingsUse(Enum):
 
 def load_certificate(
     data: bytes,
-    name: str,
+    label: str,
     *,
     trusted: bool = True,
     settings_use: TrustSettingsUse = TrustSettingsUse.IGNORED,
 ) -> x509.Certificate:
-    """Return the first certificate of a PEM file; ``name`` names the file in errors.
+    """Return the first certificate of a PEM file; ``label`` names the file in errors.
 
     Without ``trusted``, blocks ``TRUSTED CERTIFICATE`` are ignored, as by Cyclone DDS.
 
@@ -227,14 +227,14 @@ def load_certificate(
         PkiError: sros or OpenSSL cannot read the certificate, or its trust settings forbid its use
             (``settings_use``).
     """
-    return _first_certificate(data, name, trusted, settings_use)
+    return _first_certificate(data, label, trusted, settings_use)
 
 
 @lru_cache(maxsize=16)  # several readers load the certificate of an enclave, and the same few CAs
 def _first_certificate(
-    data: bytes, name: str, trusted: bool, settings_use: TrustSettingsUse
+    data: bytes, label: str, trusted: bool, settings_use: TrustSettingsUse
 ) -> x509.Certificate:
-    unreadable = f"the certificate {name} cannot be read"
+    unreadable = f"the certificate {label} cannot be read"
     labels = pem_file.CERTIFICATES if trusted else pem_file.CERTIFICATES[:-1]
     for block in _certificate_blocks(data, unreadable):
         if block.label in labels:
@@ -245,16 +245,16 @@ def _first_certificate(
 
 @lru_cache(maxsize=16)
 def load_certificates(
-    data: bytes, name: str, *, settings_use: TrustSettingsUse = TrustSettingsUse.IGNORED
+    data: bytes, label: str, *, settings_use: TrustSettingsUse = TrustSettingsUse.IGNORED
 ) -> tuple[x509.Certificate, ...]:
-    """Return all certificates of a PEM file, at least one; ``name`` names the file in errors.
+    """Return all certificates of a PEM file, at least one; ``label`` names the file in errors.
 
     Raises:
         PkiError: the file has no certificate, sros or OpenSSL cannot read a part of it, or the
             trust settings of a ``TRUSTED CERTIFICATE`` forbid its use (``settings_use``).
     """
-    load_certificate(data, name)
-    unreadable = f"the certificates {name} cannot be read"
+    load_certificate(data, label)
+    unreadable = f"the certificates {label} cannot be read"
     certificates: list[x509.Certificate] = []
     for block in list(_certificate_blocks(data, unreadable)):
         if block.label in pem_file.CERTIFICATES:
@@ -354,7 +354,7 @@ def _as_sentence(clause: str) -> str:
 
 
 def load_der_certificate(data: bytes) -> x509.Certificate:
-    """Return the certificate in ``data`` (DER), such as a signed document embeds.
+    """Return the certificate in ``data`` (DER), such as one embedded in a signed document.
 
     Raises:
         PkiError: the certificate cannot be read.

@@ -174,7 +174,7 @@ def build_chain(
     other_certificates: Sequence[x509.Certificate],
     moment: datetime,
 ) -> tuple[list[x509.Certificate], str]:
-    """Return the chain from ``start`` to a trusted CA, and why the chain ends before, or "".
+    """Return the chain from ``start`` to a trusted CA, and why it does not reach one, or "".
 
     As in OpenSSL (build_chain), the first certificate with a fitting name and fitting identifiers
     is the issuer, even if the signature was made by another key.

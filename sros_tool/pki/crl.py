@@ -135,28 +135,28 @@ def sign_crl(
     return builder.sign(key, hashes.SHA256()).public_bytes(serialization.Encoding.PEM)
 
 
-def load_crl(data: bytes, name: str) -> RevocationList:
+def load_crl(data: bytes, label: str) -> RevocationList:
     """Return the first revocation list of a PEM file; the list must state when it expires.
 
     Raises:
-        PkiError: the list cannot be read, or states no expiry; ``name`` names the file.
+        PkiError: the list cannot be read, or states no expiry; ``label`` names the file.
     """
-    return _fields_of(read_list(data, name), name)
+    return _fields_of(read_list(data, label), label)
 
 
-def load_crls(data: bytes, name: str) -> tuple[RevocationList, ...]:
+def load_crls(data: bytes, label: str) -> tuple[RevocationList, ...]:
     """Return all revocation lists of a PEM file, which may have certificates, too.
 
     Raises:
         PkiError: as `load_crl`, for any list.
     """
-    return tuple(_fields_of(crl, name) for crl in read_lists(data, name))
+    return tuple(_fields_of(crl, label) for crl in read_lists(data, label))
 
 
-def _fields_of(crl: x509.CertificateRevocationList, name: str) -> RevocationList:
+def _fields_of(crl: x509.CertificateRevocationList, label: str) -> RevocationList:
     expiry = next_update(crl)
     if expiry is None:
-        raise PkiError(f"the revocation list {name} does not say when it expires", "", _RESTORE)
+        raise PkiError(f"the revocation list {label} does not say when it expires", "", _RESTORE)
     return RevocationList(list_number(crl), last_update(crl), expiry, _entries_of(crl), crl)
 
 
@@ -175,33 +175,33 @@ def next_update(crl: x509.CertificateRevocationList) -> datetime | None:
     return cast("datetime | None", tolerant.date(crl, "next_update"))
 
 
-def read_list(data: bytes, name: str) -> x509.CertificateRevocationList:
+def read_list(data: bytes, label: str) -> x509.CertificateRevocationList:
     """Return the first revocation list of a PEM file, even if it states no expiry.
 
     Raises:
-        PkiError: the list cannot be read; ``name`` names the file.
+        PkiError: the list cannot be read; ``label`` names the file.
     """
-    with _reading_list(name, data):
+    with _reading_list(label, data):
         blocks = pem.blocks(data)
         return _read_block(next(block for block in blocks if block.label == _PEM_LABEL))
 
 
-def read_lists(data: bytes, name: str) -> tuple[x509.CertificateRevocationList, ...]:
+def read_lists(data: bytes, label: str) -> tuple[x509.CertificateRevocationList, ...]:
     """Return all revocation lists of a PEM file, which may also contain certificates.
 
     Raises:
-        PkiError: a list, or a block before it, cannot be read; ``name`` names the file.
+        PkiError: a list, or a block before it, cannot be read; ``label`` names the file.
     """
-    with _reading_list(name, data):
+    with _reading_list(label, data):
         blocks = pem.blocks(data)
         return tuple(_read_block(block) for block in blocks if block.label == _PEM_LABEL)
 
 
-def _reading_list(name: str, data: bytes) -> AbstractContextManager[None]:
+def _reading_list(label: str, data: bytes) -> AbstractContextManager[None]:
     kind = "" if CRL_MARK in data else kind_of(data)
     why = f"It is not a PEM revocation list, but {kind}" if kind else "It is not a revocation list"
     return reading(
-        f"the revocation list {name} cannot be read",
+        f"the revocation list {label} cannot be read",
         f"{why}, so DDS refuses every participant.",
         _RESTORE,
     )

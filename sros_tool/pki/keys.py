@@ -88,8 +88,8 @@ def holds_private_key(data: bytes) -> bool:
     return b"PRIVATE KEY-----" in data
 
 
-def load_key(pem: bytes, name: str, passphrase: Callable[[], str] | None = None) -> PrivateKey:
-    """Return the EC or RSA key in a PEM file; ``name`` names the file in errors.
+def load_key(pem: bytes, label: str, passphrase: Callable[[], str] | None = None) -> PrivateKey:
+    """Return the EC or RSA key in a PEM file; ``label`` names the file in errors.
 
     ``passphrase`` is called if the key is encrypted.
 
@@ -98,26 +98,26 @@ def load_key(pem: bytes, name: str, passphrase: Callable[[], str] | None = None)
             returns a wrong one; the key is neither EC nor RSA; or OpenSSL would need so long for
             the key that the process seems to hang.
     """
-    key = load_any_key(pem, name, passphrase)
+    key = load_any_key(pem, label, passphrase)
     if not isinstance(key, (ec.EllipticCurvePrivateKey, rsa.RSAPrivateKey)):
         raise PkiError(
-            f"the private key {name} is neither an elliptic-curve nor an RSA key",
+            f"the private key {label} is neither an elliptic-curve nor an RSA key",
             "DDS Security accepts EC prime256v1 and RSA 2048.",
             "Use a key of one of these kinds.",
         )
     return key
 
 
-def load_enclave_key(pem: bytes, name: str) -> PrivateKey:
+def load_enclave_key(pem: bytes, label: str) -> PrivateKey:
     """Return the key of an enclave, as `load_key`, for which the keystore can issue a certificate.
 
     Raises:
         PkiError: as `load_key`, or the key is for RSA-PSS alone.
     """
-    key = load_key(pem, name)
+    key = load_key(pem, label)
     if is_key_for_pss(pem):
         raise PkiError(
-            f"the private key {name} is an RSA key for RSA-PSS alone",
+            f"the private key {label} is an RSA key for RSA-PSS alone",
             "No DDS vendor loads it next to a certificate of the keystore.",
             "Make another key with `sros create_request`, in another folder.",
         )
@@ -125,29 +125,31 @@ def load_enclave_key(pem: bytes, name: str) -> PrivateKey:
 
 
 def load_any_key(
-    pem: bytes, name: str, passphrase: Callable[[], str] | None = None
+    pem: bytes, label: str, passphrase: Callable[[], str] | None = None
 ) -> PrivateKeyTypes:
     """Return the private key in a PEM file, even of a kind that DDS Security does not allow.
+
+    ``label`` and ``passphrase`` are as in `load_key`.
 
     Raises:
         PkiError: as `load_key`, except for the kind of the key.
     """
-    pem = _key_block(pem, name)
+    pem = _key_block(pem, label)
     if _TRADITIONAL_HEADER in pem or _ENCRYPTED.match(pem):
         if passphrase is None:
             raise PkiError(
-                f"the private key {name} is protected by a passphrase",
+                f"the private key {label} is protected by a passphrase",
                 "It is encrypted, so it cannot be used without the passphrase.",
                 "Decrypt it with `openssl pkey -in KEY -out KEY.plain`.",
             )
-        _check_derivation(pem, name)
-        key = _decrypted_key(pem, name, passphrase())
+        _check_derivation(pem, label)
+        key = _decrypted_key(pem, label, passphrase())
     else:
         try:
             key = serialization.load_pem_private_key(pem, None, unsafe_skip_rsa_key_validation=True)
         except Exception as error:  # may have one of many classes: see `reading`
-            raise _unreadable_key_error(name) from error
-    return _validated(key, name) if isinstance(key, rsa.RSAPrivateKey) else key
+            raise _unreadable_key_error(label) from error
+    return _validated(key, label) if isinstance(key, rsa.RSAPrivateKey) else key
 
 
 def is_key_for_pss(pem: bytes) -> bool:
@@ -177,20 +179,23 @@ def check_key(content: bytes, label: str = "") -> None:
         raise ValueError("a key of another algorithm than its label says")
 
 
-def _unreadable_key_error(name: str, reason: str = "") -> PkiError:
+def _unreadable_key_error(label: str, reason: str = "") -> PkiError:
     reason = reason or "it is not a PEM private key, or it is damaged"
     why = f"{reason[:1].upper()}{reason[1:]}."
-    return PkiError(f"the private key {name} cannot be read", why, "Restore it from a backup.")
+    return PkiError(f"the private key {label} cannot be read", why, "Restore it from a backup.")
 
 
-def _key_block(data: bytes, name: str) -> bytes:
-    """Return the private key that OpenSSL reads first in a PEM file, as a standard PEM block."""
+def _key_block(data: bytes, label: str) -> bytes:
+    """Return the private key that OpenSSL reads first in a PEM file, as a standard PEM block.
+
+    ``label`` names the file in errors.
+    """
     damaged = False
     try:
         for block in pem_file.blocks(data):
             if len(block.content) > _MAX_BYTES and block.label in _PRIVATE_KEY_LABELS:
                 raise PkiError(
-                    f"the private key {name} is too large",
+                    f"the private key {label} is too large",
                     f"It has more than {_MAX_BYTES // 1024} KiB. "
                     "An RSA key of 4096 bits has 4 KiB.",
                     "Use an EC prime256v1 key, or an RSA key of 2048 bits.",
@@ -205,25 +210,27 @@ def _key_block(data: bytes, name: str) -> bytes:
                 break
         else:
             raise _unreadable_key_error(
-                name, "" if damaged else pem_file.missing_block_reason(data, "PRIVATE KEY")
+                label, "" if damaged else pem_file.missing_block_reason(data, "PRIVATE KEY")
             )
     except PkiError as error:
-        raise error if error.why else _unreadable_key_error(name, error.what) from error
+        raise error if error.why else _unreadable_key_error(label, error.what) from error
     encrypted = block.headers.startswith(_TRADITIONAL_HEADER)
     if block.headers and not encrypted:
-        raise _unreadable_key_error(name, "it has other PEM headers than those of an encrypted key")
-    label, der_key = block.label, block.content
+        raise _unreadable_key_error(
+            label, "it has other PEM headers than those of an encrypted key"
+        )
+    pem_label, der_key = block.label, block.content
     # OpenSSL ignores bytes after the key, and reads the key even if the label names another form.
     if not encrypted:
         with suppress(PkiError):
             der_key, _ = der.split(block.content)
             kinds = [part.tag for part in der.children(der.first_value(der_key).content)]
             if kinds[:2] == [der.INTEGER, der.SEQUENCE]:
-                label = KEY_LABELS[0]
-    begin = [f"-----BEGIN {label}-----".encode(), *block.headers.splitlines()]
+                pem_label = KEY_LABELS[0]
+    begin = [f"-----BEGIN {pem_label}-----".encode(), *block.headers.splitlines()]
     content = base64.b64encode(der_key)
     lines = [content[start : start + 64] for start in range(0, len(content), 64)]
-    end = f"-----END {label}-----\n".encode()
+    end = f"-----END {pem_label}-----\n".encode()
     return b"\n".join([*begin, *([b""] if encrypted else []), *lines, end])
 
 
@@ -244,7 +251,7 @@ _MAX_SCRYPT_MEMORY, _MAX_SCRYPT_WORK = 2**19, 2**22
 _ENCRYPTED = re.compile(rb"-----BEGIN ENCRYPTED PRIVATE KEY-----([^-]*)")
 
 
-def _validated(key: rsa.RSAPrivateKey, name: str) -> rsa.RSAPrivateKey:
+def _validated(key: rsa.RSAPrivateKey, label: str) -> rsa.RSAPrivateKey:
     """Validate an RSA key that was loaded without validation, and return it.
 
     Raises:
@@ -252,14 +259,14 @@ def _validated(key: rsa.RSAPrivateKey, name: str) -> rsa.RSAPrivateKey:
     """
     if key.key_size > _MAX_RSA_BITS:
         raise PkiError(
-            f"the private key {name} has {key.key_size} bits",
+            f"the private key {label} has {key.key_size} bits",
             f"sros uses RSA keys of at most {_MAX_RSA_BITS} bits.",
             "Use an EC prime256v1 key, or an RSA key of 2048 bits.",
         )
     try:
         return key.private_numbers().private_key()
     except ValueError as error:
-        raise _unreadable_key_error(name) from error
+        raise _unreadable_key_error(label) from error
 
 
 _INITIAL_VALUE = re.compile(rb"^DEK-Info: *([^,\s]*),([0-9A-Fa-f]*)", re.MULTILINE)
@@ -270,7 +277,7 @@ Source: RFC 1421, 4.6.1.3.
 """
 
 
-def _check_derivation(pem: bytes, name: str) -> None:
+def _check_derivation(pem: bytes, label: str) -> None:
     """Raise `PkiError` if testing one passphrase of an encrypted key takes hours or gigabytes.
 
     Source: RFC 5958, 3; RFC 8018, A; RFC 7914, 7.
@@ -278,12 +285,12 @@ def _check_derivation(pem: bytes, name: str) -> None:
     if (match := _INITIAL_VALUE.search(pem)) and len(match[2]) < _IV_LENGTH_IN_HEX_DIGITS.get(
         match[1], 32
     ):
-        raise _unreadable_key_error(name)  # `cryptography` would panic
+        raise _unreadable_key_error(label)  # `cryptography` would panic
     for block in _ENCRYPTED.findall(pem):
         try:
             scrypt, numbers = _derivation_cost(block)
         except (ValueError, PkiError) as error:
-            raise _unreadable_key_error(name) from error
+            raise _unreadable_key_error(label) from error
         if scrypt:
             allowed = (
                 math.prod(numbers[:2]) <= _MAX_SCRYPT_MEMORY
@@ -293,7 +300,7 @@ def _check_derivation(pem: bytes, name: str) -> None:
             allowed = all(number <= _MAX_ROUNDS for number in numbers)
         if not allowed or min(numbers, default=0) < 0:
             raise PkiError(
-                f"the private key {name} takes too long to decrypt",
+                f"the private key {label} takes too long to decrypt",
                 f"Its file requires {max(numbers)} rounds to try a passphrase.",
                 "Encrypt it again with `openssl pkcs8 -topk8 -scrypt -in KEY -out KEY.new`.",
             )
@@ -348,10 +355,10 @@ def _integers(data: bytes, depth: int = 3) -> Iterator[int]:
             yield from _integers(value.content, depth - 1)
 
 
-def _decrypted_key(pem: bytes, name: str, passphrase: str) -> PrivateKeyTypes:
+def _decrypted_key(pem: bytes, label: str, passphrase: str) -> PrivateKeyTypes:
     secret = _as_bytes(passphrase)
     with reading(
-        f"the private key {name} cannot be decrypted",
+        f"the private key {label} cannot be decrypted",
         "The passphrase is wrong, or the file is damaged.",
         "Try again with the right passphrase.",
     ):
@@ -371,7 +378,7 @@ def _as_bytes(passphrase: str) -> bytes:
 
 
 def is_weak(key: object) -> bool:
-    """Return whether a key is weak: an RSA key below 2048 bits, an EC key below 256 bits.
+    """Return whether a public key is weak: RSA below 2048 bits, or EC below 256 bits.
 
     Source: NIST SP 800-57 part 1, 5.6; DDS-Security 1.1, 9.3.1.
     """

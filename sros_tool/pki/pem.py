@@ -252,7 +252,7 @@ def _kind_of_der(data: bytes) -> str:
 
 
 def _kind_of_signed(parts: list[der.Value]) -> str:
-    """Return whether a signed value is a certificate, request or revocation list, in words."""
+    """Return the kind of a signed value in words: certificate, request or revocation list."""
     tags = [part.tag for part in parts]
     if der.UTC_TIME in tags or der.GENERALIZED_TIME in tags:
         return _LIST_IN_DER

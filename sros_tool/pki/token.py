@@ -94,7 +94,10 @@ class TokenKey(ec.EllipticCurvePrivateKey):
 
     @property
     def never_left(self) -> bool:
-        """Whether the token states that the key was made on the token and cannot be exported."""
+        """Whether the key was made on the token and cannot be exported, as the token states.
+
+        True for a key that a dry run only plans.
+        """
         if self._private is None:
             return True  # a planned key, perhaps without the package for tokens
         from pkcs11 import Attribute, PKCS11Error

@@ -329,7 +329,9 @@ def unread_date(certificate: x509.Certificate) -> str:
 def date(
     dated: x509.Certificate | x509.CertificateRevocationList | x509.RevokedCertificate, name: str
 ) -> Any:
-    """Return the date in the attribute ``name``, in UTC; None for a date that a list lacks.
+    """Return the date in the attribute ``name`` of ``dated``, in UTC.
+
+    The result is None for the expiry of a list that states none.
 
     `cryptography` 41 has only attributes for dates without a time zone.
     """

@@ -485,6 +485,8 @@ class _RoleKeys:
     def open(self, rotate: Collection[str], now: datetime, expiry: MetadataExpiry) -> None:
         """Open or make the key of each role, and add a version of the root if a key changes.
 
+        The roles in ``rotate`` get new keys; before the first publication, all roles do.
+
         Raises:
             KeystoreError: a key is missing, or differs from the key that the root metadata names.
         """
@@ -525,7 +527,10 @@ class _RoleKeys:
         return self._root / fleet_key(role)
 
     def _online_signers(self, role: str, *, new: bool) -> list[CryptoSigner]:
-        """Return the signer of a role, and the previous one while robots may still need it."""
+        """Return the signer of a role, and the previous one while robots may still need it.
+
+        With ``new``, the role gets a new key.
+        """
         from sros_tool.keystore.delivery.repository import load_signer, lost_key_remedy, new_key
 
         path, before = self._path(role), self._path(f"{role}.{_BEFORE}")
@@ -712,7 +717,7 @@ class _Evaluator:
         return self._lists[kind] and not revokes
 
 
-_read_list = lru_cache(maxsize=16)(partial(read_list, name=CRL_FILE))
+_read_list = lru_cache(maxsize=16)(partial(read_list, label=CRL_FILE))
 
 
 def _sorted_by_path(enclaves: Iterable[Mapping[str, bytes]]) -> dict[str, bytes]:
@@ -1131,7 +1136,9 @@ class _Publication:
         return last
 
     def _unknown_releases(self) -> list[Release]:
-        """Return the sealed releases, by number, whose number or list the keystore does not know.
+        """Return the sealed releases whose number or revocation list the keystore does not know.
+
+        They are sorted by number.
 
         A number counts as known if the keystore's last publication in this folder has a higher one,
         for example from before a restore that was completed since.  It also counts as known if the

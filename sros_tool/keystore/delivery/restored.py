@@ -324,8 +324,12 @@ def _has_earlier_key(
         return False
     entries = keystore.ledger_file.with_values("enclave", [name]).entries
 
-    def first(certificate: x509.Certificate, key: str, recorded: str) -> tuple[str, str]:
-        """Return when a key's validity began, and when the ledger had the key first."""
+    def first_times(certificate: x509.Certificate, key: str, recorded: str) -> tuple[str, str]:
+        """Return when a key's validity began, and when the ledger recorded the key first.
+
+        For a key that is not in the ledger, the times are those of ``certificate`` and
+        ``recorded``.  All times are in ISO 8601 (UTC).
+        """
         issued = (
             (entry.not_before, entry.time)
             for entry in entries
@@ -333,7 +337,7 @@ def _has_earlier_key(
         )
         return min(issued, default=(iso(validity_of(certificate).not_before), recorded))
 
-    return first(own, own_key, "") < first(later, later_key, iso(now))
+    return first_times(own, own_key, "") < first_times(later, later_key, iso(now))
 
 
 def _governance_change(
@@ -468,7 +472,10 @@ def refuse_lost_changes(
 
 
 def _few_changes(keystore: OpenedKeystore, lines: Sequence[tuple[str, str]], label: str) -> str:
-    """Return the first of the texts in ``lines`` on enclaves, shortened; log all with a label."""
+    """Return the first texts about enclaves, shortened; log all texts with ``label`` in front.
+
+    ``lines`` are pairs of an enclave and a text; equal texts about several robots become one text.
+    """
     texts = [" ".join(text.split()) for text in folded_lines(recorded_fleet(keystore), lines)]
     for text in texts:
         _LOG.info("%s: %s", label, text)

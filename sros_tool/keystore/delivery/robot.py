@@ -587,11 +587,11 @@ def _check_known_authority(
     check_same_authority(folder, answer.files)
 
 
-def _check_newer(place: Path, answer: RequestAnswer, certificate: x509.Certificate) -> None:
+def _check_newer(enclave_dir: Path, answer: RequestAnswer, certificate: x509.Certificate) -> None:
     """Raise `KeystoreError` if the answer is older than the installed files, as in a replay."""
     remedy = "Have the request signed again, or add --force to go back to the older answer."
-    path = place / "cert.pem"
-    numbered = _check_number(place / SEAL, answer, remedy)
+    path = enclave_dir / "cert.pem"
+    numbered = _check_number(enclave_dir / SEAL, answer, remedy)
     if path.exists() and not numbered:
         old = validity_of(read_certificate(path))
         new = validity_of(certificate)
@@ -603,7 +603,7 @@ def _check_newer(place: Path, answer: RequestAnswer, certificate: x509.Certifica
                 remedy,
             )
     for role, file in ((IDENTITY, IDENTITY_CA_FILE), (PERMISSIONS, PERMISSIONS_CA_FILE)):
-        trusted = _certificates(place / file) if (place / file).exists() else ()
+        trusted = _certificates(enclave_dir / file) if (enclave_dir / file).exists() else ()
         sent_cas = load_certificates(answer.file(file) or b"", file)
         if retired := retired_authorities(trusted, sent_cas):
             raise KeystoreError(
@@ -615,30 +615,32 @@ def _check_newer(place: Path, answer: RequestAnswer, certificate: x509.Certifica
                 "docs/howto/keystore_is_lost.md says how. If this CA is right, because `sros "
                 "rotate_ca --identity-ca` or --permissions-ca named it, add --force.",
             )
-    if older := older_list(*_installed_and_sent_lists(place, answer)):
+    if older := older_list(*_installed_and_sent_lists(enclave_dir, answer)):
         here, _ = older
         raise KeystoreError(
             f"the answer for enclave {answer.name} has an older revocation list",
-            f"The list in '{place}' has the number {here.number}; with an older list, revoked "
-            "enclaves would be trusted again.",
+            f"The list in '{enclave_dir}' has the number {here.number}; with an older list, "
+            "revoked enclaves would be trusted again.",
             remedy,
         )
 
 
 def _installed_and_sent_lists(
-    place: Path, answer: RequestAnswer
+    enclave_dir: Path, answer: RequestAnswer
 ) -> tuple[dict[str, bytes], dict[str, bytes]]:
     """Return the files with revocation lists: the files here, and the files in the answer."""
-    present = {f: read_bytes(place / f, "file") for f in LIST_FILES if (place / f).exists()}
+    present = {
+        f: read_bytes(enclave_dir / f, "file") for f in LIST_FILES if (enclave_dir / f).exists()
+    }
     return present, {f: data for f in LIST_FILES if (data := answer.file(f)) is not None}
 
 
-def _lost_revocation_notes(place: Path, answer: RequestAnswer) -> Iterator[Note]:
+def _lost_revocation_notes(enclave_dir: Path, answer: RequestAnswer) -> Iterator[Note]:
     """Yield a note if the answer's revocation list lacks certificates of the installed list.
 
     Certificates that the list lacks may have expired since.
     """
-    if lost := lost_serials(*_installed_and_sent_lists(place, answer)):
+    if lost := lost_serials(*_installed_and_sent_lists(enclave_dir, answer)):
         text = (
             f"the earlier revocation list revokes {counted(len(lost), 'certificate')} that the new "
             f"list lacks, such as {min(lost):x}. This is right if these certificates have expired: "

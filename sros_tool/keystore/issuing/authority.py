@@ -281,10 +281,10 @@ def write_bundle(
         write_copies(transaction, names, f"{role}_ca.cert.pem", bundle)
 
 
-def write_copies(transaction: Transaction, names: Sequence[str], name: str, data: bytes) -> None:
-    """Stage ``data`` as the file ``name`` of all enclaves that have a copy, not a link."""
+def write_copies(transaction: Transaction, names: Sequence[str], file: str, data: bytes) -> None:
+    """Stage ``data`` as the ``file`` of all enclaves in ``names`` that have a copy, not a link."""
     for enclave in names:
-        path = f"{enclave_folder(enclave)}/{name}"
+        path = f"{enclave_folder(enclave)}/{file}"
         if (transaction.root / path).is_file() and not (transaction.root / path).is_symlink():
             transaction.write(path, data)
 

@@ -66,7 +66,7 @@ class Keyring:
     short_passphrase: bool = False
 
     def __post_init__(self) -> None:
-        """Raise `UsageError` if a place is not a valid URI, before anything is written."""
+        """Raise `UsageError` if the URI of a key contains a PIN, or is not valid."""
         for place in self.places.values():
             refuse_pin(place)
             check_ca_service(place)

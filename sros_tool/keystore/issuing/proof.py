@@ -54,19 +54,24 @@ _ACTION_SERVICES = ("send_goal", "cancel_goal", "get_result")
 _ACTION_TOPICS = ("feedback", "status")
 
 
-def _service_topics(client: bool, part: str = "") -> tuple[tuple[str, str, str], ...]:
-    """Return (direction, prefix, suffix) of both DDS topics of a service, for client or server.
+def _service_topics(is_client: bool, part: str = "") -> tuple[tuple[str, str, str], ...]:
+    """Return (direction, prefix, suffix) of both DDS topics of a service.
 
-    ``part`` stands between the name and the suffix, as in the services of an action.
+    The direction is that of a client (``is_client``) or a server.  ``part`` stands between the name
+    and the suffix, as in the services of an action.
     """
-    ask, answer = (_PUBLISH, _SUBSCRIBE) if client else (_SUBSCRIBE, _PUBLISH)
+    ask, answer = (_PUBLISH, _SUBSCRIBE) if is_client else (_SUBSCRIBE, _PUBLISH)
     return (ask, "rq", f"{part}Request"), (answer, "rr", f"{part}Reply")
 
 
-def _action_topics(client: bool) -> tuple[tuple[str, str, str], ...]:
-    """Return (direction, prefix, suffix) of all DDS topics of an action, for client or server."""
-    direction = _SUBSCRIBE if client else _PUBLISH
-    services = (end for p in _ACTION_SERVICES for end in _service_topics(client, f"/_action/{p}"))
+def _action_topics(is_client: bool) -> tuple[tuple[str, str, str], ...]:
+    """Return (direction, prefix, suffix) of all DDS topics of an action.
+
+    The direction is as in `_service_topics`.
+    """
+    direction = _SUBSCRIBE if is_client else _PUBLISH
+    parts = (f"/_action/{name}" for name in _ACTION_SERVICES)
+    services = (topic for part in parts for topic in _service_topics(is_client, part))
     return (*services, *((direction, "rt", f"/_action/{topic}") for topic in _ACTION_TOPICS))
 
 

@@ -641,7 +641,10 @@ class KeystoreChange:
         return another_ca_remedy(self.keystore, command)
 
     def result(self, kind: Callable[..., Result], **more: Any) -> Result:
-        """Return the result as a ``kind``; ``more`` are the fields that only this verb has."""
+        """Return the result as an instance of the class ``kind``.
+
+        ``more`` are the fields that only this verb has.
+        """
         shared: dict[str, Any] = {
             "root": self.root,
             "dry_run": self.dry_run,

@@ -347,7 +347,10 @@ def _vouched_certificates(
 def _key_revoked_by_enclave(
     change: KeystoreChange, revoked: Container[int], keys: Container[str], removed: Container[str]
 ) -> dict[str, bool]:
-    """Map the enclaves that keep a ``revoked`` certificate to whether their key is revoked, too."""
+    """Map the enclaves that keep a ``revoked`` certificate to whether their key is revoked, too.
+
+    ``keys`` are digests of keys that are revoked now; enclaves in ``removed`` are left out.
+    """
     replaced = {}
     for name in change.names:
         with suppress(SrosError):  # the enclave has no certificate
@@ -485,7 +488,7 @@ def refresh_crl(
 
 
 def _check_names(change: KeystoreChange, names: Sequence[str]) -> None:
-    """Raise an error unless all ``names`` are enclaves of the keystore."""
+    """Raise an error unless all ``names`` are enclaves, and none is the Zenoh router."""
     router = change.template.zenoh.router if change.template.zenoh else None
     for name in names:
         check_enclave_name(name)

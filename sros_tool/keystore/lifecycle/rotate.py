@@ -454,7 +454,10 @@ def renew_identity_ca(
 def _certificate_renewed_by_service(
     change: KeystoreChange, old: x509.Certificate, issued: bytes
 ) -> ImportedAuthority:
-    """Return a CA service's own new certificate: the same name and key, with later dates."""
+    """Return the new CA certificate in ``issued`` (PEM), after comparing it with ``old``.
+
+    A CA service issued this certificate for itself.  Name and key must be the same as in ``old``.
+    """
     if not (issued and change.keyring.ca_service(change.root, IDENTITY, change.template)):
         raise UsageError(
             "sros issues the certificate of this identity CA itself"

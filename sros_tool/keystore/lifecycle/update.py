@@ -457,7 +457,10 @@ class _Updater:
         left: tuple[UpdateStage, ...],
         progress: Progress | None,
     ) -> Callable[[], KeystoreUpdate]:
-        """Stage the changes of the stages ``done``; return a function that makes the result."""
+        """Stage the changes of the stages ``done``; return a function that makes the result.
+
+        ``left`` are the stages that remain, for the result.
+        """
         change, before, after = self._change, self._present.settings, self._goal.settings
         if after.zenoh and after.zenoh != before.zenoh:
             check_network(after.zenoh)
@@ -683,27 +686,27 @@ class _Updater:
             text = (
                 "Identity CA and permissions CA now have files of their own, but still the same "
                 "key, so an enclave can sign its own permissions until the permissions CA is "
-                f"replaced: {self._rotation_command(f' --{PERMISSIONS}')}."
+                f"replaced: {self._rotation_clause(f' --{PERMISSIONS}')}."
             )
             return [Note("keystore.one-authority", text)]
         if any(e.effect is Effect.TIGHTER and e.key.startswith("protection") for e in changes):
-            role = "" if shared else f" --{PERMISSIONS}"
+            role_option = "" if shared else f" --{PERMISSIONS}"
             text = (
                 "The signature of the previous governance stays valid: anyone who can change the "
                 "files of a robot can put this governance back there, until the CA that signed "
-                f"it is replaced: {self._rotation_command(role)}."
+                f"it is replaced: {self._rotation_clause(role_option)}."
             )
             return [Note("keystore.earlier-governance", text)]
         return []
 
-    def _rotation_command(self, role: str) -> str:
-        """Return the command that begins or continues a rotation of CAs, as a clause.
+    def _rotation_clause(self, role_option: str) -> str:
+        """Return a clause with the command that begins or continues a rotation of CAs.
 
-        ``role`` is the option that selects a CA, or "".
+        ``role_option`` is the option that selects one CA, such as " --permissions"; "" for all CAs.
         """
         command = f"sros rotate_ca {quote(str(self._root))}"
         if read_rotation(self._change.keystore).stage is RotationStage.NONE:
-            return f"`{command}{role} --next` begins that"
+            return f"`{command}{role_option} --next` begins that"
         return f"`{command} --next` goes on with the rotation that is under way"
 
 
