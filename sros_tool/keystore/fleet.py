@@ -451,20 +451,19 @@ def lost_enclaves(
 ) -> tuple[list[Note], list[Entry]]:
     """Return notes and ledger entries on enclaves and routers that robots lose.
 
-    The notes include enclaves that robots lost earlier.  No two robots of ``after`` may have an
-    enclave in common, which `write_fleet` checks.
+    The notes include enclaves that robots lost earlier.
     """
     notes: list[Note] = []
     lost: dict[str, set[str]] = {}
+    # With a path such as {namespace}/base, a new robot can have the enclave of an earlier one.
+    kept = {name for robot in after.robots.values() for name in enclaves_of(after, robot)}
     for robot in before.robots.values():
-        same_robot = after.robots.get(robot.name)
-        kept = set(enclaves_of(after, same_robot) if same_robot else ())
+        same_robot, router = after.robots.get(robot.name), ""
         if same_robot and robot.router and not same_robot.router:
             router = router_enclave_of(before, robot)
-            kept.add(router)
             if keystore.has_enclave(router):
                 notes.append(_lost_router_note(keystore, robot.name, router))
-        names = (name for name in enclaves_of(before, robot) if name not in kept)
+        names = (name for name in enclaves_of(before, robot) if name not in kept and name != router)
         if lost_names := {name for name in names if keystore.has_enclave(name)}:
             lost[robot.name] = lost_names
     # Enclaves that an earlier change of the fleet left without a robot count, too.

@@ -133,6 +133,9 @@ def test_enclaves_that_are_left_are_found_in_one_pass(
     assert "the robot a is no longer in the fleet: /a stay" in note.text
     assert (entry.what, entry.enclave, entry.reason) == ("left", "/a", "a")
     assert looked <= 2 * len(before.enclaves)
+    before = Fleet.of([Robot("old", "/a")], enclaves=["{namespace}"])
+    after = Fleet.of([Robot("new", "/a")], enclaves=["{namespace}"])
+    assert lost_enclaves(OpenedKeystore(made / "ks"), before, after, now()) == ([], [])
 
 
 @pytest.fixture(scope="module")
