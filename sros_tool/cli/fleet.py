@@ -894,8 +894,8 @@ def _fleet_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
     if status.left:
         whose = counted(len(status.left), "valid enclave")
         yield (
-            f"{whose} of robots that left the fleet: {first_few(status.left, 5)}. Revoke with "
-            f"`sros revoke {quote(str(status.keystore))} ENCLAVE...`"
+            f"{whose} of robots that left the fleet or their group: {first_few(status.left, 5)}. "
+            f"Revoke with `sros revoke {quote(str(status.keystore))} ENCLAVE...`"
         )
 
 

@@ -340,9 +340,12 @@ def test_what_happens_to_a_fleet(made: Path, tmp_path: Path) -> None:
     timer = ("renew", "ks", "--all-expiring", "9000d")
     renewed = sros(*timer, cwd=folder)
     assert (renewed.status, "renewed 21 enclaves" in renewed.out) == (1, True), renewed
-    assert "not renewed: /r9/base, /r9/lift (of robots that left the fleet: r9)" in renewed.err
-    left = "2 valid enclaves of robots that left the fleet: /r9/base, /r9/lift. Revoke with `sros "
-    assert left in sros("fleet", "status", "ks", cwd=folder).out
+    assert (
+        "not renewed: /r9/base, /r9/lift (of robots that left the fleet or their group: r9)"
+        in renewed.err
+    )
+    left = "2 valid enclaves of robots that left the fleet or their group: /r9/base, /r9/lift. "
+    assert f"{left}Revoke with `sros revoke" in sros("fleet", "status", "ks", cwd=folder).out
     assert not fleet_status(folder / "ks", now=datetime(2999, 1, 1, tzinfo=UTC)).left, "expired"
     assert "/hall/r9/base/cmd" not in str(permissions(folder / "ks", "/dispatcher"))
     assert "/hall/r11/base/cmd" in str(permissions(folder / "ks", "/dispatcher"))

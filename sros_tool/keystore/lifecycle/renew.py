@@ -201,10 +201,10 @@ def _with_consent_marks(
 def _left_note(keystore: OpenedKeystore, left: Mapping[str, str]) -> Note:
     """Return the note on due enclaves of robots that left the fleet (as of `left_enclaves`)."""
     text = (
-        f"not renewed: {first_few([*left], 3)} (of robots that left the fleet: "
-        f"{first_few(sorted({*left.values()}), 3)}). Revoke these enclaves, with "
+        f"not renewed: {first_few([*left], 3)} (of robots that left the fleet or their "
+        f"group: {first_few(sorted({*left.values()}), 3)}). Revoke these enclaves, with "
         f"{revoke_command(keystore, sorted(left))}; if a robot is to keep its enclaves, add it to "
-        "the fleet file again, and run `sros generate_artifacts`"
+        "the fleet file or the group again, and run `sros generate_artifacts`"
     )
     return Note(NOT_RENEWED, text)
 
