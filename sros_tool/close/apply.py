@@ -121,9 +121,9 @@ def undo(robot: LocalRobot, *, dry_run: bool) -> CloseState:
     observed = running.with_later_processes(robot.processes)
     drop_ins = _drop_ins_of(robot, observed)
     for path in drop_ins:
-        robot.shell.say(f"{'would remove' if dry_run else 'removed'} {path}")
         if not dry_run:
             remove_file(path)
+        robot.shell.say(f"{'would remove' if dry_run else 'removed'} {path}")
     units = {path.parent.name.removesuffix(".d") for path in drop_ins}
     # A unit without a drop-in still runs closed if an earlier --undo was killed before the restart.
     units |= {process.unit for process in observed.processes if not running.is_open(process)} - {""}

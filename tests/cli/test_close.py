@@ -1188,6 +1188,8 @@ def test_applying_that_is_interrupted_goes_on_or_back(
     robot.close("--undo")
     assert [*robot.folder.glob("systemd/*.d/*")] == []
     robot.close("--apply")
+    monkeypatch.setattr(apply, "remove_file", interrupted)
+    assert "removed" not in robot.close("--undo", status=130).err
 
 
 @sometimes("a_unit_that_does_not_run_is_not_called_open", 1 / 2)
