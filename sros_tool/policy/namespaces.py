@@ -11,9 +11,17 @@ from dataclasses import replace
 from itertools import chain, islice
 from typing import NamedTuple
 
-from sros_tool.policy.model import ALLOW, DENY, Enclave, Profile, Source
+from sros_tool.policy.model import ALLOW, DENY, Enclave, Policy, Profile, Source
 from sros_tool.policy.patterns import OTHER_NAMESPACE, common_name
-from sros_tool.policy.rights import PlacedRight, Right, Rules, parts, placed_rights
+from sros_tool.policy.rights import (
+    PlacedRight,
+    Right,
+    Rules,
+    parts,
+    placed_rights,
+    policy_rights,
+    renamed_enclaves,
+)
 from sros_tool.values import shows
 
 
@@ -46,8 +54,11 @@ def changed_forms(before: Iterable[Enclave], after: Iterable[Enclave]) -> Iterat
     """Yield the rights in ``after`` that are new only for nodes in another namespace.
 
     The names of these rights became absolute, or relative. Denials that deny less in another
-    namespace are yielded, too.
+    namespace are yielded, too.  An enclave under a new name is compared with itself.
     """
+    before, after = tuple(before), tuple(after)
+    renamed = renamed_enclaves(*(policy_rights(Policy(side)) for side in (before, after)))
+    before = tuple(replace(one, path=renamed.get(one.path, one.path)) for one in before)
     of_before, of_after = (
         [*chain.from_iterable(map(_moved_rights, enclaves))] for enclaves in (before, after)
     )

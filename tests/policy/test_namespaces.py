@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -43,6 +44,17 @@ def test_some_namespaces_are_not_every_namespace(tmp_path: Path) -> None:
         ("/cmd*", "/cmd /cmd?*"),
     ):
         assert found("DENY", before, after) == [], (before, after)
+
+
+def test_an_enclave_under_a_new_name_is_compared_with_itself(tmp_path: Path) -> None:
+    """Other lines of a comparison say of it only that it has the same rights."""
+    base, *others = (
+        [replace(enclave, path=path) for enclave in read_policy(file).enclaves]
+        for path, names in (("/e", "cmd"), ("/new", "/cmd"), ("/new", "cmd"))
+        for file in [policy_with(tmp_path, "ALLOW", names)]
+    )
+    found = [[str(form.right) for form in changed_forms(base, head)] for head in others]
+    assert found == [["/new ALLOW publish topic /cmd"], []]
 
 
 FIXED = "begins with / now, so that the namespace of its node does not apply"
