@@ -36,7 +36,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import suppress
 from datetime import datetime, timedelta
 from functools import lru_cache
-from itertools import chain
+from itertools import chain, groupby
 from pathlib import Path
 from shlex import quote
 from sys import intern
@@ -901,7 +901,7 @@ def _read_lines(
     that the head states; ``needed_text`` is as in `LedgerFile._reading`.
     """
     entries: list[Entry] = []
-    numbers = array("Q")
+    numbers, added = array("Q"), array("Q")
     faults: list[_Fault] = []
     damaged = 0  # number of lines directly before this one that are not entries
     number = size = 0
@@ -927,7 +927,7 @@ def _read_lines(
             if damaged:
                 faults.append(_not_entries_fault(number - 1, damaged))
             if not entry.previous:
-                faults.append(_Fault(number, f"line {number} was added by another program"))
+                added.append(number)
             elif entry.previous != last and not damaged:
                 reason = f"before line {number}, a line was changed or removed"
                 faults.append(_Fault(number - 1, reason))
@@ -939,6 +939,7 @@ def _read_lines(
             signed = last
     if damaged:
         faults.append(_not_entries_fault(number, damaged))
+    faults = sorted([*faults, *_added_faults(added)], key=lambda fault: fault.line)
     ended = line.endswith(b"\n") or not number
     return _ReadLines(tuple(entries), numbers, faults, number, signed, last, ended)
 
@@ -955,6 +956,14 @@ def _not_entries_fault(last: int, count: int) -> _Fault:
     if count == 1:
         return _Fault(last, f"line {last} is not an entry")
     return _Fault(last, f"lines {last - count + 1} to {last} are not entries")
+
+
+def _added_faults(numbers: Iterable[int]) -> Iterator[_Fault]:
+    """Yield a fault for each run of lines that do not name the line before them."""
+    for _, run in groupby(enumerate(numbers), key=lambda pair: pair[1] - pair[0]):
+        first, *more = (number for _, number in run)
+        lines = f"lines {first} to {more[-1]} were" if more else f"line {first} was"
+        yield _Fault(more[-1] if more else first, f"{lines} added by another program")
 
 
 def _checked_regular_file(file: BinaryIO) -> BinaryIO:

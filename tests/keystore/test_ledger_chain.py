@@ -276,13 +276,18 @@ def test_a_line_in_another_form_is_read_as_ever(root: Path) -> None:
     assert len(OpenedKeystore(root).ledger.entries) == 4
 
 
-def test_a_ledger_of_many_lines_that_are_none(root: Path) -> None:
+def test_a_ledger_of_many_lines_that_sros_did_not_write(root: Path) -> None:
     """They are one fault, not as many as lines."""
     lines = lines_of(root)
     put(root, [*lines[:3], *([b""] * 5000), *lines[3:], b"nonsense"])
     ledger = OpenedKeystore(root).ledger
     assert len(ledger.entries) == len(lines)
     assert ledger.gaps[0] == "lines 4 to 5003 are not entries"
+    put(root, [*lines, *([b'{"time":"x","what":"ca"}'] * 5000)])
+    first, last = len(lines) + 1, len(lines) + 5000
+    (text, of_head) = OpenedKeystore(root).ledger.gaps
+    assert text == f"lines {first} to {last} were added by another program"
+    assert of_head == f"line {first} was added by another program"
     assert f"line {len(lines) + 5001} is not an entry" in ledger.gaps
     assert len(ledger.gaps) <= 4
 
