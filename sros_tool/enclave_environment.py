@@ -660,7 +660,7 @@ def container_text(
 def _check_mounted(keystore: OpenedKeystore, enclave: str, target: Path) -> None:
     """Raise `KeystoreError` if a container cannot use the mounted folder of an enclave.
 
-    The folder has other enclaves below it, or links to other files of the keystore.
+    It cannot if the folder has other enclaves below it, or links to other files of the keystore.
     """
     from sros_tool.keystore.layout import enclaves_below
 

@@ -496,7 +496,7 @@ def write_all(handle: int, data: bytes) -> None:
 
 
 def exchange(first_folder: int, first: str, second_folder: int, second: str) -> bool:
-    """Exchange two names in two open folders, as `Folder.exchange`."""
+    """Exchange two names in two open folders, as `Folder.exchange`; False if this is impossible."""
     try:
         rename = _c_library().renameat2
     except AttributeError:

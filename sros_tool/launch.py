@@ -120,7 +120,7 @@ class SecuredNodes(Action):  # type: ignore[misc]  # launch has no types where i
 def _launch_node_environment(
     keystore: Path, policy: Path, enclave: str
 ) -> EnclaveEnvironment | None:
-    """Return the environment of the node of launch, or None if it has no enclave.
+    """Return the environment of the node of launch, or None if that node has no enclave.
 
     Raises:
         RuntimeError: the policy cannot be read, or has the node in several enclaves, or no process

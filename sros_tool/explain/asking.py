@@ -202,7 +202,7 @@ def open_asked_enclave(
         if policy_enclave is None and not is_enclave(Path(enclave.name)):
             raise not_in_policy_error(policy, enclave.name, policy_file)
     if policy_file and policy == stated:
-        policy_file = _file_with(enclave.name, policy_file)
+        policy_file = _file_of_enclave(enclave.name, policy_file)
     enclave = enclave._replace(
         keystore=keystore,
         policy=policy_enclave,
@@ -213,7 +213,7 @@ def open_asked_enclave(
     return AskedEnclave(enclave, policy)
 
 
-def _file_with(enclave: str, policy: Path) -> Path:
+def _file_of_enclave(enclave: str, policy: Path) -> Path:
     """Return the file that has an enclave, if ``policy`` is a folder; otherwise ``policy``."""
     if not policy.is_dir():
         return policy

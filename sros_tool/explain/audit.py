@@ -602,7 +602,7 @@ class _Judgement:
     """The rights that a process would be denied in an enclave.
 
     ``refused`` is the reason why the process cannot start in the enclave, or "".  ``undecided`` are
-    topics without a ROS name on which only permissions decide that do not load.
+    topics without a ROS name: only permissions decide on these, and the permissions do not load.
     """
 
     denied: tuple[DeniedRight, ...]

@@ -85,7 +85,7 @@ def explain_log_file(
     if policy_file:
         _, stated = policy_to_ask(policy_file, fleet_of(asking.fleet_file, None))
         policy = AskedPolicy(str(policy_file), stated, name)
-        if name and not policy.place(name)[1]:
+        if name and not policy.namespace_and_path(name)[1]:
             raise not_in_policy_error(stated, name, policy_file)
     elif name:
         named = signed_enclave(keystore, name, asking.at)
@@ -133,8 +133,8 @@ def explain_log_file(
 
     def is_named(enclave: str) -> bool:
         if policy:
-            namespace, path = policy.place(name)
-            return enclave == name if namespace else policy.place(enclave)[1] == path
+            namespace, path = policy.namespace_and_path(name)
+            return enclave == name if namespace else policy.namespace_and_path(enclave)[1] == path
         loaded = find(enclave)
         return loaded is not None and named is not None and loaded.folder == named.folder
 

@@ -447,7 +447,7 @@ class Examiner:
 
         "" unless the policy was put into a namespace, so that the names differ.
         """
-        space, path = self._policy.place(enclave.name) if self._policy else ("", "")
+        space, path = self._policy.namespace_and_path(enclave.name) if self._policy else ("", "")
         return f" to {path}, which is {enclave.name} in namespace {space}" if space else ""
 
     def _other_folder_cause(self, denial: Denial, enclave: LoadedEnclave) -> tuple[list[str], str]:
@@ -575,7 +575,7 @@ class Examiner:
         return only, f"{remedy}{renamed or new_name}"
 
     def _missing_rules(self, enclave: str, name: str, nodes: Iterable[str]) -> list[str]:
-        """Return the remapping rules, in the command of a closed robot's process, of a denied name.
+        """Return the remapping rules for a denied name in the command of a closed robot's process.
 
         ``nodes`` are the full names of the nodes of the enclave.
         """
@@ -589,7 +589,7 @@ class Examiner:
         ]
 
     def _misspelled_in_policy(self, denied: Right, named: Iterable[Right]) -> str:
-        """Return an allowed name that is like the denied one, and that no peer may use; or ""."""
+        """Return an allowed name that is similar to the denied name, and no peer may use; or ""."""
         for right in named:
             is_alike = right.right == denied.right and is_spelled_alike(denied.name, right.name)
             if is_alike and self._keystore and self._keystore.has_other_side(right) is False:
@@ -601,7 +601,7 @@ class Examiner:
         root, enclave = self._root or "KEYSTORE", denial.enclave or "ENCLAVE"
         asked, advice = self._policy.file if self._policy else root, ""
         if self._policy:
-            ns, path = self._policy.place(denial.enclave or self._policy.name)
+            ns, path = self._policy.namespace_and_path(denial.enclave or self._policy.name)
             enclave = path or self._policy.name or enclave
             private = self._private_name(denial, name, ns)
             if ns and name.startswith(f"{ns}/"):
@@ -792,7 +792,7 @@ _TOPICS_OF_EVERY_NODE = ("rt/rosout", "rt/parameter_events")
 
 
 def _nodes_clause(answer: Answer) -> tuple[str, ...]:
-    """Return a tuple with a clause on the nodes that an enclave's permissions name; or ()."""
+    """Return one clause: the nodes that an enclave's permissions name, or that they name none."""
     nodes = _served_names(answer)
     if nodes:
         return (f"the permissions are for {_listed_nodes(nodes)}",)
@@ -800,7 +800,10 @@ def _nodes_clause(answer: Answer) -> tuple[str, ...]:
 
 
 def _parameter_client_hint(denial: Denial, name: str) -> str:
-    """Return which other services a parameter client needs, if it may not call one; or ""."""
+    """Return a sentence on the other services that a parameter client needs; or "".
+
+    The denial is of a service of the node whose parameters the client uses.
+    """
     node, _, service = name.rpartition("/")
     is_client = service_of(denial.topic)[0] and not node_denied_own_service(denial)
     if service not in PARAMETER_SERVICES or not is_client:

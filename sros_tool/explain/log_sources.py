@@ -142,7 +142,7 @@ class AskedPolicy:
     policy: Policy
     name: str
 
-    def place(self, enclave: str) -> tuple[str, str]:
+    def namespace_and_path(self, enclave: str) -> tuple[str, str]:
         """Return the namespace of the policy on the robot, and an enclave's path in the policy.
 
         ``enclave`` is the path on the robot.  The path in the policy is "" if no enclave fits.
@@ -159,7 +159,7 @@ class AskedPolicy:
 
         The result is also "" if the log states the namespace.
         """
-        space, path = self.place(denied.enclave)
+        space, path = self.namespace_and_path(denied.enclave)
         stated = self.policy.enclave(path) if path and not space else None
         for placed in placed_rights(stated) if stated else ():
             own = placed.right
@@ -176,7 +176,7 @@ class AskedPolicy:
         name is no part of the namespace of its private names.
         """
         space = name.rpartition("/")[0]
-        stated = self.policy.enclave(self.place(enclave)[1])
+        stated = self.policy.enclave(self.namespace_and_path(enclave)[1])
         for profile in stated.all_profiles() if stated else ():
             space = space.removesuffix(f"/{profile.node}")
         names = {right.name for right in policy_rights(self.policy)}
@@ -187,7 +187,7 @@ class AskedPolicy:
 
         ``space`` is the namespace of the policy on the robot.
         """
-        stated = self.policy.enclave(self.place(enclave)[1])
+        stated = self.policy.enclave(self.namespace_and_path(enclave)[1])
         for profile in stated.all_profiles() if stated else ():
             own = below_namespace(expand("~", profile.ns, profile.node), space)
             if name.startswith(f"{own}/"):
@@ -199,7 +199,7 @@ class AskedPolicy:
 
         ``enclave`` is the path on the robot of the enclave in which the node runs.
         """
-        robot_ns = self.place(enclave)[0]
+        robot_ns = self.namespace_and_path(enclave)[0]
         if not node.startswith(f"{robot_ns}/"):
             return ()
         ns, _, name = node.removeprefix(robot_ns).rpartition("/")
@@ -208,7 +208,7 @@ class AskedPolicy:
 
     def enclave(self, enclave: str) -> Enclave | None:
         """Return the policy's enclave, under its path on the robot; None if the policy lacks it."""
-        ns, path = self.place(enclave)
+        ns, path = self.namespace_and_path(enclave)
         stated = self.policy.enclave(path) if path else None
         if stated is None:
             return None

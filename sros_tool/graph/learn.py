@@ -215,7 +215,7 @@ def _rights_of(node: ObservedNode, notes: _Notes) -> list[tuple[_Place, frozense
         return []
     name = stable_name(node.name)
     enclaves = [enclave for enclave in node.enclaves if _is_enclave(enclave)]
-    if not _is_place(node.ns, node.name) or not enclaves:
+    if not _is_plain_node(node.ns, node.name) or not enclaves:
         notes.add("odd-node", f"{node.fqn!r} in {' or '.join(map(repr, node.enclaves))}")
         return []
     if name != node.name:
@@ -263,7 +263,8 @@ def _is_enclave(name: str) -> bool:
     return True
 
 
-def _is_place(ns: str, name: str) -> bool:
+def _is_plain_node(ns: str, name: str) -> bool:
+    """Return whether ROS accepts the namespace and name of a node, both without wildcards."""
     try:
         plain = check_namespace(ns) == ns and not is_expression(ns)
     except InvalidNameError:
@@ -917,14 +918,14 @@ def render(learned: Learned) -> bytes:
     return (header + "\n".join(lines)).encode()
 
 
-def _content(profile: LearnedProfile, include: str, unit: str) -> Iterator[str]:
+def _content(profile: LearnedProfile, include: str, indentation: str) -> Iterator[str]:
     """Yield the XML lines inside a profile; ``include`` is the tag name of an include element."""
     yield from _includes(profile, include)
     for group in profile.groups:
         item = group.kind.removesuffix("s")
         rights = "".join(f' {right}="{qualifier}"' for right, qualifier in group.rights)
         yield f"<{group.kind}{rights}>"
-        yield from (f"{unit}<{item}>{name}</{item}>" for name in group.names)
+        yield from (f"{indentation}<{item}>{name}</{item}>" for name in group.names)
         yield f"</{group.kind}>"
 
 
@@ -1107,7 +1108,7 @@ def _includes_xml(profile: LearnedProfile, element: PlacedElement, text: EditedT
     """Return the XML of a profile's includes, to insert before the profile's content."""
     include = f"{_prefix(text) or 'xi'}:include"
     outer = text.indent_of(element)
-    lead = "" if outer is None else text.newline + outer + text.unit
+    lead = "" if outer is None else text.newline + outer + text.indentation
     return "".join(lead + line for line in _includes(profile, include))
 
 
@@ -1117,7 +1118,7 @@ def _content_xml(profile: LearnedProfile, element: PlacedElement, text: EditedTe
     outer = text.indent_of(element)
     if outer is None:
         return "".join(_content(profile, include, ""))
-    lines = [text.unit + line for line in _content(profile, include, text.unit)]
+    lines = [text.indentation + line for line in _content(profile, include, text.indentation)]
     return "".join(text.newline + outer + line for line in (*lines, ""))
 
 

@@ -308,7 +308,7 @@ class EditedText:
             )
         self.root = self._elements(root)
         self.newline = "\r\n" if "\r\n" in self.text else "\n"
-        self.unit = self._unit()
+        self.indentation = self._one_indentation()
         self._edits: list[tuple[int, int, str]] = []
 
     def _unsuitable_file_error(self, why: str) -> PolicyError:
@@ -354,7 +354,7 @@ class EditedText:
             return None
         return before
 
-    def _unit(self) -> str:
+    def _one_indentation(self) -> str:
         """Return the white space of one indentation level."""
         stack = [self.root]
         while stack:
@@ -470,14 +470,19 @@ def merge_all(path: Path, policies: Iterable[Policy]) -> Merged:
     notes = (
         *merge_notes(contradictions),
         *(Note("merge.several-instances", text) for text in several),
-        *(Note("merge.shared-enclave", text) for text in _shared_enclaves(first, policies, before)),
+        *(
+            Note("merge.shared-enclave", text)
+            for text in _texts_on_shared_enclaves(first, policies, before)
+        ),
     )
     rights = frozenset(policy_rights(before))
     return Merged(document, tuple(added), tuple(contradictions), rights, notes)
 
 
-def _shared_enclaves(before: Policy, policies: Iterable[Policy], after: Policy) -> Iterator[str]:
-    """Yield a text on each enclave that gets other nodes, and whose own are not in ``policies``.
+def _texts_on_shared_enclaves(
+    before: Policy, policies: Iterable[Policy], after: Policy
+) -> Iterator[str]:
+    """Yield a text on each enclave that gets other nodes, and none of its own from ``policies``.
 
     Nodes that have the same name in other namespaces are instances of a node, for which there is
     another note.
@@ -687,7 +692,7 @@ class _Editor:
         text = self._text
         indent = text.indent_of(sibling)
         if indent is None and sibling.tag == "enclave" and "\n" in text.text[text.root.start :]:
-            indent = text.unit  # otherwise, many new enclaves would be on one line
+            indent = text.indentation  # otherwise, many new enclaves would be on one line
         text.insert(text.position_after(sibling), self._rendered(new, indent))
 
     def _put_first(self, parent: PlacedElement, new: _NewElement) -> None:
@@ -702,7 +707,7 @@ class _Editor:
         text, outer = self._text, self._text.indent_of(parent)
         if parent.tag == "enclaves" and outer is None:
             outer = ""  # otherwise, a policy that begins empty would stay on one line
-        indent = None if outer is None else outer + text.unit
+        indent = None if outer is None else outer + text.indentation
         rendered = "".join(self._rendered(element, indent) for element in new)
         # An element without end tag, such as <profile .../>.
         if parent.close == parent.inner == parent.end:
@@ -722,7 +727,7 @@ class _Editor:
         before = "" if indent is None else self._text.newline + indent
         if not new.children:
             return f"{before}<{new.start}>{new.content}</{tag}>"
-        inner = None if indent is None else indent + self._text.unit
+        inner = None if indent is None else indent + self._text.indentation
         children = "".join(self._rendered(child, inner) for child in new.children)
         return f"{before}<{new.start}>{children}{before}</{tag}>"
 

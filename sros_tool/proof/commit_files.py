@@ -511,7 +511,7 @@ def files_used_whole(
     return used
 
 
-def includes_files(content: bytes) -> bool:
+def may_include_files(content: bytes) -> bool:
     """Return whether a file may be XML, and so may include other files."""
     begin = content[:_BEGIN_BYTES].replace(b"\0", b"").lstrip(_LEADING_BYTES)
     return not begin or begin.startswith((b"<", _EBCDIC))

@@ -320,7 +320,7 @@ def restricted_enclaves(
 ) -> tuple[set[str], ...]:
     """Return the sets of enclaves that a requirement restricts; () if it restricts all or none.
 
-    Both are decided in a namespace, but written without it.
+    The requirement and the enclaves are in ``namespace``, but are written without it.
     """
     match requirement:
         case Only(enclaves=listed):

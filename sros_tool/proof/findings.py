@@ -70,7 +70,7 @@ from sros_tool.wording import counted, first_few
 class Step:
     """A use in a witness, with the place of the right that states it, or None.
 
-    If an enclave lacks a right that it must have, the place is preferably that of a denial.
+    If an enclave lacks a right that it must have, the place is preferably the place of a denial.
 
     ``permissions_of`` is another enclave whose permissions allow the use; "" for the enclave's own
     permissions.

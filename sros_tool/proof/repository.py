@@ -77,7 +77,7 @@ class TreeEntry:
 
     @property
     def kind(self) -> str:
-        """The kind of the entry, in words, such as "folder"."""
+        """The kind of the entry, in words, such as "a folder"."""
         kinds = {FOLDER: "a folder", LINK: "a symbolic link", SUBMODULE: "a submodule"}
         return kinds.get(self.mode, "a file" if self.mode in FILES else "no file")
 

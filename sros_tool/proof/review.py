@@ -94,9 +94,9 @@ from sros_tool.proof.commit_files import (
     files_including,
     files_used_whole,
     have_same_root,
-    includes_files,
     is_whole_policy,
     may_be_policy,
+    may_include_files,
     may_match,
 )
 from sros_tool.proof.decide import restricted_enclaves, rights_that_need_a_peer
@@ -842,7 +842,7 @@ class _Review:
                 if may_include and tree_entry.mode in FILES and not _is_below(path, excluded):
                     ids[path] = tree_entry.id
         contents = {
-            digits: data for digits, data in self._contents(ids.values()) if includes_files(data)
+            digits: data for digits, data in self._contents(ids.values()) if may_include_files(data)
         }
         contents_by_path = {
             path: contents[object_id] for path, object_id in ids.items() if object_id in contents

@@ -188,8 +188,8 @@ class _StatedRights:
 
 def _candidates(stated_rights: _StatedRights, worlds: Sequence[World]) -> Iterator[Requirement]:
     for right in _SENDING_RIGHTS:
-        yield from _few_holders(stated_rights, right)
-    yield from _changing_services(stated_rights)
+        yield from _requirements_on_few_holders(stated_rights, right)
+    yield from _requirements_on_changing_services(stated_rights)
     yield from _gate_requirements(worlds[0])
     for kind, pair in RIGHTS.items():
         if any(stated_rights.wild[right] or stated_rights.names(right) for right in pair):
@@ -203,13 +203,13 @@ def _candidates(stated_rights: _StatedRights, worlds: Sequence[World]) -> Iterat
         )
 
 
-def _few_holders(stated_rights: _StatedRights, right: str) -> Iterator[Only]:
+def _requirements_on_few_holders(stated_rights: _StatedRights, right: str) -> Iterator[Only]:
     """Yield a requirement for each group of up to three enclaves that are the only users of names.
 
     Services that only read get their own requirement, so that an exception for them does not allow
     changes, too.  Names that move the robot get a requirement for any number of enclaves, even
-    without a known receiver.  Services for which `_changing_services` states the same users are
-    left out.
+    without a known receiver.  Services for which `_requirements_on_changing_services` states the
+    same users are left out.
     """
     other = PEER_RIGHT[right]
     names: dict[tuple[tuple[str, ...], bool], list[str]] = defaultdict(list)
@@ -226,7 +226,7 @@ def _few_holders(stated_rights: _StatedRights, right: str) -> Iterator[Only]:
         yield Only(source=_NOWHERE, rights=((right, tuple(names_held)),), enclaves=enclaves)
 
 
-def _changing_services(stated_rights: _StatedRights) -> Iterator[Only | Nobody]:
+def _requirements_on_changing_services(stated_rights: _StatedRights) -> Iterator[Only | Nobody]:
     """Yield requirements on services that change nodes, and that nobody may call on some nodes.
 
     The enclaves that may call such a service of another node are exceptions.

@@ -319,7 +319,7 @@ def _demanded_topics(protections: Iterable[StatedProtection]) -> dict[Level, Nam
 
 
 def _strongest_protection(domain: DomainRule, rule: TopicRule) -> int:
-    """Return the strongest protection of data, of its submessage, or of the whole message."""
+    """Return the rank of the strongest protection of data, submessages or whole messages."""
     kinds = (
         domain.rtps_protection_kind,
         rule.metadata_protection_kind,

@@ -90,7 +90,8 @@ class DecidedFiles:
 
     Without a ROS domain in ``at``, example domains from the documents of each enclave count.
     ``keystore`` is None for a policy, whose file is ``file``.  ``chosen`` are the
-    enclaves to decide on; None for all.
+    enclaves to decide on; None for all.  ``unique_subjects`` says that the subject of every
+    certificate has a unique part.
     """
 
     file: str
@@ -133,7 +134,7 @@ class DecidedFiles:
         """
         return replace(self, chosen=frozenset(enclaves))
 
-    def place(self, enclave: str, file: str) -> str:
+    def path_of(self, enclave: str, file: str) -> str:
         """Return the path of a file of an enclave; for a policy, the path of the policy."""
         return f"{self.keystore.folder(enclave)}/{file}" if self.keystore else self.file
 
@@ -456,7 +457,7 @@ def _changes_of_enclave(
         yield _refusal_change(_LOSES, files, name, new.causes[0], text)
     elif old.causes and not new.causes:
         text = f"{where}{_verdict_text(old)}; {_verdict_text(new)}"
-        yield DecisionChange(_JOINS, name, text, files.place(name, old.causes[0].file))
+        yield DecisionChange(_JOINS, name, text, files.path_of(name, old.causes[0].file))
     if old.causes or new.causes:
         return
     permissions = files.source.permissions.get(name)
@@ -465,7 +466,7 @@ def _changes_of_enclave(
         for grant in (permissions.grants if permissions else ())
         for topic in names_without_wildcards(grant)
     }
-    file = files.place(name, PERMISSIONS_FILE)
+    file = files.path_of(name, PERMISSIONS_FILE)
     for kind, first, second in ((_MORE, old, new), (_LESS, new, old)):
         gains = list(
             by_vendors.gained_topics(
@@ -501,7 +502,7 @@ def _refusal_change(
     if files.keystore and state and fault:
         view = CheckedKeystore(files.keystore, files.at)
         remedy = fault_remedy(CheckedEnclave(view, name, state), fault, cause.file)
-    return DecisionChange(kind, name, text, files.place(name, cause.file), remedy)
+    return DecisionChange(kind, name, text, files.path_of(name, cause.file), remedy)
 
 
 def _untested_findings(before: Shipped, after: Shipped) -> Iterator[Finding]:

@@ -291,7 +291,8 @@ class WrittenTopics(NamedTuple):
 class World:
     """The topics that all enclaves may write and read, with one vendor or on Zenoh.
 
-    ``title`` names the world in texts; ``longest`` is the length in bytes of its longest topic.
+    ``title`` names the world in texts; ``longest`` is the length in bytes of the
+    longest topic name that is possible in the world.
     """
 
     def __init__(

@@ -50,7 +50,7 @@ class Event:
 
     ``text`` is the message sent or received, or the reason of a refusal or failure; ``count`` is
     the number of messages sent or received; ``publishers`` maps topics to the number of publishers
-    that an observer counts.
+    that an observer counts.  ``time`` is in seconds, by the monotonic clock.
     """
 
     kind: EventKind

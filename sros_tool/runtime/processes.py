@@ -264,7 +264,8 @@ def domain_text(variable: str) -> str:
     """Return the ROS domain that ``variable``, a value of ROS_DOMAIN_ID, names, in digits.
 
     rcl reads the value with strtoul(3), which accepts 0x39, and ignores what follows a number other
-    than 0. DDS keeps 32 bits of it. A value that rcl refuses is returned in quotes, safe to print.
+    than 0. DDS keeps 32 bits of the number. A value that rcl refuses is returned in quotes, safe to
+    print.
     """
     number = _DOMAIN_NUMBER.match(variable or "0", 0, _LONGEST_NUMBER)
     if number is not None:

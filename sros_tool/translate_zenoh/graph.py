@@ -180,7 +180,7 @@ class _Tokens:
                 never = Names(without)
                 stated = {n: None for n in stated if is_expression(n) or not never.overlaps(n)}
             wild = [expression for expression in stated if is_expression(expression)]
-            allowed += self._announced(right, stated)
+            allowed += self._announcing_keys(right, stated)
             denied += [
                 self._key(_ENTITY_KIND_OF_RIGHT[right], "*/*", part, ANY_CHUNKS)
                 for name in without
@@ -200,7 +200,7 @@ class _Tokens:
         )
         return tuple(self._key(_EVERY_KIND, place, ANY_CHUNKS) for place in _token_names(named))
 
-    def _announced(self, right: str, names: Mapping[str, None]) -> list[str]:
+    def _announcing_keys(self, right: str, names: Mapping[str, None]) -> list[str]:
         """Return key expressions for the tokens of names, for each node that may use a name."""
         parts = [part for name in names for part in _token_chunks(name)]
         owners = {part: self._owner(right, part) for part in parts}

@@ -164,7 +164,7 @@ def _plain(text: str) -> str:
 
 
 def _referenced_character(match: re.Match[str]) -> str | None:
-    """Return the bytes of a reference such as ``&amp;``, or None if the reference is malformed."""
+    """Return the character of a reference such as ``&amp;``; None for a malformed reference."""
     if match[2]:
         return _ENTITIES[match[2]]
     # TinyXML-2 reads the digits backwards, from the last one to the mark before them.
