@@ -215,6 +215,7 @@ def _check_release(
 ) -> None:
     """Raise `KeystoreError` unless a release can replace the installed one.
 
+    ``present`` are the enclaves in ``folder``, whose permissions CAs are trusted.
     A trusted permissions CA must have sealed it for this robot, its number must not be lower than
     ``installed``, and it must have an enclave of this robot.
     """
@@ -267,7 +268,7 @@ def has_permissions_ca(folder: Path) -> bool:
 
 
 def _trusted_authorities(folder: Path, present: Iterable[str]) -> Iterator[x509.Certificate]:
-    """Yield the permissions CAs of the enclaves; a file that cannot be read counts as missing."""
+    """Yield the permissions CAs of the enclaves ``present``; unreadable files count as missing."""
     read_files = set()
     with Folder(folder) as opened:
         for name in present:
@@ -489,7 +490,7 @@ def _content(folder: Folder, path: str) -> bytes | str | None:
 
 
 def _check_place(folder: Folder, place: str) -> None:
-    """Raise `KeystoreError` if the folder of an enclave exists and cannot be changed."""
+    """Raise `KeystoreError` if the enclave folder ``place`` exists and cannot be changed."""
     parts = place.split("/")
     for length in range(1, len(parts) + 1):
         path = "/".join(parts[:length])

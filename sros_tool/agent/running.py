@@ -241,7 +241,7 @@ def enclaves_to_restart(
     """Return the enclaves whose processes have to be restarted, by the states of all enclaves.
 
     A restart is done when the processes of the enclave were seen with the installed files, or when
-    all processes of the machine were seen and none is in the enclave.
+    all processes of the machine were seen (``complete``) and none is in the enclave.
     """
     return tuple(
         sorted(

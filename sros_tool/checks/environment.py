@@ -25,7 +25,7 @@ from sros_tool.keystore.layout import (
     GOVERNANCE_P7S,
     IDENTITY,
     PERMISSIONS,
-    ca_key,
+    ca_key_path,
     is_keystore,
     refuse_flat_keystore,
     search_enclaves,
@@ -287,8 +287,8 @@ def _enclave_findings(
         yield DOMAIN_NOT_GOVERNED.found(DOMAIN, text)
         domain = None  # reported here, so not again for the enclave
     for role in (IDENTITY, PERMISSIONS):
-        if (root / ca_key(role)).exists():
-            yield CA_KEY_HERE.found(KEYSTORE, f"'{root / ca_key(role)}' exists")
+        if (root / ca_key_path(role)).exists():
+            yield CA_KEY_HERE.found(KEYSTORE, f"'{root / ca_key_path(role)}' exists")
             break
     if not wanted and "/" not in names:
         enforced = environment.get(STRATEGY) == "Enforce"

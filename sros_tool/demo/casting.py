@@ -58,7 +58,7 @@ from sros_tool.keystore.layout import (
     PERMISSIONS_FILE,
     PRIVATE,
     ROLES,
-    ca_key,
+    ca_key_path,
     enclave_path,
 )
 from sros_tool.keystore.reader import OpenedEnclave, OpenedKeystore
@@ -128,7 +128,7 @@ class UserKeystore(NamedTuple):
 
     def keyring(self) -> Keyring:
         """Return a keyring for the CA keys, which are in the keystore or where its settings say."""
-        inside = {role: self.root.absolute() / ca_key(role) for role in ROLES}
+        inside = {role: self.root.absolute() / ca_key_path(role) for role in ROLES}
         places = {role: f"file:{path}" for role, path in inside.items() if path.exists()}
         return Keyring(self.secrets, places)
 

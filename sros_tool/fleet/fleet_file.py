@@ -160,12 +160,12 @@ class _Reader:
     def _read_robot(
         self, name: str, values: Mapping[str, Any], groups: Mapping[str, Mapping[str, Any]]
     ) -> Robot:
-        at = f"{self._shown_key('robots')}.{name}"
-        self._check_keys(values, ("groups", *_GROUP_KEYS), at)
-        member = tuple(sorted(set(self._read_texts(values, "groups", at, _MOST_GROUPS))))
+        key_path = f"{self._shown_key('robots')}.{name}"
+        self._check_keys(values, ("groups", *_GROUP_KEYS), key_path)
+        member = tuple(sorted(set(self._read_texts(values, "groups", key_path, _MOST_GROUPS))))
         for group in member:
             if problem := name_problem(group):
-                raise self._invalid_value_error(f"{at}.groups", group, problem)
+                raise self._invalid_value_error(f"{key_path}.groups", group, problem)
         stated_values: dict[str, Any] = {}
         origin: dict[str, str] = {}
         for group in member:
@@ -175,18 +175,18 @@ class _Reader:
                     raise self._error(
                         f"the robot {name} gets its {key} from two groups",
                         f"{origin[key]} and {group_key} differ.",
-                        f"Write {at}.{key}.",
+                        f"Write {key_path}.{key}.",
                     )
                 stated_values[key], origin[key] = value, group_key
         own_values = {key: value for key, value in values.items() if key != "groups"}
         stated_values = self._read_values(stated_values, origin, name) | self._read_values(
-            own_values, {key: f"{at}.{self._shown_key(key)}" for key in own_values}
+            own_values, {key: f"{key_path}.{self._shown_key(key)}" for key in own_values}
         )
         usual = {"namespace": f"/{name}", "address": name, "user": "", "domain": None}
         robot = Robot(name, groups=member, **(usual | stated_values))
         if robot.crossing and not robot.router:
             text = "Names can pass only through a router, and the robot has none."
-            raise self._invalid_value_error(f"{at}.crossing", list(robot.crossing), text)
+            raise self._invalid_value_error(f"{key_path}.crossing", list(robot.crossing), text)
         return robot
 
     def _read_values(
@@ -215,13 +215,13 @@ class _Reader:
                 raise self._invalid_value_error(places[key], value, problem)
         return checked
 
-    def _read_crossing(self, names: Any, place: str, robot: str) -> tuple[str, ...]:
-        at, _, key = place.rpartition(".")
+    def _read_crossing(self, names: Any, key_path: str, robot: str) -> tuple[str, ...]:
+        table_path, _, key = key_path.rpartition(".")
         filled = []
-        for name in self._read_texts({key: names}, key, at, _MOST_CROSSING):
+        for name in self._read_texts({key: names}, key, table_path, _MOST_CROSSING):
             filled.append(name.replace(_ROBOT_PLACEHOLDER, robot) if robot else name)
             if problem := crossing_problem(filled[-1]):
-                raise self._invalid_value_error(place, name, problem)
+                raise self._invalid_value_error(key_path, name, problem)
         return tuple(filled)
 
     def _shown_key(self, key: str) -> str:
@@ -240,25 +240,25 @@ class _Reader:
         return tables
 
     def _read_texts(
-        self, table: Mapping[str, Any], key: str, at: str, maximum: int
+        self, table: Mapping[str, Any], key: str, key_path: str, maximum: int
     ) -> tuple[str, ...]:
         values = table.get(key, [])
-        where = f"{at}.{key}" if at else key
+        where = f"{key_path}.{key}" if key_path else key
         if not isinstance(values, list) or not all(isinstance(value, str) for value in values):
             raise self._error(f"{where} is not a list of names", "", f'Write {key} = ["NAME"].')
         if len(values) > maximum:
             raise self._error(f"{where} has more than {maximum} names")
         return tuple(values)
 
-    def _check_keys(self, table: Mapping[str, Any], keys: Iterable[str], at: str) -> None:
+    def _check_keys(self, table: Mapping[str, Any], keys: Iterable[str], key_path: str) -> None:
         known = tuple(keys)
         for key in table:
             if key not in known:
-                where = f"{at}.{_toml_key(key)}" if at else _toml_key(key)
+                where = f"{key_path}.{_toml_key(key)}" if key_path else _toml_key(key)
                 raise self._error(f"{where} is not a known key", f"There are {', '.join(known)}.")
 
-    def _invalid_value_error(self, at: str, value: object, problem: str) -> DocumentError:
-        return self._error(f"{at} has {shortened(value)}, which is not valid", problem)
+    def _invalid_value_error(self, key_path: str, value: object, problem: str) -> DocumentError:
+        return self._error(f"{key_path} has {shortened(value)}, which is not valid", problem)
 
     def _error(self, problem: str, why: str = "", remedy: str = "") -> DocumentError:
         return DocumentError(f"{self._what}: {problem}", why, remedy)
@@ -521,9 +521,9 @@ class _Inventory:
             if group not in _BUILT_IN_GROUPS:
                 self._groups[group].add(host)
 
-    def _used_variables(self, value: Any, at: object) -> dict[str, Any]:
+    def _used_variables(self, value: Any, key_path: object) -> dict[str, Any]:
         """Return the variables that a fleet uses; other variables are left out."""
-        values = self._checked_mapping(value, at)
+        values = self._checked_mapping(value, key_path)
         return {
             key: values[key] for key in (*_VARIABLES.values(), _ROBOT_VARIABLE) if key in values
         }
@@ -568,11 +568,11 @@ class _Inventory:
                 robot["domain"] = int(domain)  # variables of INI inventories are text
             yield name, {"address": host, **robot, "groups": sorted(of[host])}
 
-    def _checked_mapping(self, value: Any, at: object) -> dict[Any, Any]:
+    def _checked_mapping(self, value: Any, key_path: object) -> dict[Any, Any]:
         if value is None:
             return {}
         if not isinstance(value, dict):
-            raise self._error(f"{str(at)[:80]!r} is not a mapping")
+            raise self._error(f"{str(key_path)[:80]!r} is not a mapping")
         return value
 
     def _error(self, problem: str, why: str = "", remedy: str = "") -> DocumentError:

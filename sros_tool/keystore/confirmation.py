@@ -797,9 +797,9 @@ def _enclave_from(name: Any) -> str:
         raise _FormError(f"{_shortened(name)} is not the name of an enclave") from None
 
 
-def _digest_from(value: Any, what: str) -> str:
+def _digest_from(value: Any, label: str) -> str:
     if not _is_digest(value):
-        raise _FormError(f"{what} is not a SHA-256 digest")
+        raise _FormError(f"{label} is not a SHA-256 digest")
     return str(value)
 
 
@@ -868,9 +868,9 @@ def _requests_from(value: Any) -> tuple[str, ...]:
     return tuple(requests)
 
 
-def _list_from(value: Any, most: int, what: str) -> list[Any]:
+def _list_from(value: Any, most: int, label: str) -> list[Any]:
     if not isinstance(value, list) or len(value) > most:
-        raise _FormError(f"its {what} are not a list of at most {most} items")
+        raise _FormError(f"its {label} are not a list of at most {most} items")
     return value
 
 

@@ -32,8 +32,8 @@ from sros_tool.keystore.layout import (
     ROLES,
     SETTINGS,
     ZENOH_SIGNED,
-    ca_certificate,
-    ca_key,
+    ca_certificate_path,
+    ca_key_path,
     enclave_folder,
     enclaves_below,
     is_keystore,
@@ -625,12 +625,12 @@ def _describe_keystore(keystore: OpenedKeystore, now: datetime) -> DescribedKeys
     settings = keystore.settings
     authorities: dict[str, AuthorityFile | UnreadableFile] = {}
     for role in ROLES:
-        path = keystore.root / ca_certificate(role)
+        path = keystore.root / ca_certificate_path(role)
         if not path.exists():
             continue
         try:
             file = _describe_certificates(keystore.read(path, "file"), f"'{path}'", now)
-            authorities[role] = AuthorityFile(file, (keystore.root / ca_key(role)).exists())
+            authorities[role] = AuthorityFile(file, (keystore.root / ca_key_path(role)).exists())
         except SrosError as error:
             authorities[role] = UnreadableFile(str(error))
     names, unread = search_enclaves(keystore.root)

@@ -451,7 +451,8 @@ def lost_enclaves(
 ) -> tuple[list[Note], list[Entry]]:
     """Return notes and ledger entries on enclaves and routers that robots lose.
 
-    The notes include enclaves that robots lost earlier.
+    ``before`` and ``after`` are the fleet before and after a change.  Only enclaves that the
+    keystore still has are included, also if robots lost them earlier.
     """
     notes: list[Note] = []
     lost: dict[str, set[str]] = {}

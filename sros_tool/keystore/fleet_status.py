@@ -1142,7 +1142,7 @@ class _KeystoreRecords:
             confirmed.release and is_from_backup and confirmed.release not in self._releases
         )
 
-    def lacks_key(self, compared_robot: _ComparedRobot) -> tuple[str, ...]:
+    def enclaves_lacking_key(self, compared_robot: _ComparedRobot) -> tuple[str, ...]:
         """Return the enclaves whose certificate is for a key that the robot does not have.
 
         This is so if the robot has no file of the enclave, if it has an earlier key, or if its
@@ -1493,7 +1493,9 @@ def _robot_status(
         renew_from=min(
             (file.window.expires_soon_from() for file in validity.values()), default=None
         ),
-        lacks_key=records.lacks_key(compared_robot) if different or state is State.UNUSABLE else (),
+        lacks_key=records.enclaves_lacking_key(compared_robot)
+        if different or state is State.UNUSABLE
+        else (),
         is_ahead=is_ahead,
         reported=len((confirmed and confirmed.problems) or ()),
         is_behind=bool(confirmed and confirmed.clock is RobotClock.BEHIND),

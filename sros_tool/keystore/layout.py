@@ -131,20 +131,20 @@ def ledger_part(number: int) -> str:
     return f"ledger.{number:04}.jsonl"
 
 
-def ca_certificate(role: str) -> str:
+def ca_certificate_path(role: str) -> str:
     """Return the path of the certificate of the identity or permissions CA."""
     return f"{PUBLIC}/{role}_ca.cert.pem"
 
 
 SHARED_FILES = {
     GOVERNANCE_FILE: GOVERNANCE_P7S,
-    IDENTITY_CA_FILE: ca_certificate(IDENTITY),
-    PERMISSIONS_CA_FILE: ca_certificate(PERMISSIONS),
+    IDENTITY_CA_FILE: ca_certificate_path(IDENTITY),
+    PERMISSIONS_CA_FILE: ca_certificate_path(PERMISSIONS),
 }
 """Maps files of an enclave to the files of the keystore to which they are normally links."""
 
 
-def ca_key(role: str) -> str:
+def ca_key_path(role: str) -> str:
     """Return the path of the private key of the identity or permissions CA."""
     return f"{PRIVATE}/{role}_ca.key.pem"
 
@@ -179,7 +179,7 @@ def is_own_copy(root: Path, name: str, file: str) -> bool:
     )
 
 
-def fleet_key(role: str) -> str:
+def fleet_key_path(role: str) -> str:
     """Return the path of the private key of a metadata role, such as ``snapshot``."""
     return f"{PRIVATE}/fleet_{role}.pem"
 
@@ -229,7 +229,7 @@ def is_keystore(root: Path) -> bool:
     try:
         return folder.is_dir() and (
             (root / GOVERNANCE_P7S).is_file()
-            or (root / ca_certificate(IDENTITY)).is_file()
+            or (root / ca_certificate_path(IDENTITY)).is_file()
             or any(search_enclaves(root))
         )
     except PermissionError as error:

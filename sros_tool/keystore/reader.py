@@ -48,7 +48,7 @@ from sros_tool.keystore.layout import (
     ROLES,
     SETTINGS,
     STAGE,
-    ca_certificate,
+    ca_certificate_path,
     check_keystore,
     enclave_names,
     enclave_path,
@@ -354,7 +354,7 @@ class OpenedKeystore:
 
     def authority(self, role: str) -> tuple[x509.Certificate, ...]:
         """Return the certificates in a role's CA file, the issuing CA first; () without a file."""
-        path = self.root / ca_certificate(role)
+        path = self.root / ca_certificate_path(role)
 
         def read() -> tuple[x509.Certificate, ...]:
             if not path.exists():
@@ -365,7 +365,7 @@ class OpenedKeystore:
 
     def ca_certificate(self, role: str) -> x509.Certificate:
         """Return the certificate of the issuing identity or permissions CA."""
-        return self.certificate(ca_certificate(role), f"{role} CA certificate")
+        return self.certificate(ca_certificate_path(role), f"{role} CA certificate")
 
     def certificate(self, path: str | Path, label: str = "certificate") -> x509.Certificate:
         """Return the first certificate of a PEM file; arguments as for `read`.
@@ -397,7 +397,7 @@ class OpenedKeystore:
         """
         stems: dict[str, tuple[str, ...]] = {}
         for role in ROLES:
-            path = self.root / ca_certificate(role)
+            path = self.root / ca_certificate_path(role)
             file = path
             # A link into the stage that an interrupted change left stands for the file itself.
             if path.is_symlink() and STAGE not in (to := str(path.readlink())):

@@ -238,7 +238,7 @@ def _possible_enclaves(
 
 
 def _unrecorded_notes(
-    keystore: OpenedKeystore, below: list[str], left: list[str]
+    keystore: OpenedKeystore, below: list[str], naming: list[str]
 ) -> Iterator[Note]:
     if below:
         yield Note(
@@ -246,13 +246,13 @@ def _unrecorded_notes(
             "Enclaves in the folder of a robot that you revoke are also revoked, although the "
             f"fleet does not record them: {_names_text(below)}.",
         )
-    if left:
+    if naming:
         yield Note(
             "fleet.unrecorded-enclaves",
             "Enclaves whose path contains the name of a robot that you revoke are still valid: "
-            f"{_names_text(left)}. The fleet does not record which robot has their keys. If the "
+            f"{_names_text(naming)}. The fleet does not record which robot has their keys. If the "
             "keys were on that robot, "
-            f"run `sros revoke {quote(str(keystore.root))} {arguments_for(keystore, left)}`.",
+            f"run `sros revoke {quote(str(keystore.root))} {arguments_for(keystore, naming)}`.",
         )
 
 

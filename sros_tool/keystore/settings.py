@@ -255,10 +255,13 @@ def hand_edits(
 
 
 def _unsigned_clauses(
-    present: Template, recorded: Template | None, settings: Sequence[str]
+    present: Template, recorded: Template | None, edit_clauses: Sequence[str]
 ) -> Iterator[str]:
-    """Yield a clause if the signed governance differs from the protection in sros.toml."""
-    if not settings or (recorded and recorded.protection == present.protection):
+    """Yield a clause on a signed governance that differs from the protection in sros.toml.
+
+    Nothing is yielded if ``edit_clauses`` report edits of sros.toml that changed the protection.
+    """
+    if not edit_clauses or (recorded and recorded.protection == present.protection):
         yield f"the signed governance differs from [protection] in {SETTINGS}"
 
 

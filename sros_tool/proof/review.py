@@ -59,7 +59,7 @@ from sros_tool.keystore.layout import (
     ROLES,
     SETTINGS,
     ZENOH_FILES,
-    ca_certificate,
+    ca_certificate_path,
     is_keystore,
 )
 from sros_tool.keystore.reader import OpenedKeystore
@@ -1350,7 +1350,7 @@ def _robots_by_enclave(files: Iterable[Path], fleet: Fleet | None) -> dict[str, 
 
 
 _FILES_OF_ENCLAVES = (*REQUIRED_FILES, *OPTIONAL_FILES, *ZENOH_FILES)
-_TRUSTED_FILES = (CRL, *map(ca_certificate, ROLES))
+_TRUSTED_FILES = (CRL, *map(ca_certificate_path, ROLES))
 """The files of a keystore that all enclaves trust."""
 
 

@@ -33,7 +33,7 @@ from sros_tool.keystore.layout import (
     PERMISSIONS_FILE,
     ROUTER_FILE,
     ZENOH_SIGNED,
-    ca_certificate,
+    ca_certificate_path,
     enclave_names,
     enclave_path,
     has_zenoh_files,
@@ -267,7 +267,7 @@ def _access_of_source(path: Path, source: RightsSource) -> AccessSource:
     folders = {name: enclave_path(path, name) for name in enclave_names(path, hidden=True)}
     trusting = {
         name: (folder / IDENTITY_CA_FILE, folder / CRL_FILE) for name, folder in folders.items()
-    } | {KEYSTORE_ITSELF: (path / ca_certificate(IDENTITY), path / CRL)}
+    } | {KEYSTORE_ITSELF: (path / ca_certificate_path(IDENTITY), path / CRL)}
     if keystore.has_all_enclaves:
         governance = _common_governance(path, folders.values())
     else:

@@ -12,7 +12,7 @@ import pytest
 from sros_tool.keystore.delivery.export import exported_files
 from sros_tool.keystore.delivery.release import Release, seal_releases
 from sros_tool.keystore.issuing.authority import Authority
-from sros_tool.keystore.layout import KEY_FILE, ca_certificate, ca_key
+from sros_tool.keystore.layout import KEY_FILE, ca_certificate_path, ca_key_path
 from sros_tool.keystore.reader import OpenedKeystore, read_certificate
 from sros_tool.pki.keys import load_key
 from tests.support.harness import copy_of, sros
@@ -27,8 +27,10 @@ def moment() -> datetime:
 
 def authority_of(root: Path) -> Authority:
     """Return the permissions CA of a keystore."""
-    key = (root / ca_key("permissions")).read_bytes()
-    return Authority(read_certificate(root / ca_certificate("permissions")), load_key(key, "CA"))
+    key = (root / ca_key_path("permissions")).read_bytes()
+    return Authority(
+        read_certificate(root / ca_certificate_path("permissions")), load_key(key, "CA")
+    )
 
 
 def files_of(root: Path, names: tuple[str, ...] = NAMES) -> dict[str, bytes]:

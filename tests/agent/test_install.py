@@ -17,7 +17,7 @@ import pytest
 from sros_tool.agent.install import Installation, install_release
 from sros_tool.errors import KeystoreError
 from sros_tool.keystore.delivery.release import Release
-from sros_tool.keystore.layout import ca_certificate, ca_key
+from sros_tool.keystore.layout import ca_certificate_path, ca_key_path
 from sros_tool.keystore.lifecycle.create import create_permission
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.rotate import rotate_ca
@@ -168,8 +168,8 @@ def list_of_nobody(home: Home, later: int = 0) -> bytes:
     """
     present = load_crl(home.revoked.files[f"{A}/crl.pem"], "of /r1/a")
     return sign_crl(
-        read_certificate(home.root / ca_certificate("identity")),
-        load_key((home.root / ca_key("identity")).read_bytes(), "CA"),
+        read_certificate(home.root / ca_certificate_path("identity")),
+        load_key((home.root / ca_key_path("identity")).read_bytes(), "CA"),
         (),
         number=present.number + later,
         this_update=present.this_update,

@@ -54,7 +54,7 @@ from sros_tool.keystore.delivery.signing import sign_request
 from sros_tool.keystore.fleet_status import fleet_status
 from sros_tool.keystore.issuing.keyring import Keyring
 from sros_tool.keystore.known_keys import KnownKeys
-from sros_tool.keystore.layout import CRL, ca_key
+from sros_tool.keystore.layout import CRL, ca_key_path
 from sros_tool.keystore.layout import ROLES as ROLES_OF_CAS
 from sros_tool.keystore.ledger import Entry
 from sros_tool.keystore.lifecycle.change import KeystoreChange
@@ -1332,7 +1332,7 @@ def test_a_restored_keystore_never_brings_back_a_ca_that_was_replaced(
     replace_cas({})
     publisher.publish()
     for role, key in keys.items():
-        shutil.copy(publisher.root / ca_key(role), key)
+        shutil.copy(publisher.root / ca_key_path(role), key)
     shutil.rmtree(publisher.root)
     backup.rename(publisher.root)
     later = authorities()

@@ -35,7 +35,7 @@ from sros_tool.keystore.lifecycle.change import KeystoreChange
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, generate_artifacts
 from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
 from sros_tool.keystore.lifecycle.rotate import RotationStep, renew_identity_ca, rotate_ca
-from sros_tool.keystore.lifecycle.rotation import RotationStage, retired_key, rotation_status
+from sros_tool.keystore.lifecycle.rotation import RotationStage, retired_key_path, rotation_status
 from sros_tool.keystore.lifecycle.update import update_keystore
 from sros_tool.keystore.reader import OpenedKeystore, open_enclave
 from sros_tool.keystore.template import load_template
@@ -718,7 +718,9 @@ def test_without_the_old_key_revoking_waits_for_the_end(
     rotate_ca(separate, RotationStage.DISTRIBUTE, now=NOW)
     rotate_ca(separate, RotationStage.REISSUE, now=NOW, delete_old_key=how == "deleted")
     if how != "deleted":
-        kept = separate / retired_key(OpenedKeystore(separate).certificates_of("identity_ca")[1])
+        kept = separate / retired_key_path(
+            OpenedKeystore(separate).certificates_of("identity_ca")[1]
+        )
         assert kept.exists()
         kept.write_bytes(key_pem(generate_key()))
         if how == "elsewhere":

@@ -30,8 +30,8 @@ from sros_tool.keystore.layout import (
     PERMISSIONS,
     PUBLISHED,
     SETTINGS,
-    ca_certificate,
-    ca_key,
+    ca_certificate_path,
+    ca_key_path,
     key_path,
 )
 from sros_tool.keystore.ledger import LEDGER_REMEDY, RESTORED
@@ -385,7 +385,7 @@ def check_authorities(keystore: CheckedKeystore) -> Iterator[Finding]:
     unread = {part.path for part in keystore.unread}
     if keystore.is_original:
         for role in (IDENTITY, PERMISSIONS):
-            path = ca_certificate(role)
+            path = ca_certificate_path(role)
             if role not in keystore.authorities and path not in unread:
                 text = f"there is no certificate of the {role} CA"
                 yield CA_MISSING.found(f"{role} CA", text, keystore.shown_path(path))
@@ -489,7 +489,7 @@ def _authority(
     keystore: CheckedKeystore, role: str, chain: tuple[x509.Certificate, ...]
 ) -> Iterator[Finding]:
     certificate = chain[0]
-    file, subject = keystore.shown_path(ca_certificate(role)), f"{role} CA"
+    file, subject = keystore.shown_path(ca_certificate_path(role)), f"{role} CA"
     name, validity = authority_text(certificate), validity_of(certificate)
     begin, end = iso(validity.not_before), iso(validity.not_after)
     remedy = _NEXT_CA if role == IDENTITY and _has_ca_service(keystore) else ""
@@ -510,8 +510,8 @@ def _ca_key_findings(
     keystore: CheckedKeystore, role: str, certificate: x509.Certificate
 ) -> Iterator[Finding]:
     """Yield findings about the key that signs as a CA, and about its copies in the keystore."""
-    inside, subject = keystore.root / ca_key(role), f"{role} CA key"
-    place = (keystore.settings.key_place(role) if keystore.settings else "") or ca_key(role)
+    inside, subject = keystore.root / ca_key_path(role), f"{role} CA key"
+    place = (keystore.settings.key_place(role) if keystore.settings else "") or ca_key_path(role)
     is_file = not (is_token_uri(place) or is_ca_service(place))
     signing = key_path(keystore.root, place) if is_file else inside
     for path in dict.fromkeys((inside, signing)):
@@ -530,7 +530,7 @@ def _ca_key_findings(
             if same_key(certificate, key):
                 yield CA_KEY_PLAIN.found(subject, "it has no passphrase", str(path))
             elif path == signing and is_file:
-                text = f"'{path.name}' is not the key of '{ca_certificate(role)}'"
+                text = f"'{path.name}' is not the key of '{ca_certificate_path(role)}'"
                 yield CA_MISMATCH.found(f"{role} CA", text, str(path))
 
 
@@ -556,7 +556,7 @@ def _shared_ca_findings(keystore: CheckedKeystore) -> Iterator[Finding]:
             keystore,
             certificates[0],
             certificates[1],
-            keystore.shown_path(ca_certificate(IDENTITY)),
+            keystore.shown_path(ca_certificate_path(IDENTITY)),
         )
 
 

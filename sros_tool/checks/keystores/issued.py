@@ -29,7 +29,7 @@ from sros_tool.keystore.layout import (
     LEDGER,
     PERMISSIONS_CA_FILE,
     ROLES,
-    ca_certificate,
+    ca_certificate_path,
     enclave_folder,
     folder_of_closed_robot,
     is_original_keystore,
@@ -370,7 +370,7 @@ def _trust_findings(
             strangers = unknown_authorities(keystore.opened, role)
         for authority in strangers:
             text = f"{authority_text(authority)} is not in the ledger"
-            path = keystore.shown_path(ca_certificate(role))
+            path = keystore.shown_path(ca_certificate_path(role))
             yield UNKNOWN_AUTHORITY.found(f"{role} CA", text, path)
     for index, (role, file) in enumerate(zip(ROLES, _AUTHORITY_FILES, strict=True)):
         everyone = [summary for summary in summaries if summary.trusted[index]]

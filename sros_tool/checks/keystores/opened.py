@@ -27,7 +27,7 @@ from sros_tool.keystore.layout import (
     PUBLIC,
     ROLES,
     SETTINGS,
-    ca_certificate,
+    ca_certificate_path,
     search_enclaves,
 )
 from sros_tool.keystore.ledger import Ledger
@@ -144,7 +144,7 @@ class CheckedKeystore:
         """The certificates in the CA files by role, the issuing certificate first."""
 
         def chain(role: str) -> tuple[x509.Certificate, ...]:
-            return self._part(ca_certificate(role), lambda: self.opened.authority(role), ())
+            return self._part(ca_certificate_path(role), lambda: self.opened.authority(role), ())
 
         return {role: certificates for role in ROLES if (certificates := chain(role))}
 

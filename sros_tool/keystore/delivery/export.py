@@ -242,7 +242,10 @@ def _other_enclave_notes(
 
 
 def _removal_command(target: Path, names: Sequence[str], present: Sequence[str]) -> str:
-    """Return the command that removes enclaves from a folder, but not enclaves nested in them."""
+    """Return the command that removes enclaves from a folder, but not enclaves nested in them.
+
+    ``present`` are all enclaves in the folder ``target``.
+    """
     nested = any(
         other.startswith(f"{name}/") for name in names for other in {*present}.difference(names)
     )

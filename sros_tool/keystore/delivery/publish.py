@@ -87,10 +87,10 @@ from sros_tool.keystore.layout import (
     PERMISSIONS_CA_FILE,
     PUBLISHED,
     RETIRED,
-    ca_certificate,
+    ca_certificate_path,
     enclave_folder,
     enclave_path,
-    fleet_key,
+    fleet_key_path,
 )
 from sros_tool.keystore.ledger import PUBLISHING, REPORTED, SAME_KEY, Entry
 from sros_tool.keystore.lifecycle.change import KeystoreChange
@@ -504,7 +504,7 @@ class _RoleKeys:
             {
                 role: (self.signers[role][0], self._path(role))
                 for role in _ONLINE
-                if fleet_key(role) not in self.new
+                if fleet_key_path(role) not in self.new
             }
         )
         left = expiry.root if first else self.roots.last.expires - now
@@ -524,7 +524,7 @@ class _RoleKeys:
             self.notes.append(Note("fleet.root-expires", text))
 
     def _path(self, role: str) -> Path:
-        return self._root / fleet_key(role)
+        return self._root / fleet_key_path(role)
 
     def _online_signers(self, role: str, *, new: bool) -> list[CryptoSigner]:
         """Return the signer of a role, and the previous one while robots may still need it.
@@ -535,11 +535,11 @@ class _RoleKeys:
 
         path, before = self._path(role), self._path(f"{role}.{_BEFORE}")
         if new:
-            self.new[fleet_key(role)] = made = new_key()
+            self.new[fleet_key_path(role)] = made = new_key()
             signers = [load_signer(made, "the new key")]
             if path.exists():
                 old = read_bytes(path, "key")
-                self.new[fleet_key(f"{role}.{_BEFORE}")] = old
+                self.new[fleet_key_path(f"{role}.{_BEFORE}")] = old
                 signers.append(load_signer(old, f"'{path}'"))
             return signers
         if not path.exists():
@@ -576,7 +576,7 @@ class _RoleKeys:
             if self._elsewhere:
                 self._new_elsewhere = made
             else:
-                self.new[fleet_key("root")] = made
+                self.new[fleet_key_path("root")] = made
             keys.append(load_signer(made, "the new key"))
         named = {role: signers[0] for role, signers in self.signers.items()}
         self.roots.add({"root": keys[-1], **named}, keys, expires.replace(microsecond=0))
@@ -606,7 +606,7 @@ class _RoleKeys:
                     folder.replace(spare, self._elsewhere.name)
         with Folder(self._root) as folder:
             for role in _ONLINE:
-                folder.unlink(fleet_key(f"{role}.{_BEFORE}"), missing_ok=True)
+                folder.unlink(fleet_key_path(f"{role}.{_BEFORE}"), missing_ok=True)
 
     @staticmethod
     def _new_key_path(path: Path) -> Path:
@@ -1177,7 +1177,7 @@ class _Publication:
             entries = self.keystore.ledger_file.with_values("sha256", digests.values()).entries
             issued = {entry.sha256 for entry in entries if entry.reason != REPORTED}
             for role in (IDENTITY, PERMISSIONS):
-                authority = self.keystore.read(ca_certificate(role), "CA certificate")
+                authority = self.keystore.read(ca_certificate_path(role), "CA certificate")
                 issued.add(hashlib.sha256(authority).hexdigest())
             return all(
                 digests[path] in issued or self.keystore.read(path, "file") == data

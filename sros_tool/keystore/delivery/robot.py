@@ -711,7 +711,10 @@ class MadeRequest(NamedTuple):
 def shown_request(
     folder: Path, requested: NewRequest, *, again: bool, dry_run: bool
 ) -> MadeRequest:
-    """Return the value that ``--json`` prints for a new signing request."""
+    """Return the value that ``--json`` prints for a new signing request.
+
+    ``again`` and ``dry_run`` are as in `create_request`.
+    """
     key = (
         requested.key if again or not dry_run else None
     )  # a dry run does not keep the key that it makes

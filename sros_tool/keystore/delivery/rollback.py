@@ -106,7 +106,8 @@ def _list_pairs(
 ) -> Iterator[tuple[Revocations, Revocations]]:
     """Yield two lists for each CA that the ``sent`` files trust: the present one and the sent one.
 
-    In a rotation, the list of the second CA is in the file of the CAs.
+    ``present`` and ``sent`` are as in `older_list`.  In a rotation, the list of the second CA is in
+    the file of the CAs.
     """
     with suppress(SrosError):  # damaged files change no enclave
         for authority in load_certificates(sent.get(IDENTITY_CA_FILE, b""), IDENTITY_CA_FILE):

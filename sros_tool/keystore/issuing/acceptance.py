@@ -43,7 +43,7 @@ from sros_tool.keystore.layout import (
     PUBLIC,
     REQUEST,
     ROLES,
-    ca_certificate,
+    ca_certificate_path,
     enclave_folder,
     is_enclave,
 )
@@ -267,7 +267,7 @@ def _authority_without_list(files: _FilesOfChange) -> x509.Certificate | None:
     """
     if not files.content_after(CRL) or files.content(CRL):
         return None
-    data = files.content_after(ca_certificate(IDENTITY))
+    data = files.content_after(ca_certificate_path(IDENTITY))
     present, *others = load_certificates(data, "of the identity CA")
     return next(
         (
@@ -381,7 +381,7 @@ def _example_files(
     """Return the files of an example enclave for a new keystore, by name."""
     files = {
         f"{role}_ca.cert.pem": transaction.content_after(
-            transaction.place_after(ca_certificate(role))
+            transaction.place_after(ca_certificate_path(role))
         )
         for role in ROLES
     }

@@ -28,8 +28,8 @@ from sros_tool.keystore.layout import (
     PRIVATE,
     PUBLIC,
     ROLES,
-    ca_certificate,
-    ca_key,
+    ca_certificate_path,
+    ca_key_path,
     enclave_folder,
 )
 from sros_tool.keystore.loading import authority_refusals, refusals_text
@@ -205,9 +205,9 @@ def create_authorities(
     authority = make("ca", IDENTITY, template.authority_name)
     in_keystore = not (keyring.places.get(IDENTITY) or template.identity_key)
     for role in ROLES:
-        transaction.link(ca_certificate(role), "ca.cert.pem")
+        transaction.link(ca_certificate_path(role), "ca.cert.pem")
         if in_keystore:
-            transaction.link(ca_key(role), "ca.key.pem")
+            transaction.link(ca_key_path(role), "ca.key.pem")
     return Authorities(authority, authority, tuple(notes))
 
 
@@ -233,7 +233,7 @@ def load_authority(
         KeystoreError: the CA is missing, does not fit its key, or is not valid at ``now``.
     """
     root = keystore.root
-    if not keystore.has(ca_certificate(role)) and not keystore.has(ca_key(role)):
+    if not keystore.has(ca_certificate_path(role)) and not keystore.has(ca_key_path(role)):
         raise KeystoreError(
             f"keystore '{root}' has no {role} CA",
             "Perhaps it is an export for a robot: an export has enclaves, but no CA to create "
@@ -247,7 +247,7 @@ def load_authority(
         raise KeystoreError(
             f"the key and the certificate of the {role} CA do not belong together",
             f"'{keyring.place(role, template)}' is not the key of "
-            f"'{root / ca_certificate(role)}', so its signatures could not be verified.",
+            f"'{root / ca_certificate_path(role)}', so its signatures could not be verified.",
             "Restore both from a backup.",
         )
     validity = validity_of(certificate)

@@ -46,7 +46,7 @@ from sros_tool.keystore.layout import (
     PERMISSIONS_FILE,
     REQUEST,
     ROLES,
-    ca_certificate,
+    ca_certificate_path,
     enclave_folder,
     enclave_path,
 )
@@ -540,7 +540,7 @@ def present_files(root: Path, name: str) -> set[str]:
 
 def shared_files(root: Path, name: str) -> dict[str, str]:
     """Map the names of the files that all enclaves share to the files' paths in the keystore."""
-    shared = {f"{role}_ca.cert.pem": ca_certificate(role) for role in ROLES}
+    shared = {f"{role}_ca.cert.pem": ca_certificate_path(role) for role in ROLES}
     if enclave_folder(name) != ENCLAVES:  # the folder of the enclave / itself holds the governance
         shared[GOVERNANCE_FILE] = GOVERNANCE_P7S
     if (root / CRL).exists():

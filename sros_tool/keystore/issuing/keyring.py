@@ -16,7 +16,7 @@ from shlex import quote
 from sros_tool.errors import DocumentError, KeystoreError, PkiError, SrosError, UsageError
 from sros_tool.files import remove_file, write_new_file
 from sros_tool.keystore.issuing.ca_service import CaService, check_ca_service
-from sros_tool.keystore.layout import IDENTITY, PERMISSIONS, ROLES, ca_key, key_path
+from sros_tool.keystore.layout import IDENTITY, PERMISSIONS, ROLES, ca_key_path, key_path
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.template import Template, is_ca_service
 from sros_tool.keystore.transaction import Transaction
@@ -75,7 +75,7 @@ class Keyring:
 
     def place(self, role: str, template: Template) -> str:
         """Return the URI of a CA's key, or its path relative to the keystore."""
-        return self.places.get(role) or template.key_place(role) or ca_key(role)
+        return self.places.get(role) or template.key_place(role) or ca_key_path(role)
 
     def ca_service(self, root: Path, role: str, template: Template) -> CaService | None:
         """Return the CA service that issues as the ``role`` CA; None if sros signs with a key.
@@ -196,7 +196,10 @@ class Keyring:
         return key
 
     def _check_chosen(self, role: str, place: str, *, compared: bool) -> None:
-        """Raise `KeystoreError` unless the user chose the existing key for a new CA."""
+        """Raise `KeystoreError` unless the user chose the existing key for a new CA.
+
+        ``compared`` is as in `make`.
+        """
         if not (compared or self._is_from_user(role)):
             raise KeystoreError(
                 f"the template names an existing key for the {role} CA: '{place}'",
@@ -303,7 +306,7 @@ def check_places(keyring: Keyring, template: Template) -> None:
 def check_imported_keys(roles: Iterable[str], keyring: Keyring, template: Template) -> None:
     """Raise `UsageError` if an imported CA comes without its key, or does not fit the CA layout."""
     for role in roles:
-        if keyring.place(role, template) == ca_key(role):
+        if keyring.place(role, template) == ca_key_path(role):
             raise UsageError(
                 f"the certificate of the {role} CA is given without its key",
                 "The keystore needs the key to sign.",

@@ -745,7 +745,9 @@ def _stage_configurations(
     changed: Sequence[DriftedConfiguration],
     authority: Authority,
 ) -> dict[str, bytes]:
-    """Stage changed Zenoh configurations with signed documents; return content by path.
+    """Stage the ``changed`` Zenoh configurations with signed documents; return content by path.
+
+    ``files`` maps the paths of all configurations to their content.
 
     All cores sign together.
     """
@@ -805,7 +807,10 @@ def _left_out_notes(left_out: Mapping[str, str]) -> Iterable[Note]:
 def _revoked_name_notes(
     ledger: Ledger, names: Sequence[str], now: datetime, replaced: Collection[str]
 ) -> Iterable[Note]:
-    """Yield a note on enclaves that have a revoked certificate which has not expired."""
+    """Yield a note on enclaves that have a revoked certificate which has not expired.
+
+    ``replaced`` are enclaves whose earlier certificates are revoked by this change.
+    """
     entries = ledger.entries
     revoked = {entry.serial for entry in entries if entry.what == "revocation"}
     revoked_again = sorted(

@@ -925,10 +925,10 @@ class _EnclaveOutcome:
     other_files: str = ""
 
 
-def _other_files_notes(done: Mapping[str, _EnclaveOutcome]) -> Iterator[Note]:
+def _other_files_notes(outcomes: Mapping[str, _EnclaveOutcome]) -> Iterator[Note]:
     """Yield a note for each reason to replace certificates of enclaves that keep their rights."""
-    for reason in sorted({made.other_files for made in done.values()} - {""}):
-        names = [name for name, made in done.items() if made.other_files == reason]
+    for reason in sorted({made.other_files for made in outcomes.values()} - {""}):
+        names = [name for name, made in outcomes.items() if made.other_files == reason]
         text = f"the certificates are new, although the rights are the same: {reason}"
         yield Note("permissions.others-fit", f"{first_few(names, 5)}: {text}.")
 

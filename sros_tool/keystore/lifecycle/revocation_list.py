@@ -592,7 +592,8 @@ class RevocationListSigner:
     ) -> SignedList | None:
         """Sign the second identity CA's list, and stage it in the file of the identity CAs.
 
-        The result is None if there is no second CA, or its list cannot be signed.
+        The result is None if there is no second CA, or its list cannot be signed.  ``expiries``
+        maps serial numbers to expiries; the other arguments are as in `sign`.
         """
         rotation = read_rotation(self._keystore)
         file = self._keystore.identity_file

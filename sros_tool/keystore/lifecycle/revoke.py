@@ -149,7 +149,11 @@ def revoke(
 def _later_keys_notes(
     change: KeystoreChange, last: Mapping[str, Entry], revoked: Container[str]
 ) -> Iterator[Note]:
-    """Yield a note on revoked keys that a restored keystore certified after its last backup."""
+    """Yield a note on revoked keys that a restored keystore certified after its last backup.
+
+    ``last`` maps enclaves to the entries of their present certificates.  ``revoked`` has the serial
+    numbers (hexadecimal) of the revoked certificates.
+    """
     names = {
         entry.enclave
         for entry in change.known.certificates_shown_after_restore(last)
@@ -362,7 +366,7 @@ def _key_revoked_by_enclave(
 
 
 def _replaced_notes(change: KeystoreChange, replaced: Mapping[str, bool]) -> Iterator[Note]:
-    """Yield a note on enclaves whose certificates, and perhaps keys, were replaced."""
+    """Yield a note on the ``replaced`` certificates and keys, as in `RestoredRevocations`."""
     root = quote(str(change.root))
     on_robots = {
         name

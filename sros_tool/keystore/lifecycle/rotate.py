@@ -60,8 +60,8 @@ from sros_tool.keystore.layout import (
     ROLES,
     ROTATION,
     SETTINGS,
-    ca_certificate,
-    ca_key,
+    ca_certificate_path,
+    ca_key_path,
     enclave_folder,
     enclave_path,
     key_path,
@@ -82,7 +82,7 @@ from sros_tool.keystore.lifecycle.rotation import (
     are_crls_confusable,
     read_rotation,
     render_rotation,
-    retired_key,
+    retired_key_path,
 )
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.rights import SignedRights
@@ -566,7 +566,10 @@ class _Rotator:
         "".  A lost key is noted only while revocations need it.
         """
         revokes = stage is RotationStage.REISSUE and IDENTITY in roles
-        key, place = f"the old key of the {_ca_name(roles)}", f"{self._root}/{retired_key(old)}"
+        key, place = (
+            f"the old key of the {_ca_name(roles)}",
+            f"{self._root}/{retired_key_path(old)}",
+        )
         if not (is_here or elsewhere or revokes):
             return
         if not (is_here or elsewhere):
@@ -598,7 +601,7 @@ class _Rotator:
                     f"the file of the {role} CA has {authority_text(strangers[0])}, which the "
                     "keystore does not know",
                     "Every process trusts this CA, and would still trust it during the rotation.",
-                    f"Restore '{self._root}/{ca_certificate(role)}' from a backup; or, if all "
+                    f"Restore '{self._root}/{ca_certificate_path(role)}' from a backup; or, if all "
                     "processes may be restarted together, replace the CAs with --finish.",
                 )
         successors = _make_successors(self._change, wanted, keep_keys=keep_keys)
@@ -787,7 +790,7 @@ class _Rotator:
                 self._change.names,
             )
             self._keep_certificate(old)
-            key, elsewhere = retired_key(old), replacement.old_key
+            key, elsewhere = retired_key_path(old), replacement.old_key
             is_here = (self._root / key).exists() and not elsewhere
             self._note_old_key(
                 files[replacement.file],
@@ -819,10 +822,10 @@ class _Rotator:
         is_here, elsewhere = (root / place).is_file(), ""
         if not is_here:
             named = self._change.keyring.place(roles[0], self._template)
-            elsewhere = "" if named == ca_key(roles[0]) else named  # the key was lost
+            elsewhere = "" if named == ca_key_path(roles[0]) else named  # the key was lost
         elif not self._delete:
             key = transaction.read(place)
-            transaction.write(retired_key(successor.old[0]), key, private=True)
+            transaction.write(retired_key_path(successor.old[0]), key, private=True)
         self._note_old_key(roles, successor.old[0], stage, is_here=is_here, elsewhere=elsewhere)
         if successor.key == f"{PRIVATE}/next_{successor.file}.key.pem":
             transaction.write(place, transaction.read(successor.key), private=True)
@@ -830,8 +833,8 @@ class _Rotator:
         elif successor.key != place and (root / place).is_file():
             transaction.remove(place)
             for role in successor.roles:
-                if (root / ca_key(role)).is_symlink():
-                    transaction.remove(ca_key(role))
+                if (root / ca_key_path(role)).is_symlink():
+                    transaction.remove(ca_key_path(role))
         return elsewhere
 
     def _write_settings(self, successors: list[_Successor]) -> None:
@@ -985,7 +988,7 @@ def _check_place(change: KeystoreChange, file: str, role: str, new_keys: Keyring
             f"the key of the {role} CA is not in the keystore, so the key of the new CA should not "
             "be there either",
             f"The current key is not at '{change.root}/{place}'."
-            if (place := change.keyring.place(role, change.template)) == ca_key(role)
+            if (place := change.keyring.place(role, change.template)) == ca_key_path(role)
             else f"The current key is at '{place}'.",
             f"Name a place for the new key with --{role}-key.",
         )
@@ -999,7 +1002,7 @@ def _make_successor(
     change: KeystoreChange,
     file: str,
     roles: tuple[str, ...],
-    at: str,
+    path_of_key: str,
     wanted: _WantedAuthorities,
     validity: Window,
 ) -> _Successor:
@@ -1021,16 +1024,16 @@ def _make_successor(
         # A mistyped passphrase is refused now.
         change.keyring.open(change.keystore, roles[0], template)
         new_keys = replace(new_keys, encrypt=True, secrets=change.keyring.secrets)
-    key = new_keys.make(transaction, at, roles[0], elsewhere, compared=True)
+    key = new_keys.make(transaction, path_of_key, roles[0], elsewhere, compared=True)
     if same_key(old[0], key):
         raise KeystoreError(
-            f"the key at '{place}' belongs to the current {roles[0]} CA",
+            f"the key path_of_key '{place}' belongs to the current {roles[0]} CA",
             "A new CA needs a new key.",
             f"Name another place with --{roles[0]}-key.",
         )
     is_plain = given is False or not (given or new_keys.encrypt or is_token_uri(place))
     if is_plain and encrypted is not False:
-        path = quote(str(key_path(change.root, place or at)))
+        path = quote(str(key_path(change.root, place or path_of_key)))
         why = "but the current key has one"
         if not encrypted:
             why = "and sros cannot see whether the current key has one"
@@ -1065,7 +1068,7 @@ def _make_successor(
     else:
         later = replace(validity, not_before=max(validity.not_before, first))
         certificate = issue_ca(key, name, later)
-    return _Successor(file, roles, old, Authority(certificate, key), place or at)
+    return _Successor(file, roles, old, Authority(certificate, key), place or path_of_key)
 
 
 def _existing_ca(

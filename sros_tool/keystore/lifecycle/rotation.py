@@ -71,7 +71,7 @@ class Replacement:
 
     def old_key_place(self, certificate: x509.Certificate) -> str:
         """Return where the key of the old CA (with ``certificate``) is from REISSUE on."""
-        return self.old_key or retired_key(certificate)
+        return self.old_key or retired_key_path(certificate)
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,7 +123,7 @@ class RotationStatus:
     remarks: tuple[str, ...]
 
 
-def retired_key(certificate: x509.Certificate) -> str:
+def retired_key_path(certificate: x509.Certificate) -> str:
     """Return the path in the keystore for the key of a replaced CA."""
     return f"{RETIRED}/{certificate.serial_number:x}.key.pem"
 

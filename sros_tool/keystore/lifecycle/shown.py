@@ -440,7 +440,10 @@ def shown_lists(
     expires_soon: bool,
     dry_run: bool,
 ) -> KeystoreLists:
-    """Return what `crl --json` prints; ``enclaves`` maps serial numbers to enclaves."""
+    """Return what `crl --json` prints; ``enclaves`` maps serial numbers to enclaves.
+
+    ``refreshed_by`` is the result of signing the list again, or None.
+    """
     lists = keystore.revocation_lists
     first = lists[0] if lists else None
     return KeystoreLists(

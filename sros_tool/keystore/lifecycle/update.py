@@ -51,8 +51,8 @@ from sros_tool.keystore.layout import (
     PUBLIC,
     ROLES,
     SETTINGS,
-    ca_certificate,
-    ca_key,
+    ca_certificate_path,
+    ca_key_path,
     enclave_path,
     waits_for_answer,
 )
@@ -654,8 +654,8 @@ class _Updater:
             )
         (file,) = files
         for path, private, path_of in (
-            (f"{PUBLIC}/{file}.cert.pem", False, ca_certificate),
-            (f"{PRIVATE}/{file}.key.pem", True, ca_key),
+            (f"{PUBLIC}/{file}.cert.pem", False, ca_certificate_path),
+            (f"{PRIVATE}/{file}.key.pem", True, ca_key_path),
         ):
             if not (self._root / path).is_file():
                 continue  # the key is kept in another place
