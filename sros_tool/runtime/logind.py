@@ -10,6 +10,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from sros_tool.owners import user_name
+from sros_tool.runtime.processes import SEVERAL_USERS
 
 _FIRST_LOGIN_USER = 1000
 """The first user id whose shared memory logind removes; lower ids are of system users."""
@@ -20,7 +21,7 @@ _LOGIND = ("org.freedesktop.login1", "/org/freedesktop/login1", "org.freedesktop
 
 def login_users(users: Iterable[int]) -> list[str]:
     """Return the names (or ids) of those of ``users`` that are no system users."""
-    chosen = sorted({user for user in users if user >= _FIRST_LOGIN_USER})
+    chosen = sorted({user for user in users if _FIRST_LOGIN_USER <= user < SEVERAL_USERS})
     return [user_name(user).removeprefix("user ") for user in chosen]
 
 

@@ -8,6 +8,7 @@ import pytest
 
 from sros_tool.runtime import logind
 from sros_tool.runtime.logind import users_without_linger
+from sros_tool.runtime.processes import SEVERAL_USERS
 
 
 @pytest.mark.parametrize(
@@ -27,12 +28,12 @@ def test_users_who_log_in_lose_their_memory_without_linger(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A user of the system, such as 999, keeps it anyway."""
+    """A user of the system, such as 999, keeps it anyway; "several users" is no user."""
     monkeypatch.setattr(logind, "_LINGER_FOLDER", tmp_path)
     monkeypatch.setenv("PATH", str(tmp_path))
     (tmp_path / lingers).touch()
     if answer is not None:
         (tmp_path / "busctl").write_text(f"#!/bin/sh\necho {answer}\n")
         (tmp_path / "busctl").chmod(0o755)
-    users = {0, 999, 4711} | ({4712} if lingers == "4711" else set())
+    users = {0, 999, 4711, SEVERAL_USERS} | ({4712} if lingers == "4711" else set())
     assert users_without_linger(users) == found
