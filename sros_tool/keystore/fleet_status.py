@@ -582,7 +582,7 @@ class FleetStatus:
     """
     trusting_replaced: Sequence[str] = ()
     """The robots that may trust a replaced CA and so accept certificates that were revoked, if no
-    certificate is on the revocation list.
+    certificate is on the revocation list.  Empty if there may be a later list (`older`).
     """
     groups: Mapping[str, Sequence[str]] = field(default_factory=dict)
     """The groups of the fleet file, with their robots."""
@@ -746,7 +746,7 @@ def fleet_status(
         else None,
         publication=records.publication,
         is_any_revoked=is_any_revoked,
-        trusting_replaced=() if is_any_listed else trusting_replaced,
+        trusting_replaced=() if is_any_listed or older else trusting_replaced,
         groups=fleet.groups,
         awaited=stages.awaited,
         recorded=keystore.ledger_file.last_time(),

@@ -979,7 +979,9 @@ def test_a_revocation_list_is_in_force_after_the_restart(field: Field) -> None:
     assert in_force() == [False, False, True], "an enclave of another list, and no enclave"
 
 
-def test_a_list_whose_ca_was_replaced_is_missed_until_nothing_trusts_the_ca(field: Field) -> None:
+def test_a_list_whose_ca_was_replaced_is_missed_until_nothing_trusts_the_ca(
+    field: Field, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Robots with the files of before the rotation have no list, and let the revoked one in."""
 
     def said() -> tuple[str, list[float]]:
@@ -993,6 +995,10 @@ def test_a_list_whose_ca_was_replaced_is_missed_until_nothing_trusts_the_ca(fiel
     text, values = said()
     assert "but r1, r2 may still trust a replaced CA, and accept its revoked cert" in text
     assert text.endswith(")") and values == [0, 0]
+    with monkeypatch.context() as patched:
+        patched.setattr(_KeystoreRecords, "age_clause", "it was restored")
+        status = fleet_status(OpenedKeystore(field.root))
+        assert not status.trusting_replaced, "a later list may revoke of the new CA, too"
     field.deliver("r1", restart=[])
     field.send("r1", running={"/r1/base": RunningFiles.CURRENT})
     assert "but r2 may still" in said()[0] and said()[1] == [1, 0]
