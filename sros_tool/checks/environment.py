@@ -242,7 +242,7 @@ def variable_findings(
     yield from _enclave_findings(environment, OpenedKeystore(root), domain, now=now, zone=zone)
 
 
-def set_without_enable(environment: Mapping[str, str]) -> list[str]:
+def variables_without_enable(environment: Mapping[str, str]) -> list[str]:
     """Return the security variables that are set although ROS_SECURITY_ENABLE is not set."""
     if ENABLE in environment:
         return []
@@ -253,7 +253,7 @@ def _spelling_findings(environment: Mapping[str, str]) -> Iterator[Finding]:
     enable, strategy = environment.get(ENABLE), environment.get(STRATEGY)
     if enable not in (None, "", "true", "false"):
         yield ENABLE_MISSPELT.found(ENABLE, value_text(environment, ENABLE))
-    elif named := set_without_enable(environment):
+    elif named := variables_without_enable(environment):
         yield NOT_ENABLED.found(
             ENABLE,
             f"{enumerated(named)} {'is' if len(named) == 1 else 'are'} set, and {ENABLE} is not",
@@ -464,14 +464,15 @@ def _zenoh_security_clauses(environment: Mapping[str, str], folder: Path) -> Ite
 
 
 def _configuration_security_clauses(
-    sought_text: bytes, name: str, place: bytes | Path
+    sought_text: bytes, name: str, content: bytes | Path
 ) -> Iterator[str]:
     """Yield a clause if a configuration contains ``sought_text``, a pattern, or cannot be read.
 
-    ``name`` names the configuration in the clause; ``place`` is its content, or its path.
+    ``name`` names the configuration in the clause; ``content`` is the content of the configuration,
+    or the path of its file.
     """
     try:
-        data = place if isinstance(place, bytes) else read_bytes(place, "configuration")
+        data = content if isinstance(content, bytes) else read_bytes(content, "configuration")
     except SrosError as error:
         yield f"{name} cannot be read ({error.what})"
         return

@@ -27,8 +27,8 @@ from sros_tool.checks.environment import (
     OWN_CONFIGURATION,
     PROCESS_OPEN,
     is_zenoh,
-    set_without_enable,
     value_text,
+    variables_without_enable,
     why_configuration_is_open,
     why_no_access_control,
 )
@@ -367,7 +367,8 @@ def _recorded_window(description: str, entry: Entry) -> Mapping[str, Window]:
 def _revocation_clause(enclave: ProcessEnclave, entries: Sequence[Entry], serial: int) -> str:
     """Return a clause that says when and why a certificate was revoked, or "".
 
-    The ledger and the enclave's revocation list are searched for the serial number.
+    The ledger and the enclave's revocation list are searched for the serial number.  If ``serial``
+    is 0 (not known), the last of ``entries`` on a certificate or a revocation decides.
     """
     for entry in entries:
         if entry.what == "revocation" and entry.serial and int(entry.serial, 16) == serial:
@@ -929,7 +930,8 @@ def _unsecured_node_findings(
     environment: Mapping[str, str], nodes: Sequence[Process], *, finding_per_node: bool
 ) -> Iterator[Finding]:
     """Yield findings about running open nodes; only one if the environment requests no security."""
-    asks = environment.get(ENABLE) not in (None, "", "false") or set_without_enable(environment)
+    is_set = environment.get(ENABLE) not in (None, "", "false")
+    asks = is_set or variables_without_enable(environment)
     if asks or not _is_open(environment):
         for node in nodes:
             if not node.network:  # nodes in other networks have a finding of their own

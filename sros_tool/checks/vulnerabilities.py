@@ -226,7 +226,10 @@ def vulnerability_metrics(
 def _users_by_library(
     running: RunningProcesses, libraries: Iterable[MappedLibrary] = ()
 ) -> Mapping[MappedLibrary, list[str]]:
-    """Map libraries to the names of the processes that have mapped them."""
+    """Map libraries to the labels of the processes that have mapped them.
+
+    The result also has ``libraries``, which perhaps no process has mapped.
+    """
     users: dict[MappedLibrary, list[str]] = {library: [] for library in libraries}
     for process in running.processes:
         for library in process.dds:

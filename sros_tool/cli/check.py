@@ -443,7 +443,10 @@ def _requirements(
 
 
 def _status(chosen_findings: ChosenFindings, fail_on: str) -> int:
-    """Return the exit status: 1 for findings, and `NOT_DONE` if some processes were not seen."""
+    """Return the exit status: 1 for shown findings of the severity ``fail_on`` or higher, else 0.
+
+    `NOT_DONE` if all these findings only say that a process was not seen.
+    """
     from sros_tool.checks.kind import Severity
 
     if fail_on == "never":

@@ -1051,7 +1051,10 @@ class _Group(NamedTuple):
         return [robot.robot for robot in self.robots]
 
     def oldest_confirmation(self, moment: datetime) -> RobotStatus:
-        """Return the robot whose last confirmation is the oldest."""
+        """Return the robot whose last confirmation is the oldest.
+
+        A robot that never confirmed counts as confirmed at ``moment``.
+        """
         return min(self.robots, key=lambda robot: robot.received or moment)
 
 

@@ -931,7 +931,10 @@ def _show_update(
 
 
 def _update_lines(update: KeystoreUpdate, undone: Sequence[str]) -> Iterator[str]:
-    """Yield what changes in the settings and rights of a keystore."""
+    """Yield what changes in the settings and rights of a keystore.
+
+    ``undone`` are clauses about the edits by hand that the update undoes.
+    """
     template = f": template {update.before} -> {update.after}"
     verb = "would update" if update.dry_run else "updated"
     yield f"{verb} keystore '{update.root}'{template if update.before != update.after else ''}"

@@ -796,7 +796,11 @@ def _show_new_access(
 
 
 class PlacedChange(NamedTuple):
-    """A change that makes a review fail: an enclave or setting, a clause, and a place in HEAD."""
+    """A change that makes a review fail.
+
+    ``subject`` is an enclave or a setting, ``text`` a clause on the change, and ``place`` a line of
+    HEAD; None if no line of HEAD shows the change.
+    """
 
     subject: str
     text: str

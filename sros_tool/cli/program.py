@@ -351,7 +351,10 @@ def report_error(error: BaseException, arguments: Sequence[str], name: str = "sr
 
 
 def _named_command(arguments: Sequence[str], name: str) -> str:
-    """Return the verb in ``arguments``, for errors in which click names no verb."""
+    """Return the program's ``name`` with the verb in ``arguments``, if there is one.
+
+    It is for errors in which click names no verb.
+    """
     command: click.Command | None = program
     for word in arguments:
         if isinstance(command, click.Group) and not word.startswith("-"):

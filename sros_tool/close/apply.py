@@ -213,7 +213,7 @@ class _RemainingProcesses:
         self._started_by_hand = [*chain.from_iterable(by_hand.values())]
 
     def commands_to_open(self) -> Iterator[str]:
-        """Yield commands that restart secured processes open, except processes of units."""
+        """Yield commands that restart secured processes open; none for processes of units."""
         closed = [process for process in self._started_by_hand if process.enclave in self._secured]
         counts = Counter(process.enclave for process in closed)
         started_by: dict[str, dict[str, None]] = {}

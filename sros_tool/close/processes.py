@@ -276,7 +276,10 @@ def _sros_word() -> str:
 
 
 def run_words(export: Path, enclave: str, rmw: str) -> Sequence[str]:
-    """Return the words before a command that start it in an enclave; ``rmw`` is "" on DDS."""
+    """Return the words before a command that start it in an enclave.
+
+    If ``rmw`` is "", the words name no RMW.
+    """
     return (_sros_word(), "run", str(export), enclave, *(("--rmw", rmw) if rmw else ()), "--")
 
 

@@ -461,7 +461,7 @@ def _proof_of_processes(running: RunningRobot, number: int) -> Proof:
 
 
 def _proof_of_observed_processes(running: RunningRobot) -> Iterator[Proof]:
-    """Yield the proof that the processes in enclaves belong there, if sros does not know some."""
+    """Yield an undecided proof if enclaves have processes that sros did not see when it watched."""
     if more := running.not_observed():
         yield Proof(
             KNOWN,
@@ -574,7 +574,7 @@ def _proof_of_talk(running: RunningRobot, nodes: ObservedNodes, away: Collection
         try:
             status, audited = robot.shell.read_json(words)
         except UnavailableError as error:
-            return Proof(TALK, None, str(error), details=[*_renamed(nodes, None, fails=False)])
+            return Proof(TALK, None, str(error), details=[*_name_clauses(nodes, None, fails=False)])
         comparison = _TalkComparison(running, nodes, away, audited)
         differences = {**comparison.differences(), "not judged": audited["unjudged"]}
         # If everything is seen that the open robot did, the graph may keep changing.
@@ -586,11 +586,12 @@ def _proof_of_talk(running: RunningRobot, nodes: ObservedNodes, away: Collection
             if names
         }
         if not reasons:
-            details = [*comparison.details(), *_renamed(nodes, comparison.current, fails=False)]
+            renamed = _name_clauses(nodes, comparison.current, fails=False)
+            details = [*comparison.details(), *renamed]
             return Proof(TALK, True, comparison.summary(), comparison.denied, details)
     first, *others = reasons
     texts = f"{reasons[first]}{_remedy(robot, first)}", *(f"also {reasons[why]}" for why in others)
-    details = [*_renamed(nodes, comparison.current, fails=True)]
+    details = [*_name_clauses(nodes, comparison.current, fails=True)]
     return Proof(TALK, False, "; ".join(texts), comparison.denied, details)
 
 
@@ -793,8 +794,13 @@ def _without_counterpart(robot: LocalRobot, denied: Sequence[Right]) -> list[str
     return [*map(lost_counterpart_text, lost)]
 
 
-def _renamed(nodes: ObservedNodes, current: Observation | None, *, fails: bool) -> Iterator[str]:
-    """Yield clauses on nodes that were compared under new names, and that were not compared."""
+def _name_clauses(
+    nodes: ObservedNodes, current: Observation | None, *, fails: bool
+) -> Iterator[str]:
+    """Yield a clause on nodes compared under new names, and a clause on nodes not compared.
+
+    If the proof ``fails``, the first clause has advice, and the second clause is left out.
+    """
     if renamed := nodes.renamed:
         names = [f"{old} as {expand('~', *renamed[old])}" for old in sorted(renamed)]
         text = f"compared under a new name: {first_few(names, MOST_NAMES)}"
@@ -823,7 +829,7 @@ def _renamed(nodes: ObservedNodes, current: Observation | None, *, fails: bool) 
 
 
 def _ended_since(running: RunningRobot) -> dict[str, str]:
-    """Map enclaves to their processes that were ``running`` and have ended."""
+    """Map enclaves to the labels of processes that were ``running`` and have ended."""
     pids = {process.pid for process in RunningRobot(running.robot).processes.processes}
     return {
         enclave.name: process.label

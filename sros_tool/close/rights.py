@@ -163,13 +163,13 @@ def ordinary_uses(policy: Policy, folder: Path) -> set[tuple[str, str, str]]:
     }
 
 
-def requirements_broken_by(robot: Path, addition: str, moment: datetime) -> list[Requirement]:
-    """Return the requirements in the folder of a closed robot that more rights would break.
+def requirements_broken_by(folder: Path, addition: str, moment: datetime) -> list[Requirement]:
+    """Return the requirements in the ``folder`` of a closed robot that more rights would break.
 
     ``addition`` is the policy document with these rights.  Empty if the folder has no requirements,
     or the policy with the addition cannot be decided.
     """
-    file, path = robot / REQUIREMENTS, robot / CLOSED_POLICY
+    file, path = folder / REQUIREMENTS, folder / CLOSED_POLICY
     if not file.exists():
         return []
     try:

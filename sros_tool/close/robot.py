@@ -243,7 +243,10 @@ class LocalRobot:
         replace_file(self.processes_file, content.encode())
 
     def check_machines(self) -> None:
-        """Raise `UsageError` if --elsewhere or --here names an enclave that it cannot move."""
+        """Raise `UsageError` if --elsewhere or --here names an enclave that is not to be moved.
+
+        Such an enclave is unknown, is named by both options, or already belongs to this machine.
+        """
         known = (self.keystore_enclaves() - {OBSERVER}) | self.policy_enclaves()
         check_enclaves(self.named_elsewhere, known, "--elsewhere")
         check_enclaves(self.named_here, known, "--here")

@@ -305,9 +305,9 @@ class RunningRobot:
     ) -> ObservedProcesses:
         """Return the observed processes, and the open processes of units for new enclaves.
 
-        ``new`` maps these enclaves to the full names of their nodes. As in the other cases, only
-        processes of users who can read the enclaves count, and units that start one process. Only
-        a name shows the enclave: the last process left may be any program, and may not get rights.
+        ``new`` maps these enclaves to the full names of their nodes. Only processes of users who
+        can read the enclaves count, and only units that start a single process. Only a name shows
+        the enclave: the last process left may be any program, and may not get rights.
         """
         programs = {process.program[0] for process in self.in_domain}
         started = Counter(process_origin(pid).unit for pid in programs)
@@ -408,7 +408,7 @@ def _with_running_command(observed: ClosedProcess, running: Sequence[Process]) -
 
 
 def _is_tool(process: Process) -> bool:
-    """Return whether a process is a test, such as `ros2 topic echo` or `sros demo talker`."""
+    """Return whether a process is a tool for tests, such as `ros2 topic echo`, and no router."""
     is_tool = program_of(process.command).partition(".")[0] in _TOOLS
     return is_tool and not process.is_router
 

@@ -324,7 +324,10 @@ def _lost_namespaces(nodes: Sequence[ObservedNode], policy: Policy) -> Iterator[
 
 
 def _lost_names(renamed: Mapping[str, tuple[str, str]]) -> Iterator[str]:
-    """Yield a clause for each node that the policy has only by another name."""
+    """Yield a clause for each renamed node, unless only its namespace changed.
+
+    ``renamed`` maps old full names to the namespace and name in the policy.
+    """
     for old, (ns, name) in renamed.items():
         if old.rpartition("/")[2] != name:
             yield (

@@ -453,7 +453,10 @@ def _service_cast(rights: Mapping[str, Grant]) -> dict[str, str]:
 
 
 def _service(rights: Mapping[str, Grant], cast: Mapping[str, str]) -> str:
-    """Return the service that the server of a cast offers and the client calls."""
+    """Return the service that the server of a cast offers and the client calls.
+
+    The result is `SERVICE` if the server's permissions name no such service.
+    """
     for topic in _application_topics(rights[cast["server"]]):
         name, begin = service_of(topic)
         requests = dds_names("request", name).publish[0]
@@ -485,7 +488,7 @@ def _widest_enclaves(
             or _allows_name(grant, right, DENIED_TOPIC)
         ]
         tried = {cast[other] for other in competing_parts if other in cast}
-        width = {enclave: _width(rights[enclave], right, name) for enclave in unnamed}
+        width = {enclave: _width_key(rights[enclave], right, name) for enclave in unnamed}
         free = [enclave for enclave in unnamed if enclave not in tried]
         if not free:
             continue
@@ -497,7 +500,7 @@ def _widest_enclaves(
         yield part, (widest, why)
 
 
-def _width(grant: Grant, right: str, name: str) -> tuple[bool, bool, int]:
+def _width_key(grant: Grant, right: str, name: str) -> tuple[bool, bool, int]:
     """Return a sort key that puts wider grants last."""
     size = sum(
         len(criteria.topics)

@@ -163,12 +163,12 @@ class SecurityProvider:
     """Other packages that have `ros2 security`, but whose command does not run."""
 
     @property
-    def ours(self) -> bool:
-        """Whether the command that runs is sros's."""
+    def is_from_sros(self) -> bool:
+        """Whether the `ros2 security` that runs belongs to sros."""
         return self.provider in _SROS_PACKAGES
 
     def __str__(self) -> str:
-        if self.ours:
+        if self.is_from_sros:
             return "`ros2 security` comes from sros."
         return (
             f"`ros2 security` comes from {self.provider}, not from sros: ros2cli takes the package "

@@ -70,9 +70,10 @@ STOLEN = "/stolen"
 class KeystoreCopy:
     """A keystore to forge; ``foreign`` is another keystore with the same enclaves.
 
-    ``cast`` has the enclave of each part; ``topic`` is the attacked ROS topic, ``domain`` a domain
-    of the keystore; ``keyring`` finds the keys of the keystore's CAs.  ``router`` is the enclave of
-    the Zenoh router ("": none), which listens at ``endpoint``.
+    ``cast`` maps each part, such as "talker", to the enclave that plays the part; ``topic`` is the
+    attacked ROS topic, ``domain`` a domain of the keystore; ``keyring`` finds the keys of the
+    keystore's CAs.  ``router`` is the enclave of the Zenoh router ("": none), which listens at
+    ``endpoint``.
     """
 
     root: Path
@@ -105,7 +106,7 @@ class KeystoreCopy:
         return enclave_path(self.root, self.enclave(part))
 
     def authorities(self, root: Path | None = None) -> Authorities:
-        """Return the CAs of this keystore, or of the foreign keystore, with their keys.
+        """Return the CAs of this keystore, or of the keystore ``root``, with their keys.
 
         Raises:
             SrosError: a key of a CA cannot be loaded.
@@ -116,26 +117,26 @@ class KeystoreCopy:
         return load_authorities(keystore, keystore.template, keyring, self.now)
 
     def put(self, part: str, name: str, data: bytes) -> None:
-        """Replace a file of an enclave; a link is replaced, not followed."""
+        """Replace the file ``name`` of the enclave that plays a part; a link is not followed."""
         file = self.folder(part) / name
         file.unlink(missing_ok=True)
         file.touch(0o600)
         file.write_bytes(data)
 
     def read(self, part: str, name: str) -> bytes:
-        """Return the content of a file of an enclave."""
+        """Return the content of the file ``name`` of the enclave that plays a part."""
         return (self.folder(part) / name).read_bytes()
 
     def certificate(self, part: str) -> x509.Certificate:
-        """Return the certificate of an enclave."""
+        """Return the certificate of the enclave that plays a part."""
         return load_certificate(self.read(part, CERTIFICATE_FILE), self.enclave(part))
 
     def key(self, part: str) -> PrivateKey:
-        """Return the private key of an enclave."""
+        """Return the private key of the enclave that plays a part."""
         return load_key(self.read(part, KEY_FILE), self.enclave(part))
 
     def permissions(self, part: str) -> Permissions:
-        """Return the permissions of an enclave, without checking their signature."""
+        """Return the permissions of the enclave that plays a part, with any signature."""
         return parse_permissions(smime.parse(self.read(part, PERMISSIONS_FILE)).document)
 
     def governance(self) -> bytes:

@@ -825,7 +825,7 @@ def _uses_shared_memory(row: Row) -> bool:
 
 
 def _is_needed(party: Party, row: Row) -> bool:
-    """Return whether a row needs a party to run, because no claim expects the party's refusal."""
+    """Return whether a row needs a party to run: no intruder, nor a party that a claim refuses."""
     refused = {claim.subject for claim in row.claims if claim.relation is Relation.IS_REFUSED}
     return not party.intruder and party.name not in refused
 

@@ -597,7 +597,9 @@ class ScenarioResult:
 
     @property
     def as_expected(self) -> bool:
-        """Whether all rows are as expected."""
+        """Whether all rows are as expected and, with ``--keystore``, all tests ran that a proof
+        needs.
+        """
         return not self.wrong and not self.not_tried
 
     @property

@@ -353,8 +353,11 @@ def _sequence_of(message: Any) -> list[int]:
 # ── several nodes in one process ───────────────────────────────────────────────────────────
 
 
-def _composed(node: Any, options: NodeOptions, events: EventWriter) -> list[Any]:
-    """Run a talker, a listener and a server as three nodes in one process and one enclave."""
+def _run_composed(node: Any, options: NodeOptions, events: EventWriter) -> list[Any]:
+    """Run a talker, a listener and a server as three nodes in one process and one enclave.
+
+    ``node`` becomes the talker; returns the two other nodes.
+    """
     import rclpy
 
     # Each node gets its endpoint before the next node is created, to report the first denial.
@@ -374,7 +377,7 @@ _ROLES: Mapping[str, _Build] = {
     "client": _client,
     "action_server": _action_server,
     "action_client": _action_client,
-    "composed": _composed,
+    "composed": _run_composed,
 }
 
 

@@ -118,10 +118,10 @@ _IPV6_HEADER = 40
 
 
 def _transport(packet: bytes) -> tuple[int, int]:
-    """Return the transport protocol of an IP packet and the offset of its header.
+    """Return the transport protocol of an IP packet, and the offset of the transport header.
 
-    The result is (0, 0) unless the packet is UDP over IPv4, TCP over IPv4, or TCP over IPv6 without
-    extension headers.
+    The result is (0, 0) for a packet that is neither IPv4 nor TCP over IPv6 without extension
+    headers.
     """
     version = packet[0] >> 4 if len(packet) >= 20 else 0
     if version == 4:
@@ -148,9 +148,9 @@ def _is_protected(payload: bytes) -> bool:
     return False
 
 
-def bound_ports(process: int) -> frozenset[int]:
+def bound_ports(pid: int) -> frozenset[int]:
     """Return the UDP and TCP ports of a process (from /proc); empty for an ended process."""
-    folder = Path(f"/proc/{process}")
+    folder = Path(f"/proc/{pid}")
     try:
         links = list((folder / "fd").iterdir())
         lines = [

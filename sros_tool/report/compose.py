@@ -386,7 +386,7 @@ def group_of(enclave: str, hosts: Mapping[str, str]) -> str:
 
 
 def namespace_of(name: str) -> str:
-    """Return the namespace of a name: the part before its last slash."""
+    """Return the namespace of a name: the part before its last slash, or "/" if that is empty."""
     return name.rpartition("/")[0] or "/"
 
 
@@ -685,6 +685,8 @@ def _wildcards_used(names: set[str], *, action: bool = False) -> tuple[str, ...]
 
 def protection_of(governance: Governance | None, kind: str, name: str) -> Protection:
     """Return the weakest protection among the DDS topics of a name, by the first domain rule.
+
+    The result is `UNKNOWN` without a domain rule.
 
     The protection of whole RTPS messages protects every topic in them.  A topic without a rule
     counts as not protected: vendors refuse it.  Access counts as controlled if all domain rules

@@ -154,7 +154,7 @@ class UnitText:
 
     @cached_property
     def units(self) -> tuple[int, ...]:
-        """The units named in the text, in order."""
+        """The indices of the units named in the text, in order."""
         return tuple(unit for unit, _ in self.named)
 
     @cached_property
@@ -163,7 +163,10 @@ class UnitText:
         return self.parts, tuple(number for _, number in self.named)
 
     def fill(self, word: Callable[[int, int], str]) -> str:
-        """Return the text with ``word(unit, value)`` in place of units."""
+        """Return the text with ``word(unit, index)`` in place of each name of a unit.
+
+        ``index`` is the index of the name in the unit's ``values``.
+        """
         named = (word(*named_unit) for named_unit in self.named)
         first, *rest = self.parts
         return first + "".join(value + part for value, part in zip(named, rest, strict=True))
@@ -562,7 +565,7 @@ class _Draft:
                     if self._is_counted(unit, other_unit):
                         units_by_key[key(edge, unit, other_unit)].add(other_unit)
 
-        def several(edge: Edge, unit: int, other_unit: int, position: int) -> str:
+        def unit_text(edge: Edge, unit: int, other_unit: int, position: int) -> str:
             family = self._units[other_unit].family
             named, all_of = units_by_key[key(edge, unit, other_unit)], families[family]
             if not named or sorted(named) == sorted(
@@ -573,7 +576,7 @@ class _Draft:
             is_same_family = family == self._units[unit].family
             return f"{{{counted(len(named), 'other') if is_same_family else len(named)} of {ends}}}"
 
-        return several
+        return unit_text
 
     def _real_names(self, kind: str, name: UnitText) -> Iterable[str]:
         """Yield the real names for which a drawn name with labels stands."""

@@ -339,7 +339,10 @@ class OverlayDifference(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Influence:
-    """An enclave that influences, or is influenced, with the number of hops and a shortest path."""
+    """An enclave that influences an enclave or a name, or that an enclave influences.
+
+    An influence goes over names: an enclave sends to a name, and another enclave receives from it.
+    """
 
     enclave: str
     """Path of the enclave."""

@@ -206,9 +206,9 @@ def _compared_picture(
 ) -> Picture:
     """Return the picture of one source, or the comparison of two sources.
 
-    The comparison is "use" with ``use``, or if the second source was observed; "change" for two
-    sources of the same kind, "worlds" if a source is for Zenoh, and else "drift" (of a keystore
-    from its policy).
+    The kind of comparison is "use" if ``use`` is set, or if the second source was observed;
+    "change" for two sources of the same kind, "worlds" if a source is for Zenoh, and else "drift"
+    (of a keystore from its policy).
     """
     if len(sources_read) == 1:
         return compose(sources_read[0], hosts)
@@ -614,7 +614,7 @@ def _with_keystore(source: PictureSource, sample: SampledKeystore, now: datetime
     if problem and governance is None:
         findings.append(problem)
     try:
-        validities |= set(_authorities(keystore))
+        validities |= set(_authority_validities(keystore))
     except SrosError as error:
         findings.append(PicturedFinding("view.no-authorities", "error", str(error)))
     revoked: Sequence[str] = ()
@@ -681,9 +681,9 @@ def _validities_of(name: str, state: OpenedEnclave) -> Iterator[Validity]:
         yield _grant_validity(grant, name)
 
 
-def _grant_validity(grant: Grant, name: str) -> Validity:
+def _grant_validity(grant: Grant, enclave: str) -> Validity:
     window = grant.validity
-    return Validity(iso(window.not_after), iso(window.not_before), "permissions", name, name)
+    return Validity(iso(window.not_after), iso(window.not_before), "permissions", enclave, enclave)
 
 
 def _certificate_validity(
@@ -693,7 +693,7 @@ def _certificate_validity(
     return Validity(iso(window.not_after), iso(window.not_before), kind, title, name)
 
 
-def _authorities(keystore: OpenedKeystore) -> Iterator[Validity]:
+def _authority_validities(keystore: OpenedKeystore) -> Iterator[Validity]:
     """Yield the validity of all CA certificates and revocation lists."""
     roles: dict[x509.Certificate, list[str]] = defaultdict(list)
     for path in sorted((keystore.root / PUBLIC).glob(_AUTHORITY_FILES)):

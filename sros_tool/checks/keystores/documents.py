@@ -265,40 +265,42 @@ def _domain_problems(domains: DomainSet) -> Iterator[str]:
             yield f"{part} goes beyond {MAX_DOMAIN}"
 
 
-def _form_findings(grant: Grant, name: str, file: str) -> Iterator[Finding]:
+def _form_findings(grant: Grant, enclave: str, file: str) -> Iterator[Finding]:
     if not grant.name:
-        yield GRANT_NAME.found(name, f"the grant for {grant.subject} has no name", file)
+        yield GRANT_NAME.found(enclave, f"the grant for {grant.subject} has no name", file)
     if not (_PORTABLE_SUBJECT.match(grant.subject) and grant.subject.isascii()):
-        yield SUBJECT.found(name, f"the subject is {grant.subject!r}", file)
+        yield SUBJECT.found(enclave, f"the subject is {grant.subject!r}", file)
     if grant.default_allow:
-        yield DEFAULT_ALLOW.found(name, "<default> is ALLOW", file)
+        yield DEFAULT_ALLOW.found(enclave, "<default> is ALLOW", file)
     if grant.default_first:
-        yield DEFAULT_FIRST.found(name, "<default> stands before a rule", file)
+        yield DEFAULT_FIRST.found(enclave, "<default> stands before a rule", file)
     dates = [
         repr(moment)
         for moment in (grant.not_before, grant.not_after)
         if not (match := _PORTABLE_DATE.match(moment)) or int(match[1]) > _LAST_YEAR
     ]
     if dates:
-        yield TIME_FORMAT.found(name, f"its validity has {' and '.join(dates)}", file)
+        yield TIME_FORMAT.found(enclave, f"its validity has {' and '.join(dates)}", file)
     allow_rules = sum(rule.allow for rule in grant.rules)
     if allow_rules > 1:
-        yield ALLOW_RULES.found(name, f"the grant has {allow_rules} allow rules", file)
+        yield ALLOW_RULES.found(enclave, f"the grant has {allow_rules} allow rules", file)
     problems = [text for rule in grant.rules for text in _domain_problems(rule.domains)]
     for problem in dict.fromkeys(problems):
-        yield DOMAIN_RANGE.found(name, f"the range {problem}", file)
+        yield DOMAIN_RANGE.found(enclave, f"the range {problem}", file)
     criteria = [criterion for rule in grant.rules for criterion in (*rule.publish, *rule.subscribe)]
     if any(criterion.partitions for criterion in criteria):
-        yield PARTITIONS.found(name, _partitions_text(grant), file)
+        yield PARTITIONS.found(enclave, _partitions_text(grant), file)
     if any(not topic.strip() for criterion in criteria for topic in criterion.topics):
-        yield EMPTY_TOPIC.found(name, "a <topic> in a rule is empty", file)
+        yield EMPTY_TOPIC.found(enclave, "a <topic> in a rule is empty", file)
     topics = sorted({topic for criterion in criteria for topic in criterion.topics})
     if with_character_class := [topic for topic in topics if "[^" in topic or "[:" in topic]:
         yield CHARACTER_CLASS.found(
-            name, f"a rule names {names_text([*map(repr, with_character_class)])}", file
+            enclave, f"a rule names {names_text([*map(repr, with_character_class)])}", file
         )
     if blank := [topic.strip() for topic in topics if topic != topic.strip() != ""]:
-        yield BLANKS.found(name, f"there are spaces or line ends around {names_text(blank)}", file)
+        yield BLANKS.found(
+            enclave, f"there are spaces or line ends around {names_text(blank)}", file
+        )
 
 
 def _partitions_text(grant: Grant) -> str:

@@ -364,20 +364,20 @@ def _folder_findings(
         yield _unread_path_finding(error, root)
 
 
-def _real_path_in_mounted_secret(key: str) -> str:
-    """Return the real path of a key in a mounted Kubernetes secret, or else the given path.
+def _real_path_in_mounted_secret(key_path: str) -> str:
+    """Return the real path of a key in a mounted Kubernetes secret, or else ``key_path``.
 
     In such a secret, files are links into ..data, which is a link to a sibling folder.
     """
-    path = Path(key)
+    path = Path(key_path)
     if not path.is_symlink():
-        return key
+        return key_path
     data = path.with_name("..data")
     if not data.is_symlink():
-        return key
+        return key_path
     inside = data.readlink()
     mounted = path.readlink() == Path("..data", path.name) and len(inside.parts) == 1
-    return os.fspath(path.parent / inside / path.name) if mounted else key
+    return os.fspath(path.parent / inside / path.name) if mounted else key_path
 
 
 def _unread_path_finding(error: OSError, root: str) -> Finding:
@@ -480,9 +480,10 @@ class _Links:
             yield LINK_OUTSIDE.found(link, f"it leads to '{real}'", link)
 
     def _link_target(self, link: str, end: str) -> str:
-        """Return the real path of the target ``end`` of a link, and cache it for files.
+        """Return the real path of ``link``, whose target is ``end``.
 
-        The folder of ``link`` contains no link, so ".." in the path can be removed first.
+        The result is cached for ``end``, unless ``end`` is a link itself.  The path of the folder
+        of ``link`` contains no link, so ".." in the path can be removed first.
         """
         if Path(end).is_symlink():
             return os.path.realpath(link)

@@ -262,7 +262,7 @@ def _revoked_findings(targets: Targets) -> Iterator[Finding]:
     revocations: dict[tuple[str, tuple[str, ...]], dict[str, None]] = defaultdict(dict)
     for data, of_list in holders.items():
         for shown, target in targets.items():
-            if shown not in of_list and (names := tuple(_names_revoked(data, *target))):
+            if shown not in of_list and (names := tuple(_revoked_enclaves(data, *target))):
                 revocations[shown, names].update(of_list)
     for (shown, names), of_lists in revocations.items():
         text = (
@@ -273,10 +273,12 @@ def _revoked_findings(targets: Targets) -> Iterator[Finding]:
         yield PEERS_REVOKED.found(shown, text, shown)
 
 
-def _names_revoked(data: bytes, keystore: OpenedKeystore, enclaves: Sequence[str]) -> Iterator[str]:
-    """Yield the enclaves whose certificates a revocation list revokes."""
+def _revoked_enclaves(
+    list_data: bytes, keystore: OpenedKeystore, enclaves: Sequence[str]
+) -> Iterator[str]:
+    """Yield those of ``enclaves`` whose certificates a revocation list revokes."""
     with suppress(SrosError):
-        revocation_list = read_list(data, CRL_FILE)
+        revocation_list = read_list(list_data, CRL_FILE)
         for name in enclaves:
             with suppress(SrosError, ValueError):
                 certificate = keystore.certificate(keystore.folder(name) / CERTIFICATE_FILE)
@@ -498,7 +500,10 @@ _MOST_SHOWN = 3
 def _differences_between(
     own_governance: Governance, other: Governance
 ) -> tuple[Mismatch, tuple[tuple[str, str, str], ...]]:
-    """Return the communication that differences of two documents prevent, and these differences."""
+    """Return the communication that differences of two documents prevent, and these differences.
+
+    A difference has the name of the setting, the own value and the other value.
+    """
     disturbed = mismatch(other, own_governance)
     if not disturbed:
         return disturbed, ()

@@ -364,18 +364,18 @@ def _differences(
             yield f"{verb.value} {topic} ({answers_text})"
 
 
-def _topics_to_ask(enclave: CheckedEnclave, known: Collection[str]) -> list[str]:
+def _topics_to_ask(enclave: CheckedEnclave, known_ids: Collection[str]) -> list[str]:
     """Return topics to compare: the named topics, examples of wildcards, and an unnamed topic.
 
-    If a finding in ``known`` reports names that are no ROS names, these names are left out.
+    If a finding in ``known_ids`` reports names that are no ROS names, these names are left out.
     """
     grant = grant_of(enclave)
     named: dict[str, None] = {ROS_DISCOVERY_TOPIC: None}
     for rule in grant.rules if grant else ():
         for criteria in (*rule.publish, *rule.subscribe):
             for topic in criteria.topics:
-                if not (_BLANKS_FINDING_ID in known and topic != topic.strip()) and not (
-                    NO_ROS_NAME.id in known and has_invalid_characters(topic)
+                if not (_BLANKS_FINDING_ID in known_ids and topic != topic.strip()) and not (
+                    NO_ROS_NAME.id in known_ids and has_invalid_characters(topic)
                 ):
                     named[_example_name(topic)] = None
     return [*named, _UNNAMED_TOPIC]

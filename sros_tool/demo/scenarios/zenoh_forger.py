@@ -495,7 +495,10 @@ _WITHOUT_RULES = "access_control/enabled=false"
 
 
 def start_network(root: Path, router: str, endpoint: str, mode: Mode, now: datetime) -> None:
-    """Give a keystore a Zenoh network whose router listens at ``endpoint``, as `sros zenoh`."""
+    """Give a keystore a Zenoh network whose router listens at ``endpoint``.
+
+    `sros zenoh` does the same.
+    """
     set_zenoh(root, ZenohNetwork(router, (endpoint,), mode=mode), now=now)
 
 
