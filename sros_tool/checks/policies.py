@@ -1399,7 +1399,7 @@ def policy_file_findings(
             first = str(paths[0])
             yield SHARED_NAMESPACE.found(first, first_few(shared, 3, "; "), first)
     groups = {group_of(parts_of(pattern)) for pattern in patterns}
-    if fleet and len(read) == len(paths) and (text := _robots_in_unknown_groups(groups, fleet)):
+    if fleet and len(read) == len(paths) and (text := _unknown_groups_clause(groups, fleet)):
         yield UNKNOWN_GROUP.found(str(paths[0]), text, str(paths[0]))
     if fleet:
         yield from _written_out_robot_findings(read, fleet.with_enclaves(patterns))
@@ -1462,7 +1462,7 @@ def _robots_with_the_same_node(fleet: Fleet, enclaves: Iterable[Enclave]) -> fro
     return frozenset(chain(*(names for names in robots_by_node.values() if len(names) > 1)))
 
 
-def _robots_in_unknown_groups(named: Collection[str], fleet: Fleet) -> str:
+def _unknown_groups_clause(named: Collection[str], fleet: Fleet) -> str:
     """Return a clause on robots with a misspelled group or without a group; "" if there are none.
 
     ``named`` are the groups in the policies, with "" for enclaves of all robots.  Other groups may

@@ -993,7 +993,7 @@ def _other_keystore_findings(
     expected CA is the one of the enclave in ``environment``.
     """
     own_domain = ("", domain_text(environment.get(DOMAIN, ""))) if environment is not None else None
-    own_keys = _authorities_here(environment) if environment is not None else frozenset()
+    own_keys = _authority_keys_here(environment) if environment is not None else frozenset()
     for place, processes in _group_by_network_and_domain(secured).items():
         groups = _group_by_authorities(process for process in processes if not process.is_zenoh)
         if own_keys and place == own_domain:
@@ -1063,8 +1063,11 @@ def _group_by_authorities(processes: Iterable[Process]) -> list[tuple[_PublicKey
     return groups
 
 
-def _authorities_here(environment: Mapping[str, str]) -> _PublicKeys:
-    """Return the identity CAs of the enclave in an environment, or else of the first enclave."""
+def _authority_keys_here(environment: Mapping[str, str]) -> _PublicKeys:
+    """Return the public keys of the identity CAs of the enclave that an environment names.
+
+    Without such a name, the first enclave of the keystore counts.
+    """
     root = Path(environment.get(KEYSTORE, ""))
     name = environment.get(ENCLAVE) or next(iter(search_enclaves(root)[0]), "/")
     folder = enclave_path(root, name)

@@ -660,9 +660,9 @@ def _to_do_lines(answer: Answer) -> Iterator[str]:
 
 
 def _requirements_forbidding(answer: Answer) -> Sequence[Requirement]:
-    """Return the requirements that forbid the change.
+    """Return the requirements that forbid the change that ``answer`` proposes.
 
-    They are next to the keystore, or the policy, of a closed robot.
+    The requirements are next to the keystore, or the policy, of a closed robot.
     """
     from sros_tool.keystore.layout import folder_of_closed_robot
 

@@ -162,14 +162,14 @@ class KeystoreCopy:
         return render_permissions(Permissions(grants))
 
     def sign(self, document: bytes, root: Path | None = None) -> bytes:
-        """Sign a document with the permissions CA of this keystore, or of the foreign keystore."""
+        """Sign a document with the permissions CA of this keystore, or of the keystore ``root``."""
         authority = self.authorities(root).permissions
         return smime.sign(document, authority.certificate, authority.key)
 
     def reissue(
         self, part: str, validity: Window, *, new_key: bool = False, subject_of: str = ""
     ) -> None:
-        """Issue another certificate for an enclave, and perhaps a new key.
+        """Issue another certificate for the enclave that plays a part, and perhaps a new key.
 
         The subject stays the same, or becomes the subject of the part ``subject_of``.
         """

@@ -178,10 +178,10 @@ _SHARED_MEMORY = "/dev/shm/"  # noqa: S108 - the segments of the demo's own proc
 _LARGEST_SEGMENT = 1 << 28
 
 
-def mapped_segments(process: int) -> frozenset[Path]:
+def mapped_segments(pid: int) -> frozenset[Path]:
     """Return the shared memory segments that a process maps; empty for a process that has ended."""
     try:
-        lines = Path(f"/proc/{process}/maps").read_text("utf-8", "surrogateescape").splitlines()
+        lines = Path(f"/proc/{pid}/maps").read_text("utf-8", "surrogateescape").splitlines()
     except OSError:
         return frozenset()
     names = (line.split(maxsplit=5)[5:] for line in lines)

@@ -465,8 +465,8 @@ class EqualUnits(NamedTuple):
 class UnreadUnits(NamedTuple):
     """Units of a large keystore whose permissions were compared as text, but not parsed.
 
-    The text equals the text of the unit ``like``, except for the names. ``enclaves`` is the number
-    of enclaves of the ``members``.
+    The text equals the text of the unit ``like``, except for the names. ``what`` is "robot",
+    "namespace" or "enclave"; ``enclaves`` is the number of enclaves of the ``members``.
     """
 
     what: str
