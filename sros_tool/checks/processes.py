@@ -446,7 +446,10 @@ def _grant(enclave: ProcessEnclave, subject: str) -> Grant | None:
 def _local_time_findings(
     process: Process, loaded_files: _LoadedFiles, now: datetime, zone: tzinfo
 ) -> Iterator[Finding]:
-    """Yield a finding if permissions, read in local time as Fast DDS does, are not valid."""
+    """Yield a finding if permissions are valid in UTC, but not as Fast DDS reads them.
+
+    Fast DDS reads the dates of permissions in local time.
+    """
     grant = loaded_files.grant
     window = loaded_files.windows.get("its permissions")
     if not grant or not window or not window.contains(now):
@@ -490,7 +493,10 @@ def _parse_zone(text: str, otherwise: tzinfo) -> tzinfo:
 
 
 def _why_unsecured(process: Process) -> str:
-    """Return why a process that requests security runs unsecured, as a clause, or ""."""
+    """Return why a process that requests security runs unsecured, as a clause, or "".
+
+    The result is also "" if sros cannot know whether the process runs unsecured.
+    """
     environment, enclave = process.environment, process.enclave
     if environment.get(STRATEGY) == "Enforce" or (enclave and enclave.problem):
         return ""
@@ -1022,7 +1028,10 @@ def other_folder_findings(processes: Iterable[Process], folder: Path) -> Iterato
 
 
 def has_other_files(enclave: ProcessEnclave, root: Path) -> bool:
-    """Return whether ``root`` also has the enclave, with other files than the process loaded."""
+    """Return whether ``root`` also has the enclave, with other files than the process loaded.
+
+    False if this cannot be found out.
+    """
     with suppress(SrosError, OSError):
         place = enclave_path(root, check_enclave_name(f"/{enclave.name.strip('/')}"))
         if (

@@ -578,13 +578,13 @@ class ReadConfiguration(NamedTuple):
     notes: Notes
 
 
-def subject_rights(of_subject: RightsOfSubject) -> SubjectRights:
+def subject_rights(rights: RightsOfSubject) -> SubjectRights:
     """Return the rights of a subject as the JSON output has them."""
     return SubjectRights(
-        of_subject.subject or None,
-        of_subject.names,
-        of_subject.self_limiting,
-        [AllowedName(VERBS[r.right], r.name, r.domain, r.lacks) for r in of_subject.rights],
-        unsaid=[KeyRight(VERBS[right], key) for right, key in of_subject.unsaid],
-        denied=[KeyRight(VERBS[right], key) for right, key in of_subject.denied],
+        rights.subject or None,
+        rights.names,
+        rights.self_limiting,
+        [AllowedName(VERBS[r.right], r.name, r.domain, r.lacks) for r in rights.rights],
+        unsaid=[KeyRight(VERBS[right], key) for right, key in rights.unsaid],
+        denied=[KeyRight(VERBS[right], key) for right, key in rights.denied],
     )

@@ -861,6 +861,11 @@ class _Secrets:
         return self._known[name]
 
     def _find(self, name: str) -> str:
+        """Return the secret ``name``, which is a passphrase or a PIN in words for a prompt.
+
+        Raises:
+            PkiError: the secret is set nowhere, and there is no terminal to prompt on.
+        """
         is_pin = " PIN " in f" {name} "
         value = _taken.get(_PIN_VARIABLE if is_pin else _PASSPHRASE, "")
         file = "" if is_pin else _taken.get(_PASSPHRASE_FILE, "")
@@ -907,7 +912,11 @@ def _new_notes(notes: Iterable[Note]) -> list[Note]:
 
 
 def _first_line(path: Path) -> str:
-    """Return the first line of a passphrase file, or of a pipe such as ``<(pass show ca)``."""
+    """Return the first line of a passphrase file, or of a pipe such as ``<(pass show ca)``.
+
+    Raises:
+        PkiError: the file cannot be read, or its first line is too long.
+    """
     from sros_tool.pki.keys import LONGEST_PASSPHRASE
 
     try:

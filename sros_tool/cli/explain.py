@@ -863,7 +863,8 @@ def _decider_of_keystore(
 ) -> tuple[Decider, _WhoContext]:
     """Return the decider for the enclaves of a keystore, and the keystore's fleet and domains.
 
-    ``chosen_vendor`` is the DDS vendor that decides, None for Zenoh. With ``stated``, the deciding
+    ``chosen_vendor`` is the DDS vendor that decides, None for Zenoh; ``why_zenoh`` is the reason to
+    ask Zenoh. With ``stated``, the deciding
     vendor is the one of the distribution that the keystore or its fleet states.
     """
     from sros_tool.keystore.fleet import load_fleet
@@ -908,7 +909,11 @@ def _decider_of_policy(
     asking: AskingContext,
     enclave_filter: _EnclaveFilter,
 ) -> tuple[Decider, _WhoContext]:
-    """Return the decider for the enclaves of a policy, and the policy's fleet and domains."""
+    """Return the decider for the enclaves of a policy, and the policy's fleet and domains.
+
+    Raises:
+        UsageError: a keystore is named, too, or an option that only a keystore can answer.
+    """
     from sros_tool.explain.asking import fleet_of, policy_to_ask
     from sros_tool.explain.vendors import VendorOfPolicy
 

@@ -607,6 +607,8 @@ def _propose(
 ) -> int:
     """Show the rights that logs report as denied, and the lines; write the rights if accepted.
 
+    Returns 1 if the logs report no denied right, else 0.
+
     Raises:
         SrosError: rights were proposed, and not accepted.
     """

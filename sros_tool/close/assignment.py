@@ -150,7 +150,11 @@ _EVIDENCE_CHECKS: dict[str, Callable[[Process, ObservedNode, Mapping[str, int]],
 
 
 def process_ids_of_cyclone(pids: Sequence[int], domain: int) -> Mapping[str, int]:
-    """Map participants to the process ids that they state; empty without Cyclone DDS."""
+    """Map participants of Cyclone DDS to the process ids that they state.
+
+    ``pids`` are the ids of processes on Cyclone DDS.  The result is empty without such processes,
+    or if the participants cannot be read.
+    """
     if not pids:
         return {}
     command = [
@@ -195,7 +199,8 @@ def ended_processes(
 def with_command_of_unit(process: ClosedProcess) -> ClosedProcess:
     """Return a process with the command of its unit, to which an argument can be added.
 
-    If the unit starts another command, such as a script, return the process without its unit.
+    If the unit starts another command, such as a script, return the process without its unit.  A
+    process that has no unit, or needs no argument, does not change.
     """
     if not (process.unit and process.lacks_enclave_argument):
         return process

@@ -117,7 +117,8 @@ def prove(robot: LocalRobot) -> CloseState:
 def proofs_of(robot: LocalRobot, state: CloseState, patience: float) -> list[Proof]:
     """Wait until each process runs in its enclave, and return the proofs that the robot is closed.
 
-    If the enclave of the observer has expired, only the files are examined.
+    Waits for at most ``patience`` seconds.  If a process is then missing, the only proof is that it
+    was not started.  If the enclave of the observer has expired, only the files are examined.
     """
     expired = expired_enclaves(robot, robot.export)
     if OBSERVER in expired:

@@ -37,7 +37,8 @@ def access_lines(policy: Policy, folder: Path, others: frozenset[Right] = frozen
     """Return a line for each name that somebody may use: its senders and its receivers.
 
     The parameter services of a node are one line if the same enclaves may use them.
-    ``others`` are the signed rights of enclaves that the policy does not have.  Names are left out
+    ``folder`` is the folder of the closed robot, and ``others`` are the signed rights of enclaves
+    that the policy does not have.  Names are left out
     if they are only used as every node uses them (the common parts).  Names that move the robot
     come first, with all of their senders, and then names that nobody may send or serve.
     """
@@ -115,7 +116,10 @@ class _Users(NamedTuple):
 def _users_by_name(
     policy: Policy, folder: Path, others: frozenset[Right]
 ) -> Mapping[tuple[str, str], Sequence[_Users]]:
-    """Map each kind and name to its users: one `_Users` for each right of the kind."""
+    """Map each kind and name to its users: one `_Users` for each right of the kind.
+
+    Ordinary uses are left out.  The arguments are those of `access_lines`.
+    """
     rights, of_nodes = policy_rights(policy) | others, NodeRights(others)
     rules, enclaves = Rules(rights), sorted({right.enclave for right in rights})
     allowed = {right for right in rights if right.qualifier is ALLOW}

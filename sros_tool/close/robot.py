@@ -123,7 +123,11 @@ class LocalRobot:
         self._read_processes()
 
     def _read_processes(self) -> None:
-        """Read which processes were observed, if the robot was watched."""
+        """Set the observed processes (None if the robot was not watched), and the ROS domain.
+
+        Raises:
+            UsageError: the robot was watched in another domain than the chosen one.
+        """
         is_watched, chosen = self.processes_file.exists(), self._chosen_domain
         self.observed = read_processes(self.processes_file) if is_watched else None
         default = domain_of(self.shell.environment) if chosen is None else chosen

@@ -537,6 +537,9 @@ def _report(
 
     ``on_event`` gets all reports. ``on_ready`` is called when the node is ready. Before that
     moment, the node hears nothing in any case.
+
+    Raises:
+        SrosError: a report is too long.
     """
     data, seen, event = b"", "", None
     is_ready = False

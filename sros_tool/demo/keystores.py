@@ -93,7 +93,10 @@ class KeystoreSet:
         return part if part.startswith("/") else self._cast(identity)[part]
 
     def environment(self, identity: Identity, domain: int) -> Mapping[str, str]:
-        """Return the ROS_SECURITY_* variables and ROS_DOMAIN_ID for a process of an identity."""
+        """Return the ROS_SECURITY_* variables and ROS_DOMAIN_ID for a process of an identity.
+
+        On Zenoh, return the variables with which rmw_zenoh uses the enclave's files.
+        """
         if identity.keystore is None:
             return {DOMAIN: str(domain)}
         root = self.keystores[identity.keystore]
@@ -155,7 +158,11 @@ class KeystoreSet:
         return ProbeEnclave(environment, topic, DENIED_TOPIC)
 
     def why_inapplicable(self, row: Row) -> str:
-        """Return why a row does not apply to this keystore (no enclave for a part), or ""."""
+        """Return why a row does not apply to this keystore, or "".
+
+        A row does not apply if no enclave fits one of its parts, or if the only attacker is an
+        enclave whose permissions allow the attack.
+        """
         for party in row.parties:
             identity = party.identity
             part = identity.enclave

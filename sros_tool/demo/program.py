@@ -784,7 +784,10 @@ class _Runner:
         return start, now
 
     def _is_met(self, claim: Claim, processes: Mapping[str, _PartyProcess]) -> bool:
-        """Return whether the events that a claim expects were observed often enough."""
+        """Return whether the events that a claim expects were observed often enough.
+
+        True for relations that no event shows.
+        """
         events = processes[claim.subject].look()
         if claim.relation in (Relation.HEARS, Relation.IS_ANSWERED, Relation.EXECUTES):
             mark = f"{processes[claim.talker].text}: "

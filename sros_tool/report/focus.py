@@ -426,7 +426,10 @@ def _sentence(
 
 
 def _counted_influences(influences: Sequence[Influence], direct: int) -> str:
-    """Return the number of enclaves in words, and how many of them are direct."""
+    """Return the number of enclaves in words, and how many of them are direct.
+
+    ``direct`` is the number of hops of a direct influence.
+    """
     near = sum(influence.hops == direct for influence in influences)
     text = counted(len(influences), "enclave") if influences else "no enclave"
     return text if near == len(influences) else f"{text} ({near} directly)"

@@ -276,7 +276,7 @@ def _sample(path: Path, request: PictureRequest) -> SampledKeystore | None:
     """Return the enclaves of a keystore to read in full; None for sources of other kinds.
 
     Raises:
-        UsageError: ``request`` names a robot that the keystore lacks.
+        UsageError: ``request`` names a robot that the keystore lacks, or the source is no keystore.
     """
     if not (path.is_dir() and is_keystore(path)):
         if request.robots:

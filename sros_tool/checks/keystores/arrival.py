@@ -245,7 +245,7 @@ _SIGN_AGAIN = (
 def _token_findings(
     keystore: OpenedKeystore, name: str, now: datetime, secrets: Secrets | None
 ) -> Iterator[Finding]:
-    """Yield a finding unless the token has the key of an enclave's certificate.
+    """Yield a finding if an enclave's key is on a token, and is not the key of its certificate.
 
     Without ``secrets``, the token stays closed: the signing request says which key the token has.
     """

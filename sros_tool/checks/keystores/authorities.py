@@ -566,7 +566,7 @@ def shared_ca_findings(
     """Yield a finding if the identity CA and the permissions CA have the same key."""
     if identity.public_key() == permissions.public_key():
         text = f"{authority_text(identity)} is identity CA and permissions CA"
-        accepted = keystore.accepts(
+        accepted = keystore.accepted_by(
             ONE_AUTHORITY, lambda settings: not settings.separate_authorities
         )
         in_keystore = f"In the {ORIGINAL_KEYSTORE}: {ONE_AUTHORITY.remedy}"

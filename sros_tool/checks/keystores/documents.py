@@ -304,7 +304,10 @@ def _form_findings(grant: Grant, enclave: str, file: str) -> Iterator[Finding]:
 
 
 def _partitions_text(grant: Grant) -> str:
-    """Return a clause on the topics that rules allow only in partitions, which ROS 2 never uses."""
+    """Return a clause on topics that a rule allows only in partitions, which ROS 2 never uses.
+
+    If there are no such topics, the clause only says that a rule names partitions.
+    """
     for rule in grant.rules:
         for criteria in (*rule.publish, *rule.subscribe) if rule.allow else ():
             if (
@@ -341,13 +344,13 @@ def _validity_findings(enclave: CheckedEnclave, grant: Grant, file: str) -> Iter
     if not begin <= int(now.timestamp()) <= end:
         zone, dates = enclave.keystore.at.zone, f"{_utc_text(begin)} to {_utc_text(end)}"
         utc_dates = f"in {zone} Fast DDS reads these dates as {dates}"
-        accepted = enclave.accepts_expiry if now.timestamp() > end else ""
+        accepted = enclave.expiry_accepted_by if now.timestamp() > end else ""
         text = f"{text}, and {utc_dates}"
         remedy = f"{_RENEW_OR_UTC} {longer}".rstrip()
         yield LOCAL_TIME.found(enclave.name, text, file, remedy=remedy, accepted=accepted)
     elif now - _WEST < window.not_before or now + _EAST > window.not_after:
         is_early = now - _WEST < window.not_before
-        accepted = "" if is_early else enclave.accepts_expiry
+        accepted = "" if is_early else enclave.expiry_accepted_by
         text = f"{text}, and now it is {iso(now)}"
         remedy = f"{_RENEW_IN_TIME} {longer}".rstrip()
         if is_early:
@@ -706,7 +709,7 @@ def governance_findings(
             by = (
                 ""
                 if flaw
-                else keystore.accepts(kind, _ChosenByTemplate(kind, text, domains, vendors))
+                else keystore.accepted_by(kind, _ChosenByTemplate(kind, text, domains, vendors))
             )
             yield kind.found(subject, text, file, accepted=by)
         for part in rule.domains.ranges:

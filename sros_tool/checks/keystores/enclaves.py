@@ -91,7 +91,7 @@ def _check_loading(enclave: CheckedEnclave) -> Iterator[Finding]:
                 "If this is a copy without keys, nothing is wrong: `--exclude "
                 f"{kind.id}` hides this finding. Otherwise: {remedy}"
             )
-        accepted = enclave.accepts_expiry if problem.fault in _EXPIRY_FAULTS else ""
+        accepted = enclave.expiry_accepted_by if problem.fault in _EXPIRY_FAULTS else ""
         yield kind.found(enclave.name, text, file, remedy=remedy, accepted=accepted)
 
 
@@ -360,7 +360,7 @@ def _expiry_findings(
         if window.expires_soon_from() < now <= window.not_after:
             verb = "expires" if subject == "the certificate" else "expire"
             text = f"{subject} {verb} at {iso(window.not_after)}"
-            accepted = enclave.accepts_expiry
+            accepted = enclave.expiry_accepted_by
             yield EXPIRES_SOON.found(enclave.name, text, enclave.file(file), accepted=accepted)
 
 
@@ -375,7 +375,7 @@ def _rights_findings(enclave: CheckedEnclave, grant: Grant) -> Iterator[Finding]
             yield ONLY_DENIALS.found(enclave.name, f"{text} but {names_text(denied)}", file)
         else:
             # No template accepts this finding, because the question is whether the robot is closed.
-            accepted = keystore.accepts(EVERYTHING, lambda _: False)
+            accepted = keystore.accepted_by(EVERYTHING, lambda _: False)
             yield EVERYTHING.found(enclave.name, text, file, accepted=accepted)
     elif not _is_router(enclave) and any(
         _ANY_NODES_SERVICE in _published_expressions(rule) for rule in grant.rules if rule.allow
@@ -386,7 +386,7 @@ def _rights_findings(enclave: CheckedEnclave, grant: Grant) -> Iterator[Finding]
     window = grant.validity
     length = window.not_after - window.not_before
     if length > _LONG_VALIDITY and not unique:
-        accepted = keystore.accepts(
+        accepted = keystore.accepted_by(
             LONG_PERMISSIONS, lambda s: _lasts_at_least(s.permissions_validity, length)
         )
         text = f"they are valid from {iso(window.not_before)} to {iso(window.not_after)}"

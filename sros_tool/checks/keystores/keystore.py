@@ -243,7 +243,8 @@ def with_joined_findings(findings: Sequence[Finding]) -> list[Finding]:
 def _governing_enclave(keystore: CheckedKeystore, names: Sequence[str]) -> tuple[str, bytes]:
     """Return the first enclave with the keystore's signed governance, and this governance.
 
-    For an export, return the first enclave and its governance.
+    For an export, return the first enclave and its governance.  Without such an enclave, return ""
+    and the keystore's governance.
     """
     common = keystore.governance
     for name in names:

@@ -202,7 +202,7 @@ class CheckedKeystore:
             (self.root / folder).exists() for folder in (PUBLIC, SETTINGS)
         )
 
-    def accepts(self, kind: FindingKind, accepts_weakness: Callable[[Template], bool]) -> str:
+    def accepted_by(self, kind: FindingKind, accepts_weakness: Callable[[Template], bool]) -> str:
         """Return text that names the template or keystore which accepts a weakness, or "".
 
         ``accepts_weakness`` returns whether settings choose the weakness.  Its argument is the
@@ -243,7 +243,7 @@ class CheckedEnclave:
         return self.keystore.opened.folder(self.name)
 
     @property
-    def accepts_expiry(self) -> str:
+    def expiry_accepted_by(self) -> str:
         """Text that names the template which accepts this enclave's early expiry, or ""."""
         settings = self.keystore.settings
         # Imported here, because it reads all about renewals.

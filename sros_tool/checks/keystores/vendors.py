@@ -214,7 +214,10 @@ def check_vendors(
 
 
 def example_domains(state: OpenedEnclave) -> tuple[int, ...]:
-    """Return example domains of an enclave: one for each group of domains with the same rules."""
+    """Return example domains of an enclave: one for each group of domains with the same rules.
+
+    At most `_MOST_DOMAINS` domains; only domain 0 if the enclave can join none.
+    """
     if state.governance is None:
         return (0,)
     rules = [rule.domains for rule in state.governance.domain_access_rules]
@@ -514,6 +517,8 @@ def _ordinary_node_denial(
     participant: VendorParticipant, grant: Grant, *, described: bool
 ) -> _Denial | None:
     """Return the endpoints that an ordinary node needs and a vendor denies; None without a denial.
+
+    None also if the enclave is only for a tool, as in `with_start_finding`.
 
     ``described`` says that nodes offer ~/get_type_description (since ROS 2 Iron).
     """
