@@ -1,4 +1,4 @@
-"""What runs on a robot in the enclaves of its security folder, and the units that restart it."""
+"""The processes in the enclaves of a security folder, and the units that restart processes."""
 
 from __future__ import annotations
 

@@ -422,6 +422,8 @@ def _fitting_patterns(fleet: Fleet, enclave: str) -> Iterator[_Pattern]:
 
 
 class _Pattern(NamedTuple):
+    """A path with placeholders, and the regular expression for the paths that it stands for."""
+
     parts: Parts
     expression: re.Pattern[str]
 

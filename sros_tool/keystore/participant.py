@@ -78,10 +78,11 @@ _PLANNED_VALIDITY = timedelta(days=365)
 class LoadedEnclave(NamedTuple):
     """An enclave as DDS loads it.
 
-    ``governance`` and ``permissions`` are the XML in the signed documents.  ``signed`` are the
-    signed permissions; b"" before signing.  ``state`` is the state of the files in ``folder`` at
-    the time ``at``; None if they do not exist yet.  ``key_elsewhere`` says that the key is on the
-    robot that generated it.
+    ``subject`` is the subject of the certificate, and ``domains`` are the ROS domains of the
+    governance; "" and None if they cannot be read.  ``governance`` and ``permissions`` are the XML
+    in the signed documents.  ``signed`` are the signed permissions; b"" before signing.  ``state``
+    is the state of the files in ``folder`` at the time ``at``; None if they do not exist yet.
+    ``key_elsewhere`` says that the key is on the robot that generated it.
 
     ``keystore`` is the enclave's keystore, and ``policy`` the enclave's part of ``policy_file``, if
     known.  With ``has_placeholders``, the policy is for the robots of a fleet.  ``portable`` are
@@ -283,7 +284,8 @@ class JoinContext(NamedTuple):
 class RefusalCause(NamedTuple):
     """A reason why no node of a vendor can run in an enclave, or why peers refuse the node.
 
-    ``reason`` is the id of a fault or decision; ``text`` is a clause that names the file.
+    ``outcome`` is the decision on the node.  ``reason`` is the id of a fault or decision; ``text``
+    is a clause that names the ``file``.
     ``hits_peers`` says that the processes of peers crash, but not the node's own process.
     """
 

@@ -501,7 +501,8 @@ def notes_on_hidden_enclaves(root: Path) -> tuple[Note, ...]:
 class _Reader:
     """A reader of permissions documents, which collects notes about them.
 
-    ``unverified`` are notes on documents whose signature is missing or was not verified.
+    ``unverified`` are notes on documents whose signature is missing or was not verified.  ``sound``
+    and ``documents`` are as in `RightsSource`.
     """
 
     files: FilesReadOnce

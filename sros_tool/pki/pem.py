@@ -1,4 +1,4 @@
-"""Reading PEM files as OpenSSL 3 of all DDS vendors does (pem_lib.c), and finding file types.
+"""Reading PEM files as OpenSSL 3 does for all DDS vendors (pem_lib.c), and finding file types.
 
 OpenSSL is stricter than other programs, which RFC 7468 permits: a block begins and ends at the
 start of a line, and a damaged block hides all blocks after it.

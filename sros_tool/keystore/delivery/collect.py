@@ -331,7 +331,12 @@ class _VerifiedMessage(NamedTuple):
 
 @dataclass(slots=True)
 class _ReceivedMessage:
-    """The message of a robot on its way through the steps of `collect`."""
+    """The message of a robot on its way through the steps of `collect`.
+
+    ``outcome``, ``why``, ``enclave``, ``sequence``, ``remarks`` and ``shared_keys`` are as in
+    `CollectedMessage`.  ``verified`` is the verified content, until it is no longer needed.
+    ``received`` is the confirmation to store if the message is new.
+    """
 
     robot: Robot
     outcome: str

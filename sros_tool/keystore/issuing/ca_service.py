@@ -92,7 +92,10 @@ def check_ca_service(place: str) -> None:
 
 @dataclass(frozen=True, slots=True)
 class CaService:
-    """The CA service that issues the identity certificates of the keystore ``root``."""
+    """The CA service that issues the identity certificates of the keystore ``root``.
+
+    ``place`` is ``issuer:NAME``.
+    """
 
     place: str
     root: Path

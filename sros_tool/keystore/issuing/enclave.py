@@ -91,7 +91,10 @@ _LEAST_NOTED_LOSS = 0.01
 
 @dataclass(frozen=True, slots=True)
 class EnclaveTokens:
-    """The ``places`` of new keys on tokens, by enclave, and the keys that must not be reused."""
+    """The ``places`` of new keys on tokens, by enclave, and the keys that must not be reused.
+
+    These are the ``known`` keys of the keystore, and the keys of its ``authorities``.
+    """
 
     places: Mapping[str, TokenUri]
     secrets: Secrets

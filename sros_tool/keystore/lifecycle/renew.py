@@ -226,7 +226,11 @@ def _due_enclave_names(
 
 @dataclass
 class _Renewer:
-    """Renews enclaves one at a time; ``notes`` are about their keys."""
+    """Renews enclaves one at a time; ``notes`` are about their keys.
+
+    With ``new_key``, enclaves get new keys; with ``unique``, subjects that no earlier permissions
+    fit.
+    """
 
     change: KeystoreChange
     writer: EnclaveWriter

@@ -271,7 +271,10 @@ def may_lack_entries(keystore: OpenedKeystore) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class SupersededCertificate:
-    """A replaced certificate, with the key digest and the subject of the new certificate."""
+    """A replaced certificate, with the key digest and the subject of the new certificate.
+
+    ``name`` is the enclave, and ``old`` the ledger entry of the replaced certificate.
+    """
 
     name: str
     old: Entry
