@@ -804,7 +804,7 @@ def _access_on_zenoh(
 
 def _enclave_to_ask(
     keystore: AnyPath | Policy,
-    name: str,
+    enclave: str,
     policy: AnyPath | Policy | None,
     asking: AskingContext,
 ) -> AskedEnclave:
@@ -823,18 +823,18 @@ def _enclave_to_ask(
             why = "The first argument is a policy already."
             raise UsageError("two policies are named", why, "Leave policy= out.")
         alone = _as_policy(keystore)
-        stated_enclave = alone.enclave(name)
+        stated_enclave = alone.enclave(enclave)
         if stated_enclave is None:
-            raise not_in_policy_error(alone, name, Path(alone.file))
+            raise not_in_policy_error(alone, enclave, Path(alone.file))
         return AskedEnclave(
             planned_enclave(stated_enclave, None, asking)._replace(policy=stated_enclave), alone
         )
     opened = OpenedKeystore(Path(keystore))
     opened.check()
-    signed = signed_enclave(opened, name, asking.at)
+    signed = signed_enclave(opened, enclave, asking.at)
     assert signed
     stated = _as_policy(policy) if policy is not None else None
-    stated_enclave = stated.enclave(name) if stated else None
+    stated_enclave = stated.enclave(enclave) if stated else None
     return AskedEnclave(signed._replace(keystore=opened, policy=stated_enclave), stated)
 
 
@@ -937,9 +937,9 @@ def check_requirements(
         requirements: The TOML file of the requirements, or several.
         fleet: The file with the robots that the placeholders of a policy and its requirements stand
             for; a keystore has its own fleet.
-        template: The keystore template, by name or file, whose protection a policy gets. Without
-            it, the default template is assumed where the policy states no protection, and a finding
-            reports this.
+        template: The keystore template, by name or file, whose protection is assumed for a policy.
+            Without it, the default template is assumed where the policy states no protection, and a
+            finding reports this.
         vendor: The only DDS vendor to decide for, or "zenoh"; every tested vendor and Zenoh by
             default.
         distribution: The ROS 2 distribution, such as "lyrical", whose DDS decides; without

@@ -200,14 +200,14 @@ _ACCEPT_ADVICE = " To run the process nevertheless, add --accept-readable-key."
 
 
 def _refuse_key_readable_by_others(
-    key: Path, keystore: OpenedKeystore, name: str, how_to_accept: str
+    key: Path, keystore: OpenedKeystore, enclave: str, how_to_accept: str
 ) -> None:
     """Raise `KeystoreError` if users other than the owner can read the enclave's private key."""
     mode = stat.S_IMODE(key.stat().st_mode)
     if mode & 0o077:
-        renew = f"`sros renew KEYSTORE {name} --new-key --revoke-old`."
+        renew = f"`sros renew KEYSTORE {enclave} --new-key --revoke-old`."
         raise KeystoreError(
-            f"others can read the private key of enclave {name}",
+            f"others can read the private key of enclave {enclave}",
             f"The mode of '{key}' is {mode:04o}: whoever has read the key can act as the enclave.",
             f"Run `chmod 600 {quote(str(key))}`. If others had access, give the enclave another "
             f"key. {remedy_in_keystore(keystore.root, renew)}{how_to_accept}",
@@ -215,14 +215,14 @@ def _refuse_key_readable_by_others(
 
 
 def _refuse_folders_writable_by_others(
-    keystore: OpenedKeystore, folder: Path, name: str, how_to_accept: str
+    keystore: OpenedKeystore, folder: Path, enclave: str, how_to_accept: str
 ) -> None:
     """Raise `KeystoreError` if other users can write to the enclave's folders."""
     trusted = frozenset({0, os.geteuid(), keystore.root.stat().st_uid})
     for path in (folder, *folder.parents):
         if why := other_writers_clause(path.stat(), trusted):
             raise KeystoreError(
-                f"others can replace the files of enclave {name}",
+                f"others can replace the files of enclave {enclave}",
                 f"'{path}': {why}. Whoever replaces files decides whom the process trusts.",
                 f"Run `{closing_command(path, trusted)}`, then `sros verify "
                 f"{quote(str(keystore.root))}`.{how_to_accept}",
@@ -232,7 +232,7 @@ def _refuse_folders_writable_by_others(
 
 
 def _with_join_faults(
-    name: str, folder: Path, state: OpenedEnclave, vendor: Vendor | None, context: JoinContext
+    enclave: str, folder: Path, state: OpenedEnclave, vendor: Vendor | None, context: JoinContext
 ) -> OpenedEnclave:
     """Return an enclave with its faults for a DDS vendor; for all vendors if ``vendor`` is None.
 
@@ -246,14 +246,14 @@ def _with_join_faults(
 
     vendors = (vendor,) if vendor else TESTED
     evaluation = evaluate_enclave(
-        name, folder, state, moment=context.at, domain=context.domain, vendors=vendors
+        enclave, folder, state, moment=context.at, domain=context.domain, vendors=vendors
     )
     # `_check_rmw_reads_tokens` says that a vendor reads no token.
     refusals = evaluation.refusal_sentences(ignored=(Fault.KEY_ON_TOKEN.id,))
     if evaluation.state.problems or not refusals:
         return evaluation.state
     raise KeystoreError(
-        f"a process cannot run in enclave {name}",
+        f"a process cannot run in enclave {enclave}",
         refusals,
         f"See `sros check {quote(str(folder))}`.",
     )
@@ -286,37 +286,37 @@ def _check_dates_here(
 # ── keys on tokens ─────────────────────────────────────────────────────────────────────────
 
 
-def _missing_token_note(name: str, place: TokenUri) -> Note:
-    pin = f"the PIN in '{place.pin_source}'" if place.pin_source else "the PIN"
+def _missing_token_note(enclave: str, token_uri: TokenUri) -> Note:
+    pin = f"the PIN in '{token_uri.pin_source}'" if token_uri.pin_source else "the PIN"
     return Note(
         "token.there",
-        f"the key of {name} is on the token {place.token!r}: the process needs the device or "
-        f"socket of this token, the token's PKCS #11 module, and {pin}. This output contains "
+        f"the key of {enclave} is on the token {token_uri.token!r}: the process needs the device "
+        f"or socket of this token, the token's PKCS #11 module, and {pin}. This output contains "
         "none of them.",
     )
 
 
-def _check_rmw_reads_tokens(place: TokenUri, name: str, rmw: str) -> None:
+def _check_rmw_reads_tokens(token_uri: TokenUri, enclave: str, rmw: str) -> None:
     """Raise `KeystoreError` if the key is on a token and the RMW reads keys only from files."""
     from sros_tool.runtime.rmw import vendor_of
 
     vendor = vendor_of(rmw)
     if rmw and not (vendor and vendor.traits.reads_tokens):
         raise KeystoreError(
-            f"a process of {rmw} cannot run in enclave {name}",
-            f"The key of the enclave is on the token {place.token!r}, but {rmw} reads keys only "
-            "from key.pem.",
+            f"a process of {rmw} cannot run in enclave {enclave}",
+            f"The key of the enclave is on the token {token_uri.token!r}, but {rmw} reads keys "
+            "only from key.pem.",
             "Use rmw_fastrtps_cpp of ROS 2 Jazzy or later, or an enclave with a key in a file.",
         )
 
 
-def _check_pin(place: TokenUri, name: str, how_to_accept: str) -> None:
+def _check_pin(token_uri: TokenUri, enclave: str, how_to_accept: str) -> None:
     """Raise `KeystoreError` if other users can read a token's PIN file, or this user cannot."""
     from sros_tool.pki.token import pin_file_problem
 
-    if problem := pin_file_problem(place):
+    if problem := pin_file_problem(token_uri):
         raise KeystoreError(
-            f"the PIN for the key of enclave {name} is missing or not protected",
+            f"the PIN for the key of enclave {enclave} is missing or not protected",
             f"{problem[:1].upper()}{problem[1:]}.",
             how_to_accept.lstrip(),
         )
@@ -369,7 +369,7 @@ def _check_release(environment: Mapping[str, str]) -> None:
 
 
 def _opened_zenoh(
-    keystore: OpenedKeystore, name: str, state: OpenedEnclave, now: datetime
+    keystore: OpenedKeystore, enclave: str, state: OpenedEnclave, now: datetime
 ) -> OpenedZenoh:
     """Return the Zenoh configurations of an enclave.
 
@@ -380,28 +380,28 @@ def _opened_zenoh(
     from sros_tool.keystore.layout import PUBLIC
     from sros_tool.keystore.zenoh_files import ZenohFault, open_zenoh
 
-    root, opened_zenoh = keystore.root, open_zenoh(keystore.folder(name), name, state)
+    root, opened_zenoh = keystore.root, open_zenoh(keystore.folder(enclave), enclave, state)
     if not opened_zenoh.problems:
-        _refuse_outdated(keystore, name, now)
+        _refuse_outdated(keystore, enclave, now)
         return opened_zenoh
     write = f"`sros zenoh {quote(str(root))}`"
     if not (root / PUBLIC).is_dir():
         write = "`sros zenoh KEYSTORE` where the CA keys are, and export the enclave again"
     if opened_zenoh.problems[0].fault is ZenohFault.MISSING and not opened_zenoh.files:
         raise KeystoreError(
-            f"enclave {name} has no configuration for rmw_zenoh_cpp",
+            f"enclave {enclave} has no configuration for rmw_zenoh_cpp",
             "rmw_zenoh_cpp ignores ROS_SECURITY_*: without session.json5 the process would run "
             "unsecured.",
             f"Write it: {write}. For DDS, name another RMW with --rmw.",
         )
     raise KeystoreError(
-        f"a process of rmw_zenoh_cpp cannot run in enclave {name}",
+        f"a process of rmw_zenoh_cpp cannot run in enclave {enclave}",
         "; ".join(map(str, opened_zenoh.problems)) + ".",
         f"Write the files again: {write}.",
     )
 
 
-def _refuse_outdated(keystore: OpenedKeystore, name: str, now: datetime) -> None:
+def _refuse_outdated(keystore: OpenedKeystore, enclave: str, now: datetime) -> None:
     """Raise `KeystoreError` if the enclave's Zenoh file lacks current rights of other enclaves.
 
     A router, and a session in peer mode, enforces the rights of other enclaves: an outdated file,
@@ -414,19 +414,19 @@ def _refuse_outdated(keystore: OpenedKeystore, name: str, now: datetime) -> None
     if not keystore.has(SETTINGS):
         return
     network = keystore.settings.zenoh if keystore.settings else None
-    if network is None or (name not in network.router_names() and network.mode is Mode.CLIENT):
+    if network is None or (enclave not in network.router_names() and network.mode is Mode.CLIENT):
         return
     authority = keystore.ca_certificate(PERMISSIONS)
 
     def has_drifted(moment: datetime | None) -> bool:
         drift = zenoh_drift(keystore, network, keystore.domains, authority, moment)
-        return any(file.enclave == name for file in drift.files)
+        return any(file.enclave == enclave for file in drift.files)
 
     # Differences that only come from expired permissions of other enclaves do not count.
     if has_drifted(now) and has_drifted(None):
         where = quote(str(keystore.root))
         raise KeystoreError(
-            f"the Zenoh configuration of enclave {name} does not match the keystore",
+            f"the Zenoh configuration of enclave {enclave} does not match the keystore",
             "For other enclaves, it has rights that differ from their permissions.",
             f"Run `sros zenoh {where}`, and restart the processes that this command names.",
         )
@@ -488,7 +488,7 @@ def _zenoh_domain(
 
 def _zenoh_environment(
     folder: Path,
-    name: str,
+    enclave: str,
     zenoh: OpenedZenoh,
     variables: dict[str, str],
     environment: Mapping[str, str],
@@ -524,7 +524,7 @@ def _zenoh_environment(
         by_graph = version and release_of(version).below_topics
         images = ", and send it no images" if by_graph else ""
         text = (
-            f"start every node with `--ros-args --enclave {name}`: if a node on Zenoh names "
+            f"start every node with `--ros-args --enclave {enclave}`: if a node on Zenoh names "
             "another enclave or none, other nodes drop its graph token, and do not find its "
             f"topics and services{images}."
         )
@@ -624,8 +624,9 @@ def container_text(
         keystore: the opened keystore.
         enclave: one of its enclaves, in which a process can run.
         form: one of `sros_tool.runtime.environment.CONTAINER_FORMS`.
-        target: the keystore in the container and, for Compose, on the machine that runs it.
-        variables: the environment of the enclave there.
+        target: the keystore in the container and, for Compose, on the machine that runs the
+            container.
+        variables: the environment of the enclave in the container.
         name: the name of the service or object; "" stands for a name made from the enclave's name,
             which no other enclave gets.
         image: the image, or "".

@@ -156,22 +156,22 @@ def _enclave_problem(name: str) -> str:
     return namespace_problem(name)
 
 
-def namespace_problem(name: str) -> str:
+def namespace_problem(namespace: str) -> str:
     """Return why ROS would refuse the namespace of a node, as a sentence; "" if it is valid.
 
     Wildcards are not allowed.  Source: rmw_validate_namespace.
     """
-    if not name:
+    if not namespace:
         return "It is empty."
-    if not name.startswith("/"):
+    if not namespace.startswith("/"):
         return "It does not start with '/'."
-    if len(name) > _MAX_NAMESPACE:
-        return f"It has {len(name)} characters, more than {_MAX_NAMESPACE}."
-    if name == "/":
+    if len(namespace) > _MAX_NAMESPACE:
+        return f"It has {len(namespace)} characters, more than {_MAX_NAMESPACE}."
+    if namespace == "/":
         return ""
-    if name.endswith("/"):
+    if namespace.endswith("/"):
         return "It ends with '/'."
-    for token in name[1:].split("/"):
+    for token in namespace[1:].split("/"):
         if not token:
             return "It contains '//'."
         if not _TOKEN.match(token):

@@ -114,11 +114,11 @@ def redraw(text: str) -> None:
     os.write(sys.stderr.fileno(), f"\r\x1b[K{visible_line(text)}".encode())
 
 
-def ask_secret(name: str, *, confirm: bool) -> str:
+def ask_secret(secret: str, *, confirm: bool) -> str:
     """Ask on the terminal for a secret that is not shown, twice with ``confirm``."""
     import click
 
-    asked = visible_line(f"{name[:1].upper()}{name[1:]}")  # a keystore may name the token
+    asked = visible_line(f"{secret[:1].upper()}{secret[1:]}")  # a keystore may name the token
     answer = click.prompt(asked, hide_input=True, err=True, confirmation_prompt=confirm)
     return str(answer)
 

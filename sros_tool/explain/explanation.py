@@ -290,22 +290,22 @@ def _smallest_change(evaluator: Evaluator, answer: Answer) -> PolicyChange | Non
         lift += sorted(blocking)
 
 
-def policy_of(name: str, rights: Iterable[Right]) -> Enclave:
+def policy_of(enclave: str, rights: Iterable[Right]) -> Enclave:
     """Return a policy of an enclave with these rights, in one profile without a node name."""
     groups = tuple(
         Group(right.kind, ((right.right, right.qualifier),), (right.name,))
         for right in sorted(rights)
     )
-    return Enclave(name, (Profiles((Profile("/", "", groups),)),))
+    return Enclave(enclave, (Profiles((Profile("/", "", groups),)),))
 
 
-def _present_rights(policy: Enclave | None, name: str, answer: Answer) -> set[Right]:
+def _present_rights(policy: Enclave | None, enclave: str, answer: Answer) -> set[Right]:
     """Return the rights that an enclave has now, except those that no policy can state."""
     rights: Iterable[Right] = ()
     if policy:
-        rights = (r for profile in policy.all_profiles() for r in profile_rights(name, profile))
+        rights = (r for profile in policy.all_profiles() for r in profile_rights(enclave, profile))
     else:
-        rights = _granted_rights(name, answer)
+        rights = _granted_rights(enclave, answer)
     return {right for right in rights if right.kind != "dds"}
 
 

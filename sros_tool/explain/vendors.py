@@ -153,7 +153,7 @@ class DistributionAnswer(NamedTuple):
 class Comparison(NamedTuple):
     """The decisions of all DDS vendors, or of the DDS of all supported distributions.
 
-    ``allowed`` is the decision of the chosen vendor.
+    ``allowed`` says whether the chosen vendor allows the access.
     """
 
     asked: AskedQuestion
@@ -346,7 +346,7 @@ def _note_on_parts(evaluator: Evaluator, answer: Answer) -> Iterator[Note]:
 
 
 def _allowed_parts(evaluator: Evaluator, answer: Answer) -> tuple[str, ...]:
-    """Return the acting parts of a denied action that the enclave may do."""
+    """Return the `acting_parts` of a denied action that the enclave may use."""
     questions = {} if answer.allowed else acting_parts(answer.question)
     return tuple(part for part, asked in questions.items() if evaluator.answer(asked).allowed)
 
@@ -480,13 +480,13 @@ def _zenoh_decision(
     return ZenohNextToDds(answer.in_brief)
 
 
-def _runs_on_zenoh(keystore: OpenedKeystore, name: str) -> bool:
+def _runs_on_zenoh(keystore: OpenedKeystore, enclave: str) -> bool:
     """Return whether an enclave has Zenoh files, or the keystore is set up for Zenoh.
 
     If the settings have no [zenoh] part, other enclaves are not examined, because there may be
     thousands.
     """
-    if any((keystore.folder(name) / file).is_file() for file in ZENOH_SIGNED):
+    if any((keystore.folder(enclave) / file).is_file() for file in ZENOH_SIGNED):
         return True
     try:
         named = b"zenoh" in keystore.read(SETTINGS, "settings file")

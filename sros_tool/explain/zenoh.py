@@ -800,8 +800,8 @@ class ZenohEvaluator:
         return wide if "*" in untyped(wide).removesuffix("/*/*") else ""
 
 
-def _unrestricted_process(name: str, mode: Mode) -> ZenohProcess:
-    return ZenohProcess(name, mode, Enforcement())
+def _unrestricted_process(enclave: str, mode: Mode) -> ZenohProcess:
+    return ZenohProcess(enclave, mode, Enforcement())
 
 
 _DATA_MESSAGES = (Message.PUT, Message.QUERY, Message.LIVELINESS_TOKEN)
@@ -933,10 +933,10 @@ class ZenohOfKeystore:
         # Imported here, because a question about one enclave does not need them.
         from sros_tool.explain.who import decide_each, first_allowing_domain
 
-        def answer(name: str) -> ZenohAnswer:
+        def answer(enclave: str) -> ZenohAnswer:
             def decided(domain: int) -> ZenohAnswer:
                 evaluator = self._evaluators[domain]
-                answered = evaluator.answer(name, question, reach=False, brief=True)
+                answered = evaluator.answer(enclave, question, reach=False, brief=True)
                 return evaluator.with_parts(answered, brief=True)
 
             decisions = {domains: decided(next(iter(domains))) for domains in self._parts}

@@ -460,13 +460,13 @@ def _not_compared_clauses(base: AccessSource, head: AccessSource) -> Iterator[st
                 )
 
 
-def _permissions_fit(vendor: Vendor, side: AccessSource, name: str, subject: str) -> bool:
+def _permissions_fit(vendor: Vendor, side: AccessSource, enclave: str, subject: str) -> bool:
     """Return whether a vendor accepts the permissions of an enclave for a certificate's subject."""
     text = certified_text(vendor.traits, subject)
     with suppress(ComparisonCrash):
         return any(
             same_subject(vendor.traits.subjects, grant.subject.strip(), text)
-            for grant in side.permissions[name].grants
+            for grant in side.permissions[enclave].grants
         )
     return False
 
@@ -582,20 +582,20 @@ def _fitting_others(vendor: Vendor, *sides: AccessSource) -> _FittingOthers:
 
 def _access_on_vendor(vendor: Vendor, fitting_others: _FittingOthers) -> _AccessOf:
     def access_by(
-        side: AccessSource, governance: Governance, name: str, subject: str, at: int
+        side: AccessSource, governance: Governance, enclave: str, subject: str, at: int
     ) -> Access:
         """Return the access that an enclave's permissions give to a certificate with a subject.
 
         Permissions that do not fit the certificate count as if they did; `_not_compared_clauses`
         reports them.
         """
-        granted = (grant.subject for grant in side.permissions[name].grants[:1])
-        subject = subject if _permissions_fit(vendor, side, name, subject) else next(granted, "")
+        granted = (grant.subject for grant in side.permissions[enclave].grants[:1])
+        subject = subject if _permissions_fit(vendor, side, enclave, subject) else next(granted, "")
         governed = GovernedDomain(vendor, governance, at)
-        access = Access(governed, side.permissions[name], subject, moment=AT)
+        access = Access(governed, side.permissions[enclave], subject, moment=AT)
         if access.join().reason in ("no-grant", "malformed") or access.join().outcome == "crashes":
             raise DocumentError(
-                f"the permissions of {name} in '{side.shown}' cannot be compared",
+                f"the permissions of {enclave} in '{side.shown}' cannot be compared",
                 access.join().text,
                 "Sign them again.",
             )

@@ -1077,7 +1077,7 @@ class _Review:
             self.is_relative |= any(requirement.is_relative for requirement in wanted)
             self.namespaces_to_add |= common_namespaces(wanted, system.rights)
             earlier = yield from self._read_requirements(
-                base_files, partial(_without_left_robots, before, system.fleet)
+                base_files, partial(_without_removed_robots, before, system.fleet)
             )
             rights, later_rights = frozenset[Right](), frozenset[Right]()
             with suppress(SrosError, OSError):  # the comparison reports the error
@@ -1401,7 +1401,7 @@ _NOT_OF_DROPPED = tuple(
 
 
 class _Failure(NamedTuple):
-    """What is wrong with a requirement: uses that break it, or why it protects nothing (a text)."""
+    """The failure of a requirement: uses that break it, or a text on why it protects nothing."""
 
     uses: tuple[tuple[str, str, str, str], ...] = ()
     """Enclaves, rights, names, and the wildcards that allow them ("" without wildcard)."""
@@ -1633,7 +1633,7 @@ def _enclaves_by_node(enclaves: Iterable[Enclave]) -> dict[NodeName, set[str]]:
     return nodes
 
 
-def _without_left_robots(before: Fleet | None, after: FleetSource) -> Fleet | None:
+def _without_removed_robots(before: Fleet | None, after: FleetSource) -> Fleet | None:
     """Return the fleet ``before`` without the robots that ``after`` lacks.
 
     If one of the two fleets is missing, the result is the other one, or None.

@@ -510,7 +510,7 @@ def _without_faults(
 _MOST_MOMENTS = 10
 
 
-def _later_moments(name: str, grants: Iterable[Grant], moment: datetime) -> tuple[datetime, ...]:
+def _later_moments(enclave: str, grants: Iterable[Grant], moment: datetime) -> tuple[datetime, ...]:
     """Return a moment inside the validity of each grant that becomes valid later.
 
     Raises:
@@ -526,7 +526,7 @@ def _later_moments(name: str, grants: Iterable[Grant], moment: datetime) -> tupl
     }
     if len(moments) > _MOST_MOMENTS:
         raise KeystoreError(
-            f"the permissions of enclave {name} become valid at more than {_MOST_MOMENTS}"
+            f"the permissions of enclave {enclave} become valid at more than {_MOST_MOMENTS}"
             " different times",
             "",
             "Sign them again with create_permission or generate_artifacts.",

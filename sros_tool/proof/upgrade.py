@@ -445,7 +445,7 @@ class _ReleaseDecision:
 
 def _changes_of_enclave(
     files: DecidedFiles,
-    name: str,
+    enclave: str,
     sides: Sequence[_ReleaseDecision],
     domain: int,
     where: str,
@@ -454,23 +454,23 @@ def _changes_of_enclave(
     old, new = sides
     if new.causes and (not old.causes or (new.crashes and not old.crashes)):
         text = f"{where}{_verdict_text(new)}; {_verdict_text(old)}"
-        yield _refusal_change(_LOSES, files, name, new.causes[0], text)
+        yield _refusal_change(_LOSES, files, enclave, new.causes[0], text)
     elif old.causes and not new.causes:
         text = f"{where}{_verdict_text(old)}; {_verdict_text(new)}"
-        yield DecisionChange(_JOINS, name, text, files.path_of(name, old.causes[0].file))
+        yield DecisionChange(_JOINS, enclave, text, files.path_of(enclave, old.causes[0].file))
     if old.causes or new.causes:
         return
-    permissions = files.source.permissions.get(name)
+    permissions = files.source.permissions.get(enclave)
     names = {
         topic
         for grant in (permissions.grants if permissions else ())
         for topic in names_without_wildcards(grant)
     }
-    file = files.path_of(name, PERMISSIONS_FILE)
+    file = files.path_of(enclave, PERMISSIONS_FILE)
     for kind, first, second in ((_MORE, old, new), (_LESS, new, old)):
         gains = list(
             by_vendors.gained_topics(
-                name, first.access, second.access, second.shipped.vendor, domain, names
+                enclave, first.access, second.access, second.shipped.vendor, domain, names
             )
         )
         if gains:
@@ -479,7 +479,7 @@ def _changes_of_enclave(
             )
             closed = first.shipped.title
             opened = f"{where}{accesses}: open on {second.shipped.title}, closed on {closed}"
-            yield DecisionChange(kind, name, opened, file)
+            yield DecisionChange(kind, enclave, opened, file)
 
 
 def _gain_text(gain: Gain) -> str:
@@ -495,14 +495,14 @@ def _verdict_text(side: _ReleaseDecision) -> str:
 
 
 def _refusal_change(
-    kind: str, files: DecidedFiles, name: str, cause: RefusalCause, text: str
+    kind: str, files: DecidedFiles, enclave: str, cause: RefusalCause, text: str
 ) -> DecisionChange:
     remedy = ""
-    state, fault = files.enclaves[name].state, FAULTS.get(cause.reason)
+    state, fault = files.enclaves[enclave].state, FAULTS.get(cause.reason)
     if files.keystore and state and fault:
         view = CheckedKeystore(files.keystore, files.at)
-        remedy = fault_remedy(CheckedEnclave(view, name, state), fault, cause.file)
-    return DecisionChange(kind, name, text, files.path_of(name, cause.file), remedy)
+        remedy = fault_remedy(CheckedEnclave(view, enclave, state), fault, cause.file)
+    return DecisionChange(kind, enclave, text, files.path_of(enclave, cause.file), remedy)
 
 
 def _untested_findings(before: Shipped, after: Shipped) -> Iterator[Finding]:

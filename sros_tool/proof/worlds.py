@@ -353,10 +353,10 @@ class World:
         self._written: dict[str, WrittenTopics] = {}
         self._stated_names: dict[tuple[str, str], frozenset[str]] = {}
 
-    def _with_fitting(self, name: str, access: Mapping[str, TopicAccess]) -> TopicAccess:
+    def _with_fitting(self, enclave: str, access: Mapping[str, TopicAccess]) -> TopicAccess:
         accesses = [
             access[holder]
-            for holder in (name, *self.fitting_others.get(name, ()))
+            for holder in (enclave, *self.fitting_others.get(enclave, ()))
             if holder in access
         ]
         if len(accesses) == 1:

@@ -466,7 +466,7 @@ class CycloneLog:
 
 
 def _memory_file() -> int:
-    """Return a file in memory to which every write is appended."""
+    """Return the descriptor of a file in memory to which every write is appended."""
     file = os.memfd_create("cyclonedds")
     fcntl.fcntl(file, fcntl.F_SETFL, os.O_APPEND)
     return file
@@ -585,7 +585,7 @@ def version_of(path: Path) -> str:
     """Return the version in a shared library's name: "0.10.2" of libddsc.so.0.10.2.
 
     Wheels contain copies instead of links, so the loaded file may have the shortest name; then the
-    names of its copies count.
+    names of its copies count.  Without a version, the result is "of unknown version".
     """
     copies = [copy for copy in path.parent.glob(f"{path.name}.*") if _same_size(copy, path)]
     name = max([path.name, *(copy.name for copy in copies)], key=len)

@@ -74,13 +74,13 @@ class PrintedEnvironment(NamedTuple):
     notes: Notes
 
 
-def secured_environment(root: Path, name: str, domain: int) -> dict[str, str]:
+def secured_environment(root: Path, enclave: str, domain: int) -> dict[str, str]:
     """Return the variables with which a process runs secured in an enclave, or does not start."""
     return {
         KEYSTORE: str(root.absolute()),
         ENABLE: "true",
         STRATEGY: "Enforce",
-        ENCLAVE: name,
+        ENCLAVE: enclave,
         DOMAIN: str(domain),
     }
 
@@ -458,7 +458,7 @@ class Container:
 
     ``name`` is the name of the service or object.  ``folder`` is the absolute path of the enclave's
     files in the container and, for Compose, also on the machine that runs the container.  Without
-    ``image``, the result has to be merged with a definition that has an image.
+    ``image``, the YAML of the container has to be merged with a definition that has an image.
     """
 
     enclave: str

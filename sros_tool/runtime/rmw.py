@@ -224,7 +224,7 @@ def shipped_vendor(rmw: str, environment: Mapping[str, str]) -> Vendor | None:
     """Return the vendor of an RMW, with the rules of the release that $ROS_DISTRO ships.
 
     If the distribution is unknown or does not ship the vendor, the result is that of `vendor_of`.
-    It is None if the RMW has no known vendor.
+    The result is None if the RMW has no known vendor.
     """
     vendor, distribution = vendor_of(rmw), sourced_distribution(environment.get(ROS_DISTRO))
     shipped = (

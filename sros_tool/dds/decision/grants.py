@@ -148,14 +148,14 @@ def _same_in_any_order(granted_subject: str, certified_subject: str) -> bool:
     return len(ours) == len(theirs) and all(first_values.get(k, "") == v for k, v in ours)
 
 
-def _types_and_values(name: str) -> list[tuple[str, str]]:
+def _types_and_values(subject: str) -> list[tuple[str, str]]:
     """Return types and values of a subject's attributes.
 
     The list ends before the first malformed attribute.  Source: Fast DDS 2.14,
     DistinguishedName.cpp.
     """
     pairs: list[tuple[str, str]] = []
-    rest = name.lstrip(" ")
+    rest = subject.lstrip(" ")
     while rest and len(pairs) < _MOST_ATTRIBUTES:
         equals = _outside_quotes(rest, "=")
         if equals < 0:
@@ -180,15 +180,15 @@ _PART = re.compile(r'(?:\\.|"(?:\\.|[^"\\])*"|[^,"\\])*', re.DOTALL)
 _EQUALS = re.compile(r'(?:\\.|"(?:\\.|[^"\\])*"|[^="\\])*', re.DOTALL)
 
 
-def _attributes(name: str) -> list[tuple[str, str]]:
+def _attributes(subject: str) -> list[tuple[str, str]]:
     """Return types and unescaped values of a subject's attributes.
 
     The list ends before the first malformed attribute.
     """
     attributes = []
     index = 0
-    while index < len(name):
-        part = _PART.match(name, index)
+    while index < len(subject):
+        part = _PART.match(subject, index)
         text = part[0].strip(" ") if part else ""
         kind = _EQUALS.match(text)
         if not text or not kind or kind.end() >= len(text):
