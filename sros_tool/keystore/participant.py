@@ -471,9 +471,10 @@ def accepted_state(
 ) -> OpenedEnclave:
     """Return an enclave's state without the faults that at least one of the vendors accepts.
 
-    Documents that a vendor loads count as the enclave's documents if a CA signed them.  Two faults
-    stay even if a vendor accepts them: a document that the enclave signed itself (CVE-2023-24011),
-    and a revocation list that ROS does not pass to DDS.  There must be at least one participant.
+    Documents that a vendor loads count as the enclave's documents if a CA signed them.  Three
+    faults stay even if a vendor accepts them: a missing key, a document that the enclave signed
+    itself (CVE-2023-24011), and a revocation list that ROS does not pass to DDS.  There must be at
+    least one participant.
     """
     loading = [participant for participant in participants if participant.permissions is not None]
     if not (state.problems and loading):

@@ -453,7 +453,7 @@ class Transaction:
     # ── begin and end ──────────────────────────────────────────────────────────────────────
 
     def __enter__(self) -> Self:
-        """Begin the transaction, and lock the keystore.
+        """Begin the transaction, and lock the keystore; a dry run does not lock it.
 
         Raises:
             KeystoreError: the keystore is busy, or a new keystore would belong to another user.

@@ -577,9 +577,10 @@ def zenoh_documents(
 
 
 def _last_revocation(entries: Iterable[Entry] = (), lists: Iterable[RevocationList] = ()) -> str:
-    """Return when an enclave was last revoked, by the ledger and by revocation lists; "" if never.
+    """Return when any enclave was last revoked, by the ledger and revocation lists; "" if never.
 
-    Replaced certificates, with the reason `SUPERSEDED`, do not count.
+    The time is in ISO 8601 (UTC).  Replaced certificates, with the reason `SUPERSEDED`, do not
+    count.
     """
     moments = [
         entry.time for entry in entries if entry.what == "revocation" and entry.reason != SUPERSEDED

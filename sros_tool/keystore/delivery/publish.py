@@ -485,7 +485,7 @@ class _RoleKeys:
     def open(self, rotate: Collection[str], now: datetime, expiry: MetadataExpiry) -> None:
         """Open or make the key of each role, and add a version of the root if a key changes.
 
-        The roles in ``rotate`` get new keys; before the first publication, all roles do.
+        The roles in ``rotate`` get new keys.
 
         Raises:
             KeystoreError: a key is missing, or differs from the key that the root metadata names.

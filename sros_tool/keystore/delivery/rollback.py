@@ -131,7 +131,8 @@ def check_rollback(
     """Raise `KeystoreError` if an export would undo a revocation or a rotation in ``target``.
 
     An export is also refused if enclaves in ``target`` trust only CAs of another keystore.
-    ``present`` maps paths in ``target`` to the content of files, including all CAs and lists.
+    ``present`` maps paths in ``target`` to the content of files, including all CAs and lists;
+    ``files`` are the files of the export in the same form.
     """
     if later := _later_authorities(keystore, present, files):
         path, authority = next(iter(later.items()))

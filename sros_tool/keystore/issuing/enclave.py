@@ -270,9 +270,9 @@ class EnclaveWriter:
 
     @property
     def expiry(self) -> datetime:
-        """The first expiry of the certificates and permissions that are written.
+        """The first expiry of certificates and permissions that are written now.
 
-        Short-lived enclaves expire earlier.
+        Short-lived enclaves do not count: they expire earlier.
         """
         return min(self._certificate_validity.not_after, self._permissions_validity.not_after)
 
@@ -344,7 +344,7 @@ class EnclaveWriter:
         )
 
     def _validity_of_permissions(self, name: str, certificate: x509.Certificate) -> Window:
-        """Return the validity of an enclave's permissions, which expire with their certificate.
+        """Return the validity of permissions, which expire with their certificate at the latest.
 
         Permissions may begin before the certificate, because Fast DDS reads their dates in local
         time (`BACKDATE`).

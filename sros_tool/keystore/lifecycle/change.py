@@ -188,7 +188,7 @@ class KeystoreChange:
         self._allowed = allow_refusal
 
     def __enter__(self) -> Self:
-        """Recover and lock the keystore.
+        """Recover and lock the keystore; a dry run does neither.
 
         Raises:
             KeystoreError: the folder is not a keystore, is busy, or cannot be read.

@@ -232,8 +232,8 @@ def robots_cut_off(
     """Return the sorted names of the robots that the stage ``to`` would cut off from the others.
 
     These are the robots that have not confirmed the previous stage (`FleetStatus.unconfirmed`); if
-    stages are left out, these are all robots.  Without a fleet, and in the first stage, no robot is
-    cut off.
+    stages are left out, these are all robots with enclaves.  Without a fleet, and in the first
+    stage, no robot is cut off.
 
     Raises:
         KeystoreError: the fleet file is not the file that sros wrote last.
