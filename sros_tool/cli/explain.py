@@ -886,8 +886,8 @@ def _decider_of_keystore(
         if len({*distributions.values()}) == 1 and vendors:
             (chosen_vendor,) = vendors.values()
 
-        def vendor_of(name: str) -> Vendor | None:
-            distribution = distributions.get(name)
+        def vendor_of(enclave: str) -> Vendor | None:
+            distribution = distributions.get(enclave)
             return vendors[distribution][0] if distribution else None
 
         decider = VendorOfKeystore(keystore, *chosen_vendor, asking, names, vendor_of)

@@ -1099,7 +1099,10 @@ def _groups(
 def _rows(
     compared_fleet: ComparedFleet, robots: Sequence[str], *, apart: bool
 ) -> Iterator[tuple[str, ...]]:
-    """Yield the header and the rows of a table, or nothing if no robot needs a row."""
+    """Yield the header and the rows of a table, or nothing if no robot needs a row.
+
+    With ``apart``, each robot has a row.
+    """
     # Of named robots, `_file_details` shows the problems.
     problems = (lambda _: ()) if robots else _gravest_problem
     groups = _groups(compared_fleet, problems, apart=apart)
@@ -1111,15 +1114,15 @@ def _rows(
     for group in groups:
         names = _robot_names(group.names, compared_fleet.status.names, compared_fleet.status.groups)
         age = _age_text(group.oldest_confirmation(compared_fleet.at), compared_fleet.at)
-        what = group.what if robots else _shortened(group.what, group.names[0])
+        what = group.what if robots else _shortened_summary(group.what, group.names[0])
         yield names, _state_text(group.state), age, group.to_do, what
 
 
-def _shortened(what: str, robot: str) -> str:
+def _shortened_summary(summary: str, robot: str) -> str:
     """Return the first clauses of a summary that fit into a row, and where the others are."""
-    if len(what) <= _LONGEST_SUMMARY:
-        return what
-    begin = what[:_LONGEST_SUMMARY]
+    if len(summary) <= _LONGEST_SUMMARY:
+        return summary
+    begin = summary[:_LONGEST_SUMMARY]
     begin = begin.rpartition("; ")[0] or f"{begin.rpartition(' ')[0]} ..."
     return f"{begin}; more: --robot {robot}"
 

@@ -579,7 +579,7 @@ def create_keystore(
 
 
 def _chosen_template(
-    name: str,
+    template_name: str,
     ca_layout: str | None,
     ca_validity: str | None,
     validity: str | None,
@@ -591,7 +591,7 @@ def _chosen_template(
     from sros_tool.keystore.template import load_template
     from sros_tool.validity import parse_span
 
-    template = load_template(name)
+    template = load_template(template_name)
     if ca_layout:
         template = replace(template, separate_authorities=ca_layout == "separate")
     if ca_validity is not None:

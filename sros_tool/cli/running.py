@@ -584,9 +584,9 @@ def units(
         names = chosen_enclaves(keystore, rest[:-1], patterns, robots)
         place = target or Path(INSTALLED)
 
-        def secure(name: str) -> EnclaveEnvironment:
+        def secure(enclave: str) -> EnclaveEnvironment:
             return enclave_environment(
-                keystore, name, domain, rmw, accept_key=accept_readable_key, target=place
+                keystore, enclave, domain, rmw, accept_key=accept_readable_key, target=place
             )
 
         with progress("checking"):

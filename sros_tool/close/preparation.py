@@ -567,7 +567,9 @@ def _start_of_unknown_process(running: RunningRobot, state: CloseState) -> str:
     """Return a clause on how to start an unknown process in an enclave that has no process.
 
     Returns "" without such an enclave. The clause has the command of the process if there is only
-    one process and one enclave, and the process is of a user who can read the enclaves.
+    one process and one enclave, no unit starts the process, and the process is of a user who can
+    read the enclaves.  If units start unknown processes, and the policy has new enclaves, the clause
+    also says how to name the nodes in the units.
     """
     observed, export = state.observed, running.robot.export.absolute()
     if not (idle := sorted(state.stopped)):

@@ -315,7 +315,7 @@ class LocalRobot:
 
 
 def check_enclaves(names: Iterable[str], known: Collection[str], option: str) -> None:
-    """Raise `UsageError` if an option names an enclave that the robot does not have."""
+    """Raise `UsageError` if ``names``, from an ``option``, has an enclave that is not ``known``."""
     if unknown := sorted({*names}.difference(known)):
         raise UsageError(
             f"the robot has no enclave {unknown[0]}",

@@ -339,6 +339,7 @@ def another_permissions_ca_trusted(copy: KeystoreCopy) -> None:
 
 
 def _trust_another_permissions_ca(copy: KeystoreCopy, part: str) -> None:
+    """Let the enclave that plays ``part`` trust another permissions CA, which signs its files."""
     certificate = copy.authorities(copy.foreign).permissions.certificate
     document = (
         _wider_permissions(copy) if part == "guest" else render_permissions(copy.permissions(part))
@@ -439,7 +440,7 @@ def client_may_do_everything(copy: KeystoreCopy) -> None:
 
 
 def _allow_everything(copy: KeystoreCopy, part: str) -> None:
-    """Give an enclave the permissions that ros2/sros2 gives without a policy."""
+    """Give the enclave that plays ``part`` the permissions of ros2/sros2 without a policy."""
     wide = copy.widened_permissions(part, publish=["*"], subscribe=["*"])
     copy.put(part, PERMISSIONS_FILE, copy.sign(wide))
 
@@ -466,7 +467,7 @@ def key_of_another_enclave(copy: KeystoreCopy) -> None:
 
 
 def _revoke(copy: KeystoreCopy, part: str) -> None:
-    """Revoke an enclave, then issue a new key and certificate for the same subject."""
+    """Revoke the enclave that plays ``part``, then certify a new key for the same subject."""
     folder = copy.folder(part)
     before = {name: copy.read(part, name) for name in REQUIRED_FILES}
     lists = _outdated_lists(copy)
@@ -524,6 +525,7 @@ def guest_revocation_not_delivered(copy: KeystoreCopy) -> None:
 
 
 def _revocation_not_delivered(copy: KeystoreCopy, part: str) -> None:
+    """Revoke the enclave that plays ``part``, keep its files, and remove the listener's CRL."""
     before = {name: copy.read(part, name) for name in REQUIRED_FILES}
     _revoke(copy, part)
     stolen = enclave_path(copy.root, STOLEN)

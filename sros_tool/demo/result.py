@@ -279,9 +279,9 @@ def _judge_claim(claim: Claim, record: RowRecord) -> _ClaimFinding:
     return _JUDGES[claim.relation](_ClaimRecords(claim, record))
 
 
-def _is_of_user(name: str, row: Row) -> bool:
+def _is_of_user(party: str, row: Row) -> bool:
     """Return whether a party is of a user's scenario, which names enclaves by their paths."""
-    return any(e.name == name and e.identity.enclave.startswith("/") for e in row.parties)
+    return any(e.name == party and e.identity.enclave.startswith("/") for e in row.parties)
 
 
 def _judge_hearing(case: _ClaimRecords) -> _ClaimFinding:
@@ -476,38 +476,38 @@ _JUDGES: Mapping[Relation, Callable[[_ClaimRecords], _ClaimFinding]] = {
 }
 
 
-def _why_not_running(name: str, record: PartyRecord) -> _ClaimFinding | None:
+def _why_not_running(party: str, record: PartyRecord) -> _ClaimFinding | None:
     """Return why a party did not run until the end of the row, or None if it ran."""
     ready = any(event.kind is EventKind.READY for event in record.events)
     for event in record.events:
         if event.kind is EventKind.REFUSED:
             return _refusal_finding(
-                name, event.stage, _own_denial_message(record, "") or event.text
+                party, event.stage, _own_denial_message(record, "") or event.text
             )
         if event.kind is EventKind.FAILED:
-            return _failure(name, record, event)
+            return _failure(party, record, event)
     if record.status is not None:
-        return _ClaimFinding(RowStatus.CRASHED, f"{name} {_exit_text(record)}")
+        return _ClaimFinding(RowStatus.CRASHED, f"{party} {_exit_text(record)}")
     if not ready:
-        return _ClaimFinding(RowStatus.NOT_STARTED, f"{name} was not ready in time")
+        return _ClaimFinding(RowStatus.NOT_STARTED, f"{party} was not ready in time")
     return None
 
 
-def _failure(name: str, record: PartyRecord, event: Event) -> _ClaimFinding:
+def _failure(party: str, record: PartyRecord, event: Event) -> _ClaimFinding:
     reported = f"{event.text}\n{record.output}"
     reason = " ".join(event.text.split())
     if lacking := missing_security(reported):
-        return _ClaimFinding(RowStatus.NOT_STARTED, f"{name}: {lacking}")
+        return _ClaimFinding(RowStatus.NOT_STARTED, f"{party}: {lacking}")
     if event.stage is ProcessStage.ENDPOINT and (
         refusal := _own_denial_message(record, event.text)
     ):
-        return _refusal_finding(name, ProcessStage.ENDPOINT, refusal)
+        return _refusal_finding(party, ProcessStage.ENDPOINT, refusal)
     if event.stage in (ProcessStage.PARTICIPANT, ProcessStage.ENDPOINT):
         # A ROS node has standard topics and services: if one is denied, it does not start.
         refusal = participant_refusal(reported) or endpoint_refusal(reported)
         if refusal:
-            return _refusal_finding(name, ProcessStage.PARTICIPANT, refusal)
-    return _ClaimFinding(RowStatus.CRASHED, f"{name} failed: {reason}")
+            return _refusal_finding(party, ProcessStage.PARTICIPANT, refusal)
+    return _ClaimFinding(RowStatus.CRASHED, f"{party} failed: {reason}")
 
 
 def _own_denial_message(record: PartyRecord, reported: str) -> str:
@@ -522,12 +522,12 @@ def _is_about(line: str, topic: str) -> bool:
     return bool(re.search(name, line)) or "not allowed by security" in line.lower()
 
 
-def _refusal_finding(name: str, stage: ProcessStage | None, reason: str) -> _ClaimFinding:
+def _refusal_finding(party: str, stage: ProcessStage | None, reason: str) -> _ClaimFinding:
     reason = plain_refusal(reason)
     if stage is ProcessStage.ENDPOINT:
-        return _ClaimFinding(RowStatus.REFUSED, f"{name}: {reason}")
+        return _ClaimFinding(RowStatus.REFUSED, f"{party}: {reason}")
     return _ClaimFinding(
-        RowStatus.NOT_LET_IN, f"{name} was refused before it used the topic: {reason}"
+        RowStatus.NOT_LET_IN, f"{party} was refused before it used the topic: {reason}"
     )
 
 

@@ -120,12 +120,12 @@ def _signal_watch() -> Callable[[], bool]:
     return lambda: bool(received)
 
 
-def _fail(name: str, error: Exception, stage: ProcessStage, events: EventWriter) -> int:
+def _fail(node_name: str, error: Exception, stage: ProcessStage, events: EventWriter) -> int:
     reason = f"{type(error).__name__}: {error}"
     time.sleep(_LOG_FLUSH_SECONDS)
     sys.stdout.flush()
     events.report(EventKind.FAILED, reason, stage=stage)
-    print(f"{name}: failed at stage {stage.value}: {reason}", file=sys.stderr)
+    print(f"{node_name}: failed at stage {stage.value}: {reason}", file=sys.stderr)
     return 1
 
 

@@ -323,10 +323,17 @@ class _System:
             kind, name, sentence, tuple(sorted(senders)), tuple(sorted(receivers)), influencing
         )
 
-    def _influences(self, paths: Mapping[str, HopPath], near: int = 1) -> tuple[Influence, ...]:
+    def _influences(
+        self, paths: Mapping[str, HopPath], earlier_hops: int = 1
+    ) -> tuple[Influence, ...]:
+        """Return the influences of the enclaves in ``paths``, sorted by hops.
+
+        ``earlier_hops`` is added to the number of hops on each path.
+        """
         self._paths += paths.values()
         influences = (
-            Influence(enclave, near + len(path), path_text(path)) for enclave, path in paths.items()
+            Influence(enclave, earlier_hops + len(path), path_text(path))
+            for enclave, path in paths.items()
         )
         return tuple(sorted(influences, key=lambda influence: (influence.hops, influence.enclave)))
 

@@ -419,13 +419,14 @@ class _Draft:
             _OWN_SYMBOL if other_unit == unit else self._symbols[other_unit] for other_unit in units
         )
 
-    def _are_alike(self, view: Iterable[_Part], other: Iterable[_Part]) -> bool:
+    def _are_alike(self, view: Iterable[_Part], other_view: Iterable[_Part]) -> bool:
         """Return whether two drawings of units have at least half of their content in common.
 
         Rights that every node needs do not count, because they would make any two enclaves alike.
         """
         own, others = (
-            {part for part in parts if part[0] not in self._common_kinds} for parts in (view, other)
+            {part for part in parts if part[0] not in self._common_kinds}
+            for parts in (view, other_view)
         )
         return 2 * len(own & others) >= max(len(own), len(others))
 

@@ -257,7 +257,7 @@ def essential_edges(edges: Iterable[Edge]) -> list[Edge]:
 
 def _scene(
     picture: Picture,
-    name: str,
+    scene_id: str,
     title: str,
     edges: Sequence[Edge],
     owner: Callable[[str], str],
@@ -272,7 +272,7 @@ def _scene(
     for edge in picture.edges:
         everybody[edge.kind, edge.name].add(owner(edge.enclave))
     draft = _Draft(picture, edges, owner, members, everybody)
-    scene = draft.scene(name, title)
+    scene = draft.scene(scene_id, title)
     scene = with_positions(scene, 3) if with_places else scene
     shown = _count_real_names({(edge.kind, edge.name) for edge in edges}, drawn_as or {})
     hidden = (
@@ -342,12 +342,12 @@ class _Draft:
         nodes -= looking - drawn
         return nodes.pop() if len(nodes) == 1 else ""
 
-    def scene(self, name: str, title: str) -> Scene:
+    def scene(self, scene_id: str, title: str) -> Scene:
         """Return the scene before placement: without y, frames and the number of names."""
         cards = {card.id: card for card in self._cards()}
         width = 2 * (MARGIN + _SIDE_WIDTH + _GUTTER) + _NAMES_WIDTH
         return Scene(
-            id=name,
+            id=scene_id,
             title=title,
             width=width,
             cards=tuple(cards.values()),
@@ -743,12 +743,14 @@ def _relative_positions(columns: Sequence[Sequence[ColumnItem]]) -> dict[str, fl
 
 
 def _sort_by_barycenter(
-    column: Sequence[ColumnItem], near: Mapping[str, Sequence[str]], places: Mapping[str, float]
+    column: Sequence[ColumnItem],
+    neighbors: Mapping[str, Sequence[str]],
+    places: Mapping[str, float],
 ) -> list[ColumnItem]:
     center = {
         item.id: (
-            sum(places[neighbor] for neighbor in near[item.id]) / len(near[item.id])
-            if near[item.id]
+            sum(places[neighbor] for neighbor in neighbors[item.id]) / len(neighbors[item.id])
+            if neighbors[item.id]
             else places[item.id]
         )
         for item in column

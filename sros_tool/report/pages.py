@@ -376,9 +376,9 @@ def _open_rows(rows: Sequence[Json]) -> str:
     return f'<ul class="open">{items}</ul>' if items else ""
 
 
-def _open_row(name: str, label: str, *, is_known: bool) -> str:
+def _open_row(row_name: str, label: str, *, is_known: bool) -> str:
     kind = "warning" if is_known else "error"
-    return f'<span class="chip {kind}">{label}</span> <b>{escape(name)}</b><br>'
+    return f'<span class="chip {kind}">{label}</span> <b>{escape(row_name)}</b><br>'
 
 
 def _demo_vulnerabilities(result: Json) -> str:

@@ -658,13 +658,13 @@ def _with_enclave(source: PictureSource, folder: Path, now: datetime) -> Picture
 
 
 def _pictured_enclave(
-    name: str, state: OpenedEnclave, problems: tuple[str, ...]
+    enclave: str, state: OpenedEnclave, problems: tuple[str, ...]
 ) -> PicturedEnclave:
     certificate = state.certificate
     if certificate is None:
-        return PicturedEnclave(name, "", problems=problems)
+        return PicturedEnclave(enclave, "", problems=problems)
     return PicturedEnclave(
-        name,
+        enclave,
         "",
         subject=subject_text(certificate.subject),
         issuer=subject_text(certificate.issuer),
@@ -674,11 +674,11 @@ def _pictured_enclave(
     )
 
 
-def _validities_of(name: str, state: OpenedEnclave) -> Iterator[Validity]:
+def _validities_of(enclave: str, state: OpenedEnclave) -> Iterator[Validity]:
     if state.certificate:
-        yield _certificate_validity(state.certificate, "certificate", name, name)
+        yield _certificate_validity(state.certificate, "certificate", enclave, enclave)
     for grant in state.permissions.grants if state.permissions else ():
-        yield _grant_validity(grant, name)
+        yield _grant_validity(grant, enclave)
 
 
 def _grant_validity(grant: Grant, enclave: str) -> Validity:
@@ -687,10 +687,10 @@ def _grant_validity(grant: Grant, enclave: str) -> Validity:
 
 
 def _certificate_validity(
-    certificate: x509.Certificate, kind: str, title: str, name: str
+    certificate: x509.Certificate, kind: str, title: str, enclave: str
 ) -> Validity:
     window = validity_of(certificate)
-    return Validity(iso(window.not_after), iso(window.not_before), kind, title, name)
+    return Validity(iso(window.not_after), iso(window.not_before), kind, title, enclave)
 
 
 def _authority_validities(keystore: OpenedKeystore) -> Iterator[Validity]:
@@ -712,8 +712,8 @@ def _authority_validities(keystore: OpenedKeystore) -> Iterator[Validity]:
 # ── removing paths of this machine ─────────────────────────────────────────────────────────
 
 
-def _without_unknown_enclave(finding: PicturedFinding, known: Set[str]) -> PicturedFinding:
-    if not finding.enclave or finding.enclave in known:
+def _without_unknown_enclave(finding: PicturedFinding, known_enclaves: Set[str]) -> PicturedFinding:
+    if not finding.enclave or finding.enclave in known_enclaves:
         return finding
     return replace(finding, enclave="", text=f"{finding.enclave}: {finding.text}")
 

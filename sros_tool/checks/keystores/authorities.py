@@ -167,15 +167,15 @@ def key_findings(
 
 
 def _extension_findings(
-    certificate: x509.Certificate, subject: str, name: str, file: str
+    certificate: x509.Certificate, subject: str, ca_text: str, file: str
 ) -> Iterator[Finding]:
     if denies_issuing(certificate):
-        yield NOT_A_CA.found(subject, f"{name} may not issue certificates", file)
+        yield NOT_A_CA.found(subject, f"{ca_text} may not issue certificates", file)
     wanted = (x509.KeyUsage, x509.SubjectKeyIdentifier, x509.AuthorityKeyIdentifier)
     present = {type(extension.value) for extension in certificate.extensions}
     missing = [kind.__name__ for kind in wanted if kind not in present]
     if missing:
-        yield CA_EXTENSIONS.found(subject, f"{name} lacks {', '.join(missing)}", file)
+        yield CA_EXTENSIONS.found(subject, f"{ca_text} lacks {', '.join(missing)}", file)
 
 
 ONE_AUTHORITY = FindingKind(
