@@ -35,7 +35,10 @@ _Value = TypeVar("_Value")
 
 
 class MovedEndpoint(NamedTuple):
-    """An endpoint whose name changed because its node was renamed."""
+    """An endpoint whose name changed because its node was renamed.
+
+    ``old_node`` and ``new_node`` are full names of the node, ``old`` and ``new`` the endpoint.
+    """
 
     old_node: str
     new_node: str

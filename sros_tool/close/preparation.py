@@ -568,8 +568,8 @@ def _start_of_unknown_process(running: RunningRobot, state: CloseState) -> str:
 
     Returns "" without such an enclave. The clause has the command of the process if there is only
     one process and one enclave, no unit starts the process, and the process is of a user who can
-    read the enclaves.  If units start unknown processes, and the policy has new enclaves, the clause
-    also says how to name the nodes in the units.
+    read the enclaves.  If units start unknown processes, and the policy has new enclaves, the
+    clause also says how to name the nodes in the units.
     """
     observed, export = state.observed, running.robot.export.absolute()
     if not (idle := sorted(state.stopped)):

@@ -48,6 +48,7 @@ class Shell(NamedTuple):
 
     ``run`` runs a verb of sros, and returns its status, its output and its messages; if its second
     argument is True, the verb prints output and messages itself.  ``say`` shows progress.
+    ``environment`` has the variables of the shell, and ``zone`` is the time zone of this machine.
     """
 
     run: Callable[[Sequence[str], bool], tuple[int, str, str]]

@@ -80,7 +80,8 @@ def _module_path_variable() -> Mapping[str, str]:
 class Backend:
     """The library that the demo's nodes use; ``why`` is the reason for the choice, in one line.
 
-    ``dds`` is the name and version of the DDS, or of Zenoh.  With ``ros_observer``, an unsecured
+    ``name`` is `RCLPY`, `CYCLONE` or `ZENOH`.  ``dds`` is the name and version of the DDS, or of
+    Zenoh.  With ``ros_observer``, an unsecured
     observer of Cyclone nodes is an rclpy node; ``rmw`` is the RMW of rclpy.
     """
 

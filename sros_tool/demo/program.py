@@ -519,7 +519,7 @@ class RunPlan:
 
     ``domains`` has one domain per row; ``topic`` is absolute; ``period`` is in seconds.  With
     ``own_networks``, each row gets a separate network namespace.  ``started`` is the time at which
-    the plan was made (CLOCK_MONOTONIC, s).
+    the plan was made (CLOCK_MONOTONIC, s).  ``folder`` gets the files of the rows.
     """
 
     rows: tuple[Row, ...]

@@ -73,13 +73,13 @@ _TOPIC_RIGHTS = ("publish", "subscribe")
 class PictureSource:
     """The content of one source of a picture.
 
-    ``rights`` are the rights and denials in the source.  ``nodes`` maps paths of enclaves to names
-    of nodes; ``enclaves`` has the enclaves with data of their certificates; ``scope`` has the paths
-    of the enclaves that the source describes, None for all.  ``protections`` are the protection
-    levels that a policy states, and ``policy`` is that policy. ``keystore`` is the keystore from
-    which the source was read; ``revoked`` are revoked enclaves that it no longer has, and
-    ``unread`` units of the keystore that were only compared with other units. ``in_domains`` has
-    the rights by ROS domain; empty if the source states no domains.
+    ``origin`` is the title and kind of the source, ``rights`` are its rights and denials. ``nodes``
+    maps paths of enclaves to names of nodes; ``enclaves`` has the enclaves with data of their
+    certificates; ``scope`` has the paths of the enclaves that the source describes, None for all.
+    ``protections`` are the protection levels that a policy states, and ``policy`` is that policy.
+    ``keystore`` is the keystore from which the source was read; ``revoked`` are revoked enclaves
+    that it no longer has, and ``unread`` units of the keystore that were only compared with other
+    units. ``in_domains`` has the rights by ROS domain; empty if the source states no domains.
     """
 
     origin: SourceTitle

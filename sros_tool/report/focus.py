@@ -486,7 +486,10 @@ def flow_scene(picture: Picture, hops: int = HOPS, *, with_places: bool = True) 
 
 
 class _Stage(NamedTuple):
-    """Bundles of names in a ``column``, and the rights of enclaves on both sides of the column."""
+    """Bundles of names in a ``column``, and the rights of enclaves on both sides of the column.
+
+    Each entry of ``bundles`` is a bundle, the rights of enclaves to its left, and to its right.
+    """
 
     column: int
     bundles: tuple[tuple[Bundle, tuple[Tie, ...], tuple[Tie, ...]], ...]

@@ -63,6 +63,7 @@ _Part = tuple[int, tuple[int, ...]]
 class Folding(NamedTuple):
     """A picture in which equal units are drawn once, and the real names behind the labels.
 
+    ``equal`` describes the equal units, and ``different`` units that differ slightly from them.
     ``enclaves`` maps drawn paths to the real paths; ``names`` maps a kind and a drawn name to the
     real names.
     """
@@ -145,8 +146,8 @@ class DrawnUnit(NamedTuple):
 class UnitText:
     """A text that is split at names of units.
 
-    Each name of a unit is stored as two numbers: the index of the unit, and the index of the word
-    in the unit's ``values``.
+    ``parts`` are the texts between the names.  In ``named``, each name of a unit is stored as two
+    numbers: the index of the unit, and the index of the word in the unit's ``values``.
     """
 
     parts: tuple[str, ...]

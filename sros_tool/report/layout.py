@@ -146,6 +146,7 @@ class Card:
 class Link:
     """An arrow from the right edge of one card to the left edge of another card.
 
+    ``source`` and ``target`` are the ids of the cards, ``y1`` and ``y2`` the y of the ends.
     ``rights`` is the label, such as publish; ``wildcard`` says that only wildcards give the right,
     ``violates`` that the right breaks a requirement, ``differs`` that similar units lack the right.
     """

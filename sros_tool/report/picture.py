@@ -609,7 +609,10 @@ def _sentence_on_export(title: str) -> str:
 
 @dataclass(frozen=True, slots=True, order=True)
 class Tie:
-    """A right or denial of an enclave, or of a group of enclaves, for all names of a bundle."""
+    """A right or denial of an enclave, or of a group of enclaves, for all names of a bundle.
+
+    ``node`` is the path of the enclave, or ":" and the group; the other fields are as in `Edge`.
+    """
 
     node: str
     right: str

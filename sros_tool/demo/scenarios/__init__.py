@@ -147,7 +147,8 @@ class _Table(NamedTuple):
     """A table of a scenario file.
 
     ``kind`` is "party", "row" and so on ("": top level); ``place`` is its index among the tables of
-    this kind, to find the line for an error.
+    this kind, to find the line for an error.  ``lines`` are all lines of the file, and ``data`` has
+    the values of the table by key.
     """
 
     path: Path
