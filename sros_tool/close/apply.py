@@ -97,12 +97,14 @@ def _write_drop_ins(
     paths = [f"{unit}.d/{DROP_IN}" for unit in sorted(observed.units)]
     files = {path: read_bytes(robot.start / "units" / path, "unit").decode() for path in paths}
     _drop_ins_of(robot, observed)
-    if names := users_without_linger(each.user for each in observed.processes if each.unit):
+    if names := users_without_linger(
+        each.user for each in observed.processes if not each.container
+    ):
         linger = enumerated([f"`loginctl enable-linger {name}`" for name in names])
         robot.shell.say(
             f"WARNING: when {enumerated(names)} logs in and out again, systemd removes the shared "
-            "memory of this user, and the nodes of the units hear nothing any more (RemoveIPC in "
-            f"logind.conf(5)). First run {linger}, or give the units a system user"
+            "memory of this user, and the nodes of this user hear nothing any more (RemoveIPC in "
+            f"logind.conf(5)). First run {linger}, or run the nodes as a system user"
         )
     changes = unit_changes(_SYSTEMD_FOLDER, files, force=True)
     for path, action in changes.items():
@@ -129,11 +131,13 @@ def undo(robot: LocalRobot, *, dry_run: bool) -> CloseState:
     units |= {process.unit for process in observed.processes if not running.is_open(process)} - {""}
     policy = _readable_policy(robot)
     expected = observed.limited_to(policy) if policy else observed
-    units -= (stopped := _stopped_units(units))
-    if stopped := stopped & expected.units:
-        start = shlex.join(["systemctl", "start", *sorted(stopped)])
+    not_running = _states_of_stopped_units(units)
+    units -= not_running.keys()
+    not_running = {unit: not_running[unit] for unit in sorted(not_running.keys() & expected.units)}
+    if inactive := [unit for unit, state in not_running.items() if state == "inactive"]:
+        start = shlex.join(["systemctl", "start", *inactive])
         robot.shell.say(
-            f"{enumerated(sorted(stopped))} did not run, and --undo starts no stopped unit; to "
+            f"{enumerated(inactive)} did not run, and --undo starts no stopped unit; to "
             f"start open: {start}"
         )
     # Open processes of Fast DDS find each other also if they start together.
@@ -149,6 +153,13 @@ def undo(robot: LocalRobot, *, dry_run: bool) -> CloseState:
     remaining = _RemainingProcesses(RunningRobot(robot), expected)
     remaining.say_how_to_start()
     problems = [
+        # It may have failed because it could not start secured, or because somebody stopped it.
+        *(
+            f"{unit} has failed: start it open with `systemctl start {unit}`, or let it stay "
+            f"stopped: `systemctl reset-failed {unit}`"
+            for unit, state in not_running.items()
+            if state == "failed"
+        ),
         *remaining.commands_to_open(),
         *(() if dry_run else remaining.secured_processes_of_units()),
         *(() if dry_run else _processes_not_open(running, started)),
@@ -350,17 +361,19 @@ def _router_units(observed: ObservedProcesses) -> set[str]:
     return {process.unit for process in observed.processes if process.is_router}
 
 
-def _stopped_units(units: Iterable[str]) -> set[str]:
-    """Return the units that do not run: somebody may have stopped them for a reason.
+def _states_of_stopped_units(units: Iterable[str]) -> dict[str, str]:
+    """Map the units that do not run to their states, "inactive" or "failed".
 
-    The state "failed" does not show that nobody did: many nodes fail when they are stopped.
+    Somebody may have stopped a unit for a reason. The state "failed" does not show that nobody did:
+    many nodes fail when they are stopped.
     """
-    stopped = set[str]()
+    stopped = dict[str, str]()
     for unit in units:
         command = ["systemctl", "show", "--property=ActiveState", "--value", unit]
         with suppress(OSError):  # the restart reports it
-            state = subprocess.run(command, capture_output=True, check=False).stdout.strip()
-            stopped |= {unit} if state in (b"inactive", b"failed") else set()
+            ended = subprocess.run(command, capture_output=True, text=True, check=False)
+            if (state := ended.stdout.strip()) in ("inactive", "failed"):
+                stopped[unit] = state
     return stopped
 
 

@@ -490,7 +490,7 @@ def test_a_robot_is_closed_proved_and_opened_again(
     seen.write_text(json.dumps(twice))
     closed = robot.close("--apply")
     assert robot.restarts == ["daemon-reload", *RESTARTS]
-    assert "First run `loginctl enable-linger robo`, or give the units a sys" in closed.err
+    assert "First run `loginctl enable-linger robo`, or run the nodes as a s" in closed.err
     assert closed.out.splitlines()[-6:] == [
         "yes: every process was started in its enclave: 2 enclaves, and no open process in "
         "domain 0",
@@ -552,6 +552,9 @@ def test_a_robot_is_closed_proved_and_opened_again(
         (robot.folder / "talker.service").write_text(f"{stopped}\n")
         assert "talker.service" not in robot.close("--undo").err, "its enclave was taken away"
     policy.write_text(signed)
+    failed = "talker.service has failed: start it open with `systemctl start talker.service`, or"
+    assert failed in robot.close("--undo", status=1).out
+    (robot.folder / "talker.service").write_text("inactive\n")
     stays = "did not run, and --undo starts no stopped unit; to start open: systemctl start talk"
     assert stays in robot.close("--undo").err
     assert len(robot.restarts) == 5
