@@ -734,6 +734,7 @@ def process_origin(pid: int, proc: Path = Path("/proc")) -> ProcessOrigin:
     with suppress(OSError):
         text = (proc / str(pid) / "cgroup").read_text(errors="surrogateescape")
         unit = service[1] if (service := _SERVICE.search(text)) else ""
+        unit = "" if _SERVICE_OF_OTHERS.fullmatch(unit) else unit
         container = named[1][:12] if (named := _CONTAINER.search(text)) else ""
         folder = str((proc / str(pid) / "cwd").readlink())
     child: tuple[str, ...] = ()
@@ -790,6 +791,15 @@ def launch_word_index(command: Sequence[str]) -> int:
 
 SERVICE_NAME = r"\w[\w:.@\\-]*\.service"
 """The name of a systemd service, as a regular expression."""
+_SERVICE_OF_OTHERS = re.compile(
+    r"(cron|crond|atd|anacron|sshd?|(sshd?|getty|serial-getty)@.*|docker|containerd|supervisord?"
+    r"|NetworkManager-dispatcher|networkd-dispatcher|systemd-udevd)\.service",
+    re.A,
+)
+"""Matches services that start programs of their users, such as ``@reboot`` lines of a crontab.
+
+A restart of such a service restarts or ends other programs, too.
+"""
 _SERVICE = re.compile(
     r"^(?:0:|\d+:name=systemd):/system\.slice/(?:[^/\n]+\.slice/)*(" + SERVICE_NAME + r")$",
     re.M | re.A,
