@@ -439,11 +439,11 @@ def _shared_topic(*accesses: _Access) -> str:
     outside = {excluded for access in accesses for excluded in access.without}
     if exact:
         return "" if any(matches(excluded, exact) for excluded in outside) else exact
-    return _shared_by_wildcards(tuple(topics), tuple(sorted(outside)))
+    return _topic_shared_by_wildcards(tuple(topics), tuple(sorted(outside)))
 
 
 @lru_cache(maxsize=4096)
-def _shared_by_wildcards(topics: tuple[str, ...], wildcards_outside: tuple[str, ...]) -> str:
+def _topic_shared_by_wildcards(topics: tuple[str, ...], wildcards_outside: tuple[str, ...]) -> str:
     for prefix, (_, _, end) in _WRITER_RIGHTS.items():
         # Compare the ROS parts first, so that the result is a valid ROS name.
         inner = [_ros_part(topic, prefix, end) for topic in topics]

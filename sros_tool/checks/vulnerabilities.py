@@ -146,7 +146,7 @@ def is_fixed_later(library: RobotLibrary, advisories: Sequence[Advisory] | None 
     """
     known = known_vulnerabilities(library.product, library.version, advisories)
     numbers = version_numbers(library.version)
-    if known is None or numbers is None or _as_mapped(library).packaged:
+    if known is None or numbers is None or _as_mapped(library).is_packaged:
         return False
     return any(advisory.fixed_in(numbers) for advisory in known.known)
 
@@ -173,7 +173,7 @@ def _library_findings(
             yield VERSION_UNKNOWN.found(library.product, text)
         elif known.known:
             kind = KNOWN_VULNERABILITIES
-            if library.packaged:
+            if library.is_packaged:
                 kind = PACKAGE_VULNERABILITIES
             number = _vulnerability_counts_clause(known.known, library.version)
             ids = f": {', '.join(advisory.id for advisory in known.known)}"

@@ -723,7 +723,7 @@ def used_libraries(
         known = known_vulnerabilities(library.product, library.version, advisories)
         ids = tuple(advisory.id for advisory in known.known) if known else None
         unclear = tuple(advisory.id for advisory in known.unclear) if known else ()
-        used.add(UsedLibrary(library.product, library.version, library.packaged, ids, unclear))
+        used.add(UsedLibrary(library.product, library.version, library.is_packaged, ids, unclear))
     return tuple(sorted(used))
 
 

@@ -280,7 +280,7 @@ class DeniedRight:
 
     @property
     def can_be_added(self) -> bool:
-        """Whether an additional right in the policy allows it."""
+        """Whether an additional right in the policy would allow the access."""
         return not (self.by_rule or self.by_files)
 
     def __str__(self) -> str:

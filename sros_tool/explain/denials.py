@@ -363,7 +363,7 @@ def as_learned(
             )
             if parts:
                 parts_by_profile[_full_name(profile)] = ", ".join(parts)
-            if lacking := _lacking_parameter_services(denied, denied | has):
+            if lacking := _lacking_services_text(denied, denied | has):
                 parameter_clients[f"to {_full_name(profile)}"] = lacking
             groups = groups_of(denied - node_rights, *profile)
             profiles.append(LearnedProfile(path, *profile, denied | node_rights, parts, groups))
@@ -390,8 +390,11 @@ def as_learned(
     )
 
 
-def _lacking_parameter_services(denied: Set[NodeRight], rights: Set[NodeRight]) -> str:
-    """Return which parameter services of other nodes ``rights`` lack, if one was ``denied``."""
+def _lacking_services_text(denied: Set[NodeRight], rights: Set[NodeRight]) -> str:
+    """Return text with the parameter services of other nodes that ``rights`` lack, or "".
+
+    Only nodes of which such a service was ``denied`` count.
+    """
     asked = [right.name.rpartition("/") for right in denied if right.right == "request"]
     nodes = sorted({node for node, _, service in asked if service in PARAMETER_SERVICES})
     lacking = {

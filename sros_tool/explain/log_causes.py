@@ -286,7 +286,7 @@ class Examiner:
         peers = {name: self._find(name) for name in names if name}
         known: list[str] = []
         remedies: list[str] = []
-        rotating = self._keystore.rotates if self._keystore else False
+        rotating = self._keystore.is_reissuing if self._keystore else False
         for name, peer in peers.items():
             if peer is None:
                 continue
@@ -476,7 +476,7 @@ class Examiner:
                 enclaves = self._keystore.enclaves_for(node)
             elif self._policy:
                 enclaves = self._policy.enclaves_for(node, denial.enclave)
-            beginning = f"the permissions are for {_listed_nodes(nodes)}, and " if nodes else ""
+            beginning = f"the permissions are for {_nodes_text(nodes)}, and " if nodes else ""
             if enclaves:
                 return [
                     f"{beginning}this is the node {node}, for which there is "
@@ -724,13 +724,13 @@ def _remapping_advice(name: str, meant: str) -> str:
 
 
 def _otherwise(remedy: str) -> str:
-    """Return a remedy as it follows remedies for other causes."""
+    """Return a remedy after "Otherwise," or "Or,", to follow remedies for other causes."""
     # Such a remedy often has an "Otherwise" of its own.
     return f"{'Or' if remedy.startswith('If ') else 'Otherwise'}, {_within_sentence(remedy)}"
 
 
 def _within_sentence(remedy: str) -> str:
-    """Return a remedy as it continues a sentence."""
+    """Return a remedy with a small first letter, to continue a sentence."""
     return f"{remedy[:1].lower()}{remedy[1:]}"
 
 
@@ -795,7 +795,7 @@ def _nodes_clause(answer: Answer) -> tuple[str, ...]:
     """Return one clause: the nodes that an enclave's permissions name, or that they name none."""
     nodes = _served_names(answer)
     if nodes:
-        return (f"the permissions are for {_listed_nodes(nodes)}",)
+        return (f"the permissions are for {_nodes_text(nodes)}",)
     return (f"the permissions lack {_EVERY_NODE}",)
 
 
@@ -866,7 +866,7 @@ def _enclaves_text(enclaves: Sequence[str]) -> str:
     return f"the enclave{'s' * (len(enclaves) > 1)} {' and '.join(enclaves)}"
 
 
-def _listed_nodes(nodes: Sequence[str]) -> str:
+def _nodes_text(nodes: Sequence[str]) -> str:
     return f"the node{'s' * (len(nodes) > 1)} {', '.join(nodes)}"
 
 

@@ -85,7 +85,7 @@ class SearchedKeystore:
         return frozenset(names)
 
     @cached_property
-    def rotates(self) -> bool:
+    def is_reissuing(self) -> bool:
         """Whether a CA rotation is in the stage after which all files are from the new CAs."""
         try:
             return read_rotation(self._keystore).stage is RotationStage.REISSUE

@@ -176,9 +176,9 @@ class Comparison(NamedTuple):
     def sentence(self) -> str:
         """A sentence on the vendors or distributions that decide differently than the first."""
         if self.vendors:
-            return _vendor_differences(self.vendors)
+            return _vendor_differences_sentence(self.vendors)
         decided = [(answer.shipped.title, answer.outcome) for answer in self.distributions or ()]
-        return _differing_titles("distributions", decided)
+        return _differences_clause("distributions", decided)
 
 
 DdsExplanation = VendorExplanation | Comparison
@@ -251,18 +251,18 @@ def explain_on_dds(
         for v in DEFAULT_RELEASES
     ]
     if len({tested_answer.outcome for tested_answer in tested}) > 1:
-        notes = (*notes, Note("explain.vendors-differ", f"{_vendor_differences(tested)}."))
+        notes = (*notes, Note("explain.vendors-differ", f"{_vendor_differences_sentence(tested)}."))
     return VendorExplanation(asked, answer, why, zenoh_next_to_dds, notes)
 
 
-def _vendor_differences(answers: Sequence[Answer]) -> str:
+def _vendor_differences_sentence(answers: Sequence[Answer]) -> str:
     """Return a sentence that names the vendors whose outcome differs from the first vendor's."""
-    return _differing_titles(
+    return _differences_clause(
         "vendors", [(answer.vendor.title, answer.outcome) for answer in answers]
     )
 
 
-def _differing_titles(who: str, decided: Sequence[tuple[str, Outcome]]) -> str:
+def _differences_clause(who: str, decided: Sequence[tuple[str, Outcome]]) -> str:
     """Return a clause that names whose outcome differs from the first one's.
 
     ``who`` is a plural, such as "vendors"; ``decided`` has a title and an outcome for each of them.

@@ -226,7 +226,7 @@ class ZenohAnswer:
         return self.text if self.outcome is _Outcome.REFUSED else ""
 
     @property
-    def of_router(self) -> bool:
+    def is_of_router(self) -> bool:
         """Whether the enclave is the enclave of a router."""
         return self.mode is Mode.ROUTER
 
@@ -517,7 +517,7 @@ class ZenohEvaluator:
         A denial depends only on the enclave's own rights.  ``ends`` are the enclaves at the other
         end.
         """
-        if not answer.allowed and not answer.of_router:
+        if not answer.allowed and not answer.is_of_router:
             return set()
         wanted = self._rights(answer.enclave, answer.question)
         return ends | enclaves_with_rights(self.keystore, {right.name for right in wanted})
@@ -978,7 +978,7 @@ class ZenohOfKeystore:
         yield from notes_on_enclaves_left_out(self._keystore)
         yield from note_on_lacking_keys(self._keystore)
         yield from _note_on_unsigned(next(iter(self._evaluators.values())).unsigned_files())
-        if any(outcome.of_router and outcome.allowed for outcome in outcomes):
+        if any(outcome.is_of_router and outcome.allowed for outcome in outcomes):
             yield _ROUTERS_KEY
         if any(outcome.mode is Mode.PEER for outcome in outcomes):
             text = (
@@ -1051,7 +1051,7 @@ class ZenohExplanation(NamedTuple):
     @property
     def wants_rights(self) -> bool:
         """Whether more rights would help; never for a router, whose enclave has no rights."""
-        return not self.allowed and not self.permitted and not self.answer.of_router
+        return not self.allowed and not self.permitted and not self.answer.is_of_router
 
     @property
     def remedy(self) -> str:
@@ -1061,7 +1061,7 @@ class ZenohExplanation(NamedTuple):
     @property
     def files_remedy(self) -> str:
         """What to do if the Zenoh files do not match the permissions, or ""."""
-        if self.answer.of_router:
+        if self.answer.is_of_router:
             return "" if self.allowed else "Give the node an enclave of its own."
         if self.allowed is self.permitted and not self.out_of_date:
             return ""
@@ -1135,7 +1135,7 @@ def explain_on_zenoh(
 
 
 def _notes(answer: ZenohAnswer, stated: Answer, outdated: Sequence[str] | None) -> Iterator[Note]:
-    if answer.of_router:
+    if answer.is_of_router:
         if answer.allowed:
             yield _ROUTERS_KEY
     elif answer.allowed is not stated.allowed and not stated.problems:

@@ -246,7 +246,7 @@ def _uses_of_nodes(
     used: Mapping[str, Sequence[str]],
     common: Sequence[Group],
 ) -> tuple[EnclaveUse, ...]:
-    """Compare the rights of each node with its use.
+    """Return a comparison of the rights of each node with its use.
 
     ``stated`` and ``used`` map each node to the profiles in the policy that state its rights, and
     to the observed nodes whose use counts for it.

@@ -605,7 +605,7 @@ def _violation_clause(violation: Violation) -> str:
         case Must() | Protected():
             return _clause(violation)
         case _:
-            return f"{_clause(violation)}{_other_violators(violation)}"
+            return f"{_clause(violation)}{_other_violators_clauses(violation)}"
 
 
 def _clause(violation: Violation) -> str:
@@ -622,7 +622,7 @@ def _clause(violation: Violation) -> str:
         case Protected(level=level):
             return f"its messages are not {_protection_word(level)}"
         case AtMost():
-            return _joined_steps(steps)
+            return _joined_steps_text(steps)
         case NotBoth():
             return f"may {steps[0].action_text()} and {steps[1].action_text()}"
         case _:
@@ -644,14 +644,14 @@ def _chain_text(steps: Sequence[Step]) -> str:
     )
 
 
-def _joined_steps(steps: Sequence[Step]) -> str:
+def _joined_steps_text(steps: Sequence[Step]) -> str:
     """Return text such as ``/a and /b may publish /x``; different uses are listed one by one."""
     if len({step.action_text() for step in steps}) > 1:
         return _listed_names([step.text() for step in steps])
     return f"{_listed_names([step.use.enclave for step in steps])} may {steps[0].action_text()}"
 
 
-def _other_violators(violation: Violation) -> str:
+def _other_violators_clauses(violation: Violation) -> str:
     """Return clauses on the further enclaves that break a requirement; "" for none."""
     similar, differing = violation.alike, violation.differing
     text = f", and so may {_listed_names(similar)}" if similar else ""

@@ -933,7 +933,7 @@ class _Review:
                 yield f"'{path}' is a keystore and is not reviewed"
         except SrosError as error:
             yield f"keystores that did not change were not looked for: {error.what}"
-        if self._template_changes():
+        if self._is_template_changed():
             yield f"'{asked.template}' changes, and the access that it gives is not compared"
         for path in self._changed_settings():
             yield f"'{path}' changes and is not reviewed"
@@ -1221,7 +1221,7 @@ class _Review:
             return read_template(file)
         raise self._missing_file_error(choice)
 
-    def _template_changes(self) -> bool:
+    def _is_template_changed(self) -> bool:
         choice = self.request.template
         if not (choice and self.base) or choice in template_names():
             return False

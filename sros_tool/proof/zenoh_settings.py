@@ -196,7 +196,7 @@ def _changes(
             if old and endpoint.text not in old_endpoints:
                 address = f"{endpoint.protocol}/{endpoint.address}"[:80]
                 yield f"{key}/endpoints", "without", f"with {address}", what
-    if protocols := _added_protocols(before.protocols, after.protocols):
+    if protocols := _added_protocols_text(before.protocols, after.protocols):
         meaning = "it accepts connections over these protocols"
         yield "transport/link/protocols", "without", f"with {protocols}", meaning
     for path in sorted({*before.settings, *after.settings}):
@@ -218,7 +218,7 @@ def _changes(
                 )
 
 
-def _added_protocols(before: tuple[str, ...] | None, after: tuple[str, ...] | None) -> str:
+def _added_protocols_text(before: tuple[str, ...] | None, after: tuple[str, ...] | None) -> str:
     """Return the protocols that only ``after`` allows, as a list in words; "" if there are none."""
     if before is None:
         return ""

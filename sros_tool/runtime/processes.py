@@ -111,7 +111,7 @@ class MappedLibrary(NamedTuple):
     replaced: bool = False
 
     @property
-    def packaged(self) -> bool:
+    def is_packaged(self) -> bool:
         """Whether the library is from a Debian or Ubuntu package, which can have later fixes."""
         return self.path.startswith(("/usr/lib/", "/lib/"))
 
