@@ -690,7 +690,7 @@ def _machine_findings(
     libraries: tuple[MappedLibrary, ...] = (),
     advisories: tuple[Advisory, ...] | None = None,
 ) -> list[Finding]:
-    """Return the runtime findings on this machine, for the environment variables given.
+    """Return the runtime findings on this machine, for the variables in ``environment``.
 
     ``insecure_rmws`` maps RMWs that were found not to enforce security to the evidence.
     ``libraries`` are installed DDS libraries, and ``advisories`` are the known vulnerabilities;

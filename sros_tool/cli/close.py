@@ -504,7 +504,7 @@ def _state_text(closed: CloseState, *, apply: bool) -> str:
 
 
 def _run_state_text(closed: CloseState, enclave: str) -> str:
-    """Return how the process of an enclave runs, if not as it should."""
+    """Return in words how the process of an enclave runs, which does not run as it should."""
     if enclave in closed.secured:
         return _NOT_CURRENT
     if enclave in closed.other_files:

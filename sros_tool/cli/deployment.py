@@ -291,7 +291,7 @@ def verify(
             secrets=secrets() if tokens else None,
         )
     if as_json:
-        print_json(arrival.verified(moment, wanted))
+        print_json(arrival.verified_folder(moment, wanted))
         return 1 if arrival.findings else 0
     for enclave in arrival.enclaves:
         until = f" until {iso(enclave.valid_until)}" if enclave.valid_until else ""

@@ -144,7 +144,10 @@ _GOES_WITH = {"infrastructure": "--reach only", "patterns": "--who only", "robot
 
 
 def _refuse_ignored(mode: str) -> None:
-    """Raise `UsageError` if an option is given that has no effect in this mode."""
+    """Raise `UsageError` if an option is given that has no effect in ``mode``.
+
+    ``mode`` is --who, --reach or --log; "" is a question about one enclave.
+    """
     context = click.get_current_context()
     for parameter in context.command.params:
         name = parameter.name or ""

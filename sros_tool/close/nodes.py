@@ -108,7 +108,7 @@ class ObservedNodes:
             )
             yield replace(node, enclaves=moved) if moved else node
 
-    def expected(self, current: Observation | None = None) -> Observation:
+    def expected_nodes(self, current: Observation | None = None) -> Observation:
         """Return the nodes whose enclaves the policy has, with the names that they should have now.
 
         If the policy allows several names for an endpoint of a renamed node, the result has the
@@ -116,7 +116,7 @@ class ObservedNodes:
         """
         names, nodes = self.policy_enclaves, []
         for node in self.in_their_enclaves():
-            if node_name(node) in self.renamed or names.issuperset(node.enclaves):
+            if node_name(node) in self.renamed_nodes or names.issuperset(node.enclaves):
                 nodes.append(self._with_current_name(node, current, node.endpoints))
         return make_observation(nodes)
 
@@ -124,7 +124,7 @@ class ObservedNodes:
         self, node: ObservedNode, current: Observation | None, endpoints: Iterable[Endpoint]
     ) -> ObservedNode:
         """Return an observed node with its current name, and only with the given endpoints."""
-        new = self.renamed.get(node_name(node))
+        new = self.renamed_nodes.get(node_name(node))
         if not new:
             return replace(node, endpoints=frozenset(endpoints))
         names = self._current_endpoints(node, current)
@@ -138,11 +138,11 @@ class ObservedNodes:
 
         No process of the enclaves ``away`` runs here.
         """
-        nodes, _ = self.divide_by_profile(self.expected(current).nodes)
+        nodes, _ = self.divide_by_profile(self.expected_nodes(current).nodes)
         return make_observation(node for node in nodes if node.enclaves[0] not in away)
 
     @cached_property
-    def renamed(self) -> Mapping[str, tuple[str, str]]:
+    def renamed_nodes(self) -> Mapping[str, tuple[str, str]]:
         """Map the old full names of renamed nodes to the namespace and name in the policy.
 
         A node counts as renamed if it is the only node of its enclave without a profile, and the
@@ -165,7 +165,9 @@ class ObservedNodes:
 
     @cached_property
     def _allowed_endpoints(self) -> Mapping[ObservedNode, Mapping[Endpoint, Sequence[Endpoint]]]:
-        """Map each old endpoint of a renamed node to its allowed new names, the likeliest first.
+        """Map each renamed node to its old endpoints, and these to the allowed new endpoints.
+
+        The new endpoints of an old one are sorted, the likeliest first.
 
         If the enclave denies all possible names, only the likeliest name is kept.
         """
@@ -174,11 +176,11 @@ class ObservedNodes:
                 endpoint: _possible_endpoints(endpoint, node, *new) for endpoint in node.endpoints
             }
             for node in self.as_observed
-            if (new := self.renamed.get(node_name(node)))
+            if (new := self.renamed_nodes.get(node_name(node)))
         }
         tried = []
         for node, names in possible.items():
-            ns, name = self.renamed[node_name(node)]
+            ns, name = self.renamed_nodes[node_name(node)]
             candidates = frozenset(chain.from_iterable(names.values()))
             tried.append(replace(node, ns=ns, name=name, endpoints=candidates))
         denied = {
@@ -203,7 +205,7 @@ class ObservedNodes:
         self, node: ObservedNode, current: Observation | None
     ) -> Mapping[Endpoint, Endpoint]:
         """Map the old endpoints of a renamed node to the endpoints that it should have now."""
-        name = expand("~", *self.renamed[node_name(node)])
+        name = expand("~", *self.renamed_nodes[node_name(node)])
         nodes = (other for other in (current.nodes if current else ()) if node_name(other) == name)
         endpoints = {endpoint for other in nodes for endpoint in other.endpoints}
         return {
@@ -214,7 +216,8 @@ class ObservedNodes:
     def intermittent_endpoints(self, current: Observation) -> set[tuple[str, Endpoint]]:
         """Return the endpoints that nodes of the open robot had only for a part of the watch.
 
-        The result has the names of `endpoints_of`, as in `expected` for the ``current`` graph.
+        The result has the names of `endpoints_of`, as in `expected_nodes` for the ``current``
+        graph.
         """
         intermittent = {
             (seen.node, seen.participant, Endpoint(seen.topic, seen.direction))
@@ -235,7 +238,7 @@ class ObservedNodes:
         """Return the endpoints whose names change because their nodes were renamed."""
         return {
             MovedEndpoint(
-                node_name(node), expand("~", *self.renamed[node_name(node)]), before, after
+                node_name(node), expand("~", *self.renamed_nodes[node_name(node)]), before, after
             )
             for node in self._allowed_endpoints
             for before, after in self._current_endpoints(node, current).items()
@@ -277,7 +280,7 @@ class ObservedNodes:
             in_policy = self.policy.enclave(enclave)
             profiles = in_policy.all_profiles() if in_policy else ()
             names = {expand("~", profile.ns, profile.node) for profile in profiles}
-            return observed | names, next(iter(observed & self.renamed.keys()), "")
+            return observed | names, next(iter(observed & self.renamed_nodes.keys()), "")
         return set(), ""
 
 

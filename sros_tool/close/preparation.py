@@ -224,7 +224,7 @@ def _with_renamed_enclaves(robot: LocalRobot, observed: ObservedProcesses) -> Ob
 def _denied_rights(robot: LocalRobot) -> Sequence[DeniedRight]:
     """Return the rights that observed nodes need and the keystore denies."""
     nodes = ObservedNodes(robot)
-    return nodes.denied_rights(nodes.expected())
+    return nodes.denied_rights(nodes.expected_nodes())
 
 
 def denied_remappings(

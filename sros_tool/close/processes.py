@@ -427,7 +427,7 @@ class ObservedProcesses(NamedTuple):
 
 
 def is_in_domain(process: Process, domain: int) -> bool:
-    """Return whether a process may be in a ROS domain, in the network of this process."""
+    """Return whether a process may be in a ROS domain, in the network in which sros runs."""
     # If the variable has no number, rcl refuses it, but a program without rcl may use any domain.
     may_be_in = process.domain == str(domain) or not process.domain.isdecimal()
     return may_be_in and not process.network

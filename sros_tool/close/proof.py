@@ -628,7 +628,7 @@ class _TalkComparison:
     ) -> None:
         self.current = observation_from_json(audited)
         self._running, self._nodes, self._away, self._audited = running, nodes, away, audited
-        self._denied = nodes.denied_rights(nodes.expected(self.current))
+        self._denied = nodes.denied_rights(nodes.expected_nodes(self.current))
         self._intermittent = nodes.intermittent_endpoints(self.current)
 
     @property
@@ -642,7 +642,7 @@ class _TalkComparison:
         unseen = [node for node in self._audited["unseen"] if node["enclave"] not in self._away]
         before, expected = (
             nodes.nodes_to_compare(self._away, self.current),
-            nodes.expected(self.current),
+            nodes.expected_nodes(self.current),
         )
         names = {*map(node_name, self.current.nodes)}
         absent = {node["enclave"] for node in unseen}
@@ -693,7 +693,7 @@ class _TalkComparison:
 
     def _later_names(self, nodes: Iterable[ObservedNode]) -> list[str]:
         """Return the nodes, and the uses of other nodes, that the open robot did not have."""
-        expected = self._nodes.expected(self.current).nodes
+        expected = self._nodes.expected_nodes(self.current).nodes
         known = {*map(node_name, expected)}
         uses = {*endpoints_of(nodes)}.difference(endpoints_of(expected))
         later = sorted({*map(node_name, nodes)} - known)
@@ -702,7 +702,7 @@ class _TalkComparison:
     def _unused_rights(self) -> list[Right]:
         """Return the rights of the policy to one name that no node used, then or now."""
         policy, robot = self._nodes.policy, self._running.robot
-        nodes = [*self._nodes.expected(self.current).nodes, *self.current.nodes]
+        nodes = [*self._nodes.expected_nodes(self.current).nodes, *self.current.nodes]
         used = {
             (enclave, endpoint)
             for node in nodes
@@ -802,7 +802,7 @@ def _name_clauses(
 
     If the proof ``fails``, the first clause has advice, and the second clause is left out.
     """
-    if renamed := nodes.renamed:
+    if renamed := nodes.renamed_nodes:
         names = [f"{old} as {expand('~', *renamed[old])}" for old in sorted(renamed)]
         text = f"compared under a new name: {first_few(names, MOST_NAMES)}"
         pairs = nodes.moved_endpoints(current)

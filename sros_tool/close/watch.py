@@ -129,7 +129,7 @@ def watch(robot: LocalRobot, words: Sequence[str]) -> list[str]:
     problems = [_text_on_nodes_without_enclave(robot, without_enclave)] if without_enclave else []
     lacking = ""
     if learned["dry_run"]:
-        lacking = _lacking_text(robot, nodes, observed_nodes.renamed)
+        lacking = _lacking_text(robot, nodes, observed_nodes.renamed_nodes)
     return problems + [lacking] * bool(lacking)
 
 

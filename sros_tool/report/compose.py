@@ -425,7 +425,7 @@ def _neutral_edge(edge: Edge, unseen: frozenset[str], observed: NamesOfRights) -
     that matches a name in ``observed``.
     """
     neutral = edge.qualifier is not ALLOW or edge.enclave in unseen
-    neutral = neutral or (is_expression(edge.name) and observed.match(edge))
+    neutral = neutral or (is_expression(edge.name) and observed.has_match(edge))
     return replace(edge, mark=OverlaySide.BOTH) if neutral else edge
 
 
@@ -485,7 +485,7 @@ class NamesOfRights:
             if not is_expression(right.name):
                 self._names[right.enclave, right.right].append(right.name)
 
-    def match(self, edge: Edge) -> bool:
+    def has_match(self, edge: Edge) -> bool:
         """Return whether a wildcard drawn as a name matches a name of its enclave and right."""
         names = self._names.get((edge.enclave, edge.right), ())
         return any(matches(edge.name, name) for name in names)

@@ -290,8 +290,8 @@ class _Draft:
                 }
             if classes:
                 self._classes = classes
-                return self._folded()
-        return _unfolded(self._picture)
+                return self._make_folding()
+        return _empty_folding(self._picture)
 
     def _has_marks(self) -> bool:
         texts = (
@@ -449,7 +449,7 @@ class _Draft:
 
     # ── the picture ────────────────────────────────────────────────────────────────────────
 
-    def _folded(self) -> Folding:
+    def _make_folding(self) -> Folding:
         self._inside = {n: number for number, members in self._classes.items() for n in members}
         self._enclaves: dict[str, tuple[str, ...]] = {}
         self._names: dict[tuple[str, str], tuple[str, ...]] = {}
@@ -707,7 +707,7 @@ def _classes(views: Sequence[Counter[_Part]], before: Sequence[int]) -> dict[int
     return classes
 
 
-def _unfolded(picture: Picture) -> Folding:
+def _empty_folding(picture: Picture) -> Folding:
     return Folding(picture, (), (), {}, {})
 
 

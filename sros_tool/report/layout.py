@@ -293,8 +293,8 @@ def _count_real_names(names: Iterable[tuple[str, str]], drawn_as: DrawnAs) -> in
 class _Draft:
     """The builder of a scene before placement, with its cards and links.
 
-    ``members`` maps each node of the scene to its enclaves; ``everybody`` maps each name to the
-    nodes with any right to the name, drawn or not.
+    A node of the scene is an enclave, or ":" and a group.  ``members`` maps each node to its
+    enclaves; ``everybody`` maps each name to the nodes with any right to the name, drawn or not.
     """
 
     def __init__(
@@ -334,10 +334,10 @@ class _Draft:
         return is_plain(tie) and (tie.node, tie.right) in self._looking
 
     def _only_node(self, bundle: Bundle) -> str:
-        """Return the only node, apart from onlookers, with a right to these names, or ""."""
+        """Return the only enclave or group, except onlookers, with a right to the names, or ""."""
         looking = {tie.node for tie in bundle.ties if self._is_onlooker(tie)}
         drawn = {tie.node for tie in bundle.ties if not self._is_onlooker(tie)}
-        if not all(map(is_plain, bundle.ties)) or bundle.protection.open_text(bundle.kind):
+        if not all(map(is_plain, bundle.ties)) or bundle.protection.open_access_text(bundle.kind):
             return ""
         nodes = {node for name in bundle.names for node in self._everybody[bundle.kind, name]}
         nodes -= looking - drawn
@@ -422,7 +422,7 @@ class _Draft:
 
 
 def _onlookers(bundles: Sequence[Bundle]) -> dict[tuple[str, str], int]:
-    """Map onlookers (node and right) to the number of their names.
+    """Map onlookers (enclave or group, and right) to the number of their names.
 
     An onlooker, such as ("/recorder", "subscribe"), has wildcards for so many names that the lines
     of the onlooker would hide all other lines.
@@ -515,7 +515,7 @@ def names_card(card: str, bundle: Bundle, column: int, more: tuple[str, ...] = (
     titles, notes = _names_title(bundle)
     lines = tuple(line for title in titles for line in _wrapped_name(title, _NAMES_LETTERS))
     notes += more
-    if is_open := bundle.protection.open_text(bundle.kind):
+    if is_open := bundle.protection.open_access_text(bundle.kind):
         notes += (is_open,)
     if bundle.lacks:
         notes += (lack_text(bundle.kind, bundle.lacks),)

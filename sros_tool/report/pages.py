@@ -212,7 +212,7 @@ def _traits_json(bundle: Bundle) -> dict[str, Any]:
     return {
         "kind": bundle.kind,
         "asks": bundle.asks,
-        "open": bundle.protection.open_text(bundle.kind),
+        "open": bundle.protection.open_access_text(bundle.kind),
         "everybody": bundle.protection.everybody,
         "lacks": lack_text(bundle.kind, bundle.lacks) if bundle.lacks else "",
         "protection": as_plain(bundle.protection),
@@ -273,7 +273,7 @@ def render_demo_page(result: Json, made: str) -> str:
     body = "\n".join(
         (
             _demo_head(result, made),
-            _open_rows(result["rows"]),
+            _open_rows_html(result["rows"]),
             *scenarios,
             _demo_vulnerabilities(result),
             f'<p class="soft">{why}</p>',
@@ -357,7 +357,7 @@ def _demo_head(result: Json, made: str) -> str:
     )
 
 
-def _open_rows(rows: Sequence[Json]) -> str:
+def _open_rows_html(rows: Sequence[Json]) -> str:
     """Return a list of the rows that are open, with the reason and the remedy, or ""."""
     names: dict[tuple[bool, str, str, str], list[str]] = {}
     for row in rows:
@@ -369,14 +369,14 @@ def _open_rows(rows: Sequence[Json]) -> str:
             names.setdefault(reason, []).append(row["name"])
     here_first = sorted(names.items(), key=lambda item: item[0][0])
     items = "".join(
-        f"<li>{''.join(_open_row(name, label, is_known=is_known) for name in opened)}"
+        f"<li>{''.join(_open_row_html(name, label, is_known=is_known) for name in opened)}"
         f"{_sentence(because)} {_sentence(remedy)}</li>"
         for (is_known, label, because, remedy), opened in here_first
     )
     return f'<ul class="open">{items}</ul>' if items else ""
 
 
-def _open_row(row_name: str, label: str, *, is_known: bool) -> str:
+def _open_row_html(row_name: str, label: str, *, is_known: bool) -> str:
     kind = "warning" if is_known else "error"
     return f'<span class="chip {kind}">{label}</span> <b>{escape(row_name)}</b><br>'
 

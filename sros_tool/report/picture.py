@@ -81,7 +81,7 @@ class Protection:
             else "everybody with an identity"
         )
 
-    def open_text(self, kind: str) -> str:
+    def open_access_text(self, kind: str) -> str:
         """Return a clause on open access, such as "everybody may publish", or ""."""
         sends, receives = _VERBS[kind]
         sides = [sends] * (not self.write_control) + [receives] * (not self.read_control)

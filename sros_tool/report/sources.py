@@ -245,7 +245,7 @@ def _read_source(
         return source
     if source.origin.kind == "observation":
         text = "`sros check` does not check what was observed."
-        return replace(source, findings=(*source.findings, _not_checked(text)))
+        return replace(source, findings=(*source.findings, _not_checked_finding(text)))
     from sros_tool.checks.keystores.opened import Circumstances
     from sros_tool.checks.policies import policy_file_findings
     from sros_tool.checks.targets import path_findings
@@ -263,12 +263,12 @@ def _read_source(
         )
     except SrosError as error:
         text = f"`sros check` cannot read {title}, so nothing in it was checked: {error.what}."
-        return _with_findings(source, path, [_not_checked(text)])
+        return _with_findings(source, path, [_not_checked_finding(text)])
     pictured = [_pictured_finding(finding, {finding.subject}, shown) for finding in findings]
     return _with_findings(source, path, pictured)
 
 
-def _not_checked(text: str) -> PicturedFinding:
+def _not_checked_finding(text: str) -> PicturedFinding:
     return PicturedFinding("view.not-checked", "note", text)
 
 

@@ -434,7 +434,7 @@ def test_an_unchanged_export_has_no_findings(arrived: Path) -> None:
     one = verify_arrival(arrived / "enclaves/arm/camera", now=NOW)
     assert (one.kind, [each.name for each in one.enclaves]) == ("enclave", ["/arm/camera"])
     assert not one.findings
-    assert arrival.verified(NOW, None).ok
+    assert arrival.verified_folder(NOW, None).ok
 
 
 def _mix_up(robot: Path) -> None:
@@ -509,7 +509,7 @@ def test_findings(case: str, arrived: Path) -> None:
     spoil, enclave, file, text = FINDINGS[case]
     spoil(arrived)
     arrival = verify_arrival(arrived, now=NOW)
-    assert not arrival.verified(NOW, None).ok
+    assert not arrival.verified_folder(NOW, None).ok
     found = [
         each
         for each in arrival.findings

@@ -201,10 +201,10 @@ def test_names_without_protection_are_open_to_strangers_where_a_domain_admits_th
         ("/*", "everybody may publish and subscribe, even without an identity"),
         ("/other", ""),
     ):
-        assert protection_of(governance, "topics", name).open_text("topics") == open_text
+        assert protection_of(governance, "topics", name).open_access_text("topics") == open_text
     admits_nobody = replace(domain, allow_unauthenticated_participants=False)
     closed = governance_for(admits_nobody, DomainSet.of((0, 0)))
-    assert not protection_of(closed, "topics", "/bare").open_text("topics")
+    assert not protection_of(closed, "topics", "/bare").open_access_text("topics")
 
 
 def test_what_protects_whole_messages_protects_every_topic() -> None:

@@ -124,7 +124,7 @@ class Arrival:
     enclaves: tuple[ArrivedEnclave, ...]
     findings: tuple[Finding, ...]
 
-    def verified(self, moment: datetime, domain: int | None) -> VerifiedFolder:
+    def verified_folder(self, moment: datetime, domain: int | None) -> VerifiedFolder:
         """Return the result in the form that ``--json`` prints, for one ROS domain or all."""
         findings = [
             ArrivalFinding(

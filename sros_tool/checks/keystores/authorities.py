@@ -469,8 +469,8 @@ def _settings_and_ledger_findings(keystore: CheckedKeystore) -> Iterator[Finding
     edits, file = keystore.edits, keystore.shown_path(SETTINGS)
     if edits.settings:
         yield SETTINGS_EDITED.found("settings", "; ".join(edits.settings), file)
-    if keystore.fleet_edited and not is_of_damaged_ledger(keystore.fleet_edited):
-        clause = f"{FLEET} {keystore.fleet_edited}"
+    if keystore.fleet_edits and not is_of_damaged_ledger(keystore.fleet_edits):
+        clause = f"{FLEET} {keystore.fleet_edits}"
         yield FLEET_EDITED.found("fleet", clause, keystore.shown_path(FLEET))
     if keystore.fleet:
         yield from _former_robot_findings(keystore, keystore.fleet)

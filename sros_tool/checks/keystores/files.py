@@ -500,7 +500,11 @@ def _holds_key(keystore: CheckedKeystore, path: str, info: os.stat_result) -> bo
 
 
 def _content(keystore: CheckedKeystore, path: str) -> bytes:
-    """Return the content of a file; raise OSError if it cannot be read."""
+    """Return the content of a file, b"" if it is no longer a regular file.
+
+    Raises:
+        OSError: the file cannot be read.
+    """
     try:
         if Path(path) == keystore.root / LEDGER:
             return b"".join(keystore.opened.ledger_file.content())

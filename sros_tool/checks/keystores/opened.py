@@ -116,7 +116,7 @@ class CheckedKeystore:
     def unread(self) -> tuple[UnreadablePart, ...]:
         """The files that exist but cannot be read."""
         _ = self.settings, self.ledger, self.crl, self.authorities
-        _ = self.governance, self.fleet, self.fleet_edited
+        _ = self.governance, self.fleet, self.fleet_edits
         return tuple(self._unread.values())
 
     @cached_property
@@ -172,7 +172,7 @@ class CheckedKeystore:
         return self._part(FLEET, lambda: load_fleet(self.opened), None)
 
     @cached_property
-    def fleet_edited(self) -> str:
+    def fleet_edits(self) -> str:
         """A clause that says how the fleet file was changed by hand, or ""."""
         return self._part(FLEET, lambda: fleet_edits_clause(self.opened, self.ledger), "")
 
