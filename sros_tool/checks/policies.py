@@ -985,7 +985,7 @@ _DOMAIN_0 = DomainSet.of((0, 0))
 ROOT_ENCLAVE = FindingKind(
     "policy.root-enclave",
     WARNING,
-    "an enclave / with the rights of nodes or of other enclaves",
+    "the enclave '/', with the rights of nodes or of other enclaves",
     "A process that names no enclave runs in /, and gets all rights of /; if the keystore has no "
     "enclave /, the process does not start.",
     "rcl 9 (rcl/src/rcl/security.c, context.c: the enclave is / by default).",

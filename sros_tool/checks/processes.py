@@ -891,7 +891,7 @@ def _is_harmless_override(key: str, value: str) -> bool:
 
 
 def zenoh_findings(process: Process) -> Iterator[Finding]:
-    """Yield a finding if a Zenoh process may not enforce the files of its enclave."""
+    """Yield a finding if a Zenoh process perhaps does not enforce the files of its enclave."""
     if not process.is_zenoh:
         return
     configuration = process.configuration

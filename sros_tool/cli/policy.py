@@ -72,7 +72,7 @@ if TYPE_CHECKING:
 @click.option(
     "--enclave",
     metavar="ENCLAVE",
-    help="Put all nodes of OTHER into this enclave: one process composes them.",
+    help="Put all nodes of OTHER into this enclave.  Use it if one process composes them.",
 )
 @click.option(
     "--node",
@@ -583,8 +583,8 @@ def minimize_policy(
     that every node needs. The result is one file: includes are resolved, metadata is kept, and
     comments are lost. A DENY always stays, and an enclave that was never observed does not change.
 
-    With --fleet, all robots keep the rights that some robots used in the same enclave, and sizes
-    are those of the robot with the longest name.
+    With --fleet, a right that any robot used stays for the corresponding enclave of every robot.
+    The shown sizes of permissions.p7s are those of the robot with the longest name.
 
     The exit status is 0, also if rights are removed or missing, unless --fail-on is given.
 
@@ -912,7 +912,7 @@ def _gain_text(sign: str, gain: Gain, growth: Growth) -> str:
     if gain.action == "join":
         text = f"{who} join the domain"
     elif gain.right is None:
-        text = f"{who} {gain.action} DDS topic {gain.topic}, which no right states"
+        text = f"{who} {gain.action} DDS topic {gain.topic} without a right to it"
     else:
         text = f"{who} {gain.right.describe()}"
         if gain.source:

@@ -389,7 +389,10 @@ def _proof_of_connections(robot: LocalRobot) -> Iterator[Proof]:
 
 
 def _connections(running: RunningRobot) -> Connections:
-    """Return the connections of processes in enclaves, except those that only claim to be there."""
+    """Return the connections between processes in enclaves.
+
+    The observer is left out, and so are processes that only claim to run in an enclave.
+    """
     return connections_between(
         process
         for process, enclave in running.secured

@@ -805,9 +805,10 @@ class VendorOfKeystore(NamedTuple):
         )
 
     def notes(self, question: Question, outcomes: Sequence[VendorOutcome]) -> Iterator[Note]:
-        """Yield notes on enclaves that may be left out, and on processes that may have the right.
+        """Yield notes on enclaves and processes that perhaps have the right, too.
 
-        These processes have no identity, or have earlier permissions or a revoked certificate.
+        They are enclaves that the answer perhaps lacks, and processes without an identity, with
+        earlier permissions, or with a revoked certificate.
         """
         # As in `outcomes`.
         from sros_tool.explain.earlier import note_on_earlier_permissions, note_on_revoked_enclaves

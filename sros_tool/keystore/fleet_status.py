@@ -570,9 +570,10 @@ class FleetStatus:
     may be missing.  Null if the file does not differ.
     """
     revoked_until: datetime | None = None
-    """Until when robots need the revocation list, in UTC: when the last certificate on the list
-    expires, or the last revoked certificate of a replaced CA that a robot may still trust. Null if
-    no certificate is revoked, or if the ledger lacks a revoked certificate.
+    """The time until which robots need the revocation list, in UTC: the latest expiry of a
+    certificate on the list, or of a revoked certificate of a replaced CA that a robot may still
+    trust, whichever is later. Null if no certificate is revoked, or if the ledger lacks a revoked
+    certificate.
     """
     publication: PublishedMetadata | None = None
     """What robots fetch; null if nothing was published for any robot."""

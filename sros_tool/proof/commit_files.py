@@ -36,7 +36,7 @@ _NOWHERE = Path("/dev/null/git")
 
 
 @dataclass(frozen=True, slots=True)
-class Revision:
+class PathAtRevision:
     """A file or folder at a git revision; ``path`` is relative to the top of the repository.
 
     ``commit`` is the full id that ``name`` stood for when the revision was read.
@@ -55,7 +55,7 @@ class Revision:
         """The path of the file or folder for the policy reader; nothing has this path on disk."""
         return _NOWHERE / self.path
 
-    def policies(self) -> tuple[Revision, ...]:
+    def policies(self) -> tuple[PathAtRevision, ...]:
         """Return the policies in this folder and below, or this file.
 
         Raises:
@@ -67,7 +67,7 @@ class Revision:
             return (self,)
         below = f"{self.path}/" if self.path else ""
         files = [
-            (Revision(self.repository, self.name, self.commit, below + name), tree_entry)
+            (PathAtRevision(self.repository, self.name, self.commit, below + name), tree_entry)
             for name, tree_entry in walk(self.repository, entry.id, maximum=_MOST_POLICY_ENTRIES)
         ]
         for file, tree_entry in files:
@@ -124,8 +124,8 @@ class Revision:
         return Source(self.with_git_paths(source.file), source.line)
 
 
-def find_revision(text: str) -> Revision:
-    """Return the revision that ``git:REVISION:PATH`` names in the current repository.
+def find_path_at_revision(text: str) -> PathAtRevision:
+    """Return the path at a revision that ``git:REVISION:PATH`` names in the current repository.
 
     As for git, ``PATH`` is relative to the top of the repository, or to the working directory if it
     begins with ``./`` or ``../``.
@@ -156,7 +156,7 @@ def find_revision(text: str) -> Revision:
             "A path starts at the top of the repository; with ./, it starts at the working "
             "directory.",
         )
-    return Revision(repository, name, commit, path)
+    return PathAtRevision(repository, name, commit, path)
 
 
 _MOST_ENTRIES = 200_000
@@ -231,7 +231,7 @@ class CommitFiles:
             return [self._policy(path, placeholders)]
         if entry.mode != FOLDER:
             raise self._not_a_file_error(path, entry)
-        folder = Revision(self.repository, self.name, self.commit, path)
+        folder = PathAtRevision(self.repository, self.name, self.commit, path)
         try:
             return [self._policy(policy.path, placeholders) for policy in folder.policies()]
         except SrosError as error:
@@ -264,7 +264,10 @@ class CommitFiles:
         # Checked before reading, because many links together may be too large.
         for where, link in links.items():
             if not 0 < sizes.get(link.id, 1) <= _LONGEST_TARGET:
-                raise DocumentError(f"'{where}' is a link to a path that no file can have")
+                raise DocumentError(
+                    f"the target of the link '{where}' is not a valid path: it is empty, or longer "
+                    f"than {_LONGEST_TARGET} bytes"
+                )
         places: dict[str, list[str]] = {}
         for where, tree_entry in plain.items():
             places.setdefault(tree_entry.id, []).append(where)
@@ -274,7 +277,9 @@ class CommitFiles:
         contents = self.repository.contents(link.id for link in links.values())
         for where, link in links.items():
             if b"\0" in contents[link.id]:
-                raise DocumentError(f"'{where}' is a link to a path that no file can have")
+                raise DocumentError(
+                    f"the target of the link '{where}' is not a valid path: it contains a zero byte"
+                )
         top = self.folder / path
         with Folder(self.folder) as folder:
             _make_folders(folder, path)
@@ -310,13 +315,13 @@ class CommitFiles:
         return paths
 
     def _policy(self, path: str, placeholders: bool) -> Path:
-        revision = Revision(self.repository, self.name, self.commit, path)
+        path_at_revision = PathAtRevision(self.repository, self.name, self.commit, path)
         place = self._place_of_missing(path)
 
         def read(file: Path) -> bytes:
             where = str(file.relative_to(self._place_of_missing("")))
             try:
-                content = revision.read(file)
+                content = path_at_revision.read(file)
             except MissingFileError:
                 self.used_fallbacks.append(where)
                 raise
@@ -325,7 +330,8 @@ class CommitFiles:
                     with Folder(self.folder) as folder:
                         _make_folders(folder, where)
                 texts = (
-                    revision.with_git_paths(part) for part in (error.what, error.why, error.remedy)
+                    path_at_revision.with_git_paths(part)
+                    for part in (error.what, error.why, error.remedy)
                 )
                 self.refused.append(DocumentError(*texts))
                 raise
@@ -339,7 +345,7 @@ class CommitFiles:
         return self.folder / path
 
     def _place_of_missing(self, path: str) -> Path:
-        return Revision(self.repository, self.name, self.commit, path).place
+        return PathAtRevision(self.repository, self.name, self.commit, path).place
 
     def _write(self, path: str, entry: TreeEntry, content: bytes) -> Path:
         if path not in self.files:

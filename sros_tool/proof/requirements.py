@@ -147,7 +147,10 @@ class Must(RightsRequirement):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AtMost(RightsRequirement):
-    """No name may be used by more than ``most`` enclaves; a part of a right counts as a use."""
+    """At most ``most`` enclaves may have the right to any one name.
+
+    An enclave with a part of the right counts, such as one that may cancel the goals of an action.
+    """
 
     KIND = "at_most"
 

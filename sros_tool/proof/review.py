@@ -1041,7 +1041,7 @@ class _Review:
         keystores: Mapping[str, Path],
         earlier_sources: Mapping[str, Callable[[], AccessSource]],
         later_sources: Mapping[str, Callable[[], AccessSource]],
-        moved: Mapping[str, Callable[[], tuple[AccessSource, AccessSource]]],
+        compared_sides: Mapping[str, Callable[[], tuple[AccessSource, AccessSource]]],
     ) -> Iterator[ReviewStep]:
         if not self.request.requirements:
             return
@@ -1085,7 +1085,7 @@ class _Review:
                     rights, later_rights = (
                         sides[subject]().rights for sides in (earlier_sources, later_sources)
                     )
-            sources = moved.get(subject)
+            sources = compared_sides.get(subject)
             elsewhere = partial(
                 self._failing_elsewhere,
                 files.values(),
@@ -1240,7 +1240,7 @@ class _Review:
         earlier: Sequence[Requirement],
         wanted_requirements: Sequence[Requirement],
         system: System,
-        moved: Callable[[], tuple[AccessSource, AccessSource]] | None,
+        compared_sides: Callable[[], tuple[AccessSource, AccessSource]] | None,
         unanswered: Callable[[], Iterable[Finding]],
     ) -> tuple[int, Content] | None:
         dropped = [
@@ -1249,7 +1249,7 @@ class _Review:
         ]
         sources = None
         with suppress(SrosError, OSError):  # the comparison reports the error
-            sources = moved() if moved else None
+            sources = compared_sides() if compared_sides else None
         left = [*unanswered()]
         if sources:
             left += [*_findings_on_lost_restrictions(earlier, wanted_requirements, *sources)]

@@ -64,7 +64,7 @@ from sros_tool.policy.document import (
 )
 from sros_tool.policy.model import Enclave, Policy, Source, StatedProtection, stated_protections
 from sros_tool.policy.rights import Right, placed_rights, policy_rights
-from sros_tool.proof.commit_files import PREFIX, Revision, find_revision
+from sros_tool.proof.commit_files import PREFIX, PathAtRevision, find_path_at_revision
 from sros_tool.proof.zenoh_settings import LONE, SIGNED, SignedConfiguration
 from sros_tool.translate import permissions_for
 from sros_tool.validity import iso, window
@@ -148,7 +148,7 @@ class AccessSource:
     fleet: Fleet | None = None
     protections: tuple[StatedProtection, ...] | None = None
     enclaves: Mapping[str, Enclave] = field(default_factory=dict)
-    revision: Revision | None = None
+    path_at_revision: PathAtRevision | None = None
 
     def subject_of(self, enclave: str) -> str:
         """Return the subject of an enclave's certificate, or else of its grant, or ""."""
@@ -181,7 +181,7 @@ class AccessSource:
 
     def shown_source(self, source: Source) -> Source:
         """Return a source of this side in the form that users write."""
-        return self.revision.source(source) if self.revision else source
+        return self.path_at_revision.source(source) if self.path_at_revision else source
 
 
 ALL_DOMAINS = DomainSet.of((0, MAX_DOMAIN))
@@ -199,7 +199,7 @@ def load_side(path: Path, fleet: Fleet | None = None) -> AccessSource:
             compared.
     """
     if str(path).startswith(PREFIX):
-        return _access_at_revision(find_revision(str(path)), fleet)
+        return _access_at_revision(find_path_at_revision(str(path)), fleet)
     if path.is_dir() and not is_keystore(path) and not (path / PERMISSIONS_FILE).exists():
         files = list(files_of_policies(path))
         if files:
@@ -511,17 +511,19 @@ def _without_dates(permissions: Permissions) -> Permissions:
     )
 
 
-def _access_at_revision(revision: Revision, fleet: Fleet | None) -> AccessSource:
+def _access_at_revision(path_at_revision: PathAtRevision, fleet: Fleet | None) -> AccessSource:
     try:
         policies = [
             _read_policy_and_fleet(policy.place, fleet, policy.read)
-            for policy in revision.policies()
+            for policy in path_at_revision.policies()
         ]
-        side = _access_of_policies(str(revision), policies)
+        side = _access_of_policies(str(path_at_revision), policies)
     except SrosError as error:
-        texts = (revision.with_git_paths(part) for part in (error.what, error.why, error.remedy))
+        texts = (
+            path_at_revision.with_git_paths(part) for part in (error.what, error.why, error.remedy)
+        )
         raise DocumentError(*texts) from error
-    return replace(side, revision=revision)
+    return replace(side, path_at_revision=path_at_revision)
 
 
 _PolicyAndFleet = tuple[Policy, Fleet | None]

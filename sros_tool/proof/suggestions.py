@@ -153,11 +153,13 @@ class _StatedRights:
 
     @cached_property
     def changing_services(self) -> Mapping[str, tuple[str, ...]]:
-        """The enclaves that may call services which change nodes, by the last part of the name.
+        """The callers of services that change nodes, for each last part of the names.
 
-        A service is included only if a node offers it although no enclave may call it there.  The
-        node's enclave has to have a counterpart for another right: otherwise, as in the policy of a
-        package, the callers may be in another policy.
+        The callers for a last part, such as ``set_parameters``, are the enclaves that may call a
+        service with this last part on any node.  A last part is included only if a node offers such
+        a service that no enclave may call.  The enclave of this node must have a counterpart for
+        another right: otherwise, as in the policy of a package, the callers may be in another
+        policy.
         """
         partners = self.enclaves_with_counterpart()
         unused = {

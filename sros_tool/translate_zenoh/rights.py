@@ -192,7 +192,7 @@ def domains_of(control: AccessControl) -> set[int]:
 
 
 def stated_names(rules: Iterable[AccessRule]) -> list[tuple[str, str]]:
-    """Return the pairs of a right and a name that rules of `remote_of` state, sorted.
+    """Return the sorted pairs (right, name) that are stated by rules which `remote_of` made.
 
     Names with wildcards have the form of Zenoh.
     """

@@ -428,7 +428,7 @@ def test_a_governance_that_opens_a_topic(made: Path) -> None:
     sros("update_keystore", "open", "--rule", rule, "--allow-looser", cwd=made).ok()
     ended = sros("diff_policy", "--no-new-access", "ks", "open", cwd=made)
     assert ended.status == 1
-    assert "+ /mux, /web read DDS topic rt/wheels, which no right states\n" in ended.out
+    assert "+ /mux, /web read DDS topic rt/wheels without a right to it\n" in ended.out
     assert "+ less protection: protection.data ENCRYPT -> NONE" in ended.out
     back = sros("diff_policy", "--no-new-access", "open", "ks", cwd=made)
     assert back.status == 0

@@ -552,8 +552,12 @@ def test_a_keystore_fits_on_a_disk(change: Change) -> None:
     folders = (("40000", "long", long), ("40000", "many", many), ("40000", "odd", odd))
     top = _tree(change, *folders)
     commit = change.git("commit-tree", top, "-m", "x")
-    no_link = "a link to a path that no file can have"
-    for name, said in (("many", "has more than 1073741824"), ("odd", no_link), ("long", no_link)):
+    no_path = "the target of the link '{}/link' is not a valid path: it {}"
+    for name, said in (
+        ("many", "has more than 1073741824"),
+        ("odd", no_path.format("odd", "contains a zero byte")),
+        ("long", no_path.format("long", "is empty, or longer than 4095 bytes")),
+    ):
         with TemporaryDirectory() as folder:
             files = CommitFiles(Repository(change.folder), "HEAD", commit, Path(folder))
             with pytest.raises(DocumentError, match=said):

@@ -175,7 +175,10 @@ def another_far_router(copy: KeystoreCopy) -> None:
 
 
 def guest_as_far_router(copy: KeystoreCopy) -> None:
-    """Let the guest be the router of the second host, and let the router accept every enclave."""
+    """Let the guest play the router of the second host.
+
+    The first router gives every enclave the rights of that router.
+    """
     another_far_router(copy)
     _edit(enclave_path(copy.root, copy.router) / ROUTER_FILE, _give_rights_to_everybody(FAR_ROUTER))
 
