@@ -10,6 +10,7 @@ from shlex import quote
 from typing import Unpack
 
 from sros_tool.errors import KeystoreError, Note, PkiError, SrosError, UsageError
+from sros_tool.fleet.robots import Fleet
 from sros_tool.keystore.expiry import (
     Credentials,
     Threshold,
@@ -97,10 +98,10 @@ def renew(
         if expiring is not None:
             others = [name for name in change.names if name not in wanted]
             short_lived = enclaves_renewed_by_name(change.keystore, change.template, others)
-            left: dict[str, str] = {}
-            with suppress(SrosError):  # a fleet file that cannot be read stops no renewal
-                if fleet := load_fleet(change.keystore):
-                    left = left_enclaves(change.keystore, fleet, change.now)
+            fleet = None
+            with suppress(SrosError):  # a fleet file that cannot be read stops no other renewal
+                fleet = load_fleet(change.keystore)
+            left = left_enclaves(change.keystore, fleet or Fleet.of(()), change.now)
             due = [*_due_enclave_names(change, {*others}.difference(short_lived), expiring)]
             wanted |= dict.fromkeys(name for name in due if name not in left)
             if not_renewed := {name: left[name] for name in due if name in left}:
