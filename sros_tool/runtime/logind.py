@@ -1,6 +1,7 @@
 """Whose shared memory systemd-logind removes at the end of the user's last session.
 
-Sources: logind.conf(5) (RemoveIPC, on by default), loginctl(1) (enable-linger) of systemd 252.
+Sources: logind.conf(5) (RemoveIPC, on by default), loginctl(1) (enable-linger) and sd_booted(3)
+of systemd 252.
 """
 
 from __future__ import annotations
@@ -14,6 +15,9 @@ from sros_tool.runtime.processes import SEVERAL_USERS
 
 _FIRST_LOGIN_USER = 1000
 """The first user id whose shared memory logind removes; lower ids are of system users."""
+
+_BOOTED_FOLDER = Path("/run/systemd/system")
+"""Exists on machines that systemd has booted."""
 
 _LINGER_FOLDER = Path("/var/lib/systemd/linger")
 _LOGIND = ("org.freedesktop.login1", "/org/freedesktop/login1", "org.freedesktop.login1.Manager")
@@ -32,7 +36,12 @@ def users_without_linger(users: Iterable[int]) -> list[str]:
 
 
 def _removes_memory() -> bool:
-    """Return whether logind removes shared memory; True, the default, if logind cannot be asked."""
+    """Return whether logind removes shared memory; True, the default, if logind cannot be asked.
+
+    Without systemd, nothing removes it.
+    """
+    if not _BOOTED_FOLDER.is_dir():
+        return False
     command = ["busctl", "get-property", *_LOGIND, "RemoveIPC"]
     try:
         shown = subprocess.run(command, capture_output=True, check=False).stdout

@@ -14,6 +14,7 @@ from sros_tool.runtime.processes import SEVERAL_USERS
 @pytest.mark.parametrize(
     ("answer", "lingers", "found"),
     [
+        ("no systemd", "4712", []),
         ("b true", "4712", ["4711"]),
         ("b false", "4712", []),
         ("", "4712", ["4711"]),  # logind does not run now: the default counts
@@ -30,6 +31,8 @@ def test_users_who_log_in_lose_their_memory_without_linger(
 ) -> None:
     """A user of the system, such as 999, keeps it anyway; "several users" is no user."""
     monkeypatch.setattr(logind, "_LINGER_FOLDER", tmp_path)
+    is_booted = answer != "no systemd"
+    monkeypatch.setattr(logind, "_BOOTED_FOLDER", tmp_path if is_booted else tmp_path / "none")
     monkeypatch.setenv("PATH", str(tmp_path))
     (tmp_path / lingers).touch()
     if answer is not None:
