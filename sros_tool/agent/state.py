@@ -454,7 +454,7 @@ def _present_problems(folder: Path, state: AgentState, now: datetime) -> Iterato
     for sentence in installed_sentences(folder, names, now):
         if sentence not in known and sentence.partition(COULD_NOT_START)[0] not in subjects:
             yield sentence
-            changed -= {name for name in changed if name in sentence}
+            changed.discard(sentence.partition(f" {COULD_NOT_START}: ")[0])
     if changed:
         yield (
             f"Files of {first_few(sorted(changed), 3)} were changed after the last round of the "

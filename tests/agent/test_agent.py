@@ -246,9 +246,11 @@ def test_rounds_follow_what_home_publishes(home: Home, r1: Robot) -> None:
     (folder / "key.pem").chmod(0o644)
     (readable,) = agent_status(r1.folder, now=moment(), oldest=timedelta(days=1)).problems
     assert "enclaves/r1/a/key.pem" in readable
-    (folder / "key.pem").chmod(0o600)
     crl = (folder / "crl.pem").read_bytes()
     (folder / "crl.pem").unlink()
+    both = agent_status(r1.folder, now=moment(), oldest=timedelta(days=1)).problems
+    assert readable == both[0] and both[1].startswith("Files of /r1/a were changed")
+    (folder / "key.pem").chmod(0o600)
     (changed,) = agent_status(r1.folder, now=moment(), oldest=timedelta(days=1)).problems
     assert changed.startswith("Files of /r1/a were changed after the last round"), (
         "as with an older list"
