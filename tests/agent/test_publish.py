@@ -757,12 +757,15 @@ def test_a_publishing_folder_teaches_nothing_that_the_cas_did_not_sign(publisher
         (seal,) = seal_releases([("r2", 1, files)], publisher.permissions_ca())
         data = pack_release(Release("r2", 1, files, seal))
         (folder / f"{hashlib.sha256(data).hexdigest()}.r2.tar.gz").write_bytes(data)
-    (folder / f"{0:064x}.r5.tar.gz").write_bytes(b"x")
-    (folder / f"{1:064x}.r5.tar.gz").mkdir()
+    unreadable = [f"{digest}.r5.tar.gz" for digest in (f"{0:064x}", f"{1:064x}")]
+    unreadable.append(f"{hashlib.sha256(b'x').hexdigest()}.r5.tar.gz")  # as its name says
+    for name in (unreadable[0], unreadable[2]):
+        (folder / name).write_bytes(b"x")
+    (folder / unreadable[1]).mkdir()
     before = len(OpenedKeystore(publisher.root).ledger.entries)
     done = publisher.publish(restored=True)
     (unread,) = (note.text for note in done.notes if note.id == "fleet.archives-not-read")
-    assert all(f"{number:064x}.r5.tar.gz" in unread for number in range(2)), unread
+    assert all(name in unread for name in unreadable), unread
     added = OpenedKeystore(publisher.root).ledger.entries[before:]
     assert [(entry.what, entry.enclave) for entry in added] == [
         ("restored", ""),

@@ -258,8 +258,9 @@ def later_revoked_serials(keystore: OpenedKeystore) -> frozenset[int]:
 def releases_in(folder: Path, robots: int, altered: set[str] | None = None) -> Iterator[Release]:
     """Yield the releases in all archives of a publishing folder, whichever CA sealed them.
 
-    Archives that cannot be read are left out, and so are archives whose name does not begin with
-    their SHA-256: their content is not as published.  The names of both are added to ``altered``.
+    Archives that cannot be read, or have no release, are left out, and so are archives whose name
+    does not begin with their SHA-256: their content is not as published.  The names of all of these
+    are added to ``altered``.
     ``robots`` is the number of robots of the fleet.
 
     Raises:
@@ -282,11 +283,13 @@ def releases_in(folder: Path, robots: int, altered: set[str] | None = None) -> I
         if size > most * _MEAN_ARCHIVE_BYTES:
             excess = f"more than {most * _MEAN_ARCHIVE_BYTES // 1024**2} MiB (unpacked) of"
             break
-        if is_altered and altered is not None:
+        release = None
+        with suppress(SrosError):
+            release = None if is_altered else read_release(data)
+        if release:
+            yield release
+        elif altered is not None:
             altered.add(path.name)
-        elif not is_altered:
-            with suppress(SrosError):
-                yield read_release(data)
     if excess:
         raise KeystoreError(
             f"'{folder / 'targets/robots'}' has {excess} archives",
