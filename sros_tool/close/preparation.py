@@ -267,11 +267,9 @@ def _run_steps(
     problems: list[str] = []
     is_stopped = False
     for step in steps(robot, duration):
-        if is_stopped and dry_run:
-            break
         state = "kept" if step.made and step.made.exists() else "open"
         is_tried = step.guards and robot.policy.exists() and robot.requirements.exists()
-        if dry_run and not is_tried:
+        if dry_run and not (is_tried or is_stopped):
             robot.shell.say(f"{'kept' if state == 'kept' else 'would run'}: {step.command}")
             if step.signs and robot.keystore.exists():
                 _, output, messages = robot.shell.run((*step.words, "--dry-run"), False)

@@ -1411,6 +1411,8 @@ def test_a_process_with_the_name_of_another_is_not_signed(robot: Robot) -> None:
     assert both in said
     assert not (robot.folder / "robot/keystore").exists()
     assert both in robot.close("--apply", status=1).out
+    dry = robot.close("--dry-run", status=1).out
+    assert both in dry and "rights, without" not in dry, "nothing is signed"
     robot.more, robot.absent = (), {"/talker"}
     both = "a process that ended (/tmp/evil 'a b') and a process that ended (/opt/run talker) have"
     assert both in robot.close(status=1).out, "the policy has the rights of both"
@@ -1692,6 +1694,7 @@ def stops_as_the_run_stops(robot: Robot, policy: Path, signed: str) -> None:
         assert snapshot(robot.folder) == before
         assert ("would run: sros generate_artifacts" in dry.err) is signs, dry
         assert ("sros would sign nothing" in dry.out) is not signs, dry
+        assert "rights, without" not in dry.out, "the policy is not what was signed"
         for ended in (dry, robot.close(status=1)):
             assert "; but fix this first:\n  " in ended.out and reason in ended.out, ended
 
