@@ -346,9 +346,11 @@ def test_what_happens_to_a_fleet(made: Path, tmp_path: Path) -> None:
         in renewed.err
     )
     kept = (folder / "ks/fleet.toml").read_text()
-    (folder / "ks/fleet.toml").write_text("")
-    unread = sros(*timer, "--dry-run", cwd=folder)
-    assert (unread.status, "not renewed: /r9/base" in unread.err) == (1, True), unread
+    for edited in ("", kept.replace("r10", "r9")):
+        (folder / "ks/fleet.toml").write_text(edited)
+        unsure = sros(*timer, "--dry-run", cwd=folder)
+        assert (unsure.status, "not renewed: /r9/base" in unsure.err) == (1, True), unsure
+        assert "is not the file that sros wrote" in unsure.err and "sros revoke" not in unsure.err
     (folder / "ks/fleet.toml").write_text(kept)
     left = "2 valid enclaves of robots that left the fleet or their group: /r9/base, /r9/lift. "
     assert f"{left}Revoke with `sros revoke" in sros("fleet", "status", "ks", cwd=folder).out

@@ -20,7 +20,7 @@ from sros_tool.keystore.expiry import (
     refuse_unreadable,
     survey,
 )
-from sros_tool.keystore.fleet import left_enclaves, load_fleet, revoke_command
+from sros_tool.keystore.fleet import left_enclaves, revoke_command
 from sros_tool.keystore.issuing.authority import Authorities
 from sros_tool.keystore.issuing.ca_service import CaServiceError
 from sros_tool.keystore.issuing.enclave import (
@@ -98,14 +98,16 @@ def renew(
         if expiring is not None:
             others = [name for name in change.names if name not in wanted]
             short_lived = enclaves_renewed_by_name(change.keystore, change.template, others)
-            fleet = None
-            with suppress(SrosError):  # a fleet file that cannot be read stops no other renewal
-                fleet = load_fleet(change.keystore)
+            fleet, problem = None, None
+            try:
+                fleet = change.fleet
+            except SrosError as error:  # a fleet that is not known stops no other renewal
+                problem = error
             left = left_enclaves(change.keystore, fleet or Fleet.of(()), change.now)
             due = [*_due_enclave_names(change, {*others}.difference(short_lived), expiring)]
             wanted |= dict.fromkeys(name for name in due if name not in left)
             if not_renewed := {name: left[name] for name in due if name in left}:
-                change.notes.append(_left_note(change.keystore, not_renewed))
+                change.notes.append(_left_note(change.keystore, not_renewed, problem))
             if short_lived:
                 names_text = first_few(short_lived, 3)
                 text = (
@@ -199,14 +201,25 @@ def _with_consent_marks(
         yield entry._replace(reason=RENEWED_BY_NAME) if is_named else entry
 
 
-def _left_note(keystore: OpenedKeystore, left: Mapping[str, str]) -> Note:
-    """Return the note on due enclaves of robots that left the fleet (as of `left_enclaves`)."""
+def _left_note(
+    keystore: OpenedKeystore, left: Mapping[str, str], problem: SrosError | None
+) -> Note:
+    """Return the note on due enclaves of robots that left the fleet (as of `left_enclaves`).
+
+    ``problem`` is the reason why it is not known whether these robots are in the fleet again.
+    """
     text = (
         f"not renewed: {first_few([*left], 3)} (of robots that left the fleet or their "
-        f"group: {first_few(sorted({*left.values()}), 3)}). Revoke these enclaves, with "
-        f"{revoke_command(keystore, sorted(left))}; if a robot is to keep its enclaves, add it to "
-        "the fleet file or the group again, and run `sros generate_artifacts`"
+        f"group: {first_few(sorted({*left.values()}), 3)}). "
     )
+    if problem:
+        text += f"Whether these robots are back is not known: {problem.what}. {problem.remedy}"
+    else:
+        text += (
+            f"Revoke these enclaves, with {revoke_command(keystore, sorted(left))}; if a robot is "
+            "to keep its enclaves, add it to the fleet file or the group again, and run "
+            "`sros generate_artifacts`"
+        )
     return Note(NOT_RENEWED, text)
 
 
