@@ -406,7 +406,7 @@ def make_folders(path: Path, mode: int | None = None) -> list[Path]:
 
     Args:
         path: the path of the folder.
-        mode: the permission bits of the folder if it is made, whatever the umask is; None for the
+        mode: the permission bits of the folders that are made, whatever the umask is; None for the
             bits that the umask leaves.
 
     Raises:
@@ -417,10 +417,12 @@ def make_folders(path: Path, mode: int | None = None) -> list[Path]:
     try:
         for folder in reversed(missing):
             with contextlib.suppress(FileExistsError):  # another process created it meanwhile
-                folder.mkdir()
+                if mode is None:
+                    folder.mkdir()
+                else:
+                    with Folder(folder.parent) as parent:
+                        parent.mkdir(folder.name, mode)
                 paths.insert(0, folder)
-                if mode is not None and folder == path:
-                    folder.chmod(mode)
     except BaseException:
         remove_folders(paths)
         raise

@@ -117,9 +117,12 @@ def test_only_what_changes_is_published_again(publisher: Home) -> None:
 def test_no_private_key_is_published(publisher: Home, strict_umask: None) -> None:
     """Everything else can be read by all users, as by the account of a web server."""
     shutil.rmtree(publisher.pub)
-    publisher.publish(rotate=("timestamp", "root"), new_folder=True)
-    modes = {path.stat().st_mode & 0o777 for path in (publisher.pub, *publisher.pub.rglob("*"))}
+    made = publisher.folder / "new"
+    now = publisher.now + LATER
+    publish(publisher.root, made / "pub", now=now, rotate=("timestamp", "root"), new_folder=True)
+    modes = {path.stat().st_mode & 0o777 for path in (made, *made.rglob("*"))}
     assert modes == {0o755, 0o644}
+    (made / "pub").rename(publisher.pub)
     secrets = [path.read_bytes() for path in publisher.root.rglob("*.pem") if "key" in path.name]
     secrets += [path.read_bytes() for path in (publisher.root / "private").glob("fleet_*")]
     assert len(secrets) == 9
