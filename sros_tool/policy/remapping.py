@@ -433,13 +433,13 @@ def remapped_policy(
     policies after remapping.  A literal right to a new name of some node does not count.
     """
     used: set[UsedRule] = set()
-    new_names = {use.new for use in moved_names if use.kind}
+    new_names = {(use.kind, use.new) for use in moved_names}
     new_nodes = tuple(f"{use.new}/" for use in moved_names if not use.kind)
     other = Rules(
         right
         for right in stated
         if is_expression(right.name)
-        or not (right.name in new_names or right.name.startswith(new_nodes))
+        or not ((right.kind, right.name) in new_names or right.name.startswith(new_nodes))
     )
 
     def remapped(enclave: str, profile: Profile) -> Profile:
@@ -529,7 +529,7 @@ def _more_denials(
     """Yield a group with the additional names, if any, that a DENY of ``group`` must deny.
 
     These are the new names in ``moved_names``, and the old names in ``otherwise_allowed``.
-    An old name that is a new name of some node is left out.
+    An old name that is a new name of the same kind, of some node, is left out.
     ``stated`` and ``present`` are the full names of the group before and after remapping.
     """
     denials = tuple(right for right in group.rights if right[1] is DENY)
@@ -541,7 +541,7 @@ def _more_denials(
             for _, new in use.names_denied_by(full, group.kind):
                 if not denied.cover(new):
                     lines.setdefault(new, group.source_of(index).line)
-    taken = {*present, *(use.new for use in moved_names)}
+    taken = {*present, *(use.new for use in moved_names if use.kind == group.kind)}
     for index, full in enumerate(stated):
         if full in otherwise_allowed and full not in taken:
             lines.setdefault(full, group.source_of(index).line)

@@ -149,18 +149,23 @@ def test_a_new_name_of_one_node_stays_denied_to_the_others(
 
 
 @pytest.mark.parametrize(
-    ("rules", "denied"),
+    ("allowed", "rules", "denied"),
     [
-        (["x:=/left/x"], {"/x", "/left/x"}),
-        (["__ns:=/left"], {"/x", "/left/x"}),
-        (["x:=z", "y:=x"], {"/z"}),  # the name now stands for what was y, and was allowed
+        ("/*", ["x:=/left/x"], {"/x", "/left/x"}),
+        ("/*", ["__ns:=/left"], {"/x", "/left/x"}),
+        ("/*", ["x:=z", "y:=x"], {"/z"}),  # the name now stands for what was y, and was allowed
+        ("/x*", ["x:=z", "y:=x"], {"/x", "/z"}),  # only the service y gets this name
     ],
 )
 def test_a_wildcard_does_not_allow_an_old_name_that_was_denied(
-    rules: list[str], denied: set[str]
+    allowed: str, rules: list[str], denied: set[str]
 ) -> None:
     """Without its DENY, the old name would be allowed, and another node's may be called so."""
-    groups = group("topics", "/*", publish="ALLOW"), group("topics", "x", publish="DENY")
+    groups = (
+        group("topics", allowed, publish="ALLOW"),
+        group("topics", "x", publish="DENY"),
+        group("services", "y", request="ALLOW"),
+    )
     for stated in ([one(*groups)], [one(each) for each in groups]):
         remapped, _ = remapped_policies(stated, rules)
         rights = {right for policy in remapped for right in policy_rights(policy)}
