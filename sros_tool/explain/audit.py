@@ -134,7 +134,8 @@ class AuditedEnclaves:
     """The enclaves of a policy or keystore; ``load`` loads an enclave by its name.
 
     ``what`` is "policy" or "keystore".
-    With ``zenoh``, a right has to be in the Zenoh files of ``keystore`` and in the permissions.
+    With ``zenoh``, a right has to be in the Zenoh files of ``keystore``, and in the permissions if
+    these load.
     """
 
     what: str

@@ -619,8 +619,7 @@ class Examiner:
             for question in _questions_to_ask(denial)
         ]
         if commands:
-            one = len(commands) == 1
-            show = f"{' and '.join(commands)} {'shows' if one else 'show'}"
+            show = f"{' and '.join(commands)} {'shows' if len(commands) == 1 else 'show'}"
             if denial.by_rule:
                 return f"{show} the DENY, and where the policy has it: no ALLOW helps against it."
             return (

@@ -58,7 +58,9 @@ def changed_forms(before: Iterable[Enclave], after: Iterable[Enclave]) -> Iterat
     """
     before, after = tuple(before), tuple(after)
     renamed = renamed_enclaves(*(policy_rights(Policy(side)) for side in (before, after)))
-    before = tuple(replace(one, path=renamed.get(one.path, one.path)) for one in before)
+    before = tuple(
+        replace(enclave, path=renamed.get(enclave.path, enclave.path)) for enclave in before
+    )
     of_before, of_after = (
         [*chain.from_iterable(map(_moved_rights, enclaves))] for enclaves in (before, after)
     )

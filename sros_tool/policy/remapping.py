@@ -168,12 +168,12 @@ def remapped_name(name: str, ns: str, rules: Iterable[Remapping]) -> list[str]:
         added = [new_name for _, new_name in _renamed_with_node(name, own, new)]
         names += [new_name for new_name in added if not Names(names).cover(new_name)]
     result = []
-    for each in names:
+    for full in names:
         new_names: dict[str, str] = {}
         for rule in rules:
-            if rule.old != _NODE and matches(each, old := expand(rule.old, ns, rule.node)):
+            if rule.old != _NODE and matches(full, old := expand(rule.old, ns, rule.node)):
                 new_names.setdefault(old, expand(rule.new, ns, rule.node))
-        kept = [each] if is_expression(each) or not new_names else []
+        kept = [full] if is_expression(full) or not new_names else []
         result += [*kept, *new_names.values()]
     return list(dict.fromkeys(result))
 
@@ -327,12 +327,12 @@ def _notes_on_requirements(
             for use in uses
             if f"{use.old}/*" in gone or any(matches(name, use.old) for name in gone)
         }
+        words = " ".join(f"--remap {quote(option)}" for option in sorted(options))
         text = (
             f"requirements that name {first_few(sorted(gone), _MOST_SHOWN)} protect only the old "
             "name, unless you check them with the same remapping: `sros check POLICY "
-            f"--requirements FILE {' '.join(f'--remap {quote(each)}' for each in sorted(options))}`"
-            ", with --namespace as in the merge. Leave out each --remap whose old name no "
-            "requirement has."
+            f"--requirements FILE {words}`, with --namespace as in the merge. Leave out each "
+            "--remap whose old name no requirement has."
         )
         yield Note("merge.requirements-of-old-names", text)
     split = [

@@ -197,14 +197,17 @@ def decide(requirement: Requirement, world: World, limit: SearchLimit | None = N
             raise AssertionError(requirement)
     if witness:
         _confirm(requirement, witness, world)
-    found = _unused_names(requirement, world, limit)
+    unused_names = _unused_names(requirement, world, limit)
     missing, exceptions = _missing_enclaves(requirement, world)
     meant = (
         (name, similar_enclave_clause(name, world.enclaves))
         for name in missing
         if name not in world.away
     )
-    empty = (*(f"there is no enclave {name}{clause}" for name, clause in meant), *found.unused)
+    empty = (
+        *(f"there is no enclave {name}{clause}" for name, clause in meant),
+        *unused_names.unused,
+    )
     always = "" if witness or empty or missing else _why_never_fails(requirement, world)
     assumed = "" if witness else _assumed_protection(requirement, world, limit)
     blocked = None
@@ -214,14 +217,14 @@ def decide(requirement: Requirement, world: World, limit: SearchLimit | None = N
         requirement,
         witness,
         empty,
-        tuple(found.waiting),
+        tuple(unused_names.waiting),
         always,
         assumed,
         blocked,
-        tuple(found.unnamed),
+        tuple(unused_names.unnamed),
         absent=tuple(name for name in exceptions if name.removeprefix(EXCEPT) not in world.away),
-        unserved=tuple(found.unserved),
-        unheard=tuple(found.unheard),
+        unserved=tuple(unused_names.unserved),
+        unheard=tuple(unused_names.unheard),
     )
 
 
@@ -819,8 +822,7 @@ def _unused_names(requirement: Requirement, world: World, limit: SearchLimit) ->
     one typing error, as in ``/cmd_vle``, or if the name is in use as another kind (service or
     action).
     """
-    found = _UnusedNames([], [], [], [], [])
-    clauses, unnamed = found.unused, found.unnamed
+    result = _UnusedNames([], [], [], [], [])
     for right, name, parts in _restricted_names(requirement):
         verb = "use" if isinstance(requirement, Nobody | Protected) else right
         peer = PEER_RIGHT[right]
@@ -833,32 +835,32 @@ def _unused_names(requirement: Requirement, world: World, limit: SearchLimit) ->
             if other and _is_used_by_anybody(world, _sufficient_parts(other), name, limit):
                 meant = f", but some enclaves may {other} {_named_right(other, name)}"
             if isinstance(requirement, Nobody) and not meant:
-                unnamed.append(named)
+                result.unnamed.append(named)
             elif meant or verb != right:
-                clauses.append(f"no enclave may {verb} {named}{meant}")
+                result.unused.append(f"no enclave may {verb} {named}{meant}")
             elif not _is_used_by_anybody(world, _sufficient_parts(peer), name, limit):
-                clauses.append(f"no enclave may {verb} or {peer} {named}")
+                result.unused.append(f"no enclave may {verb} or {peer} {named}")
             elif known:
-                found.waiting.append(f"no enclave may {verb} {named}")
+                result.waiting.append(f"no enclave may {verb} {named}")
             else:
-                clauses.append(f"no enclave may {verb} {named}")
+                result.unused.append(f"no enclave may {verb} {named}")
         elif meant:
-            clauses.append(f"only wildcards match {named}{meant}")
+            result.unused.append(f"only wildcards match {named}{meant}")
         elif verb not in _CLAUSES_WITHOUT_PEER or (
             _is_used_by_anybody(world, _sufficient_parts(peer), name, limit)
         ):
             if not known:
-                unnamed.append(named)
+                result.unnamed.append(named)
         elif KIND_OF[right] == "topics":
             if known:
-                found.unheard.append(f"{_CLAUSES_WITHOUT_PEER[verb]} {named}")
+                result.unheard.append(f"{_CLAUSES_WITHOUT_PEER[verb]} {named}")
             else:
-                unnamed.append(named)
+                result.unnamed.append(named)
         elif known and (served := _similar_served_name(world, peer, name, limit)):
-            clauses.append(f"no enclave may {peer} {named} (perhaps {served} is meant)")
+            result.unused.append(f"no enclave may {peer} {named} (perhaps {served} is meant)")
         else:
-            found.unserved.append(f"{_CLAUSES_WITHOUT_PEER[verb]} {named}")
-    return found
+            result.unserved.append(f"{_CLAUSES_WITHOUT_PEER[verb]} {named}")
+    return result
 
 
 def _similar_served_name(world: World, right: str, name: str, limit: SearchLimit) -> str | None:

@@ -770,8 +770,8 @@ def common_namespaces(requirements: Iterable[Requirement], rights: Iterable[Righ
         names = [name for _, of_right in requirement.rights for name in of_right]
         if all(map(is_expression, names)):
             continue
-        found = set[str]().union(*(_namespaces_with(name, stated) for name in names))
-        common = found if common is None else common & found
+        namespaces = set[str]().union(*(_namespaces_with(name, stated) for name in names))
+        common = namespaces if common is None else common & namespaces
     return common or set()
 
 

@@ -1429,7 +1429,7 @@ class _Failure(NamedTuple):
             for enclave, right, name, by in self.uses
         )
         new_names = {old: new for (_, old), new in names.items()}
-        text = _ABSOLUTE_NAME.sub(lambda found: new_names.get(found[0], found[0]), self.text)
+        text = _ABSOLUTE_NAME.sub(lambda match: new_names.get(match[0], match[0]), self.text)
         return self._replace(uses=uses, text=text)
 
 
