@@ -98,7 +98,7 @@ def _write_drop_ins(
     files = {path: read_bytes(robot.start / "units" / path, "unit").decode() for path in paths}
     _drop_ins_of(robot, observed)
     if names := users_without_linger(
-        each.user for each in observed.processes if not each.container
+        process.user for process in observed.processes if not process.container
     ):
         linger = enumerated([f"`loginctl enable-linger {name}`" for name in names])
         robot.shell.say(
@@ -133,7 +133,9 @@ def undo(robot: LocalRobot, *, dry_run: bool) -> CloseState:
     expected = observed.limited_to(policy) if policy else observed
     not_running = _states_of_stopped_units(units)
     units -= not_running.keys()
-    not_running = {unit: not_running[unit] for unit in sorted(not_running.keys() & expected.units)}
+    changed = bool(drop_ins or not_running)  # an earlier --undo may have been killed
+    given_up = observed.units - expected.units
+    not_running = {unit: not_running[unit] for unit in sorted(not_running.keys() - given_up)}
     if inactive := [unit for unit, state in not_running.items() if state == "inactive"]:
         start = shlex.join(["systemctl", "start", *inactive])
         robot.shell.say(
@@ -142,7 +144,7 @@ def undo(robot: LocalRobot, *, dry_run: bool) -> CloseState:
         )
     # Open processes of Fast DDS find each other also if they start together.
     restarts = [["restart", *sorted(units)]] if units else []
-    _restart_units(robot, restarts, changed=bool(drop_ins), dry_run=dry_run)
+    _restart_units(robot, restarts, changed=changed, dry_run=dry_run)
     started = [process for process in observed.processes if process.unit in units and process.pid]
     if started and not dry_run:
         running = wait_until(
@@ -166,7 +168,10 @@ def undo(robot: LocalRobot, *, dry_run: bool) -> CloseState:
         *remaining.further_secured_processes(),
         *remaining.unknown_processes(),
     ]
-    runs = any(process.pid or process.alike for process in state.observed.processes)
+    runs = any(
+        (process.pid or process.alike) and process.enclave not in state.absent
+        for process in state.observed.processes
+    )
     # Without the list of observed processes, "no process runs" would be a guess.
     if robot.observed and not (dry_run or problems or runs or state.observed.unknown):
         problems = ["no process of the robot runs, open or secured: start its processes open"]

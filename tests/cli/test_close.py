@@ -557,7 +557,8 @@ def test_a_robot_is_closed_proved_and_opened_again(
     (robot.folder / "talker.service").write_text("inactive\n")
     stays = "did not run, and --undo starts no stopped unit; to start open: systemctl start talk"
     assert stays in robot.close("--undo").err
-    assert len(robot.restarts) == 5
+    assert {*robot.restarts[5:]} == {"daemon-reload"}
+    (robot.folder / "systemctl.log").write_text("before\n" * 5)
     (robot.folder / "talker.service").unlink()
     ended = "/talker does not run open, though talker.service was restarted: systemctl status talk"
     assert ended in robot.close("--undo", status=1).out
@@ -755,6 +756,10 @@ def a_unit_that_started_after_the_watch(robot: Robot, late: Process) -> None:
         assert f"  /late: process 7, known {known}: --apply restarts late.service" in ended.out
         assert "next: sros close robot --apply" in ended.err
         assert "ROS_SECURITY_ENCLAVE_OVERRIDE=/late" in drop_in.read_text()
+    robot.close("--apply", status=1)
+    robot.more = ()  # it could not start in its enclave
+    (robot.folder / "late.service").write_text("failed\n")
+    assert "late.service has failed: start it open" in robot.close("--undo", status=1).out
     named = replace(late, command=(*late.command, "-r", "__node:=other"))
     zenoh = replace(late, libraries=frozenset({"libzenohc"}))
     by_another_user = replace(late, user=os.geteuid() + 1)
@@ -1229,6 +1234,15 @@ def test_units_that_do_not_restart_are_named(robot: Robot) -> None:
     assert "`systemctl daemon-reload` ended with 1" in ended.err and "--undo" in ended.err
     (robot.folder / "status").write_text("0")
     robot.close("--apply")
+    for unit in UNITS.values():
+        (robot.folder / unit).write_text("inactive\n")
+    (robot.folder / "status").write_text("1")
+    robot.close("--undo", status=2)
+    (robot.folder / "status").write_text("0")
+    count, robot.absent = len(robot.restarts), set(PID)
+    undone = robot.close("--undo", status=1).out
+    assert undone == "no process of the robot runs, open or secured: start its processes open\n"
+    assert robot.restarts[count:] == ["daemon-reload"], "systemd still has the drop-ins"
 
 
 def test_a_node_of_another_robot_is_not_proposed_for_another_machine(robot: Robot) -> None:
