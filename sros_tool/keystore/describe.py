@@ -18,6 +18,8 @@ from cryptography import x509
 from sros_tool.dds.governance import DomainRule, TopicRule, parse_governance
 from sros_tool.dds.permissions import Grant, Permissions, parse_permissions
 from sros_tool.errors import DocumentError, SrosError
+from sros_tool.fleet.robots import Fleet
+from sros_tool.keystore.fleet import left_enclaves, load_fleet
 from sros_tool.keystore.known_keys import known_authorities, unknown_authorities
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
@@ -1004,13 +1006,17 @@ class HistoryStatus(StrEnum):
     """The state of an issued certificate or document."""
 
     CURRENT = "current"
-    """The certificate or document is in the keystore, and has not expired."""
+    """The certificate or document is in the keystore, and has not expired; or a robot that left has
+    not come back, and its enclave is valid.
+    """
     SUPERSEDED = "superseded"
     """The keystore has a later file instead, but DDS still accepts this one: it is not revoked and
     has not expired.
     """
     REPLACED = "replaced"
-    """Earlier settings of the keystore; DDS does not read them."""
+    """Earlier settings of the keystore, which DDS does not read; or a robot that left, but came
+    back, or whose enclave is no longer valid.
+    """
     REVOKED = "revoked"
     RETIRED = "retired"
     """A replaced CA, which is no longer trusted."""
@@ -1063,6 +1069,10 @@ def history(keystore: OpenedKeystore, *, now: datetime) -> History:
     revoked |= {f"{entry.serial:x}" for crl in keystore.revocation_lists for entry in crl.revoked}
     moment = iso(now)
     settings = _paths_by_digest(keystore, iter((SETTINGS, FLEET)))
+    fleet = None
+    with suppress(SrosError):  # `sros check` reports a fleet file that cannot be read
+        fleet = load_fleet(keystore)
+    left = left_enclaves(keystore, fleet or Fleet.of(()), now)
 
     def status(entry: Entry) -> HistoryStatus:
         if entry.what == GAP:
@@ -1074,7 +1084,8 @@ def history(keystore: OpenedKeystore, *, now: datetime) -> History:
         if entry.what in ("answer", "release"):
             return HistoryStatus.SENT
         if entry.what == LEFT:
-            return HistoryStatus.CURRENT
+            is_left = left.get(entry.enclave) == entry.reason
+            return HistoryStatus.CURRENT if is_left else HistoryStatus.REPLACED
         if entry.what in ("settings", "fleet"):
             return HistoryStatus.CURRENT if entry.sha256 in settings else HistoryStatus.REPLACED
         if entry.what == "revocation" or entry.serial in revoked or entry.sha256 in revoked_files:

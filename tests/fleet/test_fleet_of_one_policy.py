@@ -16,6 +16,7 @@ import pytest
 from sros_tool.api import fleet_status
 from sros_tool.dds.permissions import Permissions, parse_permissions
 from sros_tool.fleet.expansion import FleetPolicy
+from sros_tool.keystore.describe import history
 from sros_tool.keystore.fleet import left_enclaves, load_fleet, recorded_fleet
 from sros_tool.keystore.layout import enclave_names
 from sros_tool.keystore.reader import OpenedKeystore
@@ -96,6 +97,13 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ):
         sros(*line.split(), cwd=folder).ok()
     return folder
+
+
+def left_lines(root: Path) -> set[tuple[str, str]]:
+    """Return the enclaves in the ledger's last lines on robots that left, with their status."""
+    items = history(OpenedKeystore(root), now=datetime.now(UTC)).entries
+    lines = {item.entry.enclave: item.status.value for item in items if item.entry.what == "left"}
+    return {*lines.items()}
 
 
 def permissions(root: Path, name: str) -> Permissions:
@@ -371,7 +379,9 @@ def test_what_happens_to_a_fleet(made: Path, tmp_path: Path) -> None:
     refused = sros("revoke", "ks", "--robot", "r9", cwd=folder)
     assert refused.status == 2
     assert "Name the enclaves themselves: --match '/r9/*'" in refused.err
+    assert left_lines(folder / "ks") == {("/r9/base", "current"), ("/r9/lift", "current")}
     sros("revoke", "ks", "--match", "/r9/*", cwd=folder).ok()
+    assert left_lines(folder / "ks") == {("/r9/base", "replaced"), ("/r9/lift", "replaced")}
     assert "/r9" not in sros(*timer, "--dry-run", cwd=folder).ok().err
 
     # Another domain is in all permissions, or refused.
