@@ -83,10 +83,10 @@ def _run(words: Sequence[str], shows_messages: bool) -> tuple[int, str, str]:
     help="nodes: accept processes whose nodes sros does not know, nodes that belong to no process "
     "here, and processes whose nodes have the same name. unexamined: accept processes that sros "
     "could not examine, such as those of other users. unobserved: accept processes in enclaves in "
-    "which sros did not observe them. requirements: accept a missing requirements.toml, and "
-    "requirements on names that the policy no longer has. connections: accept processes of which "
-    "sros cannot see whether they hear the others, such as processes that use UDP.  Can be "
-    "repeated.",
+    "which sros did not observe them. requirements: accept a requirements.toml that is missing or "
+    "cannot be checked, and requirements on names that the policy no longer has. connections: "
+    "accept processes of which sros cannot see whether they hear the others, such as processes "
+    "that use UDP.  Can be repeated.",
 )
 @click.option("--partial", is_flag=True, help="Accept everything that --accept can accept.")
 @click.option(

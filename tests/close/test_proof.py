@@ -120,6 +120,7 @@ def test_requirements_hold_if_they_hold_here_and_elsewhere(
     assert said.holds is holds
     weak = "; but with 1 warning that a requirement protects less than it states, the first: line 7"
     assert (f"{weak}: no enclave /x" in said.reason) is bool(holds)
+    assert said.acceptance == (Acceptance.REQUIREMENTS if holds is None else None)
     required.unlink()
     said = _proof_of_requirements(robot)
     assert (
