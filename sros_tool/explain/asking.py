@@ -28,7 +28,7 @@ from sros_tool.keystore.participant import (
     loaded_enclave,
 )
 from sros_tool.keystore.reader import OpenedKeystore, open_enclave
-from sros_tool.names import action_part
+from sros_tool.names import action_part, is_expression
 from sros_tool.values import Words, shows
 
 if TYPE_CHECKING:
@@ -121,21 +121,29 @@ class AskedEnclave(NamedTuple):
     def wildcard_matches(self, right: str, name: str) -> list[Right] | None:
         """Return the rights with a wildcard that match ``name``; None if they are not known.
 
-        They are not known in a keystore with more than `_MOST_READ` enclaves.
+        They are not known in a keystore with more than `_MOST_READ` enclaves, with permissions that
+        cannot be read, or with wildcards for DDS topics, such as ``*``, which no policy states.
         """
         from sros_tool.policy.model import ALLOW
         from sros_tool.policy.patterns import matches
-        from sros_tool.policy.rights import split_actions
+        from sros_tool.policy.rights import policy_rights, split_actions
 
+        rights = set(policy_rights(self.policy)) if self.policy else set()
         keystore = self.enclave.keystore
         if keystore and len(keystore.names) > _MOST_READ:
             return None
-        fitting = (
-            stated
-            for stated in split_actions(self.other_rights("/"))
-            if stated.qualifier is ALLOW and stated.right == right and matches(stated.name, name)
+        if keystore and is_keystore(keystore.root):
+            try:
+                for enclave in keystore.names:
+                    rights.update(_rights_in(enclave, _read_permissions(keystore, enclave)))
+            except (SrosError, OSError):
+                return None
+        allowed = [stated for stated in split_actions(rights) if stated.qualifier is ALLOW]
+        if any(stated.kind == "dds" and is_expression(stated.name) for stated in allowed):
+            return None
+        return sorted(
+            stated for stated in allowed if stated.right == right and matches(stated.name, name)
         )
-        return sorted(fitting)
 
 
 _MOST_READ = 200
@@ -149,9 +157,13 @@ def rights_naming(keystore: OpenedKeystore, name: str) -> Iterator[Right]:
     """
     for enclave in keystore.names:
         with suppress(SrosError, OSError):
-            data = keystore.read(keystore.folder(enclave) / PERMISSIONS_FILE, "permissions")
+            data = _read_permissions(keystore, enclave)
             if _may_contain_topic(data, name):
                 yield from _rights_in(enclave, data)
+
+
+def _read_permissions(keystore: OpenedKeystore, enclave: str) -> bytes:
+    return keystore.read(keystore.folder(enclave) / PERMISSIONS_FILE, "permissions")
 
 
 def _may_contain_topic(document: bytes, name: str) -> bool:

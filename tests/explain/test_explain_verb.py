@@ -783,23 +783,35 @@ def test_a_change_is_for_the_node_that_the_permissions_are_for(whole: Path) -> N
     assert "not-used" not in explain(whole, ENCLAVE, "publish", "/rosout").err
 
 
+_MAY_MATCH = ", but a right with a wildcard may match it. If none does, perhaps"
+
+
 @pytest.mark.parametrize(
-    ("most", "said"),
+    ("most", "others", "said"),
     [
-        (200, "; by a wildcard, /b may subscribe topic /map_*. If /b does not use /map_a, perhaps"),
-        (0, ", but a right with a wildcard may match it. If none does, perhaps"),  # not read
+        (
+            200,
+            "rt/map_*",
+            "; by a wildcard, /b may subscribe topic /map_*. If /b does not use /map_a, perhaps",
+        ),
+        (200, "rt/cap_*", ", nor a wildcard that matches it: perhaps"),
+        (200, "*", _MAY_MATCH),  # as permissions that sros did not write
+        (200, "</topic>", _MAY_MATCH),  # no permissions
+        (0, "rt/map_*", _MAY_MATCH),  # not read
     ],
 )
 def test_a_wildcard_that_matches_a_name_of_nobody_is_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, most: int, said: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, most: int, others: str, said: str
 ) -> None:
     monkeypatch.setattr("sros_tool.explain.asking._MOST_READ", most)
     enclaves = {"/a": publish("/x"), "/b": subscribe("/map_*")}
     (policy := tmp_path / "p.xml").write_text(policy_text(enclaves))
     sros("create_keystore", tmp_path / "ks").ok()
     sros("generate_artifacts", "-k", tmp_path / "ks", "-p", policy).ok()
+    permissions = tmp_path / "ks" / "enclaves" / "b" / "permissions.p7s"
+    permissions.write_bytes(permissions.read_bytes().replace(b"rt/map_*", others.encode()))
     assert said in explain(tmp_path / "ks", "/a", "publish", "/map_a").err
-    if most:
+    if most and others == "rt/map_*":
         assert said in explain(policy, "/a", "publish", "/map_a").err
 
 
