@@ -792,7 +792,8 @@ def launch_word_index(command: Sequence[str]) -> int:
 SERVICE_NAME = r"\w[\w:.@\\-]*\.service"
 """The name of a systemd service, as a regular expression."""
 _SERVICE_OF_OTHERS = re.compile(
-    r"(cron|crond|atd|anacron|sshd?|(sshd?|getty|serial-getty)@.*|docker|containerd|supervisord?"
+    r"(cron|crond|atd|anacron|sshd?|dropbear|(sshd?|dropbear|getty|serial-getty)@.*"
+    r"|docker|containerd|supervisord?"
     r"|NetworkManager-dispatcher|networkd-dispatcher|systemd-udevd)\.service",
     re.A,
 )

@@ -18,6 +18,7 @@ from sros_tool.runtime.processes import ProcessOrigin, _forked_by, process_origi
         ("0::/user.slice/user-1000.slice/user@1000.service/app.slice/x.service\n", ""),
         ("0::/system.slice/../x y.service\n", ""),
         ("0::/system.slice/cron.service\n", ""),  # a line with @reboot
+        ("0::/system.slice/system-dropbear.slice/dropbear@1-a:22-b:9.service\n", ""),  # a login
         ("0::/system.slice/robot.service/ssh.service\n", ""),  # with Delegate=yes
         ("0::/system.slice/docker-1.scope/system.slice/ssh.service\n", ""),
         ("0::/\n", ""),
