@@ -27,7 +27,7 @@ from sros_tool.names import (
     expression_problem,
     is_expression,
 )
-from sros_tool.policy.model import ALLOW, DENY, PEER_RIGHT, Group, Policy, Profile
+from sros_tool.policy.model import ALLOW, DENY, PEER_RIGHT, Group, Policy, Profile, Qualifier
 from sros_tool.policy.patterns import Names, literal_prefix, matches, renamed_matches
 from sros_tool.policy.rights import (
     NodeName,
@@ -435,6 +435,12 @@ def remapped_policy(
     used: set[UsedRule] = set()
     new_names = {(use.kind, use.new) for use in moved_names}
     new_nodes = tuple(f"{use.new}/" for use in moved_names if not use.kind)
+    stated = tuple(stated)
+    given = {
+        (right.right, right.name)
+        for right in stated
+        if right.qualifier is ALLOW and (right.kind, right.name) in new_names
+    }
     other = Rules(
         right
         for right in stated
@@ -469,7 +475,9 @@ def remapped_policy(
                 for right, qualifier in group.rights
                 if qualifier is DENY and other.overlaps(Right(enclave, ALLOW, right, name))
             }
-            groups += _more_denials(group, stated_names, present, moved_names, otherwise_allowed)
+            groups += _more_denials(
+                group, stated_names, present, moved_names, otherwise_allowed, given
+            )
         return replace(new_profile, groups=tuple(groups))
 
     enclaves = tuple(
@@ -525,26 +533,28 @@ def _more_denials(
     present: Collection[str],
     moved_names: Iterable[UsedRule],
     otherwise_allowed: Collection[str],
+    given: Collection[tuple[str, str]],
 ) -> Iterator[Group]:
-    """Yield a group with the additional names, if any, that a DENY of ``group`` must deny.
+    """Yield groups with the additional names, if any, that a DENY of ``group`` must deny.
 
     These are the new names in ``moved_names``, and the old names in ``otherwise_allowed``.
-    An old name that is a new name of the same kind, of some node, is left out.
+    An old name is left out for the rights that some node has to it as a new name: ``given`` has
+    these rights and names.
     ``stated`` and ``present`` are the full names of the group before and after remapping.
     """
     denials = tuple(right for right in group.rights if right[1] is DENY)
     if not denials:
         return
-    denied, lines = Names(present), dict[str, int]()
+    denied = Names(present)
+    added: dict[tuple[tuple[str, Qualifier], ...], dict[str, int]] = defaultdict(dict)
     for use in sorted(moved_names, key=lambda use: (use.old, use.new)):
         for index, full in enumerate(stated):
             for _, new in use.names_denied_by(full, group.kind):
                 if not denied.cover(new):
-                    lines.setdefault(new, group.source_of(index).line)
-    taken = {*present, *(use.new for use in moved_names if use.kind == group.kind)}
+                    added[denials].setdefault(new, group.source_of(index).line)
     for index, full in enumerate(stated):
-        if full in otherwise_allowed and full not in taken:
-            lines.setdefault(full, group.source_of(index).line)
-    if lines:
-        names = tuple(lines)
-        yield replace(group, rights=denials, names=names, lines=tuple(lines.values()))
+        rights = tuple(denial for denial in denials if (denial[0], full) not in given)
+        if rights and full in otherwise_allowed and full not in present:
+            added[rights].setdefault(full, group.source_of(index).line)
+    for rights, lines in added.items():
+        yield replace(group, rights=rights, names=tuple(lines), lines=tuple(lines.values()))
