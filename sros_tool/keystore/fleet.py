@@ -22,6 +22,7 @@ from sros_tool.fleet.robots import (
     Fleet,
     Robot,
     enclaves_of,
+    former_robot_of,
     robot_of,
     router_enclave_of,
     size_problem,
@@ -525,6 +526,20 @@ def left_enclaves_notes(
             f"the robot {robot} {why}: {first_few(names, _MOST_SHOWN)} {stay} valid. To revoke "
             f"{them}, run {revoke_command(keystore, names)}.",
         )
+
+
+def former_robots_notes(
+    keystore: OpenedKeystore, fleet: Fleet, noted: Collection[str]
+) -> Iterator[Note]:
+    """Yield notes, as `left_enclaves_notes`, on robots that only the paths of enclaves show.
+
+    If the fleet file was edited, nothing else shows that such a robot left.  Enclaves in ``noted``
+    are left out.
+    """
+    former = {name: former_robot_of(fleet, name) for name in keystore.names if name not in noted}
+    yield from left_enclaves_notes(
+        keystore, fleet, {name: robot for name, robot in former.items() if robot}
+    )
 
 
 def revoke_command(keystore: OpenedKeystore, names: Sequence[str]) -> str:

@@ -434,7 +434,14 @@ def test_what_happens_to_a_fleet(made: Path, tmp_path: Path) -> None:
     revoked = ("/r7/base", "/r7/lift", "/r9/base", "/r9/lift")
     create_again = ("generate_artifacts", "-k", "ks", "-p", "robot.xml", *FLEET, "-e", *revoked)
     (folder / "ks/fleet.toml").write_text("no fleet")
-    sros(*create_again, "--dry-run", cwd=folder).ok()
+    assert "is no longer in the fleet" not in sros(*create_again, "--dry-run", cwd=folder).ok().err
+    kept_robots = [robot for robot in ROBOTS if robot not in ("r1", "r7", "r9")]
+    (folder / "fleet.toml").write_text(fleet_file(kept_robots))
+    for edited in ("no fleet", fleet_file(kept_robots)):
+        (folder / "ks/fleet.toml").write_text(edited)
+        left = sros(*create_again[:-5], "--dry-run", cwd=folder).ok().err
+        assert left.count("the robot r1 is no longer in the fleet: /r1/base, /r1/lift stay") == 1
+    (folder / "fleet.toml").write_text(fleet_file())
     (folder / "ks/fleet.toml").write_text(other_paths)
     sros(*create_again, cwd=folder).ok()
     assert (folder / "ks/fleet.toml").read_bytes() == record, "without the paths of the edit"

@@ -33,6 +33,9 @@ from sros_tool.keystore.fleet import (
     EnclaveDomains,
     enclaves_of_robot,
     fleet_before_change,
+    fleet_edits_clause,
+    former_robots_notes,
+    left_enclaves,
     load_fleet,
     lost_enclaves,
     publish_command,
@@ -76,7 +79,7 @@ from sros_tool.keystore.layout import (
     remedy_in_closed_robot,
     similar_keystores,
 )
-from sros_tool.keystore.ledger import RESTORED, certificate_entry, document_entry
+from sros_tool.keystore.ledger import RESTORED, Entry, certificate_entry, document_entry
 from sros_tool.keystore.lifecycle.change import Changed, ChangeOptions, KeystoreChange
 from sros_tool.keystore.lifecycle.replaced import (
     ReplacedRights,
@@ -577,10 +580,16 @@ def _prepare_change(
         refuse_stale_domains(
             change.keystore, EnclaveDomains(change.domains, before), recorded, stated
         )
+        entries: list[Entry] = []
         if before:
             notes, entries = lost_enclaves(change.keystore, before, recorded, change.now)
             change.notes += notes
             change.entries += entries
+        if fleet_edits_clause(change.keystore, change.keystore.ledger_with("what", "fleet")):
+            noted = {entry.enclave for entry in entries}
+            if before:
+                noted |= left_enclaves(change.keystore, recorded, change.now).keys()
+            change.notes += former_robots_notes(change.keystore, recorded, noted)
     if protections:
         _raise_protection(change, protections)
 
