@@ -23,7 +23,7 @@ from sros_tool.cli.common import (
     print_json,
     verb,
 )
-from sros_tool.close.acceptance import Acceptance, Acceptances
+from sros_tool.close.acceptance import IN_PREPARATION, IN_PROOF, Acceptance, Acceptances
 from sros_tool.errors import UsageError
 from sros_tool.terminal import echo
 from sros_tool.validity import iso
@@ -81,12 +81,12 @@ def _run(words: Sequence[str], shows_messages: bool) -> tuple[int, str, str]:
     type=click.Choice([word.value for word in Acceptance]),
     multiple=True,
     help="nodes: accept processes whose nodes sros does not know, nodes that belong to no process "
-    "here, and processes whose nodes have the same name. unexamined: accept processes that sros "
-    "could not examine, such as those of other users. unobserved: accept processes in enclaves in "
-    "which sros did not observe them. requirements: accept a requirements.toml that is missing or "
-    "cannot be checked, and requirements on names that the policy no longer has. connections: "
-    "accept processes of which sros cannot see whether they hear the others, such as processes "
-    "that use UDP.  Can be repeated.",
+    "here, Zenoh routers that sros did not observe, and processes whose nodes have the same name. "
+    "unexamined: accept processes that sros could not examine, such as those of other users. "
+    "unobserved: accept processes in enclaves in which sros did not observe them. requirements: "
+    "accept a requirements.toml that is missing or cannot be checked, and requirements on names "
+    "that the policy no longer has. connections: accept processes of which sros cannot see whether "
+    "they hear the others, because they do not share the memory of Fast DDS.  Can be repeated.",
 )
 @click.option("--partial", is_flag=True, help="Accept everything that --accept can accept.")
 @click.option(
@@ -177,6 +177,17 @@ def close(
         raise UsageError("--for is for watching an open robot", "", "Leave it out.")
     if prove and dry_run:
         raise UsageError("--proof changes nothing", "", "Leave --dry-run out.")
+    asked = frozenset() if undo else IN_PROOF if prove else IN_PREPARATION
+    asked |= IN_PROOF if apply else frozenset()
+    if useless := [f"--accept {word}" for word in accept if word not in asked]:
+        raise UsageError(
+            f"nothing asks for {enumerated(useless)} here",
+            "",
+            "Leave it out. `nodes` is for preparing a robot and for --apply, `requirements` also "
+            "for --proof, and the other words are for --apply and --proof.",
+        )
+    if undo and partial:
+        raise UsageError("nothing asks for --partial with --undo", "", "Leave it out.")
     machines = (("--elsewhere", elsewhere), ("--here", here), ("--brought", brought))
     for option, enclaves in machines:
         if enclaves and (prove or undo):

@@ -17,3 +17,9 @@ class Acceptance(StrEnum):
 
 
 Acceptances = Set[Acceptance]
+
+IN_PREPARATION: Acceptances = frozenset({Acceptance.NODES, Acceptance.REQUIREMENTS})
+"""What is asked for before a robot is closed."""
+
+IN_PROOF: Acceptances = frozenset(Acceptance) - {Acceptance.NODES}
+"""What is asked for in the proof that a robot is closed."""

@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 import os
 import shlex
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import cache, partial
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -121,8 +122,9 @@ def proofs_of(robot: LocalRobot, state: CloseState, patience: float) -> list[Pro
     was not started.  If the enclave of the observer has expired, only the files are examined.
     """
     expired = expired_enclaves(robot, robot.export)
+    unsigned_text = cache(partial(_unsigned_policy_text, robot))
     if OBSERVER in expired:
-        return [_proof_of_files(robot, expired)]
+        return [_proof_of_files(robot, expired, unsigned_text)]
     expected = {process.enclave for process in state.observed.processes} | {*state.new}
     if not expected:
         return [Proof(STARTED, False, "no process of the robot is known")]
@@ -156,18 +158,21 @@ def proofs_of(robot: LocalRobot, state: CloseState, patience: float) -> list[Pro
     return [
         proof,
         *_proof_of_observed_processes(running),
-        _proof_of_files(robot, expired),
-        _proof_of_requirements(robot),
+        _proof_of_files(robot, expired, unsigned_text),
+        _proof_of_requirements(robot, unsigned_text),
         talk,
         *connected,
         silence,
     ]
 
 
-def _proof_of_files(robot: LocalRobot, expired: Sequence[str]) -> Proof:
+def _proof_of_files(
+    robot: LocalRobot, expired: Sequence[str], unsigned_text: Callable[[], str]
+) -> Proof:
     """Return the proof that `check` finds no error in the used files, or in the keystore.
 
-    The enclaves ``expired`` of the export have expired.
+    The enclaves ``expired`` of the export have expired. ``unsigned_text`` returns a clause if the
+    signed permissions differ from the policy, or "".
     """
     status = robot.shell.check(str(robot.export))
     holds = {0: True, 1: False}.get(status)
@@ -193,7 +198,6 @@ def _proof_of_files(robot: LocalRobot, expired: Sequence[str]) -> Proof:
                 number = counted(len(changes), "file")
                 reason = f"exporting '{robot.keystore}' would change {number}, such as {changes[0]}"
                 holds, reason = False, f"{reason}; `{robot.close_command}` exports them"
-    unsigned = _unsigned_policy_text(robot) if status == 0 else ""
     examined = f"{robot.export}"
     if robot.keystore.exists() and not expired:
         examined += f", and the CAs and settings of {robot.keystore}"
@@ -207,7 +211,7 @@ def _proof_of_files(robot: LocalRobot, expired: Sequence[str]) -> Proof:
     if misplaced := _misplaced_keys_text(robot):
         reason = misplaced if holds else f"{reason}; {misplaced}"
         holds = False
-    return Proof(ACCEPTED, holds, f"{reason}: {examined}{unsigned}")
+    return Proof(ACCEPTED, holds, f"{reason}: {examined}{unsigned_text() if status == 0 else ''}")
 
 
 def _misplaced_keys_text(robot: LocalRobot) -> str:
@@ -296,9 +300,10 @@ def _errors_text(robot: LocalRobot, *words: str) -> str:
     return f"{text}; then run `{robot.close_command}`, and restart the processes"
 
 
-def _proof_of_requirements(robot: LocalRobot) -> Proof:
+def _proof_of_requirements(robot: LocalRobot, unsigned_text: Callable[[], str]) -> Proof:
     """Return the proof that the requirements hold for the enclaves that the processes use.
 
+    ``unsigned_text`` is as in `_proof_of_files`.
     They are also decided for the enclaves of the keystore (or policy) if processes run on other
     machines, or a requirement names an enclave that the export does not have.
     """
@@ -312,21 +317,20 @@ def _proof_of_requirements(robot: LocalRobot) -> Proof:
     status = 1 if 1 in statuses else max(statuses)
     reasons = {0: "all of them", 1: "at least one is violated", 2: "sros could not check them"}
     holds = {0: True, 1: False}.get(status)
-    more = _unsigned_violation_text(robot, *needed) if holds else ""
+    more = _unsigned_violation_text(robot, *needed) if holds and unsigned_text() else ""
     more += _weak_requirements_text(robot) if holds else ""
     return Proof(REQUIRED, holds, f"{reasons[status]}: {robot.requirements}{more}")
 
 
 def _unsigned_violation_text(robot: LocalRobot, *needed: str) -> str:
-    """Return a clause which says that the policy, if it is not signed yet, breaks a requirement.
+    """Return a clause which says that the policy, which is not signed yet, breaks a requirement.
 
-    ``needed`` are the options of `check` that name the requirements.
+    The result is "" if it breaks none. ``needed`` are the options of `check` that name the
+    requirements.
     """
-    if not robot.policy.exists():
-        return ""
     words = ("check", str(robot.policy), "--template", TEMPLATE, *needed, "--fail-on", "error")
     status, _, _ = robot.shell.run(words, False)
-    if status != 1 or not _unsigned_policy_text(robot):
+    if status != 1:
         return ""
     return f"; '{robot.policy}', which is not signed yet, violates at least one requirement"
 

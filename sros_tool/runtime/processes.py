@@ -794,7 +794,7 @@ SERVICE_NAME = r"\w[\w:.@\\-]*\.service"
 _SERVICE_OF_OTHERS = re.compile(
     r"(cron|crond|atd|anacron|sshd?|dropbear|(sshd?|dropbear|getty|serial-getty)@.*"
     r"|docker|containerd|supervisord?"
-    r"|NetworkManager-dispatcher|networkd-dispatcher|systemd-udevd)\.service",
+    r"|NetworkManager-dispatcher|networkd-dispatcher|systemd-udevd|rc-local)\.service",
     re.A,
 )
 """Matches services that start programs of their users, such as ``@reboot`` lines of a crontab.

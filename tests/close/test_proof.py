@@ -116,13 +116,13 @@ def test_requirements_hold_if_they_hold_here_and_elsewhere(
             run=lambda *_: (1, '{"findings": [{"line": 7, "text": "no enclave /x"}]}', ""),
         ),
     )
-    said = _proof_of_requirements(robot)
+    said = _proof_of_requirements(robot, str)
     assert said.holds is holds
     weak = "; but with 1 warning that a requirement protects less than it states, the first: line 7"
     assert (f"{weak}: no enclave /x" in said.reason) is bool(holds)
     assert said.acceptance == (Acceptance.REQUIREMENTS if holds is None else None)
     required.unlink()
-    said = _proof_of_requirements(robot)
+    said = _proof_of_requirements(robot, str)
     assert (
         said.acceptance is Acceptance.REQUIREMENTS
         and f"{required} is missing; restore it" in said.reason
@@ -144,7 +144,7 @@ def test_a_demand_for_an_enclave_that_the_export_lacks_is_judged_by_the_keystore
         not_here=[],
         shell=SimpleNamespace(check=lambda place, *_: answers[place]),
     )
-    assert _proof_of_requirements(robot).holds is False
+    assert _proof_of_requirements(robot, str).holds is False
 
 
 STRANGER = replace(robot(9)[0], user=4711)
@@ -307,8 +307,8 @@ def test_a_key_of_another_machine_in_the_export_fails_the_proof(
         enclaves_outside_policy=list,
         shell=SimpleNamespace(check=lambda *_: 0, read_json=lambda _: (0, {"changes": []})),
     )
-    assert proof._proof_of_files(robot, ()).holds
+    assert proof._proof_of_files(robot, (), str).holds
     key.touch()
-    said = proof._proof_of_files(robot, ())
+    said = proof._proof_of_files(robot, (), str)
     assert said.fails and "export has the private keys of /laptop, which" in said.reason
     assert remedy in said.reason
