@@ -33,7 +33,7 @@ from sros_tool.files import _follow_own_links, replace_file, staged_file
 from sros_tool.folders import Folder
 from sros_tool.keystore import transaction as transactions
 from sros_tool.keystore.delivery.export import distribute
-from sros_tool.keystore.delivery.robot import create_request
+from sros_tool.keystore.delivery.robot import create_requests
 from sros_tool.keystore.delivery.signing import sign_request
 from sros_tool.keystore.issuing.keyring import Keyring
 from sros_tool.keystore.layout import LOCK, STAGE
@@ -47,7 +47,7 @@ from sros_tool.keystore.transaction import staged_name
 from sros_tool.xml import read_bytes, why_unreadable
 from tests.conftest import MEMORY, POLICY
 from tests.support.children import run
-from tests.support.harness import copy_of, snapshot, sros
+from tests.support.harness import copy_of, create_request, snapshot, sros
 from tests.support.users import as_root
 
 NOW = datetime.now(UTC)
@@ -794,7 +794,7 @@ def test_no_key_is_left_to_the_owner_of_a_folder_that_waited_there(
             template = load_template("development")
             create_keystore(waiting, template=template, now=NOW, dry_run=dry_run)
         elif verb == "create_request":
-            create_request(waiting, "/a", dry_run=dry_run)
+            create_requests(waiting, ["/a"], dry_run=dry_run)
         else:
             distribute(OpenedKeystore(keystore), ["/a"], waiting, now=NOW, dry_run=dry_run)
     assert not list(waiting.iterdir())

@@ -149,7 +149,7 @@ VERBS: Mapping[str, str | Shapes] = {
     "merge_policy": "sros_tool.policy.merge:MergedPolicy",
     "minimize_policy": "sros_tool.keystore.issuing.size:PolicyMinimization",
     "generate_policy": "sros_tool.graph.learn:LearnedPolicy",
-    "create_request": "sros_tool.keystore.delivery.robot:MadeRequest",
+    "create_request": "sros_tool.keystore.delivery.robot:MadeRequests",
     "distribute_key": "sros_tool.keystore.delivery.export:ExportedEnclaves",
     "sign_request": "sros_tool.keystore.delivery.signing:SignedRequest",
     "import": "sros_tool.keystore.delivery.robot:ImportedAnswer",

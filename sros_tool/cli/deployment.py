@@ -31,6 +31,7 @@ from sros_tool.cli.common import (
     key_option,
     keystore_argument,
     keystore_arguments,
+    keystore_from_environment,
     moment_of,
     now,
     print_json,
@@ -309,25 +310,26 @@ def verify(
 
 
 @verb("create_request")
-@click.argument("name", metavar="ENCLAVE")
-@keystore_argument("folder", "[DIR]")
+@keystore_arguments("ENCLAVE... [DIR]", shell_complete=complete_file)
 @click.option(
-    "--again", is_flag=True, help="Write the signing request again, for the existing key."
+    "--again", is_flag=True, help="Write the signing requests again, for the existing keys."
 )
 @key_option
 @dry_run_option
 @json_option
 def create_request(
-    name: str, folder: Path, again: bool, key: str, dry_run: bool, as_json: bool
+    arguments: tuple[str, ...], again: bool, key: str, dry_run: bool, as_json: bool
 ) -> None:
-    """On a robot: create the key of ENCLAVE in the folder DIR, and a signing request.
+    """On a robot: create the keys of ENCLAVE... in the folder DIR, and signing requests.
 
-    The key never leaves DIR. With --key, the key is made on the robot's PKCS#11 token, and never
-    leaves the token; DIR then holds only the key's URI. The PIN comes from the URI's pin-source=,
-    from $SROS_PKCS11_PIN or from a prompt.
+    If you name more than one enclave, also name DIR: the last of several arguments is DIR.
 
-    Send the request to the keystore, where `sros sign_request` answers it; `sros import` installs
-    the answer next to the key.
+    The keys never leave DIR. With --key, the keys are made on the robot's PKCS#11 token, and never
+    leave the token; DIR then holds only their URIs. The PIN comes from the URI's pin-source=, from
+    $SROS_PKCS11_PIN or from a prompt.
+
+    Send the requests to the keystore, where `sros sign_request` answers them; `sros import`
+    installs an answer next to its key.
 
     Example:
       $ sros create_request /arm/camera robot
@@ -337,28 +339,33 @@ def create_request(
       $ ssh robot cat robot/enclaves/arm/camera/request.pem |   # or in one step
             sros sign_request keystore - | ssh robot sros import - robot
     """
-    from sros_tool.keystore.delivery.robot import create_request as create
-    from sros_tool.keystore.delivery.robot import shown_request
+    from sros_tool.keystore.delivery.robot import create_requests, shown_requests
 
-    request = create(folder, name, again=again, key=key, secrets=secrets(), dry_run=dry_run)
+    *names, last = arguments
+    folder = PATH.convert(last, None, None) if names else keystore_from_environment()
+    made = create_requests(
+        folder, names or [last], again=again, key=key, secrets=secrets(), dry_run=dry_run
+    )
     if as_json:
-        print_json(shown_request(folder, request, again=again, dry_run=dry_run))
+        print_json(shown_requests(folder, made, again=again, dry_run=dry_run))
         return
     if dry_run:
-        print_plan(folder, request.changes)
+        print_plan(folder, made.changes)
         return
-    if again:
-        echo(f"made the request of enclave {name} again, for the existing key")
-    elif request.token:
-        echo(
-            f"the key of enclave {name} is {request.token.object!r} on the token "
-            f"{request.token.token}, and stays there"
-        )
-    else:
-        echo(f"made the key of enclave {name}; the key stays in '{folder}'")
-    echo(f"  its SHA-256 is {request.key}")
-    echo(f"  bring '{request.file}' to the keystore: sros sign_request KEYSTORE request.pem")
-    print_notes(request.notes)
+    for request in made.requests:
+        name, token = request.name, request.token
+        if again:
+            echo(f"made the request of enclave {name} again, for the existing key")
+        elif token:
+            echo(
+                f"the key of enclave {name} is {token.object!r} on the token {token.token}, and "
+                "stays there"
+            )
+        else:
+            echo(f"made the key of enclave {name}; the key stays in '{folder}'")
+        echo(f"  its SHA-256 is {request.key}")
+        echo(f"  bring '{request.file}' to the keystore: sros sign_request KEYSTORE request.pem")
+    print_notes(made.notes)
 
 
 @verb("sign_request")

@@ -61,7 +61,7 @@ FAMILIES: dict[str, dict[str, VerbEntry]] = {
         ),
         "verify": VerbEntry("deployment", "On a robot: can nodes start in its enclaves?"),
         "create_request": VerbEntry(
-            "deployment", "Create a key on the robot, and a signing request."
+            "deployment", "Create keys on the robot, and signing requests."
         ),
         "sign_request": VerbEntry("deployment", "Sign the request of a robot."),
         "import": VerbEntry(

@@ -49,7 +49,6 @@ from sros_tool.keystore.delivery.repository import (
     new_key,
     read_present,
 )
-from sros_tool.keystore.delivery.robot import create_request
 from sros_tool.keystore.delivery.signing import sign_request
 from sros_tool.keystore.fleet_status import fleet_status
 from sros_tool.keystore.issuing.keyring import Keyring
@@ -67,7 +66,7 @@ from sros_tool.pki.certificates import key_digest, load_request, validity_of
 from sros_tool.pki.crl import load_crl
 from sros_tool.validity import iso
 from tests.agent.published import DAY, LATER, ROLES, Home, Thief
-from tests.support.harness import copy_of, policy_text, snapshot, sros
+from tests.support.harness import copy_of, create_request, policy_text, snapshot, sros
 from tests.support.harness import publish as allow_publish
 from tests.support.long_form import few_steps
 

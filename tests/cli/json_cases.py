@@ -288,7 +288,7 @@ CASES: dict[str, tuple[Case, ...]] = {
     "verify": (Case("out"), Case("out --domain 7 --at 2000-01-01", 1)),
     "create_request": (
         Case("/r new"),
-        Case("/r new --dry-run"),
+        Case("/r /t new --dry-run"),
         Case("/r robot --again"),
     ),
     "sign_request": (

@@ -261,7 +261,7 @@ def test_roots_from_the_environment(keystore: Path, tmp_path: Path) -> None:
     "line",
     [
         "create_request /new robot",
-        "create_request /new elsewhere",
+        "create_request /new /newer elsewhere",
         "create_request /arm/camera robot --again",
         "sign_request ks r.pem",
         "sign_request ks r.pem -o a.tgz",
@@ -296,7 +296,7 @@ MISUSE: dict[str, tuple[str, str]] = {
     "nothing to renew": ("sign_request ks r.pem --renew", "Leave --renew out"),
     "a certificate for a request": ("sign_request ks ks/enclaves/a/cert.pem", "cannot be read"),
     "the answer in a missing folder": ("sign_request ks r.pem -o no/a.tgz", "'no': No such"),
-    "a name that is none": ("create_request camera robot", "not a valid enclave name"),
+    "a name that is none": ("create_request /new camera robot", "not a valid enclave name"),
     "a key that is there": ("create_request /arm/camera robot", "has a key in 'robot'"),
     "a request in a keystore": ("create_request /c ks", "is a keystore with CAs"),
     "an answer that is missing": ("import no.tgz robot", "does not exist"),

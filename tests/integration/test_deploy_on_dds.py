@@ -14,7 +14,7 @@ from sros_tool.checks.keystores.arrival import verify_arrival
 from sros_tool.dds.domains import DomainSet
 from sros_tool.errors import SrosError
 from sros_tool.keystore.delivery.archive import pack, unpack
-from sros_tool.keystore.delivery.robot import create_request, import_answer
+from sros_tool.keystore.delivery.robot import import_answer
 from sros_tool.keystore.delivery.signing import sign_request
 from sros_tool.keystore.lifecycle.create import create_keystore, generate_artifacts
 from sros_tool.keystore.template import load_template
@@ -22,7 +22,7 @@ from sros_tool.policy.document import read_policy
 from sros_tool.runtime.environment import secured_environment
 from tests.integration.converse import converse, listener, talker
 from tests.support.children import importing, run
-from tests.support.harness import forked, policy_text, publish, snapshot
+from tests.support.harness import create_request, forked, policy_text, publish, snapshot
 
 pytestmark = pytest.mark.dds
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from sros_tool.checks.keystores.arrival import verify_arrival
-from sros_tool.keystore.delivery.robot import create_request, import_answer
+from sros_tool.keystore.delivery.robot import import_answer
 from sros_tool.keystore.delivery.signing import sign_request
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
 from sros_tool.keystore.lifecycle.revoke import revoke
@@ -20,7 +20,7 @@ from sros_tool.keystore.reader import open_enclave
 from sros_tool.keystore.template import load_template
 from tests.integration.kills import Moments, Server, server
 from tests.integration.test_kill_life import DIED, copy, in_child
-from tests.support.harness import remains, snapshot
+from tests.support.harness import create_request, remains, snapshot
 from tests.support.long_form import ONLY_LONG, few_steps
 
 __all__ = ["server"]

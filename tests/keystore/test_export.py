@@ -31,7 +31,6 @@ from sros_tool.keystore.delivery.export import (
     pack_enclaves,
     select_enclaves_to_export,
 )
-from sros_tool.keystore.delivery.robot import create_request
 from sros_tool.keystore.delivery.signing import sign_request
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, generate_artifacts
 from sros_tool.keystore.lifecycle.renew import renew
@@ -44,7 +43,7 @@ from sros_tool.keystore.transaction import KeystoreLock
 from sros_tool.pki.certificates import digest, load_certificate
 from sros_tool.pki.crl import load_crl
 from sros_tool.policy.document import read_policy
-from tests.support.harness import copy_of, policy_text, publish, snapshot, sros
+from tests.support.harness import copy_of, create_request, policy_text, publish, snapshot, sros
 
 NOW = datetime.now(UTC)
 NAMES = ("/arm/camera", "/arm/gripper", "/armada", "/base")

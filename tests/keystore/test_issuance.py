@@ -9,12 +9,11 @@ import pytest
 
 from sros_tool.dds.permissions import MAX_SIGNED_BYTES
 from sros_tool.errors import Note
-from sros_tool.keystore.delivery.robot import create_request
 from sros_tool.keystore.delivery.signing import sign_request
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
 from sros_tool.keystore.lifecycle.rotate import rotate_ca
 from sros_tool.keystore.template import load_template
-from tests.support.harness import policy_text, publish, sros, topics_of
+from tests.support.harness import create_request, policy_text, publish, sros, topics_of
 from tests.support.long_form import ONLY_LONG, sometimes
 
 NOW = datetime(2026, 6, 1, tzinfo=UTC)

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from sros_tool.errors import KeystoreError
-from sros_tool.keystore.delivery.robot import create_request, import_answer
+from sros_tool.keystore.delivery.robot import import_answer
 from sros_tool.keystore.delivery.signing import SignedRequests, sign_request
 from sros_tool.keystore.lifecycle.create import create_enclaves
 from sros_tool.keystore.lifecycle.renew import renew
@@ -18,7 +18,7 @@ from sros_tool.keystore.lifecycle.revoke import revoke
 from sros_tool.keystore.lifecycle.rotate import rotate_ca
 from sros_tool.pki.certificates import make_request
 from sros_tool.pki.keys import load_key
-from tests.support.harness import certificate, copy_of, snapshot
+from tests.support.harness import certificate, copy_of, create_request, snapshot
 
 NOW = datetime.now(UTC) + timedelta(hours=1)  # later than the keystore that is copied
 

@@ -13,7 +13,7 @@ from sros_tool.checks.keystores.arrival import verify_arrival
 from sros_tool.errors import KeystoreError, PkiError
 from sros_tool.keystore.delivery import robot as delivered
 from sros_tool.keystore.delivery.archive import pack, unpack
-from sros_tool.keystore.delivery.robot import create_request, import_answer, read_pinned_cas, seal
+from sros_tool.keystore.delivery.robot import import_answer, read_pinned_cas, seal
 from sros_tool.keystore.delivery.signing import sign_request
 from sros_tool.keystore.issuing import authority as authorities
 from sros_tool.keystore.issuing.authority import load_authority
@@ -26,7 +26,7 @@ from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.template import load_template
 from sros_tool.pki.certificates import digest
 from tests.support.children import run
-from tests.support.harness import certificate, snapshot, sros
+from tests.support.harness import certificate, create_request, snapshot, sros
 
 NOW = datetime.now(UTC)
 NAME, FOLDER = "/arm/camera", "enclaves/arm/camera"

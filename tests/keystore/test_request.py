@@ -29,7 +29,7 @@ from sros_tool.keystore.delivery.archive import (
     pack,
     unpack,
 )
-from sros_tool.keystore.delivery.robot import create_request, import_answer
+from sros_tool.keystore.delivery.robot import create_requests, import_answer
 from sros_tool.keystore.delivery.signing import SignedRequests, certify_requests, sign_request
 from sros_tool.keystore.describe import history
 from sros_tool.keystore.issuing.keyring import Keyring
@@ -57,6 +57,7 @@ from tests.support.children import run
 from tests.support.harness import (
     certificate,
     copy_of,
+    create_request,
     policy_text,
     publish,
     remains,
@@ -134,8 +135,9 @@ def test_openssl_reads_a_request_and_agrees_about_the_key(robot: Path, tmp_path:
 
 def test_no_key_is_replaced(robot: Path) -> None:
     before = snapshot(robot)
-    with pytest.raises(KeystoreError, match="has a key in"):
-        create_request(robot, NAME)
+    for names in ([NAME], ["/other", NAME]):
+        with pytest.raises(KeystoreError, match=f"{NAME} already has a key in"):
+            create_requests(robot, names)
     assert snapshot(robot) == before
     create_request(robot, "/other")
     create_request(robot, NAME, again=True)
@@ -147,7 +149,7 @@ def test_no_key_is_replaced(robot: Path) -> None:
 
 
 def test_a_dry_run_creates_nothing(tmp_path: Path) -> None:
-    made = create_request(tmp_path / "robot", NAME, dry_run=True)
+    made = create_requests(tmp_path / "robot", [NAME], dry_run=True)
     assert [change.path for change in made.changes] == [
         f"{FOLDER}/key.pem",
         f"{FOLDER}/request.pem",

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from sros_tool.errors import KeystoreError
-from sros_tool.keystore.delivery.robot import create_request, import_answer
+from sros_tool.keystore.delivery.robot import import_answer
 from sros_tool.keystore.delivery.signing import SignedRequests, sign_request
 from sros_tool.keystore.layout import LEDGER, LEDGER_HEAD
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, create_permission
@@ -19,7 +19,7 @@ from sros_tool.keystore.lifecycle.rotate import rotate_ca
 from sros_tool.keystore.template import load_template
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import Policy
-from tests.support.harness import policy_text, publish, snapshot, topics_of
+from tests.support.harness import create_request, policy_text, publish, snapshot, topics_of
 
 NOW = datetime.now(UTC)
 FILES = ("permissions.p7s", "permissions.xml")

@@ -24,6 +24,7 @@ from cryptography.hazmat.primitives import serialization
 
 from sros_tool.cli import main
 from sros_tool.dds.permissions import parse_permissions
+from sros_tool.keystore.delivery.robot import NewRequest, create_requests
 from sros_tool.keystore.layout import LEDGER_INDEX, LOCK, REQUIRED_FILES
 from sros_tool.pki import smime
 from tests.support.children import Forked
@@ -281,6 +282,12 @@ def _become_program(
 def _read(descriptor: int) -> str:
     with open(descriptor, "rb") as pipe:
         return pipe.read().decode(errors="replace")
+
+
+def create_request(folder: Path, name: str, *, again: bool = False) -> NewRequest:
+    """Create the key of one enclave on a robot, and return the signing request for the key."""
+    (request,) = create_requests(folder, [name], again=again).requests
+    return request
 
 
 def snapshot(folder: Path) -> dict[str, tuple[int, bytes]]:

@@ -111,35 +111,42 @@ class NewRequest:
     name: str
     file: Path
     key: str
-    changes: tuple[Change, ...]
     token: TokenUri | None = None
-    notes: tuple[Note, ...] = ()
 
 
-def create_request(
+@dataclass(frozen=True, slots=True)
+class NewRequests:
+    """New signing requests, and the changes of the folder on the robot."""
+
+    requests: tuple[NewRequest, ...]
+    changes: tuple[Change, ...]
+    notes: tuple[Note, ...]
+
+
+def create_requests(
     folder: Path,
-    name: str,
+    names: Sequence[str],
     *,
     again: bool = False,
     key: str = "",
     secrets: Secrets = no_secrets,
     dry_run: bool = False,
-) -> NewRequest:
-    """Create an enclave's private key in ``folder``, and a signing request for the key.
+) -> NewRequests:
+    """Create the private keys of enclaves in ``folder``, and signing requests for the keys.
 
-    ``folder`` becomes a keystore without CAs.  With ``again``, the request is made for the existing
-    key; a key is never replaced.  With ``key``, a ``pkcs11:`` URI, the key is on a token: it is
-    created there if it does not exist, and ``folder`` gets a file with the URI.  ``secrets``
-    returns the PIN.
+    ``folder`` becomes a keystore without CAs.  Either all requests are made, or none.  With
+    ``again``, they are made for the existing keys; a key is never replaced.  With ``key``, a
+    ``pkcs11:`` URI, the keys are on a token: they are created there if they do not exist, and
+    ``folder`` gets files with their URIs.  ``secrets`` returns the PIN.
 
     Raises:
-        KeystoreError: the enclave has a key already (without ``again``), or a certificate without
-            a key, or ``folder`` is a keystore with CAs.
+        KeystoreError: an enclave has a key already (without ``again``), or a certificate without a
+            key, or ``folder`` is a keystore with CAs.
         PkiError: the token cannot be used.
     """
-    check_enclave_name(name)
-    place_of_key = token_places(key, [name])[name] if key else None
-    if again and place_of_key:
+    names = [*dict.fromkeys(check_enclave_name(name) for name in names)]
+    places = token_places(key, names) if key else {}
+    if again and key:
         raise UsageError(
             "--again and --key exclude each other",
             "With --again, the request is for the key that the enclave already has.",
@@ -148,53 +155,73 @@ def create_request(
     if not dry_run and folder.is_dir():
         recover_keystore(folder)
     _refuse_ca_keystore(
-        folder, f"Make the enclave with `sros create_enclave {quote(str(folder))} {name}`."
+        folder, f"Make the enclave with `sros create_enclave {quote(str(folder))} {names[0]}`."
     )
-    place = enclave_folder(name)
+    requests: list[NewRequest] = []
+    notes: list[Note] = []
     with Transaction(folder, new_keystore=True, dry_run=dry_run) as transaction:
-        path = folder / place / KEY_FILE
-        on_token = folder / place / KEY_URI_FILE
-        if has_key(folder / place) and not again:
-            raise KeystoreError(
-                f"enclave {name} already has a key in '{folder}'",
-                "A key is never replaced, because its certificate would become useless.",
-                "Add --again to make the request again for this key, or choose another folder.",
-            )
-        made: PrivateKey
-        if again and on_token.exists() and not path.exists():
-            made = open_enclave_key(place_in_file(on_token), secrets)
-        elif again:
-            made = load_enclave_key(read_bytes(path, "private key"), f"'{path}'")
-        elif (folder / place / CERTIFICATE_FILE).exists():
-            raise KeystoreError(
-                f"enclave {name} has a certificate in '{folder}', but no key",
-                "A new key would make the certificate useless.",
-                "Restore the key, or choose another folder.",
-            )
-        elif place_of_key and dry_run:
-            transaction.write(f"{place}/{KEY_URI_FILE}", token_file_content(place_of_key))
-            made = generate_key()  # a dry run does not open the token
-        elif place_of_key:
-            made = make_enclave_key(place_of_key, secrets)
-            remedy = "Name another object of the token."
-            KnownKeys(OpenedKeystore(folder)).refuse_shared_key(made.public_key(), name, remedy)
-            transaction.write(f"{place}/{KEY_URI_FILE}", made.file)
-        else:
-            made = generate_key()
-            transaction.write(f"{place}/{KEY_FILE}", key_pem(made), private=True)
-        request = make_request(made, name)
-        # This reports an unsupported kind of key now, and not later at the keystore.
-        load_request(request, f"of enclave {name}")
-        transaction.write(f"{place}/{REQUEST}", request)
+        for name in names:
+            place = enclave_folder(name)
+            place_of_key = places.get(name)
+            if again:
+                made = _existing_key(folder / place, secrets)
+            else:
+                _refuse_existing_key(folder, name)
+                made = _write_new_key(transaction, name, place_of_key, secrets)
+            request = make_request(made, name)
+            # This reports an unsupported kind of key now, and not later at the keystore.
+            load_request(request, f"of enclave {name}")
+            transaction.write(f"{place}/{REQUEST}", request)
+            token = made.place if isinstance(made, TokenKey) else place_of_key
+            file = folder / place / REQUEST
+            requests.append(NewRequest(name, file, key_digest(made.public_key()), token))
+            notes += token_notes(made) if isinstance(made, TokenKey) else ()
         transaction.commit()
-    return NewRequest(
-        name,
-        folder / place / REQUEST,
-        key_digest(made.public_key()),
-        tuple(transaction.changes),
-        made.place if isinstance(made, TokenKey) else place_of_key,
-        tuple(token_notes(made)) if isinstance(made, TokenKey) else (),
-    )
+    return NewRequests(tuple(requests), tuple(transaction.changes), tuple(notes))
+
+
+def _existing_key(enclave: Path, secrets: Secrets) -> PrivateKey:
+    """Return the key in the folder of an enclave, or on the token that the folder names."""
+    path, on_token = enclave / KEY_FILE, enclave / KEY_URI_FILE
+    if on_token.exists() and not path.exists():
+        return open_enclave_key(place_in_file(on_token), secrets)
+    return load_enclave_key(read_bytes(path, "private key"), f"'{path}'")
+
+
+def _refuse_existing_key(folder: Path, name: str) -> None:
+    """Raise `KeystoreError` if a new key would make a key or certificate of the enclave useless."""
+    enclave = folder / enclave_folder(name)
+    if has_key(enclave):
+        raise KeystoreError(
+            f"enclave {name} already has a key in '{folder}'",
+            "A key is never replaced, because its certificate would become useless.",
+            "Add --again to make the request again for this key, or choose another folder.",
+        )
+    if (enclave / CERTIFICATE_FILE).exists():
+        raise KeystoreError(
+            f"enclave {name} has a certificate in '{folder}', but no key",
+            "A new key would make the certificate useless.",
+            "Restore the key, or choose another folder.",
+        )
+
+
+def _write_new_key(
+    transaction: Transaction, name: str, place_of_key: TokenUri | None, secrets: Secrets
+) -> PrivateKey:
+    """Return the new key of an enclave, and stage its file; with a place, the key on the token."""
+    place = enclave_folder(name)
+    if place_of_key is None or transaction.dry_run:
+        made: PrivateKey = generate_key()  # a dry run does not open the token
+        if place_of_key is None:
+            transaction.write(f"{place}/{KEY_FILE}", key_pem(made), private=True)
+        else:
+            transaction.write(f"{place}/{KEY_URI_FILE}", token_file_content(place_of_key))
+        return made
+    on_token = make_enclave_key(place_of_key, secrets)
+    known = KnownKeys(OpenedKeystore(transaction.root))
+    known.refuse_shared_key(on_token.public_key(), name, "Name another object of the token.")
+    transaction.write(f"{place}/{KEY_URI_FILE}", on_token.file)
+    return on_token
 
 
 def read_pinned_cas(text: str) -> frozenset[str]:
@@ -696,33 +723,32 @@ class RequestedEnclave(NamedTuple):
     """SHA-256 of the enclave's public key (DER), in hexadecimal; null if a dry run made no key."""
 
 
-class MadeRequest(NamedTuple):
-    """The signing request that was made."""
+class MadeRequests(NamedTuple):
+    """The signing requests that were made."""
 
     folder: Path
     """DIR, as given on the command line."""
     dry_run: DryRun
     enclaves: Sequence[RequestedEnclave]
-    """The enclave that the request is for."""
+    """The enclaves that the requests are for."""
     changes: FileChanges
     notes: Notes
 
 
-def shown_request(
-    folder: Path, requested: NewRequest, *, again: bool, dry_run: bool
-) -> MadeRequest:
-    """Return the value that ``--json`` prints for a new signing request.
+def shown_requests(folder: Path, made: NewRequests, *, again: bool, dry_run: bool) -> MadeRequests:
+    """Return the value that ``--json`` prints for new signing requests.
 
-    ``again`` and ``dry_run`` are as in `create_request`.
+    ``again`` and ``dry_run`` are as in `create_requests`.
     """
-    key = (
-        requested.key if again or not dry_run else None
-    )  # a dry run does not keep the key that it makes
     outcome = "requested_again" if again else "requested"
-    enclave = RequestedEnclave(requested.name, outcome, requested.file.parent, requested.file, key)
-    return MadeRequest(
-        folder, dry_run, (enclave,), changes_below(folder, requested.changes), requested.notes
-    )
+    has_keys = again or not dry_run  # a dry run does not keep the keys that it makes
+    enclaves = [
+        RequestedEnclave(
+            each.name, outcome, each.file.parent, each.file, each.key if has_keys else None
+        )
+        for each in made.requests
+    ]
+    return MadeRequests(folder, dry_run, enclaves, changes_below(folder, made.changes), made.notes)
 
 
 class ImportedAnswer(NamedTuple):
