@@ -838,11 +838,11 @@ def other_node_notes(
 ) -> tuple[Note, ...]:
     """Return a note if a command gives its nodes a name that the enclave's permissions lack.
 
-    A command without a namespace counts as one for "/", if it certainly starts nodes.  In two
-    cases, the node names are not certain.  If the remapping rules depend on the node's own name, a
-    note is returned only if none of the possible names is in the permissions.  If the ledger lacks
-    the permissions, sros knows only nodes that offer their standard services, so a note is returned
-    only if the permissions have the name in another namespace.
+    A command without a namespace counts as one for "/", if it certainly starts nodes.  If the
+    command's remapping rules depend on the node's own name, a note is returned only if none of the
+    possible names is in the permissions.  If the ledger lacks the permissions, sros finds only
+    those of their nodes that may offer the standard services.  Then, a note is returned only if one
+    of these has the name in another namespace.
     """
     from sros_tool.keystore.rights import RecordedRights
     from sros_tool.policy.rights import nodes_from_text, nodes_of_rights

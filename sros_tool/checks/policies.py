@@ -160,8 +160,8 @@ WRONG_KIND = FindingKind(
     "policy.wrong-kind",
     WARNING,
     "a name of another kind, such as a service in a rule for topics",
-    "Every ROS 2 node has a topic of this name and no service, or a service and no topic. So "
-    "the rule has no effect.",
+    "In ROS 2, this name is always a topic, or always a service, so a rule for the other kind "
+    "has no effect.",
     "ROS 2 Jazzy (rclcpp 28, rclpy 7); ROS 2 design, Actions.",
     "Move the name to the group of its kind: <topics> or <services>.",
 )

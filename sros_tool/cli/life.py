@@ -367,7 +367,7 @@ def _enclaves_by_serial(
 ) -> dict[str, str]:
     """Map the serial numbers in ``lists`` to enclaves, by the records of the ledger.
 
-    The record of a revocation that a restore repeated names no enclave.
+    If a revocation was repeated after a restore, its record names no enclave.
     """
     serials = {f"{entry.serial:x}" for crl in lists for entry in crl.revoked}
     ledger = keystore.ledger_file.with_values("serial", serials)
@@ -680,7 +680,7 @@ def _show_status(status: RotationStatus, unconfirmed: Sequence[str] | str, as_js
             f"  {end}  {authority.subject} (SHA-256 {authority.sha256[:8]})"
         )
     if isinstance(unconfirmed, str):
-        echo(f"which robots confirmed this stage is unknown: {unconfirmed}")
+        echo(f"it is not known which robots confirmed this stage: {unconfirmed}")
     elif unconfirmed:
         echo(f"not confirmed by {first_few(unconfirmed, _MOST_ROBOTS)}: see `sros fleet status`")
     for remark in status.remarks:

@@ -258,11 +258,11 @@ def diff_policy(
     enclaves, keystores, exports, or Zenoh configurations such as router.json5. Permissions and
     Zenoh rules are shown in ROS terms; the signature of permissions is verified if the permissions
     CA is next to them. "!" marks a right of B whose counterpart, such as the subscriber, only A
-    has. If A or B covers only some enclaves, as an export does, only these are compared. A policy
-    may lack Zenoh routers: if they have only the rights that every node needs, a note names them in
-    place of a difference. Lines that differ only in the robot of a fleet are shown as one. Two
-    policies are also compared by the protection that they demand, two keystores by their
-    governance.
+    has. If A or B covers only some enclaves, as an export does, only these are compared. If only
+    one side has Zenoh routers, and these have only the rights that every node needs, they do not
+    count as a difference; a note names them. Lines that differ only in the robot of a fleet are
+    shown as one. Two policies are also compared by the protection that they demand, two keystores
+    by their governance.
 
     The exit status is 1 if A and B differ (notes name differences that are not in the rights),
     or if DDS would refuse A or B.
@@ -275,9 +275,9 @@ def diff_policy(
     assumes that a policy is signed with a governance that controls all access. If A is a policy,
     and B is a keystore that protects less than the template production, this counts as more access.
     If A is a keystore, and B is a policy, B never counts as less protection. The last line says
-    what is assumed and what is left out, such as dates. "!" marks a DENY of A that B lacks, for
-    names that B does not allow. If only a DENY is missing, nobody gets access, so the exit status
-    is 0, but `sros review` fails.
+    what is assumed and what is left out, such as dates. Here, "!" marks a DENY of A that B lacks,
+    for names that B does not allow. If only a DENY is missing, nobody gets access, so the exit
+    status is 0, but `sros review` fails.
 
     Example:
       $ sros diff_policy robot.xml keystore

@@ -426,7 +426,7 @@ def _note_on_fitting_permissions(evaluator: Evaluator, answer: Answer) -> Iterat
         return
     holders = [
         holder.enclave.name
-        for holder in _fitting_holders(evaluator)
+        for holder in _enclaves_with_fitting_permissions(evaluator)
         if holder.for_other_certificates().answer(answer.question).allowed
     ]
     if holders:
@@ -439,7 +439,7 @@ def _note_on_fitting_permissions(evaluator: Evaluator, answer: Answer) -> Iterat
         yield Note("explain.fitting-permissions", text)
 
 
-def _fitting_holders(evaluator: Evaluator) -> Iterator[Evaluator]:
+def _enclaves_with_fitting_permissions(evaluator: Evaluator) -> Iterator[Evaluator]:
     """Yield evaluators of other enclaves whose permissions also fit this enclave's certificate.
 
     Reads only enclaves whose paths have all parts of the enclave's path.

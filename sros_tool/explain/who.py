@@ -339,7 +339,7 @@ def follow_reach(
             f"them: their influence is not followed. {refuse}"
         )
         notes.append(Note("explain.anybody", text))
-    if of_keystore and (holders := _fitting_holders(source, enclave)):
+    if of_keystore and (holders := _enclaves_with_fitting_permissions(source, enclave)):
         text = (
             f"on Cyclone DDS, whoever has the key of {enclave} can also use the permissions of "
             f"{first_few(holders, 3)}, which fit its certificate: this is not followed."
@@ -356,7 +356,7 @@ def follow_reach(
     return FollowedReach(source.path, (*without, *questions), domain, reach, source.fleet, notes)
 
 
-def _fitting_holders(source: RightsSource, enclave: str) -> list[str]:
+def _enclaves_with_fitting_permissions(source: RightsSource, enclave: str) -> list[str]:
     """Return the other enclaves of a keystore whose permissions fit an enclave's certificate.
 
     Compares only enclaves whose paths have all parts of the enclave's path.

@@ -853,7 +853,8 @@ def _problems_from(value: Any) -> tuple[str, ...]:
     for text in problems:
         if not (isinstance(text, str) and text.isprintable() and 0 < len(text) <= LONGEST_PROBLEM):
             raise _FormError(
-                f"a problem is not printable text of at most {LONGEST_PROBLEM} characters"
+                f'one of its "problems" is not printable text of at most {LONGEST_PROBLEM} '
+                "characters"
             )
     return tuple(problems)
 

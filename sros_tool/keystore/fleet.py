@@ -520,11 +520,12 @@ def left_enclaves_notes(
         why = (
             "has other enclave paths now" if robot in fleet.robots else "is no longer in the fleet"
         )
-        stay, them = ("stays", "it") if len(names) == 1 else ("stay", "them")
+        s, stay, them = ("", "stays", "it") if len(names) == 1 else ("s", "stay", "them")
         yield Note(
             "fleet.left-enclaves",
-            f"the robot {robot} {why}: {first_few(names, _MOST_SHOWN)} {stay} valid. To revoke "
-            f"{them}, run {revoke_command(keystore, names)}.",
+            f"the robot {robot} {why}, but its earlier enclave{s} "
+            f"{first_few(names, _MOST_SHOWN)} {stay} valid. To revoke {them}, run "
+            f"{revoke_command(keystore, names)}.",
         )
 
 

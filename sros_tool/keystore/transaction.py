@@ -1196,15 +1196,15 @@ def _replace_links(folder: Folder, moves: Sequence[Move]) -> None:
     _remove_empty_folders(folder, gone)
 
 
-def _move_revoked_folder(folder: Folder, certificate: str, to: str) -> None:
+def _move_revoked_folder(keystore_folder: Folder, certificate: str, to: str) -> None:
     """Move the folder of a removed ``certificate`` to ``to``, without the links in it."""
     with contextlib.suppress(FileNotFoundError):  # an earlier recovery has moved it
-        folder.rename(certificate.rpartition("/")[0], to)
+        keystore_folder.rename(certificate.rpartition("/")[0], to)
     with contextlib.suppress(FileNotFoundError):  # an earlier recovery has put it back
         kept = f"{STAGE}/{_BEFORE}/{staged_name(certificate)}"
-        folder.replace(kept, f"{to}/{CERTIFICATE_FILE}")
-    for link in folder.links(to):
-        folder.unlink(f"{to}/{link}")
+        keystore_folder.replace(kept, f"{to}/{CERTIFICATE_FILE}")
+    for link in keystore_folder.links(to):
+        keystore_folder.unlink(f"{to}/{link}")
 
 
 def _undo(folder: Folder, moves: Sequence[Move]) -> None:

@@ -1211,7 +1211,7 @@ def _has_denials_first(grant: Grant) -> bool:
     return (
         not (grant.default_first or grant.default_empty)
         and len({rule.domains for rule in grant.rules}) == 1
-        and _are_plain_domains(grant.rules[0].domains)
+        and _have_both_ends(grant.rules[0].domains)
         and kinds == sorted(kinds)
         and not any(rule.relay for rule in grant.rules)
         and all(
@@ -1222,7 +1222,7 @@ def _has_denials_first(grant: Grant) -> bool:
     )
 
 
-def _are_plain_domains(domains: DomainSet) -> bool:
+def _have_both_ends(domains: DomainSet) -> bool:
     ends = ((part.first, part.last) for part in domains.ranges)
     return all(first is not None and last is not None and first <= last for first, last in ends)
 

@@ -392,7 +392,7 @@ def _shortest_use_as_witness(uses: Mapping[str, Sequence[Use]]) -> Witness | Non
 
 
 def _witness_against_must(requirement: Must, world: World, limit: SearchLimit) -> Witness | None:
-    """Return a witness with the shortest name for which an enclave lacks a part of its right.
+    """Return a witness with the shortest name for which a required right is not complete.
 
     The result is None if the requirement holds.
     """

@@ -327,13 +327,13 @@ def _with_placeholder(name: str, robot: Robot, placeholder: Placeholder) -> str:
     return begin + "/".join(word if part == robot.name else part for part in rest.split("/"))
 
 
-def _joined_names(names: Names, value: str, fleet: Fleet) -> Names:
+def _joined_names(names: Names, placeholder_value: str, fleet: Fleet) -> Names:
     """Return the names, with one placeholder for names that exist for each robot of a group."""
     names_by_pattern: dict[str, dict[str, str]] = {}
     for name in names:
         robots = _robots_in(name, fleet)
         robot = fleet.robots[robots.pop()] if len(robots) == 1 else None
-        placeholder = Placeholder(value, plural=True)
+        placeholder = Placeholder(placeholder_value, plural=True)
         kind = _with_placeholder(name, robot, placeholder) if robot else name
         names_by_pattern.setdefault(kind, {})[robot.name if robot else ""] = name
     joined: list[str] = []
@@ -343,7 +343,7 @@ def _joined_names(names: Names, value: str, fleet: Fleet) -> Names:
             joined += of_robots.values()
         else:
             first = next(iter(of_robots))
-            placeholder = Placeholder(value, plural=True, group=group)
+            placeholder = Placeholder(placeholder_value, plural=True, group=group)
             joined.append(_with_placeholder(of_robots[first], fleet.robots[first], placeholder))
     return tuple(joined)
 

@@ -544,7 +544,7 @@ _Combination = tuple[str | None, ...]
 
 @dataclass(frozen=True)
 class Enforcement:
-    """The access control of a process, in the form that any configuration can have."""
+    """The access control of a process by any Zenoh configuration, also one not written by sros."""
 
     enabled: bool = False
     allows_by_default: bool = False

@@ -566,7 +566,7 @@ def test_a_rotation_goes_on_without_robots_if_that_is_chosen(field: Field) -> No
     (field.root / "fleet.toml").write_text("[robots.r1]\n")
     assert "is not the file that sros wrote" in field.run("rotate_ca", "ks", "--next", status=2).err
     told = field.run("rotate_ca", "ks", "--status").out
-    assert "which robots confirmed this stage is unknown: " in told
+    assert "it is not known which robots confirmed this stage: " in told
     told = field.run("rotate_ca", "ks", "--status", "--json").out
     assert json.loads(told)["unconfirmed"] is None
 

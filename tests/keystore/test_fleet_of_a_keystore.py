@@ -130,7 +130,7 @@ def test_enclaves_that_are_left_are_found_in_one_pass(
     assert lost_enclaves(OpenedKeystore(made / "ks"), before, before, now()) == ([], [])
     after = Fleet.of([Robot("b", "/b")], enclaves=paths)
     (note,), (entry,) = lost_enclaves(OpenedKeystore(made / "ks"), before, after, now())
-    assert "the robot a is no longer in the fleet: /a stay" in note.text
+    assert "the robot a is no longer in the fleet, but its earlier enclave /a stay" in note.text
     assert (entry.what, entry.enclave, entry.reason) == ("left", "/a", "a")
     assert looked <= 2 * len(before.enclaves)
     before = Fleet.of([Robot("old", "/a")], enclaves=["{namespace}"])
@@ -161,7 +161,7 @@ def test_what_an_earlier_change_left_is_named_when_a_robot_leaves(unknown: Path)
     before = recorded_fleet(OpenedKeystore(unknown / "ks"))
     after = Fleet.of([Robot("r30", "/r30")], enclaves=before.enclaves)
     (note,), _ = lost_enclaves(OpenedKeystore(unknown / "ks"), before, after, now())
-    assert "is no longer in the fleet: /r3, /r3/a, /r3/deep/er stay valid" in note.text
+    assert "but its earlier enclaves /r3, /r3/a, /r3/deep/er stay valid" in note.text
 
 
 def test_what_lies_below_a_robot_is_revoked_with_it(unknown: Path, tmp_path: Path) -> None:

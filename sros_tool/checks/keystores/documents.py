@@ -687,8 +687,8 @@ class _ChosenByTemplate:
 def _rule_findings(
     rule: DomainRule, vendors: Sequence[Vendor]
 ) -> Iterator[tuple[FindingKind, str]]:
-    yield from _domain_rule(rule, vendors)
-    yield from _topic_rules(rule)
+    yield from _findings_of_domain_rule(rule, vendors)
+    yield from _findings_of_topic_rules(rule)
 
 
 def governance_findings(
@@ -754,7 +754,9 @@ def _clause_on_topics_of_unauthenticated(rule: DomainRule, vendor: Vendor) -> st
     return f"anybody can read and write {names_text(opened)}"
 
 
-def _domain_rule(rule: DomainRule, vendors: Sequence[Vendor]) -> Iterator[tuple[FindingKind, str]]:
+def _findings_of_domain_rule(
+    rule: DomainRule, vendors: Sequence[Vendor]
+) -> Iterator[tuple[FindingKind, str]]:
     for attribute, text in _open_attributes(rule):
         kind = _OPEN_KINDS[attribute]
         if kind is UNAUTHENTICATED:
@@ -771,7 +773,7 @@ def _open_attributes(rule: DomainRule | TopicRule) -> Iterator[tuple[str, str]]:
             yield attribute.name, f"{attribute.name} is {value}"
 
 
-def _topic_rules(rule: DomainRule) -> Iterator[tuple[FindingKind, str]]:
+def _findings_of_topic_rules(rule: DomainRule) -> Iterator[tuple[FindingKind, str]]:
     expressions = [topic_rule.topic_expression for topic_rule in rule.topic_access_rules]
     if not any(covers(expression, ROS_DISCOVERY_TOPIC) for expression in expressions):
         yield NO_TOPIC_RULE, f"no topic rule matches {ROS_DISCOVERY_TOPIC}"
@@ -781,7 +783,7 @@ def _topic_rules(rule: DomainRule) -> Iterator[tuple[FindingKind, str]]:
     names = Names(expressions)
     first = {expression: index for index, expression in reversed([*enumerate(expressions)])}
     for index, topic in enumerate(rule.topic_access_rules):
-        yield from _topic_rule(rule, topic)
+        yield from _findings_of_topic_rule(rule, topic)
         same = topic.topic_expression
         covering = chain([same], islice(names.covering(same), 1))
         hiding = min((e for e in covering if first[e] < index), key=first.__getitem__, default=None)
@@ -792,7 +794,9 @@ def _topic_rules(rule: DomainRule) -> Iterator[tuple[FindingKind, str]]:
             )
 
 
-def _topic_rule(rule: DomainRule, topic: TopicRule) -> Iterator[tuple[FindingKind, str]]:
+def _findings_of_topic_rule(
+    rule: DomainRule, topic: TopicRule
+) -> Iterator[tuple[FindingKind, str]]:
     name = topic.topic_expression
     open_for = [
         word

@@ -289,7 +289,8 @@ def _shut_out_error(
     name = subject_text(old.subject)
     options = " ".join(f"--allow-refusal {word}" for word in words_of(vendors))
     return KeystoreError(
-        f"processes that still have certificates of the CA {name} would be refused in '{root}'",
+        f"after this change of '{root}', {enumerated(titles)} would refuse processes that still "
+        f"have certificates of the CA {name}",
         f"Once there is a revocation list, {demand} one from each CA, but the keyUsage of {name} "
         "lacks cRLSign. Nothing was changed.",
         f"{remedy} If no process runs with such a certificate, add {options}.",

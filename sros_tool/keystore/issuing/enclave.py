@@ -434,7 +434,8 @@ class EnclaveWriter:
     ) -> dict[str, Result]:
         """Run ``work`` for all enclaves on all cores, and map each enclave to its result.
 
-        This process calls ``progress`` with each enclave for which its own work is done.
+        Only this process calls ``progress``: with each enclave of its own slice as soon as it is
+        done, and with the other enclaves when all workers have ended.
 
         Everything that forked workers issue and stage is added to this writer and its transaction.
         If a CA key is on a token, no workers are forked, because the session of a token does not
