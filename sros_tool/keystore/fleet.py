@@ -510,9 +510,13 @@ def left_enclaves(
 
 
 def left_enclaves_notes(
-    keystore: OpenedKeystore, fleet: Fleet, left: Mapping[str, str]
+    keystore: OpenedKeystore, fleet: Fleet, left: Mapping[str, str], *, recorded: bool = True
 ) -> Iterator[Note]:
-    """Yield a note for each robot that ``left`` (as of `left_enclaves`) names."""
+    """Yield a note for each robot that ``left`` (as of `left_enclaves`) names.
+
+    ``recorded`` says whether the ledger records that the robots left; otherwise, only the paths of
+    the enclaves show it.
+    """
     enclaves: dict[str, list[str]] = {}
     for name, robot in sorted(left.items()):
         enclaves.setdefault(robot, []).append(name)
@@ -520,13 +524,21 @@ def left_enclaves_notes(
         why = (
             "has other enclave paths now" if robot in fleet.robots else "is no longer in the fleet"
         )
-        s, stay, them = ("", "stays", "it") if len(names) == 1 else ("s", "stay", "them")
-        yield Note(
-            "fleet.left-enclaves",
-            f"the robot {robot} {why}, but its earlier enclave{s} "
-            f"{first_few(names, _MOST_SHOWN)} {stay} valid. To revoke {them}, run "
-            f"{revoke_command(keystore, names)}.",
+        s, stay, them, belong = (
+            ("", "stays", "it", "belongs") if len(names) == 1 else ("s", "stay", "them", "belong")
         )
+        shown, revoke = first_few(names, _MOST_SHOWN), revoke_command(keystore, names)
+        text = (
+            f"the robot {robot} {why}, but its earlier enclave{s} {shown} {stay} valid. To revoke "
+            f"{them}, run {revoke}."
+        )
+        if not recorded:
+            text = (
+                f"{shown} {belong} to no robot of the fleet, but to a robot {robot} by the path. "
+                f"If there was such a robot, revoke {them} with {revoke}. Until then, `sros renew "
+                f"--all-expiring` renews {them}."
+            )
+        yield Note("fleet.left-enclaves", text)
 
 
 def former_robots_notes(
@@ -534,13 +546,13 @@ def former_robots_notes(
 ) -> Iterator[Note]:
     """Yield notes, as `left_enclaves_notes`, on robots that only the paths of enclaves show.
 
-    If the fleet file was edited, nothing else shows that such a robot left.  Enclaves in ``noted``
-    are left out.
+    If the fleet file was edited, nothing else shows that such a robot left.  This is no proof: the
+    path ``/{robot}`` also fits ``/dispatcher``, so a timer has to go on renewing these enclaves.
+    Enclaves in ``noted`` are left out.
     """
     former = {name: former_robot_of(fleet, name) for name in keystore.names if name not in noted}
-    yield from left_enclaves_notes(
-        keystore, fleet, {name: robot for name, robot in former.items() if robot}
-    )
+    robots = {name: robot for name, robot in former.items() if robot}
+    yield from left_enclaves_notes(keystore, fleet, robots, recorded=False)
 
 
 def revoke_command(keystore: OpenedKeystore, names: Sequence[str]) -> str:

@@ -434,13 +434,15 @@ def test_what_happens_to_a_fleet(made: Path, tmp_path: Path) -> None:
     revoked = ("/r7/base", "/r7/lift", "/r9/base", "/r9/lift")
     create_again = ("generate_artifacts", "-k", "ks", "-p", "robot.xml", *FLEET, "-e", *revoked)
     (folder / "ks/fleet.toml").write_text("no fleet")
-    assert "is no longer in the fleet" not in sros(*create_again, "--dry-run", cwd=folder).ok().err
+    assert "no robot of the fleet" not in sros(*create_again, "--dry-run", cwd=folder).ok().err
     kept_robots = [robot for robot in ROBOTS if robot not in ("r1", "r7", "r9")]
     (folder / "fleet.toml").write_text(fleet_file(kept_robots))
     for edited in ("no fleet", fleet_file(kept_robots)):
         (folder / "ks/fleet.toml").write_text(edited)
         left = sros(*create_again[:-5], "--dry-run", cwd=folder).ok().err
-        assert left.count("fleet, but its earlier enclaves /r1/base, /r1/lift stay") == 1
+        assert left.count("/r1/base, /r1/lift belong to no robot of the fleet, but to a robot") == 1
+        assert left.count("Until then, `sros renew --all-expiring` renews them.") == 1
+    assert "ks/enclaves/r1/base/cert.pem" in sros(*timer, "--dry-run", cwd=folder).ok().out
     (folder / "fleet.toml").write_text(fleet_file())
     (folder / "ks/fleet.toml").write_text(other_paths)
     sros(*create_again, cwd=folder).ok()

@@ -275,8 +275,9 @@ LEFT_ENCLAVES = FindingKind(
     "keystore.left-enclaves",
     NOTE,
     "enclaves that may be of robots that left the fleet, or left the group of these enclaves",
-    "Anyone who has the files of such an enclave has its rights until the files expire, and "
-    "`--robot` no longer chooses the enclave.",
+    "Anyone who has the files of such an enclave has its rights, and `--robot` no longer chooses "
+    "the enclave. `sros renew --all-expiring` renews it, because its path is no proof that it "
+    "belonged to a robot.",
     "sros: the paths have the form of a robot's enclaves, and no robot has these enclaves.",
     "Revoke the enclaves with `sros revoke KEYSTORE ENCLAVE...` if the robots are gone. Keep an "
     "enclave that never belonged to a robot.",
