@@ -70,7 +70,8 @@ _THREE_NUMBERS = re.compile(r"\.so\.(\d+\.\d+\.\d+)(?:\.\d+)?\Z", re.ASCII)
 _MOST_ENTRIES = 10_000
 _MOST_COPIES_SOUGHT = 20
 """Maximum number of libraries of a process for which copies are searched to find the version."""
-_DAEMON = ("_ros2_daemon", "ros2cli.daemon", "ros2-daemon")
+_DAEMON, _DAEMON_MODULE = "_ros2_daemon", "ros2cli.daemon"
+"""The script of the ros2 daemon in ROS 2 Foxy, and the module that later releases run."""
 _ZENOHD = "zenohd"
 """The Zenoh router without rmw_zenoh, which does not read the variables of rmw_zenoh."""
 _ROUTERS = ("rmw_zenohd", _ZENOHD)
@@ -257,7 +258,7 @@ class Process:
     @property
     def is_daemon(self) -> bool:
         """Whether the process is the ros2 daemon."""
-        return any(mark in word for word in self.command for mark in _DAEMON)
+        return _is_daemon(self.command)
 
 
 def domain_text(variable: str) -> str:
@@ -828,11 +829,16 @@ def _programs_in(command: tuple[str, ...]) -> set[str]:
     return {Path(word).name for word in command[:3]}
 
 
+def _is_daemon(command: tuple[str, ...]) -> bool:
+    """Return whether a command is one with which ros2cli starts its daemon."""
+    runs_module = command[1:2] == ("-c",) and any(_DAEMON_MODULE in code for code in command[2:3])
+    return runs_module or any(Path(word).name == _DAEMON for word in command[:2])
+
+
 def _uses_ros_or_zenoh(command: tuple[str, ...]) -> bool:
     """Return whether a command shows that the process uses ROS 2 or Zenoh."""
     is_of_zenoh = not _programs_in(command).isdisjoint((*_ROUTERS, *_BRIDGES))
-    is_daemon = any(mark in word for word in command[:3] for mark in _DAEMON)
-    return ROS_ARGS in command or is_of_zenoh or is_daemon
+    return ROS_ARGS in command or is_of_zenoh or _is_daemon(command)
 
 
 def _is_sros_run(command: tuple[str, ...]) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import struct
 import time
 from collections.abc import Iterator
@@ -90,6 +91,7 @@ def proc(tmp_path: Path) -> Proc:
         (("/usr/bin/zenohd",), "", True),
         (("python3", "-c", "from ros2cli.daemon import main"), "", True),
         (("python3", "/opt/_ros2_daemon"), "", True),
+        (("/opt/ros2-daemon/editor",), "", False),
     ],
 )
 def test_who_speaks(command: tuple[str, ...], maps: str, found: bool, proc: Proc) -> None:
@@ -253,6 +255,22 @@ def test_only_the_nodes_of_the_demo_secure_themselves_without_rcl(
     process = Process(7, tuple(command.split()), {}, NOW, frozenset({"libddsc"}))
     assert process.is_without_rcl is without
     assert not replace(process, libraries=process.libraries | {"librcl"}).is_without_rcl
+
+
+@pytest.mark.parametrize(
+    ("command", "is_daemon"),
+    [
+        ("python3 -c 'from ros2cli.daemon.daemonize import main' --name ros2-daemon", True),
+        ("/usr/bin/python3 /opt/ros/foxy/bin/_ros2_daemon --ros-domain-id 0", True),
+        ("/opt/ros/foxy/bin/_ros2_daemon", True),
+        ("python3 /srv/ros2-daemon/drive.py", False),
+        ("/opt/drive --ros-args -r __node:=_ros2_daemon", False),
+        ("python3 drive.py ros2cli.daemon", False),
+    ],
+)
+def test_only_what_ros2_starts_is_its_daemon(command: str, is_daemon: bool) -> None:
+    """No finding says that the daemon runs open."""
+    assert Process(7, tuple(shlex.split(command)), {}, NOW).is_daemon is is_daemon
 
 
 def test_endless_texts_are_not_looked_at_and_named(proc: Proc) -> None:
