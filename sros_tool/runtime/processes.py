@@ -23,7 +23,7 @@ import re
 import stat
 import struct
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
@@ -1020,7 +1020,8 @@ class ProcessEnclave:
     ``keystore`` is the path that the process names, and ``local_keystore`` the path by which sros
     reaches this keystore; None if sros sees another folder, or none, at ``keystore``.  ``is_there``
     says that the enclave's folder exists.  ``moved`` maps folders of the keystore whose last change
-    was a move or a new mode, without added or removed files, to the time of that change.
+    was a move or a new mode, without added or removed files, to the time of that change; also
+    folders above the keystore that were moved.
     ``writable`` is a clause on a folder that users other than the keystore's owner can change.
     ``folders`` are the device and inode of the keystore and of the enclave, as far as these exist.
     ``problem`` is a clause on why the enclave could not be examined.
@@ -1265,15 +1266,33 @@ def _loaded_enclave(
             for file in (*ENCLAVE_FILES, _KEY_ON_TOKEN, _CRL)
         ),
         is_there=True,
-        moved={
-            path: _moment(state.st_ctime_ns)
-            for path, state in own_folders
-            if state.st_mtime_ns < state.st_ctime_ns
-        },
+        moved=_moved_folders(folders, {path for path, _ in own_folders}),
         writable=_writable_folder_clause(own_folders, user),
         local_keystore=here,
         folders=(folder_of_keystore, _identity(folders)),
     )
+
+
+def _moved_folders(
+    folders: Sequence[tuple[str, os.stat_result]], own: Set[str]
+) -> Mapping[str, datetime]:
+    """Return the folders whose last change was a move, with its time.
+
+    For the folders ``own``, a new mode counts as a move. Folders above them often get new modes or
+    times, but a move also changes the parent folder: a folder that changed after its parent folder
+    was not moved.
+    """
+    latest = {path: state.st_ctime_ns + _LONGEST_MOVE_NS for path, state in folders}
+    return {
+        path: _moment(state.st_ctime_ns)
+        for path, state in folders
+        if state.st_mtime_ns < state.st_ctime_ns
+        and (path in own or state.st_ctime_ns <= latest[path.rpartition("/")[0] or "/"])
+    }
+
+
+_LONGEST_MOVE_NS = 1_000_000_000
+"""Maximum time by which a moved folder can seem younger than its parent folder."""
 
 
 def _reason(error: OSError) -> str:

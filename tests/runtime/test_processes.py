@@ -457,8 +457,43 @@ def test_a_replaced_link_is_a_change(root: ProcessRoot, tmp_path: Path) -> None:
     (tmp_path / "root/old/f").write_text("1")
     before = root.load("x", "/old/f").changed
     assert before is not None
-    while datetime.now(UTC) - before < timedelta(milliseconds=20):  # the clock of the kernel ticks
-        (tmp_path / "tick").touch()
+    wait_for_tick(before, tmp_path)
     (tmp_path / "root/live").symlink_to("old")
     after = root.load("x", "/live/f").changed
     assert after is not None and after > before
+
+
+def wait_for_tick(since: datetime, folder: Path) -> None:
+    """Wait until the kernel gives files another time than ``since``."""
+    while datetime.now(UTC) - since < timedelta(milliseconds=20):
+        (folder / "tick").touch()
+
+
+def test_a_folder_above_the_keystore_that_was_moved_is_a_change(
+    root: ProcessRoot, tmp_path: Path
+) -> None:
+    (tmp_path / "root/new/ks/enclaves/a").mkdir(parents=True)
+    environment = {ENABLE: "true", KEYSTORE: "/robot/ks", ENCLAVE: "/a"}
+    process = Process(1, (), environment, datetime.now(UTC))
+    wait_for_tick(process.started, tmp_path)
+    (tmp_path / "root/new").rename(tmp_path / "root/robot")
+    enclave = with_files(process, root, "/").enclave
+    assert enclave and [*enclave.moved] == ["/robot"] and enclave.moved["/robot"] > process.started
+
+
+@pytest.mark.parametrize(
+    ("path", "parent_changed", "own", "moved"),
+    [
+        ("/robot", 8, "", True),
+        ("/robot", 7, "", True),  # the kernel changes the folder and its parent one after the other
+        ("/robot", 5, "", False),  # only its mode or its times changed
+        ("/robot", 5, "/robot", True),
+    ],
+)
+def test_a_folder_that_changed_after_its_parent_was_not_moved(
+    path: str, parent_changed: int, own: str, moved: bool
+) -> None:
+    second = 10**9
+    top = Mock(st_mtime_ns=parent_changed * second, st_ctime_ns=parent_changed * second)
+    folder = Mock(st_mtime_ns=second, st_ctime_ns=8 * second)
+    assert [*processes._moved_folders([("/", top), (path, folder)], {own})] == [path] * moved
