@@ -1000,6 +1000,8 @@ def _parse_line(line: bytes) -> Entry | None:
     (time, kind, enclave, subject, serial, sha256, begin, end, policy, reason, key) = match.groups(
         ""
     )[:11]
+    if kind == "revocation" and not serial:
+        return None  # it does not say which certificate it revokes
     number, settings, nodes, previous = match.groups("")[11:]
     # Texts that many lines have in common are kept in memory once.
     return Entry(
@@ -1037,6 +1039,8 @@ def _parse_any_line(line: bytes) -> Entry | None:
         valid = _SERIAL.fullmatch(entry.serial)
         if not valid or not 0 < int(entry.serial, 16).bit_length() <= _MOST_SERIAL_BITS:
             return None
+    elif entry.what == "revocation":
+        return None
     return entry
 
 

@@ -125,7 +125,14 @@ def test_the_history_names_what_was_signed_from_a_policy(keystore: Path, tmp_pat
     assert sros("inspect", keystore, "--policy", policy).status == 2
 
 
-@pytest.mark.parametrize("line", ["{", "[]", "3", '{"unknown": 1}', '{"time": "x"}', "\xff"])
+REVOCATION = '{"time":"x","what":"revocation"}'
+"""A line that names no certificate."""
+
+
+@pytest.mark.parametrize(
+    "line",
+    ["{", "[]", "3", '{"unknown": 1}', '{"time": "x"}', "\xff", REVOCATION, f"{REVOCATION} "],
+)
 def test_a_damaged_ledger_is_reported_and_kept(line: str, tmp_path: Path) -> None:
     root = made(tmp_path / "ks", "/a")
     with (root / LEDGER).open("a", encoding="latin-1") as file:
