@@ -486,19 +486,26 @@ def left_enclaves(
 ) -> dict[str, str]:
     """Map the enclaves of robots that left the fleet or their group to these robots.
 
-    Only enclaves that the ledger records as left are known.  With ``now``, enclaves whose
-    certificates have expired are left out.
+    Only enclaves that the ledger records as left are known.  A line that is not certain counts
+    until the rights of the enclave are stated again: robots may have left before a gap.  With
+    ``now``, enclaves whose certificates have expired are left out.
     """
     names = {
         entry.enclave
         for entry in keystore.ledger_file.with_values("what", (LEFT,)).entries
         if entry.what == LEFT and keystore.has_enclave(entry.enclave)
     }
-    robots: dict[str, str] = {}
-    for entry in keystore.ledger_file.with_values("enclave", names).entries if names else ():
+    ledger = keystore.ledger_file.with_values("enclave", names) if names else Ledger()
+    uncertain = ledger.entries[: len(ledger.entries) - len(ledger.certain)]
+    robots = {entry.enclave: entry.reason for entry in uncertain if entry.what == LEFT}
+    unproven = {*robots}
+    for entry in ledger.certain:
         if entry.what == LEFT:
             robots[entry.enclave] = entry.reason
-        elif entry.what == "revocation" and entry.reason != SUPERSEDED:
+            unproven.discard(entry.enclave)
+        elif (entry.what == "revocation" and entry.reason != SUPERSEDED) or (
+            entry.what == "permissions" and entry.enclave in unproven
+        ):
             robots.pop(entry.enclave, None)  # it was made again, not for the robot
     left: dict[str, str] = {}
     for name, robot in sorted(robots.items()):

@@ -16,9 +16,10 @@ import pytest
 from sros_tool.cli.common import now
 from sros_tool.fleet import robots
 from sros_tool.fleet.robots import Fleet, Robot
-from sros_tool.keystore.fleet import lost_enclaves, recorded_fleet
+from sros_tool.keystore.fleet import left_enclaves, lost_enclaves, recorded_fleet
 from sros_tool.keystore.layout import list_enclaves
 from sros_tool.keystore.reader import OpenedKeystore
+from sros_tool.validity import iso
 from tests.support.harness import Ended, copy_of, policy_text, publish, snapshot, sros
 
 FLEET = "[robots]\na = {}\na_arm = {}\n"
@@ -39,19 +40,23 @@ def generate(folder: Path, path: str) -> Ended:
     return sros("generate_artifacts", "-k", folder / "ks", *words)
 
 
+def forge_line(root: Path, **values: str) -> None:
+    """Add a line to the ledger that fits into the chain, but that no head signs."""
+    ledger = root / "ledger.jsonl"
+    lines = ledger.read_bytes().splitlines()
+    values = {"time": iso(now()), **values, "previous": sha256(lines[-1]).hexdigest()}
+    line = json.dumps(values, separators=(",", ":")).encode()
+    ledger.write_bytes(b"\n".join([*lines, line]) + b"\n")
+
+
 def test_a_forged_record_does_not_hide_an_edit(made: Path, tmp_path: Path) -> None:
     """A line that fits into the chain, but that no head signs, says nothing of the fleet."""
     root = tmp_path / "ks"
     copy_of(made / "ks", root)
     sros("distribute_key", root, "--robot", "a", tmp_path / "before").ok()
-    file, ledger = root / "fleet.toml", root / "ledger.jsonl"
+    file = root / "fleet.toml"
     file.write_text(file.read_text().replace('"/{robot}"', '"/{robot}", "/{robot}_arm"'))
-    lines = ledger.read_bytes().splitlines()
-    forged = json.loads(next(each for each in lines if b'"what":"fleet"' in each))
-    forged["sha256"] = sha256(file.read_bytes()).hexdigest()
-    forged["previous"] = sha256(lines[-1]).hexdigest()
-    line = json.dumps(forged, separators=(",", ":")).encode()
-    ledger.write_bytes(b"\n".join([*lines, line]) + b"\n")
+    forge_line(root, what="fleet", sha256=sha256(file.read_bytes()).hexdigest())
     ended = sros("distribute_key", root, "--robot", "a", tmp_path / "out")
     assert (ended.status, "is perhaps not the file that sros wrote" in ended.err) == (2, True), (
         ended
@@ -162,6 +167,25 @@ def test_what_an_earlier_change_left_is_named_when_a_robot_leaves(unknown: Path)
     after = Fleet.of([Robot("r30", "/r30")], enclaves=before.enclaves)
     (note,), _ = lost_enclaves(OpenedKeystore(unknown / "ks"), before, after, now())
     assert "but its earlier enclaves /r3, /r3/a, /r3/deep/er stay valid" in note.text
+
+
+def test_an_uncertain_line_on_a_robot_that_left_counts_until_rights_are_stated(
+    unknown: Path, tmp_path: Path
+) -> None:
+    """What is uncertain leaves nothing to be renewed in silence, and ends with stated rights."""
+    root = copy_of(unknown / "ks", tmp_path / "ks")
+    for what, enclave in (("left", "/desk"), ("left", "/r3_b"), ("revocation", "/r3_b")):
+        forge_line(root, what=what, enclave=enclave, reason="r9", serial="7")
+    fleet = recorded_fleet(OpenedKeystore(root))
+    assert left_enclaves(OpenedKeystore(root), fleet) == {"/desk": "r9", "/r3_b": "r9"}
+    policy = policy_text({"/desk": publish("x"), "/{robot}/a": publish("x")})
+    (tmp_path / "policy.xml").write_text(policy)
+    words = ("-p", tmp_path / "policy.xml", "--fleet", unknown / "fleet.toml")
+    sros("generate_artifacts", "-k", root, *words).ok()
+    assert left_enclaves(OpenedKeystore(root), fleet) == {"/r3_b": "r9"}
+    sros("revoke", root, "/r3_b").ok()
+    sros("create_enclave", root, "/r3_b").ok()
+    assert not left_enclaves(OpenedKeystore(root), fleet)
 
 
 def test_what_lies_below_a_robot_is_revoked_with_it(unknown: Path, tmp_path: Path) -> None:
