@@ -580,7 +580,7 @@ PROCESS_PERMISSIVE = FindingKind(
 PROCESS_WITHOUT_RCL = FindingKind(
     "runtime.process-without-rcl",
     WARNING,
-    "a program that uses DDS without rcl, in the environment of a secured node",
+    "a program that uses a DDS without rcl, in the environment of a secured node",
     "Only rcl reads ROS_SECURITY_ENABLE and the other variables: unless the program itself secures "
     "its participants, everybody on the network hears it and can send to it.",
     "rcl 9 (rcl/src/rcl/security.c); Cyclone DDS 0.10.2, tested.",
@@ -691,6 +691,8 @@ class Security(StrEnum):
 
 def _security_of(process: Process) -> Security:
     """Return the security with which a process runs."""
+    if process.asks_for_security and process.other_dds:
+        return Security.UNKNOWN
     if process.is_zenoh:
         if process.configuration and process.configuration.problem:
             return Security.UNKNOWN
@@ -745,6 +747,9 @@ def process_findings(
             if process.is_without_rcl and not process.is_zenoh:
                 text = f"it runs {_domain_text(process)} with {ENABLE}=true"
                 yield PROCESS_WITHOUT_RCL.found(process.label, text)
+            if others := [f"'{_plain_path(path)}'" for path in process.other_dds]:
+                text = f"it runs {_domain_text(process)}, and also uses "
+                yield PROCESS_WITHOUT_RCL.found(process.label, text + first_few(others, 3))
             if vendor_of(process.rmw) is None and not process.is_zenoh:
                 text = f"it runs {_domain_text(process)} on {plain(process.rmw)}"
                 yield PROCESS_RMW_UNKNOWN.found(process.label, text)

@@ -237,6 +237,18 @@ class Process:
         return bool(self.libraries & _DDS_NAMES) and "librcl" not in self.libraries and not is_demo
 
     @property
+    def other_dds(self) -> Sequence[str]:
+        """The paths of the DDS libraries that a process of rcl has mapped, except that of its RMW.
+
+        The program itself uses these libraries, as SDKs of robots do, and rcl does not secure them.
+        """
+        own = middleware_of(self.rmw)
+        if own is None or "librcl" not in self.libraries:
+            return ()
+        of_rcl = next((library for library in self.dds if library.product == own.name), None)
+        return [library.path for library in self.dds if library is not of_rcl]
+
+    @property
     def demo_command(self) -> tuple[str, ...]:
         """The `sros demo` command that started this node or router; () for other processes.
 

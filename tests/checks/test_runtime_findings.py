@@ -22,11 +22,13 @@ from sros_tool.checks.runtime import RuntimeState
 from sros_tool.keystore.layout import CERTIFICATE_FILE, CRL_FILE
 from sros_tool.runtime.processes import (
     LoadedFile,
+    MappedLibrary,
     Process,
     ProcessEnclave,
     ProcessTable,
     RunningProcesses,
 )
+from sros_tool.runtime.rmw import RMW
 from sros_tool.zenoh.json5 import MOST_BYTES
 from tests.checks import zenoh_cases
 from tests.checks.bench import DAY, SECRET, Bench
@@ -456,6 +458,38 @@ def test_a_node_that_asks_for_security_and_runs_without(
     )
     state = with_processes(sound_one, changed)
     assert ("runtime.process-runs-unsecured" in ids(state)) is unsecured
+
+
+FAST, CYCLONE_DDS, OF_SDK = (
+    MappedLibrary("Fast DDS", "2.14.6", "/opt/ros/jazzy/lib/libfastrtps.so.2.14.6"),
+    MappedLibrary("Cyclone DDS", "0.10.5", "/opt/ros/jazzy/lib/libddsc.so.0.10.5"),
+    MappedLibrary("Cyclone DDS", "", "/opt/sdk/lib/libddsc.so"),
+)
+
+
+@pytest.mark.parametrize(
+    ("rmw", "mapped", "other"),
+    [
+        ("rmw_fastrtps_cpp", (FAST,), None),
+        ("rmw_fastrtps_cpp", (FAST, OF_SDK), OF_SDK),
+        ("rmw_cyclonedds_cpp", (FAST, CYCLONE_DDS), FAST),
+        ("rmw_cyclonedds_cpp", (CYCLONE_DDS, OF_SDK), OF_SDK),
+    ],
+)
+def test_rcl_does_not_secure_the_dds_of_an_sdk(
+    rmw: str,
+    mapped: tuple[MappedLibrary, ...],
+    other: MappedLibrary | None,
+    sound_one: RuntimeState,
+) -> None:
+    node = sound_one.running.processes[0]
+    libraries = frozenset({"librcl", *(Path(each.path).name.split(".")[0] for each in mapped)})
+    environment = {**node.environment, RMW: rmw}
+    node = replace(node, environment=environment, libraries=libraries, dds=mapped)
+    found = runtime_findings(with_processes(sound_one, node))
+    texts = [each.text for each in found if each.id == "runtime.process-without-rcl"]
+    unsecured = f"it runs in domain 0, and also uses '{other and other.path}'"
+    assert texts == ([unsecured] if other else [])
 
 
 @pytest.mark.parametrize(("hours", "unsecured"), [(1, True), (-1, False)])
