@@ -1,4 +1,4 @@
-"""Benchmark of a fleet that fetches: agents against one nginx, set up as docs/fetching.md says.
+"""Benchmark of a fleet that fetches: agents against one nginx, as in docs/howto/fleet_server.md.
 
 Each round runs every agent once, in as many processes as there are cores.  Requests and bytes are
 those that nginx counted.

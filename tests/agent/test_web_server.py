@@ -1,4 +1,4 @@
-"""The recipe for nginx in docs/fetching.md, with a real nginx between robots and home."""
+"""The recipe for nginx in docs/howto/fleet_server.md, with a real nginx between robots and home."""
 
 from __future__ import annotations
 
@@ -178,7 +178,7 @@ def test_a_robot_reads_what_is_published_and_writes_nothing_there(
 
 def test_the_robot_that_a_subject_names() -> None:
     """The map of the page, for subjects as nginx writes them."""
-    page = (PROJECT / "docs/fetching.md").read_text()
+    page = (PROJECT / "docs/howto/fleet_server.md").read_text()
     (written,) = re.findall(r'"~(\^.*CN=.*\$)" \$name;', page)
     expression = re.compile(written.replace("(?<", "(?P<").removesuffix("$") + r"\Z")
     unique = "0123456789abcdef"

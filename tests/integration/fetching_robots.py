@@ -176,7 +176,7 @@ class Robot:
 
 @dataclass
 class Home:
-    """Home: a keystore, what is published, the inbox, and nginx as docs/fetching.md has it."""
+    """Home: a keystore, what is published, the inbox, and nginx of docs/howto/fleet_server.md."""
 
     folder: Path
     robots: dict[str, Robot] = field(default_factory=dict)
@@ -320,7 +320,7 @@ def _connect(home: Namespaces, street: Namespaces) -> None:
 
 
 def _serve(home: Home) -> None:
-    """Start nginx as docs/fetching.md says, with the paths of this folder."""
+    """Start nginx as docs/howto/fleet_server.md says, with the paths of this folder."""
     certify_server(home.folder, home.folder / "keystore", HOME_ADDRESS)
     home.server = nginx_of_page(home.folder, home.folder / "nginx")
     home.nginx()

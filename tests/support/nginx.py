@@ -1,4 +1,4 @@
-"""The web server of docs/fetching.md: a real nginx, with paths and an address of this machine."""
+"""The web server of docs/howto/fleet_server.md: a real nginx, with paths of this machine."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import subprocess
 from pathlib import Path
 
 NGINX = "/usr/sbin/nginx"
-_PAGE = Path(__file__).parents[2] / "docs/fetching.md"
+_PAGE = Path(__file__).parents[2] / "docs/howto/fleet_server.md"
 _AROUND = """
 {main}
 pid {folder}/nginx.pid;
