@@ -412,7 +412,11 @@ def _signature_lines(signature: SignatureFacts) -> Iterator[str]:
     if signer is None:
         yield "not signed"
         return
-    verified = {True: "signature verified", False: "SIGNATURE NOT VERIFIED", None: "not verified"}
+    verified = {
+        True: "signature verified",
+        False: "SIGNATURE DOES NOT VERIFY",
+        None: "not verified",
+    }
     yield (
         f"signed by {_authority_name(signer.signer, signer.signer_sha256)}, {signer.digest}, "
         f"{signer.bytes} bytes: {verified[signature.signature_verified]}"

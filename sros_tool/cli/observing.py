@@ -128,7 +128,7 @@ def observer_environment(
     if not root:
         raise UsageError(
             f"the keystore of --enclave {enclave} is not named",
-            f"Only --keystore names it: {arguments}.",
+            f"No argument names it: {arguments}.",
             f"Add --keystore KEYSTORE, or set {KEYSTORE_VARIABLE}.",
         )
     return enclave_environment(OpenedKeystore(Path(root)), enclave, domain).variables

@@ -101,8 +101,9 @@ def _write_drop_ins(
         process.user for process in observed.processes if not process.container
     ):
         linger = enumerated([f"`loginctl enable-linger {name}`" for name in names])
+        one_of_them = names[0] if len(names) == 1 else f"one of the users {enumerated(names)}"
         robot.shell.say(
-            f"WARNING: when {enumerated(names)} logs in and out again, systemd removes the shared "
+            f"WARNING: when {one_of_them} logs in and out again, systemd removes the shared "
             "memory of this user, and the nodes of this user hear nothing any more (RemoveIPC in "
             f"logind.conf(5)). First run {linger}, or run the nodes as a system user"
         )

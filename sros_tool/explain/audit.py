@@ -203,7 +203,7 @@ def audited_enclaves(
     if rights.kind != "policy":
         raise UsageError(
             f"'{path}' is neither a policy nor a keystore",
-            "A robot has nodes of several enclaves.",
+            "An audit needs the rights of all enclaves of the robot.",
             "Name the policy, or the folder of the keystore.",
         )
     protection = load_template(DEFAULT_TEMPLATE).protection

@@ -575,7 +575,10 @@ def _left_out_notes(grants: Iterable[Grant]) -> Iterator[Note]:
     for grant in grants:
         name = _enclave_of(grant)
         if name in seen:
-            text = f"another grant for {grant.subject} is ignored: DDS reads only the first one."
+            text = (
+                f"this answer ignores another grant for {grant.subject}: a process has only one, "
+                "the first (on Fast DDS, the first that is valid now)."
+            )
             yield Note("rights.later-grant", text)
             continue
         seen.add(name)

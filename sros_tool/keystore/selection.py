@@ -366,7 +366,7 @@ def missing_enclave_error(
     if below := [existing for existing in names if name and existing.startswith(f"{name}/")]:
         return KeystoreError(
             missing,
-            f"It is the namespace of {first_few(below, _MOST_SHOWN)}.",
+            f"There are only enclaves below it: {first_few(below, _MOST_SHOWN)}.",
             f"Name an enclave; verbs that take several enclaves also have --match '{name}/*'.",
         )
     uses = _enclaves_using(keystore, name, names)

@@ -204,9 +204,9 @@ def build_chain(
             else _find_issuer(last, other_certificates, moment, chain)
         )
         if below is None:
-            kind = "self-signed" if complete else "issuer"
+            kind = "self-signed certificate" if complete else "issuer"
             name = subject_text(last.subject if complete else last.issuer)
-            return chain, f"the {kind} {name} is not a trusted certificate"
+            return chain, f"the {kind} {name} is not trusted"
         chain.append(below)
         only_others += 1
     return chain, "the chain is too long"

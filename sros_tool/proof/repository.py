@@ -625,7 +625,7 @@ def _unknown_revision_error(name: str) -> DocumentError:
         f"git finds no revision '{name}'",
         "",
         "`git log --oneline` and `git branch` list revisions. In a shallow clone, as "
-        "in CI, fetch it first.",
+        "in CI, first fetch the revision.",
     )
 
 

@@ -705,7 +705,8 @@ def _group_members(
                 key,
                 f"{placeholder} stands for robots, but no fleet says which",
                 "",
-                "For a policy, name the fleet file with --fleet. A keystore must have a fleet.",
+                "For a policy, name the fleet file with --fleet. Give a keystore a fleet with "
+                "`sros generate_artifacts --fleet`.",
             )
         try:
             robots = fleet.members(placeholder.group)

@@ -519,7 +519,8 @@ def render_container(container: Container, form: str) -> str:
             raise UsageError(
                 f"{value!r} cannot be written in the format {form}",
                 "",
-                "Use a path of letters, digits and /._- only.",
+                "Leave control characters out of paths and names; for Kubernetes, also leave ':' "
+                "out of the path.",
             )
     return yaml_text(_service(container) if form == COMPOSE else _deployment(container))
 

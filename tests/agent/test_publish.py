@@ -1113,7 +1113,7 @@ def test_a_restore_in_which_nothing_shows_what_was_revoked_says_since_when(
     note, of_root = publisher.publish(restored=True, new_folder=True).notes
     assert (note.id, of_root.id) == ("fleet.revocations-not-shown", "fleet.root-not-seen")
     assert (
-        f"which rights were taken away, after {iso(last)}, the last entry of the ledger"
+        f"which rights were taken away, after {iso(last)} (the last entry of the ledger)"
         in note.text
     )
     assert note.text.index("fleet collect ") < note.text.index("`sros revoke ")

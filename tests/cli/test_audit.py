@@ -376,7 +376,7 @@ FAILS = {"fails": "node", "says": "boom"}
         (graph(FINE), ("robot.xml", "--patch", "robot.xml"), "already exists"),
         (graph(FINE), ("robot.xml", "--watch", "1s"), "--watch and --spin-time exclude"),
         (graph(FINE), ("robot.xml", "--keystore", "ks"), "without --enclave"),
-        (graph(FINE), ("ks", "--enclave", "/t"), "Only --keystore names it: 'ks' is compared"),
+        (graph(FINE), ("ks", "--enclave", "/t"), "No argument names it: 'ks' is compared"),
         (graph(FINE), ("robot.xml", "--domain", "999"), "999"),
     ],
 )

@@ -121,7 +121,7 @@ def test_a_configuration_of_another_ca(folder: Path) -> None:
     for file in ("session.json5", "session.p7s"):
         ended = sros("inspect", f"ks/enclaves/a/{file}", "--ca", ca, cwd=folder)
         assert ended.status == 1
-        assert "SIGNATURE NOT VERIFIED" in ended.out
+        assert "SIGNATURE DOES NOT VERIFY" in ended.out
 
 
 def test_a_configuration_that_sros_did_not_write(tmp_path: Path) -> None:

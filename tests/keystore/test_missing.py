@@ -59,8 +59,9 @@ def test_a_namespace_is_not_taken_for_an_enclave_that_is_missing() -> None:
         missing_enclave_error(OpenedKeystore(Path("robot")), "/r1", ["/r1/base", "/r1/arm", "/r10"])
     )
     assert text == (
-        "enclave /r1 does not exist in keystore 'robot'. It is the namespace of /r1/arm, "
-        "/r1/base. Name an enclave; verbs that take several enclaves also have --match '/r1/*'."
+        "enclave /r1 does not exist in keystore 'robot'. There are only enclaves below it: "
+        "/r1/arm, /r1/base. Name an enclave; verbs that take several enclaves also have --match "
+        "'/r1/*'."
     )
 
 

@@ -919,7 +919,7 @@ class _Publication:
         where, since = quote(str(self.keystore.root)), "the backup"
         last = self.keystore.ledger_file.last_time()
         if last and not restores_after_last_release(self.keystore):
-            since = f"{iso(last)}, the last entry of the ledger"
+            since = f"{iso(last)} (the last entry of the ledger)"
         return Note(
             "fleet.revocations-not-shown",
             f"nothing in '{self._folder}' shows what was revoked, or which rights were taken away, "

@@ -213,7 +213,7 @@ def _left_note(
         f"group: {first_few(sorted({*left.values()}), 3)}). "
     )
     if problem:
-        text += f"Whether these robots are back is not known: {problem.what}. {problem.remedy}"
+        text += f"It is not known whether these robots are back: {problem.what}. {problem.remedy}"
     else:
         text += (
             f"Revoke these enclaves, with {revoke_command(keystore, sorted(left))}; if a robot is "

@@ -1027,7 +1027,7 @@ def _make_successor(
     key = new_keys.make(transaction, path_of_key, roles[0], elsewhere, compared=True)
     if same_key(old[0], key):
         raise KeystoreError(
-            f"the key path_of_key '{place}' belongs to the current {roles[0]} CA",
+            f"the key at '{place}' belongs to the current {roles[0]} CA",
             "A new CA needs a new key.",
             f"Name another place with --{roles[0]}-key.",
         )
