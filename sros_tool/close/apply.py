@@ -60,6 +60,8 @@ def apply(robot: LocalRobot, prepared: CloseState, *, dry_run: bool) -> CloseSta
     robot.shell.check_open()
     observed, secured = prepared.observed, prepared.secured
     changes = _write_drop_ins(robot, observed, dry_run=dry_run)
+    if not dry_run:
+        _remember_new_units(robot, observed)
     unsecured = [process for process in observed.processes if not secured.get(process.enclave)]
     open_units = observed._replace(processes=unsecured).units
     idle = {process.unit for process in observed.processes if not (process.pid or process.alike)}
@@ -113,6 +115,17 @@ def _write_drop_ins(
     if not dry_run:
         write_units(_SYSTEMD_FOLDER, files, changes)
     return [FileChange(action, str(_SYSTEMD_FOLDER / path)) for path, action in changes.items()]
+
+
+def _remember_new_units(robot: LocalRobot, observed: ObservedProcesses) -> None:
+    """Write processes of units that started after the watch into the folder.
+
+    Without a drop-in, nothing else shows --undo that such a unit belongs to the robot.
+    """
+    known = {process.enclave for process in robot.processes.processes}
+    if new := [each for each in observed.processes if each.unit and each.enclave not in known]:
+        processes = [*robot.processes.processes, *new]
+        robot.write_processes(robot.processes._replace(processes=processes))
 
 
 def undo(robot: LocalRobot, *, dry_run: bool) -> CloseState:

@@ -756,10 +756,16 @@ def a_unit_that_started_after_the_watch(robot: Robot, late: Process) -> None:
         assert f"  /late: process 7, known {known}: --apply restarts late.service" in ended.out
         assert "next: sros close robot --apply" in ended.err
         assert "ROS_SECURITY_ENCLAVE_OVERRIDE=/late" in drop_in.read_text()
+    processes = robot.folder / "robot/processes.json"
+    before = processes.read_bytes()
+    robot.close("--apply", "--dry-run")
+    assert processes.read_bytes() == before
     robot.close("--apply", status=1)
     robot.more = ()  # it could not start in its enclave
     (robot.folder / "late.service").write_text("failed\n")
-    assert "late.service has failed: start it open" in robot.close("--undo", status=1).out
+    for _ in range(2):
+        assert "late.service has failed: start it open" in robot.close("--undo", status=1).out
+    processes.write_bytes(before)
     named = replace(late, command=(*late.command, "-r", "__node:=other"))
     zenoh = replace(late, libraries=frozenset({"libzenohc"}))
     by_another_user = replace(late, user=os.geteuid() + 1)
