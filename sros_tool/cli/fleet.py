@@ -669,8 +669,8 @@ def _status(
 
     The revocation list is in force on a robot if the robot has the list, and confirms that no
     process has to restart for it. An earlier list that revokes the same certificates counts, too.
-    `sros agent` and `sros fleet report` confirm for each process whether the process lacks the
-    list. In other confirmations, every restart that is due counts as a restart for the list.
+    `sros agent`, `sros fleet report` and the Ansible collection confirm which restarts the list
+    needs. In other confirmations, every restart that is due counts as a restart for the list.
 
     Example:
       $ sros fleet status keystore

@@ -297,8 +297,8 @@ class RobotStatus:
     False if this is not known, or if the keystore was restored from a backup and lacks what its
     robots have; null if the keystore has no list, or the robot has no enclave. A restart that is
     due only for new permissions, a new governance or a new certificate of the process itself does
-    not count if ``sros agent`` or a play reported it; on other robots, any restart that is due
-    counts.
+    not count if the confirmation says which restarts the list needs, as those of ``sros agent``,
+    ``sros fleet report`` and the Ansible collection do; otherwise, any restart that is due counts.
     """
     expiry: Mapping[Annotated[str, Words(_EXPIRING_KINDS)], datetime]
     """By kind of file, the first expiry of the files that the robot confirmed, in UTC, according
