@@ -464,13 +464,13 @@ def _proof_of_processes(running: RunningRobot, number: int) -> Proof:
         done = "" if wrong else f"true for {counted(number, 'enclave')}; "
         text = f"{done}{first_few(texts, MOST_NAMES, '; ')}"
     else:
-        text += "".join(f"; {guest}" for guest in _unexpected_processes(running))
+        text += "".join(f"; {guest}" for guest in _open_elsewhere(running))
     return Proof(STARTED, False if wrong else None if findings else True, text)
 
 
 def _proof_of_observed_processes(running: RunningRobot) -> Iterator[Proof]:
     """Yield an undecided proof if enclaves have processes that sros did not see when it watched."""
-    if more := running.not_observed():
+    if more := [*running.not_observed(), *running.with_other_files()]:
         yield Proof(
             KNOWN,
             None,
@@ -497,14 +497,9 @@ def _process_findings(running: RunningRobot) -> list[Finding]:
     ]
 
 
-def _unexpected_processes(running: RunningRobot) -> Iterator[str]:
-    """Yield texts on processes in enclaves of other folders, and open ones in other domains."""
-    known_pids = {process.pid for process, _ in running.secured}
+def _open_elsewhere(running: RunningRobot) -> Iterator[str]:
+    """Yield texts on the open processes in other domains."""
     in_domain = running.in_domain
-    for process in in_domain:
-        if process.enclave and process.pid not in known_pids and not process.is_daemon:
-            files = keystore_text(process.enclave)
-            yield f"{process.label} runs in {process.enclave.name} with the files of '{files}'"
     for process in running.processes.processes:
         is_open = not (process.enclave or process.network or process.is_daemon)
         if is_open and process not in in_domain:

@@ -237,6 +237,18 @@ class RunningRobot:
             for process, enclave in further
         ]
 
+    def with_other_files(self) -> Iterator[str]:
+        """Yield the processes of the domain in enclaves of other folders, as text.
+
+        Programs of `ros2` and sros do not count.
+        """
+        pids = {process.pid for process, _ in self.secured}
+        for process in self.in_domain:
+            enclave = process.enclave
+            if enclave and not (process.pid in pids or process.is_daemon or _is_tool(process)):
+                files = keystore_text(enclave)
+                yield f"{process.label} in {enclave.name} (with the files of '{files}')"
+
     def further_processes(
         self, secured: Sequence[SecuredProcess], observed: ObservedProcesses
     ) -> Iterator[SecuredProcess]:

@@ -1002,6 +1002,12 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     guest = "in domain 0; process 5 (guest) runs open in domain 7\n"
     said = robot.close("--proof", status=1).out
     assert f"{guest}not checked (--accept unobserved accepts this): {more}" in said
+    (copy := robot.folder / "copy/enclaves/office").mkdir(parents=True)
+    environment = secured_environment(copy.parents[1], "/office", 0)
+    robot.more = (robot.with_its_files(replace(talker, pid=9, environment=environment)),)
+    office = f"process 9 (run) in /office (with the files of '{copy.parents[1]}')"
+    assert f"there: sros did not see {office} when" in robot.close("--proof", status=1).out
+    robot.more = others
     robot.more = (*robot.more[:2], *robot.more[4:], replace(seven, environment={}))
     said = robot.close("--proof", status=1).out
     assert "no: not every process was started in its enclave: process 5 (guest)" in said
