@@ -254,8 +254,8 @@ def counterpart_notes(policies: Iterable[Policy], merged: Collection[Right]) -> 
 
 _MARKUP = re.compile(
     r"<!--.*?-->|<\?.*?\?>|<!\[CDATA\[.*?\]\]>"
-    r"|</(?P<close>[^\s>]+)\s*>"
-    r"|<(?P<open>[^\s/>!?]+)(?:[^>\"']|\"[^\"]*\"|'[^']*')*?(?P<empty>/?)>",
+    r"|</(?P<close>[^ \t\r\n>]+)[ \t\r\n]*>"
+    r"|<(?P<open>[^ \t\r\n/>!?]+)(?:[^>\"']|\"[^\"]*\"|'[^']*')*?(?P<empty>/?)>",
     re.DOTALL,
 )
 _COMMENTS_OF_THE_LINE = re.compile(r"(?>[ \t]*<!--.*?-->)++(?=[ \t]*(?:\r?\n|\Z))", re.DOTALL)
@@ -303,23 +303,25 @@ class EditedText:
         except (UnicodeError, LookupError):
             faithful = False
         if not faithful:
-            raise self._unsuitable_file_error(
-                f"Its encoding {self._encoding} cannot be kept exactly."
-            )
+            raise self._unsuitable_encoding_error()
         self.root = self._elements(root)
         self.newline = "\r\n" if "\r\n" in self.text else "\n"
         self.indentation = self._one_indentation()
         self._edits: list[tuple[int, int, str]] = []
 
-    def _unsuitable_file_error(self, why: str) -> PolicyError:
+    def _unsuitable_encoding_error(self) -> PolicyError:
         return PolicyError(
             f"{self._name} cannot be edited in place",
-            why,
+            f"Its encoding {self._encoding} cannot be kept exactly.",
             "Save it as UTF-8.",
         )
 
     def _elements(self, root: etree._Element) -> PlacedElement:
-        """Return the tree of elements with their positions, which lxml does not know."""
+        """Return the tree of elements with their positions, which lxml does not know.
+
+        Raises:
+            PolicyError: lxml reads other elements, because it decodes the document differently.
+        """
         nodes = root.iter()
         top: PlacedElement | None = None
         stack: list[PlacedElement] = []
@@ -330,9 +332,7 @@ class EditedText:
             elif mark["open"]:
                 node = next(nodes, None)
                 if node is None or etree.QName(node).localname != mark["open"].split(":")[-1]:
-                    raise self._unsuitable_file_error(
-                        f"<{mark['open']}> is not at the expected position."
-                    )
+                    raise self._unsuitable_encoding_error()
                 end = mark.end()
                 element = PlacedElement(node, mark.start(), end, end, end)
                 if stack:
@@ -341,7 +341,7 @@ class EditedText:
                 if not mark["empty"]:
                     stack.append(element)
         if top is None or stack or next(nodes, None) is not None:
-            raise self._unsuitable_file_error("Its elements are not at the expected positions.")
+            raise self._unsuitable_encoding_error()
         return top
 
     # ── layout of the text ────────────────────────────────────────────────────────────────
@@ -392,6 +392,8 @@ class EditedText:
 def _encoding(data: bytes, root: etree._Element) -> str:
     """Return an encoding that decodes a document with its byte order mark as a character."""
     declared = root.getroottree().docinfo.encoding or "utf-8"
+    if data.startswith(codecs.BOM_UTF32_LE):  # it begins with the one of UTF-16
+        return declared
     if data.startswith(codecs.BOM_UTF16_LE):
         return "utf-16-le"
     if data.startswith(codecs.BOM_UTF16_BE):

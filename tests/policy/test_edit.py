@@ -191,9 +191,10 @@ FORMS = {
     "latin-1": POLICY.replace("UTF-8", "ISO-8859-1").replace(">me", ">ä").encode("latin-1"),
     "utf-8 letters": POLICY.replace(">me", ">äöü €").encode(),
     "utf-16": POLICY.replace("UTF-8", "UTF-16").encode("utf-16"),
+    "utf-32": POLICY.replace("UTF-8", "UTF-32").encode("utf-32"),
     "no declaration": POLICY.split("\n", 1)[1].encode(),
     "CDATA and tricks": POLICY.replace(
-        "me &amp; you", "<![CDATA[</metadata><topic>]]><a b='>' c=\"/>\"/><!-- </policy> -->"
+        "me &amp; you", "<![CDATA[</metadata><topic>]]><a\u1680 b='>' c=\"/>\"/><!-- </policy> -->"
     ).encode(),
     "groups on one line": re.sub(
         r"(<topics p.*?</topics>)", lambda m: re.sub(r"\n\s*", "", m[0]), POLICY, flags=re.DOTALL
@@ -214,7 +215,7 @@ def test_everything_else_survives(file: Path, form: str, asked: int) -> None:
     file.write_bytes(before)
     merged = merge_into(file, ASKED[asked])
     assert merged.added
-    encoding = {"latin-1": "latin-1", "utf-16": "utf-16"}.get(form, "utf-8")
+    encoding = form if form in ("latin-1", "utf-16", "utf-32") else "utf-8"
     old, new = before.decode(encoding), merged.document.decode(encoding)
     if asked == 1:  # the empty profile is opened
         old = old.replace('node="m"/>', 'node="m"></profile>')
@@ -245,6 +246,13 @@ def test_nothing_to_add_is_the_file_itself(file: Path) -> None:
 
 
 # ── where it cannot be done ────────────────────────────────────────────────────────────────
+
+
+def test_an_encoding_that_cannot_be_kept_is_named(file: Path) -> None:
+    """Without a byte order mark, which Python would add."""
+    file.write_bytes(POLICY.replace("UTF-8", "UTF-16").encode("utf-16-be"))
+    with pytest.raises(PolicyError, match="encoding UTF-16 cannot be kept exactly"):
+        merge_into(file, ASKED[0])
 
 
 def test_an_included_enclave_is_not_added_to(file: Path) -> None:
