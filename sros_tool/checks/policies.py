@@ -986,8 +986,8 @@ ROOT_ENCLAVE = FindingKind(
     "policy.root-enclave",
     WARNING,
     "the enclave '/', with the rights of nodes or of other enclaves",
-    "A process that names no enclave runs in /, and gets all rights of /; if the keystore has no "
-    "enclave /, the process does not start.",
+    "A process that names no enclave runs in /, and gets all rights of /. Without an enclave /, it "
+    "would not start (with ROS_SECURITY_STRATEGY=Enforce).",
     "rcl 9 (rcl/src/rcl/security.c, context.c: the enclave is / by default).",
     "Remove the enclave / from the policy once each process has its own enclave: `sros "
     "generate_policy POLICY --enclave-per-node` writes such a policy.",

@@ -48,8 +48,8 @@ UNNAMED = FindingKind(
     "requirement.unnamed",
     NOTE,
     "a requirement about a name that no right states",
-    "At most a wildcard matches the name. Either the name is misspelled, or it is meant to stay "
-    "unused.",
+    "No right has exactly this name; a wildcard may match it. Either the name is misspelled, or "
+    "it is meant to stay unused.",
     "The requirements file.",
     "Compare the name with the robot's names; ignore this finding if the name is meant to stay "
     "unused.",

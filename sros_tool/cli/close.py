@@ -181,13 +181,14 @@ def close(
     asked |= IN_PROOF if apply else frozenset()
     if useless := [f"--accept {word}" for word in accept if word not in asked]:
         raise UsageError(
-            f"nothing asks for {enumerated(useless)} here",
+            f"{enumerated(useless)} would accept nothing here",
             "",
-            "Leave it out. `nodes` is for preparing a robot and for --apply, `requirements` also "
-            "for --proof, and the other words are for --apply and --proof.",
+            f"Leave {'them' if useless[1:] else 'it'} out. `nodes` is for preparing a robot and "
+            "for --apply, `requirements` also for --proof, and the other words are for --apply and "
+            "--proof.",
         )
     if undo and partial:
-        raise UsageError("nothing asks for --partial with --undo", "", "Leave it out.")
+        raise UsageError("--partial would accept nothing with --undo", "", "Leave it out.")
     machines = (("--elsewhere", elsewhere), ("--here", here), ("--brought", brought))
     for option, enclaves in machines:
         if enclaves and (prove or undo):

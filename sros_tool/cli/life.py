@@ -490,7 +490,8 @@ def rotate_ca(
     longer trust the old CA. Processes load the new files only when they start: after each stage,
     export all enclaves to their robots again, and restart all processes.
 
-    With Fast DDS (2.9.1), all processes can talk to each other at every moment of a rotation.
+    Unless the output says otherwise, all processes on Fast DDS (2.9.1) can talk to each other at
+    every moment of a rotation.
     Cyclone DDS (0.10.2) trusts one CA at a time: after stage 2, restart all its processes
     together. To only extend the validity of the identity CA, use --same-key: it has no stages, and
     you need not restart all processes together.

@@ -335,7 +335,7 @@ class _ObservingCommand(WatchingVerb):
 
 @verb("generate_policy", cls=_ObservingCommand)
 @click.argument("file", type=PATH, required=False)
-@observing_options("Observe in this enclave; with --from-log, the enclave of the node.")
+@observing_options("The enclave of the observer; with --from-log, of the node.")
 @click.option(
     "--enclave-per-node",
     is_flag=True,

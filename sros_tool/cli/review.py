@@ -55,7 +55,7 @@ _TITLES = {
     "requirements-before": "Earlier requirements",
     "files": "Files",
     "keystore": "Keystore",
-    "signed": "Signed for the policies",
+    "signed": "Signed rights",
     "expiry": "Expiry",
     "policy": "Policy",
     "rights": "Rights",

@@ -383,7 +383,7 @@ def _configuration_lines(
                 )
                 yield f"  may {VERBS[right]} {stated.name}{domain}{lacks}"
         yield from _key_lines("may also {} the keys {}", rights.unsaid)
-        yield from _key_lines("may {} the keys {}, but only by a wildcard", rights.denied)
+        yield from _key_lines("may {} the keys {} only by a message with a wildcard", rights.denied)
 
 
 def _key_lines(clause: str, pairs: Sequence[tuple[str, str]]) -> Iterator[str]:

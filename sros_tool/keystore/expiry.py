@@ -29,9 +29,8 @@ from sros_tool.wording import counted, first_few
 
 IF_EXPIRED = "If files that processes loaded have expired, restart all processes together."
 ONE_BY_ONE = (
-    "restart the processes one by one; restarted processes communicate with all other processes, "
-    "as long as "
-    f"the files that these loaded are valid. {IF_EXPIRED}"
+    "restart the processes one by one; restarted processes communicate with all others whose "
+    f"loaded files are still valid. {IF_EXPIRED}"
 )
 """Text on restarting processes one by one, or together if they loaded files that have expired.
 

@@ -1356,8 +1356,8 @@ def _vendors_differ_error(
         )
     return PolicyError(
         f"{difference}, because the order of the rules matters",
-        f"On DDS {next(iter(reasons))}, and rule {denying[0]} comes too late to deny it. On Zenoh, "
-        "as in a policy, a deny rule wins wherever it stands.",
+        f"On DDS, {next(iter(reasons))}, and rule {denying[0]} comes too late to deny it. On "
+        "Zenoh, as in a policy, a deny rule wins wherever it stands.",
         f"In a policy, list the names to {verb}, without that deny rule, and sign the policy with "
         "`sros create_permission`.",
     )

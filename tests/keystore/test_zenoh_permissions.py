@@ -107,7 +107,7 @@ def test_what_every_vendor_decides_is_said(rules: list[Rule], names: list[str]) 
         ),
         (
             [rule("allow", "rt/c/a"), rule("deny", "rt/c/*"), rule("allow", "rt/*")],
-            f"publish rt/c/a cannot be expressed in Zenoh, {ORDER}. On DDS rule 1 allows publish "
+            f"publish rt/c/a cannot be expressed in Zenoh, {ORDER}. On DDS, rule 1 allows publish "
             "rt/c/a by rt/c/a, and rule 2 comes too late to deny it.",
         ),
         ([rule("deny", "*"), rule("allow", "*")], "publish DDS topic * cannot be expressed"),

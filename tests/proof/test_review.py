@@ -1217,7 +1217,7 @@ def test_whether_a_keystore_is_signed_for_the_policies(
     results = json.loads(change.sarif.read_text())["runs"][0]["results"]
     (stale,) = (each for each in results if each["ruleId"] == "enclave.stale-permissions")
     assert stale["level"] == "note" and "seldom has the keys" in str(stale["suppressions"])
-    assert "### Signed for the policies: allowed" in summary.read_text()
+    assert "### Signed rights: allowed" in summary.read_text()
     change.commit({"r1/export/enclaves/a/permissions.p7s": "x", "enclaves/governance.p7s": "x"})
     unnamed = change.review("--policy", "robot.xml", "--new-access", "allow").ok().out
     for path in ("ks", "r1/export", "."):

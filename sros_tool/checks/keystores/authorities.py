@@ -118,7 +118,7 @@ WEAK = FindingKind(
     "a weak key, or a signature with a weak hash",
     "An attacker who computes the key of a CA, or finds another document with the same "
     "signature, can issue any identity or any permissions. An attacker who computes the key of "
-    "an enclave can act as the enclave. DDS accepts weak keys and weak hashes.",
+    "an enclave can act as the enclave. Some vendors accept weak keys and weak hashes.",
     "NIST SP 800-57 part 1, 5.6, and SP 800-131A: RSA under 2048 bits, EC under 256 bits, SHA-1.",
     "Replace a CA with `sros rotate_ca KEYSTORE`; renew an enclave with `sros renew KEYSTORE "
     "ENCLAVE`.",

@@ -194,8 +194,8 @@ ROOT_ENCLAVE = FindingKind(
     "keystore.root-enclave",
     WARNING,
     "an enclave / with all rights of other enclaves",
-    "A process that names no enclave runs in /, and gets all rights of /; if the keystore has no "
-    "enclave /, the process does not start.",
+    "A process that names no enclave runs in /, and gets all rights of /. Without an enclave /, it "
+    "would not start (with ROS_SECURITY_STRATEGY=Enforce).",
     "rcl 9 (rcl/src/rcl/security.c, context.c: the enclave is / by default).",
     "Start each process in its enclave, run `sros revoke KEYSTORE /`, and remove the enclave / "
     "from the policy.",

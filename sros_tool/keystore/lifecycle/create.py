@@ -455,7 +455,8 @@ def _revoked_before_notes(
         raise KeystoreError(
             f"the keystore '{root}' lacks {first_few(unasked, 3)}, which got certificates after "
             "the last backup",
-            "If a robot made its own key for such an enclave, a new key from here would not fit.",
+            "If a robot made its own key for such an enclave, it could not use files for a new key "
+            "from here.",
             "For keys that robots made, sign the requests again, with `sros sign_request "
             f"{quote(str(root))} REQUEST --no-answer -p POLICY_FILE"
             f"{' --fleet FLEET_FILE' if fleet else ''}`. For keys that were made here, name the "
