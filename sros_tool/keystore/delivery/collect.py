@@ -140,7 +140,8 @@ class CollectedMessage(NamedTuple):
     """The requests for renewal in the message."""
     shared_keys: bool
     """Whether two computers seem to have the robot's keys: the message came from an earlier start
-    of the computer than the message before it. The exit status is then 1.
+    of the computer than the message before it. The exit status of this run is then 1;
+    `sros fleet status` exits with 1 for up to a day.
     """
 
 
