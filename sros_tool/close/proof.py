@@ -20,6 +20,7 @@ from sros_tool.checks.connections import (
     connections_between,
     not_connected_text,
 )
+from sros_tool.checks.environment import is_zenoh
 from sros_tool.checks.keystores.issued import STALE
 from sros_tool.checks.kind import NOTE, Finding
 from sros_tool.checks.processes import PROCESS_NOT_SEEN, process_findings
@@ -433,8 +434,27 @@ def _proof_of_silence(robot: LocalRobot, before: Observation, *, hears: bool) ->
     if not hears:
         why = "this proves nothing, because the observer in its enclave does not see the robot now"
         return Proof(SILENCE, None, why)
-    seen = nodes_text(before.nodes)
-    return Proof(SILENCE, True, f"the listener saw {seen} before, and sees none now")
+    reason = f"the listener saw {nodes_text(before.nodes)} before, and sees none now"
+    return Proof(SILENCE, True, reason, details=[*_narrow_discovery(robot.shell.environment)])
+
+
+def _narrow_discovery(environment: Mapping[str, str]) -> Iterator[str]:
+    """Yield a clause on each variable that keeps the listener from seeing other machines.
+
+    rmw_zenoh ignores these variables. Source: rcl/src/rcl/discovery_options.c and localhost.c.
+    """
+    if is_zenoh(environment):
+        return
+    wide_values = {
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": ("", "SUBNET", "SYSTEM_DEFAULT"),
+        "ROS_LOCALHOST_ONLY": ("", "0"),
+    }
+    for name, wide in wide_values.items():
+        if (value := environment.get(name, "")) not in wide:
+            yield (
+                f"with {name}={value} in this shell, the listener sees only this machine: unset "
+                f"{name}, and run the proof again"
+            )
 
 
 def _proof_of_processes(running: RunningRobot, number: int) -> Proof:

@@ -523,7 +523,10 @@ def test_a_robot_is_closed_proved_and_opened_again(
     differs = "differs from the signed permissions of /listener, which the processes use: bring"
     assert f"robot/export; 'robot/policy.xml' {differs} the signed" in proved
     policy.write_text(signed)
-    assert "yes: everything that talked can still talk: 2 nodes" in robot.close("--proof").out
+    proved = robot.close("--proof", ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST").out
+    assert "yes: everything that talked can still talk: 2 nodes" in proved
+    here = "with ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST in this shell, the listener sees only this"
+    assert f" before, and sees none now\n  {here} machine: unset " in proved
     refused = robot.close("--apply", status=2).err
     assert "A new keystore would have other CAs." in refused
     assert (
@@ -532,7 +535,8 @@ def test_a_robot_is_closed_proved_and_opened_again(
     (robot.folder / "home").rename(robot.folder / "robot/keystore")
     more = '<topics publish="ALLOW"><topic>chatter</topic></topics><topics subscribe="ALLOW">'
     policy.write_text(signed.replace('<topics subscribe="ALLOW">', more, 1))
-    proved = robot.close("--proof").out
+    proved = robot.close("--proof", ROS_AUTOMATIC_DISCOVERY_RANGE="SUBNET").out
+    assert "the listener sees only this machine" not in proved
     breaks = "'robot/policy.xml', which is not signed yet, violates at least one requirement"
     assert f"yes: the requirements hold: all of them: robot/requirements.toml; {breaks}\n" in proved
     assert "\n  in the policy, but not signed yet: /listener publish topic /chatter\n" in proved
