@@ -351,7 +351,7 @@ def added_crossing(
         return
     if after is None:
         if new.later is not None and new.zenoh_files:
-            meaning = "what passes between routers is not known"
+            meaning = "it is not known what passes between routers"
             yield _looser_change("Zenoh settings", "limit crossing", "missing", meaning)
         return
     kept = {*before.router_names()} & {*after.router_names()}

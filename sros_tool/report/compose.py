@@ -468,7 +468,10 @@ def _unused_rights(edges: Iterable[Edge]) -> tuple[OverlayDifference, ...]:
     for right, unused in reached.items():
         if any(unused):
             were = "was" if sum(unused) == 1 else "were"
-            note = f"{sum(unused)} of the {len(unused)} names that it matches {were} never observed"
+            which = f"{sum(unused)} of the {len(unused)} names"
+            if len(unused) == 1:
+                which = "the only name"
+            note = f"{which} that it matches {were} never observed"
             differences[OverlaySide.FIRST, right] = (note,)
     return tuple(
         OverlayDifference(mark, str(right), notes)

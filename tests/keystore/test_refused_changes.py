@@ -154,7 +154,7 @@ def test_a_first_list_shuts_out_nobody_who_has_a_certificate_of_the_old_ca(
     sros("rotate_ca", corporate, "--next").ok()
     before = contents(corporate)
     ended = sros("revoke", corporate, "/lost")
-    assert ended.status == 2 and "cRLSign" in ended.err and "would be refused" in ended.err, ended
+    assert ended.status == 2 and "cRLSign" in ended.err and "would refuse" in ended.err, ended
     assert f"sros rotate_ca {corporate} --finish" in ended.err
     assert contents(corporate) == before
     sros("revoke", corporate, "/lost", "--allow-refusal", "all-fastdds").ok()
@@ -312,7 +312,10 @@ def test_a_revoked_enclave_that_is_put_back_keeps_nobody_from_signing_a_list(
         with pytest.raises(KeystoreError, match=r"start in /b, /b/c of"):
             refuse_stopping_nodes(transaction, now())
     ended = sros("crl", root, "--refresh").ok()
-    assert "note [keystore.revoked-put-back]: the folder of /a is in the keystore" in ended.err
+    assert (
+        "note [keystore.revoked-put-back]: revoked certificates of /a are in the keystore"
+        in ended.err
+    )
     assert (enclave_path(root, "/b") / "crl.pem").read_bytes() == (root / CRL).read_bytes()
 
 
@@ -324,7 +327,10 @@ def test_a_list_that_comes_back_from_a_robot_is_signed_again(sound: Path, tmp_pa
     sros("revoke", root, "/a").ok()
     shutil.copy(root / "enclaves/b/crl.pem", backup / CRL)
     ended = sros("crl", backup, "--refresh").ok()
-    assert "note [keystore.revoked-put-back]: the folder of /a is in the keystore" in ended.err
+    assert (
+        "note [keystore.revoked-put-back]: revoked certificates of /a are in the keystore"
+        in ended.err
+    )
     sros("revoke", backup, "/a").ok()
     (revoked,) = json.loads(sros("crl", backup, "--json").ok().out)["revoked"]
     assert revoked["enclave"] == "/a"

@@ -77,7 +77,7 @@ def without_settings(keystore: Path, _: Path) -> None:
             0,
             "- more protection: crossing of router /r1/router",
         ),
-        (without_settings, 1, "Zenoh settings limit crossing -> missing: what passes"),
+        (without_settings, 1, "Zenoh settings limit crossing -> missing: it is not"),
         (rules_of_the_wide_one, 1, "rules of router /router for router /r1/router without -> wi"),
     ],
 )

@@ -92,7 +92,8 @@ def test_over_privilege_stands_out_and_agrees_with_minimize_policy(tmp_path: Pat
 
 def test_what_a_wildcard_reaches_and_nobody_used_is_counted(tmp_path: Path) -> None:
     topics = [f"/t{n}" for n in range(6)]
-    allowed = {"/w": group("topics", "publish", *topics), "/r": group("topics", "subscribe", "/*")}
+    reading = group("topics", "subscribe", "/*") + group("topics", "subscribe", "/t0*")
+    allowed = {"/w": group("topics", "publish", *topics), "/r": reading}
     used = {
         "/w": group("topics", "publish", *topics[1:]),
         "/r": group("topics", "subscribe", "/t1", "/t2"),
@@ -103,6 +104,11 @@ def test_what_a_wildcard_reaches_and_nobody_used_is_counted(tmp_path: Path) -> N
             OverlaySide.FIRST,
             "/r ALLOW subscribe topic /*",
             ("4 of the 6 names that it matches were never observed",),
+        ),
+        (
+            OverlaySide.FIRST,
+            "/r ALLOW subscribe topic /t0*",
+            ("the only name that it matches was never observed",),
         ),
         (OverlaySide.FIRST, "/w ALLOW publish topic /t0", ()),
     ]

@@ -999,7 +999,7 @@ def _revoke_again(
         )
     except SrosError as error:
         if not robots_with_lists:
-            text = f"what messages of robots show cannot be recorded in the ledger: {error.what}"
+            text = f"the ledger cannot record what messages of robots show: {error.what}"
             return "", [*notes, Note("fleet.certificates-restored", text)], []
         why = (
             f"{have} a revocation list that the keystore signed but does not know, and no new list "

@@ -155,8 +155,8 @@ def refuse_stopping_nodes(
     ]
     if revoked:
         text = (
-            f"the folder of {_names_text(revoked)} is in the keystore again with a certificate "
-            "that was revoked: every process with the new revocation list refuses this certificate"
+            f"revoked certificates of {_names_text(revoked)} are in the keystore again: every "
+            "process with the new revocation list refuses them"
         )
         notes.append(Note("keystore.revoked-put-back", text))
     if unseen := transaction.files_not_kept():

@@ -270,7 +270,7 @@ def _scope_notes(policy: Policy, result: MinimizedPolicy, observed: Set[Right]) 
     ]
     if denied:
         text = (
-            "what an observed file allows counts as used, even if the file also denies it: "
+            "rights that an observed file allows count as used, even if the file also denies them: "
             f"{first_few(denied, _MOST_SHOWN)}."
         )
         yield Note("minimize.observed-denial", text)
