@@ -282,11 +282,31 @@ def test_listeners_of_what_nobody_may_send_any_more_are_named(tmp_path: Path) ->
 def test_an_observer_that_did_not_see_everything_proves_no_silence(is_settled: bool) -> None:
     """A stranger that keeps changing the graph hides no open node behind a green proof."""
     value = {"nodes": [], "notes": [], "settled": is_settled}
-    closed = SimpleNamespace(
-        folder=Path("robot"), domain=0, shell=SimpleNamespace(read_json=lambda _: (1, value))
-    )
-    proof = _proof_of_silence(cast("Any", closed), Observation(), hears=True)
+    proof = _proof_of_silence(robot_beside_graph(value), Observation(), hears=True)
     assert proof.holds is (True if is_settled else None)
+
+
+def robot_beside_graph(value: dict[str, Any], **environment: str) -> Any:
+    shell = SimpleNamespace(read_json=lambda _: (1, value), environment=environment)
+    return SimpleNamespace(folder=Path("robot"), domain=0, shell=shell)
+
+
+@pytest.mark.parametrize(
+    ("variables", "narrow"),
+    [
+        ({}, ""),
+        ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "SYSTEM_DEFAULT", "ROS_LOCALHOST_ONLY": "0"}, ""),
+        ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "subnet"}, "ROS_AUTOMATIC_DISCOVERY_RANGE=subnet"),
+        ({"ROS_LOCALHOST_ONLY": "1"}, "ROS_LOCALHOST_ONLY=1"),
+        ({"ROS_LOCALHOST_ONLY": "1", "RMW_IMPLEMENTATION": "rmw_zenoh_cpp"}, ""),
+    ],
+)
+def test_a_listener_that_sees_only_this_machine_is_named(
+    variables: dict[str, str], narrow: str
+) -> None:
+    robot = robot_beside_graph({"nodes": [], "notes": [], "settled": True}, **variables)
+    details = "".join(_proof_of_silence(robot, Observation(), hears=True).details)
+    assert details.partition(" in this shell")[0] == (f"with {narrow}" if narrow else "")
 
 
 @pytest.mark.parametrize(
