@@ -1034,7 +1034,8 @@ class ProcessEnclave:
     says that the enclave's folder exists.  ``moved`` maps folders of the keystore whose last change
     was a move or a new mode, without added or removed files, to the time of that change; also
     folders above the keystore that were moved.
-    ``writable`` is a clause on a folder that users other than the keystore's owner can change.
+    ``writable`` is a clause on a folder, of the keystore or above it, that unexpected users can
+    change.
     ``folders`` are the device and inode of the keystore and of the enclave, as far as these exist.
     ``problem`` is a clause on why the enclave could not be examined.
     """
@@ -1279,7 +1280,7 @@ def _loaded_enclave(
         ),
         is_there=True,
         moved=_moved_folders(folders, {path for path, _ in own_folders}),
-        writable=_writable_folder_clause(own_folders, user),
+        writable=_writable_folder_clause(own_folders, above[:-1], user),
         local_keystore=here,
         folders=(folder_of_keystore, _identity(folders)),
     )
@@ -1314,14 +1315,23 @@ def _reason(error: OSError) -> str:
     return error.strerror or str(error)
 
 
-def _writable_folder_clause(folders: list[tuple[str, os.stat_result]], user: int) -> str:
+def _writable_folder_clause(
+    own: Sequence[tuple[str, os.stat_result]],
+    above: Sequence[tuple[str, os.stat_result]],
+    user: int,
+) -> str:
     """Return a clause on the first folder that unexpected users can change, or "".
 
-    Expected users are root, ``user`` and the owner of the first of ``folders``.
+    Expected users are root, ``user``, the owner of the keystore, which is the first of the folders
+    ``own``, and the owners of the folders ``above`` the keystore.
     """
-    trusted = frozenset({0, user, folders[0][1].st_uid})
-    for path, state in folders:
+    trusted = frozenset({0, user, own[0][1].st_uid})
+    for path, state in own:
         if why := other_writers_clause(state, trusted):
+            return f"'{path}': {why}"
+    for path, state in above:
+        is_sticky = state.st_mode & stat.S_ISVTX  # nobody can rename what others own there
+        if not is_sticky and (why := other_writers_clause(state, trusted | {state.st_uid})):
             return f"'{path}': {why}"
     return ""
 

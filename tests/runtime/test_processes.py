@@ -482,6 +482,25 @@ def test_a_folder_above_the_keystore_that_was_moved_is_a_change(
 
 
 @pytest.mark.parametrize(
+    ("folder", "mode", "clause"),
+    [
+        ("srv", 0o755, ""),
+        ("srv", 0o1777, ""),
+        ("srv", 0o777, "'/srv': its mode is 0777, so everybody can write"),
+        ("srv/ks", 0o1777, "'/srv/ks': its mode is 1777, so everybody can write"),
+    ],
+)
+def test_a_keystore_is_replaceable_in_a_folder_that_others_can_write_to(
+    folder: str, mode: int, clause: str, root: ProcessRoot, tmp_path: Path
+) -> None:
+    (tmp_path / "root/srv/ks/enclaves/a").mkdir(parents=True)
+    (tmp_path / "root" / folder).chmod(mode)
+    environment = {ENABLE: "true", KEYSTORE: "/srv/ks", ENCLAVE: "/a"}
+    enclave = with_files(Process(1, (), environment, NOW), root, "/").enclave
+    assert enclave and enclave.writable == clause
+
+
+@pytest.mark.parametrize(
     ("path", "parent_changed", "own", "moved"),
     [
         ("/robot", 8, "", True),
