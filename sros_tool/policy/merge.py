@@ -23,7 +23,7 @@ from typing import NamedTuple
 from lxml import etree
 
 from sros_tool.errors import DocumentError, Note, PolicyError
-from sros_tool.names import check_namespace, expand
+from sros_tool.names import GLOBAL_TOPICS, check_namespace, expand, only_reads
 from sros_tool.policy.document import instruction_text, read_policy
 from sros_tool.policy.model import (
     ALLOW,
@@ -43,6 +43,7 @@ from sros_tool.policy.rights import (
     Rules,
     compare,
     group_rights,
+    is_of_every_node,
     join_actions,
     lost_counterparts_text,
     order,
@@ -453,13 +454,16 @@ def merge_all(path: Path, policies: Iterable[Policy]) -> Merged:
     first = before = read_policy(path, document, may_be_empty=True)
     added: list[Right] = []
     contradictions: list[Contradiction] = []
+    shared: list[str] = []
     for additions in policies:
+        present = before
         plan = plan_merge(before, additions)
         contradictions += plan.contradictions
         if plan.added:
             document = _Editor(document, path, before).add(plan.entries)
             before = _checked_policy(path, document, before, plan.added)
             added += plan.added
+        shared += _texts_on_shared_enclaves(present, additions, before)
         _check_protection(path, before, additions)
     first_nodes = nodes_in_several_namespaces(first.enclaves)
     several = (
@@ -472,36 +476,71 @@ def merge_all(path: Path, policies: Iterable[Policy]) -> Merged:
     notes = (
         *merge_notes(contradictions),
         *(Note("merge.several-instances", text) for text in several),
-        *(
-            Note("merge.shared-enclave", text)
-            for text in _texts_on_shared_enclaves(first, policies, before)
-        ),
+        *(Note("merge.shared-enclave", text) for text in shared),
     )
     rights = frozenset(policy_rights(before))
     return Merged(document, tuple(added), tuple(contradictions), rights, notes)
 
 
-def _texts_on_shared_enclaves(
-    before: Policy, policies: Iterable[Policy], after: Policy
-) -> Iterator[str]:
-    """Yield a text on each enclave that gets other nodes, and none of its own from ``policies``.
+def _texts_on_shared_enclaves(before: Policy, additions: Policy, after: Policy) -> Iterator[str]:
+    """Yield a text on each enclave of ``before`` that gets nodes of another program.
 
-    Nodes that have the same name in other namespaces are instances of a node, for which there is
-    another note.
+    These have other names, or the same name, but nothing of their own in common.  Nodes that have
+    the same name in other namespaces are instances of a node, for which there is another note.
     """
-    asked: dict[str, set[str]] = {}
-    for additions in policies:
-        for enclave, nodes in additions.nodes().items():
-            asked.setdefault(enclave, set()).update(map(_name_of, nodes))
     now = after.nodes()
-    for enclave, nodes in before.nodes().items():
-        come = [node for node in now[enclave] if node not in nodes]
-        if nodes and come and asked.get(enclave, set()).isdisjoint(map(_name_of, nodes)):
+    for enclave in additions.enclaves:
+        present = before.enclave(enclave.path)
+        rights = _rights_of_nodes(present) if present else {}
+        new_rights = _rights_of_nodes(enclave)
+        nodes, come = sorted(rights), sorted({*now.get(enclave.path, ())} - rights.keys())
+        if nodes and come and {*map(_name_of, nodes)}.isdisjoint(map(_name_of, new_rights)):
             yield (
-                f"{enclave} has {_nodes_text(nodes)}, and now also {_nodes_text(come)}: each "
+                f"{enclave.path} has {_nodes_text(nodes)}, and now also {_nodes_text(come)}: each "
                 "process in this enclave has the rights of all these nodes. Unless they run in one "
                 "process, give one of them another enclave, with --enclave or in its policy."
             )
+        for node in sorted(new_rights.keys() & rights.keys()):
+            if _are_different_programs(rights[node], new_rights[node]):
+                yield (
+                    f"{enclave.path} already has a node {node}, and the merged policy gives the "
+                    "node entirely different rights. If these are two programs, each of them now "
+                    "has the rights of both: then merge with another --namespace, or with "
+                    "--enclave and --remap __node:=NAME."
+                )
+
+
+def _rights_of_nodes(enclave: Enclave) -> dict[str, set[Right]]:
+    """Map the full name of each node to its ALLOW rights."""
+    rights: dict[str, set[Right]] = {}
+    for profile in enclave.all_profiles():
+        of_node = rights.setdefault(profile.full_name, set())
+        of_node.update(e for e in profile_rights(enclave.path, profile) if e.qualifier is ALLOW)
+    return rights
+
+
+def _are_different_programs(rights: Iterable[Right], others: Iterable[Right]) -> bool:
+    """Return whether both nodes have rights of their own, and share only those of any node.
+
+    Rights without those that every node needs, such as a patch of `sros audit`, are no program.
+    """
+    own, other_own = ({e for e in side if not _is_of_any_node(e.name)} for side in (rights, others))
+    basics = Rules(e for e in rights if is_of_every_node(e.name))
+    if not own or not other_own or not any(map(basics.overlaps, others)):
+        return False
+    return not any(map(Rules(own).overlaps, other_own))
+
+
+def _is_of_any_node(name: str) -> bool:
+    return (
+        is_of_every_node(name)
+        or name in GLOBAL_TOPICS
+        or only_reads(name)
+        or name.endswith(_OF_LIFECYCLE_NODES)
+    )
+
+
+_OF_LIFECYCLE_NODES = ("/change_state", "/transition_event")
 
 
 def _name_of(node: str) -> str:

@@ -70,6 +70,37 @@ def test_a_merge_notes_an_enclave_that_gets_nodes_of_another_policy(folder: Path
     assert "merge.shared-enclave" not in sros("merge_policy", "a.xml", "package.xml").ok().err
 
 
+SHARED = "note [merge.shared-enclave]: /valve already has a node /valve, and the merged policy"
+
+
+def test_a_merge_notes_a_node_of_another_package_with_the_same_name(folder: Path) -> None:
+    """Twins: the package again, its next version, what an audit found missing, another namespace.
+
+    Rights that any node may have do not make two packages one.
+    """
+    of_any = ("/rosout", "/diagnostics", "~/transition_event")
+    for name, topics in (
+        ("own", ("/x",)),
+        ("gripper", ("pressure", "state", *of_any)),
+        ("next", ("pressure", "status", *of_any)),
+        ("water", ("flow", *of_any)),
+        ("missing", ("flow",)),
+    ):
+        text = policy_text({"/valve" if name != "own" else "/own": publish(*topics)})
+        (folder / f"{name}.xml").write_text(text.replace('node="n"', 'node="valve"'))
+    (folder / "robot.xml").write_text(sros("merge_policy", "own.xml", "gripper.xml").ok().out)
+    for words, said in (
+        (("robot.xml", "water.xml"), True),
+        (("own.xml", "gripper.xml", "water.xml"), True),
+        (("robot.xml", "gripper.xml"), False),
+        (("robot.xml", "next.xml"), False),
+        (("robot.xml", "missing.xml"), False),
+        (("robot.xml", "water.xml", "--namespace", "/left"), False),
+        (("robot.xml", "water.xml", "--enclave", "/w", "--remap", "__node:=w"), False),
+    ):
+        assert (SHARED in sros("merge_policy", *words).ok().err) == said, words
+
+
 def test_the_nodes_of_a_package_are_merged_into_the_enclave_that_composes_them(
     folder: Path,
 ) -> None:
