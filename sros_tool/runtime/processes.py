@@ -46,8 +46,8 @@ from sros_tool.runtime.rmw import DEFAULT_RMW, RMW, middleware_of
 from sros_tool.runtime.variables import DOMAIN, ENABLE, ENCLAVE, KEYSTORE
 
 _LIBRARIES = re.compile(
-    rb"/(lib(?:rcl|rmw_[a-z0-9_]+?|ddsc|dds_security_auth|fastrtps|fastdds|nddsc|nddscore|zenohc"
-    rb"|zenohpico)|zenoh)(?:-[0-9a-f]{6,40})?(?:\.abi3|\.cpython-[\w-]+)?\.so"
+    rb"/(lib(?:rcl|rmw_[a-z0-9_]+?|ddsc|dds_security_auth|fastrtps|fastdds|nddsc|nddscore"
+    rb"|OpenDDS_Dcps|zenohc|zenohpico)|zenoh)(?:-[0-9a-f]{6,40})?(?:\.abi3|\.cpython-[\w-]+)?\.so"
 )
 _DDS_LIBRARIES = re.compile(
     rb"^[^/\n]*(/(?:[^\n]*/)?lib(fastrtps|fastdds|ddsc)(?:-[0-9a-f]{6,40})?"
@@ -299,6 +299,7 @@ _RMW_OF = {
     "libfastrtps": "rmw_fastrtps",
     "libfastdds": "rmw_fastrtps",
     "libnddsc": "rmw_connextdds",
+    "libOpenDDS_Dcps": "rmw_opendds",
     "libzenohc": "rmw_zenoh",
     "zenoh": "rmw_zenoh",
     "libzenohpico": "rmw_zenoh",

@@ -87,6 +87,7 @@ def proc(tmp_path: Path) -> Proc:
         (("a",), "/v/cyclonedds.libs/libddsc-4d7a8b3c.so.11", True),
         (("a",), "/v/site-packages/zenoh/zenoh.abi3.so", True),
         (("a",), "/usr/lib/libfastrtps.so.2.14", True),
+        (("a",), "/opt/opendds/lib/libOpenDDS_Dcps.so.3.28.1", True),
         (("a",), "/home/u/notes about librcl.txt", False),
         (("/usr/bin/zenohd",), "", True),
         (("python3", "-c", "from ros2cli.daemon import main"), "", True),
