@@ -71,7 +71,7 @@ _REPLACE_CA = (
 _SIGN_CRL = "Sign the list again: `sros crl {root} --refresh`, and export it to the robots again."
 _MAKE_KEY = (
     "The key was made on this robot, and nothing else has it: restore it from a backup of the "
-    "robot. Without a backup, make another key in a new folder: `sros create_request {enclave} "
+    "robot. Without a backup, make another key with `sros create_request {enclave} "
     "NEW_FOLDER`, sign its request.pem with `sros sign_request {root} request.pem --renew`, and "
     "install the answer with `sros import ANSWER NEW_FOLDER`."
 )
@@ -167,7 +167,8 @@ class Fault(Enum):
         "ca-expired",
         "a CA that an enclave trusts has expired",
         "Nothing that it issued or signed is accepted any more (Fast DDS: Error '10' verifying "
-        "CA certificate), but Cyclone DDS 11 still accepts documents of an expired permissions CA.",
+        "CA certificate); only Cyclone DDS 11 still accepts documents of an expired permissions "
+        "CA.",
         _SOURCE_TESTS,
         _REPLACE_CA,
     )

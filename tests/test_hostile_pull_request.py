@@ -186,7 +186,7 @@ LIE_TABLE = (
     Lie("absolute link", "is a symbolic link", _to("/etc/passwd")),
     Lie("include of a link", "is a symbolic link",
         _and(_text(_including("linked.xml")), _to("../../common/node.xml", "linked.xml"))),
-    Lie("include through a link", "is not a folder of the revision",
+    Lie("include through a link", "is not a folder in the commit",
         _and(_text(_including("linked/node.xml")), _to("../../common", "linked"))),
     Lie("include of another folder", "leaves the folder of the policy",
         _text(_including("../../common/node.xml"))),

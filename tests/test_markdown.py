@@ -124,7 +124,7 @@ def test_certificates_as_markdown(tmp_path: Path) -> None:
     sros("create_enclave", "ks", "/a", cwd=tmp_path).ok()
     words = ("check", "ks", "--format", "markdown", "--needs-renewal")
     fine = sros(*words, "30d", cwd=tmp_path).ok()
-    assert fine.out == "### Certificates: the only enclave does not need to be renewed (30d)\n\n"
+    assert fine.out == "### Certificates: no enclave needs to be renewed (30d)\n\n"
     due = sros(*words, "9000d", cwd=tmp_path)
     assert due.status == 1
     assert due.out.startswith("### Certificates: 1 enclave needs to be renewed (9000d)\n\n- `/a ")

@@ -353,7 +353,7 @@ def _fetch_error(error: Exception, source: str, now: datetime) -> FetchError:
             "`sros distribute_key KEYSTORE --robot ROBOT FOLDER --force`.",
         )
     if isinstance(error, exceptions.DownloadError):
-        what = f"{source} cannot be fetched from"
+        what = f"nothing can be fetched from {source}"
         cause = error.__cause__
         if isinstance(cause, ssl.SSLCertVerificationError) and cause.verify_code in _DATE_ERRORS:
             why = f"{why} The clock here shows {iso(now)}."

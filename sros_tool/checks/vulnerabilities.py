@@ -209,9 +209,9 @@ def vulnerability_metrics(
     return (
         Metric(
             "sros_dds_known_vulnerabilities",
-            "Number of known vulnerabilities of a DDS that processes have loaded, by its version: "
-            "fixes that its package has without a new version are not known. If several releases "
-            "are loaded, the number for the most vulnerable release.",
+            "Number of vulnerabilities known for the version of a DDS that processes have loaded. "
+            "They count even if the package has fixes for them without a new version. If several "
+            "releases are loaded, the number for the most vulnerable release.",
             tuple(Sample(number, {"product": name}) for name, number in sorted(most.items())),
         ),
         Metric(

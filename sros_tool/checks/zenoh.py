@@ -552,7 +552,7 @@ class SubjectRights(NamedTuple):
     rights: Sequence[AllowedName]
     """Rights of the subject."""
     unsaid: Sequence[KeyRight]
-    """Rights to keys that no ROS name states exactly."""
+    """Rights to keys that no ROS name expresses exactly."""
     denied: Sequence[KeyRight]
     """Denied keys; a message with a wildcard may bypass a denial."""
 

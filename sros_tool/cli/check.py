@@ -737,10 +737,8 @@ def _show_renewals(root: Path, text: str, moment: datetime, form: str) -> int:
     else:
         due = [describe_lifetime(enclave, moment) for enclave in expiring.due]
         unknown = [f"{enclave.name}  unknown: {enclave.error}" for enclave in expiring.unreadable]
-        none_due = {0: "no enclave needs", 1: "the only enclave does not need"}.get(
-            expiring.lasting, f"none of {expiring.lasting} enclaves needs"
-        )
-        none_due += f" to be renewed ({text})"
+        none = f"none of {expiring.lasting} enclaves" if expiring.lasting > 1 else "no enclave"
+        none_due = f"{none} needs to be renewed ({text})"
         if expiring.short_lived and not expiring.lasting:
             none_due = ""
         left_out = expiring.short_lived_text()

@@ -326,7 +326,7 @@ def _process_line(process: ClosedProcess, closed: CloseState, policy: Policy) ->
         state = "not running"
     elif process.pid:
         # A process first seen in its enclave, but now elsewhere, was recognized by its command.
-        signs = {"elimination": "as the only process left", "enclave": "by its command"}
+        signs = {"elimination": "because no other process is left", "enclave": "by its command"}
         sign = signs.get(process.known_by, f"by its {process.known_by}")
         state = f"process {process.pid}" + ("" if runs else f", known {sign}")
     elif runs:

@@ -611,7 +611,7 @@ def _answer_lines(answer: Answer, why: str) -> Iterator[str]:
     for line in answer.lines:
         stated = line.stated
         if level := line.group.protect:
-            stated += f", protected at least with {level.lower()}"
+            stated += f', protect="{level.lower()}"'
         yield _labeled_row("from", f"{_place_text(line.source)}: {stated}")
     if answer.policy_sha256 and not answer.enclave.policy_file and decision.rule is not None:
         digest = answer.policy_sha256

@@ -668,9 +668,13 @@ def _use_lines(enclave: MinimizedEnclave) -> Iterator[str]:
     yield f"  permissions.p7s: {sizes.before} bytes{then}, of at most {sizes.limit - 1}{too_large}"
     for proposal in enclave.proposals:
         names = [right.describe() for right in proposal.adds]
-        adds = first_few(names, _MOST_SHOWN) or "no other known name"
+        adds = (
+            f"also allows {first_few(names, _MOST_SHOWN)}"
+            if names
+            else "allows no other known name"
+        )
         yield f"    {proposal.rule.describe()}  in place of {len(proposal.replaces)} names"
-        yield f"      this rule saves {proposal.saves} bytes, and also allows {adds}"
+        yield f"      this rule saves {proposal.saves} bytes, and {adds}"
 
 
 def _as_written(value: Any) -> Any:

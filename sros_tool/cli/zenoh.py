@@ -435,7 +435,7 @@ def _notes_on_lost_rules(subjects: Sequence[RightsOfSubject]) -> Iterator[Note]:
             yield Note(
                 "zenoh.unsaid",
                 f"{_subject_text(rights)}: the policy lacks {counted(len(rights.unsaid), 'right')} "
-                f"that no ROS name states exactly: {keys}",
+                f"to keys that no ROS name expresses exactly: {keys}",
             )
     domains = sorted(
         {right.domain for rights in subjects for right in rights.rights} - {"0", "*"}, key=int

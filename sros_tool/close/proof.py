@@ -96,7 +96,7 @@ _START_SECONDS = 3.0
 
 _OTHERS_SEEN = {
     "graph.silent": "nodes without endpoints:",
-    "graph.stray": "writers or readers that belong to no ROS node, of topics",
+    "graph.stray": "topics with writers or readers that belong to no ROS node:",
 }
 """The notes of `generate_policy` on what it sees besides nodes with endpoints, as words."""
 
@@ -150,7 +150,7 @@ def proofs_of(robot: LocalRobot, state: CloseState, patience: float) -> list[Pro
     talk = _proof_of_talk(running, nodes, away)
     if talk.fails and (present := sorted(not_here - away)):
         options = " ".join(f"--without {name}" for name in present)
-        away_text = f"if the other machines may be away, add {options}"
+        away_text = f"if the other machines are away on purpose, add {options}"
         talk = talk._replace(reason=f"{talk.reason}; {away_text}")
     silence = _proof_of_silence(robot, nodes.nodes_to_compare(away), hears=talk.holds is not None)
     connected = [*_proof_of_connections(robot)]
@@ -389,7 +389,7 @@ def _proof_of_connections(robot: LocalRobot) -> Iterator[Proof]:
     elif len(connections.compared) > 1:
         number = counted(len(connections.compared), "process", "processes")
         reason = f"{number} of Fast DDS, each with all others"
-        reason += "; sros cannot see those of other machines" * bool(robot.not_here)
+        reason += "; sros cannot see processes on other machines" * bool(robot.not_here)
         yield Proof(CONNECTED, True, reason)
 
 
@@ -533,7 +533,7 @@ def _why_missing(running: RunningRobot, missing: Sequence[str], observed: Observ
     causes = {
         process.enclave: f"{process.unit} does not run it: systemctl status {process.unit}"
         if process.is_absent(running.processes)
-        else f"stop {process.pids_text}, which is open"
+        else f"{process.pids_text} is open: stop it"
         for process in observed.processes
         if process.pid or process.alike
     }

@@ -1780,10 +1780,9 @@ def _dds_metrics(
         unknown.append(Sample(unknown_libraries, labels))
     yield Metric(
         "sros_fleet_dds_known_vulnerabilities",
-        "Number of known vulnerabilities of a DDS that processes of a robot have loaded or that is "
-        "only installed, by its version: fixes that its package has without a new version are "
-        "not known. If the robot has several releases of the "
-        "DDS, the largest number.",
+        "Number of vulnerabilities known for the version of a DDS that processes of a robot have "
+        "loaded, or that is only installed. They count even if the package has fixes for them "
+        "without a new version. If the robot has several releases of the DDS, the largest number.",
         tuple(numbers),
     )
     yield Metric(

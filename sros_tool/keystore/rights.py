@@ -853,10 +853,12 @@ def without_enclaves_of_sros(source: RightsSource, other: RightsSource) -> Right
         return source
     notes = source.notes
     if named := sorted(left_out & routers):
-        number = counted(len(named), "Zenoh router")
-        text = (
-            f"left out: {number} with only the rights that every node needs, and not in the policy"
+        number = counted(
+            len(named),
+            "Zenoh router that is not in the policy and has",
+            "Zenoh routers that are not in the policy and have",
         )
+        text = f"left out: {number} only the rights that every node needs"
         notes = (*notes, Note("rights.routers", f"{text}: {first_few(named, 5)}."))
     return replace(
         source,

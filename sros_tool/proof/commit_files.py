@@ -109,7 +109,7 @@ class PathAtRevision:
             raise MissingFileError(f"'{shown}' does not exist")
         if entry.mode not in FILES:
             raise DocumentError(
-                f"'{shown}' is {entry.kind}", "", "Name a regular file of the revision."
+                f"'{shown}' is {entry.kind}", "", "Name a regular file in the commit."
             )
         return self.repository.content(entry.id)
 

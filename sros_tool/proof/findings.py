@@ -809,7 +809,7 @@ def _assumption_finding(requirement: Requirement, name: str) -> Finding:
 def _not_crossing_finding(requirement: Requirement, blocked_use: BlockedUse) -> Finding:
     place, use, peers = requirement.source, blocked_use.use, _listed_names(blocked_use.others)
     ends = f"from {use.enclave} to {peers}" if use.writes else f"from {peers} to {use.enclave}"
-    text = f"{use.name} does not pass between routers {ends}: {demand(requirement)}"
+    text = f"the routers do not pass {use.name} {ends}: {demand(requirement)}"
     return NOT_CROSSING.found(place.file, text, place.file, place.line)
 
 

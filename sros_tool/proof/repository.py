@@ -322,7 +322,7 @@ class Repository:
         gone: list[str] = []
         for part in path.split("/") if path else ():
             if entry.mode != FOLDER:
-                raise DocumentError(f"'{'/'.join(gone)}' is not a folder of the revision")
+                raise DocumentError(f"'{'/'.join(gone)}' is not a folder in the commit")
             tree_entry = _entries_of_folder(self, entry.id).get(part)
             if tree_entry is None:
                 return None

@@ -1528,9 +1528,9 @@ def _findings_on_lost_restrictions(
                 reported[node] |= outside
                 place = requirement.source
                 name, to = expand("~", *node), first_few(sorted(outside), 3)
-                text = f"node {name} moves to enclave {to}; "
-                text += f"for users in namespace {ns}, " if ns != "/" else ""
-                text += "the requirement does not apply to this enclave"
+                where = "enclave" if len(outside) == 1 else "enclaves"
+                text = f"node {name} moves to {where} {to}, where the requirement does not apply"
+                text += f" for users in namespace {ns}" if ns != "/" else ""
                 remedy = "Let the requirement apply to the enclave, or approve this in the review."
                 yield DROPPED.found(str(requirement), text, place.file, place.line, remedy)
 

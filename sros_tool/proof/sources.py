@@ -234,7 +234,7 @@ def _access_of_source(path: Path, source: RightsSource) -> AccessSource:
             raise DocumentError(
                 f"the permissions of {enclave} in '{path}' have several grants",
                 "Vendors differ in which grant they use.",
-                "Sign one grant for each enclave.",
+                "Sign permissions with one grant for each enclave.",
             )
     if source.kind == "zenoh":
         (document,) = source.configurations.values()

@@ -472,7 +472,7 @@ def _render_markdown(picture: Picture, *, everything: bool = False) -> str:
     if not spellings.isdisjoint(_MOVING):
         lines += ["", "A relative name moves with the namespace of its node; absolute names stay."]
     elif spellings == {Spelling.ABSOLUTE}:
-        lines += ["", "All names are absolute: they stay in any namespace of their nodes."]
+        lines += ["", "All names are absolute: the namespaces of their nodes do not change them."]
     return "\n".join((*lines, ""))
 
 

@@ -603,7 +603,7 @@ def test_what_systemd_does_not_start_is_done_by_hand(
     assert ended.err.endswith("next: run these commands, and then sros close robot --proof\n")
     assert (
         "no: not every process was started in its enclave: no secured process of this robot runs "
-        "in /listener (stop process 4712, which is open), /talker (stop process 4711, which is open"
+        "in /listener (process 4712 is open: stop it), /talker (process 4711 is open: stop it"
     ) in robot.close("--proof", status=1).out
     for root in ("robot/keystore", "robot/export"):
         denied = sros("explain", root, "/talker", "publish", "/x", cwd=robot.folder).out
@@ -1060,7 +1060,7 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     assert "with 36 endpoints as before (types are not compared)\n" in said
     robot.nodes = (TALKER, LISTENER, ("/", "", observe.NOBODY, "03", ["publish rt/cmd_vel"]))
     assert (
-        "writers or readers that belong to no ROS node, of topics rt/cmd_vel; stop what runs open"
+        "topics with writers or readers that belong to no ROS node: rt/cmd_vel; stop what runs open"
         in robot.close("--proof", status=1).out
     )
     robot.nodes = (TALKER, LISTENER)
@@ -2063,7 +2063,8 @@ def test_an_enclave_that_belongs_to_another_machine(robot: Robot) -> None:
     robot.remaining = (TALKER,)
     said = robot.close("--proof", status=1).out
     assert (
-        "not seen: /listener" in said and "machines may be away, add --without /listener\n" in said
+        "not seen: /listener" in said
+        and "machines are away on purpose, add --without /listener\n" in said
     )
     ended = robot.close("--proof", "--without", "/listener")
     assert (

@@ -221,7 +221,7 @@ def test_from_the_request_to_a_running_process(keystore: Path, tmp_path: Path) -
     assert ended.status == 2
     assert "It was made on its robot and stays there" in ended.err
     (tmp_path / "robot" / FOLDER / "key.pem").unlink()
-    again = f"make another key in a new folder: `sros create_request {NAME} NEW_FOLDER`"
+    again = f"make another key with `sros create_request {NAME} NEW_FOLDER`"
     for words in (("run", "robot", NAME, "--", "true"), ("verify", "robot")):
         lost = sros(*words, cwd=tmp_path)
         assert again in lost.out + lost.err and "distribute_key" not in lost.out + lost.err

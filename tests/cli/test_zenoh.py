@@ -86,8 +86,8 @@ def test_a_router_without_rights_of_its_own_does_not_differ_from_the_policy(fold
     assert "+ /router ALLOW publish" in sros(*compare, cwd=folder).out
     sros("zenoh", "ks", cwd=folder).ok()
     ended = sros(*compare, cwd=folder).ok()
-    left_out = "left out: 1 Zenoh router with only the rights that every"
-    assert (ended.out, f"{left_out} node needs, and not in the policy: /router." in ended.err) == (
+    left_out = "left out: 1 Zenoh router that is not in the policy and has only the rights that"
+    assert (ended.out, f"{left_out} every node needs: /router." in ended.err) == (
         "",
         True,
     )

@@ -154,7 +154,7 @@ STRANGER = replace(robot(9)[0], user=4711)
     ("processes", "not_here", "holds", "says"),
     [
         (robot(1, 2, 3), (), True, "3 processes of Fast DDS, each with all others"),
-        (robot(1, 2, 3), ("/laptop",), True, "; sros cannot see those of other machines"),
+        (robot(1, 2, 3), ("/laptop",), True, "; sros cannot see processes on other machines"),
         (robot(1, 2, 3, deaf=[(1, 2)]), (), False, "do not hear each other; restart process 1"),
         (
             [*robot(1, 2), replace(robot(3)[0], own_ports=frozenset())],

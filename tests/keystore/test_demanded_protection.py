@@ -94,7 +94,7 @@ def test_a_new_keystore_is_made_with_it(folder: Path) -> None:
     asked = ("/mux", "publish", "/cmd_vel", "--policy", "p.xml")
     for shown in (sros("explain", "new", *asked, cwd=folder), sros("explain", *asked, cwd=folder)):
         assert "payload ENCRYPT" in shown.out
-        assert "p.xml:6: ALLOW publish /cmd_vel, protected at least with encrypt" in shown.out
+        assert 'p.xml:6: ALLOW publish /cmd_vel, protect="encrypt"' in shown.out
 
 
 def test_a_template_that_protects_more_stays(folder: Path) -> None:

@@ -544,7 +544,7 @@ def test_the_check_answers_by_its_exit_status(tmp_path: Path) -> None:
     sros("create_enclave", root, "/a").ok()
     check = ("check", "keystore", root, "--needs-renewal")
     well = sros(*check, "66%").ok()
-    assert (well.out, well.err) == ("", "the only enclave does not need to be renewed (66%)\n")
+    assert (well.out, well.err) == ("", "no enclave needs to be renewed (66%)\n")
     due = sros(*check, "181d")
     assert (due.status, due.out.startswith("/a  permissions until ")) == (1, True), due
     (entry,) = json.loads(sros(*check, "181d", "--json").out)["enclaves"]

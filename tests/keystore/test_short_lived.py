@@ -124,7 +124,7 @@ def test_a_short_lived_enclave_is_renewed_by_its_name_alone(tmp_path: Path) -> N
     create(root)
     said = sros("check", "keystore", root, "--needs-renewal", "30d").ok().err
     none, left_out = said.splitlines()
-    assert none == "the only enclave does not need to be renewed (30d)"
+    assert none == "no enclave needs to be renewed (30d)"
     assert left_out.startswith(
         f"not counted: 1 short-lived enclave (renewed only by name): {SHORT}"
     )

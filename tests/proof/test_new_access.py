@@ -584,7 +584,7 @@ def test_a_revision_is_read_with_its_own_includes(repository: Path) -> None:
         ("git::robot.xml", "does not name a policy at a git revision"),
         ("git:main:policies/link.xml", "is a symbolic link"),
         ("git:main:policies/fallback.xml", "is a symbolic link"),
-        ("git:main:policies/through.xml", "is not a folder of the revision"),
+        ("git:main:policies/through.xml", "is not a folder in the commit"),
         ("git:main:policies/away.xml", "leaves the folder of the policy"),
     ],
 )

@@ -1121,8 +1121,8 @@ def _moved(node: str, path: str, enclaves: dict[str, str] = _NODES) -> dict[str,
                 _NODES,
                 '[[only]]\npublish = ["cmd"]\nenclaves = ["/drive", "*/arm/operator/*"]\n',
                 _moved("eye", "/operator/eye"),
-                "node /eye moves to enclave /operator/eye; for users in namespace /arm, the "
-                "requirement does not apply to this enclave",
+                "node /eye moves to enclave /operator/eye, where the requirement does not apply "
+                "for users in namespace /arm",
             ),
             # Each node moves out in another namespace.
             (
@@ -1130,8 +1130,8 @@ def _moved(node: str, path: str, enclaves: dict[str, str] = _NODES) -> dict[str,
                 '[[only]]\npublish = ["cmd"]\n'
                 'enclaves = ["/drive", "*/arm/operator/*", "*/leg/helper/*"]\n',
                 _moved("eye", "/operator/eye", _moved("ear", "/helper/ear")),
-                "node /ear moves to enclave /helper/ear; for users in namespace /leg, the "
-                "requirement does not apply to this enclave",
+                "node /ear moves to enclave /helper/ear, where the requirement does not apply "
+                "for users in namespace /leg",
             ),
             # Both enclaves are bound, or both are exempt; or the node is new.
             (_NODES, _ONLY_OPERATORS, _moved("eye", "/lens/eye"), ""),
@@ -1164,7 +1164,7 @@ def test_a_node_moves_out_of_no_requirement(
     change.commit({"robot.xml": policy_text(after), "robot.toml": required})
     ended = change.review(*words)
     assert said in ended.out, ended
-    assert ("requirement does not apply to this enclave" in ended.out) == bool(said), ended
+    assert ("where the requirement does not apply" in ended.out) == bool(said), ended
     assert ended.status == bool(said), ended
     assert change.review(*words, "--dropped-requirements", "allow").status == 0
 

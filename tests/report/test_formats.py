@@ -144,7 +144,7 @@ def test_a_table_says_which_names_move_with_the_namespace(tmp_path: Path) -> Non
     for rights, rows, end in (
         ({"/a": relative, "/b": absolute}, ("`/width` (relative for some nodes) |",), legend),
         ({"/a": relative + action}, ("`/width` (relative) |", "`/grasp` (rel", "`/tf` |"), legend),
-        ({"/a": absolute}, (), "All names are absolute: they stay in any"),
+        ({"/a": absolute}, (), "All names are absolute: the namespaces of"),
     ):
         (tmp_path / "p.xml").write_text(policy_text(rights))
         table = sros("view", tmp_path / "p.xml", "--format", "markdown").ok().out

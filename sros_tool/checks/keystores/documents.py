@@ -476,7 +476,7 @@ def _domain_findings(enclave: CheckedEnclave, grant: Grant, file: str) -> Iterat
             wanted = EnclaveDomains(governed, None, robots).domains_of(enclave.name)
     if allowed == wanted:
         return
-    text = f"the permissions are for domain {str(allowed) or 'none'}, but "
+    text = f"the permissions are for {f'domain {allowed}' if allowed.ranges else 'no domain'}, but "
     if wanted != governed:
         yield DOMAINS.found(enclave.name, f"{text}its robot is in domain {wanted}", file)
         return

@@ -875,7 +875,7 @@ _PERMISSIONS_ROWS: tuple[Row, ...] = (
                 (Condition.SHARED_SUBJECTS, Condition.CYCLONE),
                 RowStatus.HEARD,
                 "Cyclone DDS 0.10 accepts permissions for a longer subject name that contains all"
-                " parts of the certificate's",
+                " parts of the subject name in the certificate",
                 "use the template production (unique_subject), or enclave names that do not contain"
                 " each other",
             ),

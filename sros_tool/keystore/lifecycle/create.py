@@ -816,10 +816,10 @@ def _restart_text(mismatch: Mismatch, *, revoked: bool) -> str:
         which, where, more = "all processes together", "", ""
         if not mismatch.everything:
             which = f"together the processes that use {', '.join(mismatch.names)}"
-            where, more = " on these names, but do on all other names", f" {IF_EXPIRED}"
+            where, more = "on these names, but on no others, ", f" {IF_EXPIRED}"
         return (
-            f"Cyclone DDS and Fast DDS: restart {which}; restarted processes do not communicate "
-            f"with processes that were not restarted{where}. Until then, running processes "
+            f"Cyclone DDS and Fast DDS: restart {which}; {where}restarted processes do not "
+            "communicate with processes that were not restarted. Until then, running processes "
             f"communicate as before.{more}"
         )
     return f"All vendors: {ONE_BY_ONE} Until its restart, a process keeps its former files."
@@ -838,8 +838,8 @@ def exports_note(keystore: OpenedKeystore, names: Sequence[str]) -> Note:
     text += f"{shown} ENCLAVE TARGET --force`)"
     remote = [name for name in names if key_on_robot(keystore.folder(name))]
     if remote:
-        text += "; if the key was made on the robot, answer the request again (`sros sign_request "
-        text += f"{shown} REQUEST --renew`), here for {', '.join(remote)}"
+        text += f"; if the key was made on the robot, as for {', '.join(remote)}, answer the "
+        text += f"request again (`sros sign_request {shown} REQUEST --renew`)"
     return Note("keystore.export-again", remedy_in_closed_robot(keystore.root, f"{text}."))
 
 
