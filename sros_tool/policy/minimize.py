@@ -75,6 +75,39 @@ def enclaves_of_nodes(
     }
 
 
+def moved_to_policy(observed: Policy, policy: Policy) -> tuple[Policy, dict[str, dict[str, str]]]:
+    """Return ``observed`` with nodes moved to their enclaves in ``policy``, and the moved nodes.
+
+    The second value maps observed enclaves to their nodes, and each node to its enclave in the
+    policy.  Only enclaves with the name of one of their nodes change, as ``generate_policy
+    --enclave-per-node`` gives a process the name of one of its nodes.  Nodes that the policy has in
+    several enclaves, or in none, do not move.
+    """
+    stated = policy.nodes()
+    moves: dict[str, dict[str, str]] = {}
+    profiles: dict[str, list[Profile]] = defaultdict(list)
+    for enclave in observed.enclaves:
+        homes: dict[str, str] = {}
+        names = sorted({profile.full_name for profile in enclave.all_profiles()})
+        for node in names if enclave.path in names else ():
+            exact = [path for path, nodes in stated.items() if node in nodes]
+            if any(covers(wide, node) for wide in stated.get(enclave.path, ())):
+                homes[node] = enclave.path
+            elif len(exact) == 1:
+                homes[node] = exact[0]
+        is_divided = len({*homes.values()}) > 1
+        rest = enclave.path
+        if is_divided or (homes and enclave.path not in stated):
+            moves[enclave.path] = homes
+            rest = enclave.path if is_divided else next(iter(homes.values()))
+        else:
+            homes = {}
+        for profile in enclave.all_profiles():
+            profiles[homes.get(profile.full_name, rest)].append(profile)
+    enclaves = (Enclave(path, (Profiles(tuple(own)),)) for path, own in profiles.items())
+    return Policy(tuple(enclaves)), moves
+
+
 class WideRule(NamedTuple):
     """A wildcard that matches more names than were used."""
 
@@ -215,9 +248,8 @@ def nodes_not_as_observed(
     nodes = policy.nodes()
     seen: dict[str, dict[str, list[Profile]]] = defaultdict(lambda: defaultdict(list))
     for enclave in (enclave for source in observed for enclave in source.enclaves):
-        home = enclaves_of_nodes([enclave.path], nodes).get(enclave.path, enclave.path)
         for profile in enclave.all_profiles():
-            seen[home][profile.full_name].append(profile)
+            seen[enclave.path][profile.full_name].append(profile)
     differing = {}
     for enclave in policy.enclaves:
         of_enclave = seen[enclave.path]

@@ -492,6 +492,33 @@ def test_a_node_that_was_observed_in_an_enclave_of_its_own(folder: Path) -> None
     assert "minimize.enclave-not-in-policy" in ended.err
 
 
+def test_nodes_of_one_process_count_for_their_own_enclaves_in_the_policy(folder: Path) -> None:
+    """The observed enclave may have the name of one of them, which the policy has for it alone."""
+    own = {"one": publish("x"), "two": publish("y")}
+    of_node = {f"/{node}": f'node="{node}">{rules}' for node, rules in own.items()}
+    together = '</profile><profile ns="/" '.join(of_node.values())
+
+    def file(name: str, enclaves: dict[str, str]) -> None:
+        text = policy_text({path: f"@{rules}" for path, rules in enclaves.items()})
+        (folder / name).write_text(text.replace('node="n">@', ""))
+
+    words = ("minimize_policy", "robot.xml", "--observed", "seen.xml", "--fail-on", "difference")
+    divided = "note [minimize.divided-process]: the nodes /one and /two were observed in one"
+    moved = "count for /pipe, because the policy has the nodes /one and /two there."
+    for stated, seen, status, said in (
+        (of_node, {"/one": together}, 1, divided),
+        ({"/one": of_node["/one"], "/b": of_node["/two"]}, {"/two": together}, 1, divided),
+        ({"/pipe": together}, {"/one": together}, 0, moved),
+        (of_node, of_node, 0, ""),
+    ):
+        file("robot.xml", stated)
+        file("seen.xml", seen)
+        ended = sros(*words)
+        assert (ended.status, said in ended.err) == (status, True), seen
+        assert "not allowed" not in ended.out and "never observed;" not in ended.out
+        assert ended.err.count("[") == bool(said), ended.err
+
+
 def test_a_job_fails_where_the_policy_and_what_was_observed_differ(folder: Path) -> None:
     """As the page on continuous integration says, for which one of its steps is enough."""
     page = (Path(__file__).parents[2] / "docs/howto/ci.md").read_text()

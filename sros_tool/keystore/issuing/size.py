@@ -29,8 +29,8 @@ from sros_tool.policy.minimize import (
     EnclaveUse,
     MinimizedPolicy,
     WildcardProposal,
-    enclaves_of_nodes,
     minimize,
+    moved_to_policy,
     nodes_not_as_observed,
     propose_wildcards,
 )
@@ -40,7 +40,7 @@ from sros_tool.policy.rights import Right, Rules, policy_rights
 from sros_tool.translate import permissions_for
 from sros_tool.validity import window
 from sros_tool.values import DryRun, FileChanges, Notes, shows
-from sros_tool.wording import first_few
+from sros_tool.wording import enumerated, first_few
 
 _MOST_SHOWN = 5
 """Maximum number of robots that a note names."""
@@ -162,39 +162,55 @@ def minimized_policy(
     """
     policy = read_policy(file, placeholders=fleet is not None)
     sources = [load_rights(path, fleet) for path in observed]
-    used = observed_rights = frozenset(right for source in sources for right in source.rights)
+    used = frozenset(right for source in sources for right in source.rights)
     notes = [note for source in sources for note in source.notes]
+    policies = [source.policy for source in sources if source.policy]
     robots = FleetPolicy(policy, fleet) if fleet else None
     gaps: list[Note] = []
     if robots:
         observed_rights = with_placeholders(robots, used)
         gaps += _robot_notes(unobserved_robots(robots, used))
     else:
-        homes = enclaves_of_nodes({right.enclave for right in used}, policy.nodes())
-        observed_rights = frozenset(
-            right._replace(enclave=homes.get(right.enclave, right.enclave)) for right in used
-        )
-        notes += [
-            Note(
-                "minimize.enclave-of-node",
-                f"The rights observed in enclave {path} count for {home}, because the policy has "
-                f"the node {path} there.",
-            )
-            for path, home in sorted(homes.items())
-        ]
+        moved = [moved_to_policy(of_source, policy) for of_source in policies]
+        policies = [of_source for of_source, _ in moved]
+        of_documents = (source.rights for source in sources if not source.policy)
+        observed_rights = frozenset().union(*of_documents, *map(policy_rights, policies))
+        for path, homes in sorted({k: v for _, moves in moved for k, v in moves.items()}.items()):
+            (gaps if len({*homes.values()}) > 1 else notes).append(_note_on_moved(path, homes))
     stated = with_absolute_names(policy)
     result = minimize(stated, observed_rights, () if strict else _node_basics())
     if robots:
         check_narrowed(robots, result, used)
     gaps += _scope_notes(policy, result, observed_rights)
     if not robots:
-        policies = [source.policy for source in sources if source.policy]
         gaps += _node_notes(stated, policies, result, strict=strict)
     narrowed = with_names_as_written(result.policy)
     document = checked_text(narrowed, output, "narrowed", placeholders=fleet is not None)
     enclaves = _measured_enclaves(stated, result, observed_rights, fleet)
     is_as_observed = not gaps and all(use.is_as_observed for use in result.uses)
     return Minimization(document, enclaves, [*notes, *gaps], is_as_observed)
+
+
+def _note_on_moved(path: str, homes: Mapping[str, str]) -> Note:
+    """Return a note on an observed enclave; ``homes`` are the enclaves of its nodes in the policy.
+
+    The policy may have the nodes in several enclaves.
+    """
+    nodes = f"the node{'s' * (len(homes) > 1)} {enumerated(list(homes))}"
+    places = sorted({*homes.values()})
+    if len(places) == 1:
+        text = (
+            f"The rights observed in enclave {path} count for {places[0]}, because the policy has "
+            f"{nodes} there."
+        )
+        return Note("minimize.enclave-of-node", text)
+    text = (
+        f"{nodes} were observed in one enclave, but the policy has them in {enumerated(places)}. "
+        "So the rights of each node count for its own enclave. If one process composes these "
+        "nodes, first put them into one enclave (`sros merge_policy EMPTY POLICY --enclave "
+        "ENCLAVE`, with --node for each), and use the result as POLICY."
+    )
+    return Note("minimize.divided-process", text)
 
 
 def _node_basics() -> Sequence[Group]:
@@ -256,8 +272,8 @@ def _scope_notes(policy: Policy, result: MinimizedPolicy, observed: Set[Right]) 
     if unknown:
         text = (
             f"these enclaves were observed, but the policy lacks them: {', '.join(unknown)}. If "
-            "the policy has their nodes in another enclave, write that enclave into the observed "
-            "file."
+            "the policy has their nodes in another enclave, write that enclave into path= of the "
+            "observed file. If it has them in several enclaves, write one of these nodes there."
         )
         yield Note("minimize.enclave-not-in-policy", text)
     rules, stated = Rules(observed), Rules(policy_rights(policy))
