@@ -882,7 +882,9 @@ def _named_rule(text: str) -> NamedValues:
     words = text.split()
     if len(words) < 3:
         raise UsageError(
-            f"{text!r} is not a rule", "", "Write 'topic /camera/* data=NONE metadata=SIGN'."
+            f"{text!r} is not a rule",
+            "",
+            "Write for example 'topic /camera/* data=NONE metadata=SIGN'.",
         )
     kind, name = _kind_and_name(words[:2])
     return NamedValues(kind, name, tuple(_key_and_value(word) for word in words[2:]))

@@ -406,7 +406,7 @@ class OpenedKeystore:
                 raise KeystoreError(
                     f"keystore '{self.root}' has no {role} CA",
                     f"'{path}' is missing, or is a link to a file outside of the keystore.",
-                    "Use the keystore that this one was exported from.",
+                    "Restore the file. In place of an export, use the keystore that it comes from.",
                 )
             stem = file.name.removesuffix(".cert.pem")
             stems[stem] = (*stems.get(stem, ()), role)
