@@ -675,7 +675,7 @@ def _late_renewal_notes(keystore: OpenedKeystore) -> Iterator[Note]:
         if soon_limit(validity) < timedelta(days=2):
             text = (
                 f"{what} are valid for {elapsed(validity)}, and count as expiring soon only "
-                f"in the last {elapsed(soon_limit(validity))}: the daily job `renew` may run "
+                f"in the last {elapsed(soon_limit(validity))}: the daily job `renew` may come "
                 "too late. Choose a validity of 6 days or more, or run the job more often "
                 "(`systemctl edit sros-renew.timer`: [Timer], OnCalendar=hourly)"
             )
