@@ -75,7 +75,7 @@ from sros_tool.policy.model import (
 from sros_tool.policy.node_basics import are_basic
 from sros_tool.policy.patterns import ComparisonLimit, Names, covers, literal_prefix, matches
 from sros_tool.policy.placeholders import parts_of
-from sros_tool.policy.rights import ACTION_RIGHT, Right, Rules, parts, placed_rights, policy_rights
+from sros_tool.policy.rights import Right, Rules, parts, placed_rights, policy_rights
 from sros_tool.spelling import NearNames, is_typing_error
 from sros_tool.translate import permissions_for
 from sros_tool.validity import Window
@@ -1137,10 +1137,13 @@ HALF_ACTION = FindingKind(
     ERROR,
     "an action that is allowed only in part",
     "An action consists of three services and two topics. The client or server of an action "
-    "creates all five when it starts, and fails if one of them is denied. (A right to only the "
-    "topics, feedback and status, is not reported: a node that observes an action needs no more.)",
+    "creates all five when it starts, and fails if one of them is denied. An enclave that has only "
+    "a part of the right to execute the action can still send false feedback or results. (Not "
+    "reported are rights to subscribe to feedback and status, which a node needs to observe an "
+    "action, and to request cancel_goal or get_result.)",
     "ROS 2 design, Actions; rcl_action 9 (rcl_action_client_init, rcl_action_server_init).",
-    'Write <actions call="ALLOW"> or <actions execute="ALLOW"> with the name of the action.',
+    'Write <actions call="ALLOW"> or <actions execute="ALLOW"> with the name of the action, or '
+    "remove the part.",
 )
 
 
@@ -1178,15 +1181,25 @@ def _statement_findings(statement: _Statement, rules: Rules) -> Iterator[Finding
         return
     enclave, _, right, name = statement.right
     action, separator, ending = name.rpartition(ACTION_SEPARATOR)
-    if separator and matches(ending, "send_goal") and right in ACTION_RIGHT:
-        whole = ACTION_RIGHT[right]
-        if not rules.allow(enclave, whole, action):
-            text = f"{name} is allowed, but not everything needed to {whole} {action}"
-            yield statement.found(HALF_ACTION, text)
+    whole = _action_right(right, ending) if separator else ""
+    if whole and not rules.allow(enclave, whole, action):
+        text = f"{right} {name} is allowed, but not everything needed to {whole} {action}"
+        yield statement.found(HALF_ACTION, text)
     elif right in ACTION_PARTS and not is_expression(name) and rules.overlaps(denial):
         shown = ", ".join(f"{by.right} {by.name}" for by in rules.overlapping(denial))
         text = f"{right} {name} is allowed, but a part of the action is denied by {shown}"
         yield statement.found(HALF_ACTION, text, "Remove the DENY of the part, or the ALLOW.")
+
+
+def _action_right(right: str, ending: str) -> str:
+    """Return the right to an action of which a part may be a mistake, or ""."""
+    if right == "request":
+        return "call" if matches(ending, "send_goal") else ""
+    executes = any(
+        right == of_part and matches(ending, part.removeprefix(ACTION_SEPARATOR))
+        for of_part, part in ACTION_PARTS["execute"]
+    )
+    return "execute" if executes else ""
 
 
 def _redundancy_findings(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
