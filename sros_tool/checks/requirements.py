@@ -80,9 +80,10 @@ HOLDS_ALONE = FindingKind(
     "requirement.holds-alone",
     NOTE,
     "a requirement that only further enclaves could break",
-    "With the enclaves here, the requirement, or a part of it, cannot fail, or a name in it lacks "
-    "its other side. Perhaps this is the policy of a package, and only the policies of the "
-    "package's users have the enclaves that could break the requirement.",
+    "The enclaves here cannot break the requirement, or a part of it; or none of them has the "
+    "other side of a name in it, such as the server of a called service. Perhaps this is the "
+    "policy of a package, and only the policies of the package's users have the enclaves that "
+    "could break the requirement.",
     "The requirements file.",
     "If this is the policy of a package, also check a policy that has other enclaves: `sros check "
     "ROBOT_POLICY --requirements FILE --namespace NS`. If it is the policy of a whole robot, "

@@ -259,7 +259,7 @@ def _vulnerability_counts_clause(advisories: Sequence[Advisory], version: str) -
 
 def _unclear_text(advisories: Sequence[Advisory]) -> str:
     return (
-        "These advisories do not mention the release line: "
+        "Advisories that do not mention this release line: "
         f"{', '.join(advisory.id for advisory in advisories)}"
     )
 

@@ -1002,8 +1002,9 @@ def _who_lines(
     holding = [outcome for outcome in answer.outcomes if outcome.by_permissions_of]
     for outcome in holding:
         holders = first_few(outcome.by_permissions_of, 3)
-        text = f"{outcome.enclave}  with the permissions of {holders}, which fit its certificate"
-        lines.append((outcome.enclave, text))
+        enclave = outcome.enclave
+        text = f"{enclave}  with the permissions of {holders}, which fit the certificate of "
+        lines.append((enclave, f"{text}{enclave}, too"))
     for outcome in able:
         wildcard = f"  by the wildcard {outcome.wildcard}" if outcome.wildcard else ""
         where = f"  in domain {outcome.domains}" if by_domains else ""

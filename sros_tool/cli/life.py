@@ -586,8 +586,8 @@ def rotate_ca(
         )
     cannot = "could not" if dry_run else "cannot"
     cut_off = (
-        f"cut off until they have the files of this stage: {', '.join(step.cut_off)}. Robots with "
-        f"these files {cannot} talk to robots without them"
+        "these robots are cut off until they have the files of this stage: "
+        f"{', '.join(step.cut_off)}. Robots with these files {cannot} talk to robots without them"
     )
     is_published = bool(publish_command(root))
     if is_published and step.stage == "retire" and step.replaces_identity:

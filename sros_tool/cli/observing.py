@@ -412,7 +412,7 @@ def generate_policy(
             --from-log talker.log --accept
       added 1 right to 'robot.xml'
         /talker_listener/talker ALLOW publish topic /nope
-      these log lines ask for the rights; a process can print any line:
+      a process can print any line; these log lines ask for the rights:
         talker.log:7: talker-1: publish rt/nope in /talker_listener/talker
 
     On a secured robot, observe in a separate enclave. Create this enclave with `sros
@@ -652,7 +652,7 @@ def _propose(
 
 def _show_lines(lines: Sequence[DenialLine], *, err: bool = False) -> None:
     if lines:
-        echo("these log lines ask for the rights; a process can print any line:", err=err)
+        echo("a process can print any line; these log lines ask for the rights:", err=err)
     for line in lines:
         by = line.process or "a process without a name in the log"
         denial = f"{line.direction} {line.topic} in {line.enclave}"

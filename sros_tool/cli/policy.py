@@ -922,7 +922,9 @@ def _gain_text(sign: str, gain: Gain, growth: Growth) -> str:
         if gain.source:
             text += f"  ({gain.source})"
         if gain.right.enclave not in gain.enclaves:
-            text += f" by the permissions of {gain.right.enclave}, which fit its certificate"
+            certificates = "certificate" if len(gain.enclaves) == 1 else "certificates"
+            text += f" (by the permissions of {gain.right.enclave}, which fit the {certificates} "
+            text += f"of {who}, too)"
         if gain.name != gain.right.name:
             text += f": such as {gain.name}"
     if gain.denied:

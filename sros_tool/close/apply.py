@@ -153,8 +153,8 @@ def undo(robot: LocalRobot, *, dry_run: bool) -> CloseState:
     if inactive := [unit for unit, state in not_running.items() if state == "inactive"]:
         start = shlex.join(["systemctl", "start", *inactive])
         robot.shell.say(
-            f"{enumerated(inactive)} did not run, and --undo starts no stopped unit; to "
-            f"start open: {start}"
+            f"{enumerated(inactive)} did not run, and --undo starts no stopped unit; to start "
+            f"{'it' if len(inactive) == 1 else 'them'} open: {start}"
         )
     # Open processes of Fast DDS find each other also if they start together.
     restarts = [["restart", *sorted(units)]] if units else []
@@ -371,7 +371,7 @@ def _drop_ins_of(robot: LocalRobot, observed: ObservedProcesses) -> list[Path]:
             raise SrosError(
                 f"'{path}' is not the drop-in of this folder",
                 "Its first line names another folder, or was edited. sros changed nothing.",
-                "Write the folder exactly as its first line names it, or remove the drop-in.",
+                "Name the folder exactly as the first line does, or remove the drop-in.",
             )
     return drop_ins
 

@@ -471,8 +471,8 @@ def _user_problems(robot: LocalRobot, observed: ObservedProcesses) -> Iterator[s
     for user in sorted({process.user for process in observed.processes}):
         if user == SEVERAL_USERS:
             yield (
-                "a process runs as several users, such as a set-user-ID program, and only one user "
-                "can read the enclaves: start it as one user"
+                "a process, such as a set-user-ID program, runs as several users, and only one "
+                "user can read the enclaves: start it as one user"
             )
             continue
         barred = [path for path in export.parents if not _may_enter(user, path.stat())]
@@ -518,7 +518,7 @@ def _unknown_process_problems(running: RunningRobot, state: CloseState) -> Itera
         processes = first_few(observed.unknown, MOST_NAMES)
         advice = f"watch again while {runs}: {close} --for 1m"
         if observed.elsewhere:
-            advice += "; if sros still sees no node, first add the node's name to the command of "
+            advice += "; if sros still sees no node, add the node's name to the command of "
             advice += f"each process ({_REMAP})"
         if state.secured:
             advice = _start_of_unknown_process(running, state)

@@ -342,7 +342,8 @@ def follow_reach(
     if of_keystore and (holders := _enclaves_with_fitting_permissions(source, enclave)):
         text = (
             f"on Cyclone DDS, whoever has the key of {enclave} can also use the permissions of "
-            f"{first_few(holders, 3)}, which fit its certificate: this is not followed."
+            f"{first_few(holders, 3)}, which fit the certificate of {enclave}, too: this is not "
+            "followed."
         )
         notes.append(Note("explain.fitting-permissions", text))
     if source.routers and enclave not in source.routers:

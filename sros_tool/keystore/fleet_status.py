@@ -1708,8 +1708,8 @@ def fleet_metrics(
         ),
         Metric(
             "sros_fleet_agent_problems",
-            "For robots that report problems: number of problems, without changed files that the "
-            "robot's agent has replaced.",
+            "For robots that report problems: number of problems, not counting changed files that "
+            "the robot's agent has replaced.",
             per_robot(
                 lambda robot: (
                     None

@@ -134,7 +134,7 @@ def check_name(name: Parts, path: Parts, *, several: bool) -> None:
                     f"{placeholder} stands for several names, but only one can be here."
                 )
         elif not of_path:
-            suggestion = f" For a name for each robot, write {placeholder._replace(plural=True)}."
+            suggestion = f" For the names of all robots, write {placeholder._replace(plural=True)}."
             raise ValueError(
                 f"{placeholder} stands for one robot, but the enclave's path does not say which "
                 f"one.{suggestion if several else ''}"

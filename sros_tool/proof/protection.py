@@ -398,7 +398,7 @@ def _looser_router_moves(
                 crossing = _crossing_text(_crossing_of_both(before, old_router, old_place))
                 yield _looser_change(
                     f"router of {enclave}",
-                    f"{old_router}, which passes on {crossing}",
+                    f"{old_router}, passing on {crossing}",
                     new_router,
                     f"{name} may pass between this enclave and the enclaves of router {old_place}",
                 )

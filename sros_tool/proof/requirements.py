@@ -578,7 +578,7 @@ class _Table:
             if not problem and name[0] not in "/*?[":
                 problem = "An enclave begins with '/'."
             if problem:
-                raise self.error(key, f"{shortened(enclave)} is not an enclave in {key}", problem)
+                raise self.error(key, f"{shortened(enclave)} is not an enclave", problem)
         if all(enclave.startswith(EXCEPT) for enclave in enclaves):
             raise self.error(
                 key,

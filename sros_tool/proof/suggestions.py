@@ -399,7 +399,7 @@ def _with_lists(requirement: Requirement, change: Callable[[Names, str], Names])
 _HEADING = """\
 # Requirements that hold for {of} today, for all names that could ever be used.
 # Keep the requirements that have to hold tomorrow, say why, and delete the others.
-# In a package, leave out the first "/" of names that move with the namespace of the users.
+# In a package, leave out the first "/" of names that its users put into a namespace.
 """
 
 

@@ -60,9 +60,8 @@ def render_page(
     origins = ", ".join(f"{origin.kind} {origin.title}" for origin in picture.origins)
     made = f"{origins}. Findings are as of {iso(now)[:10]}."
     if unread := sum(units.enclaves for units in picture.unread):
-        made += (
-            f" Only compared, and without findings and expiry here: {counted(unread, 'enclave')}."
-        )
+        only = counted(unread, "enclave is", "enclaves are")
+        made += f" {only} only compared, without findings and expiry here."
     return _document(
         f"{picture.title}: who may do what",
         Template(_asset("view.html")).substitute(title=escape(picture.title), made=escape(made)),

@@ -375,14 +375,14 @@ _CYCLONE_START_TEXTS = (
     ),
     _log_text(
         "crl-expired", _CYCLONE, r"Certificate not valid: error: CRL (?:has expired|is not yet)",
-        "the CRL has expired or is not valid yet, so that every participant is refused",
+        "the CRL has expired or is not valid yet, so every participant is refused",
         "Check the clock of the host. If it is right, sign the CRL again: `sros crl KEYSTORE "
         "--refresh`.",
         (Fault.CRL_EXPIRED, Fault.CRL_NOT_YET_VALID),
     ),
     _log_text(
         "crl-unreadable", _CYCLONE, r"Failed to read CRL",
-        "crl.pem is not a CRL, so that every participant is refused",
+        "crl.pem is not a CRL, so every participant is refused",
         "Sign the CRL again: `sros crl KEYSTORE --refresh`.", (Fault.CRL_MALFORMED,),
     ),
     _log_text(

@@ -62,7 +62,7 @@ class ZenohRouter:
     def __str__(self) -> str:
         """Return text like ``/r1/router at r1.local:7447 for /r1/*``."""
         served = f" for {' '.join(self.enclaves)}" if self.enclaves else ""
-        passing = f", which passes on {' '.join(self.crossing)}" if self.crossing else ""
+        passing = f", passing on {' '.join(self.crossing)}" if self.crossing else ""
         return f"{self.name} at {' '.join(self.endpoints)}{served}{passing}"
 
     def listening(self) -> tuple[str, ...]:

@@ -64,7 +64,7 @@ def test_a_mended_release_has_no_known_vulnerability() -> None:
     (finding,) = vulnerability_findings(running(library))
     assert finding.id == "runtime.vulnerabilities-unclear"
     assert finding.text.endswith(
-        "These advisories do not mention the release line: CVE-2024-30258, CVE-2024-30259"
+        "Advisories that do not mention this release line: CVE-2024-30258, CVE-2024-30259"
     )
     (finding,) = vulnerability_findings(running(library._replace(version="3.2.4")))
     assert finding.id == "runtime.known-vulnerabilities"

@@ -559,7 +559,7 @@ def test_a_robot_is_closed_proved_and_opened_again(
     failed = "talker.service has failed: start it open with `systemctl start talker.service`, or"
     assert failed in robot.close("--undo", status=1).out
     (robot.folder / "talker.service").write_text("inactive\n")
-    stays = "did not run, and --undo starts no stopped unit; to start open: systemctl start talk"
+    stays = "did not run, and --undo starts no stopped unit; to start it open: systemctl start talk"
     assert stays in robot.close("--undo").err
     assert {*robot.restarts[5:]} == {"daemon-reload"}
     (robot.folder / "systemctl.log").write_text("before\n" * 5)
@@ -1280,7 +1280,7 @@ def test_processes_that_show_no_id_are_to_be_named(robot: Robot) -> None:
     )
     said = robot.close(status=1).out
     assert "; watch again while they run: sros close" in said
-    assert "first add the node's name to the command of each process (--ros-args" in said
+    assert "add the node's name to the command of each process (--ros-args" in said
     assert "for nodes of /left, /right. If they run on another machine" in said
     assert "from 'robot/policy.xml', and remove 'robot/requirements.toml', which sros then" in said
 

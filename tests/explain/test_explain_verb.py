@@ -638,7 +638,9 @@ def test_permissions_of_another_enclave_that_fit_are_said(tmp_path: Path) -> Non
             fits = (template, vendor) == ("sros2", "cyclonedds")
             words = ("publish", "/cmd_vel", "--vendor", vendor)
             who = explain(keystore, "--who", *words).ok().out.splitlines()
-            line = "/mux  with the permissions of /robot/mux, which fit its certificate"
+            line = (
+                "/mux  with the permissions of /robot/mux, which fit the certificate of /mux, too"
+            )
             assert who[:-1] == [line] * fits + ["/robot/mux"]
             assert who[-1].endswith(
                 "; 1 more may do so with the permissions of another enclave" if fits else "/cmd_vel"

@@ -180,6 +180,7 @@ def test_vendors_that_refuse_a_permissions_ca_are_named(
     if not takes:
         return
     assert ("portable.ca-purpose" in ended.err) == bool(words)
+    assert {vendor for vendor in TESTED if vendor.title in ended.err} == {*TESTED} - takes
     sros("create_enclave", root, "/a").ok()
     for vendor in TESTED:
         asked = sros("explain", root, "/a", "join", "--vendor", vendor)

@@ -70,7 +70,7 @@ def without_settings(keystore: Path, _: Path) -> None:
         (
             settings('enclaves = ["/r1/*"]', 'enclaves = ["/r1/router"]'),
             1,
-            "router of /r1/base /r1/router, which passes on /fleet/* -> /router: /",
+            "router of /r1/base /r1/router, passing on /fleet/* -> /router: /",
         ),
         (
             settings('enclaves = ["/r1/*"]', 'enclaves = ["/r1/*"]\ncrossing = ["/fleet/state"]'),
@@ -177,7 +177,7 @@ crossing = ["/fleet/*"]
         (FLEET, 0, ""),
         (FLEET.replace("/fleet/*", "/fleet/state"), 0, "- more protection: crossing of router"),
         (FLEET.replace("/fleet/*", "/r1/*"), 1, "crossing of router /r1/router /fleet/* -> /r1/*"),
-        ("[robots.r1]\n", 1, "router of /r1/base /r1/router, which passes on /fleet/* -> /router"),
+        ("[robots.r1]\n", 1, "router of /r1/base /r1/router, passing on /fleet/* -> /router"),
     ],
 )
 def test_what_crosses_by_a_fleet_file_is_compared(

@@ -140,7 +140,7 @@ def test_the_verb_says_what_was_only_compared(large: Path) -> None:
     assert "were only compared" in ended.out
     page = sros("view", large).ok().out
     assert said in page
-    assert "Only compared, and without findings and expiry here: 15 enclaves." in page
+    assert "15 enclaves are only compared, without findings and expiry here." in page
     assert '"unread":15' in page  # the headline says where no error was found
     assert '"/a4/nav"' not in page
     wanted = sros("view", large, "--robot", "a4").ok().out

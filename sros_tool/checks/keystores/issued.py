@@ -175,7 +175,7 @@ REMOVED = FindingKind(
     "keystore.enclave-removed",
     NOTE,
     "an enclave that was removed from the keystore, and not revoked",
-    "Whoever kept its files, such as a robot or a backup, has its rights until they expire.",
+    "Whoever has its files, as from a robot or a backup, has its rights until the files expire.",
     "sros: ledger.jsonl has the certificate, and no revocation of it.",
     "Restore the enclave's folder from a backup. Or create the enclave again with `sros "
     "create_enclave KEYSTORE ENCLAVE`, and run `sros revoke KEYSTORE ENCLAVE`, which revokes "

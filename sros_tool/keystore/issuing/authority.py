@@ -408,9 +408,8 @@ def _refusal_notes(
             "portable.ca-purpose",
             f"{fault}: Fast DDS 2.9.1 and Cyclone DDS 0.10.2 refuse all documents that the CA "
             "signs "
-            '("unsuitable certificate purpose"), and only Fast DDS 2.14 accepts them. Issue '
-            "the CA's certificate again with keyUsage digitalSignature and without "
-            "extendedKeyUsage, unless all robots run Fast DDS 2.14.",
+            '("unsuitable certificate purpose"). If a robot runs one of these, issue the '
+            "CA's certificate again with keyUsage digitalSignature and without extendedKeyUsage.",
         )
     for certificate in chain:
         key, name = certificate.public_key(), subject_text(certificate.subject)

@@ -574,7 +574,7 @@ class _Rotator:
             return
         if not (is_here or elsewhere):
             text = f"{key} is missing; until the stage retire, `sros revoke` needs it at "
-            text += f"'{place}', or the option --until-retired"
+            text += f"'{place}'; without the key, add --until-retired"
         elif self._delete:
             text = f"--delete-old-key deletes {key}"
             text += "; until the stage retire, `sros revoke` needs --until-retired" * revokes
