@@ -48,7 +48,7 @@ KindOfName = Annotated[str, Words((*RIGHTS, "dds"))]
 RIGHT_ORDER = {right: number for number, right in enumerate(KIND_OF)}
 """Right → position in lists: publish, subscribe, request, reply, call, execute."""
 
-ACTION_RIGHT = {"request": "call", "reply": "execute"}
+_ACTION_RIGHT = {"request": "call", "reply": "execute"}
 """Right to use or offer a service → the same right to a whole action."""
 
 
@@ -195,10 +195,13 @@ def join_actions(rights: Iterable[Right]) -> frozenset[Right]:
     remaining = set(split_actions(rights))
     actions = [
         Right(
-            right.enclave, right.qualifier, ACTION_RIGHT[right.right], right.name.removesuffix(GOAL)
+            right.enclave,
+            right.qualifier,
+            _ACTION_RIGHT[right.right],
+            right.name.removesuffix(GOAL),
         )
         for right in remaining
-        if right.right in ACTION_RIGHT and right.name.endswith(GOAL) and right.name.startswith("/")
+        if right.right in _ACTION_RIGHT and right.name.endswith(GOAL) and right.name.startswith("/")
     ]
     complete = [right for right in actions if right.name and remaining.issuperset(parts(right))]
     for right in complete:
