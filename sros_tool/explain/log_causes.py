@@ -565,10 +565,16 @@ class Examiner:
                     "machine), ask the whole keystore: `sros explain KEYSTORE --log LOG`. "
                     f"{_otherwise(remedy)}"
                 )
+            compare = "compare the node's command with"
+            if self._closed_commands():
+                return facts, (
+                    f"Probably the node lacks a remapping, or has a wrong one: {compare} "
+                    f"start/commands.txt of the robot's folder.{renamed or new_name} "
+                    f"{_otherwise(remedy)}"
+                )
             return facts, (
-                "Probably the node lacks a remapping, or has a wrong one: compare its start "
-                "command with the command in the robot's launch files (after `sros close`: "
-                f"start/commands.txt).{renamed or new_name} {_otherwise(remedy)}"
+                f"{remedy} If the node lacks a remapping, or has a wrong one: {compare} the "
+                f"robot's launch files.{renamed or new_name}"
             )
         if renamed and is_used:  # its peers may mean the new name, or the old one
             return only, f"{remedy}{renamed}{new_name}"
@@ -579,14 +585,17 @@ class Examiner:
 
         ``nodes`` are the full names of the nodes of the enclave.
         """
-        root = Path(self._root)
-        commands = enclaves_of_closed_robot(root).commands if self._root else {}
+        commands = self._closed_commands()
         places = [node.rpartition("/") for node in nodes or ("/",)]
         return [
             f"`-r {of_node}{':' * bool(of_node)}{old}:={new}`"
             for of_node, old, new in remapping_rules(commands.get(enclave, ()))
             if any(name in (old, expand(old, ns or "/", node)) for ns, _, node in places)
         ]
+
+    def _closed_commands(self) -> Mapping[str, Sequence[str]]:
+        """Map enclaves to the commands that `sros close` remembers, if the folder is of it."""
+        return enclaves_of_closed_robot(Path(self._root)).commands if self._root else {}
 
     def _misspelled_in_policy(self, denied: Right, named: Iterable[Right]) -> str:
         """Return an allowed name that is similar to the denied name, and no peer may use; or ""."""
@@ -717,8 +726,8 @@ class Examiner:
 def _remapping_advice(name: str, meant: str) -> str:
     """Return what to change in a command that remaps to ``name`` in place of ``meant``."""
     return (
-        f"If its command already has `-r OLD:={quote(name)}` (or a parameter with this name), "
-        f"write {meant} in place of {name} there: ROS applies only one rule to a name."
+        f"If its command already sets the name by `-r OLD:={quote(name)}` or a parameter, write "
+        f"{meant} there instead: ROS applies only one rule to a name."
     )
 
 

@@ -1414,15 +1414,15 @@ def test_the_other_side_of_a_name_tells_whether_a_remapping_may_be_forgotten(
     for topic, facts in (
         (
             "/rear/image",
-            (rear, "has `-r OLD:=/rear/image` (or a parameter with this name), write "),
+            (rear, "sets the name by `-r OLD:=/rear/image` or a parameter, write "),
         ),
         ("/map_a", ("If `-r OLD:=/map_a` or a parameter gives the node this name, remove it",)),
         (
             "/frnt/image",
             (
                 "-r /frnt/image:=/front/image",
-                "already has `-r OLD:=/frnt/image` (or a parameter with this name), write "
-                "/front/image in place of /frnt/image there: ROS applies only one rule to a name.",
+                "already sets the name by `-r OLD:=/frnt/image` or a parameter, write /front/image "
+                "there instead: ROS applies only one rule to a name.",
                 "lacks this remapping, merge the policy with `--remap /front/image:=/frnt/image`.",
             ),
         ),
@@ -1430,14 +1430,15 @@ def test_the_other_side_of_a_name_tells_whether_a_remapping_may_be_forgotten(
             "/odometry",
             (
                 "no enclave of the keystore may publish /odometry\n",
-                "Probably the node lacks a remapping, or has a wrong one: compare its ",
-                "Or, if the policy is for another version of the node, use the policy of",
+                "  remedy    If the policy is for another version of the node, use the policy of",
+                "If the node lacks a remapping, or has a wrong one: compare the node's command "
+                "with the robot's launch files. If `-r OLD:=/odometry`",
             ),
         ),
     ):
         log.write_text(f"rt{topic} topic not found in allow rule. check_create_datareader\n")
         found = sros("explain", keystore, "/weed", "--log", log).out
-        for fact in ("-r /frnt/image:=", "no enclave ", "Probably the node lacks"):
+        for fact in ("-r /frnt/image:=", "no enclave ", "lacks a remapping, or"):
             assert (fact in found) is any(fact in each for each in facts), (topic, found)
         assert all(fact in found for fact in facts) and "subscribe" in found
         assert ("-r /rear/image:=/front/image" in found) is (rear in facts)
@@ -1460,13 +1461,18 @@ def test_the_other_side_of_a_name_tells_whether_a_remapping_may_be_forgotten(
     found = sros("explain", export, "--log", log, "/weed").out
     assert "no enclave of the export may publish /odometry\n" in found
     assert "ask the whole keystore: `sros explain KEYSTORE --log LOG`. Or, if the policy" in found
-    assert "Probably the node lacks a remapping" in found and "therwise, If" not in found
+    assert "If the node lacks a remapping, or has" in found and "therwise, If" not in found
     command = ["weed", "--ros-args", "-r", "odometry:=front/image"]
     listed = {"processes": [{"enclave": "/weed", "command": command}], "not_here": []}
     (tmp_path / "processes.json").write_text(json.dumps(listed))
     found = sros("explain", export, "--log", log, "/weed").out
     assert "had `-r odometry:=front/image` in its command when sros watched it\n" in found
     assert "Start the process by its command in start/commands.txt of" in found
+    listed["processes"] = [{"enclave": "/weed", "command": ["weed"]}]
+    (tmp_path / "processes.json").write_text(json.dumps(listed))
+    found = sros("explain", export, "--log", log, "/weed").out
+    assert "Probably the node lacks a remapping, or has a wrong one: compare the node's" in found
+    assert "with start/commands.txt of the robot's folder." in found
     (tmp_path / "processes.json").unlink()
     (keystore / "enclaves/camera/permissions.p7s").write_text("damaged")
     found = sros("explain", keystore, "/weed", "--log", log).out
