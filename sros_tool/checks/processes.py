@@ -98,8 +98,8 @@ PROCESS_REVOKED = FindingKind(
     "runtime.process-revoked",
     ERROR,
     "a process of a revoked enclave",
-    "The process keeps its certificate until it ends. Processes that started before the "
-    "revocation list changed still communicate with it.",
+    "A running process keeps its certificate. Processes that started before the revocation list "
+    "changed still communicate with this process.",
     "Fast DDS 2.14.5, Cyclone DDS 0.10.2 (they read the files when they start).",
     "Stop the process, and restart all processes that started before the revocation.",
 )

@@ -279,7 +279,7 @@ def generate_artifacts(
             "Give -p FILE... .",
         )
     if robots and not fleet_file:
-        raise UsageError("--robot needs the fleet of the policies", "", "Give --fleet FILE.")
+        raise UsageError("--robot needs --fleet", "", "Add --fleet FILE.")
     if fleet_file:
         policies: list[Policy | FleetPolicy] = [*fleet_policies(policy_files, fleet_file, robots)]
     else:

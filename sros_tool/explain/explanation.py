@@ -423,7 +423,7 @@ def remapping_clause(name: str, meant: str) -> str:
     """Return why a node may use ``name`` in place of ``meant``, the policy's name, as a clause."""
     return (
         f"the node may lack the remapping -r {name}:={meant}, or the policy may lack "
-        f"--remap {meant}:={name}, or a remapping or parameter gives the node the wrong name {name}"
+        f"--remap {meant}:={name}, or a remapping or parameter makes the node use the wrong {name}"
     )
 
 

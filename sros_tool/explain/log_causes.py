@@ -528,9 +528,9 @@ class Examiner:
         rule = Remapping("", name, meant)
         add, renamed, only = f", add `--ros-args -r {quote(str(rule))}`.", "", list[str]()
         new_name = (
-            f" If `-r OLD:={quote(name)}` or a parameter gives the node this name, remove it from "
-            "the node's command, or give the name to the policy: `sros merge_policy POLICY OTHER "
-            f"--remap OLD:={quote(name)}`."
+            f" If `-r OLD:={quote(name)}` or a parameter makes the node use this name, remove it "
+            "from the node's command, or give the name to the policy: `sros merge_policy POLICY "
+            f"OTHER --remap OLD:={quote(name)}`."
         )
         if question.type == "action" and (not is_used or len(own) == 1):
             add = f": {renamed_action_text(rule)}"

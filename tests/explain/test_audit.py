@@ -88,7 +88,7 @@ def lacks(used: str, allowed: str) -> str:
     node = f"the node may lack the remapping -r {used}:={allowed}"
     return (
         f"; perhaps the policy means {allowed} ({node}, or the policy may lack "
-        f"--remap {allowed}:={used}, or a remapping or parameter gives the node the wrong name "
+        f"--remap {allowed}:={used}, or a remapping or parameter makes the node use the wrong "
         f"{used})"
     )
 

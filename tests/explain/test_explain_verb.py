@@ -772,7 +772,7 @@ def test_a_change_is_for_the_node_that_the_permissions_are_for(whole: Path) -> N
     assert f"note [explain.likely-name]: the enclave may serve {own}" in meant.err
     assert "may publish /chatter: " in explain(whole, ENCLAVE, "publish", "/chater").err
     rules = "-r /front/chatter:=/chatter, or the policy may lack --remap /chatter:=/front/chatter, "
-    rules += "or a remapping or parameter gives the node the wrong name /front/chatter)."
+    rules += "or a remapping or parameter makes the node use the wrong /front/chatter)."
     assert rules in explain(whole, ENCLAVE, "publish", "/front/chatter").err
     assert "may publish /chatter: " in explain(whole, "--who", "publish", "/chater").err
     assert "may publish /chatter: " in explain(whole, ENCLAVE, "publish", "/chattre").err

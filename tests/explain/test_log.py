@@ -1416,7 +1416,7 @@ def test_the_other_side_of_a_name_tells_whether_a_remapping_may_be_forgotten(
             "/rear/image",
             (rear, "sets the name by `-r OLD:=/rear/image` or a parameter, write "),
         ),
-        ("/map_a", ("If `-r OLD:=/map_a` or a parameter gives the node this name, remove it",)),
+        ("/map_a", ("If `-r OLD:=/map_a` or a parameter makes the node use this name, remove it",)),
         (
             "/frnt/image",
             (

@@ -91,8 +91,8 @@ SHARED_NODE = FindingKind(
     "these enclaves can remove or imitate the node of another enclave. The topics and services "
     "of that node are then not found, although its data still arrive.",
     "rmw_zenoh (graph_cache.cpp); sros (docs/zenoh.md).",
-    "Name each node in the policy of one enclave. If a wildcard gives an enclave the services of "
-    "all nodes, deny the services of other enclaves' nodes, such as `/camera/*`.",
+    "In the policy, name each node in only one enclave. If a wildcard gives an enclave the "
+    "services of all nodes, deny the services of other enclaves' nodes, such as `/camera/*`.",
 )
 _RENEW_REMEDY = (
     "Renew the enclave with `sros renew KEYSTORE ENCLAVE`, or revoke it if nobody needs it."
