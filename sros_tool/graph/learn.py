@@ -1013,7 +1013,7 @@ def merge_policies(
         check_enclave_name(enclave)
         additions = [policy_in_enclave(addition, enclave) for addition in additions]
     merged = merge_all(path, additions)
-    notes += (*merged.notes, *counterpart_notes((present, *stated), merged.rights))
+    notes += (*merged.notes, *counterpart_notes(present, stated, merged.rights))
     document = merged.document
     if merged.added and may_include:
         document = _with_common_parts(path, document, additions)

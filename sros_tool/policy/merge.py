@@ -240,17 +240,25 @@ def merge_notes(contradictions: Sequence[Contradiction]) -> tuple[Note, ...]:
     return tuple(notes)
 
 
-def counterpart_notes(policies: Iterable[Policy], merged: Collection[Right]) -> Iterator[Note]:
-    """Yield a note on ``merged`` rights that lost their counterpart in one of ``policies``.
+def counterpart_notes(
+    before: Policy, additions: Iterable[Policy], merged: Collection[Right]
+) -> Iterator[Note]:
+    """Yield notes on ``merged`` rights whose counterpart ``before`` or ``additions`` have.
 
-    The counterpart of a right to subscribe is a right to publish, for instance.  The cause is a
-    DENY of another policy that denies the counterpart, or another name in the other policy.
+    The counterpart of a right to subscribe is a right to publish, for instance.  It is gone because
+    of a DENY of another policy, or because ``additions`` are merged under other names.
     """
-    lost: set[Right] = set()
-    for rights in map(policy_rights, policies):
-        lost.update(rights_without_counterpart(rights, merged, compare(rights, merged)))
-    if lost:
-        yield Note("merge.no-counterpart", lost_counterparts_text(lost))
+    gone, missing = (
+        {
+            right
+            for rights in map(policy_rights, policies)
+            for right in rights_without_counterpart(rights, merged, compare(rights, merged))
+        }
+        for policies in ((before,), additions)
+    )
+    for lost, when in ((gone, "any more"), (missing - gone, "in the result of this merge")):
+        if lost:
+            yield Note("merge.no-counterpart", lost_counterparts_text(lost, when))
 
 
 _MARKUP = re.compile(

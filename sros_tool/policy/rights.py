@@ -625,16 +625,16 @@ def _name_or_wildcard(name: str) -> str:
     return "*" if is_expression(name) else name.partition(ACTION_SEPARATOR)[0]
 
 
-def lost_counterpart_text(right: Right) -> str:
-    """Return a clause on a right that lost its counterpart."""
+def lost_counterpart_text(right: Right, when: str = "any more") -> str:
+    """Return a clause on a right without a counterpart; ``when`` ends it."""
     other = PEER_RIGHT[right.right]
     other = {"reply": "serve", "subscribe": "subscribe to"}.get(other, other)
-    return f"{right.enclave} may {right.right} {right.name}, but no enclave may {other} it any more"
+    return f"{right.enclave} may {right.right} {right.name}, but no enclave may {other} it {when}"
 
 
-def lost_counterparts_text(rights: Iterable[Right]) -> str:
-    """Return a sentence on some rights that lost their counterpart."""
-    clauses = list(map(lost_counterpart_text, sorted(rights)))
+def lost_counterparts_text(rights: Iterable[Right], when: str = "any more") -> str:
+    """Return a sentence on some rights without a counterpart; ``when`` ends each clause."""
+    clauses = [lost_counterpart_text(right, when) for right in sorted(rights)]
     return f"{first_few(clauses, _MOST_SHOWN, '; ', ', and ')}."
 
 
