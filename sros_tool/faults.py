@@ -380,7 +380,7 @@ class Fault(Enum):
     )
     CA_CRASH = (
         "ca-crash",
-        "a CA file that crashes a vendor",
+        "a CA file that crashes Fast DDS",
         "If the first certificate of a CA file is not signed with SHA-256, Fast DDS (except 2.9.1) "
         "uses memory that it has already freed.",
         "Fast DDS 2.6 to 3.6 (FileProvider.cpp); tested.",
@@ -388,7 +388,7 @@ class Fault(Enum):
     )
     CERTIFICATE_CRASH = (
         "certificate-crash",
-        "a certificate that crashes a vendor",
+        "a certificate that crashes Fast DDS",
         "Fast DDS crashes on a certificate with an empty subject, even on the certificate of a "
         "peer that is not verified yet.",
         "Fast DDS 2.6 to 3.6 (PKIDH.cpp); tested.",

@@ -374,7 +374,7 @@ def _fetch_error(error: Exception, source: str, now: datetime) -> FetchError:
         f"{why} Probably a published file was damaged or altered. This robot keeps its files.",
         "On the keystore machine, run `sros fleet publish KEYSTORE PUB`, which publishes altered "
         "files again; if robots fetch from a copy of PUB, copy it again. If the keystore was "
-        "restored or made again, its keys for publishing may be others: see "
+        "restored or made again, it may publish with other keys: see "
         "docs/howto/keystore_is_lost.md (--rotate-key; or `sros agent init` with --force and the "
         "new root.json).",
     )

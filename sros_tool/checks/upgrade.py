@@ -68,7 +68,7 @@ NO_NODE = FindingKind(
 BUFFERS = FindingKind(
     "upgrade.zenoh-buffers",
     WARNING,
-    "Zenoh files that lack the Zenoh keys (names) by which rmw_zenoh sends images after the update",
+    "Zenoh files that lack the Zenoh keys (names) on which rmw_zenoh sends images after the update",
     "rmw_zenoh of Lyrical sends messages with arrays of bytes, such as images and point clouds, "
     "on Zenoh keys (names) below the key of the topic. With files of an earlier sros, Zenoh "
     "drops these messages without a log line.",

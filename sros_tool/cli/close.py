@@ -408,7 +408,7 @@ def _show_end(
         is_asked = all(proof.holds for proof in closed.proofs)
         exceptions = "" if is_asked else ", except for the claims that were not checked"
         if missing := [name for name in closed.without if name not in closed.secured]:
-            exceptions += f", without a process of {', '.join(missing)}"
+            exceptions += f"; no process of {', '.join(missing)} runs"
         answer, details = f"the robot is closed{exceptions}", _validity_lines(robot, closed)
         if robot.keystore.exists():
             details.append(f"bring {folder}/keystore, which has the CA keys, to another machine")

@@ -274,7 +274,7 @@ def diff_policy(
     who put the node into another namespace. The exit status is 2 if sros cannot decide this. sros
     assumes that a policy is signed with a governance that controls all access. If A is a policy,
     and B is a keystore that protects less than the template production, this counts as more access.
-    If A is a keystore, and B is a policy, B never counts as less protection. The last line says
+    If A is a keystore, and B is a policy, B never counts as protecting less. The last line says
     what is assumed and what is left out, such as dates. Here, "!" marks a DENY of A that B lacks,
     for names that B does not allow. If only a DENY is missing, nobody gets access, so the exit
     status is 0, but `sros review` fails.

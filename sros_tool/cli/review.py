@@ -63,7 +63,7 @@ _TITLES = {
 """Kind of step → title, the most important first: code hosts cut a long comment at its end."""
 _ALLOWED_BY = {
     "requirements-before": "option --dropped-requirements allow",
-    "signed": "review: whoever changes a policy seldom has the keys of the CAs",
+    "signed": "review, because whoever changes a policy seldom has the keys of the CAs",
 }
 """Kind of step → the option that allows its findings; ``--new-access allow`` for other kinds."""
 
@@ -228,9 +228,9 @@ def review(
 ) -> int:
     r"""Review a change of policies, requirements and keystores, as in a pull request.
 
-    Checks the policies and keystores of the commit HEAD, decides whether the requirements of HEAD
-    and the requirements that HEAD drops hold, and compares all access with the commit BASE. PATHs
-    are relative to the top of the repository.
+    Checks the policies and keystores of the commit HEAD, decides whether the requirements hold,
+    including those that HEAD drops, and compares all access with the commit BASE. PATHs are
+    relative to the top of the repository.
 
     Both commits are read from git itself: nothing is checked out, and files of the work tree are
     read only to report that they differ from HEAD. No link in a commit is followed, and no program

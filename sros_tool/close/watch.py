@@ -189,8 +189,9 @@ def _text_on_nodes_without_enclave(robot: LocalRobot, names: Sequence[str]) -> s
     """Return a sentence that names the nodes which the graph shows without an enclave."""
     return (
         f"the identifiers of these nodes belong to secured processes: "
-        f"{first_few(names, MOST_NAMES)}. '{robot.policy}' has no rights for these nodes. Start "
-        f"the nodes that belong to the robot open, and watch again: {robot.close_command} --for 1m"
+        f"{first_few(names, MOST_NAMES)}. '{robot.policy}' has no rights for these nodes. If "
+        "they belong to the robot, start them open, and watch again: "
+        f"{robot.close_command} --for 1m"
     )
 
 

@@ -280,7 +280,7 @@ class _Enclaves(NamedTuple):
             yield f"{first_few(sorted(self.without_list), 1)} without the newest revocation list"
         if self.other_governance:
             names = first_few(sorted(self.other_governance), 1)
-            yield f"{names} whose governance differs from the other enclaves'"
+            yield f"{names} with another governance than the other enclaves"
         if self.other_domain:
             yield f"{first_few(sorted(self.other_domain), 1)} outside domain {self.domain}"
 

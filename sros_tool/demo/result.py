@@ -410,7 +410,7 @@ def _judge_view(case: _ClaimRecords) -> _ClaimFinding:
         e for e in observer.events if e.kind is EventKind.SEEN and _is_in_window(e, case.record)
     ]
     if not looks:
-        return _undecided_finding(f"{claim.subject} did not count during the observation")
+        return _undecided_finding(f"{claim.subject} made no poll during the observation")
     most = max(event.publishers.get(topic, 0) for event in looks)
     seen = f"{counted(most, 'server' if serves else 'publisher')} on {topic}"
     return case.result(
@@ -429,7 +429,7 @@ def _judge_loss(case: _ClaimRecords) -> _ClaimFinding:
     # Only inside the window, because the talker ends after it.
     inside = [event for event in looks if _is_in_window(event, case.record)]
     if not inside:
-        return _undecided_finding(f"{claim.subject} did not count during the observation")
+        return _undecided_finding(f"{claim.subject} made no poll during the observation")
     left = inside[-1].publishers.get(topic, 0)
     detail = (
         f"{case.subject.library} counts {counted(most, 'publisher')} on {topic}, and {left} after "

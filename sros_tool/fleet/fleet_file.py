@@ -532,7 +532,7 @@ class _Inventory:
         own = self._own[host]
         if unclear := sorted(self._unclear[host] - own.keys()):
             raise self._error(
-                f"the host {host!r} gets {unclear[0]} from two groups that differ",
+                f"the host {host!r} gets {unclear[0]} from two groups, with different values",
                 "",
                 "Set it for the host.",
             )

@@ -502,8 +502,9 @@ class ReceivedConfirmation:
             "sros knows the files of only one of the two computers. Give the robot new keys, and "
             "revoke the earlier keys (docs/howto/one_robot.md: Same name, new hardware)."
         ) + was_restored * (
-            " Because the keystore was restored from a backup, this problem is shown even after "
-            f"new keys, until a message comes after {iso(alternated + _ALTERNATED_SHOWN)}."
+            " Because the keystore was restored from a backup, this problem is shown, even if the "
+            "robot has new keys, until a message comes after "
+            f"{iso(alternated + _ALTERNATED_SHOWN)}."
         )
 
     def clock_note(self) -> str:
@@ -674,8 +675,7 @@ def refusals(keystore: OpenedKeystore) -> dict[str, RefusedMessage]:
     except (SrosError, ValueError, TypeError, KeyError, AttributeError) as error:
         raise DocumentError(
             f"'{path}' is damaged",
-            "It lists the robots whose last message was refused, so sros does not know what these "
-            "robots have.",
+            "So sros does not know from which robots the last message was refused.",
             "Remove it, and run `sros fleet collect`, which writes it again.",
         ) from error
 

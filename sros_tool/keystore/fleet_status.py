@@ -1658,8 +1658,8 @@ def fleet_metrics(
         ),
         Metric(
             "sros_fleet_expiry_timestamp_seconds",
-            "For each kind of file: when the first file that a robot confirmed expires, as the "
-            "ledger says, in seconds since 1970.",
+            "For each kind of file: the earliest expiry of the files that a robot confirmed, as "
+            "the ledger says, in seconds since 1970.",
             tuple(
                 Sample(int(end.timestamp()), {**labels, "kind": kind})
                 for labels, robot in robots

@@ -589,8 +589,8 @@ def _left_out_notes(grants: Iterable[Grant]) -> Iterator[Note]:
             yield Note("rights.partitions", "this answer ignores its partitions.")
         if any(rule.relay for rule in grant.rules):
             text = (
-                "this answer ignores its <relay>: by this rule, peers on Fast DDS let a process "
-                "subscribe that does not apply its own permissions."
+                "this answer ignores its <relay>: by this rule, a process that does not apply its "
+                "own permissions can subscribe to peers on Fast DDS."
             )
             yield Note(RELAY, text)
         if len({rule.domains for rule in grant.rules}) > 1:

@@ -342,8 +342,8 @@ def _notes_on_requirements(
     ]
     if split:
         text = (
-            f"the last right to {first_few(split, _MOST_SHOWN)} moves to the new name, but other "
-            "nodes keep the old name, so requirements that name it may protect nothing. If these "
+            f"the remapping leaves no right to {first_few(split, _MOST_SHOWN)}, but other nodes "
+            "keep the old name, so requirements with the old name may protect nothing. If these "
             "nodes are to use the new name, add a --remap for them, too. Otherwise, write both "
             "names into a copy of the requirements."
         )

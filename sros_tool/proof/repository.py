@@ -670,7 +670,7 @@ def _entries(data: bytes, id_length: int) -> dict[str, TreeEntry]:
         name, data = os.fsdecode(raw), rest[id_length:]
         if name in entries or name in ("", ".", "..") or "/" in name or name.lower() == ".git":
             raise DocumentError(
-                f"a folder of the commit has '{name}' twice, or no file can have this name",
+                f"a folder of the commit has '{name}' twice, or '{name}' is no valid file name",
                 "Programs interpret such a folder in different ways.",
             )
         entries[name] = TreeEntry(_mode_on_checkout(mode), rest[:id_length].hex())

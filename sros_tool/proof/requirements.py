@@ -396,9 +396,9 @@ def parse_requirements(
         requirements.append(requirement)
         if len(requirements) > _MOST_FILLED:
             raise DocumentError(
-                f"{table.source}: with the robots of the fleet, or all namespaces, the tables up "
-                f"to this line stand for more than {_MOST_FILLED} requirements",
-                "",
+                f"{table.source}: the tables up to this line stand for more than {_MOST_FILLED} "
+                "requirements",
+                "A table counts once for each namespace, and for each robot that fills it in.",
                 "Name a group of robots, as in {robot:carriers}, or divide the file.",
             )
         pairs_left -= _number_of_pairs(requirement)

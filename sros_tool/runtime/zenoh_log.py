@@ -78,8 +78,8 @@ _LISTENING_TEXTS = (
     _zenoh_text(
         "no-subject", r"(?P<zid>[0-9a-f]{1,32}) did not match any configured ACL subject\. "
         r"Default permission `Deny`",
-        "a PEER is connected, and may do nothing: no rule of this process is for the name in its "
-        "certificate",
+        "a PEER is connected, and may do nothing: no rule of this process is for the name in the "
+        "peer's certificate",
         "`sros zenoh KEYSTORE --check` shows whether the files are up to date; restart the "
         "processes that it names. If the peer is the router, it runs in another enclave than the "
         "router enclave of the keystore.",

@@ -894,7 +894,7 @@ def test_a_node_that_does_not_run_always(robot: Robot) -> None:
         "talk: 1 node with 18 endpoints as before (types are not compared), without /listener\n"
         in ended.out
     )
-    assert "the robot is closed, without a process of /listener\n  the files are" in ended.err
+    assert "the robot is closed; no process of /listener runs\n  the files are" in ended.err
     robot.unseen = (UnseenProcess(9, (), "/proc hides it", uses_ros=False),)
     robot.close(*without, "--accept", "unobserved", status=1)
     ended = robot.close(*without, "--accept", "unexamined")

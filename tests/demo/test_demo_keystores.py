@@ -169,7 +169,7 @@ def test_a_governance_of_an_enclave_alone_is_said_to_be_untried(place: Place) ->
     copy = replace(place.copy(), cast={"talker": place.victim, "listener": place.victim})
     forger.weaker_governance(copy)
     assert opened(place.root).not_tried == (
-        "/odd/victim whose governance differs from the other enclaves'",
+        "/odd/victim with another governance than the other enclaves",
     )
 
 

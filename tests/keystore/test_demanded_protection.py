@@ -57,7 +57,7 @@ def test_an_existing_keystore_gets_a_governance_that_keeps_to_it(folder: Path) -
     ended = sros("check", ks, "--policy", policy, "--include", "governance.less*", cwd=folder)
     assert ended.status == 1
     assert f"{policy.name}:3: error" in ended.out
-    assert "topic /cmd_vel has none, but the policy demands encrypt" in ended.out
+    assert "topic /cmd_vel has the protection none, but the policy demands encrypt" in ended.out
 
     before = snapshot(ks)
     planned = sros("generate_artifacts", "-k", ks, "-p", policy, "--dry-run", cwd=folder).ok()

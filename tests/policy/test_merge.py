@@ -283,9 +283,8 @@ def test_a_name_that_only_one_side_remaps_is_noted(rules: str, split: str) -> No
     )
     _, notes = remapped_policies([driver, driver_of_topic, viewer], rules.split())
     texts = [note.text for note in notes if note.id == "merge.requirements-of-split-names"]
-    assert [text.startswith(f"the last right to {split} moves") for text in texts] == [True] * bool(
-        split
-    )
+    starts = [text.startswith(f"the remapping leaves no right to {split}, but") for text in texts]
+    assert starts == [True] * bool(split)
 
 
 def test_names_that_are_exchanged_are_denied_as_before() -> None:

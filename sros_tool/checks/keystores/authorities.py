@@ -274,7 +274,7 @@ FLEET_EDITED = FindingKind(
 LEFT_ENCLAVES = FindingKind(
     "keystore.left-enclaves",
     NOTE,
-    "enclaves that may be of robots that left the fleet, or left the group of these enclaves",
+    "enclaves of robots that perhaps left the fleet, or the group that has these enclaves",
     "Anyone who has the files of such an enclave has its rights, and `--robot` no longer chooses "
     "the enclave. `sros renew --all-expiring` renews it, because its path is no proof that it "
     "belonged to a robot.",
@@ -285,7 +285,7 @@ LEFT_ENCLAVES = FindingKind(
 ROBOT_LEFT = FindingKind(
     "keystore.robot-left",
     WARNING,
-    "valid enclaves of robots that left the fleet, or left the group of these enclaves",
+    "valid enclaves of robots that left the fleet, or the group that has these enclaves",
     "Other robots still accept these enclaves, although no robot of the fleet has them. `sros "
     "renew --all-expiring` does not renew them.",
     "sros: ledger.jsonl has the enclaves of each robot that left.",
@@ -342,8 +342,8 @@ PUBLICATION_UNSEEN = FindingKind(
     "keystore.publication-unseen",
     WARNING,
     "a last publication that cannot be examined",
-    "If the keystore was restored from a backup, only the publishing folder may show it: the "
-    "keystore may lack revocations.",
+    "If the keystore was restored from a backup, it may lack revocations, and perhaps only the "
+    "publishing folder shows this.",
     "sros: published.json has the folder and the versions of the last publication.",
     "Run `sros fleet status KEYSTORE`, which names the remedy. If the folder belongs on another "
     "machine, add `--exclude keystore.publication-unseen`.",

@@ -118,7 +118,8 @@ SUBJECT = FindingKind(
     "beyond ASCII in their escaped form; Fast DDS 2.6 and 2.9 treat spaces around = as part of the "
     "name.",
     "Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; tested.",
-    "Write the subject in the form of RFC 4514, CN=/name, without , | and quotes in the name.",
+    "Write the subject in the form of RFC 4514, CN=/name, with no comma, vertical bar or quote in "
+    "the name.",
 )
 TIME_FORMAT = FindingKind(
     "portable.time-format",

@@ -256,8 +256,8 @@ PIN_FILE = FindingKind(
     "Anyone who can read the file can use the key while the token is there; a node that cannot "
     "read the file does not start.",
     "RFC 7512, 2.4 and 4; libp11 0.4.12 (eng_parse.c), tested.",
-    "Write only the PIN into the file. Make the user that runs the node its owner, and 0600 its "
-    "mode.",
+    "Write only the PIN into the file. Give the file to the user that runs the node, with mode "
+    "0600.",
 )
 
 _LONG_VALIDITY = timedelta(days=2 * 366)

@@ -343,7 +343,8 @@ def _lower_protection_findings(keystore: CheckedKeystore) -> Iterator[Finding]:
     except SrosError:
         return  # another check reports it
     for protection, level in unfulfilled_protections(governance, stated):
-        text = f"{protection} has {level.lower()}, but the policy demands {protection.word}"
+        text = f"{protection} has the protection {level.lower()}, but the policy demands "
+        text += protection.word
         yield LESS_PROTECTED.found(
             protection.enclave, text, protection.source.file, protection.source.line
         )

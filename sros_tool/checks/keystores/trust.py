@@ -66,7 +66,7 @@ PEERS_ACCEPT = FindingKind(
     "A node with this list still communicates with enclaves that only the other list revokes, for "
     "example with the thief of a key.",
     "RFC 5280, 5.2.3; rmw_dds_common (crl.pem).",
-    "Export the enclaves that have this list again (`sros distribute_key KEYSTORE ENCLAVE "
+    "Export again the enclaves that have this list (`sros distribute_key KEYSTORE ENCLAVE "
     "TARGET --force` in their keystore), bring the files to the robot, and restart the "
     "processes.",
 )

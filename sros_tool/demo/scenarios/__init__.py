@@ -380,7 +380,7 @@ def _check_controls(
             problem = f"{talker.identity.enclave} may not send, so nobody hears it"
             remedy = (
                 f'Claim the refusal: {{ party = "{talker.name}", expected = "refused" }}. '
-                "Add a control that something works."
+                "Add a control, which shows that something works."
             )
         raise table.error("claim", f"{problem}: a crash would look the same", remedy)
 

@@ -688,7 +688,7 @@ _IDENTITY_ROWS: tuple[Row, ...] = (
             _DATES_CHECKED,
         ),
         _successful_injection_row(
-            "the same identity before it expires",
+            "the same identity with the right dates",
             Identity(Undefended(forger.identity_in_date), "talker"),
             "the wrong dates",
         ),

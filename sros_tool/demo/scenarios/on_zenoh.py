@@ -447,7 +447,7 @@ _CONNECTION_ROWS = (
             "TLS checks the dates of the certificate",
             "certificate not valid yet",
         ),
-        _valid_certificate_row("the same identity before it expires", "the wrong dates"),
+        _valid_certificate_row("the same identity with the right dates", "the wrong dates"),
     ),
     *tries(
         "the key of another enclave",

@@ -663,7 +663,9 @@ class _Verifier:
             signed = smime.parse_new(data)
             signer = signed.signer()
             if signer is None or len(signed.signatures) != 1:
-                raise _RefusedError("it is not signed by exactly one certificate that it contains")
+                raise _RefusedError(
+                    "it lacks the signer's certificate, or does not have exactly one signature"
+                )
             signed.verify(signer)
             if weakness := signed.weakness():
                 raise _RefusedError(weakness)

@@ -924,10 +924,10 @@ class _Publication:
             "fleet.revocations-not-shown",
             f"nothing in '{self._folder}' shows what was revoked, or which rights were taken away, "
             f"after {since}: a robot that was stolen after that gets releases, and is trusted. "
-            f"Run `sros fleet collect {where} INBOX` if you have not yet: it revokes again what "
-            "messages of robots show as revoked. Revoke again what else was stolen (`sros revoke "
-            f"{where} --robot NAME`), and sign the present policy (`sros generate_artifacts`). "
-            "Then publish again.",
+            f"Run `sros fleet collect {where} INBOX` if you have not yet: it revokes again "
+            "everything that messages of robots show as revoked. Also revoke again every other "
+            f"stolen robot (`sros revoke {where} --robot NAME`), and sign the present policy "
+            "(`sros generate_artifacts`). Then publish again.",
         )
 
     def _unseen_root_note(self) -> Note:
@@ -1218,10 +1218,10 @@ class _Publication:
             f"has releases of {first_few(robots, _MOST_NAMES)} that the keystore "
             f"'{self.keystore.root}' sealed but does not know (up to the number "
             f"{unknown[-1].number})",
-            f"run `sros fleet collect {where} INBOX`, which revokes again what messages of robots "
-            f"show as revoked. Revoke again what else was revoked (`sros revoke {where} --robot "
-            f"NAME`). Empty '{self._folder / _METADATA}', and add --restored --new-folder to "
-            f"{self._command}: "
+            f"run `sros fleet collect {where} INBOX`, which revokes again everything that messages "
+            "of robots show as revoked. Revoke again what else was revoked (`sros revoke "
+            f"{where} --robot NAME`). Empty '{self._folder / _METADATA}', and add --restored "
+            f"--new-folder to {self._command}: "
             "this also revokes again what these releases revoke. Then renew all certificates, and "
             f"publish again.{end} docs/howto/keystore_is_lost.md has these steps",
         )

@@ -248,7 +248,7 @@ class Keyring:
                 error.why,
                 f"The keystore '{root}' of user {owner} names this key. If the CA may sign for "
                 f"this keystore, set SROS_{role.upper()}_KEY=file:{path}; otherwise, find out who "
-                "changed its settings.",
+                "changed the keystore's settings.",
             ) from error
 
     def _is_from_user(self, role: str) -> bool:
@@ -298,7 +298,7 @@ def check_places(keyring: Keyring, template: Template) -> None:
     if not template.separate_authorities and len({place or "" for place in named.values()}) > 1:
         raise KeystoreError(
             "a keystore with one CA for both roles needs one place for its key",
-            "The command names different places for the identity key and the permissions key.",
+            "The command does not name the same place for the identity and the permissions key.",
             "Name the same place for both, or use --ca-layout separate.",
         )
 
