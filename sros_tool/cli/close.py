@@ -313,7 +313,7 @@ def _process_line(process: ClosedProcess, closed: CloseState, policy: Policy) ->
     """Return the enclave of a process, how sros knows the process, and how it is restarted."""
     restart = "by hand, with its launch file" if process.launch else "by hand"
     restart = "by hand, with Docker Compose" if process.container else restart
-    does = "restarts" if process.pid else "adds a drop-in to"
+    does = "adds a drop-in to" if process.is_idle else "restarts"
     restart = f"--apply {does} {process.unit}" if process.unit else restart
     runs = process.enclave in closed.secured
     if closed.secured.get(process.enclave):

@@ -64,7 +64,7 @@ def apply(robot: LocalRobot, prepared: CloseState, *, dry_run: bool) -> CloseSta
         _remember_new_units(robot, observed)
     unsecured = [process for process in observed.processes if not secured.get(process.enclave)]
     open_units = observed._replace(processes=unsecured).units
-    idle = {process.unit for process in observed.processes if not (process.pid or process.alike)}
+    idle = {process.unit for process in observed.processes if process.is_idle}
     restarts = [
         ["try-restart" if unit in idle else "restart", unit]
         # A Zenoh router comes first: nodes wait for it.
@@ -182,10 +182,7 @@ def undo(robot: LocalRobot, *, dry_run: bool) -> CloseState:
         *remaining.further_secured_processes(),
         *remaining.unknown_processes(),
     ]
-    runs = any(
-        (process.pid or process.alike) and process.enclave not in state.absent
-        for process in state.observed.processes
-    )
+    runs = any(process.pid or process.alike for process in state.observed.processes)
     # Without the list of observed processes, "no process runs" would be a guess.
     if robot.observed and not (dry_run or problems or runs or state.observed.unknown):
         problems = ["no process of the robot runs, open or secured: start its processes open"]

@@ -26,9 +26,11 @@ from sros_tool.runtime.processes import (
     Process,
     ProcessOrigin,
     RunningProcesses,
+    boot_id,
     launch_word_index,
     process_origin,
     program_of,
+    start_of,
     without_launch_files,
 )
 from sros_tool.runtime.rmw import RMW
@@ -89,6 +91,15 @@ class ClosedProcess(NamedTuple):
     """The ids of several processes that fit equally well; sros does not choose one, and `pid` is
     0.
     """
+    started: str = ""
+    """The id of the boot, and the clock ticks from the boot to the start of the process `pid`:
+    after the process ends, another process may get its id. It is empty if sros did not see the
+    start.
+    """
+    absent: bool = False
+    """Whether the process does not run now, although its systemd unit started it when sros
+    watched.
+    """
 
     @classmethod
     def from_process(
@@ -99,7 +110,8 @@ class ClosedProcess(NamedTuple):
         start = enclave, pid, _start_command(process), origin.folder, process.user, origin.unit
         rmw = _rmw_to_start(process)
         chooses = process.environment.get(ENCLAVE) == enclave
-        return cls(*start, known_by, origin.launch, origin.container, rmw, (), chooses)
+        known = cls(*start, known_by, origin.launch, origin.container, rmw, (), chooses)
+        return known._replace(started=start_of(pid))
 
     @property
     def is_router(self) -> bool:
@@ -155,8 +167,7 @@ class ClosedProcess(NamedTuple):
         """Return a copy with the id that the process has now, in its ROS domain and network.
 
         A process that runs in its enclave of the ``export`` is preferred to open ones.  The id
-        stays if the process may run but could not be examined, or if its unit restarts the process.
-        A process that ended while sros watched has no id.
+        stays if the process may run but could not be examined.
         """
         in_domain = [other for other in running.processes if is_in_domain(other, domain)]
         in_enclave = [
@@ -171,24 +182,38 @@ class ClosedProcess(NamedTuple):
                 other.program[0] for other in in_enclave or in_domain if self.fits(other)
             )
         ]
+        is_same = self.pid in pids and self.still_runs
+        may_run = self._may_run_unseen(running)
+        if is_same or (may_run and not pids and not in_enclave):
+            return self._replace(alike=(), absent=False)
         if in_enclave:
-            pids = [self.pid] if self.pid in pids else pids[:1]  # all of them run in the enclave
-        elif self.pid not in pids and len(pids) > 1:
-            pids = [pid for pid in pids if process_origin(pid).folder == self.folder] or pids
-        unseen = {process.pid for process in running.unseen}
-        may_run = (self.unit and self.pid) or running.hidden or self.pid in unseen
-        if self.pid in pids or (may_run and not in_enclave):
-            return self._replace(alike=())
+            pids = pids[:1]  # all of them run in the enclave
+        elif len(pids) > 1:
+            origins = {pid: process_origin(pid) for pid in pids}
+            of_unit = [pid for pid in pids if self.unit and origins[pid].unit == self.unit]
+            pids = of_unit or [pid for pid in pids if origins[pid].folder == self.folder] or pids
+        runs = may_run or any(map(self.fits, running.processes))
+        now = self._replace(pid=0, alike=(), absent=not (self.is_idle or runs) and bool(self.unit))
         if len(pids) > 1:
-            return self._replace(pid=0, alike=pids)
+            return now._replace(alike=pids)
         known_by = "command" if pids and self.known_by != "enclave" else self.known_by
-        return self._replace(pid=next(iter(pids), 0), known_by=known_by, alike=())
+        return now._replace(pid=next(iter(pids), 0), known_by=known_by)
 
-    def is_absent(self, running: RunningProcesses) -> bool:
-        """Return whether the process's unit runs without it: the process failed, or was stopped."""
-        may_run = running.hidden or self.pid in {process.pid for process in running.unseen}
-        runs = any(map(self.fits, running.processes))
-        return bool(self.unit and self.pid) and not (may_run or runs)
+    @property
+    def is_idle(self) -> bool:
+        """Whether no process is known, and none has to run: it ended while sros watched."""
+        return not (self.pid or self.alike or self.absent)
+
+    @property
+    def still_runs(self) -> bool:
+        """Whether the process `pid` is the process that sros saw, and not a later one."""
+        return bool(self.started) and start_of(self.pid) == self.started
+
+    def _may_run_unseen(self, running: RunningProcesses) -> bool:
+        """Return whether the process may run, although sros could not examine it."""
+        if running.hidden:
+            return bool(self.started) and self.started.partition(" ")[0] == boot_id()
+        return self.pid in {process.pid for process in running.unseen} and self.still_runs
 
     def open_command(self, domain: int) -> str:
         """Return the shell command that starts the process open, in its ROS domain and RMW."""
@@ -323,7 +348,7 @@ class ObservedProcesses(NamedTuple):
 
     def with_current_pids(self, running: RunningProcesses, export: Path) -> ObservedProcesses:
         """Return a copy with the current ids and the current unknown processes."""
-        pids = {process.pid for process in self.processes}
+        pids = {process.pid for process in self.processes if process.still_runs}
         unknown = [
             process_text(process)
             for process in running.processes
@@ -478,7 +503,7 @@ def _observed_from(value: Any) -> ObservedProcesses:
     _check_types((*names, *observed.brought.values()), (observed.domain,))
     for process in (*processes, *moved):
         words = (process.enclave, process.folder, process.container, process.rmw)
-        texts = (*words, *process.command, *process.launch, *process.shares)
+        texts = (*words, *process.command, *process.launch, *process.shares, process.started)
         _check_types((*texts, process.known_by), (process.pid, process.user, *process.alike))
         if process.unit and not re.fullmatch(SERVICE_NAME, process.unit, re.A):
             raise ValueError(f"{process.unit!r} is not a service")

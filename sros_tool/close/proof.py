@@ -532,10 +532,10 @@ def _why_missing(running: RunningRobot, missing: Sequence[str], observed: Observ
     outdated = {name: found for name, found in running.not_current.items() if name in missing}
     causes = {
         process.enclave: f"{process.unit} does not run it: systemctl status {process.unit}"
-        if process.is_absent(running.processes)
+        if process.absent
         else f"{process.pids_text} is open: stop it"
         for process in observed.processes
-        if process.pid or process.alike
+        if not process.is_idle
     }
     has_start = {*causes}
     absent = [name for name in missing if name not in outdated]

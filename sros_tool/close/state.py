@@ -610,9 +610,7 @@ def current_state(robot: LocalRobot, policy: Policy | None) -> CloseState:
     observed = observed.limited_to(policy) if policy else observed
     if secured and policy:
         observed = running.with_new_units(observed, _new_enclaves(robot, policy, observed, secured))
-    absent = {
-        process.enclave for process in observed.processes if process.is_absent(running.processes)
-    }
+    absent = {process.enclave for process in observed.processes if process.absent}
     new = _new_enclaves(robot, policy, observed, secured) if policy else {}
     outdated = {
         name: processes

@@ -353,6 +353,21 @@ def boot_id(proc: Path = Path("/proc")) -> str:
         return ""
 
 
+def start_of(pid: int) -> str:
+    """Return the id of this boot, and the clock ticks from the boot to the start of a process.
+
+    Together with the id of the process, this identifies the process.  The result is "" if no such
+    process runs, or sros cannot see it.
+    """
+    with suppress(OSError):
+        handle = os.open(f"/proc/{pid}", os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        try:
+            return f"{boot_id()} {_stat(handle).ticks}"
+        finally:
+            os.close(handle)
+    return ""
+
+
 def plain(text: str, longest: int = _LONGEST_TEXT) -> str:
     """Return a text that a process chose, shortened and escaped for messages."""
     return re.sub(r"[^\w.+/ -]", "?", text[:longest])

@@ -22,7 +22,7 @@ import yaml
 import sros_tool
 from sros_tool.api import renew
 from sros_tool.cli import close
-from sros_tool.close import apply, assignment, nodes, preparation, proof, state, watch
+from sros_tool.close import apply, assignment, nodes, preparation, processes, proof, state, watch
 from sros_tool.close import robot as of_robot
 from sros_tool.close.acceptance import Acceptance
 from sros_tool.close.assignment import with_command_of_unit
@@ -44,6 +44,7 @@ from sros_tool.runtime.processes import (
     ProcessTable,
     RunningProcesses,
     UnseenProcess,
+    boot_id,
     launch_word_index,
     process_origin,
     user_text,
@@ -199,6 +200,7 @@ def robot(beside_graph: Beside, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
             robot.units.get(units.get(pid, f"{pid}"), ""), "/opt", robot.launch, robot.container
         ),
     )
+    monkeypatch.setattr(processes, "start_of", lambda pid: f"{boot_id()} {pid}")
     # The RMWs of this machine may lack security.
     lacking = tmp_path / "lacking"
     monkeypatch.setattr(of_robot, "built_without_security", lambda *_: lacking.exists())

@@ -28,6 +28,7 @@ from sros_tool.runtime.processes import (
     ProcessOrigin,
     RunningProcesses,
     UnseenProcess,
+    boot_id,
 )
 from sros_tool.runtime.rmw import RMW
 from sros_tool.terminal import visible
@@ -47,11 +48,16 @@ def test_a_command_is_written_so_that_it_controls_no_terminal() -> None:
         assert done.stdout == b"|".join(map(os.fsencode, words)) + b"|"
 
 
-def test_a_process_to_stop_is_named_by_the_id_that_it_has_now() -> None:
-    talker = ClosedProcess("/talker", 7, ("talk", "a"), "/opt", 0, "", "program")
+def test_a_process_to_stop_is_named_by_the_id_that_it_has_now(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Later, or after the machine was started again, another process may have the earlier id."""
+    seen = f"{boot_id()} 70"
+    talker = ClosedProcess("/talker", 7, ("talk", "a"), "/opt", 0, "", "program", started=seen)
     again, other = process(8, "talk", "a"), process(7, "talk", "b")
     unseen = UnseenProcess(7, (), "another user's", uses_ros=False)
-    for processes, pid in (
+    hidden = RunningProcesses((other,), hidden="those of other users")
+    for running, pid in (
         (RunningProcesses((process(7, "talk", "a"), again)), 7),
         (RunningProcesses((other, again)), 8),
         (RunningProcesses((replace(again, environment={"ROS_DOMAIN_ID": "64"}),)), 0),
@@ -60,12 +66,50 @@ def test_a_process_to_stop_is_named_by_the_id_that_it_has_now() -> None:
         (RunningProcesses((process(9, "talk", "a", "--ros-args", "--enclave", "/talker"),)), 9),
         (RunningProcesses((process(9, "talk", "a", "--ros-args", "--enclave", "/other"),)), 0),
         (RunningProcesses((other,)), 0),
-        (RunningProcesses((other,), hidden="those of other users"), 7),
+        (hidden, 7),
         (RunningProcesses(unseen=(unseen,)), 7),
     ):
-        assert talker.with_current_pid(processes, 0, Path("/export")).pid == pid
-    of_unit = talker._replace(unit="talker.service")
-    assert of_unit.with_current_pid(RunningProcesses(), 0, Path("/export")).pid == 7
+        monkeypatch.setattr(
+            "sros_tool.close.processes.start_of", lambda pid: seen if pid == 7 else ""
+        )
+        now = talker.with_current_pid(running, 0, Path("/export"))
+        assert (now.pid, now.absent) == (pid, False)
+        monkeypatch.setattr("sros_tool.close.processes.start_of", lambda _: f"{boot_id()} 71")
+        later = talker.with_current_pid(running, 0, Path("/export"))
+        assert later.pid == (0 if pid == 7 and running != hidden else pid)
+    earlier_boot = talker._replace(started="another 70")
+    assert not earlier_boot.with_current_pid(hidden, 0, Path("/export")).pid
+    assert [*later.alike] == [] and not later.absent
+    known = ObservedProcesses(0, [talker])
+    assert known.with_current_pids(RunningProcesses((other,)), Path("/export")).unknown == [
+        "process 7 (talk): talk b"
+    ]
+
+
+def test_a_process_of_a_unit_is_looked_up_among_those_of_the_unit(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The id of the watch says nothing after a restart; a unit without a process is not idle."""
+    units = {8: "other.service", 9: "talker.service"}
+    monkeypatch.setattr(
+        "sros_tool.close.processes.process_origin",
+        lambda pid: ProcessOrigin(units.get(pid, ""), "/opt"),
+    )
+    unit = "talker.service"
+    talker = ClosedProcess("/talker", 7, ("talk",), "/opt", 0, unit, "process id", started="x 70")
+    twins = process(8, "talk"), process(9, "talk")
+    for running, pid, alike, absent in (
+        ((), 0, (), True),
+        (twins[:1], 8, (), False),
+        (twins, 9, (), False),
+        ((twins[0], process(10, "talk")), 0, (8, 10), False),
+        ((replace(twins[1], environment={"ROS_DOMAIN_ID": "64"}),), 0, (), False),
+    ):
+        for known in (talker, talker.with_current_pid(RunningProcesses(), 0, Path("/export"))):
+            now = known.with_current_pid(RunningProcesses(running), 0, Path("/export"))
+            assert (now.pid, (*now.alike,), now.absent) == (pid, alike, absent)
+    idle = talker._replace(pid=0).with_current_pid(RunningProcesses(), 0, Path("/export"))
+    assert idle.is_idle and not idle.absent
 
 
 def test_sros_does_not_choose_among_processes_that_fit_equally() -> None:
