@@ -140,13 +140,8 @@ def proofs_of(robot: LocalRobot, state: CloseState, patience: float) -> list[Pro
     # A laptop may be away; a computer whose nodes were seen has to be seen again.
     may_be_away = not_here - {node.enclaves[0] for node in nodes.nodes_to_compare(()).nodes}
     away = {*missing} | may_be_away | not_here.intersection(robot.without)
-    proof = _proof_of_processes(running, len(expected) - len(missing))
-    absence = "not seen" if running.processes.unseen or running.processes.hidden else "not running"
-    for names, where in ((missing, absence), (sorted(not_here), "on other machines")):
-        if names:
-            proof = proof._replace(
-                reason=f"{proof.reason}; not counted: {', '.join(names)} ({where})"
-            )
+    files = _proof_of_files(robot, expired, unsigned_text)
+    required = _proof_of_requirements(robot, unsigned_text)
     talk = _proof_of_talk(running, nodes, away)
     if talk.fails and (present := sorted(not_here - away)):
         options = " ".join(f"--without {name}" for name in present)
@@ -156,11 +151,19 @@ def proofs_of(robot: LocalRobot, state: CloseState, patience: float) -> list[Pro
     connected = [*_proof_of_connections(robot)]
     if talk.holds and not connected:
         talk = talk._replace(details=[*talk.details, _NOT_PROVED])
+    looks = (running, RunningRobot(robot))  # again: the observers took up to a minute
+    proof = _proof_of_processes(looks, state.observed, expected.difference(missing))
+    absence = "not seen" if running.processes.unseen or running.processes.hidden else "not running"
+    for names, where in ((missing, absence), (sorted(not_here), "on other machines")):
+        if names:
+            proof = proof._replace(
+                reason=f"{proof.reason}; not counted: {', '.join(names)} ({where})"
+            )
     return [
         proof,
-        *_proof_of_observed_processes(running),
-        _proof_of_files(robot, expired, unsigned_text),
-        _proof_of_requirements(robot, unsigned_text),
+        *_proof_of_observed_processes(looks),
+        files,
+        required,
         talk,
         *connected,
         silence,
@@ -457,55 +460,79 @@ def _narrow_discovery(environment: Mapping[str, str]) -> Iterator[str]:
             )
 
 
-def _proof_of_processes(running: RunningRobot, number: int) -> Proof:
+def _proof_of_processes(
+    looks: Sequence[RunningRobot], observed: ObservedProcesses, enclaves: Collection[str]
+) -> Proof:
     """Return the proof that no process runs open, and that no process has findings.
 
-    ``number`` enclaves have a process with the current files.
+    ``looks`` are the processes at the beginning and at the end of the proof. At its beginning, each
+    of the ``enclaves`` had a process with the current files.
     """
-    robot = running.robot
-    findings = _process_findings(running)
-    enclaves = {tuple(process.command): process.enclave for process in robot.processes.processes}
+    last, robot = looks[-1], looks[-1].robot
+    if not_current := sorted(last.not_current.keys() & enclaves):
+        now = observed.with_current_pids(last.processes, robot.export)
+        return Proof(STARTED, False, _why_missing(last, not_current, now))
+    robot.shell.say(
+        f'$ eval "$(sros env {shlex.quote(str(robot.export))} {OBSERVER})"; sros check runtime'
+    )
+    found = chain(*map(_process_findings, looks))
+    # The text about all unseen processes is kept only once, because such processes come and go.
+    findings = [
+        *{
+            (each.id, each.subject, each.subject != "processes" and each.text): each
+            for each in found
+        }.values()
+    ]
+    enclave_of = {tuple(process.command): process.enclave for process in robot.processes.processes}
     remedies = {
-        process.label: f"Stop it: another process runs in {enclaves[process.program[1]]}."
+        process.label: f"Stop it: another process runs in {enclave_of[process.program[1]]}."
+        for running in looks
         for process in running.in_domain
         if not process.asks_for_security
-        and enclaves.get(process.program[1]) in running.current_enclaves
+        and enclave_of.get(process.program[1]) in running.current_enclaves
     }
     for finding in findings:
         remedy = remedies.get(finding.subject, finding.remedy)
         robot.shell.say(f"{finding.subject}: {finding.text}. {remedy}")
     wrong = [finding for finding in findings if finding.id != PROCESS_NOT_SEEN.id]
-    text = f"{counted(number, 'enclave')}, and no open process in domain {robot.domain}"
+    number = counted(len(enclaves), "enclave")
+    text = f"{number}, and no open process in domain {robot.domain}"
     if findings:
         texts = [
             finding.text if finding.subject == "processes" else f"{finding.subject}: {finding.text}"
             for finding in wrong or findings
         ]
-        done = "" if wrong else f"true for {counted(number, 'enclave')}; "
+        done = "" if wrong else f"true for {number}; "
         text = f"{done}{first_few(texts, MOST_NAMES, '; ')}"
     else:
-        text += "".join(f"; {guest}" for guest in _open_elsewhere(running))
+        text += "".join(f"; {guest}" for guest in _texts_of_all(_open_elsewhere, looks))
     return Proof(STARTED, False if wrong else None if findings else True, text)
 
 
-def _proof_of_observed_processes(running: RunningRobot) -> Iterator[Proof]:
+def _texts_of_all(
+    texts_of: Callable[[RunningRobot], Iterable[str]], looks: Iterable[RunningRobot]
+) -> list[str]:
+    """Return the texts about several looks at the processes, each text once."""
+    return [*dict.fromkeys(chain(*map(texts_of, looks)))]
+
+
+def _proof_of_observed_processes(looks: Sequence[RunningRobot]) -> Iterator[Proof]:
     """Yield an undecided proof if enclaves have processes that sros did not see when it watched."""
-    if more := [*running.not_observed(), *running.with_other_files()]:
+    more = _texts_of_all(RunningRobot.not_observed, looks)
+    more += _texts_of_all(RunningRobot.with_other_files, looks)
+    if more:
         yield Proof(
             KNOWN,
             None,
             f"sros did not see {first_few(more, MOST_NAMES)} when it watched, and each process has "
             "all rights of its enclave: stop what is not yours; if only the command of a process "
-            f"is new, `{running.robot.close_command}` remembers it",
+            f"is new, `{looks[-1].robot.close_command}` remembers it",
         )
 
 
 def _process_findings(running: RunningRobot) -> list[Finding]:
     """Return the findings of `check runtime` in the robot's domain and the observer's enclave."""
     robot = running.robot
-    robot.shell.say(
-        f'$ eval "$(sros env {shlex.quote(str(robot.export))} {OBSERVER})"; sros check runtime'
-    )
     # This shell starts no node.
     environment = {**robot.shell.environment, **robot.variables(OBSERVER), ENCLAVE: ""}
     examined = replace(running.processes, processes=tuple(running.in_domain))

@@ -924,6 +924,17 @@ def ended_before_the_audit(robot: Robot, enclave: str) -> Any:
     return run
 
 
+def started_after_the_audit(robot: Robot, *processes: Process) -> Any:
+    """What runs verbs, and lets processes start when the audit has ended."""
+
+    def run(words: Any, live: bool, run: Any = close._run) -> Any:
+        ended = run(words, live)
+        robot.more = processes if words[0] == "audit" else robot.more
+        return ended
+
+    return run
+
+
 def beside_a_graph_that_changes(words: Any, live: bool, run: Any = close._run) -> Any:
     """Run a verb, and say of an audit that the graph kept changing."""
     status, output, messages = run(words, live)
@@ -1018,6 +1029,19 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     said = robot.close("--proof", status=1).out
     assert "no: not every process was started in its enclave: process 5 (guest)" in said
     assert "belongs there" not in said, "only programs of ros2 are left"
+    lax_talker = replace(talker, pid=11, environment=lax)
+    for late, says in (
+        (
+            (lax_talker,),
+            "in its enclave: ROS_SECURITY_STRATEGY is not 'Enforce' in the processes of",
+        ),
+        ((replace(seven, environment={}), others[2]), "in its enclave: process 5 (guest): in doma"),
+        ((others[2],), "belongs there: sros did not see process 6 (thief) in /talker when"),
+    ):
+        robot.more = ()
+        with monkeypatch.context() as patched:
+            patched.setattr(close, "_run", started_after_the_audit(robot, *late))
+            assert says in robot.close("--proof", status=1).out
     robot.more = ()
     robot.remaining = (TALKER,)
     lost = "no: not everything that talked can still talk: "
