@@ -7,7 +7,7 @@ import os
 import signal
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from datetime import datetime, timedelta
@@ -53,11 +53,11 @@ from sros_tool.cli.common import (
     save,
     verb,
 )
-from sros_tool.dds.decision.vendors import TESTED, ZENOH
+from sros_tool.dds.decision.vendors import TESTED, ZENOH, Vendor
 from sros_tool.errors import NOT_DONE, SrosError, UsageError
 from sros_tool.terminal import echo, echo_document, echo_lines, visible, visible_json
 from sros_tool.values import file_change, shows, versioned
-from sros_tool.wording import counted
+from sros_tool.wording import counted, enumerated
 
 if TYPE_CHECKING:
     from sros_tool.checks.keystores.opened import Circumstances
@@ -383,6 +383,8 @@ def check(
         findings = [finding for finding in findings if not is_mended_by(assumed, finding)]
     chosen = selection.choose(map(_with_relative_paths, findings))
     if form == "text":
+        if scope := _scope(vendors if vendor else (), distro, all_distros=all_distros):
+            echo(f"checked for {scope}", err=True)
         _print_text(chosen, _fleet_of(at, paths))
     elif form == "markdown":
         _print_markdown(chosen, _fleet_of(at, paths))
@@ -619,6 +621,17 @@ def _vendors(
     if vendor == ZENOH:
         return (vendor,)
     return selected_vendors(vendor or "", SUPPORTED if all_distros else (distro,) if distro else ())
+
+
+def _scope(vendors: Iterable[str], distro: Distribution | None, *, all_distros: bool) -> str:
+    """Return the distributions, and the vendors, that options select; "" without options."""
+    from sros_tool.distributions import SUPPORTED
+
+    distributions = SUPPORTED if all_distros else (distro,) if distro else ()
+    titles = ["Zenoh" if vendor == ZENOH else Vendor(vendor).title for vendor in vendors]
+    if distributions:
+        titles.append(f"ROS 2 {enumerated([each.title for each in distributions])}")
+    return ", ".join(titles)
 
 
 def _refuse_options_with_upgrade() -> None:

@@ -144,6 +144,26 @@ def test_type_descriptions_are_of_iron_and_later(
     assert sros("check", "policy", file, "--distro", "humbel").status == 2
 
 
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ((), ""),
+        (("--vendor", "zenoh"), "checked for Zenoh\n"),
+        (("--all-distros",), "checked for ROS 2 Humble, Jazzy, Kilted and Lyrical\n"),
+        (("--distro", "humble"), "checked for ROS 2 Humble\n"),
+        (
+            ("--distro", "humble", "--vendor", "fastdds"),
+            "checked for Fast DDS 2.6, ROS 2 Humble\n",
+        ),
+    ],
+)
+def test_options_that_choose_a_dds_are_repeated(
+    words: tuple[str, ...], said: str, tmp_path: Path
+) -> None:
+    (file := tmp_path / "robot.xml").write_text(policy(enclave("")))
+    assert sros("check", file, *words).ok().err == f"{said}nothing found\n"
+
+
 def test_a_node_that_lacks_everything_lacks_its_parameters_too(tmp_path: Path) -> None:
     found = ids(tmp_path, policy(enclave(topics("publish", "a"), basics=False)))
     assert "policy.no-parameter-services" in found
