@@ -605,11 +605,22 @@ class _Review:
             for name, tree_entry in self._changed_files(self.head, self.base):
                 if tree_entry.id == entry.id:
                     became = f"The change renames it to '{name}'."
+        elif below := self._same_name_below(path):
+            became = f"Paths begin at the top of the repository: is '{below}' meant?"
         return DocumentError(
             f"'{path}' is not in the commit",
             became,
             f"Review the files that the robot uses.{advice if entry else ''}",
         )
+
+    def _same_name_below(self, path: str) -> str:
+        """Return a file or folder of HEAD whose path ends with ``path``, or ""."""
+        with suppress(SrosError):  # a hint, without which the error is right, too
+            for name, _ in self._changed_files(self.head, None):
+                before, found, _ = f"{name}/".partition(f"/{path.strip('/')}/")
+                if found:
+                    return f"{before}{found}".rstrip("/")
+        return ""
 
     @staticmethod
     def _changed_files(
