@@ -57,7 +57,7 @@ from sros_tool.keystore.fleet import (
     left_enclaves,
     recorded_fleet,
 )
-from sros_tool.keystore.known_keys import restored_at
+from sros_tool.keystore.known_keys import KnownKeys, other_keys_remedy, restored_at
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     CRL,
@@ -1143,6 +1143,13 @@ class _KeystoreRecords:
             confirmed.release and is_from_backup and confirmed.release not in self._releases
         )
 
+    @cached_property
+    def enclaves_with_other_keys(self) -> frozenset[str]:
+        """The enclaves for which the restored keystore made other keys than their robots have."""
+        known = KnownKeys(self._keystore)
+        names = self._keystore.names if self.was_restored else ()
+        return frozenset(known.made_unknowing(names).values())
+
     def enclaves_lacking_key(self, compared_robot: _ComparedRobot) -> tuple[str, ...]:
         """Return the enclaves whose certificate is for a key that the robot does not have.
 
@@ -1175,6 +1182,7 @@ class _KeystoreRecords:
                 )
                 if has_other_key or file.path.rpartition("/")[0] not in folders:
                     enclaves_without_key.add(enclave_of(file.path))
+        enclaves_without_key.difference_update(self.enclaves_with_other_keys)
         keys = {name: enclave_path(self.root, name) / KEY_FILE for name in enclaves_without_key}
         return tuple(sorted(name for name, key in keys.items() if os.path.lexists(key)))
 
@@ -1434,11 +1442,15 @@ def _robot_status(
         compared_robot = compared_robot._replace(notes=(*compared_robot.notes, ahead_note))
     is_lost = state is State.REFUSED and refusal and refusal.why.startswith(NOT_IN_LEDGER)
     if (is_lost or (state is State.UNKNOWN and not is_ahead)) and records.is_restored:
-        lost_note = (
-            "the keystore was restored, and lacks what it issued after the backup. If the "
-            "message is genuine, run `sros distribute_key "
-            f"{quote(str(records.root))} --robot NAME FOLDER --force`"
+        others = sorted(records.enclaves_with_other_keys.intersection(compared_robot.enclaves))
+        remedy = (
+            f"made another key for {', '.join(others)} than the robot has. "
+            + other_keys_remedy(records.root, others).removesuffix(".")
+            if others
+            else "lacks what it issued after the backup. If the message is genuine, run `sros "
+            f"distribute_key {quote(str(records.root))} --robot NAME FOLDER --force`"
         )
+        lost_note = f"the keystore was restored, and {remedy}"
         compared_robot = compared_robot._replace(notes=(lost_note, *compared_robot.notes))
     problems = confirmed.problems if confirmed else None
     if (

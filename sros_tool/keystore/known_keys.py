@@ -13,6 +13,7 @@ from collections.abc import Collection, Container, Iterable, Iterator, Mapping, 
 from contextlib import suppress
 from datetime import datetime
 from functools import cached_property
+from pathlib import Path
 from shlex import quote
 
 from cryptography import x509
@@ -25,6 +26,7 @@ from sros_tool.keystore.layout import (
     PERMISSIONS,
     REQUEST,
     REVOKED,
+    has_key,
     revoked_certificates,
 )
 from sros_tool.keystore.ledger import RECORDED_LATE, REPORTED, RESTORED, Entry, Ledger
@@ -452,7 +454,57 @@ class KnownKeys:
         """Return the ledger entry of the first certificate for the newest key of an enclave.
 
         The newest key is the one whose validity began last, by the ledger; revoked keys do not
-        count.  The result is None if ``key`` is the newest key, or is not in the ledger.
+        count.  If ``key`` is the enclave's present key, only keys count that a robot had after the
+        backup, because the operator replaced all others.  Keys that `made_unknowing` returns do not
+        count, either.  The result is None if ``key`` is the newest key, or is not in the ledger.
+        """
+        first = self._first_certificates(name)
+        if key not in first or len(first) == 1:
+            return None
+        shown = {entry.key for entry in self.certificates_shown_after_restore([name])}
+        is_present = key == self._present_key(name)
+        counts = shown if is_present else {*first}.difference(self.made_unknowing([name]))
+        kept = [
+            entry
+            for entry in first.values()
+            if entry.key == key or (entry.key in counts and not self.is_revoked(entry.key))
+        ]
+        # Of keys that became valid at the same time, the later one is later in the ledger, too.
+        newest = max(reversed(kept), key=lambda entry: entry.not_before)
+        return newest if newest.key != key else None
+
+    def made_unknowing(
+        self, names: Collection[str], unrecorded: Iterable[Entry] = ()
+    ) -> dict[str, str]:
+        """Map keys that a restored keystore made to their enclaves, if robots have other keys.
+
+        The keystore made such a key after it was restored, before a message or a published release
+        showed it the certificate for the robot's key, which was made after the backup and is not
+        revoked.  ``unrecorded`` are such certificates that the ledger still lacks.  Only enclaves
+        whose present key is in the keystore are in the result.
+        """
+        found: dict[str, str] = {}
+        shown: dict[str, list[Entry]] = defaultdict(list)
+        for entry in (*self.certificates_shown_after_restore(names), *unrecorded):
+            shown[entry.enclave].append(entry)
+        for name in shown:
+            if not (self._keystore.has_enclave(name) and has_key(self._keystore.folder(name))):
+                continue
+            first, own = self._first_certificates(name), self._present_key(name)
+            recorded_before = [*first][: [*first].index(own)] if own in first else [*first]
+            if own in first and any(
+                entry.key not in (own, *recorded_before)
+                and entry.not_before <= first[own].not_before
+                and not self.is_revoked(entry.key)
+                for entry in shown[name]
+            ):
+                found[own] = name
+        return found
+
+    def _first_certificates(self, name: str) -> dict[str, Entry]:
+        """Map the keys of an enclave to the entries of their first certificates.
+
+        The keys are in the order of the ledger.
         """
         first: dict[str, Entry] = {}
         for entry in self._keystore.ledger_file.with_values("enclave", [name]).entries:
@@ -460,12 +512,13 @@ class KnownKeys:
                 known = first.setdefault(entry.key, entry)
                 if entry.not_before < known.not_before:
                     first[entry.key] = entry
-        if key not in first or len(first) == 1:
-            return None
-        kept = [entry for entry in first.values() if not self.is_revoked(entry.key)]
-        # Of keys that became valid at the same time, the later one is later in the ledger, too.
-        newest = max(reversed(kept), key=lambda entry: entry.not_before, default=None)
-        return newest if newest and newest.key != key else None
+        return first
+
+    def _present_key(self, name: str) -> str:
+        """Return the digest of the key in an enclave's certificate; "" if it cannot be read."""
+        with suppress(SrosError):
+            return _key_digest_of(self._keystore.certificate_of(name))
+        return ""
 
     def missing_key_notes(self) -> Iterator[Note]:
         """Yield a note if the ledger may lack keys that were revoked."""
@@ -603,6 +656,16 @@ class KnownKeys:
         entries = self._keystore.ledger_file.with_values("key", (key,)).entries
         recorded = {e.enclave for e in entries if e.what == "certificate" and e.key == key}
         return [name for name in sorted(recorded) if key in _key_digests(self._keystore, name)]
+
+
+def other_keys_remedy(root: Path, names: Sequence[str]) -> str:
+    """Return what to do about enclaves whose robots have other keys than the keystore."""
+    where, enclaves = quote(str(root)), " ".join(map(quote, names))
+    return (
+        f"If a robot made its key, sign its request again, with `sros sign_request {where} REQUEST "
+        f"--no-answer --renew`, and run `sros renew {where} {enclaves} --revoke-old`. Otherwise, "
+        f"give new keys: `sros renew {where} {enclaves} --new-key --revoke-old`."
+    )
 
 
 def _key_and_description(certificate: x509.Certificate) -> tuple[str, str]:

@@ -1424,38 +1424,80 @@ def test_a_key_that_was_replaced_is_found_where_all_certificates_begin_at_a_fixe
     assert publisher.publish(restored=True).names("published") == ["r1", "r2", "r5"]
 
 
-def test_a_restored_keystore_makes_no_key_for_a_robot_that_made_its_own(publisher: Home) -> None:
+_ORDERS = [
+    "restored, generate!, sign, generate",
+    "generate!, restored, sign, generate",
+    "name, restored!, old!, generate old!, sign again, old, restored",
+    "name, restored!, sign again, restored, old",
+    "name, new, restored!, sign again, old, restored",
+    "lost, generate, collect, restored!, sign again, old, restored",
+    "lost, generate, restored, collect, old!, sign again, old",
+]
+"""Commands of an operator after a restore; ``!`` stands for a refusal."""
+
+
+@pytest.mark.parametrize("order", _ORDERS)
+def test_a_restored_keystore_replaces_no_key_that_a_robot_made(
+    publisher: Home, order: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The robot came after the backup; only its release and its request have its key."""
-    root, fleet = publisher.root, publisher.folder / "fleet.toml"
+    monkeypatch.setattr("sros_tool.cli.common._clock", lambda: publisher.now)
+    root, fleet, name = publisher.root, publisher.folder / "fleet.toml", "/r9/base"
     policy = ("-p", "policy.xml", "--fleet", "fleet.toml")
+    publisher.publish()  # so that the backup records the folder
     backup = copy_of(root, publisher.folder / "backup")
     fleet.write_text(f"{fleet.read_text()}[robots.r9]\n")
-    request = create_request(publisher.folder / "r9", "/r9/base").file
-    sign = ("sign_request", "ks", request, "--no-answer", *policy)
+    request = create_request(publisher.folder / "r9", name).file
+    sign = ("sign_request", "ks", request, "--no-answer")
     generate = ("generate_artifacts", "-k", "ks", *policy)
-    publisher.run(*sign)
+    publisher.run(*sign, *policy)
     publisher.run(*generate)
     publisher.publish()
+    later = OpenedKeystore(root).certificate_of(name)
     shutil.rmtree(root)
     backup.rename(root)
-    notes = {note.id: note.text for note in publisher.publish(restored=True).notes}
-    assert (
-        "if it made its keys, sign its requests again (`sros sign_request "
-        in (notes["fleet.certificates-restored"])
-    )
-    refused = sros(*generate, cwd=publisher.folder)
-    assert (
-        refused.status == 2
-        and "lacks /r9/base, which got certificates after the last backup" in refused.err
-    )
-    assert "`sros sign_request ks REQUEST --no-answer -p POLICY_FILE --fleet" in refused.err
-    copy = copy_of(root, publisher.folder / "copy")
-    publisher.run("generate_artifacts", "-k", copy, "-e", "/r9/base", *policy)
-    publisher.run(*sign)
-    publisher.run(*generate)
+    lost = order.startswith("lost")
+    if lost:
+        shutil.rmtree(publisher.pub)
+
+    def collect() -> None:
+        shown = LostRecords(OpenedKeystore(root), publisher.now)
+        shown.add_certificate(later)
+        (note,) = (e.text for e in restore_revocations(root, shown, now=publisher.now).notes)
+        assert mend in note and f"other keys for {name} than the keystore" in note
+
+    request_again = f"sign its request again, with `sros sign_request {root} REQUEST --no-answer"
+    mend = f"{request_again} --renew`, and run `sros renew {root} /r9/base --revoke-old`"
+    commands = {
+        "restored": ("fleet", "publish", "ks", "pub", "--restored", *["--new-folder"] * lost),
+        "generate": generate,
+        "generate old": (*generate, "--revoke-old"),
+        "name": (*generate, "-e", name),
+        "new": ("renew", "ks", name, "--new-key", "--revoke-old"),
+        "old": ("renew", "ks", name, "--revoke-old"),
+        "sign": (*sign, *policy),
+        "sign again": (*sign, "--renew"),
+    }
+    key, made = key_digest(load_request(request.read_bytes(), "it").public_key), set[str]()
+    for step in order.removeprefix("lost, ").split(", "):
+        publisher.now += LATER
+        if step == "collect":
+            collect()
+            continue
+        done = sros(*commands[step.removesuffix("!")], cwd=publisher.folder)
+        assert done.status == (2 if step.endswith("!") else 0), (step, done.err)
+        if step.endswith("!") and "generate" not in step:
+            assert mend.replace(str(root), "ks") in done.err, (step, done.err)
+        if (root / "enclaves/r9/base/key.pem").exists():
+            made.add(key_digest(OpenedKeystore(root).certificate_of(name).public_key()))  # type: ignore[arg-type]
     assert not (root / "enclaves/r9/base/key.pem").exists()
-    assert (copy / "enclaves/r9/base/key.pem").exists()
-    assert "r9" in publisher.publish().names("published")
+    publisher.publish()
+    certificate = x509.load_pem_x509_certificate(
+        read_release(archives(publisher)["r9"]).files[f"enclaves{name}/cert.pem"]
+    )
+    assert key_digest(certificate.public_key()) == key  # type: ignore[arg-type]
+    known = KnownKeys(OpenedKeystore(root))
+    assert not known.is_revoked(key) and all(known.is_revoked(each) for each in made)
 
 
 def test_a_later_key_of_a_robot_is_certified_again_as_publishing_advises(
@@ -1481,7 +1523,8 @@ def test_a_later_key_of_a_robot_is_certified_again_as_publishing_advises(
     earlier = [command.replace("REQUEST", str(files[0])).split() for command in commands]
     newest = key_digest(load_request(second, "it").public_key)
     assert "agent run" in mend and f" is {newest}" in sros(*earlier[0], cwd=publisher.folder).err
-    assert f"made the key {newest} after" in sros(*earlier[1], cwd=publisher.folder).err
+    another = f"the keystore has another key of enclave {name} than its robot"
+    assert another in sros(*earlier[1], cwd=publisher.folder).err
     for command in commands:
         publisher.run(*command.replace("REQUEST", str(files[1])).split())
     assert publisher.publish(restored=True).names("published") == ["r1", "r2", "r5"]

@@ -76,6 +76,7 @@ from sros_tool.keystore.fleet import (
     recorded_fleet,
 )
 from sros_tool.keystore.issuing.keyring import IN_KEYSTORE, Keyring
+from sros_tool.keystore.known_keys import KnownKeys
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     CRL_FILE,
@@ -1082,7 +1083,12 @@ class _Publication:
         changes = without_agreed_changes(
             self.keystore, later_changes(self.keystore, self._last_releases(), self._now)
         )
-        lost = [change for change in changes if change.change in ("key", "governance")]
+        unknown = forgotten_lists.unknown_certificates(self.keystore).values()
+        unknowing = KnownKeys(self.keystore).made_unknowing(self.keystore.names, unknown)
+        others = {*unknowing.values()} - {e.enclave for e in changes if e.change == "key"}
+        changes += [LaterChange("other_key", name, "") for name in sorted(others)]
+        kinds = ("key", "other_key", "governance")
+        lost = [change for change in changes if change.change in kinds]
         rights = [change.enclave for change in changes if change.change == "rights_taken"]
         revocation = restore_revocations(
             self.keystore.root,
@@ -1112,7 +1118,9 @@ class _Publication:
             change
             for change in changes
             if change.enclave not in self._revoked
-            and not (change.change == "key" and change.enclave in revocation.replaced)
+            and not (
+                change.change in ("key", "other_key") and change.enclave in revocation.replaced
+            )
         ]
         refuse_lost_changes(self.keystore, self._folder, changes)
         self.notes += other_changes_notes(self.keystore, changes)

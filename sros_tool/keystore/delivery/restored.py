@@ -30,7 +30,7 @@ from sros_tool.keystore.delivery.published import read_published
 from sros_tool.keystore.delivery.release import Release, sealed_robot
 from sros_tool.keystore.delivery.rollback import retired_authorities
 from sros_tool.keystore.fleet import enclaves_of_robot, recorded_fleet
-from sros_tool.keystore.known_keys import KnownKeys
+from sros_tool.keystore.known_keys import KnownKeys, other_keys_remedy
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     GOVERNANCE_FILE,
@@ -71,13 +71,23 @@ class LaterChange(NamedTuple):
     change: Annotated[
         str,
         Words(
-            ("certificate", "key", "rights_taken", "governance", "rights_given", "missing", "added")
+            (
+                "certificate",
+                "key",
+                "other_key",
+                "rights_taken",
+                "governance",
+                "rights_given",
+                "missing",
+                "added",
+            )
         ),
     ]
     """``certificate``: the certificate was replaced and revoked; ``key``: the enclave got another
-    key; ``rights_taken``: the enclave lost rights or ROS domains; ``governance``: the governance
-    was changed; ``rights_given``: the enclave got rights or ROS domains; ``missing``: the keystore
-    lacks the enclave; ``added``: the robot's last release lacks the enclave.  The first four keep
+    key; ``other_key``: the restored keystore made another key for the enclave than its robot has;
+    ``rights_taken``: the enclave lost rights or ROS domains; ``governance``: the governance was
+    changed; ``rights_given``: the enclave got rights or ROS domains; ``missing``: the keystore
+    lacks the enclave; ``added``: the robot's last release lacks the enclave.  The first five keep
     ``--restored`` from publishing.
     """
     enclave: str
@@ -443,6 +453,9 @@ def refuse_lost_changes(
                 "a request was revoked, first make a new key on the robot (docs/howto/rotate.md, "
                 "A key in wrong hands)."
             )
+    if others := names["other_key"]:
+        what.append(f"robots got other keys for {shown(others)} than the keystore has")
+        steps.append(other_keys_remedy(keystore.root, others))
     if missing := names["missing"]:
         steps.append(_missing_step(root, missing))
     if rights := names["rights_taken"]:
@@ -453,7 +466,7 @@ def refuse_lost_changes(
         perhaps = ", or may have been" * any(": not known, because" in text for _, text in taken)
         what.append(f"rights of {shown(rights)} were taken away{perhaps} ({why})")
         steps.append("Sign the present policy again, with `sros generate_artifacts`.")
-        if not (certificates or keys or names["governance"]):
+        if not (certificates or keys or others or names["governance"]):
             steps.append(f"If the enclaves are to have these rights, run {renew(rights)}.")
     for change in changes:
         if change.change == "governance":

@@ -36,7 +36,12 @@ from sros_tool.keystore.issuing.acceptance import refuse_stopping_nodes
 from sros_tool.keystore.issuing.authority import Authorities, Authority, load_authority
 from sros_tool.keystore.issuing.enclave import EnclaveTokens, EnclaveWriter
 from sros_tool.keystore.issuing.keyring import IN_KEYSTORE, Keyring
-from sros_tool.keystore.known_keys import KnownKeys, unknown_authorities, unlisted_revocations
+from sros_tool.keystore.known_keys import (
+    KnownKeys,
+    other_keys_remedy,
+    unknown_authorities,
+    unlisted_revocations,
+)
 from sros_tool.keystore.layout import (
     GOVERNANCE_P7S,
     IDENTITY,
@@ -423,9 +428,13 @@ class KeystoreChange:
 
         The enclaves ``recipients`` get the revocation list, and their processes must be restarted.
         The default is `RevocationListSigner.recipients`.
+
+        Raises:
+            KeystoreError: the keystore was restored, and this would revoke the key of a robot.
         """
         if not superseded:
             return
+        self._refuse_revoking_keys_of_robots(superseded)
         lists = self.revocation_lists()
         revocations = lists.superseded_revocations(superseded)
         if recipients is None:
@@ -434,6 +443,22 @@ class KeystoreChange:
         self.entries += lists.sign(revocations, self.restart, incomplete=False)[1]
         self.remarks += lists.remarks
         self.revoked = len(revocations)
+
+    def _refuse_revoking_keys_of_robots(self, superseded: Sequence[SupersededCertificate]) -> None:
+        """Raise `KeystoreError` if only a key would stay valid that the robot does not have.
+
+        The keystore was restored, and publishing or a message showed it the robot's key.
+        """
+        unknowing = self.known.made_unknowing([certificate.name for certificate in superseded])
+        for name, key in ((each.name, each.new_key) for each in superseded):
+            if not (key in unknowing or self.known.later_key(name, key)):
+                continue
+            raise KeystoreError(
+                f"the keystore has another key of enclave {name} than its robot",
+                "After the backup of the keystore, the robot got a certificate for its key. "
+                "--revoke-old would revoke this key.",
+                other_keys_remedy(self.root, [name]),
+            )
 
     def stage_zenoh(
         self,

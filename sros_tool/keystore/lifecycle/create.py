@@ -27,7 +27,8 @@ from sros_tool.errors import KeystoreError, Note, PolicyError, SrosError, UsageE
 from sros_tool.fleet.expansion import FleetPolicy
 from sros_tool.fleet.robots import Fleet, Robot
 from sros_tool.keystore.comparison import Mismatch, compare_governance, mismatch
-from sros_tool.keystore.delivery.published import may_have_later_releases
+from sros_tool.keystore.delivery.published import may_have_later_releases, read_published
+from sros_tool.keystore.delivery.restored import restores_after_last_release
 from sros_tool.keystore.expiry import IF_EXPIRED, ONE_BY_ONE
 from sros_tool.keystore.fleet import (
     EnclaveDomains,
@@ -79,7 +80,7 @@ from sros_tool.keystore.layout import (
     remedy_in_closed_robot,
     similar_keystores,
 )
-from sros_tool.keystore.ledger import RESTORED, Entry, certificate_entry, document_entry
+from sros_tool.keystore.ledger import PUBLISHING, RESTORED, Entry, certificate_entry, document_entry
 from sros_tool.keystore.lifecycle.change import Changed, ChangeOptions, KeystoreChange
 from sros_tool.keystore.lifecycle.replaced import (
     ReplacedRights,
@@ -414,7 +415,7 @@ def _revoked_before_notes(
 
     Raises:
         KeystoreError: an enclave is not named, but still in a policy, and was revoked, or got a
-            certificate after the backup from which the keystore was restored.
+            certificate after the backup from which the keystore was restored, or may have got one.
     """
     existing, known, root = frozenset(change.names), change.known, change.root
     missing = [name for name in wanted_names if name not in existing]
@@ -463,7 +464,29 @@ def _revoked_before_notes(
             f"enclaves with -e, so that they get new keys: {command(unasked)}. Then repeat this "
             "command.",
         )
+    if unasked := [name for name in missing if name not in named]:
+        _refuse_before_restored(change.keystore, unasked)
     return list(known.revoked_before_notes(revoked_before))
+
+
+def _refuse_before_restored(keystore: OpenedKeystore, missing: Sequence[str]) -> None:
+    """Raise `KeystoreError` if later releases exist, which may have the enclaves ``missing``.
+
+    Once ``--restored`` has read the releases, the ledger has their certificates.
+    """
+    if may_have_later_releases(keystore) and PUBLISHING not in restores_after_last_release(
+        keystore
+    ):
+        folder = read_published(keystore).folder
+        raise KeystoreError(
+            f"'{folder}' has later metadata than the keystore '{keystore.root}' knows",
+            "The keystore was restored from a backup, or is a copy. The policy would create "
+            f"{first_few(missing, 3)} with new keys, but a robot may have made the keys of such an "
+            "enclave after the backup.",
+            f"First run `sros fleet publish {quote(str(keystore.root))} {quote(folder)} "
+            "--restored`, which says what to do; docs/howto/keystore_is_lost.md has the other "
+            "steps.",
+        )
 
 
 def _names_with_keys_made_on_robots(change: KeystoreChange, names: Sequence[str]) -> list[str]:

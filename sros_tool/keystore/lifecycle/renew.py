@@ -9,7 +9,7 @@ from pathlib import Path
 from shlex import quote
 from typing import Unpack
 
-from sros_tool.errors import KeystoreError, Note, PkiError, SrosError, UsageError
+from sros_tool.errors import KeystoreError, Note, SrosError, UsageError
 from sros_tool.fleet.robots import Fleet
 from sros_tool.keystore.expiry import (
     Credentials,
@@ -29,7 +29,7 @@ from sros_tool.keystore.issuing.enclave import (
     Issuance,
     NewIdentity,
 )
-from sros_tool.keystore.layout import KEY_URI_FILE, enclave_path, has_key, key_on_robot
+from sros_tool.keystore.layout import KEY_URI_FILE, enclave_path, has_key
 from sros_tool.keystore.ledger import RENEWED_BY_NAME, RESTORED, Entry
 from sros_tool.keystore.lifecycle.change import Changed, ChangeOptions, KeystoreChange
 from sros_tool.keystore.lifecycle.replaced import (
@@ -46,7 +46,6 @@ from sros_tool.pki.certificates import (
     enclave_subject,
     has_unique_part,
     issued_by,
-    key_digest,
     other_issuer_text,
 )
 from sros_tool.pki.keys import PrivateKey, generate_key
@@ -122,8 +121,6 @@ def renew(
             with suppress(SrosError):
                 change.notes += change.edit_notes()
             return change.result(Changed)
-        if revoke_old:
-            _refuse_earlier_keys(change, wanted)
         writer = change.writer(keys_on_token=bool(places), revoke_old=revoke_old)
         renewer = _Renewer(
             change,
@@ -163,27 +160,6 @@ def renew(
         works_until=until if until and until >= change.now else None,
         may_work_longer=may_work_longer,
     )
-
-
-def _refuse_earlier_keys(change: KeystoreChange, names: Iterable[str]) -> None:
-    """Raise `KeystoreError` if revoking would leave only an earlier key of a robot valid.
-
-    The keystore was restored, and publishing or a message showed it the later key.
-    """
-    names = [name for name in names if key_on_robot(enclave_path(change.root, name))]
-    shown = {entry.enclave for entry in change.known.certificates_shown_after_restore(names)}
-    for name in (name for name in names if name in shown):
-        with suppress(PkiError):  # the renewal refuses an enclave that cannot be read
-            public = change.keystore.certificate_of(name).public_key()
-            later = change.known.later_key(name, key_digest(public))  # type: ignore[arg-type]
-            if later:
-                raise KeystoreError(
-                    f"the keystore has an earlier key of enclave {name} than its robot",
-                    f"The robot made the key {later.key} after the backup of the keystore. "
-                    "--revoke-old would revoke this key.",
-                    "First sign the robot's request for this key: `sros sign_request "
-                    f"{quote(str(change.root))} REQUEST --no-answer --renew`.",
-                )
 
 
 def _with_consent_marks(

@@ -14,7 +14,7 @@ from typing import Unpack
 
 from sros_tool.errors import KeystoreError, Note, SrosError, UsageError
 from sros_tool.keystore.issuing.keyring import IN_KEYSTORE
-from sros_tool.keystore.known_keys import revoked_serials
+from sros_tool.keystore.known_keys import other_keys_remedy, revoked_serials
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     IDENTITY,
@@ -429,6 +429,12 @@ def _unknown_note(change: KeystoreChange, unknown: Mapping[str, Entry]) -> Note:
             f"generate_artifacts`, then give them new keys: `sros renew {root} --robot NAME "
             "--new-key --revoke-old`. To revoke such an enclave, create it again first, or replace "
             "the CA with `sros rotate_ca`"
+        )
+    unknowing = change.known.made_unknowing({*valid}, unknown.values())
+    if others := sorted({*unknowing.values()}):
+        text += (
+            f". Robots have other keys for {first_few(others, _MOST_SHOWN)} than the keystore. "
+            + other_keys_remedy(change.root, others).removesuffix(".")
         )
     return Note("fleet.certificates-restored", f"{text}.")
 
