@@ -558,8 +558,12 @@ def _edit_text(violation: Violation) -> str:
     if requirement.robot or any(name.startswith(EXCEPT) for name in listed):
         return ""
     space = requirement.namespace.rstrip("/")
-    if not all(name.startswith(f"{space}/") for name in enclaves):
-        effect += "; the name of an enclave that begins with * counts in every namespace"
+    outside = sorted(name for name in enclaves if not name.startswith(f"{space}/"))
+    if outside:
+        effect += (
+            f"; *{outside[0]} also allows /stranger{outside[0]}, so if a package ships the file, "
+            "write it only into a copy"
+        )
     written = {
         name.removeprefix(space) if name.startswith(f"{space}/") else f"*{name}"
         for name in enclaves
