@@ -308,10 +308,10 @@ def _collect(
       $ sros fleet collect keystore inbox --publish pub
 
     The exit status is 0 if nothing was refused, 1 if a message, request or release was refused, the
-    fleet file does not allow a request, two computers seem to have the keys of a robot, or
-    published files were altered, and 2 if the CAs cannot sign, or the releases cannot be published.
-    For two computers, only the run that notices them exits with 1; `sros fleet status` exits with 1
-    for up to a day.
+    fleet file does not allow a request, two computers seem to have the keys of a robot (or its
+    disk was restored), or published files were altered, and 2 if the CAs cannot sign, or the
+    releases cannot be published. For two computers, only a run that notices them exits with 1;
+    `sros fleet status` exits with 1 for up to a day.
     """
     from sros_tool.keystore.delivery.collect import PublishedAnswers, collect
 

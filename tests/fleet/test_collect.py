@@ -369,8 +369,10 @@ def test_two_computers_with_the_keys_of_a_robot_are_noted(home: Home) -> None:
         *((last - 1, True, True), (last, False, True)),
     ):
         home.send("r1", release=release)
-        remarks = "".join(home.of("r1").remarks)
-        assert ("two computers have its keys" in remarks) == is_noted
+        collected = home.collect()
+        (message,) = (each for each in collected.robots if each.robot == "r1")
+        assert ("two computers have its keys" in "".join(message.remarks)) == is_noted
+        assert collected.complete != (is_noted and is_shown), "so that the service fails"
         (r1,) = fleet_status(OpenedKeystore(home.root), ["r1"]).robots
         assert any("Two computers" in text for text in r1.problems or ()) == is_shown
     home.send("r1", NOW + timedelta(days=2), release=last - 1)

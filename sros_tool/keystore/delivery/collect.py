@@ -139,9 +139,10 @@ class CollectedMessage(NamedTuple):
     requests: Sequence[CollectedRequest]
     """The requests for renewal in the message."""
     shared_keys: bool
-    """Whether two computers seem to have the robot's keys: the message came from an earlier start
-    of the computer than the message before it. The exit status of this run is then 1;
-    `sros fleet status` exits with 1 for up to a day.
+    """Whether two computers seem to have the robot's keys, or its disk was restored: the message
+    came from an earlier start of the computer than the message before it, or shows an earlier
+    release. The exit status of this run is then 1; `sros fleet status` exits with 1 for up to a
+    day.
     """
 
 
@@ -588,7 +589,8 @@ class _Verifier:
                 went_back = is_earlier_start = False
                 alternated = before.alternated if before else None
         # A new agent begins without a release, and a robot can only claim unpublished releases.
-        if went_back and installed and self._is_published(before_it):
+        has_earlier_release = went_back and bool(installed) and self._is_published(before_it)
+        if has_earlier_release:
             alternated = arrived
         received = ReceivedConfirmation(
             replace(verified.confirmation, requests=None, crl=None, seal=None),
@@ -601,7 +603,7 @@ class _Verifier:
             release = f"release {installed}" if installed else "no release"
             remarks.append(
                 f"it has {release}, and had release {before_it} before: its disk was restored, or "
-                "two computers have its keys"
+                "two computers have its keys (`sros fleet status` says what to do)"
             )
         elif is_earlier_start:
             remarks.append(
@@ -614,7 +616,7 @@ class _Verifier:
             verified=verified,
             received=received,
             remarks=remarks,
-            shared_keys=is_earlier_start,
+            shared_keys=is_earlier_start or has_earlier_release,
         )
 
     def _has_new_keys(self, robot: Robot, last: ReceivedConfirmation) -> bool:
