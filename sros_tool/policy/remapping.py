@@ -285,6 +285,12 @@ def _unused_rule_error(
     )
 
 
+def _moves_with_node(use: UsedRule, old: str, new: str) -> bool:
+    """Return whether a name only changes as it does if the node ``old`` is renamed to ``new``."""
+    below = use.old.removeprefix(f"{old}/")
+    return below != use.old and use.new == f"{new}/{below}"
+
+
 def _notes_on_requirements(
     policies: Iterable[Policy], rules: Iterable[Remapping]
 ) -> Iterator[Note]:
@@ -314,7 +320,7 @@ def _notes_on_requirements(
     )
     kept = {(kind, name) for kind, _, name in after}
     moved = {name for kind, _, name in before if (kind, name) not in kept}
-    nodes = {use.old for _, uses in remapped for use in uses if not use.kind}
+    nodes = {use.old: use.new for _, uses in remapped for use in uses if not use.kind}
     # A requirement may also name what is below a node's name, but is in no right.
     gone = {
         next((f"{node}/*" for node in nodes if name.startswith(f"{node}/")), name) for name in moved
@@ -326,13 +332,14 @@ def _notes_on_requirements(
             for _, uses in remapped
             for use in uses
             if f"{use.old}/*" in gone or any(matches(name, use.old) for name in gone)
+            if not any(_moves_with_node(use, *node) for node in nodes.items())
         }
         words = " ".join(f"--remap {quote(option)}" for option in sorted(options))
         text = (
             f"requirements that name {first_few(sorted(gone), _MOST_SHOWN)} protect only the old "
             "name, unless you check them with the same remapping: `sros check POLICY "
-            f"--requirements FILE {words}`, with --namespace as in the merge. Leave out each "
-            "--remap whose old name no requirement has."
+            f"--requirements FILE {words}`, with --namespace as in the merge. If no "
+            "requirement has the old name of a --remap, `sros check` says so: then leave it out."
         )
         yield Note("merge.requirements-of-old-names", text)
     split = [

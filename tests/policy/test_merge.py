@@ -250,12 +250,16 @@ def test_a_name_of_no_single_node_is_remapped() -> None:
 def test_the_note_on_requirements_names_rules_that_they_take() -> None:
     driver = one(group("topics", "x ~/y z", publish="ALLOW"), node="driver")
     viewer = one(group("topics", "z", subscribe="ALLOW"), node="viewer")
+    panel = one(group("topics", "driver/y", subscribe="ALLOW"), node="panel")
     for texts, options in (
         (["__node:=front"], ["driver:__node:=front"]),
+        (["panel:driver/y:=front/y", "driver:__node:=front"], ["driver:__node:=front"]),
+        (["panel:driver/y:=/v", "driver:~/y:=/v"], ["driver/y:=/v", "driver:~/y:=/v"]),
         (["~/y:=/v", "driver:x:=/w"], ["driver:~/y:=/v", "x:=/w"]),
         (["x:=/w", "driver:z:=/u"], ["x:=/w"]),
     ):
-        _, notes = remapped_policies([driver, viewer], texts)
+        others = [panel] if "panel" in texts[0] else [viewer]
+        _, notes = remapped_policies([driver, *others], texts)
         (text,) = (note.text for note in notes if note.id == OF_REQUIREMENTS)
         rules = split(text.partition("FILE ")[2].partition("`")[0])[1::2]
         assert rules == options
