@@ -28,7 +28,7 @@ class Subjects(Enum):
     EXACT = auto()
     """The same attributes in the same order; spaces around attributes do not count."""
     WHOLE_ATTRIBUTES = auto()
-    """The same texts between commas, escaped or not; spaces are ignored (Fast DDS 2.6, 2.9)."""
+    """Equal texts between commas, even escaped ones; spaces around texts are ignored (2.6, 2.9)."""
     ANY_ORDER = auto()
     """The same attributes in any order (Fast DDS 2.14)."""
     SUBSET = auto()
