@@ -372,11 +372,12 @@ def _fetch_error(error: Exception, source: str, now: datetime) -> FetchError:
         FetchProblem.NOT_SIGNED,
         f"the files in {source} are damaged, or not signed with the trusted keys",
         f"{why} Probably a published file was damaged or altered. This robot keeps its files.",
-        "On the keystore machine, run `sros fleet publish KEYSTORE PUB`, which publishes altered "
-        "files again; if robots fetch from a copy of PUB, copy it again. If the keystore was "
-        "restored or made again, it may publish with other keys: see "
-        "docs/howto/keystore_is_lost.md (--rotate-key; or `sros agent init` with --force and the "
-        "new root.json).",
+        "On the keystore machine, run `sros fleet publish KEYSTORE PUB`, which puts altered files "
+        "right, and prints the SHA-256 of the root metadata: if this robot is new, compare it with "
+        "the SHA-256 that `sros agent init` printed. If robots fetch from a copy of PUB, copy it "
+        "again, and remove files there that PUB does not have. If the keystore was restored or "
+        "made again, it may publish with other keys: see docs/howto/keystore_is_lost.md "
+        "(--rotate-key; or `sros agent init` with --force and the new root.json).",
     )
 
 

@@ -498,6 +498,7 @@ def _publish(
     Example:
       $ sros fleet publish keystore pub
       published new releases of 2 robots in 'pub', unchanged: 48 robots
+      robots pin pub/metadata/1.root.json, SHA-256 daaeacc27199d9193220b79479981f64...
       robots accept these files until 2027-05-22T09:00:00Z: publish again before then
       $ mv keystore/private/fleet_root.pem /media/safe/
       $ sros fleet publish keystore pub --rotate-key timestamp
@@ -505,7 +506,7 @@ def _publish(
 
     The exit status is 1 in three cases: an enclave of a robot cannot run, so that its release was
     refused; the root metadata has expired, so that robots refuse everything; or files in PUB were
-    missing, changed or older than this verb published them, so that it published them again.
+    missing, changed, older than this verb published them or foreign, so that it put them right.
     """
     from sros_tool.keystore.delivery.publish import publish
     from sros_tool.keystore.delivery.published import MetadataExpiry
@@ -564,8 +565,7 @@ def _published_lines(published: PublishedFleet, moment: datetime) -> Iterator[st
             f"new keys: {', '.join(published.rotated)}; {published.root.name} lets robots accept "
             "them"
         )
-    if published.versions.get("timestamp") == 1:
-        yield f"robots pin {published.root}, SHA-256 {published.root_sha256}"
+    yield f"robots pin {published.root}, SHA-256 {published.root_sha256}"
     accepting = "robots accept"
     if published.refused_by:
         accepting = "robots that trust this CA accept"
@@ -857,11 +857,18 @@ def _fleet_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
     elif any(robot.state == "later" for robot in status.robots):
         yield f"the keystore may be older than its robots: if it was restored, {restored}"
     elif publication and publication.lacks:
-        decide = ", which says what to check" if publication.lacks.startswith("metadata/") else ""
+        decide = (
+            ", which puts it right or prints the remedy"
+            if publication.lacks.startswith("metadata/")
+            else ""
+        )
         yield f"'{folder}' lacks {publication.lacks}, which robots fetch: run `{publish}`{decide}"
     elif publication and publication.refused:
         why = publication.refused
-        yield f"the published files do not verify: {why}. Run `{publish}`, which prints the remedy"
+        yield (
+            f"the published files do not verify: {why}. Run `{publish}`, which puts them right, or "
+            "prints the remedy"
+        )
     elif publication and publication.accepted is False and publication.expires:
         ago = elapsed(compared_fleet.at - publication.expires)
         yield f"the published files expired {ago} ago, so robots get no new files: run `{publish}`"
@@ -877,9 +884,9 @@ def _fleet_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
     if publication and publication.altered:
         ago = elapsed(compared_fleet.at - max(publication.altered.values()))
         yield (
-            "published files were missing, changed or older than published: "
+            "published files were missing, changed, older than published or foreign: "
             f"{first_few(list(publication.altered), _MOST_GROUPS)} (last seen {ago} ago). sros "
-            "published them again; find out who else can write to the folder"
+            "put them right; find out who else can write to the folder"
         )
     if status.stage != "complete":
         behind, robots = len(status.unconfirmed), sum(bool(each.enclaves) for each in status.robots)

@@ -502,8 +502,8 @@ class PublishedMetadata:
     if the metadata verifies, or if the folder is ``unseen``.
     """
     altered: Mapping[str, datetime] = field(default_factory=dict)
-    """Files that ``sros fleet publish`` published again in the last day, because they were missing,
-    changed or older than published; each with the time, in UTC.
+    """Files that ``sros fleet publish`` put right in the last day, because they were missing,
+    changed, older than published or foreign; each with the time, in UTC.
     """
 
     @property
@@ -1011,7 +1011,7 @@ class _KeystoreRecords:
         self.has_list = keystore.has(CRL)
         """Whether the keystore has a revocation list."""
         # Most keystores publish nothing.
-        from sros_tool.keystore.delivery.publish import metadata_problem
+        from sros_tool.keystore.delivery.publish import publication_problem
 
         published = read_published(keystore)
         missing = published.first_missing()
@@ -1025,7 +1025,7 @@ class _KeystoreRecords:
                 published.root_until,
                 unseen=unseen_clause(missing),
                 lacks=missing or "",
-                refused=metadata_problem(keystore),
+                refused=publication_problem(keystore),
                 altered=published.altered,
             )
             if published.robots
@@ -1714,8 +1714,8 @@ def fleet_metrics(
         ),
         Metric(
             "sros_fleet_publication_altered",
-            "Number of published files that `sros fleet publish` replaced in the last day, because "
-            "they were missing, changed or older than the last publication.",
+            "Number of published files that `sros fleet publish` put right in the last day, "
+            "because they were missing, changed, older than the last publication or foreign.",
             (Sample(len(status.publication.altered), place),) if status.publication else (),
         ),
         Metric(

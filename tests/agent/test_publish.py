@@ -11,7 +11,7 @@ import re
 import shutil
 import stat
 import tarfile
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from datetime import datetime, timedelta
 from pathlib import Path
 
@@ -19,7 +19,7 @@ import pytest
 from cryptography import x509
 from tuf.api.metadata import Metadata, Root
 
-from sros_tool.agent.fetch import FetchProblem
+from sros_tool.agent.fetch import FetchError, FetchProblem
 from sros_tool.cli.fleet import _published_lines
 from sros_tool.errors import DocumentError, KeystoreError, SrosError
 from sros_tool.folders import Folder
@@ -269,6 +269,98 @@ def test_a_folder_that_went_back_is_published_again_and_shown(publisher: Home, w
     assert [note.id for note in result.notes] == ["fleet.metadata-older"]
     assert_shown_for_a_day(publisher, result, "metadata/timestamp.json")
     publisher.robot().gets()
+
+
+ROOT, NEXT_ROOT = "metadata/1.root.json", "metadata/2.root.json"
+ALTERED: dict[str, tuple[str, bytes | str, bool]] = {
+    "the root of another keystore after the last root": (NEXT_ROOT, b"foreign root", True),
+    "no metadata after the last root": (NEXT_ROOT, b"x", True),
+    "a folder after the last root": (NEXT_ROOT, "folder", True),
+    "a folder for the last root": (ROOT, "folder", False),
+    "a link after the last root": (NEXT_ROOT, "link", True),
+    "a pipe after the last root": (NEXT_ROOT, "pipe", True),
+    "the root of another keystore for the first root": (ROOT, b"foreign root", False),
+    "no first root": (ROOT, "missing", False),
+    "a link for the first root": (ROOT, "link", False),
+    "another timestamp": ("metadata/timestamp.json", b"{}", True),
+    "no timestamp": ("metadata/timestamp.json", "missing", True),
+    "a folder for the timestamp": ("metadata/timestamp.json", "folder", True),
+    "another snapshot": ("metadata/*.snapshot.json", b"{}", True),
+    "no list of targets": ("metadata/*.targets.json", "missing", True),
+    "a folder for a list of archives": ("metadata/*.robots-*.json", "folder", True),
+    "a folder in the way of the next timestamp": ("metadata/.timestamp.json.new", "folder", False),
+}
+"""Maps alterations of a publishing folder to the file, its new content, and whether robots can
+fetch nothing until it is put right.
+"""
+
+
+def alter(file: Path, content: bytes | str) -> None:
+    """Put other content in the place of a file, or nothing, or what is no file."""
+    if content != "missing" or file.exists():
+        file.unlink(missing_ok=True)
+    if content == "folder":
+        (file / "inside").mkdir(parents=True)
+    elif content == "link":
+        file.symlink_to("timestamp.json")
+    elif content == "pipe":
+        os.mkfifo(file)
+    elif isinstance(content, bytes):
+        file.write_bytes(content)
+
+
+def test_altered_metadata_is_put_right_and_shown(publisher: Home) -> None:
+    """Also for new robots; what was foreign is renamed, so that the next run finds nothing."""
+    publisher.publish()
+    robots = [publisher.robot("r2") for _ in ALTERED]
+    root = (publisher.pub / ROOT).read_bytes()
+    keys = {role: load_signer(new_key(), role) for role in ROLES}
+    foreign = Roots()
+    foreign.add(keys, [keys["root"]], publisher.now + DAY)
+    ((_, foreign_root),) = foreign.files()
+    for robot, (case, (name, content, stops_robots)) in zip(robots, ALTERED.items(), strict=True):
+        content = foreign_root if content == b"foreign root" else content
+        for file in [*publisher.pub.glob(name)] or [publisher.pub / name]:
+            alter(file, content)
+        with pytest.raises(FetchError) if stops_robots else nullcontext():
+            robot.fetch()
+        status = fleet_status(OpenedKeystore(publisher.root)).publication
+        altered = [] if name.endswith(".new") else [name if "root" in name else "metadata"]
+        assert status and bool(status.refused or status.lacks) == bool(altered), case
+        result = publisher.publish()
+        assert result.altered == altered, case
+        assert result.is_complete(publisher.now) == (not altered), case
+        assert robot.gets() == publisher.robot("r2").gets(), case
+        assert (publisher.pub / ROOT).read_bytes() == root, case
+        assert result.root_sha256 == hashlib.sha256(root).hexdigest(), case
+        status = fleet_status(OpenedKeystore(publisher.root)).publication
+        assert status and {*altered} <= status.altered.keys(), case
+        assert not (status.refused or status.lacks), case
+    assert publisher.publish().is_complete(publisher.now)
+
+
+def test_a_root_that_waits_for_the_next_rotation(publisher: Home) -> None:
+    """Robots read it only after the rotation, which takes it and the one before it away."""
+    robot, metadata = publisher.robot(), publisher.pub / "metadata"
+    for number in (2, 3):
+        (metadata / f"{number}.root.json").write_bytes(b"foreign")
+    result = publisher.publish(rotate=("timestamp",))
+    assert result.altered == ["metadata/2.root.json", "metadata/3.root.json"]
+    assert [file.name for file in metadata.glob("*.foreign")]
+    robot.gets()
+    assert publisher.publish().is_complete(publisher.now)
+    (metadata / "2.root.json").unlink()
+    assert publisher.publish().altered == ["metadata/2.root.json"]
+
+
+def test_altered_metadata_is_put_right_only_in_the_last_folder(publisher: Home) -> None:
+    """Elsewhere, the keystore does not know that the metadata was its own."""
+    publisher.publish()
+    (publisher.pub / "metadata/timestamp.json").write_bytes(b"{}")
+    other = publisher.kept("other")
+    with pytest.raises(KeystoreError, match="did not write"):
+        publish(publisher.root, other, now=publisher.now)
+    assert publisher.publish().altered == ["metadata"]
 
 
 def assert_shown_for_a_day(publisher: Home, result: PublishedFleet, file: str) -> None:
@@ -983,13 +1075,14 @@ def test_damaged_archives_do_not_count_as_huge(
     forged = json.loads(timestamp.read_bytes())
     forged["signed"]["version"] += 1
     timestamp.write_text(json.dumps(forged))
-    with pytest.raises(KeystoreError, match="metadata that this keystore did not write") as refused:
-        publisher.publish()
-    assert refused.value.remedy.startswith("If the keystore was restored from a backup, first")
     damaged = sorted(archive.name.split(".")[1] for archive in others)
+    with pytest.raises(KeystoreError, match="metadata that this keystore did not write") as refused:
+        publisher.publish(restored=True)
+    assert refused.value.remedy.startswith("If the keystore was restored from a backup, first")
     assert f"Archives are missing or changed, too: {', '.join(damaged)}" in refused.value.why
-    shutil.rmtree(publisher.pub / "metadata")
-    assert publisher.publish(new_folder=True).names("published") == ["r1", "r2", "r5"]
+    result = publisher.publish()
+    assert result.altered == [*(f"robots/{robot}.tar.gz" for robot in damaged), "metadata"]
+    assert result.names("published") == damaged
 
 
 def test_a_publishing_folder_that_was_lost(publisher: Home) -> None:
@@ -1170,11 +1263,11 @@ def test_damaged_metadata_after_a_completed_restore_shows_no_other_restore(
     publisher.publish()
     for file in publisher.pub.glob("metadata/*.robots-*.json"):
         file.write_bytes(file.read_bytes().replace(b'"length"', b'"lengtn"'))
-    for root, is_restored in ((publisher.root, False), (second, True)):
-        with pytest.raises(KeystoreError) as refused:
-            publish(root, publisher.pub, now=publisher.now)
-        assert ("The keystore was restored" in refused.value.why) == is_restored
-        assert ("--restored" in refused.value.remedy) == is_restored
+    with pytest.raises(KeystoreError) as refused:
+        publish(second, publisher.pub, now=publisher.now)
+    assert "The keystore was restored" in refused.value.why
+    assert "--restored" in refused.value.remedy
+    assert publisher.publish().altered == ["metadata"]
     shutil.rmtree(publisher.pub / "metadata")
     with pytest.raises(KeystoreError, match="sealed but does not know"):
         publish(second, publisher.pub, now=publisher.now, new_folder=True)

@@ -156,8 +156,8 @@ class PublishedAnswers(NamedTuple):
     refused: Sequence[str]
     """Robots whose release was refused, because an enclave cannot run."""
     altered: Sequence[str]
-    """Published files that were missing, changed or older than published, as with ``sros fleet
-    publish``.
+    """Published files that were missing, changed, older than published or foreign, as with ``sros
+    fleet publish``.
     """
 
 

@@ -11,6 +11,7 @@ import hashlib
 import json
 import os
 import re
+import stat
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from datetime import UTC, datetime, timedelta
@@ -198,9 +199,10 @@ class PublishedFleet(NamedTuple):
     later: Sequence[LaterChange]
     """With ``--restored``: changes made after the backup, which the keystore lacks."""
     altered: Sequence[str]
-    """Archives (``robots/NAME.tar.gz``) and ``metadata/timestamp.json``, if this run found these
-    files missing, changed, or older than the keystore had published. This run published these files
-    again, and the exit status is 1.
+    """Files that this run found missing, changed, older than published, or foreign:
+    ``robots/NAME.tar.gz`` (archives), ``metadata/timestamp.json`` (an earlier copy of the
+    metadata), ``metadata/N.root.json`` and ``metadata`` (other metadata). This run published these
+    files again, or renamed foreign files, and the exit status is 1.
     """
     changes: FileChanges
     notes: Notes
@@ -319,7 +321,7 @@ def _newer_folder_clause(keystore: OpenedKeystore) -> str:
     """
     with suppress(SrosError, ValueError, OSError, KeyError, TypeError):
         # Archives are read only where the keystore signed the metadata: anybody can write many.
-        if may_have_later_releases(keystore) and not metadata_problem(keystore):
+        if may_have_later_releases(keystore) and not _metadata_problem(keystore):
             check_tuf()
             folder, never = Path(read_published(keystore).folder), datetime.min.replace(tzinfo=UTC)
             run = _Publication(keystore, folder, never, MetadataExpiry(), dry_run=True)
@@ -330,7 +332,7 @@ def _newer_folder_clause(keystore: OpenedKeystore) -> str:
     return ""
 
 
-def metadata_problem(keystore: OpenedKeystore) -> str:
+def _metadata_problem(keystore: OpenedKeystore) -> str:
     """Return why the metadata in the publishing folder does not verify, as a clause, or "".
 
     The result is also "" if this cannot be determined here: the folder or the package ``tuf`` is
@@ -359,6 +361,30 @@ def metadata_problem(keystore: OpenedKeystore) -> str:
         if version and version < last
         else ""
     )
+
+
+def publication_problem(keystore: OpenedKeystore) -> str:
+    """Return why robots refuse what is in the publishing folder, as a clause, or "".
+
+    The problem is that of `_metadata_problem`, or a root file that is not the keystore's.  A later
+    root file of the keystore itself, which a restored keystore does not know, is no problem.
+
+    Raises:
+        DocumentError: the list of published files is damaged.
+    """
+    if problem := _metadata_problem(keystore):
+        return problem
+    known = read_published(keystore)
+    with suppress(ImportError, OSError):
+        folder, roots = Path(known.folder), _roots(keystore)
+        if known.folder and roots.versions and (folder / _METADATA).is_dir():
+            roots.add_later_versions(folder)
+            with Folder(folder) as opened:
+                altered = roots.altered_in(opened, is_complete=True)
+            if altered:
+                files = ", ".join(altered)
+                return f"'{folder}' has root metadata that is changed, missing or foreign: {files}"
+    return ""
 
 
 def _roots(keystore: OpenedKeystore) -> Roots:
@@ -408,7 +434,7 @@ def unseen_publication_clause(keystore: OpenedKeystore) -> str:
         return f"the folder of the last publication{folder} {why}"
     if missing and missing.startswith("metadata/"):
         return f"'{known.folder}' lacks {missing}"
-    return metadata_problem(keystore)
+    return publication_problem(keystore)
 
 
 def older_keystore_notes(keystore: OpenedKeystore) -> Iterator[Note]:
@@ -744,7 +770,7 @@ class _Publication:
         dry_run: bool,
     ) -> None:
         """Read what was published before, and what is in the folder now."""
-        from sros_tool.keystore.delivery.repository import read_present
+        from sros_tool.keystore.delivery.repository import PresentMetadata, read_present
 
         self.keystore = keystore
         self.expiry = expiry
@@ -762,6 +788,8 @@ class _Publication:
         self._now = now
         self._dry_run = dry_run
         self._unread: set[str] = set()
+        self._metadata_error: KeystoreError | None = None
+        is_last_folder = self._earlier_folder == self.list.folder
         try:
             self._present = read_present(folder, self.roots)
         except KeystoreError as error:
@@ -771,7 +799,21 @@ class _Publication:
             if damaged := [r for r, known in robots if not self._has_files_of(r, known.release)]:
                 names = first_few(damaged, _MOST_DAMAGED)
                 error.why += f" Archives are missing or changed, too: {names}."
-            raise
+            can_mend = os.access(folder / _METADATA, os.R_OK | os.W_OK | os.X_OK)
+            if not (is_last_folder and can_mend):
+                raise
+            self._present, self._metadata_error = PresentMetadata(), error
+        is_partly_there = any(os.path.exists(folder / path) for path in self.list.metadata)  # noqa: PTH110 - no error if it cannot be read
+        self._mends_metadata = (
+            is_last_folder and not self._present.timestamp and is_partly_there
+        ) or self._metadata_error is not None
+        """Whether metadata that the keystore wrote here was altered, and is written again."""
+        self._altered_roots: list[str] = []
+        if (folder / _METADATA).is_dir():
+            with Folder(folder) as opened:
+                self._altered_roots = self.roots.altered_in(
+                    opened, is_complete=is_last_folder and bool(self._present.timestamp)
+                )
         self._present_releases = self._present.releases()
         self._composed: NewMetadata | None = None
         self._outcomes: list[_ReleaseOutcome] = []
@@ -815,7 +857,12 @@ class _Publication:
                 ``restored`` is true, but nothing shows a restore; or the enclaves that the later
                 releases revoke cannot be read.
         """
-        is_lost = self._published_before and not self._present.timestamp
+        if restored and self._metadata_error:
+            raise self._metadata_error
+        if restored or new_folder:
+            self._mends_metadata = self._metadata_error is not None
+        has_nothing = self._published_before and not self._present.timestamp
+        is_lost = has_nothing and not self._mends_metadata
         unknown = [] if self._present.timestamp else self._unknown_releases()
         if unknown and not restored:
             raise self._unknown_error(unknown)
@@ -826,7 +873,7 @@ class _Publication:
         if self._is_other_folder:
             self._check_earlier_folder()
         if not restored:
-            is_new_place = is_lost or self._is_other_folder
+            is_new_place = has_nothing or self._is_other_folder
             is_known = has_unpublished_restore(self.keystore) or (
                 is_new_place and bool(restores_after_last_release(self.keystore))
             )
@@ -1274,7 +1321,8 @@ class _Publication:
             has_files = before is not None and self._has_files_of(robot, before.release)
             if not before or before.files != state or not has_files:
                 changed_robots.append(_ChangedRobot(robot, names, state))
-            if before and not has_files and self._present_releases.get(robot) == before.release:
+            was_here = before and self._present_releases.get(robot) == before.release
+            if before and not has_files and (was_here or self._mends_metadata):
                 self._damaged.add(robot)
         known = self.list.robots.keys() | self._present_releases.keys()
         gone = (known if among is None else looked_at) - wanted
@@ -1441,7 +1489,7 @@ class _Publication:
         }
 
     def _note_altered(self) -> None:
-        """Note which published files are missing, changed or older, and list them for a day."""
+        """Note which published files are missing, changed, older or foreign, and list them."""
         altered = [release_target(robot) for robot in sorted(self._damaged)]
         if altered:
             names = first_few(sorted(self._damaged), _MOST_DAMAGED)
@@ -1462,11 +1510,37 @@ class _Publication:
                 "there: find out who else can write to this folder."
             )
             self.notes.append(Note("fleet.metadata-older", text))
+        if self._mends_metadata:
+            altered.append(_METADATA)
+            error = self._metadata_error
+            why = f"{error.what}: {error.why}" if error else f"{TIMESTAMP_PATH} was missing."
+            text = (
+                f"metadata in '{self._folder}' was missing or changed, and is published again: "
+                f"{why} Find out who else can write to this folder."
+            )
+            self.notes.append(Note("fleet.metadata-altered", text))
+        altered += self._note_altered_roots()
         self._altered = altered
         self.list.altered = {
             **altered_lately(self.list.altered, self._now),
             **dict.fromkeys(altered, self._now),
         }
+
+    def _note_altered_roots(self) -> list[str]:
+        """Note which root files are not the keystore's, and return their paths."""
+        altered, after_last = self._altered_roots, self.roots.next_path()
+        if os.path.lexists(self._folder / after_last) and after_last not in altered:
+            altered = [*altered, after_last]  # it begins to count with a new root
+        if altered:
+            text = (
+                f"root metadata in '{self._folder}' was missing, changed or foreign: "
+                f"{', '.join(altered)}. sros writes its own files again, and renames foreign files "
+                "to NAME.foreign, because robots that read them fetch nothing. Find out who else "
+                "can write to this folder. If a robot was set up with such a file, repeat its "
+                "`sros agent init`, with --force."
+            )
+            self.notes.append(Note("fleet.root-altered", text))
+        return altered
 
     def _removable_paths(self) -> Iterator[str]:
         """Yield the paths of files in the folder that may be removed at some time."""
@@ -1509,8 +1583,12 @@ class _Publication:
         complete metadata at every moment.
         """
         assert self._composed
+        from sros_tool.keystore.delivery.repository import has_file
+
         with Folder(self._folder) as folder:
-            roots = [file for file in self.roots.files() if not folder.state(file[0])]
+            for path in {*self._altered_roots, self.roots.next_path()}:
+                _move_away(folder, path)
+            roots = [file for file in self.roots.files() if not has_file(folder, *file)]
             roots_after_timestamp = [] if self._present.follows(self.roots.last) else roots
             *files, timestamp = self._composed.files
             for path, data in (*([] if roots_after_timestamp else roots), *files):
@@ -1529,7 +1607,8 @@ class _Publication:
             folder.flush_file_system()
             for path, superseded_at in self.list.superseded.items():
                 if self._now - superseded_at >= _KEPT:
-                    folder.unlink(path, missing_ok=True)
+                    with suppress(IsADirectoryError):  # sros never made a folder there
+                        folder.unlink(path, missing_ok=True)
         keys.finish()
 
     # ── the result ─────────────────────────────────────────────────────────────────────────
@@ -1605,6 +1684,20 @@ def _put_file(folder: Folder, path: str, data: bytes) -> None:
     """Write a file of the publishing folder, whole or not at all."""
     parent, _, name = path.rpartition("/")
     spare = f"{parent}/.{name}.new"
+    for in_the_way in (spare, path):
+        if stat.S_ISDIR(folder.mode(in_the_way)):
+            _move_away(folder, in_the_way)
     folder.unlink(spare, missing_ok=True)
     folder.write(spare, data, 0o644, ignores_umask=True)  # web servers have to read it
     folder.replace(spare, path)
+
+
+def _move_away(folder: Folder, path: str) -> None:
+    """Rename what is at ``path`` so that robots do not read it; replace what was renamed before."""
+    if folder.state(path):
+        place = f"{path}.foreign"
+        if stat.S_ISDIR(folder.mode(place)):
+            folder.remove_tree(place)
+        elif stat.S_ISDIR(folder.mode(path)):
+            folder.unlink(place, missing_ok=True)
+        folder.replace(path, place)

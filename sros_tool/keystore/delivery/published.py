@@ -116,8 +116,8 @@ class PublicationRecord:
     ``superseded`` maps paths in the publishing folder that nothing names any more to the time when
     sros first noticed this.  ``folder`` is the absolute path of the publishing folder, "" if
     unknown. ``metadata`` has the paths there of the metadata to which the timestamp leads.
-    ``altered`` maps files that a run found missing, changed or older than published to the time of
-    that run; it has only targets and ``metadata/timestamp.json``, so that it stays small.
+    ``altered`` maps files that a run found missing, changed, older than published or foreign to the
+    time of that run; as `PublishedFleet.altered` lists few names, it stays small.
     ``until`` is the first expiry of the metadata: from then on, robots refuse it; ``root_until`` is
     the expiry of the root metadata.  These fields, from ``folder`` on, are empty
     or None if nothing was published, or if an earlier release of sros, which did not record them,

@@ -150,6 +150,25 @@ class Roots:
         for version in self.versions:
             yield f"{_METADATA}/{version.signed.version}.{_ROOT}.json", _metadata_bytes(version)
 
+    def altered_in(self, folder: Folder, *, is_complete: bool) -> list[str]:
+        """Return the paths of root files in a publishing folder that are not as in these versions.
+
+        Robots read the next version until one is missing, so a file after the last version counts.
+        Missing files count if ``is_complete`` is set.
+        """
+        paths = [
+            path
+            for path, data in self.files()
+            if (is_complete or folder.state(path)) and not has_file(folder, path, data)
+        ]
+        after_last = self.next_path()
+        return [*paths, after_last] if folder.state(after_last) else paths
+
+    def next_path(self) -> str:
+        """Return the path in the publishing folder of the version after the last one."""
+        number = self.last.version if self.versions else 0
+        return f"{_METADATA}/{number + 1}.{_ROOT}.json"
+
     def add(
         self, signers: Mapping[str, CryptoSigner], keys: Sequence[CryptoSigner], expires: datetime
     ) -> None:
@@ -195,6 +214,14 @@ class Roots:
             if _is_signed(version.signed, role, metadata):
                 return
         raise RepositoryError(f"no root metadata names the keys that signed {role}")
+
+
+def has_file(folder: Folder, path: str, data: bytes) -> bool:
+    """Return whether a regular file, not a link, with this content is at ``path``."""
+    try:
+        return folder.read(path, max_bytes=_MOST_BYTES) == data
+    except (SrosError, OSError):
+        return False
 
 
 def _verify(
