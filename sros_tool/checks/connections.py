@@ -56,10 +56,6 @@ _REMEDY_FOR_USERS = (
 )
 _MOST_NAMES = 4
 
-_FIRST_PORT, _PORTS_OF_DOMAIN, _FIRST_OF_PARTICIPANT = 7400, 250, 11
-"""The port for user data of participant N in domain D is 7400 + 250 * D + 11 + 2 * N (DDSI-RTPS
-2.5, 9.6.2.3)."""
-
 
 class Connections(NamedTuple):
     """The connections between processes of one machine.
@@ -124,9 +120,9 @@ def _ports_by_place(process: Process) -> Mapping[_Place, set[MemoryPort]]:
     """Return the ports on which a process receives the data of nodes."""
     ports: dict[_Place, set[MemoryPort]] = {}
     for port in process.own_ports:
-        domain, offset = divmod(port.number - _FIRST_PORT, _PORTS_OF_DOMAIN)
-        if domain >= 0 and offset >= _FIRST_OF_PARTICIPANT and offset % 2:
-            ports.setdefault(_Place(process.network, port.memory, domain), set()).add(port)
+        if port.domain is not None:
+            place = _Place(process.network, port.memory, port.domain)
+            ports.setdefault(place, set()).add(port)
     return ports
 
 

@@ -80,7 +80,7 @@ from sros_tool.runtime.processes import (
 from sros_tool.runtime.rmw import DEFAULT_RMW, RMW, vendor_of
 from sros_tool.runtime.variables import DOMAIN, ENABLE, ENCLAVE, KEYSTORE, STRATEGY
 from sros_tool.validity import Window, elapsed, iso, parse_iso
-from sros_tool.wording import first_few
+from sros_tool.wording import enumerated, first_few
 from sros_tool.xml import read_bytes
 from sros_tool.zenoh.document import ZenohEndpoint
 from sros_tool.zenoh.json5 import Json5Error, parse_json5
@@ -648,6 +648,17 @@ PROCESS_ELSEWHERE = FindingKind(
     "there.",
     prominent=True,
 )
+PROCESS_FURTHER_DOMAIN = FindingKind(
+    "runtime.process-further-domain",
+    NOTE,
+    "a process that is also in a domain other than the one that it names",
+    "A program can join further domains, as domain_bridge does, and can leave security out there. "
+    "sros does not see whether it did.",
+    "rclpy (Context.init), rclcpp (InitOptions::set_domain_id); tested with ROS 2 Jazzy.",
+    "Look for open nodes in that domain, without ROS_SECURITY_ENABLE: `sros generate_policy "
+    "open.xml --domain NUMBER --dry-run`.",
+    prominent=True,
+)
 
 CONTAINER_ALONE = FindingKind(
     "runtime.container-alone",
@@ -739,6 +750,8 @@ def process_findings(
             if is_secured_here and _network_and_domain(process) == own_domain:
                 yield from _daemon_findings(process, environment)
             continue
+        if process.further_domains:
+            yield PROCESS_FURTHER_DOMAIN.found(process.label, further_domains_text(process))
         yield from zenoh_findings(process)
         yield from lost_memory_findings([process])
         if process.asks_for_security:
@@ -784,6 +797,13 @@ def _network_and_domain(process: Process) -> tuple[str, str]:
 def _domain_text(process: Process) -> str:
     network = " of another network namespace" if process.network else ""
     return f"in domain {process.domain}{network}"
+
+
+def further_domains_text(process: Process) -> str:
+    """Return a clause on the further domains of a process."""
+    further = enumerated([*map(str, process.further_domains)])
+    noun = "domain" if len(process.further_domains) == 1 else "domains"
+    return f"its ports show that it is also in {noun} {further}"
 
 
 def _daemon_findings(process: Process, environment: Mapping[str, str]) -> Iterator[Finding]:

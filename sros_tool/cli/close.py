@@ -86,7 +86,8 @@ def _run(words: Sequence[str], shows_messages: bool) -> tuple[int, str, str]:
     "unobserved: accept processes in enclaves in which sros did not observe them. requirements: "
     "accept a requirements.toml that is missing or cannot be checked, and requirements on names "
     "that the policy no longer has. connections: accept processes of which sros cannot see whether "
-    "they hear the others, because they do not share the memory of Fast DDS.  Can be repeated.",
+    "they hear the others, because they do not share the memory of Fast DDS. domains: accept "
+    "processes that are also in another domain.  Can be repeated.",
 )
 @click.option("--partial", is_flag=True, help="Accept everything that --accept can accept.")
 @click.option(

@@ -14,6 +14,7 @@ class Acceptance(StrEnum):
     UNOBSERVED = "unobserved"
     REQUIREMENTS = "requirements"
     CONNECTIONS = "connections"
+    DOMAINS = "domains"
 
 
 Acceptances = Set[Acceptance]

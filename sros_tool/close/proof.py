@@ -23,7 +23,7 @@ from sros_tool.checks.connections import (
 from sros_tool.checks.environment import is_zenoh
 from sros_tool.checks.keystores.issued import STALE
 from sros_tool.checks.kind import NOTE, Finding
-from sros_tool.checks.processes import PROCESS_NOT_SEEN, process_findings
+from sros_tool.checks.processes import PROCESS_NOT_SEEN, further_domains_text, process_findings
 from sros_tool.checks.requirements import MISSPELLED_ENCLAVE, VACUOUS
 from sros_tool.close.nodes import (
     MovedEndpoint,
@@ -38,6 +38,7 @@ from sros_tool.close.rights import ordinary_uses
 from sros_tool.close.robot import MOST_NAMES, OBSERVER, TEMPLATE, LocalRobot
 from sros_tool.close.state import (
     ACCEPTED,
+    ALONE,
     CONNECTED,
     KNOWN,
     REQUIRED,
@@ -162,6 +163,7 @@ def proofs_of(robot: LocalRobot, state: CloseState, patience: float) -> list[Pro
     return [
         proof,
         *_proof_of_observed_processes(looks),
+        *_proof_of_domains(looks),
         files,
         required,
         talk,
@@ -527,6 +529,27 @@ def _proof_of_observed_processes(looks: Sequence[RunningRobot]) -> Iterator[Proo
             f"sros did not see {first_few(more, MOST_NAMES)} when it watched, and each process has "
             "all rights of its enclave: stop what is not yours; if only the command of a process "
             f"is new, `{looks[-1].robot.close_command}` remembers it",
+        )
+
+
+def _proof_of_domains(looks: Sequence[RunningRobot]) -> Iterator[Proof]:
+    """Yield an undecided proof if a process of the domain is also in other domains."""
+    found = {
+        process.label: process
+        for running in looks
+        for process in running.in_domain
+        if process.further_domains and not process.is_daemon
+    }
+    if found:
+        processes = found.values()
+        texts = [f"{each.label}: {further_domains_text(each)}" for each in processes]
+        numbers = sorted({number for each in processes for number in each.further_domains})
+        look = f"`sros generate_policy open.xml --domain {numbers[0]} --dry-run`"
+        yield Proof(
+            ALONE,
+            None,
+            f"{first_few(texts, MOST_NAMES, '; ')}; a program can leave out security there: accept "
+            f"this if {look} finds no node of it",
         )
 
 

@@ -64,6 +64,7 @@ _TOOLS = ("ros2", "sros", "sros_tool")
 
 STARTED = "every process was started in its enclave"
 KNOWN = "every process in an enclave belongs there"
+ALONE = "no process is in a domain that was not examined"
 ACCEPTED = "the files are accepted"
 REQUIRED = "the requirements hold"
 TALK = "everything that talked can still talk"
@@ -72,6 +73,7 @@ SILENCE = "an open listener finds nothing"
 _NEGATIONS = {
     STARTED: "not every process was started in its enclave",
     KNOWN: "not every process in an enclave belongs there",
+    ALONE: "a process is in a domain that was not examined",
     ACCEPTED: "the files are not accepted",
     REQUIRED: "the requirements do not all hold",
     TALK: "not everything that talked can still talk",
@@ -81,6 +83,7 @@ _NEGATIONS = {
 _ACCEPTANCES = {
     STARTED: Acceptance.UNEXAMINED,
     KNOWN: Acceptance.UNOBSERVED,
+    ALONE: Acceptance.DOMAINS,
     REQUIRED: Acceptance.REQUIREMENTS,
     CONNECTED: Acceptance.CONNECTIONS,
 }

@@ -23,7 +23,7 @@ import re
 import stat
 import struct
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence, Set
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
@@ -65,6 +65,11 @@ _DELETED_MEMORY = re.compile(
 """Matches a port, or a segment with messages, of Fast DDS that is mapped and was deleted."""
 _OWN_MEMORY = re.compile(r"/fast(?:rtps|dds)_(port\d{1,5}|[0-9a-f]{16})_el(?: \(deleted\))?\Z")
 """Matches the file that a process keeps locked while only it uses a port or segment."""
+_FIRST_PORT, _PORTS_OF_DOMAIN, _FIRST_OF_PARTICIPANT = 7400, 250, 11
+"""The port for user data of participant N in domain D is 7400 + 250 * D + 11 + 2 * N; the port for
+discovery by multicast is 7400 + 250 * D (DDSI-RTPS 2.5, 9.6.2.3)."""
+_LAST_DOMAIN = 101
+"""Linux gives any program the ports above this domain's (ip_local_port_range)."""
 _PRODUCTS = {b"fastrtps": "Fast DDS", b"fastdds": "Fast DDS", b"ddsc": "Cyclone DDS"}
 _THREE_NUMBERS = re.compile(r"\.so\.(\d+\.\d+\.\d+)(?:\.\d+)?\Z", re.ASCII)
 _MOST_ENTRIES = 10_000
@@ -128,6 +133,13 @@ class MemoryPort(NamedTuple):
     memory: str
     file: int
 
+    @property
+    def domain(self) -> int | None:
+        """The ROS domain whose data a process receives on the port; None for other ports."""
+        domain, offset = divmod(self.number - _FIRST_PORT, _PORTS_OF_DOMAIN)
+        is_for_data = offset >= _FIRST_OF_PARTICIPANT and offset % 2
+        return domain if domain >= 0 and is_for_data else None
+
 
 @dataclass(frozen=True, slots=True)
 class Process:
@@ -146,7 +158,9 @@ class Process:
     process; for a set-user-ID program, of the user who started it; `SEVERAL_USERS` if several users
     can control the process. ``own_ports`` are the ports of Fast DDS that only this process reads,
     and ``mapped_ports`` also those to which it has sent. ``lost_memory`` says that files of its own
-    shared memory were deleted, so that no other process of Fast DDS can open them.
+    shared memory were deleted, so that no other process of Fast DDS can open them. ``domains`` are
+    the ROS domains that its ports show, which may be more than the domain that it names: a program
+    can join others, and need not secure itself there.
     """
 
     pid: int
@@ -165,6 +179,7 @@ class Process:
     own_ports: frozenset[MemoryPort] = frozenset()
     mapped_ports: frozenset[MemoryPort] = frozenset()
     lost_memory: bool = False
+    domains: frozenset[int] = frozenset()
 
     @property
     def program(self) -> tuple[int, tuple[str, ...]]:
@@ -185,6 +200,11 @@ class Process:
     def domain(self) -> str:
         """The ROS domain that the process names, as a number; see `domain_text`."""
         return domain_text(self.environment.get(DOMAIN, ""))
+
+    @property
+    def further_domains(self) -> Sequence[int]:
+        """The ROS domains in which the process is, besides the domain that it names."""
+        return sorted(number for number in self.domains if str(number) != self.domain)
 
     @property
     def rmw(self) -> str:
@@ -633,7 +653,10 @@ def _examine(pid: int, folder: int, command: tuple[str, ...], started: datetime)
         for memory, file, number in _MEMORY_PORTS.findall(maps)
     )
     deleted = {name.decode() for name in _DELETED_MEMORY.findall(maps)}
-    own = _own_memory(folder) if ports or deleted else set()
+    opened = _open_files(folder)
+    own = {match[1] for match in map(_OWN_MEMORY.search, opened) if match}
+    own_ports = frozenset(port for port in ports if f"port{port.number}" in own)
+    domains = {port.domain for port in own_ports} | _discovery_domains(folder, opened)
     return Process(
         pid,
         command,
@@ -645,24 +668,43 @@ def _examine(pid: int, folder: int, command: tuple[str, ...], started: datetime)
         dds=_mapped_dds(maps),
         forked_by=_forked_by(folder, command),
         own_pid=_number(_OWN_PID, status) or pid,
-        own_ports=frozenset(port for port in ports if f"port{port.number}" in own),
+        own_ports=own_ports,
         mapped_ports=ports,
         lost_memory=not own.isdisjoint(deleted),
+        domains=frozenset(number for number in domains if number is not None),
     )
 
 
-def _own_memory(folder: int) -> set[str]:
-    """Return the names of the ports and segments of Fast DDS that only this process uses."""
+def _open_files(folder: int) -> list[str]:
+    """Return the files and sockets that a process has opened, as /proc/PID/fd names them."""
     handle = os.open("fd", os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC, dir_fd=folder)
     try:
-        names = set[str]()
+        names = []
         for name in os.listdir(handle)[:_MOST_ENTRIES]:
             with suppress(FileNotFoundError):  # closed since
-                match = _OWN_MEMORY.search(os.readlink(name, dir_fd=handle))
-                names |= {match[1]} if match else set()
+                names.append(os.readlink(name, dir_fd=handle))
         return names
     finally:
         os.close(handle)
+
+
+def _discovery_domains(folder: int, opened: Iterable[str]) -> set[int]:
+    """Return the ROS domains on whose port for discovery by multicast a process receives.
+
+    ``opened`` are the files that it has opened. Without multicast (such as with
+    ROS_LOCALHOST_ONLY=1), DDS does not open this port.
+    """
+    sockets = {name[8:-1] for name in opened if name.startswith("socket:[")}
+    domains = set[int]()
+    for table in ("net/udp", "net/udp6"):
+        with suppress(FileNotFoundError):  # a kernel without IPv6
+            for line in _read(folder, table, _MOST_MAPS).decode().splitlines()[1:]:
+                columns = line.split()
+                port = int(columns[1].rpartition(":")[2], 16)
+                domain, offset = divmod(port - _FIRST_PORT, _PORTS_OF_DOMAIN)
+                is_for_discovery = not offset and 0 <= domain <= _LAST_DOMAIN
+                domains |= {domain} if is_for_discovery and columns[9] in sockets else set()
+    return domains
 
 
 def _forked_by(folder: int, command: tuple[str, ...]) -> tuple[int, tuple[str, ...]]:

@@ -287,6 +287,7 @@ CASES: dict[str, Change] = {
     "runtime.process-files-replaceable": _others_can_write,
     "runtime.process-key-readable": _others_can_read_the_key,
     "runtime.process-elsewhere": changed(0, network="net:[1]"),
+    "runtime.process-further-domain": changed(0, domains=frozenset({0, 92})),
     "runtime.process-not-seen": _unseen,
     "runtime.container-alone": lambda state, _: replace(
         state, running=replace(state.running, is_in_container=True)

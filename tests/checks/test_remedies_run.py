@@ -164,6 +164,7 @@ _MACHINE = "its command looks at this machine, and not at the one of the case"
 NOT_HERE = {
     "runtime.container-alone": _MACHINE,
     "runtime.process-elsewhere": _MACHINE,
+    "runtime.process-further-domain": _MACHINE,
     "runtime.process-not-seen": _MACHINE,
     "runtime.process-rmw-unknown": _MACHINE,
     "runtime.rmw-without-security": _MACHINE,

@@ -1029,6 +1029,10 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     said = robot.close("--proof", status=1).out
     assert "no: not every process was started in its enclave: process 5 (guest)" in said
     assert "belongs there" not in said, "only programs of ros2 are left"
+    robot.more = (replace(talker, pid=8, command=("ros2", "topic"), domains=frozenset({0, 92})),)
+    further = "not checked (--accept domains accepts this): no process is in a domain that was not "
+    further += "examined: process 8 (ros2): its ports show that it is also in domain 92; "
+    assert further in robot.close("--proof", status=1).out
     lax_talker = replace(talker, pid=11, environment=lax)
     for late, says in (
         (

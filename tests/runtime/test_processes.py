@@ -50,7 +50,8 @@ class Proc:
         start: str = "100",
     ) -> Path:
         folder = self.path / str(pid)
-        (folder / "ns").mkdir(parents=True, exist_ok=True)
+        for name in ("ns", "fd", "net"):
+            (folder / name).mkdir(parents=True, exist_ok=True)
         numbers = ["S", str(parent), *"0000", str(flags), *"000000000000", start, "4096", *"00000"]
         (folder / "stat").write_text(f"{pid} (a) b) {' '.join(numbers)}\n")
         (folder / "cmdline").write_bytes("\0".join((*command, "")).encode())
@@ -135,12 +136,35 @@ def test_the_ports_in_shared_memory_that_only_this_process_reads(
     folder = proc.add(7, *ROS)
     lines = [f"7f00-7f01 rw-s 00 00:1b {n} /dev/shm/fastrtps_{m}" for n, m in enumerate(mapped)]
     (folder / "maps").write_text("".join(f"{line}\n" for line in lines))
-    (folder / "fd").mkdir()
     for number, name in enumerate(locked):
         (folder / "fd" / str(number)).symlink_to(f"/dev/shm/fastrtps_{name}")
     (process,) = proc.look().processes
     assert {port.number for port in process.own_ports} == ports
     assert process.lost_memory is lost
+    assert process.domains == ({0} if ports else set())
+
+
+@pytest.mark.parametrize(
+    ("port", "inode", "further"),
+    [
+        (7400 + 250 * 92, 5, [92]),
+        (7400 + 250 * 90, 5, []),  # the domain that it names
+        (7400 + 250 * 101, 5, [101]),
+        (7400 + 250 * 102, 5, []),  # any program may get this port
+        (7400 + 250 * 92 + 10, 5, []),
+        (7150, 5, []),
+        (7400 + 250 * 92, 6, []),  # the port of another process
+    ],
+)
+@pytest.mark.parametrize("table", ["udp", "udp6"])
+def test_the_domains_that_a_process_joins_by_its_code(
+    port: int, inode: int, further: list[int], table: str, proc: Proc
+) -> None:
+    folder = proc.add(7, *ROS, environment=b"ROS_DOMAIN_ID=90")
+    (folder / "fd" / "3").symlink_to("socket:[5]")
+    row = f"9: 00000000:{port:04X} 00000000:0000 07 00000000:00000000 00:00000000 00000000 0 0"
+    (folder / "net" / table).write_text(f"  sl  local_address\n  {row} {inode} 2 0 0\n")
+    assert [process.further_domains for process in proc.look().processes] == [further]
 
 
 def test_kernel_threads_and_processes_that_wait_for_a_node_are_none(proc: Proc) -> None:
