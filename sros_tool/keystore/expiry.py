@@ -143,7 +143,7 @@ class ExpiringEnclaves(NamedTuple):
     unreadable: Sequence[EnclaveProblem]
     """Enclaves whose expiry cannot be read."""
     short_lived: Sequence[DueEnclave]
-    """Short-lived enclaves with their expiry that ``sros renew`` renews only by name."""
+    """Short-lived enclaves, which ``sros renew`` renews only by name, with their expiry."""
 
 
 def expiring_enclaves(renewals: ExpiryCheck) -> ExpiringEnclaves:

@@ -198,7 +198,7 @@ class ConfirmedFile:
     since: str = ""
     """When the keystore issued the robot's file, in UTC; null if the ledger does not record it."""
     enclave: str = ""
-    """The enclave to which the robot's file belongs; null if it is the enclave of the path."""
+    """The enclave to which the robot's file belongs; null if ``path`` names this enclave."""
     robot: str = ""
     """The robot to which ``enclave`` belongs, or null."""
     surplus: bool = False

@@ -288,8 +288,8 @@ class RenewedEnclaves(NamedTuple):
     because it or the last permissions for it expire. Null if all have expired or were revoked.
     """
     may_work_longer: bool
-    """Whether certificates that the ledger lacks may work longer, because the keystore is an old
-    copy, or was restored from a backup.
+    """Whether earlier certificates that the ledger lacks may work after that time, because the
+    keystore is an old copy, or was restored from a backup.
     """
     revoked: int
     """Number of certificates that were revoked (``--revoke-old``)."""
