@@ -922,11 +922,12 @@ class _Review:
             yield "requirements: none are named"
         others = ""
         if self.decided_elsewhere:
-            others = f": there, sros decided only {self.decided_elsewhere}, not whether all hold"
+            others = f": there, sros only decided {self.decided_elsewhere}"
         if self.is_relative and not asked.namespaces:
             options = [f"--namespace {quote(name)}" for name in sorted(self.namespaces_to_add)]
             add = f" (add {' '.join(options[:_MOST_NAMESPACES])})" if options else ""
-            yield f"requirements with relative names in namespaces other than /{add}{others}"
+            names = "whether requirements with relative names hold"
+            yield f"{names} in namespaces other than /{add}{others}"
         if not self.base:
             yield "nothing is compared with an earlier commit, as the options say"
         if asked.allow_new_access:

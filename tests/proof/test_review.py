@@ -1458,7 +1458,10 @@ def test_requirements_of_a_package_are_decided_in_a_namespace(
     change.commit({"other": "1"})
     asked = ("--policy", "robot.xml", "--requirements", "robot.toml")
     ended = change.review(*asked).ok()
-    assert "namespaces other than / (add --namespace /l): there, sros decided only" in ended.out
+    assert (
+        "hold in namespaces other than / (add --namespace /l): there, sros only decided"
+        in ended.out
+    )
     with monkeypatch.context() as patched:
         patched.setattr(review, "_MOST_NAMESPACES", 1)
         some = "the change breaks them in 1 of 2 namespaces (those of changed names first)"
@@ -1468,7 +1471,7 @@ def test_requirements_of_a_package_are_decided_in_a_namespace(
         in sros("review", "--base", "none", *asked, cwd=change.folder).out
     )
     ended = change.review(*asked, "--namespace", "/l", "--namespace", "/")
-    assert ended.status == 1 and "decided only" not in ended.out, ended
+    assert ended.status == 1 and "only decided" not in ended.out, ended
     assert "requirements robot.xml: 1 error, 2 notes in /l and /" in ended.out, ended
     assert "/b: may publish /l/x, but only /l/a may publish /l/x" in ended.out
     ended = change.review(*asked, "--namespace", "/l", "--remap", "x:=/x")
@@ -1491,7 +1494,7 @@ def test_requirements_of_a_package_are_decided_in_a_namespace(
     change.base = change.commit({"robot.xml": policy_text({"/a": publish("x", "/m/y")})})
     change.commit({"other": "2"})
     ended = change.review(*asked).ok()
-    assert "namespaces other than /: there, sros decided only" in ended.out, ended
+    assert "namespaces other than /: there, sros only decided" in ended.out, ended
     moved = sros(
         "check", "robot.xml", "--requirements", "robot.toml", "--namespace", "/m", cwd=change.folder
     )
