@@ -194,7 +194,8 @@ def _refuse_ignored(mode: str) -> None:
 @click.option("--all-vendors", is_flag=True, help="Compare the decisions of all vendors.")
 @distro_option(
     "Decide as a DDS that this ROS 2 distribution ships, such as lyrical: the DDS of --vendor or "
-    "$RMW_IMPLEMENTATION, else the default DDS of the distribution. [default: $ROS_DISTRO]"
+    "$RMW_IMPLEMENTATION, else the default DDS of the distribution. [default: the only one that "
+    "the keystore's fleet or settings state for the enclave, else $ROS_DISTRO]"
 )
 @all_distros_option("Compare the decisions of all supported ROS 2 distributions.")
 @click.option(

@@ -56,7 +56,7 @@ class ArrivalFinding(NamedTuple):
     enclave: str | None
     """The enclave that the finding is about, or null."""
     file: str
-    """The file that the finding is about: its path in the enclave's folder, else relative to DIR."""
+    """The file that the finding is about: its path in the enclave's folder, else in DIR."""
     text: str
     """The fault and its remedy."""
 
