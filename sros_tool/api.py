@@ -543,9 +543,7 @@ def renew(
 
     names = tuple(enclaves)
     if not names and expiring is None:
-        raise UsageError(
-            "nothing is given to renew", "", "Pass enclaves, or expiring=timedelta(...)."
-        )
+        raise UsageError("no enclaves are given", "", "Pass enclaves, or expiring=timedelta(...).")
     return lifecycle.renew(
         Path(keystore),
         names,
@@ -890,7 +888,7 @@ def check(
 
     levels = {level.word: level for level in Severity}
     if not paths:
-        raise UsageError("no path is given to check", "", "Pass at least one path.")
+        raise UsageError("no path is given", "", "Pass at least one path.")
     if severity not in levels:
         raise UsageError(f"unknown severity {severity!r}", "", f"Choose {', '.join(levels)}.")
     robots = read_fleet(Path(fleet)) if fleet else None

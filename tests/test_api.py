@@ -284,7 +284,7 @@ def test_enclaves_are_created_renewed_and_revoked(keystore: sros_tool.Keystore) 
     gone = sros_tool.revoke(keystore, ["/c"], reason="keyCompromise")
     assert gone.names("revoked") == ("/c",) and "/c" not in keystore.enclaves
     assert set(gone.restart) == set(keystore.enclaves)
-    with pytest.raises(UsageError, match="nothing is given to renew"):
+    with pytest.raises(UsageError, match="no enclaves are given"):
         sros_tool.renew(keystore)
     with pytest.raises(UsageError, match="unknown reason"):
         sros_tool.revoke(keystore, ["/c"], reason="spring")

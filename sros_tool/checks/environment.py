@@ -171,8 +171,8 @@ DOMAIN_MALFORMED = FindingKind(
     "runtime.domain-malformed",
     ERROR,
     "ROS_DOMAIN_ID is not a valid domain id",
-    "Nodes do not start; if the value has a leading zero, they read it as octal and join another "
-    "domain.",
+    "Nodes do not start. But if the value has a leading zero, they read it as octal, and join "
+    "another domain.",
     "rcl 9 (rcl/src/rcl/domain_id.c: strtoul with base 0); Cyclone DDS refuses domains above 230.",
     "Write one whole number from 0 to 230, without leading zeros.",
 )

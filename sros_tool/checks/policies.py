@@ -236,9 +236,9 @@ MISSPELT = FindingKind(
     "policy.name-misspelt",
     WARNING,
     "a name that differs from its likely counterpart in spelling, namespace or kind",
-    "Neither of the two names has a counterpart, so the nodes do not communicate. One name may be "
-    "misspelled, lack a namespace, or be of another kind, such as a service where an action is "
-    "called.",
+    "Neither of the two names has an exact counterpart, so the nodes do not communicate. One name "
+    "may be misspelled, lack a namespace, or be of another kind, such as a service where an action "
+    "is called.",
     "sros: compares the rights of all enclaves in the policy.",
     "Write the same name, of the same kind, in both places, as the nodes have it after remapping.",
 )

@@ -799,7 +799,7 @@ def update_keystore(
         )
     if take_edits and next_stage:
         raise UsageError(
-            "--take-edits has no stages",
+            "--take-edits excludes --next",
             "The first stage would write sros.toml, and so undo the edits that belong to the "
             "second stage.",
             "Copy sros.toml elsewhere, undo the edits with --discard-edits, and name the copy with "

@@ -719,8 +719,8 @@ def _agent_inbox(root: Path) -> tuple[list[str], list[Note]]:
         text = (
             f"sros cannot read the settings of an agent in '{root}' (`sros agent init` writes "
             "them, for the owner alone). If the agent's inbox is a folder, not a URL, write the "
-            "units again as the owner once they exist: the unit lets the agent write only into "
-            "folders that it names"
+            "units again as the owner once the settings exist: the unit lets the agent write only "
+            "into folders that the unit names"
         )
         return [], [Note("units.no-agent", text)]
     inbox = read_settings(root, to_run=False).inbox

@@ -845,8 +845,8 @@ class _TalkComparison:
             )
         if topics := self._nodes.topics_without_node:
             yield (
-                "not compared, because they belonged to no ROS node: writers or readers of "
-                f"{topics} (programs without security cannot talk to the closed robot)"
+                f"not compared: writers or readers of {topics}, which belonged to no ROS node "
+                "(programs without security cannot talk to the closed robot)"
             )
 
 

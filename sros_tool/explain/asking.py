@@ -282,7 +282,7 @@ def note_on_lacking_keys(keystore: OpenedKeystore) -> Iterator[Note]:
     """Yield a note for a keystore or export in which no enclave has its key."""
     if is_keystore(keystore.root) and not keystore.has_keys:
         text = (
-            f"no enclave in '{keystore.root}' has its key: this is answered as if the keys were "
+            f"no enclave in '{keystore.root}' has its key: sros answers as if the keys were "
             "there. On the robot, `sros verify FOLDER`, with the folder of its enclaves, says "
             "whether the keys are there."
         )

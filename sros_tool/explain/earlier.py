@@ -296,4 +296,4 @@ def _note_on_unknown_answer(
 ) -> Note:
     """Return a note which says that the answer is not known, for what reason, and what to do."""
     remedy = remedy or f"`sros check {quote(str(keystore.root))}` says what to do."
-    return Note(kind, f"{_UNKNOWN_TEXTS[kind]} is not known: {reason}. {remedy}")
+    return Note(kind, f"it is not known {_UNKNOWN_TEXTS[kind]}: {reason}. {remedy}")

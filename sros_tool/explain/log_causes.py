@@ -851,10 +851,11 @@ def _renaming_advice(nodes: Sequence[str], wrong: str, enclave: str) -> str:
     renamed = ""
     if len(meant) == 1:
         renamed = (
-            f". If the new name is wanted, write {wrong} in the profile of {meant[0]}, or, for the "
-            "policy of a package, merge it again, into a policy without the node: `sros "
-            f"merge_policy POLICY OTHER {_merge_options(meant[0], wrong)}` (before `:__node`, "
-            "write the name that OTHER has for the node)"
+            f". If the new name is wanted, write {wrong} in the profile of {meant[0]}. If the "
+            "profile was merged from the policy of a package, merge that policy again instead, "
+            "into a policy without the node: `sros merge_policy POLICY OTHER "
+            f"{_merge_options(meant[0], wrong)}` (before `:__node`, write the name that OTHER has "
+            "for the node)"
         )
     return (
         f"{start}{renamed}. A further node needs a profile with common/node.xml: in the policy of "

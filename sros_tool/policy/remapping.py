@@ -237,8 +237,8 @@ def remapped_policies(
         nodes = sorted({use.node for use in uses})
         if rule.old == _NODE and len(nodes) > 1:
             text = (
-                f"--remap {rule} gives one name to the nodes {enumerated(nodes)}. Choose the node "
-                f"with --node, or write its name, as in {nodes[0]}:{rule}."
+                f"--remap {rule} gives the same name to the nodes {enumerated(nodes)}. Choose the "
+                f"node with --node, or write its name, as in {nodes[0]}:{rule}."
             )
             notes.append(Note("merge.remapped-nodes", text))
         if rule.old != _NAMESPACE and any(use.kind == "actions" for use in uses):
@@ -337,8 +337,8 @@ def _notes_on_requirements(
         words = " ".join(f"--remap {quote(option)}" for option in sorted(options))
         text = (
             f"requirements that name {first_few(sorted(gone), _MOST_SHOWN)} protect only the old "
-            "name, unless you check them with the same remapping: `sros check POLICY "
-            f"--requirements FILE {words}`, with --namespace as in the merge. If no "
+            f"name{'s' * (len(gone) > 1)}, unless you check them with the same remapping: `sros "
+            f"check POLICY --requirements FILE {words}`, with --namespace as in the merge. If no "
             "requirement has the old name of a --remap, `sros check` says so: then leave it out."
         )
         yield Note("merge.requirements-of-old-names", text)

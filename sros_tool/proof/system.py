@@ -550,7 +550,8 @@ def _zenoh_worlds(
     for note in source.notes:
         if note.id in UNCERTAIN:
             raise KeystoreError(
-                f"what Zenoh enforces in keystore '{root}' is not known: {note.text.rstrip('.')}",
+                f"it is not known what Zenoh enforces in keystore '{root}': "
+                f"{note.text.rstrip('.')}",
                 "",
                 "Write the Zenoh files again (`sros zenoh`), or name a DDS vendor with --vendor.",
             )

@@ -900,7 +900,7 @@ def test_a_revoked_enclave_that_processes_without_the_list_still_accept(keystore
     )
     permissions.write_bytes(kept)
     (keystore / "ledger.jsonl").rename(keystore / "kept")
-    assert "is not known: ledger.jsonl is missing" in revoked_notes(*other)
+    assert "accept revoked certificates: ledger.jsonl is missing" in revoked_notes(*other)
 
 
 @pytest.mark.parametrize("vendor", ["fastdds", "zenoh"])
@@ -984,7 +984,8 @@ def test_earlier_permissions_that_still_allow_it(keystore: Path, tmp_path: Path)
     ledger.write_text("".join((*lines[:earlier], "damaged\n", *lines[earlier + 1 :])))
     denied = explain(keystore, "--who", *asked)
     assert (
-        "whether earlier permissions may still allow it is not known: ledger.jsonl:" in denied.err
+        "it is not known whether earlier permissions may still allow it: ledger.jsonl:"
+        in denied.err
     )
     ledger.write_text("".join(lines))
     sros("renew", keystore, ENCLAVE, "--revoke-old").ok()
@@ -995,7 +996,7 @@ def test_earlier_permissions_that_still_allow_it(keystore: Path, tmp_path: Path)
         assert denied.status == 1
         for unknown in ("earlier permissions may still allow it", "still accept revoked certifi"):
             (line,) = (line for line in denied.err.splitlines() if unknown in line)
-            assert "is not known: " in line
+            assert "it is not known whether " in line
             assert "`sros check " in line or "Restore" in line, line
         if ledger.is_file():
             ledger.unlink()

@@ -193,7 +193,7 @@ OLDER_LIST = FindingKind(
 ROOT_ENCLAVE = FindingKind(
     "keystore.root-enclave",
     WARNING,
-    "an enclave / with all rights of other enclaves",
+    "the enclave '/', with all rights of other enclaves",
     "A process that names no enclave runs in /, and gets all rights of /. Without an enclave /, it "
     "would not start (with ROS_SECURITY_STRATEGY=Enforce).",
     "rcl 9 (rcl/src/rcl/security.c, context.c: the enclave is / by default).",

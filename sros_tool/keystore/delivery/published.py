@@ -293,7 +293,7 @@ def releases_in(folder: Path, robots: int, altered: set[str] | None = None) -> I
     if excess:
         raise KeystoreError(
             f"'{folder / 'targets/robots'}' has {excess} archives",
-            "The keystore did not publish so many. sros would have to read all of them, because "
+            "The keystore published less. sros would have to read all of them, because "
             "the keystore does not know the metadata in this folder.",
             f"Find out who else can write to the folder. Then move '{folder}' away, and publish "
             "with --new-folder of `sros fleet publish`. But if the keystore was restored from a "

@@ -486,7 +486,8 @@ class _RequestCertifier:
             "request.all-domains",
             f"{name} belongs to no robot of the fleet, so its permissions are for all domains of "
             f"the keystore ({domains}). If it belongs to a robot, sign its request again with "
-            "--renew, --fleet FLEET_FILE, and a policy that has {robot} in its path.",
+            "--renew, --fleet FLEET_FILE, and a policy in which the path of the enclave has "
+            "{robot}.",
         )
 
     def _remove_key_other_than(self, request: SigningRequest) -> bool:

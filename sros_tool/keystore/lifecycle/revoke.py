@@ -165,8 +165,8 @@ def _later_keys_notes(
             "revoke.later-keys",
             "the keystore was restored from a backup, and learned only afterwards of newer keys of "
             f"{first_few(sorted(names), _MOST_SHOWN)} (for example of new hardware). These keys "
-            f"{would} revoked, too, and get no certificates again: create new keys on "
-            "the robot. docs/howto/keystore_is_lost.md says how to revoke only the earlier keys.",
+            f"{would} revoked, too, and get no certificates again: create new keys on their "
+            "robots. docs/howto/keystore_is_lost.md says how to revoke only the earlier keys.",
         )
 
 

@@ -544,10 +544,11 @@ class _Rotator:
                 "Add --delete-old-key to a later stage.",
             )
         if self._delete and self.kept_elsewhere:
+            keys = "this key" if len(self.kept_elsewhere) == 1 else "these keys"
             raise UsageError(
                 f"sros deletes no key outside of the keystore: {', '.join(self.kept_elsewhere)}",
-                "Another keystore may use the key, and there may be copies.",
-                "Leave out --delete-old-key. After the stage retire, delete this key yourself, and "
+                f"Another keystore may use {keys}, and there may be copies.",
+                f"Leave out --delete-old-key. After the stage retire, delete {keys} yourself, and "
                 f"the files `*.key.pem` in '{self._root}/{RETIRED}'.",
             )
 
