@@ -439,8 +439,9 @@ def list_enclaves(
     for name in names:
         echo(name)
     if hidden:
+        where = "a hidden folder" if len(hidden) == 1 else "hidden folders"
         echo(
-            f"not listed, but loaded by DDS: {counted(len(hidden), 'enclave')} in a hidden folder: "
+            f"not listed, but loaded by DDS: {counted(len(hidden), 'enclave')} in {where}: "
             f"{first_few(hidden, 5)}. `sros check {quote(str(root))}` says what to do.",
             err=True,
         )

@@ -280,7 +280,7 @@ class _RemainingProcesses:
             names, old_name = nodes.names_in(process.enclave)
             named = node_argument(process.command)
             has_old_name = old_name and (not named or expand("~", *named) == old_name)
-            was = f" (its node was {old_name} when sros watched; the new name is also right)"
+            was = f" (its node was {old_name} when sros watched; it may also have its new name)"
             state, start = "does not run; ", "start it"
             if similar := [
                 (len({*process.command}.intersection(other.program[1])), other.label)

@@ -729,8 +729,8 @@ def test_what_systemd_does_not_start_is_done_by_hand(
     undone = robot.close("--undo")  # with the open process 12
     assert undone.err.startswith(
         "/listener may run open by another command (process 12 (run)); if that is not so, "
-        "start /listener open (its node was /listener when sros watched; the new name is also "
-        "right): cd /opt && /opt/run listener\n"
+        "start /listener open (its node was /listener when sros watched; it may also have its "
+        "new name): cd /opt && /opt/run listener\n"
         "/talker does not run; start it open: cd /opt "
     )
     processes = robot.folder / "robot/processes.json"
