@@ -285,6 +285,7 @@ ALTERED: dict[str, tuple[str, bytes | str, bool]] = {
     "another timestamp": ("metadata/timestamp.json", b"{}", True),
     "no timestamp": ("metadata/timestamp.json", "missing", True),
     "a folder for the timestamp": ("metadata/timestamp.json", "folder", True),
+    "no metadata": ("metadata", "missing", True),
     "another snapshot": ("metadata/*.snapshot.json", b"{}", True),
     "no list of targets": ("metadata/*.targets.json", "missing", True),
     "a folder for a list of archives": ("metadata/*.robots-*.json", "folder", True),
@@ -297,8 +298,9 @@ fetch nothing until it is put right.
 
 def alter(file: Path, content: bytes | str) -> None:
     """Put other content in the place of a file, or nothing, or what is no file."""
-    if content != "missing" or file.exists():
-        file.unlink(missing_ok=True)
+    if file.is_dir():
+        shutil.rmtree(file)
+    file.unlink(missing_ok=True)
     if content == "folder":
         (file / "inside").mkdir(parents=True)
     elif content == "link":

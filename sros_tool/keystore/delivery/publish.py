@@ -18,6 +18,7 @@ from datetime import UTC, datetime, timedelta
 from functools import lru_cache, partial
 from itertools import chain, islice
 from pathlib import Path
+from secrets import token_hex
 from shlex import quote
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
@@ -803,7 +804,7 @@ class _Publication:
             if not (is_last_folder and can_mend):
                 raise
             self._present, self._metadata_error = PresentMetadata(), error
-        is_partly_there = any(os.path.exists(folder / path) for path in self.list.metadata)  # noqa: PTH110 - no error if it cannot be read
+        is_partly_there = any(os.path.exists(folder / path) for path in self.list.paths())  # noqa: PTH110 - no error if it cannot be read
         self._mends_metadata = (
             is_last_folder and not self._present.timestamp and is_partly_there
         ) or self._metadata_error is not None
@@ -1535,7 +1536,7 @@ class _Publication:
             text = (
                 f"root metadata in '{self._folder}' was missing, changed or foreign: "
                 f"{', '.join(altered)}. sros writes its own files again, and renames foreign files "
-                "to NAME.foreign, because robots that read them fetch nothing. Find out who else "
+                "to NAME.*.foreign, because robots that read them fetch nothing. Find out who else "
                 "can write to this folder. If a robot was set up with such a file, repeat its "
                 "`sros agent init`, with --force."
             )
@@ -1693,11 +1694,6 @@ def _put_file(folder: Folder, path: str, data: bytes) -> None:
 
 
 def _move_away(folder: Folder, path: str) -> None:
-    """Rename what is at ``path`` so that robots do not read it; replace what was renamed before."""
+    """Rename what is at ``path``, whatever it is, so that robots do not read it."""
     if folder.state(path):
-        place = f"{path}.foreign"
-        if stat.S_ISDIR(folder.mode(place)):
-            folder.remove_tree(place)
-        elif stat.S_ISDIR(folder.mode(path)):
-            folder.unlink(place, missing_ok=True)
-        folder.replace(path, place)
+        folder.replace(path, f"{path}.{token_hex(4)}.foreign")  # a name that nobody can block
