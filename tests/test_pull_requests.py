@@ -198,8 +198,11 @@ def test_a_checkout_below_the_workspace_is_reviewed(origin: Origin, tmp_path: Pa
         ({"policy": "../robot.xml"}, "is not a path from the top of the repository"),
         ({"policy": "/robot.xml"}, "is not a path from the top of the repository"),
         ({"policy": ""}, "no policy and no keystore is named"),
-        ({"policy": "robot.policy.xml"}, f"top of the repository: is '{POLICY}' meant?"),
-        ({"keystore": "common"}, "begin at the top of the repository: is 'robot/common' meant?"),
+        ({"policy": "robot.policy.xml"}, f"repository: perhaps '{POLICY}' is meant. Review"),
+        (
+            {"keystore": "common"},
+            "begin at the top of the repository: perhaps 'robot/common' is meant. R",
+        ),
         ({"requirements": "robot/none.toml"}, "'robot/none.toml' is not in the commit"),
         ({"fleet": "robot/none.toml"}, "'robot/none.toml' is not in the commit"),
         ({"keystore": "none"}, "'none' is not in the commit"),

@@ -606,7 +606,7 @@ class _Review:
                 if tree_entry.id == entry.id:
                     became = f"The change renames it to '{name}'."
         elif below := self._same_name_below(path):
-            became = f"Paths begin at the top of the repository: is '{below}' meant?"
+            became = f"Paths begin at the top of the repository: perhaps '{below}' is meant."
         return DocumentError(
             f"'{path}' is not in the commit",
             became,
