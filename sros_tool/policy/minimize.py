@@ -13,7 +13,7 @@ from __future__ import annotations
 import re
 from bisect import bisect_left
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from itertools import chain
 from typing import NamedTuple
@@ -75,15 +75,17 @@ def enclaves_of_nodes(
     }
 
 
-def moved_to_policy(observed: Policy, policy: Policy) -> tuple[Policy, dict[str, dict[str, str]]]:
-    """Return ``observed`` with nodes moved to their enclaves in ``policy``, and the moved nodes.
+def moved_to_enclaves(
+    observed: Policy, stated: Mapping[str, Collection[str]]
+) -> tuple[Policy, dict[str, dict[str, str]]]:
+    """Return ``observed`` with nodes moved to their enclaves in a policy, and the moved nodes.
 
-    The second value maps observed enclaves to their nodes, and each node to its enclave in the
-    policy.  Only enclaves with the name of one of their nodes change, as ``generate_policy
-    --enclave-per-node`` gives a process the name of one of its nodes.  Nodes that the policy has in
-    several enclaves, or in none, do not move.
+    ``stated`` maps enclaves of the policy to the full names of their nodes.  The second value maps
+    observed enclaves to their nodes, and each node to its enclave in the policy.  Only enclaves
+    with the name of one of their nodes change, as ``generate_policy --enclave-per-node`` gives a
+    process the name of one of its nodes.  Nodes that the policy has in several enclaves, or in
+    none, do not move.
     """
-    stated = policy.nodes()
     moves: dict[str, dict[str, str]] = {}
     profiles: dict[str, list[Profile]] = defaultdict(list)
     for enclave in observed.enclaves:

@@ -51,7 +51,7 @@ from sros_tool.pki.certificates import (
 )
 from sros_tool.pki.keys import algorithm
 from sros_tool.policy.document import read_policy
-from sros_tool.policy.minimize import enclaves_of_nodes
+from sros_tool.policy.minimize import enclaves_of_nodes, moved_to_enclaves
 from sros_tool.policy.patterns import Names
 from sros_tool.policy.rights import RightsDifference, policy_rights
 from sros_tool.report.compose import (
@@ -157,7 +157,8 @@ def draw(request: PictureRequest) -> tuple[Picture, Folding]:
     places = {enclave: robot.name for enclave, robot in robots.items()}
     hosts = places | _hosts(request.hosts)
     if observed:
-        observation = union(list(map(PictureSource.with_title, observed, titles[len(read) :])))
+        titled = map(PictureSource.with_title, observed, titles[len(read) :])
+        observation = union([_in_enclaves_of(read[0], source) for source in titled])
         enclave_of = enclaves_of_nodes(observation.nodes, read[0].nodes)
         read.append(observation.moved_to_homes(enclave_of))
     picture = _compared_picture(read, hosts, use=bool(request.observed))
@@ -477,6 +478,14 @@ def _finding_text(finding: Finding, subject: str, shown: Callable[[str], str] = 
 
 
 # ── one source ─────────────────────────────────────────────────────────────────────────────
+
+
+def _in_enclaves_of(source: PictureSource, observed: PictureSource) -> PictureSource:
+    """Return an observed source with its nodes moved to their enclaves in ``source``."""
+    if observed.policy is None:
+        return observed
+    moved, _ = moved_to_enclaves(observed.policy, source.nodes)
+    return replace(observed, rights=policy_rights(moved), nodes=moved.nodes())
 
 
 def read_source(

@@ -521,6 +521,8 @@ def test_nodes_of_one_process_count_for_their_own_enclaves_in_the_policy(folder:
         assert (ended.status, said in ended.err) == (status, True), seen
         assert "not allowed" not in ended.out and "never observed;" not in ended.out
         assert ended.err.count("[") == bool(said), ended.err
+        view = sros("view", "robot.xml", "--observed", "seen.xml", "--json").ok()
+        assert {edge["mark"] for edge in json.loads(view.out)["edges"]} == {"both"}, seen
 
 
 def test_a_job_fails_where_the_policy_and_what_was_observed_differ(folder: Path) -> None:

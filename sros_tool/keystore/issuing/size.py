@@ -30,7 +30,7 @@ from sros_tool.policy.minimize import (
     MinimizedPolicy,
     WildcardProposal,
     minimize,
-    moved_to_policy,
+    moved_to_enclaves,
     nodes_not_as_observed,
     propose_wildcards,
 )
@@ -171,7 +171,7 @@ def minimized_policy(
         observed_rights = with_placeholders(robots, used)
         gaps += _robot_notes(unobserved_robots(robots, used))
     else:
-        moved = [moved_to_policy(of_source, policy) for of_source in policies]
+        moved = [moved_to_enclaves(of_source, policy.nodes()) for of_source in policies]
         policies = [of_source for of_source, _ in moved]
         of_documents = (source.rights for source in sources if not source.policy)
         observed_rights = frozenset().union(*of_documents, *map(policy_rights, policies))
