@@ -31,6 +31,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import product
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple
 
 from sros_tool.checks.kind import Finding, RelatedPlace
@@ -220,6 +221,27 @@ def patterns_of_enclaves(requirement: Requirement) -> tuple[str, ...]:
         case _:
             return ()
     return tuple(name.removeprefix(EXCEPT) for name in listed)
+
+
+def enclaves_of(requirement: Requirement) -> tuple[str, ...]:
+    """Return the enclaves and patterns of a requirement, also the enclave of `Must`."""
+    if isinstance(requirement, Must):
+        return (requirement.enclave,)
+    return patterns_of_enclaves(requirement)
+
+
+def names_of(requirement: Requirement) -> tuple[str, ...]:
+    """Return the names of topics, services and actions in a requirement."""
+    match requirement:
+        case RightsRequirement(rights=rights):
+            pass
+        case NotBoth(first=first, second=second):
+            rights = (*first, *second)
+        case Protected(names=names):
+            return tuple(name for _, name in names)
+        case _:
+            return ()
+    return tuple(name for _, names in rights for name in names)
 
 
 def demand(requirement: Requirement) -> str:
@@ -1042,9 +1064,14 @@ def _demanded_by(requirements: Iterable[Requirement]) -> Callable[[Requirement],
 
 
 def dropped_findings(
-    before: Iterable[Requirement], after: Iterable[Requirement], file: str
+    before: Iterable[Requirement],
+    after: Iterable[Requirement],
+    file: str,
+    clauses: Mapping[Requirement, str] = MappingProxyType({}),
 ) -> list[Finding]:
     """Return a finding for each requirement that ``after`` does not fully demand.
+
+    ``clauses`` has texts to add to findings.
 
     The requirements that one table makes for several robots share a finding.  Its place is a table
     that still demands something about the same names; without one, it is ``file``, the path of the
@@ -1058,7 +1085,9 @@ def dropped_findings(
     return [
         DROPPED.found(
             ": ".join(filter(None, (first.name, first.demand))),
-            first.text() + _other_robots_text([other.requirement.robot for other in others]),
+            first.text()
+            + clauses.get(first.requirement, "")
+            + _other_robots_text([other.requirement.robot for other in others]),
             *((first.kept[0].source.file, first.kept[0].source.line) if first.kept else (file, 0)),
             related=(RelatedPlace("required before", first.file, first.line or None),),
         )

@@ -73,7 +73,7 @@ from sros_tool.keystore.template import Template, load_template, read_template, 
 from sros_tool.names import expand, is_expression
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import ALLOW, PEER_RIGHT, Enclave, Policy, policy_in_namespace
-from sros_tool.policy.patterns import common_name
+from sros_tool.policy.patterns import common_name, overlap
 from sros_tool.policy.remapping import Remapping
 from sros_tool.policy.rights import (
     NodeName,
@@ -113,10 +113,19 @@ from sros_tool.proof.growth import Growth, compare_access
 from sros_tool.proof.repository import FILES, LINK, SUBMODULE, Repository, TreeEntry, walk
 from sros_tool.proof.requirements import (
     KINDS,
+    AtMost,
     FleetSource,
+    Must,
+    Nobody,
+    NotBoth,
+    NothingBut,
+    Only,
     Requirement,
+    Widest,
     dropped_findings,
     dropped_requirements,
+    enclaves_of,
+    names_of,
     patterns_of_enclaves,
     read_all_requirements,
     read_requirements,
@@ -1117,11 +1126,22 @@ class _Review:
                 and (subject in keystores or self.has_all_policies),
             )
             required_before = [*chain.from_iterable(earlier.values())]
+            moves = _Moves()
+            with suppress(SrosError, OSError):  # the step on requirements reports the error
+                moves = _moves(before, system.fleet())
+            if moves.namespaces and earlier:
+                moved = read_all_requirements(
+                    [base_files[path] for path in earlier],
+                    partial(_without_removed_robots, moves.fleet, system.fleet),
+                    self.request.namespaces,
+                    self.request.remaps,
+                )
+                required_before = moves.follow(required_before, moved, wanted, system)
             unanswered = partial(
                 _unanswered_requirement_findings, required_before, wanted, rights, later_rights
             )
             decide = partial(
-                self._dropped_step, required_before, wanted, system, sources, unanswered
+                self._dropped_step, required_before, wanted, system, sources, unanswered, moves
             )
             yield from self._step_result(
                 "requirements-before", subject, decide, is_wanted=len(read) == len(files)
@@ -1254,6 +1274,7 @@ class _Review:
         system: System,
         compared_sides: Callable[[], tuple[AccessSource, AccessSource]] | None,
         unanswered: Callable[[], Iterable[Finding]],
+        moves: _Moves,
     ) -> tuple[int, Content] | None:
         dropped = [
             requirement.requirement
@@ -1264,7 +1285,9 @@ class _Review:
             sources = compared_sides() if compared_sides else None
         left = [*unanswered()]
         if sources:
-            left += [*_findings_on_lost_restrictions(earlier, wanted_requirements, *sources)]
+            left += _findings_on_lost_restrictions(
+                earlier, wanted_requirements, *sources, moves.namespaces
+            )
         if not (dropped or left):
             return None
         assert self.base
@@ -1274,7 +1297,7 @@ class _Review:
             else finding._replace(
                 file=str(self.head.folder / Path(place.file).relative_to(self.base.folder))
             )
-            for finding in dropped_findings(earlier, wanted_requirements, "")
+            for finding in dropped_findings(earlier, wanted_requirements, "", moves.clauses)
             for place in finding.related
         ]
         broken = requirement_findings(dropped, system)
@@ -1502,13 +1525,16 @@ def _findings_on_lost_restrictions(
     requirements: Sequence[Requirement],
     before: AccessSource,
     after: AccessSource,
+    moved_namespaces: Mapping[str, str],
 ) -> Iterator[Finding]:
     """Yield a finding for each node that moves to an enclave that a requirement does not restrict.
 
     Before the move, the requirement and a similar one of ``earlier`` restricted its enclave.
+    ``moved_namespaces`` maps old to new namespaces of robots.
     """
     old_enclaves, new_enclaves = (
-        _enclaves_by_node(source.enclaves.values()) for source in (before, after)
+        _enclaves_by_node(source.enclaves.values(), namespaces)
+        for source, namespaces in ((before, moved_namespaces), (after, {}))
     )
     moves = [
         (node, old - new_enclaves[node], new_enclaves[node] - old)
@@ -1637,10 +1663,15 @@ def _namespaces_in(names: Iterable[str]) -> Iterator[str]:
         yield from ("/".join(parts[:end]) for end in range(2, len(parts) + 1))
 
 
-def _enclaves_by_node(enclaves: Iterable[Enclave]) -> dict[NodeName, set[str]]:
+def _enclaves_by_node(
+    enclaves: Iterable[Enclave], moved_namespaces: Mapping[str, str]
+) -> dict[NodeName, set[str]]:
     nodes: dict[NodeName, set[str]] = {}
     for enclave in enclaves:
         for node in nodes_of(enclave):
+            own = [ns for ns in moved_namespaces if f"{node.ns}/".startswith(f"{ns}/")]
+            if old := max(own, key=len, default=""):
+                node = node._replace(ns=moved_namespaces[old] + node.ns.removeprefix(old))
             nodes.setdefault(node, set()).add(enclave.path)
     return nodes
 
@@ -1662,6 +1693,78 @@ def _without_removed_robots(before: Fleet | None, after: FleetSource) -> Fleet |
     return Fleet.of(
         (robot for robot in before.robots.values() if robot.name not in gone), before.groups
     )
+
+
+@dataclass(frozen=True, slots=True)
+class _Moves:
+    """The robots whose namespaces HEAD changes.
+
+    ``namespaces`` maps their old to their new namespaces; ``fleet`` is the fleet of BASE with the
+    new namespaces.  ``clauses`` say why a requirement does not follow its robot.
+    """
+
+    namespaces: Mapping[str, str] = field(default_factory=dict)
+    fleet: Fleet | None = None
+    clauses: dict[Requirement, str] = field(default_factory=dict)
+
+    def follow(
+        self,
+        earlier: Sequence[Requirement],
+        moved: Sequence[Requirement],
+        requirements: Iterable[Requirement],
+        system: System,
+    ) -> list[Requirement]:
+        """Return ``earlier``, with the requirements that follow their robots as in ``moved``.
+
+        A requirement of BASE that HEAD does not demand follows its robot, unless HEAD still has
+        rights to the names, or the enclaves, of the robot's old namespace.
+        """
+        if len(earlier) != len(moved):
+            return [*earlier]
+        dropped = {each.requirement for each in dropped_requirements(earlier, requirements)}
+        result: list[Requirement] = []
+        for old, new in zip(earlier, moved, strict=True):
+            clause = _old_names_clause(old, new, system) if old in dropped and old != new else ""
+            if clause:
+                self.clauses[old] = (
+                    f"; its robot has another namespace now, but {clause}. Remove this from the "
+                    "policy, or demand the same for the old name"
+                )
+            result.append(new if old in dropped and not clause else old)
+        return result
+
+
+def _moves(before: Fleet | None, after: Fleet | None) -> _Moves:
+    if before is None or after is None:
+        return _Moves()
+    robots = [
+        robot._replace(namespace=after.robots.get(robot.name, robot).namespace)
+        for robot in before.robots.values()
+    ]
+    pairs = [(before.robots[robot.name].namespace, robot.namespace) for robot in robots]
+    moved = {old: new for old, new in pairs if old != new}
+    is_clear = all(moved.get(old, old) == new for old, new in pairs)
+    return _Moves(moved, Fleet.of(robots, before.groups)) if is_clear else _Moves()
+
+
+def _old_names_clause(old: Requirement, new: Requirement, system: System) -> str:
+    """Return a clause if something in HEAD has a name that only ``old`` has, or ""."""
+    enclaves = {*enclaves_of(old)}.difference(enclaves_of(new))
+    for enclave in sorted({right.enclave for right in system.rights}):
+        if any(overlap(enclave, name) for name in enclaves):
+            return f"the enclave {enclave} still exists"
+    if isinstance(old, Must | NothingBut | Widest):  # these do not restrict who may use a name
+        return ""
+    names = {*names_of(old)}.difference(names_of(new))
+    for right in sorted(system.rights):
+        is_stated = right.qualifier is ALLOW and not is_expression(right.name)
+        if is_stated and any(overlap(right.name, name) for name in names):
+            return f"{right.enclave} may still {right.right} {right.name}"
+    if isinstance(old, Only | Nobody | AtMost | NotBoth):
+        for finding in requirement_findings([old], system):
+            if finding.kind is VIOLATED:
+                return f"{finding.subject} {finding.text}"
+    return ""
 
 
 def _undecided_step(kind: str, subject: str, error: SrosError | OSError) -> ReviewStep:

@@ -849,6 +849,64 @@ def test_a_fleet_counts_as_each_commit_has_it(change: Change) -> None:
     assert "new-access fleet.toml: 'r1' gets its keys at another address: 10.6.6.6" in ended.out
 
 
+_MUX, _BASE = publish("cmd"), '<topics subscribe="ALLOW"><topic>cmd</topic></topics>'
+_PLACED = {"/{robot}/mux": _MUX, "/{robot}/base": _BASE}
+_MOVED = """[[only]]
+publish = ["{namespace}/cmd"]
+enclaves = ["/{robot}/mux"]
+[[must]]
+enclave = "/{robot}/base"
+subscribe = ["{namespace}/cmd"]
+[[nothing_but]]
+enclaves = ["/{robot}/base"]
+subscribe = ["{namespace}/cmd"]
+"""
+
+
+@pytest.mark.parametrize(
+    ("policy", "required", "said"),
+    some(
+        [
+            (_PLACED, _MOVED, ""),
+            ({**_PLACED, "/spy": publish("/n1/cmd")}, _MOVED, "but /spy may still publish /n1/cmd"),
+            ({**_PLACED, "/spy": publish("/n1/*")}, _MOVED, "only /r1/mux may publish /n1/cmd"),
+            (
+                _PLACED,
+                _MOVED[_MOVED.index("[[must]]") :],
+                "only /r1/mux may publish /n2/cmd: the new",
+            ),
+            (
+                {**_PLACED, "/{robot}/x": _BASE},
+                _MOVED,
+                "node /n2/base moves to enclave /r1/x, where",
+            ),
+        ],
+        3,
+    ),
+)
+def test_requirements_follow_a_robot_to_its_new_namespace(
+    change: Change, policy: dict[str, str], required: str, said: str
+) -> None:
+    fleet = "[robots.r1]\nnamespace = '/n1'\n"
+
+    def text(rights: dict[str, str]) -> str:
+        """Return a policy in the robot's namespace; /x, if it is there, has the node of /base."""
+        whole = policy_text(rights).replace('ns="/"', 'ns="{namespace}"')
+        whole = whole.replace('ns="{namespace}" node="spy"', 'ns="/" node="spy"')
+        moved = whole.replace('node="base"', 'node="lift"').replace('node="x"', 'node="base"')
+        return moved if "/{robot}/x" in rights else whole
+
+    change.base = change.commit(
+        {"robots.xml": text(_PLACED), "robots.toml": _MOVED, "fleet.toml": fleet}
+    )
+    moved = fleet.replace("n1", "n2")
+    change.commit({"robots.xml": text(policy), "robots.toml": required, "fleet.toml": moved})
+    words = ("--policy", "robots.xml", "--fleet", "fleet.toml", "--requirements", "robots.toml")
+    ended = change.review(*words, "--new-access", "allow")
+    assert ("requirements-before" in ended.out) == bool(said), ended
+    assert said in ended.out, ended
+
+
 _TWO = """[robots.r1]
 address = "10.0.0.1"
 namespace = "/n1"
