@@ -83,6 +83,7 @@ from sros_tool.policy.rights import (
 )
 from sros_tool.proof.requirements import Must, read_requirements
 from sros_tool.runtime.environment import ROS_ARGS, named_enclave
+from sros_tool.runtime.rmw import RMW
 from sros_tool.runtime.variables import ENCLAVE
 from sros_tool.validity import iso
 from sros_tool.wording import counted, enumerated, first_few
@@ -440,26 +441,35 @@ def _proof_of_silence(robot: LocalRobot, before: Observation, *, hears: bool) ->
         why = "this proves nothing, because the observer in its enclave does not see the robot now"
         return Proof(SILENCE, None, why)
     reason = f"the listener saw {nodes_text(before.nodes)} before, and sees none now"
-    return Proof(SILENCE, True, reason, details=[*_narrow_discovery(robot.shell.environment)])
+    environment = robot.shell.environment
+    if not (narrow := _narrow_discovery(environment)):
+        return Proof(SILENCE, True, reason)
+    settings = enumerated([f"{name}={value}" for name, value in narrow.items()])
+    only_here = f"with {settings} in this shell, the listener sees only this machine: unset "
+    only_here += enumerated([*narrow])
+    if environment.get(RMW, "").startswith("rmw_cyclonedds"):
+        # The observer would no longer see the nodes that run with these variables.
+        listen = shlex.join(("sros", *words, "--dry-run"))
+        return Proof(SILENCE, True, reason, details=[f"{only_here}, and listen again: `{listen}`"])
+    return Proof(SILENCE, None, f"{only_here}, and run the proof again")
 
 
-def _narrow_discovery(environment: Mapping[str, str]) -> Iterator[str]:
-    """Yield a clause on each variable that keeps the listener from seeing other machines.
+def _narrow_discovery(environment: Mapping[str, str]) -> Mapping[str, str]:
+    """Return the variables that keep the listener from seeing other machines.
 
     rmw_zenoh ignores these variables. Source: rcl/src/rcl/discovery_options.c and localhost.c.
     """
     if is_zenoh(environment):
-        return
+        return {}
     wide_values = {
         "ROS_AUTOMATIC_DISCOVERY_RANGE": ("", "SUBNET", "SYSTEM_DEFAULT"),
         "ROS_LOCALHOST_ONLY": ("", "0"),
     }
-    for name, wide in wide_values.items():
-        if (value := environment.get(name, "")) not in wide:
-            yield (
-                f"with {name}={value} in this shell, the listener sees only this machine: unset "
-                f"{name}, and run the proof again"
-            )
+    return {
+        name: value
+        for name, wide in wide_values.items()
+        if (value := environment.get(name, "")) not in wide
+    }
 
 
 def _proof_of_processes(
