@@ -236,7 +236,7 @@ class Fault(Enum):
     CRL_USAGE = (
         "crl-usage",
         "a revocation list of a CA that may not sign lists",
-        "The keyUsage of the CA lacks cRLSign, so every vendor refuses the list, and every "
+        "The keyUsage of the CA lacks cRLSign, so with this list, every vendor refuses every "
         "participant.",
         "RFC 5280, 4.2.1.3; OpenSSL 3 (x509_vfy.c); Fast DDS 2.9.1 and 2.14.5, Cyclone DDS 0.10.2; "
         "tested.",

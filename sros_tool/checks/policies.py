@@ -178,7 +178,7 @@ WIDE = FindingKind(
     "policy.wide-wildcard",
     WARNING,
     "a wildcard wider than a namespace",
-    "* also matches slashes, so the rule reaches nodes and namespaces that you may not expect.",
+    "* also matches slashes, so the rule may reach more nodes and namespaces than you expect.",
     "DDS-Security 1.1, 9.4.1.3 (POSIX fnmatch, in which * also matches a slash).",
     "Begin the name with a whole namespace, as in /arm/*, or end it with a whole "
     "name, as in /*/scan.",

@@ -688,7 +688,7 @@ def check_keystore(root: Path) -> None:
             parent = next((path for path in root.parents[-2::-1] if not path.exists()), None)
             why = "It does not exist."
             why += (
-                f" The folder '{parent}' does not exist either: its disk may not be mounted."
+                f" The folder '{parent}' does not exist either: perhaps its disk is not mounted."
                 if parent
                 else ""
             )

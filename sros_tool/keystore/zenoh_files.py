@@ -1124,7 +1124,7 @@ def grant_for_all_vendors(document: bytes, name: str, subject: str) -> Grant | N
             read[reader] = read_permissions_as(vendor, document)
         chosen = _grant_for(vendor, read[reader], subject, at)
         if isinstance(chosen, Refusal):
-            raise DocumentError(f"{name} are not accepted by every DDS vendor: {chosen.text}")
+            raise DocumentError(f"not every DDS vendor accepts {name}: {chosen.text}")
         if (chosen.rules, chosen.default_allow) != (grant.rules, grant.default_allow):
             raise DocumentError(
                 f"{name} are not the same for every DDS vendor: {vendor.title} uses other rules"

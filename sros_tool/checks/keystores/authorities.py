@@ -204,7 +204,7 @@ CA_EXPIRED = FindingKind(
     ERROR,
     "a CA of the keystore is not valid now",
     "Nothing can be issued or signed with the CA, and DDS refuses everything that it issued or "
-    "signed.",
+    "signed. Only Cyclone DDS 11 still accepts documents of an expired permissions CA.",
     "RFC 5280, 6.1.3; Fast DDS 2.14.5 (Error '10' verifying CA certificate).",
     "Check the clock of this machine. If it is right, replace the CA: `sros rotate_ca KEYSTORE "
     "--finish`.",

@@ -529,7 +529,7 @@ NO_ACCESS_CONTROL = FindingKind(
     "governance.no-access-control",
     WARNING,
     "topics that every participant in the domain may read or write",
-    "Permissions are not checked for these topics, so a policy has no effect on them.",
+    "Permissions are not checked for this access, so a policy has no effect on it.",
     f"{_GOVERNANCE_SOURCE} (enable_read_access_control, enable_write_access_control).",
     _TEMPLATE_REMEDY,
 )

@@ -311,8 +311,8 @@ def _lost_revocations(
                     shown = (
                         f"revokes {counted(len(lacking), 'certificate')} that the keystore's "
                         "revocation list lacks",
-                        f"The certificate with the serial number {min(lacking):x} may not have "
-                        "expired",
+                        f"The certificate with the serial number {min(lacking):x} has perhaps not "
+                        "expired yet",
                     )
                 else:
                     continue

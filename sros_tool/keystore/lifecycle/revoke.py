@@ -478,7 +478,7 @@ def refresh_crl(
         if not any(signed_by(each.list, ca) for each in lost for ca in authorities):
             raise KeystoreError(
                 "no identity CA of the keystore signed the revocation list that was given",
-                "Whoever wrote it could have any certificate revoked. Nothing was changed.",
+                "Whoever wrote it could revoke any certificate. Nothing was changed.",
                 "Give a list of this keystore, such as crl.pem of a robot.",
             )
         if forgotten.add(crl):
