@@ -8,7 +8,6 @@ import subprocess
 import time
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from contextlib import suppress
 from datetime import timedelta
 from itertools import chain
 from pathlib import Path
@@ -34,6 +33,7 @@ from sros_tool.policy.model import Policy
 from sros_tool.runtime.environment import node_argument
 from sros_tool.runtime.logind import users_without_linger
 from sros_tool.runtime.processes import Process, program_of, user_text
+from sros_tool.runtime.unit_properties import unit_properties
 from sros_tool.runtime.units import unit_changes, write_units
 from sros_tool.values import FileChange
 from sros_tool.wording import enumerated
@@ -385,11 +385,9 @@ def _states_of_stopped_units(units: Iterable[str]) -> dict[str, str]:
     """
     stopped = dict[str, str]()
     for unit in units:
-        command = ["systemctl", "show", "--property=ActiveState", "--value", unit]
-        with suppress(OSError):  # the restart reports it
-            ended = subprocess.run(command, capture_output=True, text=True, check=False)
-            if (state := ended.stdout.strip()) in ("inactive", "failed"):
-                stopped[unit] = state
+        state = unit_properties(unit, "ActiveState").get("ActiveState", "")
+        if state in ("inactive", "failed"):
+            stopped[unit] = state
     return stopped
 
 

@@ -27,6 +27,7 @@ from sros_tool.errors import UsageError
 from sros_tool.graph.observation import FAST_DDS, ObservedNode
 from sros_tool.runtime.environment import node_argument
 from sros_tool.runtime.processes import Process, ProcessOrigin, process_origin, program_of
+from sros_tool.runtime.unit_properties import unit_properties
 from sros_tool.runtime.units import unit_words
 
 _CYCLONE_SECONDS = 30.0
@@ -204,13 +205,9 @@ def with_command_of_unit(process: ClosedProcess) -> ClosedProcess:
     """
     if not (process.unit and process.lacks_enclave_argument):
         return process
-    command = ["systemctl", "show", "--property=ExecStart", "--value", process.unit]
-    try:
-        shown = subprocess.run(command, capture_output=True, check=False).stdout
-    except OSError:
-        shown = b""
+    shown = unit_properties(process.unit, "ExecStart").get("ExecStart", "")
     with suppress(UsageError):  # some words cannot be written in a unit
         for words in (process.command, process.command[1:]):
-            if f"; argv[]={' '.join(words)} ;".encode() in shown and [*unit_words(words)]:
+            if f"; argv[]={' '.join(words)} ;" in shown and [*unit_words(words)]:
                 return process._replace(command=words)
     return process._replace(unit="")

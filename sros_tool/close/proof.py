@@ -33,6 +33,7 @@ from sros_tool.close.nodes import (
     nodes_text,
     ros_use,
 )
+from sros_tool.close.overrides import overrides
 from sros_tool.close.processes import ObservedProcesses
 from sros_tool.close.rights import ordinary_uses
 from sros_tool.close.robot import MOST_NAMES, OBSERVER, TEMPLATE, LocalRobot
@@ -586,14 +587,23 @@ def _open_elsewhere(running: RunningRobot) -> Iterator[str]:
             yield f"{process.label} runs open in domain {process.domain}"
 
 
+def _log_command(robot: LocalRobot, unit: str = "") -> str:
+    """Return the command that explains the log of a unit, or of a process without a unit."""
+    explain = f"sros explain {shlex.quote(str(robot.export))} --log"
+    return f"`journalctl -n 100 -u {unit} | {explain} -`" if unit else f"`{explain} ITS_LOG`"
+
+
 def _why_missing(running: RunningRobot, missing: Sequence[str], observed: ObservedProcesses) -> str:
     """Return the enclaves without a secured process, and why their other processes do not count."""
     robot = running.robot
     outdated = {name: found for name, found in running.not_current.items() if name in missing}
+    overridden = overrides(running, observed)
+    apply = f"`{robot.close_command} --apply`"
     causes = {
         process.enclave: f"{process.unit} does not run it: systemctl status {process.unit}"
         if process.absent
-        else f"{process.pids_text} is open: stop it"
+        else f"{process.pids_text} is open: "
+        + (f"{apply} restarts {process.unit}" if process.unit else "stop it")
         for process in observed.processes
         if not process.is_idle
     }
@@ -604,13 +614,23 @@ def _why_missing(running: RunningRobot, missing: Sequence[str], observed: Observ
         for process in running.in_domain
         if (enclave := process.enclave)
     }
+    causes |= {
+        name: f"{overridden[name].process.label}: {overridden[name].text}" for name in overridden
+    }
     enclaves = ", ".join(f"{name} ({causes[name]})" if name in causes else name for name in absent)
     reasons = [f"no secured process of this robot runs in {enclaves}"] * bool(absent)
     advice = ""
-    if absent:
-        log = f"`sros explain {shlex.quote(str(robot.export))} --log ITS_LOG`"
-        advice = f". Start each process as {robot.commands_file} says. If a process ended, its log "
-        advice += f"says why: {log}"
+    units = {process.enclave: process.unit for process in observed.processes if process.unit}
+    if any(name not in units for name in absent):
+        advice = f". Start each process as {robot.commands_file} says"
+    stopped = [
+        process.unit
+        for process in observed.processes
+        if process.absent and process.enclave in absent and process.enclave not in overridden
+    ]
+    if stopped or advice:
+        log = _log_command(robot, *stopped[:1])
+        advice += f". If a process ended, its log says why: {log}"
     if may_end := [name for name in absent if name not in {*has_start, *robot.without}]:
         options = ", ".join(f"--without {name}" for name in may_end)
         advice += f". For a process that does not always run, add its option: {options}"
@@ -621,19 +641,24 @@ def _why_missing(running: RunningRobot, missing: Sequence[str], observed: Observ
             name: [str(process.pid) for process, cause in outdated[name] if cause == why]
             for name in outdated
         }
+        names = [name for name in missing if pids.get(name)]
         enclaves = ", ".join(
             f"{name} ({'process' if len(pids[name]) == 1 else 'processes'} "
             f"{first_few(pids[name], MOST_NAMES)})"
-            for name in missing
-            if pids.get(name)
+            for name in names
         )
-        reasons.append(f"{why} the processes of {enclaves}; restart them")
+        texts = [overridden[name].text for name in names if name in overridden]
+        if to_restart := [name for name in names if name not in overridden]:
+            of_units = units.keys() >= {*to_restart}
+            texts.insert(0, f"{apply} restarts them" if of_units else "restart them")
+        reasons.append(f"{why} the processes of {enclaves}; {'; '.join(texts)}")
     named = {
         pid
         for process in observed.processes
         if process.enclave in absent
         for pid in (process.pid, *process.alike)
     }
+    named |= {override.process.program[0] for override in overridden.values()}
     if others := [
         process.label
         for process in running.open_processes

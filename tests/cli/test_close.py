@@ -22,7 +22,17 @@ import yaml
 import sros_tool
 from sros_tool.api import renew
 from sros_tool.cli import close
-from sros_tool.close import apply, assignment, nodes, preparation, processes, proof, state, watch
+from sros_tool.close import (
+    apply,
+    assignment,
+    nodes,
+    overrides,
+    preparation,
+    processes,
+    proof,
+    state,
+    watch,
+)
 from sros_tool.close import robot as of_robot
 from sros_tool.close.acceptance import Acceptance
 from sros_tool.close.assignment import with_command_of_unit
@@ -79,7 +89,7 @@ EVENTS = ("publish rt/parameter_events", "subscribe rt/parameter_events")
 TALKER = ros_node("talker", "010f0000671200000000", "publish rt/chatter")
 LISTENER = ros_node("listener", "010f0000681200000000", "subscribe rt/chatter")
 SYSTEMCTL = """#!/bin/sh
-[ $1 = show ] && exec cat {states}/$4 2> /dev/null
+[ $1 = show ] && exec cat {states}/$3 2> /dev/null
 echo "$@" >> {log}
 exit $(cat {status})
 """
@@ -182,7 +192,7 @@ class Robot:
 def find_origins(
     monkeypatch: pytest.MonkeyPatch, process_origin: Callable[[int], ProcessOrigin]
 ) -> None:
-    for module in (assignment, state, watch):
+    for module in (assignment, overrides, state, watch):
         monkeypatch.setattr(module, "process_origin", process_origin)
 
 
@@ -555,12 +565,12 @@ def test_a_robot_is_closed_proved_and_opened_again(
     robot.more = (replace(robot.process("/talker", is_secured=False), pid=12, user=12),)
     policy.write_text(signed.replace('"/talker"', '"/other"'))
     for stopped in ("inactive", "failed"):
-        (robot.folder / "talker.service").write_text(f"{stopped}\n")
+        (robot.folder / "talker.service").write_text(f"ActiveState={stopped}\n")
         assert "talker.service" not in robot.close("--undo").err, "its enclave was taken away"
     policy.write_text(signed)
     failed = "talker.service has failed: start it open with `systemctl start talker.service`, or"
     assert failed in robot.close("--undo", status=1).out
-    (robot.folder / "talker.service").write_text("inactive\n")
+    (robot.folder / "talker.service").write_text("ActiveState=inactive\n")
     stays = "did not run, and --undo starts no stopped unit; to start it open: systemctl start talk"
     assert stays in robot.close("--undo").err
     assert {*robot.restarts[5:]} == {"daemon-reload"}
@@ -768,7 +778,7 @@ def a_unit_that_started_after_the_watch(robot: Robot, late: Process) -> None:
     assert processes.read_bytes() == before
     robot.close("--apply", status=1)
     robot.more = ()  # it could not start in its enclave
-    (robot.folder / "late.service").write_text("failed\n")
+    (robot.folder / "late.service").write_text("ActiveState=failed\n")
     for _ in range(2):
         assert "late.service has failed: start it open" in robot.close("--undo", status=1).out
     processes.write_bytes(before)
@@ -970,7 +980,7 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     assert "no: not every process was started in its enclave: process 5 (spy)" in ended.out
     assert "ROS_SECURITY_ENABLE. Stop it: another process runs in /talker.\n" in ended.err
     robot.more = ()
-    robot.outdated = {"/talker"}
+    robot.outdated, restarts = {"/talker"}, "`sros close robot --apply` restarts"
     key = robot.folder / "robot/export/enclaves/talker/key.pem"
     key.chmod(0o644)
     said = robot.close("--proof", status=1).out
@@ -979,11 +989,11 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
         "others can read key.pem (its mode is 0644): if anybody read it, run `sros renew " in said
     )
     assert " and 2 more changed, or got another mode, after the start of" in said
-    assert f"the processes of /talker (process {PID['/talker']}); restart them\n" in said
+    assert f"the processes of /talker (process {PID['/talker']}); {restarts} them\n" in said
     said = robot.close().out
     assert " another mode, after the start of the processes of /talker: restart them\n" in said
     robot.more = (replace(robot.process("/talker", is_secured=True), pid=13, command=("b",)),)
-    named = f"the processes of /talker (processes {PID['/talker']}, 13); restart them\n"
+    named = f"the processes of /talker (processes {PID['/talker']}, 13); {restarts} them\n"
     assert named in robot.close("--proof", status=1).out
     robot.outdated, robot.absent = set(), {"/talker"}
     talker = robot.process("/talker", is_secured=True)
@@ -1000,7 +1010,7 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
         (replace(talker, user=12345), "user 12345, not the owner of the files, can control"),
     ):
         robot.more = (changed,)
-        named = f"{why} the processes of /talker (process {PID['/talker']}); restart them\n"
+        named = f"{why} the processes of /talker (process {PID['/talker']}); {restarts} them\n"
         assert f"in its enclave: {named}" in robot.close("--proof", status=1).out
     robot.absent = set()
     seven = Process(5, ("guest",), {"ROS_DOMAIN_ID": "7"}, datetime.now(UTC))
@@ -1257,7 +1267,8 @@ def test_a_unit_that_does_not_run_is_not_called_open(
     robot.absent = {"/listener"}
     unit = robot.units["/listener"]
     said = robot.close("--proof", status=1).out
-    assert f"in /listener ({unit} does not run it: systemctl status {unit}). Start " in said
+    assert f"in /listener ({unit} does not run it: systemctl status {unit}). If a p" in said
+    assert f"ended, its log says why: `journalctl -n 100 -u {unit} | sros explain robot/exp" in said
     assert "--without" not in said
     ended = robot.close()
     assert "  /listener: not running: --apply restarts" in ended.out
@@ -1281,7 +1292,7 @@ def test_units_that_do_not_restart_are_named(robot: Robot) -> None:
     (robot.folder / "status").write_text("0")
     robot.close("--apply")
     for unit in UNITS.values():
-        (robot.folder / unit).write_text("inactive\n")
+        (robot.folder / unit).write_text("ActiveState=inactive\n")
     (robot.folder / "status").write_text("1")
     robot.close("--undo", status=2)
     (robot.folder / "status").write_text("0")
@@ -2210,7 +2221,9 @@ def test_containers_are_started_with_the_files_of_their_enclaves(robot: Robot) -
 def test_a_node_on_zenoh_gets_an_argument_from_its_unit(robot: Robot) -> None:
     """If its unit starts the command of the process, and no script."""
     systemctl = robot.folder / "bin/systemctl"
-    systemctl.write_text("#!/bin/sh\necho '{ path=/opt/talk ; argv[]=/opt/talk a ; x }'\n")
+    systemctl.write_text(
+        "#!/bin/sh\necho 'ExecStart={ path=/opt/talk ; argv[]=/opt/talk a ; x }'\n"
+    )
     start = "/talker", 1, ("python3", "/opt/talk", "a"), "/opt", 0, "talker.service", "program"
     on_zenoh = ClosedProcess(*start, rmw="rmw_zenoh_cpp")
     assert with_command_of_unit(on_zenoh).command == ("/opt/talk", "a")
