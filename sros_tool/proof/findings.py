@@ -415,6 +415,7 @@ def unused_remapping_findings(
     """
     unused = unused_remappings(files, system.fleet, namespaces, remaps) if remaps else []
     names = {right.name for right in system.rights}
+    other_rule = ", or another --remap moves it already" if len(remaps) > 1 else ""
     for rule in unused:
         if not has_new_name(rule, names, namespaces or ("/",)):
             raise UsageError(
@@ -425,7 +426,9 @@ def unused_remapping_findings(
             )
     return [
         REMAPPING_UNUSED.found(
-            system.file, f"--remap {rule}: no requirement has the old name", system.file
+            system.file,
+            f"--remap {rule}: no requirement has the old name{other_rule}",
+            system.file,
         )
         for rule in unused
     ]

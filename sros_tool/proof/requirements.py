@@ -374,17 +374,24 @@ def unused_remappings(
     namespaces: Sequence[str],
     remaps: Iterable[Remapping],
 ) -> list[Remapping]:
-    """Return the remapping rules that do not change any requirement in the files.
+    """Return the remapping rules without which the requirements in the files stay the same.
+
+    Without all of these rules together, too: of two rules that move a name to the same new name,
+    the one for a node counts as used.
 
     Raises:
         SrosError: as `read_requirements`.
     """
-    paths, rules = tuple(paths), tuple(dict.fromkeys(remaps))
+    paths, used = tuple(paths), list(dict.fromkeys(remaps))
     read = partial(read_all_requirements, paths, fleet, namespaces)
-    requirements = read(rules)
-    return [
-        rule for rule in rules if read([other for other in rules if other != rule]) == requirements
-    ]
+    requirements = read(used)
+    unused = []
+    for rule in sorted(used, key=lambda rule: rule.depends_on_node):
+        rest = [other for other in used if other != rule]
+        if read(rest) == requirements:
+            used = rest
+            unused.append(rule)
+    return unused
 
 
 def parse_requirements(

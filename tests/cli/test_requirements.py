@@ -591,6 +591,12 @@ def test_what_merging_prints_runs_where_no_requirement_names_the_node(tmp_path: 
     ended = sros(*asked, cwd=tmp_path).ok()
     assert "--remap mapper:__node:=sonar_map: no requirement has the old name" in ended.out
     assert ended.out.count("remapping-unused") == 1, ended
+    (tmp_path / "r.toml").write_text('[[only]]\nrequest = ["mapper/reset"]\nenclaves = ["/a"]\n')
+    twice = ("mapper/reset:=sonar_map/reset", "mapper:__node:=sonar_map")
+    words = [word for rule in twice for word in ("--remap", rule)]
+    ended = sros(*command[: command.index("--remap")], *words, *asked[-2:], cwd=tmp_path).ok()
+    assert ended.out.count("[requirement.remapping-unused]") == 1, ended
+    assert f"--remap {twice[0]}: no requirement has the old name, or another" in ended.out
     for misspelled in ("mapper:__node:=sonar_mop", "mapper:~/reset:=~/rest", "rnge:=distanc"):
         ended = sros(*asked, "--remap", misspelled, cwd=tmp_path)
         said = f"{misspelled}: no requirement has the old name, and 'p.xml' does not have the new"
