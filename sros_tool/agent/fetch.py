@@ -119,14 +119,14 @@ def pin_root(agent_folder: Path, data: bytes, *, now: datetime) -> str:
             FetchProblem.NOT_SIGNED,
             "the file is not the root metadata of a publishing folder",
             f"{_error_sentence(error)}",
-            "Use the root.json that `sros fleet publish` wrote into PUB/metadata.",
+            'Use the file that `sros fleet publish` names ("robots pin ...").',
         ) from error
     if root.signed.is_expired(now):
         raise FetchError(
             FetchProblem.EXPIRED,
             f"the root metadata expired at {iso(root.signed.expires)}",
             "",
-            f"Use the current root.json of the publishing folder; or {_SET_CLOCK}.",
+            f'Use the file that `sros fleet publish` names ("robots pin ..."); or {_SET_CLOCK}.',
         )
     with Folder(agent_folder) as folder:
         if folder.is_folder(_METADATA):
