@@ -544,7 +544,8 @@ PROCESS_UNSECURED = FindingKind(
     "runtime.process-unsecured",
     WARNING,
     "a node without security next to secured nodes",
-    "This node and the secured nodes do not see each other.",
+    "Unless the governance allows unauthenticated participants, this node and the secured nodes do "
+    "not see each other.",
     "DDS-Security 1.1, 9.4.1.2 (allow_unauthenticated_participants is false).",
     "Restart it with `sros run KEYSTORE ENCLAVE -- COMMAND...`.",
 )
