@@ -1058,8 +1058,8 @@ def _namespace(path: Path) -> str:
 
 _CRL = "crl.pem"
 _KEY, _KEY_ON_TOKEN = "key.pem", "key.p11"
-_UNREAD_FILES = (_KEY, _KEY_ON_TOKEN, "governance.p7s")
-"""Files that are not read: private keys, and files whose content shows nothing about a process."""
+_KEYS = (_KEY, _KEY_ON_TOKEN)
+"""Files that are not read."""
 _MOST_FILE_BYTES = 16 * 1024 * 1024
 _MOST_BYTES_OF_FILES = 64 * 1024 * 1024
 _LAST_SECOND = 253402300799
@@ -1333,7 +1333,7 @@ def _loaded_enclave(
         keystore,
         name,
         tuple(
-            root.load(file, f"{place}/{file}", read=file not in _UNREAD_FILES)
+            root.load(file, f"{place}/{file}", read=file not in _KEYS)
             for file in (*ENCLAVE_FILES, _KEY_ON_TOKEN, _CRL)
         ),
         is_there=True,

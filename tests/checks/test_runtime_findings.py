@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -147,6 +148,14 @@ def test_found(expected: str, sound_one: RuntimeState, bench: Bench) -> None:
             os.utime(path, (begin, begin))
         assert expected not in ids(sound_one)
     assert expected in ids(CASES[expected](state, bench))
+
+
+def test_the_same_files_in_another_folder_are_no_other_files(
+    sound_one: RuntimeState, bench: Bench
+) -> None:
+    """Its twin with another governance is among the cases."""
+    copy = shutil.copytree(sound_one.environment[KEYSTORE], bench.root.parent / "copy")
+    assert not ids(running(0, **{KEYSTORE: str(copy)})(sound_one, bench))
 
 
 def test_nothing_on_zenoh_with_a_session_file(sound_one: RuntimeState, bench: Bench) -> None:
