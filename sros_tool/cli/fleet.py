@@ -1088,7 +1088,7 @@ def _groups(
                 *_expiry_clauses(robot, compared_fleet.at),
                 *_summary(robot, status.stage, compared_fleet.at),
             )
-            is_problem = robot.to_do in _OFTEN_BY_PROBLEM
+            is_problem = robot.to_do in _OFTEN_BY_PROBLEM or robot.may_have_copied_key
             clauses = (*problems(robot), *files) if is_problem else (*files, *problems(robot))
             what = _CLOCK_SENTENCE.sub("", _without_robot_name("; ".join(clauses), robot.robot))
             clauses_by_robot[robot.robot] = what

@@ -366,6 +366,11 @@ class RobotStatus:
         return self.is_settled or is_over
 
     @property
+    def may_have_copied_key(self) -> bool:
+        """Whether a problem says that somebody may have copied a key of the robot."""
+        return any(problem_rank(problem) == 0 for problem in self.problems or ())
+
+    @property
     def problem_clauses(self) -> list[str]:
         """The problems, the gravest first; the robot's own words begin with "it reports"."""
         problems = enumerate(self.problems or ())
@@ -440,8 +445,11 @@ class RobotStatus:
             return "publish"
         if self.lacks_ca and self.state not in (State.BROKEN, *_SUSPICIOUS_STATES):
             return "deliver"
-        if self.state is State.RESTART and self.got_earlier_release:
-            return "check its server"  # the state says the restart
+        if self.state is State.RESTART:  # the state says the restart
+            if self.may_have_copied_key:
+                return "look into it"
+            if self.got_earlier_release:
+                return "check its server"
         if self.state in _TASKS_BY_STATE and not self.is_ahead:
             return _TASKS_BY_STATE[self.state]
         if self.state is State.UNUSABLE:

@@ -345,6 +345,9 @@ def test_the_gravest_problem_of_a_robot_is_shown_and_the_number_of_the_others(
     row = f"it reports: {'word ' * 29}...; more: --robot r3\n"
     assert row in field.run("fleet", "status", "ks", status=1).out
     assert words in field.run("fleet", "status", "ks", "--robot", "r3", status=1).out
+    field.send("r1", problems=["a", key], restart=["/r1/base"])
+    said = field.run("fleet", "status", "ks", status=1).out
+    assert re.search(rf"(?m)^r1 +restart due .* look into it +it reports: {re.escape(key)};", said)
     copied = (KEY_READABLE.title, PROCESS_KEY_READABLE.title, key)
     assert {*map(problem_rank, copied)} == {0} and problem_rank(mended) == 2
 
