@@ -1155,6 +1155,7 @@ def _check_rules(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
         elif not checked_policy.rules.overlaps(statement.right._replace(qualifier=ALLOW)):
             text = f"no rule gives the right to {statement.right.describe()}"
             yield statement.found(NO_EFFECT, text, _remedy_of_denial(statement.written))
+    yield from _actions_in_part(checked_policy)
     yield from _redundancy_findings(checked_policy)
 
 
@@ -1179,16 +1180,34 @@ def _statement_findings(statement: _Statement, rules: Rules) -> Iterator[Finding
         else:
             yield statement.found(UNREACHABLE, f"{statement.right.describe()} is denied by {shown}")
         return
-    enclave, _, right, name = statement.right
-    action, separator, ending = name.rpartition(ACTION_SEPARATOR)
-    whole = _action_right(right, ending) if separator else ""
-    if whole and not rules.allow(enclave, whole, action):
-        text = f"{right} {name} is allowed, but not everything needed to {whole} {action}"
-        yield statement.found(HALF_ACTION, text)
-    elif right in ACTION_PARTS and not is_expression(name) and rules.overlaps(denial):
+    right, name = statement.right.right, statement.right.name
+    if right in ACTION_PARTS and not is_expression(name) and rules.overlaps(denial):
         shown = ", ".join(f"{by.right} {by.name}" for by in rules.overlapping(denial))
         text = f"{right} {name} is allowed, but a part of the action is denied by {shown}"
         yield statement.found(HALF_ACTION, text, "Remove the DENY of the part, or the ALLOW.")
+
+
+def _actions_in_part(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
+    """Yield a finding for each action of an enclave of which only parts are allowed."""
+    rules = checked_policy.rules
+    parts_of_actions: dict[tuple[str, str, str], list[_Statement]] = defaultdict(list)
+    for statement in checked_policy.statements:
+        enclave, _, right, name = statement.right
+        action, separator, ending = name.rpartition(ACTION_SEPARATOR)
+        if not (statement.allows and separator) or rules.cover(
+            statement.right._replace(qualifier=DENY)
+        ):
+            continue
+        if whole := _action_right(right, ending):
+            parts_of_actions[enclave, whole, action].append(statement)
+    for (enclave, whole, action), statements in parts_of_actions.items():
+        if not rules.allow(enclave, whole, action):
+            shown = first_few([f"{s.right.right} {s.name}" for s in statements], 2)
+            is_are = "is" if len(statements) == 1 else "are"
+            text = f"{shown} {is_are} allowed, but not everything needed to {whole} {action}"
+            remedy = f'Write <actions {whole}="ALLOW"> with the name of the action, or remove '
+            remedy += "the part." if len(statements) == 1 else "the parts."
+            yield statements[0].found(HALF_ACTION, text, remedy)
 
 
 def _action_right(right: str, ending: str) -> str:

@@ -144,6 +144,15 @@ def test_type_descriptions_are_of_iron_and_later(
     assert sros("check", "policy", file, "--distro", "humbel").status == 2
 
 
+def test_parts_of_one_action_are_one_finding(tmp_path: Path) -> None:
+    parts = (f"dock/_action/{part}" for part in ("send_goal", "get_result", "cancel_goal"))
+    (file := tmp_path / "robot.xml").write_text(policy(enclave(services("reply", *parts))))
+    found = sros("check", file).out
+    assert found.count("[policy.action-in-part]") == 1
+    assert "and 1 more are allowed, but not everything needed to execute /dock\n" in found
+    assert 'Write <actions execute="ALLOW"> with' in found
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
