@@ -1328,7 +1328,7 @@ def _summary(robot: RobotStatus, stage: str, moment: datetime) -> Iterator[str]:
     elif robot.lacks_ca:
         yield "does not trust the CA that seals releases: fetching does not change this"
     elif robot.is_locked_out(moment):
-        yield "a web server with the current CA and revocation list refuses the robot"
+        yield "a web server that checks certificates refuses the robot"
     if not (early or late):
         yield from robot.notes
     groups: dict[tuple[str, str], Counter[str]] = {}

@@ -649,7 +649,7 @@ def test_a_robot_that_was_off_during_a_rotation_has_missed_it(field: Field) -> N
     field.age("r2", timedelta(hours=1))
     assert shown() == ("earlier", "deliver")
     said = field.run("fleet", "status", "ks", "--robot", "r2", status=1).out
-    assert "a web server with the current CA and revocation list refuses the robot; " in said
+    assert "a web server that checks certificates refuses the robot; " in said
     field.deliver("r2")
     assert field.states()["r2"] == "current"
 
@@ -1312,7 +1312,7 @@ def test_what_is_to_be_done_for_robots_that_do_not_fetch_what_is_published(field
     rows = said()
     assert rows["r1"][0] == "deliver" and "lacks the key of /r1/base: releases" in rows["r1"][1]
     assert "is published" not in rows["r1"][1], "no other enclave waits for it"
-    refused = "a web server with the current CA and revocation list refuses the robot"
+    refused = "a web server that checks certificates refuses the robot"
     waits = "1 revoked certificate: the new one waits for the robot"
     assert rows["r3"] == ("wait, else deliver", f"{waits}; {refused}; more: --robot r3")
     assert rows["r2"][0] == "wait: it fetches"
