@@ -1014,7 +1014,7 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
         assert f"in its enclave: {named}" in robot.close("--proof", status=1).out
     robot.absent = set()
     seven = Process(5, ("guest",), {"ROS_DOMAIN_ID": "7"}, datetime.now(UTC))
-    robot.more = (seven, replace(seven, command=("inner",), network="net:[1]"))
+    robot.more = (seven, replace(seven, command=("inner",), environment={}, network="net:[1]"))
     robot.more += tuple(
         replace(talker, pid=pid, command=command, started=talker.started + timedelta(pid))
         for pid, command in ((6, ("/tmp/thief",)), (7, talker.command), (8, ("ros2", "topic")))
@@ -1026,7 +1026,9 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     robot.absent, robot.more = set(), others
     more = "sros did not see process 6 (thief) in /talker, process 7 (run) in /talker when it wat"
     more = f"every process in an enclave belongs there: {more}"
-    guest = "in domain 0; process 5 (guest) runs open in domain 7\n"
+    guest = "in domain 0; process 5 (guest) runs open in domain 7; process 5 (inner) runs open in "
+    guest += "domain 0 of another network namespace, where this proof does not look: find out who "
+    guest += "reaches it\n"
     said = robot.close("--proof", status=1).out
     assert f"{guest}not checked (--accept unobserved accepts this): {more}" in said
     (copy := robot.folder / "copy/enclaves/office").mkdir(parents=True)
