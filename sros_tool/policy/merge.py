@@ -14,7 +14,7 @@ import codecs
 import re
 from bisect import bisect_left
 from collections import defaultdict
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import groupby
 from pathlib import Path
@@ -502,7 +502,7 @@ def _texts_on_shared_enclaves(before: Policy, additions: Policy, after: Policy) 
         rights = _rights_of_nodes(present) if present else {}
         new_rights = _rights_of_nodes(enclave)
         nodes, come = sorted(rights), sorted({*now.get(enclave.path, ())} - rights.keys())
-        if nodes and come and {*map(_name_of, nodes)}.isdisjoint(map(_name_of, new_rights)):
+        if nodes and come and _names(rights).isdisjoint(_names(new_rights)):
             yield (
                 f"{enclave.path} has {_nodes_text(nodes)}, and now also {_nodes_text(come)}: each "
                 "process in this enclave has the rights of all these nodes. Unless they run in one "
@@ -516,6 +516,12 @@ def _texts_on_shared_enclaves(before: Policy, additions: Policy, after: Policy) 
                     "has the rights of both: then merge with another --namespace, or with "
                     "--enclave and --remap __node:=NAME."
                 )
+
+
+def _names(rights: Mapping[str, Iterable[Right]]) -> set[str]:
+    """Return the names of nodes without namespaces; without a component container, if possible."""
+    own = [node for node, of_node in rights.items() if not all(_is_of_any_node(r) for r in of_node)]
+    return {node.rpartition("/")[2] for node in own or rights}
 
 
 def _rights_of_nodes(enclave: Enclave) -> dict[str, set[Right]]:
@@ -532,27 +538,28 @@ def _are_different_programs(rights: Iterable[Right], others: Iterable[Right]) ->
 
     Rights without those that every node needs, such as a patch of `sros audit`, are no program.
     """
-    own, other_own = ({e for e in side if not _is_of_any_node(e.name)} for side in (rights, others))
+    own, other_own = ({e for e in side if not _is_of_any_node(e)} for side in (rights, others))
     basics = Rules(e for e in rights if is_of_every_node(e.name))
     if not own or not other_own or not any(map(basics.overlaps, others)):
         return False
     return not any(map(Rules(own).overlaps, other_own))
 
 
-def _is_of_any_node(name: str) -> bool:
+def _is_of_any_node(right: Right) -> bool:
+    """Return whether nodes of different programs may have a right, as lifecycle nodes do."""
+    name = right.name
     return (
         is_of_every_node(name)
         or name in GLOBAL_TOPICS
         or only_reads(name)
-        or name.endswith(_OF_LIFECYCLE_NODES)
+        or name.endswith(_OF_KINDS_OF_NODES)
     )
 
 
-_OF_LIFECYCLE_NODES = ("/change_state", "/transition_event")
-
-
-def _name_of(node: str) -> str:
-    return node.rpartition("/")[2]
+_OF_KINDS_OF_NODES = (
+    *("/change_state", "/transition_event"),
+    *("/_container/load_node", "/_container/unload_node"),
+)
 
 
 def _nodes_text(nodes: Sequence[str]) -> str:

@@ -70,6 +70,19 @@ def test_a_merge_notes_an_enclave_that_gets_nodes_of_another_policy(folder: Path
     assert "merge.shared-enclave" not in sros("merge_policy", "a.xml", "package.xml").ok().err
 
 
+def test_a_component_container_does_not_make_two_packages_one(folder: Path) -> None:
+    """Twin: the next version of the package, with one more component."""
+    basics = publish("/rosout")
+    load = '<services reply="ALLOW"><service>~/_container/load_node</service></services>'
+    for name, nodes in (("one", "a"), ("other", "b"), ("next", "a b")):
+        own = (f'</profile><profile ns="/" node="{n}">{publish(n)}' for n in nodes.split())
+        text = policy_text({"/pipeline": basics + load + "".join(own)})
+        (folder / f"{name}.xml").write_text(text.replace('node="n"', 'node="container"'))
+    noted = "/pipeline has the nodes /a, /container, and now also the node /b: each process"
+    assert noted in sros("merge_policy", "one.xml", "other.xml").ok().err
+    assert "shared-enclave" not in sros("merge_policy", "one.xml", "next.xml").ok().err
+
+
 SHARED = "note [merge.shared-enclave]: /valve already has a node /valve, and the merged policy"
 
 
