@@ -398,7 +398,7 @@ class AgentStatus(NamedTuple):
     restart: Sequence[str]
     """Enclaves whose processes were not yet seen with the installed files."""
     unseen: Sequence[str]
-    """Enclaves of ``restart`` of which no process was seen, although some processes on this
+    """Enclaves of ``restart`` of which no process was seen, perhaps because some processes on this
     machine cannot be seen. Use ``sros agent run FOLDER --once --restarted`` to say that these
     restarts are done.
     """

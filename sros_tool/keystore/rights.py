@@ -704,9 +704,9 @@ class PolicyDifference(NamedTuple):
     governance_differs: bool
     """Whether the governance of the enclaves differs between A and B, or cannot be read."""
     unclear: Sequence[str]
-    """Enclaves whose permissions differ in more than rights, such as partitions, the order of
-    rules, missing rules for `ros_discovery_info`, or a default that allows everything. `notes` of A
-    and B name the difference.
+    """Enclaves whose permissions differ in something that no right states, such as partitions, the
+    order of rules, missing rules for `ros_discovery_info`, or a default that allows everything.
+    `notes` of A and B name the difference.
     """
     changed_forms: Sequence[ChangedForm]
     """Rights and denials of policy B that differ from A only for users who put the node into

@@ -284,8 +284,8 @@ class RenewedEnclaves(NamedTuple):
     ]
     """The renewed enclaves."""
     replaced_work_until: datetime | None
-    """When the last earlier certificate of these enclaves in the ledger stops working, in UTC,
-    because it or the last permissions for it expire. Null if all have expired or were revoked.
+    """When the last earlier certificate of these enclaves in the ledger stops working, in UTC: it
+    expires, or the last permissions for it expire. Null if all have expired or were revoked.
     """
     may_work_longer: bool
     """Whether earlier certificates that the ledger lacks may work after that time, because the
@@ -363,7 +363,7 @@ class UpdatedKeystore(NamedTuple):
     ]
     """Enclaves that got a certificate or permissions."""
     replaced_work_until: datetime | None
-    """When the last replaced certificate stops working, in UTC, because it or the last permissions
+    """When the last replaced certificate stops working, in UTC: it expires, or the last permissions
     for it expire. Null if no certificate was replaced, or all were revoked.
     """
     revoked: int
