@@ -43,3 +43,8 @@ def enumerated(texts: Sequence[str]) -> str:
     """Return all texts as in a sentence: "a, b and c"."""
     *first, last = texts
     return f"{', '.join(first)} and {last}" if first else last
+
+
+def perhaps_meant(names: Sequence[str]) -> str:
+    """Return the end of a sentence that has named one or several similar names."""
+    return f"perhaps {'this name' if len(names) == 1 else 'one of these names'} is meant"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from sros_tool.wording import counted, enumerated, first_few
+from sros_tool.wording import counted, enumerated, first_few, perhaps_meant
 
 
 @pytest.mark.parametrize(
@@ -36,3 +36,8 @@ def test_clauses_have_their_own_separators() -> None:
 )
 def test_a_list_ends_in_and(texts: list[str], words: str) -> None:
     assert enumerated(texts) == words
+
+
+@pytest.mark.parametrize(("names", "words"), [("a", "this name"), ("ab", "one of these names")])
+def test_a_hint_says_whether_it_is_about_one_name(names: str, words: str) -> None:
+    assert perhaps_meant(names) == f"perhaps {words} is meant"

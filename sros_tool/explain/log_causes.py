@@ -69,7 +69,7 @@ from sros_tool.runtime.zenoh_log import ZENOH_IDS
 from sros_tool.spelling import is_spelled_alike, is_typing_error
 from sros_tool.translate import grant_rights
 from sros_tool.values import shows
-from sros_tool.wording import enumerated, first_few
+from sros_tool.wording import enumerated, first_few, perhaps_meant
 
 _CHANGING_NUMBERS = re.compile(r"\b[0-9a-f]{2}(?:\.[0-9a-f]{2}){5,}\S*|\d+")
 
@@ -539,8 +539,8 @@ class Examiner:
                 only = [f"by exact name, the enclave may {question.word} only action {meant}"]
                 renamed = f" If the policy means this action by {meant}{add}"
         if names:
-            is_meant = f"{' and '.join(names)}: perhaps that is meant"
-            facts = [f"the enclave may {question.word} {is_meant}"]
+            may = f"the enclave may {question.word} {enumerated(names)}"
+            facts = [f"{may}: {perhaps_meant(names)}"]
             if is_used:
                 return facts, (
                     f"{remedy} Or, if the node lacks a remapping that its policy has{add} "

@@ -63,7 +63,7 @@ from sros_tool.owners import is_for_root_alone
 from sros_tool.policy.model import OFFERING_RIGHT, PEER_RIGHT, Policy
 from sros_tool.policy.rights import Right, is_of_every_node, policy_rights
 from sros_tool.values import shows
-from sros_tool.wording import first_few
+from sros_tool.wording import enumerated, first_few, perhaps_meant
 
 
 @shows("zenoh")
@@ -378,14 +378,15 @@ def _other_name_notes(answer: Answer, asked_enclave: AskedEnclave) -> Iterator[N
     if any((right.right, right.name) == (needed, question.name) for right in rights):
         return
     if names := likely_names(answer):
-        text = f"the enclave may {question.word} {' and '.join(names)}: perhaps that is meant"
+        may = f"the enclave may {question.word} {enumerated(names)}"
+        text = f"{may}: {perhaps_meant(names)}"
         is_moved = {name.rpartition("/")[2] for name in names} == {question.name.rpartition("/")[2]}
         if len(names) == 1 and is_moved and question.type != "action":
             text += f" ({remapping_clause(question.name, names[0])})"
         yield Note("explain.likely-name", f"{text}.")
     elif names := likely_actions(answer):
         does = "call" if question.right == "request" else "execute"
-        text = f"the enclave may {does} action {' and '.join(names)}: perhaps that is meant"
+        text = f"the enclave may {does} action {enumerated(names)}: {perhaps_meant(names)}"
         yield Note("explain.likely-name", f"{text} (add --type action).")
     elif asked_enclave.has_peers and not is_of_every_node(question.name):
         kind, does = ("not-used", "needs")

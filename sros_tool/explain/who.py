@@ -45,7 +45,7 @@ from sros_tool.reach import (
     unguarded_topics,
 )
 from sros_tool.values import shows
-from sros_tool.wording import first_few
+from sros_tool.wording import first_few, perhaps_meant
 from sros_tool.xml import read_bytes
 
 
@@ -184,7 +184,7 @@ def note_on_names_meant(
     meant = same_last or likely_names(question.name, exact)
     if not meant or question.name in meant:  # the name is right, but its enclave cannot start
         return None
-    text = f"some enclaves may {question.word} {first_few(meant, 3)}: perhaps that is meant."
+    text = f"some enclaves may {question.word} {first_few(meant, 3)}: {perhaps_meant(meant)}."
     return Note("explain.likely-name", text)
 
 
