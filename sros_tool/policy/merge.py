@@ -256,9 +256,14 @@ def counterpart_notes(
         }
         for policies in ((before,), additions)
     )
-    for lost, when in ((gone, "any more"), (missing - gone, "in the result of this merge")):
-        if lost:
-            yield Note("merge.no-counterpart", lost_counterparts_text(lost, when))
+    if gone:
+        yield Note("merge.no-counterpart", lost_counterparts_text(gone))
+    if missing := missing - gone:
+        text = (
+            f"{lost_counterparts_text(missing, 'in the result of this merge')} If a --remap moved "
+            "the name, nodes that are to use the new name need the same remapping."
+        )
+        yield Note("merge.no-counterpart", text)
 
 
 _MARKUP = re.compile(
