@@ -596,7 +596,7 @@ class WildcardProposal(NamedTuple):
     replaces: tuple[Right, ...]
     """Rights that the wildcard makes redundant."""
     adds: tuple[Right, ...]
-    """Known names of other enclaves that the wildcard newly allows."""
+    """Rights that the wildcard adds, to names in the rights of other enclaves."""
     saves: int
     """Number of bytes by which the permissions document becomes smaller."""
 

@@ -32,7 +32,7 @@ class ChangedForm(NamedTuple):
     right: Right
     """The right, in the namespace that the policy states."""
     written: str
-    """The name as the policy has it: with `/` at its beginning if it became absolute."""
+    """The name as written in the policy, such as `/cmd` if it became absolute."""
     place: Source
     """File and line of the right."""
 
