@@ -1526,7 +1526,7 @@ _ORDERS = [
     "name, restored!, sign again, restored, old",
     "name, new, restored!, sign again, old, restored",
     "lost, generate, collect, restored!, sign again, old, restored",
-    "lost, generate, restored, collect, old!, sign again, old",
+    "lost, generate, restored, collect, old!, deliver!, sign again, old",
 ]
 """Commands of an operator after a restore; ``!`` stands for a refusal."""
 
@@ -1569,6 +1569,7 @@ def test_a_restored_keystore_replaces_no_key_that_a_robot_made(
         "generate old": (*generate, "--revoke-old"),
         "name": (*generate, "-e", name),
         "new": ("renew", "ks", name, "--new-key", "--revoke-old"),
+        "deliver": ("distribute_key", "ks", "--robot", "r9", "r9", "--force"),
         "old": ("renew", "ks", name, "--revoke-old"),
         "sign": (*sign, *policy),
         "sign again": (*sign, "--renew"),

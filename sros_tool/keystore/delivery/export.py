@@ -38,7 +38,10 @@ from sros_tool.keystore.delivery.rollback import (
 )
 from sros_tool.keystore.fleet import load_fleet, unrecorded_notes
 from sros_tool.keystore.known_keys import (
+    KnownKeys,
     known_authorities,
+    other_keys_remedy,
+    restored_at,
     unlisted_revocations,
 )
 from sros_tool.keystore.layout import (
@@ -160,6 +163,7 @@ def distribute(
         KeystoreError: an enclave does not exist or cannot run, ``target`` cannot be used, or
             ``target`` has other content, which only ``force`` replaces.
     """
+    _check_keys_of_robots(keystore, names)
     files = exported_files(keystore, names, now, keyless=keyless)
     notes = (*_token_notes(files), *unrecorded_notes(keystore, load_fleet(keystore), names))
     if target.name.endswith(SUFFIXES):
@@ -271,6 +275,7 @@ def pack_enclaves(
     Raises:
         KeystoreError: an enclave does not exist, or cannot run.
     """
+    _check_keys_of_robots(keystore, names)
     files = exported_files(keystore, names, now, keyless=keyless)
     return PackedEnclaves(pack(files), tuple(files), tuple(_token_notes(files)))
 
@@ -308,6 +313,18 @@ def exported_files(
             raise _refused_enclave_error(keystore, name, evaluation.problems)
         files |= _files_of(keystore, name, evaluation)
     return dict(sorted(files.items()))
+
+
+def _check_keys_of_robots(keystore: OpenedKeystore, names: Sequence[str]) -> None:
+    """Raise `KeystoreError` if the export would replace a key that its robot made."""
+    unknowing = KnownKeys(keystore).made_unknowing(names) if restored_at(keystore) else {}
+    if others := sorted({*unknowing.values()}):
+        raise KeystoreError(
+            f"the keystore has other keys for {first_few(others, 3)} than the robots",
+            "After the backup of the keystore, robots got certificates for their keys, which "
+            "the export would replace.",
+            other_keys_remedy(keystore.root, others),
+        )
 
 
 class ReleasedEnclave(NamedTuple):
