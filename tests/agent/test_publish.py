@@ -1596,6 +1596,25 @@ def test_a_restored_keystore_replaces_no_key_that_a_robot_made(
     assert not known.is_revoked(key) and all(known.is_revoked(each) for each in made)
 
 
+def test_a_restored_keystore_makes_no_other_key_for_a_router(publisher: Home) -> None:
+    """No policy names its enclave."""
+    root, fleet = publisher.root, publisher.folder / "fleet.toml"
+    generate = ("generate_artifacts", "-k", "ks", "-p", "policy.xml", "--fleet", "fleet.toml")
+    publisher.run("zenoh", "ks", "--endpoint", "office.local:7447")
+    publisher.publish()
+    backup = copy_of(root, publisher.folder / "backup")
+    fleet.write_text(f"{fleet.read_text()}[robots.r9]\nrouter = 'r9.local:7447'\n")
+    publisher.run(*generate)
+    publisher.publish()
+    shutil.rmtree(root)
+    backup.rename(root)
+    publisher.publish(restored=True)
+    refused = sros(*generate, "-e", "/r9/base", cwd=publisher.folder)
+    assert "lacks /r9/router, which got certificates after the last backup" in refused.err
+    assert "FLEET_FILE` (for a router, without -p and --fleet)." in refused.err
+    publisher.run(*generate, "-e", "/r9/base", "/r9/router")
+
+
 def test_a_later_key_of_a_robot_is_certified_again_as_publishing_advises(
     publisher: Home, monkeypatch: pytest.MonkeyPatch
 ) -> None:

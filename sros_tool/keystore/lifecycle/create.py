@@ -451,6 +451,8 @@ def _revoked_before_notes(
             f"or, to create {them} again with {keys} and the rights of the policy, "
             f"{'; '.join(steps)}.",
         )
+    routers = _missing_routers(change).difference(missing)
+    missing += sorted(routers)
     later = _enclaves_certified_after_backup(change, missing) - {*revoked_before, *named}
     if unasked := [name for name in missing if name in later]:
         raise KeystoreError(
@@ -460,13 +462,21 @@ def _revoked_before_notes(
             "from here.",
             "For keys that robots made, sign the requests again, with `sros sign_request "
             f"{quote(str(root))} REQUEST --no-answer -p POLICY_FILE"
-            f"{' --fleet FLEET_FILE' if fleet else ''}`. For keys that were made here, name the "
+            f"{' --fleet FLEET_FILE' if fleet else ''}`"
+            f"{' (for a router, without -p and --fleet)' * bool(routers.intersection(unasked))}. "
+            "For keys that were made here, name the "
             f"enclaves with -e, so that they get new keys: {command(unasked)}. Then repeat this "
             "command.",
         )
     if unasked := [name for name in missing if name not in named]:
         _refuse_before_restored(change.keystore, unasked)
     return list(known.revoked_before_notes(revoked_before))
+
+
+def _missing_routers(change: KeystoreChange) -> set[str]:
+    """Return the enclaves of the Zenoh network's routers that the keystore lacks."""
+    network = change.template.zenoh
+    return {*(network.router_names() if network else ())}.difference(change.names)
 
 
 def _refuse_before_restored(keystore: OpenedKeystore, missing: Sequence[str]) -> None:
@@ -894,8 +904,7 @@ def write_enclaves(
 
     Returns: The rights that enclaves gain and lose with their new permissions.
     """
-    network = change.template.zenoh
-    if routers := set(network.router_names() if network else ()).difference(change.names):
+    if routers := _missing_routers(change):
         wanted_enclaves = ChainMap(dict.fromkeys(sorted(routers)), wanted_enclaves)  # type: ignore[arg-type]
     writer = change.writer(keys_on_token=bool(places), revoke_old=revoke_old)
     maker = _EnclaveMaker(
