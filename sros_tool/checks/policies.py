@@ -247,7 +247,8 @@ MISTAKEN_SIDE = FindingKind(
     WARNING,
     "a service or action for which request and reply, or call and execute, were confused",
     "A node offers (reply, execute) the services and actions under its own name, and other nodes "
-    "use them (request, call). Nobody has the opposite right, so no call succeeds.",
+    "use them (request, call). The rule states the wrong side, and nobody has its counterpart, so "
+    "no call succeeds.",
     "sros: compares the rights of all enclaves in the policy.",
     'Write reply="ALLOW" (action: execute) at the node that offers the service, and '
     'request="ALLOW" (action: call) at the nodes that use it.',
@@ -346,7 +347,7 @@ def _check_counterparts(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
             continue
         if statement.right.kind != "topics" and statement.is_private:
             text = (
-                f"{statement.right.describe()} is under the node's own name, and nobody offers it"
+                f"the node may {statement.right.describe()}, a name of its own that nobody offers"
             )
             yield statement.found(MISTAKEN_SIDE, text, f'Write {other}="ALLOW" for it.')
             continue
@@ -433,8 +434,9 @@ def _offered_by_others_findings(unused_statements: Iterable[_Statement]) -> Iter
             asking = _ASKING_RIGHT[statement.right.right]
             place = RelatedPlace(f"{owner.right.enclave} offers it", *_source_place(owner.source))
             text = (
-                f"{statement.right.describe()} is under the name of a node in {owner.right.enclave}"
-                f"; that enclave also offers it ({place}), and nobody may {asking} it"
+                f"the node may {statement.right.describe()}, under the name of a node in "
+                f"{owner.right.enclave}; that enclave also offers it ({place}), and nobody may "
+                f"{asking} it"
             )
             remedy = f'Write {asking}="ALLOW" for it.'
             yield statement.found(MISTAKEN_SIDE, text, remedy)._replace(related=(place,))
@@ -1165,7 +1167,7 @@ def _remedy_of_denial(written: str) -> str:
         return NO_EFFECT.remedy
     return (
         f"{NO_EFFECT.remedy} Write /*{written.lstrip('*')} to deny the name in every namespace: "
-        f"merged with `--namespace /left`, {written} denies only /left/{written}."
+        f"after a merge with `--namespace /left`, {written} denies only /left/{written}."
     )
 
 

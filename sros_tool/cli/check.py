@@ -958,7 +958,11 @@ def _report_sections(
     diagnosis: Diagnosis, provider: SecurityProvider | None, findings: Sequence[Finding]
 ) -> dict[str, list[str]]:
     """Return the lines of a support report; findings are counted by kind, without names."""
-    words = {True: "enforces security", False: "does not enforce it", None: "could not be tried"}
+    words = {
+        True: "enforces security",
+        False: "does not enforce security",
+        None: "could not be tried",
+    }
     stacks = [
         f"{stack.name}: {words[stack.enforces]}. {stack.dds} {stack.version}. {stack.evidence}"
         for stack in diagnosis.stacks

@@ -331,8 +331,8 @@ def _process_line(process: ClosedProcess, closed: CloseState, policy: Policy) ->
         sign = signs.get(process.known_by, f"by its {process.known_by}")
         state = f"process {process.pid}" + ("" if runs else f", known {sign}")
     elif runs:
-        state = "runs by a new command; sros keeps the observed command (to replace the observed "
-        state += "command, watch the open robot again)"
+        state = "was started by a new command; sros keeps the observed command (to replace the "
+        state += "observed command, watch the open robot again)"
     else:
         ended = process.enclave in closed.observed.ended
         state = "has ended" if ended else "no process runs its command"
@@ -469,7 +469,8 @@ def _idle_lines(closed: CloseState, ask: str) -> list[str]:
     if not (stopped := sorted(idle.intersection(closed.pending))):
         return []
     options = "".join(f" --without {name}" for name in stopped)
-    return [f"to prove the robot closed without a process of {enumerated(stopped)}: {ask}{options}"]
+    without = f"to prove that the robot is closed, without a process of {enumerated(stopped)}"
+    return [f"{without}: {ask}{options}"]
 
 
 def _advice_without_security(robot: LocalRobot, closed: CloseState) -> str:

@@ -803,8 +803,8 @@ def _link_lines(answer: ZenohAnswer) -> Iterator[str]:
         passing = sum(link.passes for link in more)
         yield _labeled_row(
             "link",
-            f"{counted(len(more), 'more link')}: the message passes on {passing}, and is dropped "
-            f"on {len(more) - passing}",
+            f"{counted(len(more), 'more link')}: the message passes through {passing}, and is "
+            f"dropped at {len(more) - passing}",
         )
 
 

@@ -855,7 +855,8 @@ def _fleet_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
     if status.older:
         yield f"the keystore is older than its robots: {status.older}. Publish with {restored}"
     elif any(robot.state == "later" for robot in status.robots):
-        yield f"the keystore may be older than its robots: if it was restored, {restored}"
+        text = "the keystore may be older than its robots: if it was restored, publish with"
+        yield f"{text} {restored}"
     elif publication and publication.lacks:
         decide = (
             ", which puts it right or prints the remedy"

@@ -558,9 +558,9 @@ class _MinimizeVerb(SeveralValues):
     show_default=True,
     help="`difference`: exit with 1 if POLICY has rights to remove, wildcards to replace, or "
     "rights that were used only in part; if POLICY lacks an observed right; or if an enclave is "
-    "only in POLICY or only in OBSERVED. With --fleet, an enclave that was never observed for one "
-    "robot also counts. Without --fleet, sros also compares each node of an enclave, if OBSERVED "
-    "has profiles of the nodes.",
+    "only in POLICY or only in OBSERVED. With --fleet, an enclave also counts if it was "
+    "not observed for every robot. Without --fleet, sros also compares each node of an enclave, if "
+    "OBSERVED has profiles of the nodes.",
 )
 @force_option
 @dry_run_option

@@ -192,8 +192,8 @@ def _write_later_processes(robot: LocalRobot) -> None:
     for old, new in zip(before.processes, now.processes, strict=False):
         if new != old:
             robot.shell.say(
-                f"{new.enclave} runs by another command than before; sros remembers the new one: "
-                f"{new.open_command(robot.domain)}; before: {old.open_command(robot.domain)}"
+                f"{new.enclave} was started by another command than before; sros remembers the new "
+                f"one: {new.open_command(robot.domain)}; before: {old.open_command(robot.domain)}"
             )
     if now != robot.observed:
         robot.write_processes(now)

@@ -63,8 +63,8 @@ def check_watchable(robot: LocalRobot) -> None:
         raise UsageError(
             f"the robot runs closed: {first_few(secured, MOST_NAMES)}",
             "Only an open robot can be watched.",
-            f"Leave the robot closed, and add what is missing to '{robot.policy}': `sros explain "
-            f"{shlex.quote(str(robot.export))} --log FILE` names the rights that a process lacked. "
+            f"Leave the robot closed, and add the missing rights to '{robot.policy}': `sros "
+            f"explain {shlex.quote(str(robot.export))} --log FILE` names them. "
             f"To watch the whole robot again, open it first: `{robot.close_command} --undo`.",
         )
     nodes = [process for process in running.in_domain if not process.is_daemon]

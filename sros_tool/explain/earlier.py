@@ -156,7 +156,7 @@ def note_on_revoked_enclaves(
         remedy += f"{root}` says where it is in force)"
     else:
         old = "the current Zenoh files"
-        remedy = "the files at a restart: Zenoh has no revocation list"
+        remedy = "the files at a restart, because Zenoh has no revocation list"
     for decided, has_right in (
         (True, "have the right"),
         (False, "work with permissions that are not here, whose rights are not known"),

@@ -824,7 +824,9 @@ def _expiry_from(value: Any) -> dict[str, EnclaveExpiry]:
     expiry = {}
     for name, times in value.items():
         if not isinstance(times, dict) or times.keys() != set(EnclaveExpiry._fields):
-            raise _FormError('the keys of an expiry are not "certificate" and "permissions"')
+            raise _FormError(
+                'an entry of "expiry" does not have the keys "certificate" and "permissions"'
+            )
         moments = (
             None if times[file] is None else _moment_from(times[file])
             for file in EnclaveExpiry._fields

@@ -950,7 +950,7 @@ class _EnclaveFiles:
                 f"but by {other_issuer_text(certificate, ca)}"
             )
             if refusal := self._chain_problem(certificate, authorities or b""):
-                text += f"; {IDENTITY_CA_FILE} also has its issuer, but {refusal}"
+                text += f"; {IDENTITY_CA_FILE} also has this issuer, but {refusal}"
             self._add(CERTIFICATE_FILE, text, Fault.CERTIFICATE_ISSUER)
         elif certificate and ca and authorities and not self._problems:
             self._check_chain(certificate, authorities)

@@ -328,7 +328,8 @@ def _wrong_signer_clause(signer: x509.Certificate | None, authority: x509.Certif
     """Return a clause about the wrong signer; None stands for a signer without a certificate."""
     name = authority.subject.rfc4514_string()
     if signer is None:
-        return f"not by the permissions CA {name}, but by a signer whose certificate it lacks"
+        lacks = "by a signer whose certificate the document lacks"
+        return f"not by the permissions CA {name}, but {lacks}"
     if signer.subject != authority.subject:
         return f"by {signer.subject.rfc4514_string()}, not by the permissions CA {name}"
     same_key = _public_key(signer) == _public_key(authority)

@@ -1650,7 +1650,7 @@ def _namespaces_of_patterns(requirement: Requirement) -> list[str]:
         raise DocumentError(
             f"the enclaves of a requirement name more than {_MOST_NAMESPACES} namespaces: "
             f"{requirement}",
-            "So it is not known whether a node moves out of the requirement in one of them.",
+            "So it is not known whether a node escapes the requirement in one of them.",
             "Name fewer namespaces there, or name the namespaces of the robots with --namespace.",
         )
     return [*namespaces]

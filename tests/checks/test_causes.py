@@ -98,7 +98,7 @@ def _(bench: Bench) -> None:
 
 @cause(
     "enclave.certificate-issuer",
-    "identity_ca.cert.pem also has its issuer, but the chain is longer than the",
+    "identity_ca.cert.pem also has this issuer, but the chain is longer than the",
 )
 def _(bench: Bench) -> None:
     root, key = bench.new_authority(ONLY_LEAVES, common_name="root")

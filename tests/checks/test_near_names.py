@@ -183,10 +183,10 @@ def test_sides_that_are_mistaken_for_each_other(tmp_path: Path) -> None:
     assert sides(file, right, use) == []
     assert sides(file, right, "") == []
     (own,) = sides(file, services("request", "~/home"), use)
-    assert own.startswith("2: request service /_server/home is under the node's own name")
+    assert own.startswith("2: the node may request service /_server/home, a name of its own that")
     assert own.endswith('Write reply="ALLOW" for it.')
     (foreign,) = sides(file, right, services("reply", "_server/home"))
-    assert foreign.startswith("3: reply service /_server/home is under the name of a node")
+    assert foreign.startswith("3: the node may reply service /_server/home, under the name of a")
     assert foreign.endswith('Write request="ALLOW" for it.')
     assert "p.xml:2" in foreign and "nobody may request it" in foreign
     both = services("reply", "_server/home") + use

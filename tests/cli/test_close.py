@@ -648,8 +648,8 @@ def test_what_systemd_does_not_start_is_done_by_hand(
     commands = (robot.folder / "robot/start/commands.txt").read_text()
     assert "\nros2 launch --secured " in commands
     assert "except for /listener (not running); next: start this process by the com" in ended.err
-    idle = "  to prove the robot closed without a process of /listener: sros close robot --proof"
-    assert f"and then sros close robot --proof\n{idle} --without /listener\n" in ended.err
+    idle = "  to prove that the robot is closed, without a process of /listener: sros close rob"
+    assert f"and then sros close robot --proof\n{idle}ot --proof --without /listener\n" in ended.err
     robot.absent = set()
     assert "start again with" in (said := robot.close("--apply", status=1).out)
     assert "process 4712" in said and "process 4711" not in said
@@ -657,8 +657,8 @@ def test_what_systemd_does_not_start_is_done_by_hand(
     ended = robot.close()
     assert "  /talker: process 4711: closed\n" in ended.out
     now = "/opt/run talker --ros-args -r __node:=talker -r words:=chatter"
-    remembered = "/talker runs by another command than before; sros remembers the new one: "
-    assert f"{remembered}cd /opt && {now}; before: cd /opt && /opt/run talker\n" in ended.err
+    remembered = "/talker was started by another command than before; sros remembers the new "
+    assert f"{remembered}one: cd /opt && {now}; before: cd /opt && /opt/run talker\n" in ended.err
     commands = (robot.folder / "robot/start/commands.txt").read_text()
     assert f" /talker -- {now}\n" in commands and " /opt/run talker\n" not in commands
     in_enclaves = "\nthe processes run in their enclaves; next: sros close robot --proof\n  the fi"
@@ -669,7 +669,7 @@ def test_what_systemd_does_not_start_is_done_by_hand(
     robot.more += (replace(robot.more[0], pid=14, command=("/opt/c",)),)
     ended = robot.close()
     assert "\n  not observed before: process 14 (c) in /talker; if it does not belong" in ended.out
-    kept = "runs by a new command; sros keeps the observed command (to replace the observed "
+    kept = "was started by a new command; sros keeps the observed command (to replace the obser"
     assert (
         f"  /talker: {kept}" in ended.out and "sros remembers: cd /opt && /opt/b" not in ended.err
     )

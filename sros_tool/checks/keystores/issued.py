@@ -123,7 +123,7 @@ NOT_IN_POLICY = FindingKind(
 NOT_IN_KEYSTORE = FindingKind(
     "keystore.enclave-missing",
     WARNING,
-    "an enclave of the policy that the keystore does not have",
+    "an enclave that is in the policy, but not in the keystore",
     "A node that starts in this enclave fails.",
     "rcl 9 (security.c).",
     "Run `sros generate_artifacts -k KEYSTORE -p POLICY_FILE`.",
@@ -131,7 +131,7 @@ NOT_IN_KEYSTORE = FindingKind(
 NOT_IN_EXPORT = FindingKind(
     "keystore.not-in-export",
     NOTE,
-    "enclaves of the policy that the export does not have",
+    "enclaves that are in the policy, but not in the export",
     "A robot needs only the enclaves of its own processes; a node that starts in another enclave "
     "fails there.",
     "rcl 9 (security.c).",

@@ -107,7 +107,7 @@ _REASONS = {
     "unrestricted": "the governance does not control this access",
     "no-topic-rule": "no topic rule of the governance matches the topic",
     "domain-not-in-governance": "no domain rule of the governance lists the domain",
-    "peer-refuses-participant": "peers do not accept the participant on this domain",
+    "peer-refuses-participant": "peers do not accept the participant in this domain",
     "no-grant": "no grant names the subject",
     "empty-subject": "a certificate with an empty subject crashes the process",
     "blank-subject": "a grant whose subject has a part of only blanks crashes the process",

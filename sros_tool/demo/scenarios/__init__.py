@@ -251,7 +251,7 @@ def _read_party(table: _Table, policy: Policy) -> Party:
     role = roles[word]
     topic = table.text("topic", "")
     if not topic and role in _ROLES_WITH_NAMES:
-        problem = f"the {word} {name!r} needs the key topic: the name of its service or action"
+        problem = f"the {word} {name!r} needs topic=, with the name of its service or action"
         raise table.error("name", problem)
     try:
         topic = check_topic(topic) if topic else ""

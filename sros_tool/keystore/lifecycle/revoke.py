@@ -423,12 +423,12 @@ def _unknown_note(change: KeystoreChange, unknown: Mapping[str, Entry]) -> Note:
     if missing := [name for name in valid if not change.keystore.has_enclave(name)]:
         text += (
             f". The keystore lacks {first_few(missing, _MOST_SHOWN)}, whose certificates stay "
-            "valid. If the robot of such an enclave stays in use: if it made its keys, sign its "
-            f"requests again (`sros sign_request {root} REQUEST --no-answer -p POLICY_FILE --fleet "
-            "FLEET_FILE --enclave ENCLAVE`); if not, create its enclaves again with `sros "
-            f"generate_artifacts`, then give them new keys: `sros renew {root} --robot NAME "
-            "--new-key --revoke-old`. To revoke such an enclave, create it again first, or replace "
-            "the CA with `sros rotate_ca`"
+            "valid. If the robot of such an enclave stays in use, and made its keys, sign its "
+            f"requests again: `sros sign_request {root} REQUEST --no-answer -p POLICY_FILE --fleet "
+            "FLEET_FILE --enclave ENCLAVE`. If it did not make its keys, create its enclaves again "
+            f"with `sros generate_artifacts`, then give them new keys: `sros renew {root} --robot "
+            "NAME --new-key --revoke-old`. To revoke such an enclave, create it again first, or "
+            "replace the CA with `sros rotate_ca`"
         )
     unknowing = change.known.made_unknowing({*valid}, unknown.values())
     if others := sorted({*unknowing.values()}):
