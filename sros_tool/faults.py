@@ -305,7 +305,7 @@ class Fault(Enum):
     )
     SIGNER_NO_CA = (
         "signer-no-ca",
-        "a document that no CA signed, but some vendors accept",
+        "a document that no CA signed, but that some vendors accept",
         "Cyclone DDS 0.10 and Fast DDS 2.9.1 accept every signer whose certificate the "
         "permissions CA issued. If that CA also issues identities, each enclave can sign rights "
         "for itself.",
@@ -374,7 +374,7 @@ class Fault(Enum):
         "certificate-file",
         "a file of certificates that a vendor cannot read",
         "Fast DDS reads the whole CA file, and refuses it if any part is damaged; Cyclone DDS "
-        "reads only the first certificate, and does not read 'TRUSTED CERTIFICATE'.",
+        "reads only the first certificate, and no block of the kind 'TRUSTED CERTIFICATE'.",
         "OpenSSL 3.0 (pem_info.c); Fast DDS 2.6 to 3.6, Cyclone DDS 0.10 and 11.0; tested.",
         "Keep only certificates in the file, each under the line '-----BEGIN CERTIFICATE-----'.",
     )

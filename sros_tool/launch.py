@@ -91,7 +91,9 @@ class SecuredNodes(Action):  # type: ignore[misc]  # launch has no types where i
             perform_substitutions(context, substitutions) for substitutions in self._given
         )
         if not keystore or not policy:
-            raise RuntimeError("secured_nodes needs a keystore and a policy: one of them is empty.")
+            raise RuntimeError(
+                "secured_nodes needs a keystore and a policy: at least one is empty."
+            )
         if context.launch_configurations.get(_FILTER):
             raise RuntimeError(
                 f"secured_nodes cannot be used with {_FILTER}: the processes that the filter "

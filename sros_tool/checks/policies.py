@@ -304,7 +304,8 @@ def _check_names(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
         if kind := _kind_of_ros_name(statement):
             yield statement.found(
                 WRONG_KIND,
-                f"{statement.name} is one of the {kind}, not of the {statement.right.kind}",
+                f"{statement.name} is a {kind.removesuffix('s')}, and the rule is for "
+                f"{statement.right.kind}",
             )
         if statement.allows:
             yield from _broad_right_findings(statement)

@@ -87,8 +87,7 @@ VULNERABILITIES = FindingKind(
     "upgrade.vulnerabilities",
     NOTE,
     "known vulnerabilities that the update fixes or brings",
-    "sros compares the latest release that each of the two distributions ships; `sros check "
-    "runtime` "
+    "sros compares the latest DDS releases that the two distributions ship; `sros check runtime` "
     "examines the libraries that processes have loaded.",
     "Advisories in the OSV format, which ship with sros or are in --advisories FILE.",
     "Take new vulnerabilities into account before the update. Against vulnerabilities that no "

@@ -386,7 +386,7 @@ def _next_step_hints(result: Creation, as_json: bool) -> Iterator[str]:
             "FOLDER`"
         )
     if published and has_robot((*result.changed, *result.completed)):
-        yield f"robots that fetch get the changed files by {published}"
+        yield f"robots that fetch get the changed files after {published}"
     elif result.changed and not (as_json or result.dry_run):
         yield remedy_in_closed_robot(
             result.root,

@@ -623,7 +623,7 @@ def _step_lines(
         done = (
             "the last rotation is complete"
             if status.rotation.stage == "none"
-            else f"the keystore is at the stage {status.rotation.stage}"
+            else f"the keystore is already at the stage {status.rotation.stage}"
         )
         return "", [f"nothing is left to do: {done}"]
     if same_key:

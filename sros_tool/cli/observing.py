@@ -292,9 +292,9 @@ def why_no_node_was_observed(
         )
     if secured := [*security_clauses(merged, Path.cwd())]:
         return looked + (
-            f"The observer does not see open nodes, because {' and '.join(secured)} in this shell: "
-            "unset the variable to observe an open robot, or give --keystore and --enclave to "
-            "observe a secured robot."
+            f"The observer does not see open nodes, because {' and '.join(secured)}. To observe an "
+            "open robot, unset the named variables, or run sros in a folder without the named "
+            "file. To observe a secured robot, give --keystore and --enclave."
         )
     if merged.get(KEYSTORE):
         return looked + (

@@ -220,7 +220,7 @@ def _rows_of(kind: _Interface, pair_meaning: str) -> tuple[Row, ...]:
         ),
         _answered_call_row(
             f"unsecured client of an unsecured {kind.server}",
-            "no security on either side: the control of the rows below",
+            "no security on either side, for comparison with the rows below",
             open_client,
             open_server,
         ),
