@@ -85,6 +85,7 @@ from sros_tool.policy.rights import (
 from sros_tool.proof.requirements import Must, read_requirements
 from sros_tool.runtime.environment import ROS_ARGS, named_enclave
 from sros_tool.runtime.rmw import RMW
+from sros_tool.runtime.unit_properties import unit_properties
 from sros_tool.runtime.variables import ENCLAVE
 from sros_tool.validity import iso
 from sros_tool.wording import counted, enumerated, first_few
@@ -140,12 +141,13 @@ def proofs_of(robot: LocalRobot, state: CloseState, patience: float) -> list[Pro
         observed = state.observed.with_current_pids(running.processes, robot.export)
         return [Proof(STARTED, False, _why_missing(running, sorted(needed) or missing, observed))]
     nodes, not_here = ObservedNodes(robot), robot.not_here
+    restarts = _Restarts(robot, state.observed)
     # A laptop may be away; a computer whose nodes were seen has to be seen again.
     may_be_away = not_here - {node.enclaves[0] for node in nodes.nodes_to_compare(()).nodes}
     away = {*missing} | may_be_away | not_here.intersection(robot.without)
     files = _proof_of_files(robot, expired, unsigned_text)
     required = _proof_of_requirements(robot, unsigned_text)
-    talk = _proof_of_talk(running, nodes, away)
+    talk = _proof_of_talk(running, nodes, away, restarts)
     if talk.fails and (present := sorted(not_here - away)):
         options = " ".join(f"--without {name}" for name in present)
         away_text = f"if the other machines are away on purpose, add {options}"
@@ -678,11 +680,42 @@ def _why_missing(running: RunningRobot, missing: Sequence[str], observed: Observ
     return f"{'; '.join(reasons)}{advice}"
 
 
-def _proof_of_talk(running: RunningRobot, nodes: ObservedNodes, away: Collection[str]) -> Proof:
+class _Restarts:
+    """How often systemd restarted units, because their processes ended, since this object was made.
+
+    Units of enclaves that the user named with --without are left out.
+    """
+
+    def __init__(self, robot: LocalRobot, observed: ObservedProcesses) -> None:
+        self._robot = robot
+        processes = [each for each in observed.processes if each.enclave not in robot.without]
+        self._units = {each.enclave: each.unit for each in processes if each.unit}
+        self._before = {unit: self._count(unit) for unit in self._units.values()}
+
+    def _count(self, unit: str) -> int:
+        properties = unit_properties(unit, "NRestarts", "SubState")
+        waits = properties.get("SubState") == "auto-restart"  # systemd restarts it soon
+        return int(properties.get("NRestarts") or 0) + waits
+
+    def texts(self) -> Mapping[str, str]:
+        """Map the enclaves of restarted units to a text on the restarts, and on the log."""
+        now = {unit: self._count(unit) - count for unit, count in self._before.items()}
+        return {
+            enclave: f"{enclave} ({unit}, {counted(now[unit], 'time')}; its log says why: "
+            f"{_log_command(self._robot, unit)})"
+            for enclave, unit in self._units.items()
+            if now[unit] > 0
+        }
+
+
+def _proof_of_talk(
+    running: RunningRobot, nodes: ObservedNodes, away: Collection[str], restarts: _Restarts
+) -> Proof:
     """Return the proof that an observer in an enclave sees the same nodes as on the open robot.
 
     Processes of the enclaves ``away`` do not run; ``running`` are the processes of the other
-    enclaves at the beginning of the proof.
+    enclaves at the beginning of the proof. ``restarts`` counts since then: a process that ends
+    again and again may be seen, and does not work.
     """
     robot = running.robot
     words = ["audit", str(robot.rights_source), "--keystore", str(robot.export)]
@@ -694,7 +727,12 @@ def _proof_of_talk(running: RunningRobot, nodes: ObservedNodes, away: Collection
         except UnavailableError as error:
             return Proof(TALK, None, str(error), details=[*_name_clauses(nodes, None, fails=False)])
         comparison = _TalkComparison(running, nodes, away, audited)
-        differences = {**comparison.differences(), "not judged": audited["unjudged"]}
+        restarted = restarts.texts()
+        differences = {
+            "restarted by systemd while the proof ran": [*restarted.values()],
+            **comparison.differences(restarted),
+            "not judged": audited["unjudged"],
+        }
         # If everything is seen that the open robot did, the graph may keep changing.
         if status and audited["settled"] and not any(differences.values()):
             differences = {"not done": ["`sros audit` fails, and does not say why"]}
@@ -753,10 +791,17 @@ class _TalkComparison:
         """The rights, as sentences, that the nodes used and the keystore denies."""
         return [str(right) for right in self._denied]
 
-    def differences(self) -> Mapping[str, Sequence[str]]:
-        """Return the differences from the open robot, by kind, such as "not seen"."""
+    def differences(self, restarted: Collection[str]) -> Mapping[str, Sequence[str]]:
+        """Return the differences from the open robot, by kind, such as "not seen".
+
+        What nodes of the enclaves ``restarted`` lack is left out.
+        """
         ended, nodes = _ended_since(self._running), self._nodes
-        unseen = [node for node in self._audited["unseen"] if node["enclave"] not in self._away]
+        unseen = [
+            node
+            for node in self._audited["unseen"]
+            if node["enclave"] not in {*self._away, *restarted}
+        ]
         before, expected = (
             nodes.nodes_to_compare(self._away, self.current),
             nodes.expected_nodes(self.current),
@@ -766,7 +811,8 @@ class _TalkComparison:
         present = [
             node
             for node in before.nodes
-            if node_name(node) in names or node.enclaves[0] not in absent
+            if (node_name(node) in names or node.enclaves[0] not in absent)
+            and node.enclaves[0] not in restarted
         ]
         moved, enclaves = nodes.moved_endpoints(self.current), nodes.policy_enclaves
         observed = [

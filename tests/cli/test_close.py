@@ -924,11 +924,12 @@ def test_a_node_that_does_not_run_always(robot: Robot) -> None:
     )
 
 
-def ended_before_the_audit(robot: Robot, enclave: str) -> Any:
-    """What runs verbs, and lets the process of an enclave end when the audit begins."""
+def before_the_audit(happen: Callable[[], object]) -> Any:
+    """What runs verbs, and lets something happen when the audit begins."""
 
     def run(words: Any, live: bool, run: Any = close._run) -> Any:
-        robot.absent |= {enclave} if words[0] == "audit" else set()
+        if words[0] == "audit":
+            happen()
         return run(words, live)
 
     return run
@@ -1067,11 +1068,23 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
         in robot.close("--proof", status=1).out
     )
     with monkeypatch.context() as patched:
-        patched.setattr(close, "_run", ended_before_the_audit(robot, "/listener"))
+        patched.setattr(close, "_run", before_the_audit(partial(robot.absent.add, "/listener")))
         stopped = "/listener (process 4712 (run); start it again, or, if it does not always run, "
         said = robot.close("--proof", status=1).out
     robot.absent = set()
     assert f"{lost}ended while the proof ran: {stopped}add --without /listener)\n" in said
+    unit = robot.folder / "listener.service"
+    loops = f"{lost}restarted by systemd while the proof ran: /listener (listener.service, 2 times"
+    for seen in (robot.remaining, robot.nodes):  # a process that ends again and again may be seen
+        unit.write_text("NRestarts=5\nSubState=running\n")
+        robot.remaining = seen
+        with monkeypatch.context() as patched:
+            later = "NRestarts=6\nSubState=auto-restart\n"
+            patched.setattr(close, "_run", before_the_audit(partial(unit.write_text, later)))
+            said = robot.close("--proof", status=1).out
+        log = "`journalctl -n 100 -u listener.service | sros explain robot/export --log -`"
+        assert f"{loops}; its log says why: {log})\n" in said
+    unit.unlink()
     robot.remaining = (TALKER, ros_node("listener", LISTENER[3]))
     with monkeypatch.context() as patched:
         patched.setattr(close, "_run", beside_a_graph_that_changes)
