@@ -132,7 +132,7 @@ VERBS: Mapping[str, str | Shapes] = {
     ),
     "env": "sros_tool.runtime.environment:PrintedEnvironment",
     "zenoh": Shapes(
-        "The Zenoh configurations of a keystore's enclaves, or an existing one.",
+        "The Zenoh configurations of a keystore's enclaves, or an existing configuration.",
         {
             "KEYSTORE": f"{_LIFECYCLE}:KeystoreZenoh",
             "--from": "sros_tool.checks.zenoh:ReadConfiguration",

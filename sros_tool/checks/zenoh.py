@@ -552,9 +552,9 @@ class SubjectRights(NamedTuple):
     rights: Sequence[AllowedName]
     """Rights of the subject."""
     unsaid: Sequence[KeyRight]
-    """Rights to keys that no ROS name expresses exactly."""
+    """Rights to Zenoh keys that no ROS name expresses exactly."""
     denied: Sequence[KeyRight]
-    """Denied keys; a message with a wildcard may bypass a denial."""
+    """Denied Zenoh keys; a message with a wildcard may bypass a denial."""
 
 
 class ReadConfiguration(NamedTuple):

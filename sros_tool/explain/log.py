@@ -44,7 +44,7 @@ class ExplainedLog(NamedTuple):
     log: str
     """Path of the log."""
     findings: Sequence[LogFinding]
-    """The different security messages."""
+    """The security messages, each of them once."""
     secured: bool | None
     """Whether a line says that a node of the named enclave ran secured; null if no enclave is
     named, or on Zenoh, which logs no such line.

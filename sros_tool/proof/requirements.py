@@ -123,7 +123,7 @@ class RightsRequirement(Requirement):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Only(RightsRequirement):
-    """Only the listed ``enclaves`` may have one of the rights to one of the names."""
+    """Only the listed ``enclaves`` may have any of the rights to any of the names."""
 
     KIND = "only"
 
@@ -132,7 +132,7 @@ class Only(RightsRequirement):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Nobody(RightsRequirement):
-    """No enclave may have one of the rights to one of the names."""
+    """No enclave may have any of the rights to any of the names."""
 
     KIND = "nobody"
 

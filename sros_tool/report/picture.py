@@ -540,7 +540,7 @@ class Picture:
     equal: tuple[EqualUnits, ...] = ()
     """Robots, namespaces or enclaves that are equal except for their names, drawn once."""
     different: tuple[DifferentUnit, ...] = ()
-    """Units that differ slightly from equal units."""
+    """Units that differ only slightly from the units of a label in ``equal``."""
     exports: tuple[str, ...] = ()
     """The sources that are exports, which may lack enclaves of their keystore."""
     revoked: tuple[str, ...] = ()

@@ -138,7 +138,7 @@ class KeystoreAuthority(NamedTuple):
 
     facts: AuthorityFacts
     imported: bool
-    """Whether the CA existed before (``--identity-ca``, ``--permissions-ca``)."""
+    """Whether an existing CA is used (``--identity-ca``, ``--permissions-ca``)."""
 
 
 class NewKeystore(NamedTuple):
