@@ -16,7 +16,13 @@ from typing import TYPE_CHECKING
 from sros_tool.errors import KeystoreError, Note, UsageError
 from sros_tool.keystore.layout import PERMISSIONS_FILE, remedy_in_keystore
 from sros_tool.keystore.reader import read_consistently
-from sros_tool.owners import closing_command, other_writers_clause
+from sros_tool.owners import (
+    closing_command,
+    link_of_stranger,
+    other_writers_clause,
+    steps_to,
+    user_name,
+)
 from sros_tool.wording import first_few
 
 if TYPE_CHECKING:
@@ -217,18 +223,24 @@ def _refuse_key_readable_by_others(
 def _refuse_folders_writable_by_others(
     keystore: OpenedKeystore, folder: Path, enclave: str, how_to_accept: str
 ) -> None:
-    """Raise `KeystoreError` if other users can write to the enclave's folders."""
-    trusted = frozenset({0, os.geteuid(), keystore.root.stat().st_uid})
-    for path in (folder, *folder.parents):
-        if why := other_writers_clause(path.stat(), trusted):
+    """Raise `KeystoreError` if other users can replace the enclave's folders."""
+    users = frozenset({0, os.geteuid()})
+    trusted = users | {keystore.root.stat().st_uid}
+    reasons = [
+        (path, other_writers_clause(path.stat(), trusted), trusted)
+        for path in (folder, *folder.parents)
+        if path.is_relative_to(keystore.root)
+    ]
+    if link := link_of_stranger(steps_to(folder), users):  # it may lead to a keystore of this user
+        reasons.append((link, f"it is a link of {user_name(link.lstat().st_uid)}", users))
+    for path, why, allowed in reasons:
+        if why:
             raise KeystoreError(
                 f"others can replace the files of enclave {enclave}",
                 f"'{path}': {why}. Whoever replaces files decides whom the process trusts.",
-                f"Run `{closing_command(path, trusted)}`, then `sros verify "
+                f"Run `{closing_command(path, allowed)}`, then `sros verify "
                 f"{quote(str(keystore.root))}`.{how_to_accept}",
             )
-        if path == keystore.root:
-            return
 
 
 def _with_join_faults(

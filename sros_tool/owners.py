@@ -9,7 +9,7 @@ import grp
 import os
 import pwd
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
@@ -60,7 +60,7 @@ def replaceable_on_the_way(path: Path, trusted_users: frozenset[int]) -> Iterato
     In a sticky folder such as ``/tmp``, only the owner of a file can rename the file.  So a sticky
     folder counts only if others own the next part of the path.
     """
-    for step, state in _path_states(path):
+    for step, state in steps_to(path):
         kept = state.st_mode & stat.S_ISVTX and state.st_uid in trusted_users
         if not kept and (why := other_writers_clause(state, trusted_users)):
             yield step, why
@@ -72,7 +72,7 @@ def refuse_link_of_stranger(path: Path) -> None:
     Raises:
         KeystoreError: another user made a link on the way to ``path`` where everybody can write.
     """
-    if link := _link_of_stranger(path):
+    if link := link_of_stranger(steps_to(path), frozenset({0, os.geteuid()})):
         raise KeystoreError(
             f"'{link}' is a link of another user",
             "Every user can create a link at this path, and this link leads to "
@@ -81,13 +81,22 @@ def refuse_link_of_stranger(path: Path) -> None:
         )
 
 
-def _link_of_stranger(path: Path) -> Path | None:
-    for step, state in _path_states(path):
-        if (
-            stat.S_ISLNK(state.st_mode)
-            and state.st_uid not in (0, os.geteuid())
-            and step.parent.stat().st_mode & stat.S_IWOTH
-        ):
+def link_of_stranger(
+    steps: Iterable[tuple[str | Path, os.stat_result]], trusted_users: frozenset[int]
+) -> Path | None:
+    """Return the first link that another user than ``trusted_users`` made on a way, or None.
+
+    ``steps`` are the folders and links on the way, as `steps_to` yields them. The owner of a folder
+    may make links in it, unless everybody can write there.
+    """
+    folders: dict[Path, os.stat_result] = {}
+    for step, state in ((Path(name), state) for name, state in steps):
+        if not stat.S_ISLNK(state.st_mode):
+            folders[step] = state
+            continue
+        folder = folders[step.parent]
+        owners = trusted_users | (set() if folder.st_mode & stat.S_IWOTH else {folder.st_uid})
+        if state.st_uid not in owners:
             return step
     return None
 
@@ -99,14 +108,14 @@ def file_of_root(path: Path) -> Path | None:
         state = real.lstat()
     except (OSError, RuntimeError, ValueError):  # a loop of links, or a NUL byte
         return None
-    ways = [state, *(status for _, status in _path_states(real))]
+    ways = [state, *(status for _, status in steps_to(real))]
     is_ours = stat.S_ISREG(state.st_mode) and not any(
         other_writers_clause(status, _ROOT) for status in ways
     )
     return real if is_ours else None
 
 
-def _path_states(path: Path) -> Iterator[tuple[Path, os.stat_result]]:
+def steps_to(path: Path) -> Iterator[tuple[Path, os.stat_result]]:
     """Yield the folders and links on the way to ``path``, each with its lstat(2).
 
     ``path`` itself is included only if it is a link.

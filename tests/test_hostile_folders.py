@@ -44,6 +44,7 @@ from sros_tool.keystore.lifecycle.rotate import rotate_ca
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.template import load_template
 from sros_tool.keystore.transaction import staged_name
+from sros_tool.runtime.processes import FileReader, Process, ProcessRoot, with_files
 from sros_tool.xml import read_bytes, why_unreadable
 from tests.conftest import MEMORY, POLICY
 from tests.support.children import run
@@ -816,6 +817,33 @@ def test_no_key_goes_where_the_link_of_another_user_leads(
     assert not list(elsewhere.iterdir())
     os.chown(link, 0, 0, follow_symlinks=False)
     distribute(OpenedKeystore(keystore), ["/a"], Path(f"{link}{below}"), now=NOW)
+
+
+@as_root
+@pytest.mark.parametrize("owner", [STRANGER, 0])
+def test_a_link_of_another_user_on_the_way_to_the_keystore_is_named(
+    owner: int, keystore: Path, tmp_path: Path
+) -> None:
+    """Also if the keystore there belongs to the user of the link."""
+    (shared := tmp_path / "shared").mkdir()
+    (link := shared / "ks").symlink_to(keystore)
+    os.chown(link, owner, owner, follow_symlinks=False)
+    os.chown(keystore, owner, owner)
+    refused = f"'{link}': it is a link of user {STRANGER}. Whoever" in sros("env", link, "/a").err
+    assert refused is bool(owner)
+    state = {"KEYSTORE": str(link), "ENABLE": "true", "ENCLAVE_OVERRIDE": "/a"}
+    environment = {f"ROS_SECURITY_{name}": value for name, value in state.items()}
+    process = Process(1, (), environment, NOW)
+    root = os.open("/", os.O_PATH | os.O_DIRECTORY)
+    try:
+        enclave = with_files(process, ProcessRoot(root, FileReader()), "/").enclave
+    finally:
+        os.close(root)
+    assert enclave
+    assert (enclave.writable == f"'{link}': it is a link of another user") is bool(owner)
+    found = json.loads(sros("check", link, "--json").out)["findings"]
+    of_link = [each["id"] for each in found if each["subject"] == str(link)]
+    assert ("keystore.replaceable" in of_link) is bool(owner)
 
 
 # ── files that grow, wait, or have no end ──────────────────────────────────────────────────

@@ -10,8 +10,10 @@ import pytest
 from sros_tool.owners import (
     closing_command,
     file_of_root,
+    link_of_stranger,
     other_writers_clause,
     replaceable_on_the_way,
+    steps_to,
 )
 from tests.support.users import as_root
 
@@ -56,6 +58,26 @@ def test_the_way_to_a_file(
         (top / name).chmod(mode)
     names = {str(path.relative_to(top)) for path, _ in replaceable_on_the_way(file, US)}
     assert names == ({name} if found else set())
+
+
+@as_root
+@pytest.mark.parametrize(
+    ("of_link", "of_folder", "mode", "found"),
+    [
+        (STRANGER, 0, 0o755, True),
+        (STRANGER, STRANGER, 0o755, False),  # a home folder
+        (STRANGER, STRANGER, 0o1777, True),
+        (0, STRANGER, 0o1777, False),
+    ],
+)
+def test_a_link_of_another_user(
+    of_link: int, of_folder: int, mode: int, found: bool, file: Path
+) -> None:
+    link = file.parent
+    os.chown(link, of_link, -1, follow_symlinks=False)
+    os.chown(link.parent, of_folder, -1)
+    link.parent.chmod(mode)
+    assert link_of_stranger(steps_to(file), US) == (link if found else None)
 
 
 def test_a_file_of_root(file: Path) -> None:

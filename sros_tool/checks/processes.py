@@ -139,10 +139,11 @@ PROCESS_REPLACEABLE = FindingKind(
     "runtime.process-files-replaceable",
     WARNING,
     "a process whose enclave other users can replace",
-    "Anyone who can write to a folder of the keystore decides which files the process loads at its "
-    "next start.",
+    "Anyone who can write to a folder of the keystore, or owns a link on the way to it, decides "
+    "which files the process loads at its next start.",
     "POSIX.1-2017, rename() and unlink(): they need only the right to write to the folder.",
-    "Remove the write permission of other users: `chmod go-w FOLDER`.",
+    "Remove the write permission of other users: `chmod go-w FOLDER`; if it is a link, start the "
+    "process with the real path of the keystore.",
 )
 PROCESS_KEY_READABLE = FindingKind(
     "runtime.process-key-readable",

@@ -32,7 +32,7 @@ from itertools import pairwise, takewhile
 from pathlib import Path
 from typing import NamedTuple
 
-from sros_tool.owners import other_writers_clause
+from sros_tool.owners import link_of_stranger, other_writers_clause
 from sros_tool.runtime.cyclone import ENCLAVE_FILES
 from sros_tool.runtime.environment import (
     NO_CONFIGURATION,
@@ -1092,8 +1092,8 @@ class ProcessEnclave:
     says that the enclave's folder exists.  ``moved`` maps folders of the keystore whose last change
     was a move or a new mode, without added or removed files, to the time of that change; also
     folders above the keystore that were moved.
-    ``writable`` is a clause on a folder, of the keystore or above it, that unexpected users can
-    change.
+    ``writable`` is a clause on a folder or link, of the keystore or above it, that unexpected users
+    can change.
     ``folders`` are the device and inode of the keystore and of the enclave, as far as these exist.
     ``problem`` is a clause on why the enclave could not be examined.
     """
@@ -1225,8 +1225,8 @@ class ProcessRoot:
         except OSError:
             return []
 
-    def folders(self, path: str) -> list[tuple[str, os.stat_result]]:
-        """Return the parents of a folder, and last the folder itself, with their states.
+    def steps(self, path: str) -> list[tuple[str, os.stat_result]]:
+        """Return the folders and links on the way to a folder, and last the folder itself.
 
         Raises:
             OSError: The folder does not exist, or cannot be examined.
@@ -1234,7 +1234,7 @@ class ProcessRoot:
         with self._opened(path) as (_, way):
             if not stat.S_ISDIR(way[-1][1].st_mode):
                 raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR))
-            return [(step, state) for step, state in way if stat.S_ISDIR(state.st_mode)]
+            return way
 
     @contextmanager
     def _opened(self, path: str) -> Iterator[tuple[int, list[tuple[str, os.stat_result]]]]:
@@ -1317,18 +1317,20 @@ def _loaded_enclave(
     top = keystore if keystore.startswith("/") else f"{folder}/{keystore}"
     place = f"{top}/enclaves/{name.strip('/')}"
     try:
-        above = root.folders(top)
+        above = _only_folders(root.steps(top))
     except OSError as error:
         return ProcessEnclave(keystore, name, problem=_reason(error))
     folder_of_keystore, here = _identity(above), _path_if_same_folder(top, above)
     try:
-        folders = root.folders(place)
+        steps = root.steps(place)
     except OSError as error:
         there = (folder_of_keystore,)
         return ProcessEnclave(
             keystore, name, local_keystore=here, folders=there, problem=_reason(error)
         )
+    folders = _only_folders(steps)
     own_folders = [above[-1], *folders[len(above) - 1 :]]
+    link = link_of_stranger(steps, frozenset({0, user}))
     return ProcessEnclave(
         keystore,
         name,
@@ -1338,10 +1340,18 @@ def _loaded_enclave(
         ),
         is_there=True,
         moved=_moved_folders(folders, {path for path, _ in own_folders}),
-        writable=_writable_folder_clause(own_folders, above[:-1], user),
+        writable=f"'{link}': it is a link of another user"
+        if link
+        else _writable_folder_clause(own_folders, above[:-1], user),
         local_keystore=here,
         folders=(folder_of_keystore, _identity(folders)),
     )
+
+
+def _only_folders(
+    steps: Sequence[tuple[str, os.stat_result]],
+) -> list[tuple[str, os.stat_result]]:
+    return [(step, state) for step, state in steps if stat.S_ISDIR(state.st_mode)]
 
 
 def _moved_folders(

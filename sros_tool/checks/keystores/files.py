@@ -41,8 +41,10 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.owners import (
     is_for_root_alone,
+    link_of_stranger,
     other_writers_clause,
     replaceable_on_the_way,
+    steps_to,
     user_name,
 )
 from sros_tool.pki.keys import holds_private_key
@@ -265,7 +267,11 @@ def check_files(keystore: CheckedKeystore, names: Sequence[str] | None = None) -
         yield FOREIGN_OWNER.found(root, f"it belongs to {user_name(state.st_uid)}", root)
     trusted = frozenset({0, os.geteuid(), state.st_uid})
     kept: list[str] = []
-    for folder, why in replaceable_on_the_way(keystore.root, trusted):
+    replaceable = dict(replaceable_on_the_way(keystore.root, trusted))
+    # The user of such a link may also own the keystore to which it leads.
+    if link := link_of_stranger(steps_to(keystore.root), frozenset({0, os.geteuid()})):
+        replaceable.setdefault(link, f"it is a link of {user_name(link.lstat().st_uid)}")
+    for folder, why in replaceable.items():
         yield REPLACEABLE.found(str(folder), why, str(folder))
     yield from _write_access_findings(root, state, trusted)
     links = _Links(root)
