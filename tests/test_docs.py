@@ -75,6 +75,14 @@ def test_every_verb_is_described() -> None:
     assert "(docs/verbs.md)" in read("README.md")
 
 
+def test_every_verb_that_refuses_to_stop_nodes_is_listed() -> None:
+    verbs = re.split(r"^### sros ", read("docs/reference/options.md"), flags=re.MULTILINE)
+    refusing = {each.partition("\n")[0] for each in verbs if "`--allow-refusal VENDOR`" in each}
+    _, _, page = read("docs/life_of_keys.md").partition("\n## Changes that would stop nodes\n")
+    (listed,) = re.findall(r"These verbs are (.*?)\.", page)
+    assert {name.partition(" --")[0] for name in re.findall(r"`(.+?)`", listed)} >= refusing
+
+
 def test_setup_py_installs_every_policy_of_a_package(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
