@@ -824,6 +824,8 @@ def _unused_names(requirement: Requirement, world: World, limit: SearchLimit) ->
     """
     result = _UnusedNames([], [], [], [], [])
     for right, name, parts in _restricted_names(requirement):
+        if isinstance(requirement, Protected) and name == "/*":  # also of a kind without names yet
+            continue
         verb = "use" if isinstance(requirement, Nobody | Protected) else right
         peer = PEER_RIGHT[right]
         named = _named_right(right, name)

@@ -280,6 +280,7 @@ CAN_FAIL = (
     '[[at_most]]\npublish = ["/x"]\nenclaves = 2',
     '[[widest]]\nenclaves = ["/r/b"]\npublish = ["/x"]\nsubscribe = ["/*"]',
     '[[apart]]\nfrom = ["/r/c"]\nto = ["/r/b"]\nthrough = ["/r/a"]',
+    '[[protected]]\ntopics = ["/*"]\nservices = ["/*"]\nactions = ["/*"]\nlevel = "sign"',
 )
 
 
