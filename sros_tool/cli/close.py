@@ -533,7 +533,7 @@ def _other_machines_lines(robot: LocalRobot, closed: CloseState) -> list[str]:
     lines, keystore = [], shlex.quote(str(robot.keystore))
     if needed := closed.needed_elsewhere:
         lines.append(
-            f"on other machines, files from before these times are outdated: {_times_text(needed)}"
+            f"other machines need the current files of {_times_text(needed)}"
             f"; bring the output of `sros distribute_key {keystore} ENCLAVE FOLDER --force` to the "
             "machine, restart the process there, and then run "
             f"`{robot.close_command} --brought ENCLAVE`"

@@ -17,7 +17,7 @@ from sros_tool.close.nodes import ObservedNodes
 from sros_tool.close.processes import ClosedProcess, ObservedProcesses, process_text
 from sros_tool.close.proof import proofs_of
 from sros_tool.close.robot import LocalRobot
-from sros_tool.close.start_files import DROP_IN, drop_in_heading
+from sros_tool.close.start_files import DROP_IN, SYSTEMD_FOLDER, drop_in_heading
 from sros_tool.close.state import (
     CloseState,
     RunningRobot,
@@ -38,8 +38,6 @@ from sros_tool.runtime.units import unit_changes, write_units
 from sros_tool.values import FileChange
 from sros_tool.wording import enumerated
 from sros_tool.xml import read_bytes
-
-_SYSTEMD_FOLDER = Path("/etc/systemd/system")
 
 _RESTART_SECONDS = 30.0
 """How long processes that sros restarted may take until they run in their enclaves, or open."""
@@ -65,10 +63,12 @@ def apply(robot: LocalRobot, prepared: CloseState, *, dry_run: bool) -> CloseSta
     unsecured = [process for process in observed.processes if not secured.get(process.enclave)]
     open_units = observed._replace(processes=unsecured).units
     idle = {process.unit for process in observed.processes if process.is_idle}
+    # A Zenoh router comes first: nodes wait for it.
+    routers = {process.unit for process in observed.processes if process.is_router}
+    last = {process.unit for process in observed.processes if prepared.may_restart_last(process)}
     restarts = [
         ["try-restart" if unit in idle else "restart", unit]
-        # A Zenoh router comes first: nodes wait for it.
-        for unit in sorted(open_units, key=lambda unit: (unit not in _router_units(observed), unit))
+        for unit in sorted(open_units, key=lambda unit: (unit not in routers, unit in last, unit))
     ]
     _restart_units(robot, restarts, changed=bool(changes), dry_run=dry_run)
     state = prepared._replace(changes=[*prepared.changes, *changes])
@@ -109,12 +109,12 @@ def _write_drop_ins(
             "memory of this user, and the nodes of this user hear nothing any more (RemoveIPC in "
             f"logind.conf(5)). First run {linger}, or run the nodes as a system user"
         )
-    changes = unit_changes(_SYSTEMD_FOLDER, files, force=True)
+    changes = unit_changes(SYSTEMD_FOLDER, files, force=True)
     for path, action in changes.items():
-        robot.shell.say(f"{'would ' if dry_run else ''}{action} {_SYSTEMD_FOLDER / path}")
+        robot.shell.say(f"{'would ' if dry_run else ''}{action} {SYSTEMD_FOLDER / path}")
     if not dry_run:
-        write_units(_SYSTEMD_FOLDER, files, changes)
-    return [FileChange(action, str(_SYSTEMD_FOLDER / path)) for path, action in changes.items()]
+        write_units(SYSTEMD_FOLDER, files, changes)
+    return [FileChange(action, str(SYSTEMD_FOLDER / path)) for path, action in changes.items()]
 
 
 def _remember_new_units(robot: LocalRobot, observed: ObservedProcesses) -> None:
@@ -359,11 +359,11 @@ def _drop_ins_of(robot: LocalRobot, observed: ObservedProcesses) -> list[Path]:
     """Return the drop-ins for this folder; raise `SrosError` if another folder has one."""
     drop_ins = [
         path
-        for path in sorted(_SYSTEMD_FOLDER.glob(f"*.d/{DROP_IN}"))
+        for path in sorted(SYSTEMD_FOLDER.glob(f"*.d/{DROP_IN}"))
         if read_bytes(path, "unit").startswith(drop_in_heading(robot).encode())
     ]
     for unit in sorted(observed.units):
-        path = _SYSTEMD_FOLDER / f"{unit}.d/{DROP_IN}"
+        path = SYSTEMD_FOLDER / f"{unit}.d/{DROP_IN}"
         if path not in drop_ins and os.path.lexists(path):
             raise SrosError(
                 f"'{path}' is not the drop-in of this folder",
@@ -371,10 +371,6 @@ def _drop_ins_of(robot: LocalRobot, observed: ObservedProcesses) -> list[Path]:
                 "Name the folder exactly as the first line does, or remove the drop-in.",
             )
     return drop_ins
-
-
-def _router_units(observed: ObservedProcesses) -> set[str]:
-    return {process.unit for process in observed.processes if process.is_router}
 
 
 def _states_of_stopped_units(units: Iterable[str]) -> dict[str, str]:

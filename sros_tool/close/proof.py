@@ -284,16 +284,19 @@ def _unsigned_policy_text(robot: LocalRobot) -> str:
     _, output, _ = robot.shell.run(words, False)
     stale = [finding["subject"] for finding in json.loads(output)["findings"]]
     unsigned = robot.policy_enclaves().difference(list_enclaves(signed))
-    changed = sorted({*stale} | (unsigned if has_keystore else unsigned - robot.not_here))
-    if not changed:
+    unsigned = unsigned if has_keystore else unsigned - robot.not_here
+    clauses = []
+    if changed := sorted({*stale} - unsigned):
+        names = first_few(changed, MOST_NAMES)
+        clauses.append(f"differs from the signed permissions of {names}, which the processes use")
+    if unsigned:
+        clauses.append(f"has {first_few(sorted(unsigned), MOST_NAMES)}, without signed permissions")
+    if not clauses:
         return ""
     remedy = f"`{robot.close_command}` checks and signs it"
     if not has_keystore:
         remedy = "bring the signed policy here, or sign this policy where the keystore is"
-    return (
-        f"; '{robot.policy}' differs from the signed permissions of "
-        f"{first_few(changed, MOST_NAMES)}, which the processes use: {remedy}"
-    )
+    return f"; '{robot.policy}' {' and '.join(clauses)}: {remedy}"
 
 
 def _errors_text(robot: LocalRobot, *words: str) -> str:
@@ -976,8 +979,8 @@ def _name_clauses(
             text += " (to keep a name, write it in policy.xml with a leading /)"
         if fails:
             text += (
-                " (if the new name belongs to another node, remove the unused rights from "
-                "the profile of that node)"
+                " (if a new name belongs to another node, and not to the renamed one, remove the "
+                "unused rights from this other node's profile)"
             )
         yield text
     _, without_profile = nodes.divide_by_profile(nodes.as_observed)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 import shutil
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -27,6 +28,7 @@ from sros_tool.values import FileChange
 from sros_tool.xml import read_bytes
 
 DROP_IN = "sros-close.conf"
+SYSTEMD_FOLDER = Path("/etc/systemd/system")
 
 
 def write_start_files(robot: LocalRobot, state: CloseState) -> list[FileChange]:
@@ -68,7 +70,12 @@ def _remove_earlier_files(robot: LocalRobot, kept: Collection[str]) -> list[File
     ]
     for path in unneeded:
         remove_file(path)
-        robot.shell.say(f"removed {path}: it was for an enclave without a known process")
+        used = SYSTEMD_FOLDER / path.parent.name / path.name
+        stays = ""
+        if path.name == DROP_IN and os.path.lexists(used):
+            unit = path.parent.name.removesuffix(".d")
+            stays = f"; {used} stays, so {unit} cannot start open (--undo removes the drop-in)"
+        robot.shell.say(f"removed {path}: it was for an enclave without a known process{stays}")
     return [FileChange("remove", str(path)) for path in unneeded]
 
 

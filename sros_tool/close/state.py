@@ -591,9 +591,9 @@ class CloseState(NamedTuple):
             for command, processes in by_hand.items()
             if any(process.enclave in self.pending for process in processes)
         ]
-        return dict(sorted(due, key=lambda entry: all(map(self._may_restart_last, entry[1]))))
+        return dict(sorted(due, key=lambda entry: all(map(self.may_restart_last, entry[1]))))
 
-    def _may_restart_last(self, process: ClosedProcess) -> bool:
+    def may_restart_last(self, process: ClosedProcess) -> bool:
         """Return whether a process may restart after processes with a new key or new rights."""
         why = self.outdated.get(process.enclave, "")
         return why.endswith(_ACCEPTS_REVOKED) and process.enclave != ROUTER

@@ -30,6 +30,7 @@ from sros_tool.close import (
     preparation,
     processes,
     proof,
+    start_files,
     state,
     watch,
 )
@@ -214,7 +215,8 @@ def robot(beside_graph: Beside, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     # The RMWs of this machine may lack security.
     lacking = tmp_path / "lacking"
     monkeypatch.setattr(of_robot, "built_without_security", lambda *_: lacking.exists())
-    monkeypatch.setattr(apply, "_SYSTEMD_FOLDER", tmp_path / "systemd")
+    for module in (apply, start_files):
+        monkeypatch.setattr(module, "SYSTEMD_FOLDER", tmp_path / "systemd")
     monkeypatch.setattr(apply, "_RESTART_SECONDS", 0.1)
     monkeypatch.setattr(apply, "_STABLE_FOR", timedelta())
     monkeypatch.setattr(apply, "_SECONDS_BETWEEN", 0)
@@ -1185,6 +1187,12 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
         "from the signed permissions of /listener, which the processes use: `sros close robot` "
         "checks and signs it\n" in ended.out
     )
+    renamed = policy.read_text()
+    pad = '<enclave path="/pad"><profiles><profile ns="/" node="pad"/></profiles></enclave>'
+    policy.write_text(renamed.replace("</enclaves>", f"{pad}</enclaves>"))
+    both = "which the processes use and has /pad, without signed permissions: `sros close robot` "
+    assert both in robot.close("--proof", "--partial", "--without", "/pad").out
+    policy.write_text(renamed)
     assert (
         "not checked (accepted): every process was started in its enclave: true for 2 "
         "enclaves; process 9 (?) (/proc hides it), process 10 (init) (Permission denied) may be "
@@ -1882,7 +1890,9 @@ def test_what_is_exported_without_the_enclaves_of_other_machines(
         )
         said = capsys.readouterr()
         assert ("fix this first" in said.out) is bool(problems)
-        assert "are outdated: /b (2027-01-15T08:00:00Z); bring the output of" in said.err
+        assert (
+            "need the current files of /b (2027-01-15T08:00:00Z); bring the output of" in said.err
+        )
     # Until the files change, their machine has those that --brought said are there.
     when = state_now.needed_elsewhere
     robot.named_brought = ["/b"]
@@ -2089,7 +2099,9 @@ def test_an_enclave_that_belongs_to_another_machine(robot: Robot) -> None:
     robot.by_hand = {"/talker"}
     sros("renew", "robot/keystore", "/talker", "--new-key", "--revoke-old", cwd=robot.folder).ok()
     shared = robot.folder / "robot/keystore/public/identity_ca.crl.pem"
-    needed = f"are outdated: /listener ({iso(time_of_file(shared.stat().st_mtime))}); bring"
+    needed = (
+        f"need the current files of /listener ({iso(time_of_file(shared.stat().st_mtime))}); bring"
+    )
     assert needed in robot.close().err
     ended = robot.close("--proof")
     assert needed in ended.err
@@ -2112,7 +2124,7 @@ def test_an_enclave_that_belongs_to_another_machine(robot: Robot) -> None:
     )
     policy.write_bytes(stated)
     os.utime(shared)
-    assert "are outdated: /listener (" in robot.close().err
+    assert "need the current files of /listener (" in robot.close().err
     robot.remaining = (TALKER,)
     said = robot.close("--proof", status=1).out
     assert (
@@ -2159,6 +2171,27 @@ def test_an_enclave_that_belongs_to_another_machine(robot: Robot) -> None:
     assert f"sros sees no process in an enclave of this folder; {there} without sros run\n" in (
         robot.close("--undo").err
     )
+
+
+def test_units_restart_in_order_and_keep_the_drop_ins_of_removed_processes(
+    robot: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A process that was revoked restarts before those that then refuse its earlier key."""
+    robot.units = UNITS
+    robot.close()
+    robot.close("--apply")
+    robot.outdated, count = set(PID), len(robot.restarts)
+    with monkeypatch.context() as patched:
+        patched.setattr(
+            state.CloseState, "may_restart_last", lambda _, known: known.enclave == "/listener"
+        )
+        robot.close("--apply", status=1)
+    assert robot.restarts[count:] == ["daemon-reload", *RESTARTS[::-1]]
+    robot.outdated = set()
+    said = robot.close("--elsewhere", "/listener", status=1).err
+    unit = "listener.service"
+    stays = f"{robot.folder}/systemd/{unit}.d/sros-close.conf stays, so {unit} cannot start open"
+    assert f": it was for an enclave without a known process; {stays} (--undo removes" in said
 
 
 def test_an_enclave_that_gets_another_name_keeps_its_process(robot: Robot) -> None:
