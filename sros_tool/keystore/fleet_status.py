@@ -506,8 +506,8 @@ class PublishedMetadata:
     archive.  Null if nothing is missing, or if the folder is ``unseen``.
     """
     refused: str = ""
-    """Why the metadata in ``folder`` does not verify, so that robots refuse it, as a clause.  Null
-    if the metadata verifies, or if the folder is ``unseen``.
+    """Why the metadata in ``folder`` does not verify, as a clause; robots refuse such metadata.
+    Null if the metadata verifies, or if the folder is ``unseen``.
     """
     altered: Mapping[str, datetime] = field(default_factory=dict)
     """Files that ``sros fleet publish`` put right in the last day, because they were missing,

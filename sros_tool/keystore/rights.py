@@ -696,8 +696,8 @@ class PolicyDifference(NamedTuple):
     enclave of B may subscribe any more.
     """
     domains: Sequence[DifferentDomains]
-    """Enclaves of both sides with different ROS domains; only enclaves for which both sides state
-    domains.
+    """Enclaves whose ROS domains differ between the sides; only enclaves for which both sides
+    state domains.
     """
     enclaves: Sequence[DifferentEnclave]
     """Enclaves that have no rights, and that only one side has."""
