@@ -123,8 +123,9 @@ def prove(robot: LocalRobot) -> CloseState:
 def proofs_of(robot: LocalRobot, state: CloseState, patience: float) -> list[Proof]:
     """Wait until each process runs in its enclave, and return the proofs that the robot is closed.
 
-    Waits for at most ``patience`` seconds.  If a process is then missing, the only proof is that it
-    was not started.  If the enclave of the observer has expired, only the files are examined.
+    Waits for at most ``patience`` seconds.  If a process is then missing, the only proofs are that
+    it was not started, and, if so, that the files are not accepted.  If the enclave of the observer
+    has expired, only the files are examined.
     """
     expired = expired_enclaves(robot, robot.export)
     unsigned_text = cache(partial(_unsigned_policy_text, robot))
@@ -139,7 +140,9 @@ def proofs_of(robot: LocalRobot, state: CloseState, patience: float) -> list[Pro
     needed = {*missing}.difference(robot.without) | running_now.intersection(missing)
     if needed or expected == {*missing}:
         observed = state.observed.with_current_pids(running.processes, robot.export)
-        return [Proof(STARTED, False, _why_missing(running, sorted(needed) or missing, observed))]
+        why = _why_missing(running, sorted(needed) or missing, observed)
+        files = _proof_of_files(robot, expired, unsigned_text)
+        return [Proof(STARTED, False, why), *([files] if files.fails else [])]
     nodes, not_here = ObservedNodes(robot), robot.not_here
     restarts = _Restarts(robot, state.observed)
     # A laptop may be away; a computer whose nodes were seen has to be seen again.

@@ -987,6 +987,7 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     key = robot.folder / "robot/export/enclaves/talker/key.pem"
     key.chmod(0o644)
     said = robot.close("--proof", status=1).out
+    assert "no: the files are not accepted: sros check finds 1 error, the first in " in said
     key.chmod(0o600)
     assert (
         "others can read key.pem (its mode is 0644): if anybody read it, run `sros renew " in said
