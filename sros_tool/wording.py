@@ -47,4 +47,4 @@ def enumerated(texts: Sequence[str]) -> str:
 
 def perhaps_meant(names: Sequence[str]) -> str:
     """Return the end of a sentence that has named one or several similar names."""
-    return f"perhaps {'this name' if len(names) == 1 else 'one of these names'} is meant"
+    return "perhaps the right name" if len(names) == 1 else "perhaps one of them is the right name"

@@ -38,6 +38,6 @@ def test_a_list_ends_in_and(texts: list[str], words: str) -> None:
     assert enumerated(texts) == words
 
 
-@pytest.mark.parametrize(("names", "words"), [("a", "this name"), ("ab", "one of these names")])
+@pytest.mark.parametrize(("names", "words"), [("a", "the"), ("ab", "one of them is the")])
 def test_a_hint_says_whether_it_is_about_one_name(names: str, words: str) -> None:
-    assert perhaps_meant(names) == f"perhaps {words} is meant"
+    assert perhaps_meant(names) == f"perhaps {words} right name"

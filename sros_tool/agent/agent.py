@@ -849,11 +849,11 @@ class _Round:
             _since_boot(),
         )
 
-        def on_the_clock(moments: Mapping[str, float]) -> dict[str, datetime]:
+        def on_the_clock(seconds_since_boot: Mapping[str, float]) -> dict[str, datetime]:
             return {
-                name: now - timedelta(seconds=since_boot - moment)
-                for name, moment in moments.items()
-                if moment <= since_boot  # a later time is of an earlier start of the machine
+                name: now - timedelta(seconds=since_boot - seconds)
+                for name, seconds in seconds_since_boot.items()
+                if seconds <= since_boot  # a later time is of an earlier start of the machine
             }
 
         return look_at_processes(

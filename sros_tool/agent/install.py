@@ -606,7 +606,7 @@ def _apply_changes(folder: Path, changes: Mapping[str, _Change]) -> dict[str, st
 def _write_changes(folder: Path, changes: Iterable[_Change]) -> None:
     with Transaction(folder, partial=True) as transaction, Folder(folder) as opened:
         for change in changes:
-            _check_seen(opened, change)
+            _refuse_changed_files(opened, change)
             for path, data in change.write.items():
                 transaction.write(path, data, private=path.endswith(f"/{KEY_FILE}"))
             for path in change.remove:
@@ -614,7 +614,7 @@ def _write_changes(folder: Path, changes: Iterable[_Change]) -> None:
         transaction.commit()
 
 
-def _check_seen(folder: Folder, change: _Change) -> None:
+def _refuse_changed_files(folder: Folder, change: _Change) -> None:
     """Raise `KeystoreError` if files changed after the new ones were compared with them."""
     for path, before in change.seen.items():
         if _content(folder, path) != before:

@@ -104,8 +104,8 @@ def _merge_robots(
         if others:
             count = counted(len(others), "more robot")
             names = first_few(list(of_robot)[1:], _MOST_ROBOTS, joint=", and ")
-            said = " (each finding names different robots)" if many else ""
-            yield first, f"the same for {count}{said}: {names}"
+            text = f"similar for {count} (with other names)" if many else f"the same for {count}"
+            yield first, f"{text}: {names}"
         else:
             yield from ((alone, "") for alone in (first, *more))
 

@@ -1023,9 +1023,9 @@ def merge_policies(
 def _with_common_parts(path: Path, merged: bytes, others: Sequence[Policy]) -> bytes:
     """Return the policy file ``merged`` with includes of common parts in its new profiles.
 
-    A profile is new if the file at ``path`` lacks it. If ``others``, which are the merged policies,
-    have no includes, ``merged`` is returned unchanged.  Rights never change.  A profile does not
-    change if it states a protection, or if its enclave denies a right in the parts.
+    A profile is new if the file at ``path`` lacks it. If ``others``, the policies that were added,
+    have no includes, ``merged`` is returned unchanged.  Rights never change.  A profile that states
+    a protection does not change.  A part is not included if the enclave denies a right in it.
     """
     if not any(
         group.source.file != merged_policy.file

@@ -634,7 +634,10 @@ def hidden_enclaves(root: Path, among: Iterable[str] | None = None) -> tuple[str
 
 
 def _is_kubernetes_secret(folder: Path) -> bool:
-    """Return whether Kubernetes made ``folder`` for a Secret: the enclave links to its files."""
+    """Return whether Kubernetes made ``folder`` for a Secret.
+
+    Then its parent, the folder of an enclave, has links to the files in it.
+    """
     link = folder.parent / "..data"
     try:
         return link.is_symlink() and all(

@@ -708,10 +708,10 @@ def _witness_against_apart(requirement: Apart, world: World, limit: SearchLimit)
 def _similar_chains(
     chain: _Chain, world: World, sources: Collection[str], through: Container[str]
 ) -> Iterator[_Chain]:
-    """Yield the chain once for each other enclave that can replace the enclave that findings name.
+    """Yield the chain with each other enclave that can be in the place of the enclave in findings.
 
-    Findings name the source of a direct influence, or else the first enclave that passes the
-    influence on.
+    Findings name one enclave of a chain: the source of a direct influence, or else the first
+    enclave that passes the influence on.
     """
     worlds = (world, *world.elsewhere)
     used = {ANYBODY, *(enclave for hop in chain for enclave in (hop.source, hop.target))}

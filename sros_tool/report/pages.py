@@ -60,8 +60,8 @@ def render_page(
     origins = ", ".join(f"{origin.kind} {origin.title}" for origin in picture.origins)
     made = f"{origins}. Findings are as of {iso(now)[:10]}."
     if unread := sum(units.enclaves for units in picture.unread):
-        only = counted(unread, "enclave is", "enclaves are")
-        made += f" {only} only compared, without findings and expiry here."
+        enclaves = counted(unread, "enclave")
+        made += f" The page lacks findings and expiry of {enclaves}, only compared with others."
     return _document(
         f"{picture.title}: who may do what",
         Template(_asset("view.html")).substitute(title=escape(picture.title), made=escape(made)),

@@ -175,8 +175,8 @@ class Name:
     protection: Protection
     """Protection of the name by the governance."""
     wildcard: bool = False
-    """Whether the name is a wildcard. A wildcard is drawn like a name only if no arrow to a known
-    name would show it.
+    """Whether the name is a wildcard. A wildcard is drawn as arrows to the known names that it
+    matches, and as a name of its own only if there is no such arrow.
     """
     lacks: Lack = Lack.NOTHING
     """The side (senders or receivers) on which no enclave has a right to the name; empty if no

@@ -1390,8 +1390,9 @@ def _writable_folder_clause(
 ) -> str:
     """Return a clause on the first folder that unexpected users can change, or "".
 
-    Expected users are root, ``user``, the owner of the keystore, which is the first of the folders
-    ``own``, and the owners of the folders ``above`` the keystore.
+    Expected users are root, ``user``, and the owner of the keystore, which is the first of the
+    folders ``own``.  For a folder in ``above``, its owner is expected, too; sticky folders there do
+    not count.
     """
     trusted = frozenset({0, user, own[0][1].st_uid})
     for path, state in own:

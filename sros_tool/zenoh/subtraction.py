@@ -161,8 +161,9 @@ def _around_wildcards(chunks: Chunks) -> tuple[Chunks, Chunks]:
 
 
 def _parts(wide: Chunks, denied: Iterable[Chunks]) -> Iterator[Chunks]:
-    """Yield parts of ``wide`` whose ``**`` overlaps no fixed start or end of a denied expression.
+    """Divide ``wide`` so that each ``**`` is clear of the starts and ends of denied expressions.
 
+    The start of an expression is the chunks before its first ``**``; its end, those after its last.
     So a part can be compared with a denied expression chunk by chunk, first from the start, then
     from the end.
     """

@@ -1081,7 +1081,10 @@ def test_damaged_archives_do_not_count_as_huge(
     with pytest.raises(KeystoreError, match="metadata that this keystore did not write") as refused:
         publisher.publish(restored=True)
     assert refused.value.remedy.startswith("If the keystore was restored from a backup, first")
-    assert f"Archives are missing or changed, too: {', '.join(damaged)}" in refused.value.why
+    assert (
+        f"archives of these robots are missing or changed, too: {', '.join(damaged)}"
+        in refused.value.why
+    )
     result = publisher.publish()
     assert result.altered == [*(f"robots/{robot}.tar.gz" for robot in damaged), "metadata"]
     assert result.names("published") == damaged

@@ -708,7 +708,7 @@ def test_a_part_of_an_action_is_told_as_the_action(fibonacci: Path) -> None:
         found = explain(fibonacci, enclave, word, f"/fibonacci/_action/{part}")
         assert found.status == 1 and added in found.out
         assert f"ask about `{asked} /fibonacci --type action`" in found.err
-    meant = "the enclave may call action /fibonacci: perhaps this name is meant (add --type action)"
+    meant = "the enclave may call action /fibonacci: perhaps the right name (add --type action)"
     assert f"[explain.likely-name]: {meant}." in explain(fibonacci, CLIENT, "call", "/fibonaci").err
     allowed = explain(fibonacci, CLIENT, "subscribe", "/fibonacci/_action/status")
     assert allowed.status == 0 and "part-of-action" not in allowed.err

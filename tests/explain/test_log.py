@@ -1373,7 +1373,7 @@ def test_a_folder_that_is_there_has_the_right_name(keystore: Path, tmp_path: Pat
 
 def test_a_forgotten_remapping_is_shown(keystore: Path, tmp_path: Path) -> None:
     log = tmp_path / "robot.log"
-    meant = ": perhaps this name is meant"
+    meant = ": perhaps the right name"
     typo = "If the program misspells the name, write /chatter th"
     for topic, why in (
         ("front/chatter", meant),

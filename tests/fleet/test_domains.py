@@ -211,7 +211,7 @@ def test_a_name_that_nobody_has_leads_to_that_of_the_robot(halls: Path) -> None:
     ended = sros(*asked, "/north/estop", cwd=halls)
     assert (
         ended.status == 1
-        and "some enclaves may publish /hall/estop: perhaps this name is meant" in ended.err
+        and "some enclaves may publish /hall/estop: perhaps the right name" in ended.err
     )
     for words in (("/nothing",), ("/plan", "--robot", "p01"), ("/x/plan", "--robot", "p01")):
         ended = sros(*asked, *words, cwd=halls)

@@ -208,8 +208,7 @@ def test_findings_that_also_differ_in_other_robots_are_one_if_they_are_many() ->
     ]
     assert told([("r1", "r2"), ("r3", "r4")]) == ["/r1/nav ", "/r3/nav "]
     assert told([*zip(names, names[1:] + names[:1], strict=True)]) == [
-        "/r0/nav the same for 7 more robots (each finding names different robots): "
-        "r1, r2, r3, r4, r5, r6, r7"
+        "/r0/nav similar for 7 more robots (with other names): r1, r2, r3, r4, r5, r6, r7"
     ]
 
 

@@ -140,7 +140,7 @@ def test_the_verb_says_what_was_only_compared(large: Path) -> None:
     assert "were only compared" in ended.out
     page = sros("view", large).ok().out
     assert said in page
-    assert "15 enclaves are only compared, without findings and expiry here." in page
+    assert "The page lacks findings and expiry of 15 enclaves, only compared with others." in page
     assert '"unread":15' in page  # the headline says where no error was found
     assert '"/a4/nav"' not in page
     wanted = sros("view", large, "--robot", "a4").ok().out

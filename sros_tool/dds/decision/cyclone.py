@@ -95,7 +95,7 @@ class _Reader:
                 text = self._text[self._index : stop]
                 self._index = stop + len(end)
                 return self._unescaped(text)
-        raise self._error("an attribute has no value")
+        raise self._error("the value of an attribute is missing or not in quotation marks")
 
     def _element(self, depth: int) -> XmlElement:
         self._skip()

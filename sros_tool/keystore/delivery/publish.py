@@ -799,7 +799,7 @@ class _Publication:
             robots = self.list.robots.items()
             if damaged := [r for r, known in robots if not self._has_files_of(r, known.release)]:
                 names = first_few(damaged, _MOST_DAMAGED)
-                error.why += f" Archives are missing or changed, too: {names}."
+                error.why += f" The archives of these robots are missing or changed, too: {names}."
             can_mend = os.access(folder / _METADATA, os.R_OK | os.W_OK | os.X_OK)
             if not (is_last_folder and can_mend):
                 raise
