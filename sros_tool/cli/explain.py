@@ -271,7 +271,8 @@ def explain(
 
     The exit status is 0 if the operation is allowed (with --who: to at least one enclave), and 1 if
     it is denied. With --log, it is 1 if the log reports a fault, or if no line says that a node
-    runs secured in ENCLAVE (not on Zenoh, which logs no such line). An action is allowed only if
+    runs secured in ENCLAVE. Zenoh logs no such line: if RMW_IMPLEMENTATION or the log shows that
+    the node uses Zenoh, only an empty log counts as a fault. An action is allowed only if
     all of its services and topics are allowed. With --who, "in part" marks an enclave that has only
     some of these rights, but can command the action's server, for example by send_goal.
 
@@ -1135,7 +1136,8 @@ def _show_log(
         _echo_answer(_finding_lines(finding))
     print_notes([note for note in explained.notes if note.id != "log.other-folder"])
     if explained.secured is False and not explained.findings:
-        echo(_NOT_SHOWN_SECURED)
+        if_on_zenoh = "" if os.environ.get(RMW) else _IF_ON_ZENOH
+        echo(f"{_NOT_SHOWN_SECURED}{if_on_zenoh}" if text.strip() else _EMPTY_LOG)
     elif not explained.findings:
         lines = text.count("\n") + (not text.endswith("\n")) if text else 0
         for line in _lines_without_findings(text, lines):
@@ -1150,6 +1152,15 @@ _NOT_SHOWN_SECURED = (
     "at level info): perhaps the node runs open. Start it with `sros run KEYSTORE ENCLAVE -- "
     "COMMAND`, and log all its output from the start"
 )
+_IF_ON_ZENOH = (
+    ". If the node uses rmw_zenoh, which logs no such line, set RMW_IMPLEMENTATION=rmw_zenoh_cpp "
+    "for this command"
+)
+_EMPTY_LOG = (
+    "the log is empty: it shows nothing about its node. `sros check runtime` on the node's machine "
+    "shows how processes run"
+)
+_PERHAPS_OPEN = "whether a node runs open (`sros check runtime` on its machine)"
 _SILENT_ON_ZENOH = "denials on Zenoh, because a log has them only with RUST_LOG=zenoh=trace"
 
 
@@ -1159,15 +1170,12 @@ def _lines_without_findings(log: str, count: int) -> Iterator[str]:
     from sros_tool.runtime.vendor_log import log_lines, plain_text, security_directory
 
     if not count:
-        yield (
-            "the log is empty: it shows nothing about its node. `sros check runtime` on the "
-            "node's machine shows how processes run"
-        )
+        yield _EMPTY_LOG
         return
     not_found = f"no message of DDS Security, and no denial by Zenoh, in {counted(count, 'line')}"
     if is_zenoh(os.environ):
         yield not_found
-        yield f"not shown: {_SILENT_ON_ZENOH}"
+        yield f"not shown: {_PERHAPS_OPEN}; {_SILENT_ON_ZENOH}"
     elif match := next(filter(None, map(security_directory, log_lines(plain_text(log)))), None):
         yield f"{not_found}; a node found its enclave '{match['folder']}'"
         yield (
@@ -1176,10 +1184,7 @@ def _lines_without_findings(log: str, count: int) -> Iterator[str]:
         )
     else:
         yield f"{not_found}, and no line 'Found security directory'"
-        yield (
-            "not shown: whether a node runs open (`sros check runtime` on its machine); "
-            f"{_SILENT_ON_ZENOH}"
-        )
+        yield f"not shown: {_PERHAPS_OPEN}; {_SILENT_ON_ZENOH}"
 
 
 _ZENOH_TESTS = "caching permissions for `"

@@ -27,7 +27,7 @@ from sros_tool.explain.log_causes import Examiner, LogFinding
 from sros_tool.explain.log_drops import dropped_message_findings
 from sros_tool.explain.log_lines import grouped_hits, lines_naming
 from sros_tool.explain.log_sources import AskedPolicy, FindEnclave, SearchedKeystore
-from sros_tool.keystore.layout import ZENOH_SIGNED, is_keystore
+from sros_tool.keystore.layout import is_keystore
 from sros_tool.keystore.participant import JoinContext, LoadedEnclave
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.names import check_enclave_name
@@ -47,7 +47,8 @@ class ExplainedLog(NamedTuple):
     """The security messages, each of them once."""
     secured: bool | None
     """Whether a line says that a node of the named enclave ran secured; null if no enclave is
-    named, or on Zenoh, which logs no such line.
+    named, or if RMW_IMPLEMENTATION or the log shows that the node uses Zenoh, which logs no such
+    line.
     """
     notes: Sequence[Note]
     """Notes, which text output prints on standard error."""
@@ -139,7 +140,7 @@ def explain_log_file(
         return loaded is not None and named is not None and loaded.folder == named.folder
 
     secured = None
-    if name and not _is_of_zenoh(plain, rmw, named):
+    if name and not (plain.strip() and _is_of_zenoh(plain, rmw)):
         secured = any(is_named(enclave) for enclave, _ in started)
     examined = named.folder if named and not keystore else keystore and keystore.root
     notes = [*_other_folder_notes(examined, [folder for _, folder in started])] if examined else []
@@ -147,14 +148,14 @@ def explain_log_file(
     return ExplainedLog(log, findings, secured, notes)
 
 
-def _is_of_zenoh(log: str, rmw: str, named: LoadedEnclave | None) -> bool:
-    """Return whether a log may be of a node on Zenoh, which logs nothing about its security."""
+def _is_of_zenoh(log: str, rmw: str) -> bool:
+    """Return whether a log is of a node on Zenoh, which logs nothing about its security.
+
+    Zenoh files in the enclave show nothing: a node on DDS leaves them unused.
+    """
     if rmw:  # stated by the user; a bridge, or the text of a message, can put such a line in a log
         return rmw.startswith(RMW_ZENOH)
-    if any(ZENOH_LINE.search(labeled_line(line)[1]) for line in log_lines(log)):
-        return True
-    folder = named.folder if named else None
-    return folder is not None and any((folder / file).exists() for file in ZENOH_SIGNED)
+    return any(ZENOH_LINE.search(labeled_line(line)[1]) for line in log_lines(log))
 
 
 def _other_folder_notes(examined: Path, folders: Iterable[str]) -> Iterator[Note]:
