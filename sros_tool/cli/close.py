@@ -460,13 +460,13 @@ def _show_end(
         echo(f"  {detail}", err=True)
 
 
-def _idle_lines(closed: CloseState, ask: str) -> list[str]:
+def _idle_lines(state: CloseState, ask: str) -> list[str]:
     """Return how to prove the robot closed without the processes that do not run now.
 
     ``ask`` is the command for the proof.
     """
-    idle = closed.stopped if closed.secured else {*closed.observed.ended}
-    if not (stopped := sorted(idle.intersection(closed.pending))):
+    idle = state.stopped if state.secured else {*state.observed.ended}
+    if not (stopped := sorted(idle.intersection(state.pending))):
         return []
     options = "".join(f" --without {name}" for name in stopped)
     without = f"to prove that the robot is closed, without a process of {enumerated(stopped)}"

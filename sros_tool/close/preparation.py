@@ -232,7 +232,8 @@ def denied_remappings(
 ) -> dict[str, Sequence[str]]:
     """Map enclaves to the remapping rules of their start commands that give a denied name.
 
-    A rule for one node counts for this node only.  Rules that name the node itself are left out.
+    A rule for one node counts for this node only.  Rules that change the name or
+    namespace of a node are left out.
     """
     remappings: dict[str, Sequence[str]] = {}
     for process in processes:

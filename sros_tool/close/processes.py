@@ -201,7 +201,7 @@ class ClosedProcess(NamedTuple):
 
     @property
     def is_idle(self) -> bool:
-        """Whether no process is known, and none has to run: it ended while sros watched."""
+        """Whether no process is known, and none has to run, because the process ended."""
         return not (self.pid or self.alike or self.absent)
 
     @property

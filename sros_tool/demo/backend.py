@@ -130,7 +130,7 @@ class Backend:
 
     @property
     def vendor(self) -> Condition | None:
-        """The DDS vendor, as a condition for expected results; None for other vendors."""
+        """The condition for results of Cyclone DDS or of Fast DDS; None for other middleware."""
         if self.dds.startswith("Cyclone DDS"):
             return Condition.CYCLONE
         return Condition.FAST if self.dds.startswith("Fast DDS") else None

@@ -201,12 +201,12 @@ _COMMANDING_SERVICES = ("send_goal", "cancel_goal")
 """The services of an action that command its server; get_result only reads."""
 
 
-def acting_parts(question: Question) -> dict[str, Question]:
-    """Map the parts of an action that influence its other side to questions about these parts.
+def influencing_parts(question: Question) -> dict[str, Question]:
+    """Return a question for each part of an action that is enough to influence the other side.
 
     An enclave that may only send or cancel goals can already command the server, without the right
     to call the whole action.  An enclave that may only reply or publish for the server can already
-    inform the clients.  Empty if the question is not about an action.
+    inform the clients.  The result is empty if the question is not about an action.
     """
     if question.type != "action":
         return {}

@@ -14,7 +14,7 @@ from typing import NamedTuple
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.permissions import parse_permissions
 from sros_tool.errors import Note, SrosError
-from sros_tool.explain.answer import Evaluator, Question, acting_parts
+from sros_tool.explain.answer import Evaluator, Question, influencing_parts
 from sros_tool.explain.asking import AskingContext, domains_decided_alike
 from sros_tool.keystore.known_keys import IssuedCredentials, removed_enclaves, revoked_entries
 from sros_tool.keystore.layout import LEDGER, PERMISSIONS_FILE, REVOKED, ROUTER_FILE
@@ -263,7 +263,7 @@ def _allows(
     vendor: Vendor | None,
     asking: AskingContext,
 ) -> bool:
-    """Return whether signed permissions give a certificate a right or one of its `acting_parts`."""
+    """Return whether permissions give a certificate a right or one of its `influencing_parts`."""
     governance, document = keystore.governance, keystore.files.signed_document(permissions).document
     grant = parse_permissions(document).grant_of(certificate.subject)
     if vendor is None and grant:
@@ -276,7 +276,7 @@ def _allows(
         keystore.domains,
         plain_governance=governance,
     )
-    questions = (question, *acting_parts(question).values())
+    questions = (question, *influencing_parts(question).values())
     for domains in domains_decided_alike(keystore.domains, governance, grant, asking.domain):
         context = asking._replace(domain=next(iter(domains))).context(None)
         evaluator = Evaluator(vendor or Vendor.STANDARD, enclave, context)

@@ -20,7 +20,7 @@ from sros_tool.explain.answer import (
     Evaluator,
     Provenance,
     Question,
-    acting_parts,
+    influencing_parts,
     text_of_parts,
 )
 from sros_tool.explain.asking import (
@@ -346,8 +346,8 @@ def _note_on_parts(evaluator: Evaluator, answer: Answer) -> Iterator[Note]:
 
 
 def _allowed_parts(evaluator: Evaluator, answer: Answer) -> tuple[str, ...]:
-    """Return the `acting_parts` of a denied action that the enclave may use."""
-    questions = {} if answer.allowed else acting_parts(answer.question)
+    """Return the `influencing_parts` of a denied action that the enclave may use."""
+    questions = {} if answer.allowed else influencing_parts(answer.question)
     return tuple(part for part, asked in questions.items() if evaluator.answer(asked).allowed)
 
 
@@ -500,7 +500,7 @@ def _runs_on_zenoh(keystore: OpenedKeystore, enclave: str) -> bool:
 
 
 class AccessWithoutIdentity(NamedTuple):
-    """The access of processes without an identity: a whole right, or else its `acting_parts`."""
+    """The access of processes without an identity: a right, or else its `influencing_parts`."""
 
     whole: bool = False
     parts: tuple[str, ...] = ()
@@ -641,7 +641,7 @@ def _access_without_identity(evaluator: Evaluator, question: Question) -> Access
         return AccessWithoutIdentity()
     if all(part.topic in opened for part in question.parts):
         return AccessWithoutIdentity(whole=True)
-    sent = {part: asked.parts for part, asked in acting_parts(question).items()} or {
+    sent = {part: asked.parts for part, asked in influencing_parts(question).items()} or {
         part.role: (part,) for part in question.parts if part.verb is AccessVerb.PUBLISH
     }
     return AccessWithoutIdentity(

@@ -78,7 +78,7 @@ class EnclaveOutcome(Protocol):
 
     @property
     def in_part(self) -> Sequence[str]:
-        """The `acting_parts` of an action that the enclave may use without the whole right."""
+        """The `influencing_parts` of an action that the enclave may use without the whole right."""
 
     @property
     def by_permissions_of(self) -> Sequence[str]:

@@ -26,7 +26,7 @@ from sros_tool.explain.answer import (
     PolicyChange,
     Question,
     StatedInPolicy,
-    acting_parts,
+    influencing_parts,
     text_of_parts,
 )
 from sros_tool.explain.asking import (
@@ -426,7 +426,7 @@ class ZenohEvaluator:
         """
         if answer.outcome is not _Outcome.DROPPED:
             return answer
-        parts = acting_parts(answer.question).items()
+        parts = influencing_parts(answer.question).items()
         passing = [part for part, asked in parts if self._passes_part(answer.enclave, asked, brief)]
         return replace(answer, in_part=tuple(passing))
 

@@ -544,7 +544,11 @@ class _Draft:
         return other in self._inside or unit in self._inside
 
     def _other_units_text(self) -> Callable[[Edge, int, int, int], str]:
-        """Return a function that returns the number of other units for a right, as text."""
+        """Return a function that returns the text for another unit in the name of a right.
+
+        The text is the label of the unit's class, or, if only some units of its family are named,
+        their number, such as ``{3 others of r1…r9}``.
+        """
         units_by_key: dict[object, set[int]] = defaultdict(set)
         families: dict[int, list[int]] = defaultdict(list)
         for n in sorted(set(self._unit_of.values()), key=self._unit_name_order):

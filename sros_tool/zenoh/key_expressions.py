@@ -427,7 +427,7 @@ def _automaton(expression: str) -> Automaton | None:
 
 
 def _add_chunk_edges(
-    chunk: str, begin: int, number: Iterator[int], edges: list[tuple[int, Letters, int]]
+    chunk: str, begin: int, positions: Iterator[int], edges: list[tuple[int, Letters, int]]
 ) -> int:
     """Append edges for a chunk to ``edges``, and return the position after the chunk.
 
@@ -437,10 +437,10 @@ def _add_chunk_edges(
     at, wild = begin, len(parts) > 1
     for index, part in enumerate(parts):
         if index and at == begin:  # "$*" at the beginning of the chunk
-            gap = next(number)
+            gap = next(positions)
             edges += [(begin, _CHUNK_BEGIN_LETTERS, gap), (gap, _CHUNK_LETTERS, gap)]
             if part:
-                after = next(number)
+                after = next(positions)
                 edges += [(gap, Letters.of(part[0]), after)]
                 edges += [(begin, Letters.of(part[0]) & _CHUNK_BEGIN_LETTERS, after)]
                 part, at = part[1:], after
@@ -450,7 +450,7 @@ def _add_chunk_edges(
             edges.append((at, _CHUNK_LETTERS, at))
         for letter in part:
             letters = Letters.of(letter)
-            to = next(number)
+            to = next(positions)
             edges.append(
                 (at, letters & _CHUNK_BEGIN_LETTERS if wild and at == begin else letters, to)
             )

@@ -93,7 +93,7 @@ def rules_at_the_router_only(copy: KeystoreCopy) -> None:
 
 
 def sessions_that_limit_themselves(copy: KeystoreCopy) -> None:
-    """Let sessions enforce only their own rights towards all peers; the router enforces nothing."""
+    """Let each session only limit itself, by its own rights; the router enforces nothing."""
     through_the_router(copy)
     for name, path in _files(copy).items():
         _edit(

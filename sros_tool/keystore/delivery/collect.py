@@ -409,7 +409,7 @@ class _File(NamedTuple):
 
 
 def _read_inbox(inbox: Path, fleet: Fleet, verifier: _Verifier) -> Iterator[_ReceivedMessage]:
-    """Yield the verified message of each robot of the fleet."""
+    """Yield each robot's message as verified; without a valid message, yield the reason."""
     try:
         folder = Folder(inbox)
     except OSError as error:
