@@ -365,6 +365,35 @@ def test_altered_metadata_is_put_right_only_in_the_last_folder(publisher: Home) 
     assert publisher.publish().altered == ["metadata"]
 
 
+def test_a_forged_later_timestamp_keeps_new_enclaves_waiting_only_for_publishing(
+    publisher: Home, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It looks as if the keystore was restored, until publishing has put the metadata right."""
+    publisher.publish()
+    monkeypatch.setattr("sros_tool.cli.common._clock", lambda: publisher.now)
+    with (publisher.folder / "fleet.toml").open("a") as fleet:
+        fleet.write("[robots.r9]\n")
+    timestamp = publisher.pub / "metadata/timestamp.json"
+    forged = json.loads(timestamp.read_bytes())
+    forged["signed"]["version"] += 1
+    timestamp.write_text(json.dumps(forged))
+    generate = ("generate_artifacts", "-k", "ks", "-p", "policy.xml", "--fleet", "fleet.toml")
+    refused = sros(*generate, cwd=publisher.folder)
+    remedy = re.search(r"First run `sros (fleet publish [^`]+)`, which puts", refused.err)
+    assert refused.status == 2 and remedy, refused.err
+    assert sros(*remedy[1].split(), cwd=publisher.folder).status == 1
+    assert "created enclave /r9/base" in publisher.run(*generate).out
+
+
+@pytest.mark.parametrize("content", ["x", "[]", "{}", '{"roots": 5}', '{"roots": [{}]}'])
+def test_damaged_root_metadata_in_the_keystore(publisher: Home, content: str) -> None:
+    (publisher.root / "fleet_root.json").write_text(content)
+    for words in (("publish", "ks", "pub"), ("status", "ks")):
+        refused = sros("fleet", *words, cwd=publisher.folder)
+        assert refused.status == 2 and "fleet_root.json' is damaged" in refused.err
+        assert "publish to another folder" in refused.err
+
+
 def assert_shown_for_a_day(publisher: Home, result: PublishedFleet, file: str) -> None:
     """Assert that a run which published a file again ends with 1, and the status has the file."""
     assert result.altered == [file] and not result.is_complete(publisher.now)

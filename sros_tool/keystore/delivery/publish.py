@@ -389,13 +389,25 @@ def publication_problem(keystore: OpenedKeystore) -> str:
 
 
 def _roots(keystore: OpenedKeystore) -> Roots:
-    """Return the root metadata in the keystore."""
+    """Return the root metadata in the keystore.
+
+    Raises:
+        DocumentError: it is damaged.
+    """
     from sros_tool.keystore.delivery.repository import Roots
 
-    documents = ()
-    if keystore.has(FLEET_ROOT):
-        documents = parse_json(keystore.read(FLEET_ROOT, "root metadata"))["roots"]
-    return Roots(documents)
+    if not keystore.has(FLEET_ROOT):
+        return Roots()
+    try:
+        return Roots(parse_json(keystore.read(FLEET_ROOT, "root metadata"))["roots"])
+    except (DocumentError, ValueError, KeyError, TypeError) as error:
+        raise DocumentError(
+            f"'{keystore.root / FLEET_ROOT}' is damaged",
+            "It is not the root metadata that sros wrote.",
+            "Restore it from a backup. If there is none, move it and 'private/fleet_*' out of the "
+            "keystore, publish to another folder, and give robots the root metadata of that folder "
+            "(`sros agent init` with --force).",
+        ) from error
 
 
 def age_clause(keystore: OpenedKeystore) -> str:
@@ -1517,7 +1529,8 @@ class _Publication:
             why = f"{error.what}: {error.why}" if error else f"{TIMESTAMP_PATH} was missing."
             text = (
                 f"metadata in '{self._folder}' was missing or changed, and is published again: "
-                f"{why} Find out who else can write to this folder."
+                f"{why} Either a run was interrupted, or somebody else can write to this folder: "
+                "find out who."
             )
             self.notes.append(Note("fleet.metadata-altered", text))
         altered += self._note_altered_roots()
@@ -1536,9 +1549,10 @@ class _Publication:
             text = (
                 f"root metadata in '{self._folder}' was missing, changed or foreign: "
                 f"{', '.join(altered)}. sros writes its own files again, and renames foreign files "
-                "to NAME.*.foreign, because robots that read them fetch nothing. Find out who else "
-                "can write to this folder. If a robot was set up with such a file, repeat its "
-                "`sros agent init`, with --force."
+                "to NAME.*.foreign, because robots that read them fetch nothing. Either a run was "
+                "interrupted, or somebody else can write to this folder: find out who. If a robot "
+                "was set up with a changed or foreign file, repeat its `sros agent init`, with "
+                "--force."
             )
             self.notes.append(Note("fleet.root-altered", text))
         return altered

@@ -493,9 +493,8 @@ def _refuse_before_restored(keystore: OpenedKeystore, missing: Sequence[str]) ->
             "The keystore was restored from a backup, or is a copy. The policy would create "
             f"{first_few(missing, 3)} with new keys, but a robot may have made the keys of such an "
             "enclave after the backup.",
-            f"First run `sros fleet publish {quote(str(keystore.root))} {quote(folder)} "
-            "--restored`, which says what to do; docs/howto/keystore_is_lost.md has the other "
-            "steps.",
+            f"First run `sros fleet publish {quote(str(keystore.root))} {quote(folder)}`, which "
+            "puts altered metadata right, or says what to do after a restore.",
         )
 
 
