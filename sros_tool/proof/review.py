@@ -1115,17 +1115,24 @@ class _Review:
                 system,
                 sources,
             )
+            required_before = [*chain.from_iterable(earlier.values())]
+            known = partial(self._known_notes, required_before, system, sources)
             yield from self._step_result(
                 "requirements",
                 subject,
                 partial(
-                    self._decided_requirements, files.values(), wanted, system, rights, elsewhere
+                    self._decided_requirements,
+                    files.values(),
+                    wanted,
+                    system,
+                    rights,
+                    elsewhere,
+                    known,
                 ),
                 is_wanted=bool(read),
                 complete=len(read) == len(paths)
                 and (subject in keystores or self.has_all_policies),
             )
-            required_before = [*chain.from_iterable(earlier.values())]
             moves = _Moves()
             with suppress(SrosError, OSError):  # the step on requirements reports the error
                 moves = _moves(before, system.fleet())
@@ -1165,11 +1172,16 @@ class _Review:
         system: System,
         before: Iterable[Right],
         elsewhere: Callable[[], Iterable[Finding]],
+        known_notes: Callable[[], Collection[str]],
     ) -> tuple[int, ChosenFindings]:
         """Return the exit status and the findings on requirements, also in other namespaces."""
         asked = self.request
+        decided = requirement_findings(requirements, system, before)
+        if any(finding.kind is HOLDS_ALONE for finding in decided):
+            known = known_notes()
+            decided = [of for of in decided if of.kind is not HOLDS_ALONE or of.text not in known]
         findings = [
-            *requirement_findings(requirements, system, before),
+            *decided,
             *left_out_robot_findings(system, asked.namespaces),
             *elsewhere(),
             *unused_remapping_findings(files, system, asked.namespaces, asked.remaps),
@@ -1177,6 +1189,23 @@ class _Review:
         # In several namespaces, a requirement with absolute names is decided several times.
         chosen = FindingFilter().choose(dict.fromkeys(findings))
         return _status_of_findings(chosen), chosen
+
+    def _known_notes(
+        self,
+        earlier: Sequence[Requirement],
+        system: System,
+        sources: Callable[[], tuple[AccessSource, AccessSource]] | None,
+    ) -> Collection[str]:
+        """Return the texts of BASE's notes on requirements that only further enclaves could break.
+
+        Each review of a package would repeat them, and its change has not caused them.
+        """
+        if system.is_keystore or self.request.fleet or not sources:
+            return ()
+        policy = Policy(tuple(sources()[0].enclaves.values()))
+        before = policy_system(policy, self._circumstances(), self._template())
+        findings = requirement_findings(earlier, replace(before, file=system.file))
+        return {finding.text for finding in findings if finding.kind is HOLDS_ALONE}
 
     def _failing_elsewhere(
         self,

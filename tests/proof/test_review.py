@@ -10,7 +10,7 @@ import re
 import shutil
 import subprocess
 import tarfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from unittest.mock import Mock
@@ -63,7 +63,7 @@ class Change:
         )
         return done.stdout.decode().strip()
 
-    def commit(self, files: dict[str, str | bytes | None]) -> str:
+    def commit(self, files: Mapping[str, str | bytes | None]) -> str:
         for name, text in files.items():
             place = self.folder / name
             place.parent.mkdir(parents=True, exist_ok=True)
@@ -1530,7 +1530,7 @@ def test_requirements_of_a_package_are_decided_in_a_namespace(
     )
     ended = change.review(*asked, "--namespace", "/l", "--namespace", "/")
     assert ended.status == 1 and "only decided" not in ended.out, ended
-    assert "requirements robot.xml: 1 error, 2 notes in /l and /" in ended.out, ended
+    assert "requirements robot.xml: 1 error, 1 note in /l and /" in ended.out, ended
     assert "/b: may publish /l/x, but only /l/a may publish /l/x" in ended.out
     ended = change.review(*asked, "--namespace", "/l", "--remap", "x:=/x")
     assert "/a: may publish /x, but only /l/a may" in ended.out and "/l/x" not in ended.out, ended
@@ -1560,6 +1560,27 @@ def test_requirements_of_a_package_are_decided_in_a_namespace(
         "/x without the namespace, as the policy of a package does: leave out `--namespace /m`"
         in moved.out
     ), moved
+
+
+def test_a_note_on_what_only_users_could_break_comes_with_the_change_that_causes_it(
+    change: Change,
+) -> None:
+    only = '[[only]]\npublish = ["x"]\nenclaves = ["/a"]\n'
+    second = only.replace('"x"', '"y"')
+    note = "no enclave may subscribe to topic {0}; required: only /a may publish {0}"
+    package, wider = ({"robot.xml": policy_text({"/a": publish(*names)})} for names in ("x", "xy"))
+    asked = ("--policy", "robot.xml", "--requirements", "robot.toml", "--new-access", "allow")
+    for before, after, texts in (
+        ({**package, "robot.toml": only}, {"robot.toml": f"# Why.\n{only}"}, ()),
+        ({**package, "robot.toml": only}, wider, ()),
+        ({**wider, "robot.toml": only}, {"robot.toml": only + second}, (note.format("/y"),)),
+        ({"robot.xml": policy_text(WIDER), "robot.toml": only}, package, (note.format("/x"),)),
+    ):
+        change.base = change.commit(before)
+        change.commit(after)
+        ended = change.review(*asked)
+        notes = re.findall(r"note: (.*) \[requirement\.holds-alone]", ended.out)
+        assert tuple(notes) == texts, ended
 
 
 def test_a_name_that_breaks_requirements_of_users_in_a_namespace(change: Change) -> None:
