@@ -126,12 +126,12 @@ REMAPPING_UNUSED = FindingKind(
     "requirement.remapping-unused",
     NOTE,
     "a remapping that changes no requirement",
-    "The policy has the new name or node, but no requirement has the old name, or another "
-    "remapping moves it, such as that of a node. If the remapping misspells the old name, "
-    "requirements on the correct name do not move to the new name.",
+    "The policy has the new name or node, but requirements have only a name that is similar to the "
+    "old name, or another remapping gives the old name another new name. If the remapping "
+    "misspells the old name, requirements on the correct name do not move to the new name.",
     "The requirements file.",
     "Compare the old name with the names in the requirements; leave out the --remap if no "
-    "requirement should have the old name, or if another --remap moves it.",
+    "requirement should have the old name, or if the other --remap is right.",
     prominent=True,
 )
 NOT_ON_ZENOH = FindingKind(

@@ -997,12 +997,12 @@ def merge_policies(
     if nodes:
         additions = [policy_of_nodes(addition, nodes) for addition in additions]
         known = {
-            p.node for addition in additions for e in addition.enclaves for p in e.all_profiles()
+            p.node for policy in of_all_nodes for e in policy.enclaves for p in e.all_profiles()
         }
         if missing := [node for node in nodes if node not in known]:
             raise UsageError(
                 f"--node {missing[0]}: no policy to merge has a node of this name",
-                "",
+                f"They have {first_few(sorted(known), _MOST_SHOWN)}.",
                 "Write the name as in node= of its <profile>.",
             )
     notes: list[Note] = []

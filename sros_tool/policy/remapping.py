@@ -55,9 +55,14 @@ class Remapping(NamedTuple):
     new: str
 
     @property
+    def renames_node(self) -> bool:
+        """Whether the rule changes the name of a node."""
+        return self.old == _NODE
+
+    @property
     def depends_on_node(self) -> bool:
         """Whether the rule has names that differ from node to node."""
-        return self.old == _NODE or "~" in (self.old[0], self.new[0])
+        return self.renames_node or "~" in (self.old[0], self.new[0])
 
     def __str__(self) -> str:
         return f"{self.node}{':' * bool(self.node)}{self.old}:={self.new}"
@@ -278,11 +283,42 @@ def _unused_rule_error(
             f"It is for {enumerated(nodes)}, which --node leaves out.",
             f"Add --node {nodes[0]}, or leave out the rule.",
         )
+    similar = _similar_names(rule, policies)
+    reason = "Perhaps an update of a package changed the name: compare its policy with the earlier."
+    if similar:
+        names = " or ".join(similar)
+        reason = f"Perhaps the right name is {names}, for example after an update of a package."
     return UsageError(
         f"--remap {rule} matches no name or node in the policies to merge",
-        "",
+        reason,
         "Write the name, and the node if you state one, as in the policy.",
     )
+
+
+def _similar_names(rule: Remapping, policies: Iterable[Policy]) -> list[str]:
+    """Return the names in policies that are most similar to the old name of a rule.
+
+    If no node has the rule's node, these are names of nodes.
+    """
+    from difflib import get_close_matches  # imported only for this error
+
+    profiles = [
+        profile
+        for policy in policies
+        for enclave in policy.enclaves
+        for profile in enclave.all_profiles()
+    ]
+    nodes = {profile.node for profile in profiles}
+    if rule.node and rule.node not in nodes:
+        return get_close_matches(rule.node, nodes, _MOST_SHOWN)
+    names = {
+        name
+        for profile in profiles
+        if rule.node in ("", profile.node)
+        for group in profile.groups
+        for name in group.names
+    }
+    return get_close_matches(rule.old, names, _MOST_SHOWN)
 
 
 def _moves_with_node(use: UsedRule, old: str, new: str) -> bool:
@@ -338,8 +374,7 @@ def _notes_on_requirements(
         text = (
             f"requirements that name {first_few(sorted(gone), _MOST_SHOWN)} protect only the old "
             f"name{'s' * (len(gone) > 1)}, unless you check them with the same remapping: `sros "
-            f"check POLICY --requirements FILE {words}`, with --namespace as in the merge. If no "
-            "requirement has the old name of a --remap, `sros check` says so: then leave it out."
+            f"check POLICY --requirements FILE {words}`, with --namespace as in the merge."
         )
         yield Note("merge.requirements-of-old-names", text)
     split = [

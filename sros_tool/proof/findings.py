@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from shlex import quote
@@ -29,12 +29,13 @@ from sros_tool.faults import REFUSE_STRANGERS
 from sros_tool.keystore.template import DEFAULT_TEMPLATE
 from sros_tool.names import (
     action_part,
+    expand,
     is_expression,
     service_of,
 )
 from sros_tool.policy.model import ALLOW, DENY, Level, Source
 from sros_tool.policy.patterns import covers
-from sros_tool.policy.remapping import Remapping, has_new_name
+from sros_tool.policy.remapping import Remapping, has_new_name, remapped_name
 from sros_tool.policy.rights import KIND_OF, Right
 from sros_tool.proof.decide import (
     MOST_STEPS,
@@ -59,6 +60,8 @@ from sros_tool.proof.requirements import (
     RightsRequirement,
     Widest,
     demand,
+    names_of,
+    read_all_requirements,
     unused_remappings,
 )
 from sros_tool.proof.system import Place, System
@@ -402,12 +405,15 @@ def left_out_robot_findings(system: System, namespaces: Sequence[str]) -> list[F
 
 
 def unused_remapping_findings(
-    files: Iterable[Path],
+    files: Collection[Path],
     system: System,
     namespaces: Sequence[str],
     remaps: Sequence[Remapping],
 ) -> list[Finding]:
-    """Return a finding for each rule that changes no requirement in ``files``.
+    """Return a finding for each rule that changes no requirement, but perhaps should change one.
+
+    `merge_policy` names a rule for each name that it moves, also if no requirement in ``files`` is
+    about the name: then the rule is right, and there is no finding.
 
     Raises:
         UsageError: a rule changes no requirement, and ``system`` does not have the new name.
@@ -415,6 +421,11 @@ def unused_remapping_findings(
     """
     unused = unused_remappings(files, system.fleet, namespaces, remaps) if remaps else []
     names = {right.name for right in system.rights}
+    required = [
+        name
+        for requirement in (read_all_requirements(files, system.fleet) if unused else ())
+        for name in names_of(requirement)
+    ]
     other_rule = ", or another --remap moves it already" if len(remaps) > 1 else ""
     for rule in unused:
         if not has_new_name(rule, names, namespaces or ("/",)):
@@ -431,7 +442,23 @@ def unused_remapping_findings(
             system.file,
         )
         for rule in unused
+        if _may_be_wrong(rule, remaps, required)
     ]
+
+
+def _may_be_wrong(rule: Remapping, rules: Sequence[Remapping], required: Iterable[str]) -> bool:
+    """Return whether an unused rule perhaps misspells a name, or another rule replaces it.
+
+    ``required`` are the full names in requirements for the namespace /.
+    """
+    from difflib import get_close_matches  # imported only for unused rules
+
+    old = expand("~" if rule.renames_node else rule.old, "/", rule.node)
+    moved, moved_alone = (remapped_name(old, "/", of) for of in (rules, [rule]))
+    other_names = {*required} - {old}
+    if rule.renames_node:
+        other_names = {name.rpartition("/")[0] for name in other_names} - {old}
+    return moved != moved_alone or bool(get_close_matches(old, other_names, 1))
 
 
 def _with_parent_namespaces(namespace: str) -> Iterator[str]:

@@ -1167,7 +1167,7 @@ class _Review:
 
     def _decided_requirements(
         self,
-        files: Iterable[Path],
+        files: Collection[Path],
         requirements: Sequence[Requirement],
         system: System,
         before: Iterable[Right],

@@ -132,6 +132,7 @@ def test_the_nodes_of_a_package_are_merged_into_the_enclave_that_composes_them(
     assert one["name"] == "/left/image"
     ended = sros("merge_policy", "a.xml", "package.xml", "--node", "scaner")
     assert ended.status == 2 and "--node scaner: no policy to merge has a node" in ended.err
+    assert "of this name. They have n, scanner. Write the name" in ended.err
     ended = sros("merge_policy", "a.xml", "package.xml", "--enclave", "x y")
     assert ended.status == 2 and "is not a valid enclave name" in ended.err
 
@@ -144,7 +145,14 @@ def test_the_names_of_a_merged_policy_are_remapped(folder: Path) -> None:
     nodes = policy_text({"/cam": publish("/image"), "/b": publish("state")})
     (folder / "cam.xml").write_text(nodes.replace('node="n"', 'node="cam"', 1))
     for more, said in (
-        (("imag:=/front/image",), "matches no name or node in the policies to merge"),
+        (
+            ("imag:=/front/image",),
+            "matches no name or node in the policies to merge. Perhaps the right name is /image, "
+            "for example after an update of a package. Write",
+        ),
+        (("tate:=/s",), "Perhaps the right name is state, for"),  # `state` became longer
+        (("cm:image:=/i",), "Perhaps the right name is cam, for"),
+        (("xyz:=/i",), "merge. Perhaps an update of a package changed the name: compare"),
         (
             ("cam:__node:=eye", "--remap", "cam:image:=/i"),
             "The rule cam:__node:=eye applies first. Write the node and the name as they are after "
