@@ -70,12 +70,12 @@ def refuse_link_of_stranger(path: Path) -> None:
     """Refuse to write keys where a link of another user leads.
 
     Raises:
-        KeystoreError: another user made a link on the way to ``path`` where everybody can write.
+        KeystoreError: `link_of_stranger` finds a link on the way to ``path``.
     """
     if link := link_of_stranger(steps_to(path), frozenset({0, os.geteuid()})):
         raise KeystoreError(
             f"'{link}' is a link of another user",
-            "Every user can create a link at this path, and this link leads to "
+            f"It belongs to {user_name(link.lstat().st_uid)}, who decides where it leads: now to "
             f"'{os.path.realpath(link)}'.",
             "Choose another folder, or name the folder itself.",
         )

@@ -812,7 +812,7 @@ def test_no_key_goes_where_the_link_of_another_user_leads(
     elsewhere.mkdir()
     link.symlink_to(elsewhere)
     os.chown(link, STRANGER, STRANGER, follow_symlinks=False)
-    with pytest.raises(KeystoreError, match="is a link of another user"):
+    with pytest.raises(KeystoreError, match=f"is a link of another user.*user {STRANGER}, who"):
         distribute(OpenedKeystore(keystore), ["/a"], Path(f"{link}{below}"), now=NOW)
     assert not list(elsewhere.iterdir())
     os.chown(link, 0, 0, follow_symlinks=False)
@@ -842,8 +842,9 @@ def test_a_link_of_another_user_on_the_way_to_the_keystore_is_named(
     assert enclave
     assert (enclave.writable == f"'{link}': it is a link of another user") is bool(owner)
     found = json.loads(sros("check", link, "--json").out)["findings"]
-    of_link = [each["id"] for each in found if each["subject"] == str(link)]
-    assert ("keystore.replaceable" in of_link) is bool(owner)
+    of_link = [(each["id"], each["remedy"]) for each in found if each["subject"] == str(link)]
+    named = "keystore.replaceable", f"Run `sudo chown -h root {link}`."
+    assert (named in of_link) is bool(owner)
 
 
 # ── files that grow, wait, or have no end ──────────────────────────────────────────────────

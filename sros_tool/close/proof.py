@@ -708,7 +708,7 @@ class _Restarts:
         now = {unit: self._count(unit) - count for unit, count in self._before.items()}
         return {
             enclave: f"{enclave} ({unit}, {counted(now[unit], 'time')}; its log says why: "
-            f"{_log_command(self._robot, unit)})"
+            f"{_log_command(self._robot, unit)}; if it ends on purpose, add --without {enclave})"
             for enclave, unit in self._units.items()
             if now[unit] > 0
         }
@@ -726,7 +726,7 @@ def _proof_of_talk(
     robot = running.robot
     words = ["audit", str(robot.rights_source), "--keystore", str(robot.export)]
     words += ["--enclave", OBSERVER, "--domain", str(robot.domain), "--json"]
-    words += ["--partial"] * bool(away)
+    words += ["--partial"] * bool(away or robot.without)
     for _ in range(_MOST_TRIES):  # nodes may still be starting
         try:
             status, audited = robot.shell.read_json(words)
@@ -778,6 +778,7 @@ class _TalkComparison:
     """A comparison of the nodes of the open robot with the nodes that an observer audited now.
 
     ``audited`` is the JSON of `sros audit`; the other arguments are as in `_proof_of_talk`.
+    Processes of --without that ended since the beginning of the proof are away, too.
     """
 
     def __init__(
@@ -788,7 +789,9 @@ class _TalkComparison:
         audited: Mapping[str, Any],
     ) -> None:
         self.current = observation_from_json(audited)
-        self._running, self._nodes, self._away, self._audited = running, nodes, away, audited
+        self._running, self._nodes, self._audited = running, nodes, audited
+        self._ended = _ended_since(running)
+        self._away = {*away, *self._ended.keys() & running.robot.without}
         self._denied = nodes.denied_rights(nodes.expected_nodes(self.current))
         self._intermittent = nodes.intermittent_endpoints(self.current)
 
@@ -802,7 +805,7 @@ class _TalkComparison:
 
         What nodes of the enclaves ``restarted`` lack is left out.
         """
-        ended, nodes = _ended_since(self._running), self._nodes
+        ended, nodes = self._ended, self._nodes
         unseen = [
             node
             for node in self._audited["unseen"]

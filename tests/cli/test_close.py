@@ -1074,6 +1074,9 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
         patched.setattr(close, "_run", before_the_audit(partial(robot.absent.add, "/listener")))
         stopped = "/listener (process 4712 (run); start it again, or, if it does not always run, "
         said = robot.close("--proof", status=1).out
+        robot.absent.clear()
+        without = robot.close("--proof", "--without", "/listener").out
+        assert "as before (types are not compared), without /listener\n" in without
     robot.absent = set()
     assert f"{lost}ended while the proof ran: {stopped}add --without /listener)\n" in said
     unit = robot.folder / "listener.service"
@@ -1086,7 +1089,8 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
             patched.setattr(close, "_run", before_the_audit(partial(unit.write_text, later)))
             said = robot.close("--proof", status=1).out
         log = "`journalctl -n 100 -u listener.service | sros explain robot/export --log -`"
-        assert f"{loops}; its log says why: {log})\n" in said
+        on_purpose = "if it ends on purpose, add --without /listener"
+        assert f"{loops}; its log says why: {log}; {on_purpose})\n" in said
     unit.unlink()
     robot.remaining = (TALKER, ros_node("listener", LISTENER[3]))
     with monkeypatch.context() as patched:

@@ -40,6 +40,7 @@ from sros_tool.keystore.layout import (
     is_layout_path,
 )
 from sros_tool.owners import (
+    closing_command,
     is_for_root_alone,
     link_of_stranger,
     other_writers_clause,
@@ -269,10 +270,12 @@ def check_files(keystore: CheckedKeystore, names: Sequence[str] | None = None) -
     kept: list[str] = []
     replaceable = dict(replaceable_on_the_way(keystore.root, trusted))
     # The user of such a link may also own the keystore to which it leads.
-    if link := link_of_stranger(steps_to(keystore.root), frozenset({0, os.geteuid()})):
-        replaceable.setdefault(link, f"it is a link of {user_name(link.lstat().st_uid)}")
+    users = frozenset({0, os.geteuid()})
+    if link := link_of_stranger(steps_to(keystore.root), users):
+        replaceable[link] = f"it is a link of {user_name(link.lstat().st_uid)}"
     for folder, why in replaceable.items():
-        yield REPLACEABLE.found(str(folder), why, str(folder))
+        remedy = f"Run `{closing_command(folder, users)}`." if folder == link else ""
+        yield REPLACEABLE.found(str(folder), why, str(folder), remedy=remedy)
     yield from _write_access_findings(root, state, trusted)
     links = _Links(root)
     if names is None:
