@@ -616,7 +616,8 @@ def _check_protection(path: Path, merged: Policy, additions: Policy) -> None:
                 f'{protection.source}: {protection} has protect="{protection.word}", and '
                 f"'{path}' {says}",
                 "A merge adds rights, and does not change existing names.",
-                "State the same protection in both files, and merge again.",
+                "State the same protection in both files, and merge again"
+                + (f", or merge '{path}' into the policy that states it." if old is None else "."),
             )
 
 

@@ -154,8 +154,13 @@ def test_a_merge_keeps_it_and_adds_it_with_new_names(tmp_path: Path) -> None:
     same = merge_into(file, read(policy(enclave("/a", f"scan{ENCRYPT}", "/free"))))
     assert same.document.decode() == WRITTEN
     for other, text in ((f"scan{SIGN}", "says protect=.encrypt"), (f"/free{SIGN}", "no protect")):
-        with pytest.raises(PolicyError, match=text):
+        with pytest.raises(PolicyError, match=text) as caught:
             merge_into(file, read(policy(enclave("/a", other))))
+        reverse = f", or merge '{file}' into the policy that states it."
+        assert caught.value.remedy.endswith(reverse) is (text == "no protect")
+    (protecting := tmp_path / "new.xml").write_text(policy(enclave("/a", f"/free{SIGN}")))
+    merged = read(merge_into(protecting, read(WRITTEN)).document.decode())
+    assert {*said(merged)} == {"/a topic /free sign", *SAID}, said(merged)
 
 
 def test_a_narrowed_policy_demands_the_same_of_the_names_that_are_left() -> None:
