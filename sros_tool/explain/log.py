@@ -140,7 +140,9 @@ def explain_log_file(
         return loaded is not None and named is not None and loaded.folder == named.folder
 
     secured = None
-    if name and not (plain.strip() and _is_of_zenoh(plain, rmw)):
+    # Zenoh files in the enclave show nothing: a node on DDS leaves them unused.
+    of_zenoh = rmw.startswith(RMW_ZENOH) if rmw else not started and _has_zenoh_line(plain)
+    if name and not (plain.strip() and of_zenoh):
         secured = any(is_named(enclave) for enclave, _ in started)
     examined = named.folder if named and not keystore else keystore and keystore.root
     notes = [*_other_folder_notes(examined, [folder for _, folder in started])] if examined else []
@@ -148,13 +150,8 @@ def explain_log_file(
     return ExplainedLog(log, findings, secured, notes)
 
 
-def _is_of_zenoh(log: str, rmw: str) -> bool:
-    """Return whether a log is of a node on Zenoh, which logs nothing about its security.
-
-    Zenoh files in the enclave show nothing: a node on DDS leaves them unused.
-    """
-    if rmw:  # stated by the user; a bridge, or the text of a message, can put such a line in a log
-        return rmw.startswith(RMW_ZENOH)
+def _has_zenoh_line(log: str) -> bool:
+    """Return whether a log has a line of Zenoh; a bridge, or a message's text, can have it, too."""
     return any(ZENOH_LINE.search(labeled_line(line)[1]) for line in log_lines(log))
 
 

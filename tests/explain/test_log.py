@@ -722,6 +722,8 @@ def test_a_log_of_an_enclave_has_to_show_that_its_node_runs_secured(
         ([keystore, ENCLAVE], node, zenoh, None),
         ([keystore, ENCLAVE], OF_ZENOH + node, {}, None),
         ([keystore, ENCLAVE], OF_ZENOH + node, dds, False),
+        ([keystore, ENCLAVE], OF_ZENOH + STARTED.format(keystore, "/other") + node, {}, False),
+        ([keystore, ENCLAVE], OF_ZENOH + own + node, {}, True),
         ([keystore, ENCLAVE], " \n", zenoh, False),
         ([keystore], node, {}, None),
     ):
