@@ -1202,10 +1202,12 @@ class _Review:
         """
         if system.is_keystore or self.request.fleet or not sources:
             return ()
-        policy = Policy(tuple(sources()[0].enclaves.values()))
-        before = policy_system(policy, self._circumstances(), self._template())
-        findings = requirement_findings(earlier, replace(before, file=system.file))
-        return {finding.text for finding in findings if finding.kind is HOLDS_ALONE}
+        with suppress(SrosError, OSError):  # the comparison reports the error
+            policy = Policy(tuple(sources()[0].enclaves.values()))
+            before = policy_system(policy, self._circumstances(), self._template())
+            findings = requirement_findings(earlier, replace(before, file=system.file))
+            return {finding.text for finding in findings if finding.kind is HOLDS_ALONE}
+        return ()
 
     def _failing_elsewhere(
         self,

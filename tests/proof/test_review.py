@@ -1569,12 +1569,15 @@ def test_a_note_on_what_only_users_could_break_comes_with_the_change_that_causes
     second = only.replace('"x"', '"y"')
     note = "no enclave may subscribe to topic {0}; required: only /a may publish {0}"
     package, wider = ({"robot.xml": policy_text({"/a": publish(*names)})} for names in ("x", "xy"))
+    fixed = {"robot.xml": policy_text({"/a": publish("/x")})}
     asked = ("--policy", "robot.xml", "--requirements", "robot.toml", "--new-access", "allow")
     for before, after, texts in (
         ({**package, "robot.toml": only}, {"robot.toml": f"# Why.\n{only}"}, ()),
         ({**package, "robot.toml": only}, wider, ()),
         ({**wider, "robot.toml": only}, {"robot.toml": only + second}, (note.format("/y"),)),
         ({"robot.xml": policy_text(WIDER), "robot.toml": only}, package, (note.format("/x"),)),
+        # Nothing of BASE can be read: all notes are there.
+        ({"robot.xml": "<policy/>", "robot.toml": ONLY}, fixed, (note.format("/x"),)),
     ):
         change.base = change.commit(before)
         change.commit(after)
