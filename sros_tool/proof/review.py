@@ -1143,7 +1143,11 @@ class _Review:
                     self.request.namespaces,
                     self.request.remaps,
                 )
-                required_before = moves.follow(required_before, moved, wanted, system)
+                try:
+                    required_before = moves.follow(required_before, moved, wanted, system)
+                except SrosError as error:
+                    yield _undecided_step("requirements-before", subject, error)
+                    continue
             unanswered = partial(
                 _unanswered_requirement_findings, required_before, wanted, rights, later_rights
             )
@@ -1316,9 +1320,7 @@ class _Review:
             sources = compared_sides() if compared_sides else None
         left = [*unanswered()]
         if sources:
-            left += _findings_on_lost_restrictions(
-                earlier, wanted_requirements, *sources, moves.namespaces
-            )
+            left += _findings_on_lost_restrictions(earlier, wanted_requirements, *sources, moves)
         if not (dropped or left):
             return None
         assert self.base
@@ -1556,30 +1558,33 @@ def _findings_on_lost_restrictions(
     requirements: Sequence[Requirement],
     before: AccessSource,
     after: AccessSource,
-    moved_namespaces: Mapping[str, str],
+    robot_moves: _Moves,
 ) -> Iterator[Finding]:
     """Yield a finding for each node that moves to an enclave that a requirement does not restrict.
 
-    Before the move, the requirement and a similar one of ``earlier`` restricted its enclave.
-    ``moved_namespaces`` maps old to new namespaces of robots.
+    Before the move, the requirement and a similar one of ``earlier`` restricted its enclave.  A
+    node in the old namespace of a robot may follow the robot, or keep its name: both count.
     """
-    old_enclaves, new_enclaves = (
-        _enclaves_by_node(source.enclaves.values(), namespaces)
-        for source, namespaces in ((before, moved_namespaces), (after, {}))
-    )
+    new_enclaves = _enclaves_by_node(after.enclaves.values())
     moves = [
         (node, old - new_enclaves[node], new_enclaves[node] - old)
-        for node, old in old_enclaves.items()
+        for follow in (robot_moves.new_name, str)
+        for node, old in _enclaves_by_node(before.enclaves.values(), follow).items()
         if new_enclaves.get(node, old) - old
     ]
+    new_paths = {path: robot_moves.new_name(path) for path in before.enclaves}
     similar_requirements = similarity_to(earlier)
     for requirement in requirements if moves else ():
         reported: dict[NodeName, set[str]] = defaultdict(set)
         # The namespaces of a fleet are known, and its policies name the enclaves in them.
         for ns in ("/",) if after.fleet else _namespaces_of_patterns(requirement):
-            was_restricted, now_restricted = (
-                restricted_enclaves(requirement, source.enclaves, ns) for source in (before, after)
-            )
+            now_restricted = restricted_enclaves(requirement, after.enclaves, ns)
+            was_restricted = [
+                {path for path, new in new_paths.items() if not restricted.isdisjoint((path, new))}
+                for restricted in restricted_enclaves(
+                    requirement, {*new_paths, *new_paths.values()}, ns
+                )
+            ]
             left = [
                 (node, old & was, at, new - now)
                 for at, (was, now) in enumerate(zip(was_restricted, now_restricted, strict=True))
@@ -1587,7 +1592,7 @@ def _findings_on_lost_restrictions(
                 if old & was and new - now
             ]
             required = [
-                restricted_enclaves(similar, before.enclaves, ns)
+                restricted_enclaves(robot_moves.before(similar), before.enclaves, ns)
                 for similar in (similar_requirements(requirement) if left else ())
             ]
             left = [move for move in left if any(move[1] & was[move[2]] for was in required)]
@@ -1695,14 +1700,12 @@ def _namespaces_in(names: Iterable[str]) -> Iterator[str]:
 
 
 def _enclaves_by_node(
-    enclaves: Iterable[Enclave], moved_namespaces: Mapping[str, str]
+    enclaves: Iterable[Enclave], new_name: Callable[[str], str] = str
 ) -> dict[NodeName, set[str]]:
     nodes: dict[NodeName, set[str]] = {}
     for enclave in enclaves:
         for node in nodes_of(enclave):
-            own = [ns for ns in moved_namespaces if f"{node.ns}/".startswith(f"{ns}/")]
-            if old := max(own, key=len, default=""):
-                node = node._replace(ns=moved_namespaces[old] + node.ns.removeprefix(old))
+            node = node._replace(ns=new_name(node.ns))
             nodes.setdefault(node, set()).add(enclave.path)
     return nodes
 
@@ -1731,12 +1734,27 @@ class _Moves:
     """The robots whose namespaces HEAD changes.
 
     ``namespaces`` maps their old to their new namespaces; ``fleet`` is the fleet of BASE with the
-    new namespaces.  ``clauses`` say why a requirement does not follow its robot.
+    new namespaces.  ``clauses`` say why a requirement does not follow its robot; ``followed`` maps
+    requirements that do to what they were.
     """
 
     namespaces: Mapping[str, str] = field(default_factory=dict)
     fleet: Fleet | None = None
     clauses: dict[Requirement, str] = field(default_factory=dict)
+    followed: dict[Requirement, Requirement] = field(default_factory=dict)
+
+    def new_name(self, name: str) -> str:
+        """Return a name or namespace of BASE as it is after the move of its robot."""
+        old = name
+        while old:
+            if old in self.namespaces:
+                return self.namespaces[old].rstrip("/") + name.removeprefix(old) or "/"
+            old = old.rpartition("/")[0]
+        return self.namespaces.get("/", "") + name
+
+    def before(self, requirement: Requirement) -> Requirement:
+        """Return a requirement as BASE has it."""
+        return self.followed.get(requirement, requirement)
 
     def follow(
         self,
@@ -1761,7 +1779,10 @@ class _Moves:
                     f"; its robot has another namespace now, but {clause}. Remove this from the "
                     "policy, or demand the same for the old name"
                 )
-            result.append(new if old in dropped and not clause else old)
+            follows = old in dropped and not clause
+            if follows:
+                self.followed[new] = old
+            result.append(new if follows else old)
         return result
 
 
@@ -1781,16 +1802,20 @@ def _moves(before: Fleet | None, after: Fleet | None) -> _Moves:
 def _old_names_clause(old: Requirement, new: Requirement, system: System) -> str:
     """Return a clause if something in HEAD has a name that only ``old`` has, or ""."""
     enclaves = {*enclaves_of(old)}.difference(enclaves_of(new))
-    for enclave in sorted({right.enclave for right in system.rights}):
+    for enclave in sorted({right.enclave for right in system.rights}) if enclaves else ():
         if any(overlap(enclave, name) for name in enclaves):
             return f"the enclave {enclave} still exists"
     if isinstance(old, Must | NothingBut | Widest):  # these do not restrict who may use a name
         return ""
     names = {*names_of(old)}.difference(names_of(new))
-    for right in sorted(system.rights):
-        is_stated = right.qualifier is ALLOW and not is_expression(right.name)
-        if is_stated and any(overlap(right.name, name) for name in names):
-            return f"{right.enclave} may still {right.right} {right.name}"
+    stated = (
+        right
+        for right in system.rights
+        if right.qualifier is ALLOW and not is_expression(right.name)
+        if any(overlap(right.name, name) for name in names)
+    )
+    if right := min(stated, default=None):
+        return f"{right.enclave} may still {right.right} {right.name}"
     if isinstance(old, Only | Nobody | AtMost | NotBoth):
         for finding in requirement_findings([old], system):
             if finding.kind is VIOLATED:

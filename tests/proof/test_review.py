@@ -907,6 +907,39 @@ def test_requirements_follow_a_robot_to_its_new_namespace(
     assert said in ended.out, ended
 
 
+@pytest.mark.parametrize(
+    ("before", "after", "ns", "said"),
+    some(
+        [
+            ("{namespace}/mux", "{namespace}/mux", "{namespace}", ""),
+            ("{namespace}/mux", "/free/{robot}", "{namespace}", "node /n2/mux moves to enclave"),
+            ("/{robot}/mux", "/free/{robot}", "{namespace}", "node /n2/mux moves to enclave"),
+            ("/{robot}/mux", "/free/{robot}", "/n1", "node /n1/mux moves to enclave /free/r1,"),
+        ],
+        2,
+    ),
+)
+def test_no_node_escapes_while_its_robot_gets_another_namespace(
+    change: Change, before: str, after: str, ns: str, said: str
+) -> None:
+    required = "[[only]]\npublish = ['{namespace}/x']\nenclaves = ['{namespace}/mux']\n"
+    required += "[[widest]]\npublish = []\nenclaves = ['{namespace}/*', '/{robot}/*']\n"
+
+    def files(enclave: str, namespace: str) -> dict[str, str | bytes | None]:
+        policy = policy_text({enclave: publish("/y"), "/{robot}/rest": publish("/z")})
+        node = 'node="mux"' if enclave.endswith("mux") else 'node="{robot}"'
+        policy = policy.replace(f'ns="/" {node}', f'ns="{ns}" node="mux"')
+        fleet = f"[robots.r1]\nnamespace = '{namespace}'\n"
+        return {"robots.xml": policy, "robots.toml": required, "fleet.toml": fleet}
+
+    change.base = change.commit(files(before, "/n1"))
+    change.commit(files(after, "/n2"))
+    words = ("--policy", "robots.xml", "--fleet", "fleet.toml", "--requirements", "robots.toml")
+    ended = change.review(*words, "--new-access", "allow")
+    assert ("requirements-before" in ended.out) == bool(said), ended
+    assert said in ended.out, ended
+
+
 _TWO = """[robots.r1]
 address = "10.0.0.1"
 namespace = "/n1"
