@@ -148,6 +148,8 @@ def _refuse_ignored(mode: str) -> None:
 
     ``mode`` is --who, --reach or --log; "" is a question about one enclave.
     """
+    from sros_tool.runtime.rmw import RMW
+
     context = click.get_current_context()
     for parameter in context.command.params:
         name = parameter.name or ""
@@ -155,6 +157,8 @@ def _refuse_ignored(mode: str) -> None:
             option = parameter.opts[0]
             text = f"{mode} takes no {option}" if mode else f"{option} goes with {_GOES_WITH[name]}"
             remedy = "Leave it out."
+            if (mode, name) == ("--log", "vendor"):
+                remedy += f" {RMW} can say which RMW the node uses."
             if name == "robots":
                 remedy = "Name one of the robot's enclaves instead; `sros list_enclaves KEYSTORE "
                 remedy += f"--robot {quote(context.params[name][0])}` lists them."

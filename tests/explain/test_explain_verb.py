@@ -560,6 +560,7 @@ def test_access_control_that_is_off_is_told(tmp_path: Path) -> None:
         (["--who", "publish", "/x", "--reach", "/a"], "exclude each other"),
         (["--reach", "/a", "--vendor", "fastdds"], "--reach takes only --vendor zenoh"),
         (["--reach", "/a", "--at", "90d"], "--reach takes no --at"),
+        (["--log", "-", "--vendor", "zenoh"], "Leave it out. RMW_IMPLEMENTATION can say which"),
         (["--who", "publish", "/x", "--all-vendors"], "--who takes no --all-vendors"),
         (["--who", "publish", "/x", "--policy", "p.xml"], "p.xml' does not exist"),
         (
