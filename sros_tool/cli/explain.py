@@ -274,11 +274,13 @@ def explain(
     keystore, sros decides by the permissions that the policy would give; this is for DDS only.
 
     The exit status is 0 if the operation is allowed (with --who: to at least one enclave), and 1 if
-    it is denied. With --log, it is 1 if the log reports a fault, or if no line says that a node
-    runs secured in ENCLAVE. Zenoh logs no such line: if RMW_IMPLEMENTATION or the log shows that
-    the node uses Zenoh, only an empty log counts as a fault. An action is allowed only if
-    all of its services and topics are allowed. With --who, "in part" marks an enclave that has only
-    some of these rights, but can command the action's server, for example by send_goal.
+    it is denied. With --log, it is 1 if the log reports a fault. With --log and ENCLAVE, it is also
+    1 if the log is empty, or if no line says that a node runs secured in ENCLAVE. Zenoh logs no
+    such line, so sros expects none if RMW_IMPLEMENTATION or the log shows that the node uses Zenoh.
+
+    An action is allowed only if all of its services and topics are allowed. With --who, "in part"
+    marks an enclave that has only some of these rights, but can command the action's server, for
+    example by send_goal.
 
     Example:
       $ sros explain keystore /talker publish /chatter --policy robot.xml
