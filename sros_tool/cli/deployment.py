@@ -342,6 +342,7 @@ def create_request(
     from sros_tool.keystore.delivery.robot import create_requests, shown_requests
 
     *names, last = arguments
+    _refuse_enclave_as_folder(names, last)
     folder = PATH.convert(last, None, None) if names else keystore_from_environment()
     made = create_requests(
         folder, names or [last], again=again, key=key, secrets=secrets(), dry_run=dry_run
@@ -366,6 +367,17 @@ def create_request(
         echo(f"  its SHA-256 is {request.key}")
         echo(f"  bring '{request.file}' to the keystore: sros sign_request KEYSTORE request.pem")
     print_notes(made.notes)
+
+
+def _refuse_enclave_as_folder(names: list[str], folder: str) -> None:
+    """Raise `UsageError` if ``folder`` is probably one more enclave, as ``names`` are."""
+    top = folder.split("/")[1] if folder.startswith("/") else ""
+    if top and not Path("/", top).exists() and any(n.split("/")[1:2] == [top] for n in names):
+        raise UsageError(
+            f"there is no folder '/{top}': '{folder}' is perhaps meant as an enclave",
+            "The last of several arguments is the folder in which the keys are made.",
+            "Name the folder last.",
+        )
 
 
 @verb("sign_request")

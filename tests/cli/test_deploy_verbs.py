@@ -297,6 +297,7 @@ MISUSE: dict[str, tuple[str, str]] = {
     "a certificate for a request": ("sign_request ks ks/enclaves/a/cert.pem", "cannot be read"),
     "the answer in a missing folder": ("sign_request ks r.pem -o no/a.tgz", "'no': No such"),
     "a name that is none": ("create_request /new camera robot", "not a valid enclave name"),
+    "an enclave as folder": ("create_request /r9/base /r9/arm", "no folder '/r9'"),
     "a key that is there": ("create_request /arm/camera robot", "has a key in 'robot'"),
     "a request in a keystore": ("create_request /c ks", "is a keystore with CAs"),
     "an answer that is missing": ("import no.tgz robot", "does not exist"),
