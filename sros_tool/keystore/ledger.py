@@ -87,6 +87,11 @@ PUBLISHING = "publishing"
 
 A line with an enclave says that publishing was refused, and named rights that the enclave had lost.
 """
+PERHAPS_REVOKED = "perhaps revoked"
+"""The ``reason`` of a restore, on a line with an enclave that was perhaps revoked.
+
+Publishing waits until the enclave is revoked, or has a key that the ledger records after this line.
+"""
 RENEWED_BY_NAME = "renewed by name"
 """The ``reason`` of permissions that `sros renew` signed for a named enclave after a restore."""
 NEW_CA = "new CA"

@@ -1796,6 +1796,71 @@ def test_what_a_restored_keystore_cannot_know_is_not_published_in_silence(
     assert lacking in note and len(note.split()) < 70, note
 
 
+@pytest.mark.parametrize(
+    ("roles", "lags"), [(("--identity",), False), (("--identity",), True), ((), False)]
+)
+@pytest.mark.parametrize("kept", [True, False])
+def test_an_enclave_that_was_revoked_after_the_backup_is_not_published_again(
+    publisher: Home,
+    roles: tuple[str, ...],
+    lags: bool,
+    kept: bool,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A CA that the keystore has lost revoked it: the identity CA, or both CAs were replaced.
+
+    Archives in the folder may still show the revoked certificate (``kept``), and the robot may have
+    got no release since (``lags``).
+    """
+    monkeypatch.setattr("sros_tool.cli.common._clock", lambda: publisher.now)
+    name = "/r5/arm"
+    rotation = ("rotate_ca", *roles, "--finish", "--allow-unconfirmed")
+
+    def run(verb: str, *words: str) -> None:
+        publisher.now += LATER
+        publisher.run(verb, "ks", *words)
+
+    policy = policy_text({"/{robot}/base": allow_publish("x"), "/{robot}/arm": allow_publish("y")})
+    (publisher.folder / "policy.xml").write_text(policy)
+    sign = ("generate_artifacts", "-k", "ks", "-p", "policy.xml", "--fleet", "fleet.toml")
+    publisher.run(*sign)
+    publisher.publish()
+    backup = copy_of(publisher.root, publisher.folder / "backup")
+    stolen = key_digest(OpenedKeystore(publisher.root).certificate_of(name).public_key())  # type: ignore[arg-type]
+    run(*rotation)
+    publisher.publish()
+    if lags:
+        run("renew", name)
+        (publisher.root / "enclaves/r5/base/permissions.p7s").write_bytes(b"x")
+    run("revoke", name)
+    names = publisher.publish().names("refused")
+    assert names == ["r5"] * lags
+    if not kept:
+        last = {read_release(data).number for data in archives(publisher).values()}
+        lasting = {"r5": min(numbers(publisher).values())} if lags else {}
+        for path in (publisher.pub / "targets/robots").iterdir():
+            robot = path.name.split(".")[1]
+            if _number(path) != lasting.get(robot, max(last)):
+                path.unlink()
+    shutil.rmtree(publisher.root)
+    backup.rename(publisher.root)
+    with pytest.raises(KeystoreError, match="replaced after the backup"):
+        publisher.publish(restored=True)
+    run(*rotation)
+    for _ in range(2):
+        with pytest.raises(KeystoreError, match=r"/r5/arm.* may have been revoked") as refused:
+            publisher.publish(restored=True)
+        run("renew", name)  # with the key that may have been revoked
+    assert f"sros revoke {publisher.root}" in refused.value.remedy
+    run("revoke", name)
+    for enclave in ("/r5/base",) * lags:
+        run("renew", enclave, "--new-key", "--revoke-old")
+    assert publisher.publish(restored=True).names("published") == ["r1", "r2", "r5"]
+    release = read_release(archives(publisher)["r5"])
+    assert [*release.enclaves()] == ["/r5/base"]
+    assert KnownKeys(OpenedKeystore(publisher.root)).is_revoked(stolen)
+
+
 @pytest.mark.parametrize("steps", [(0, 1), (1, 3)])
 def test_a_restored_keystore_does_not_leave_a_later_stage_of_a_rotation(
     publisher: Home, steps: tuple[int, int]

@@ -66,8 +66,10 @@ from sros_tool.keystore.delivery.restored import (
     later_changes,
     older_than_robots_error,
     other_changes_notes,
+    perhaps_revoked_enclaves,
     refuse_lost_changes,
     restores_after_last_release,
+    with_earlier_keys,
     without_agreed_changes,
 )
 from sros_tool.keystore.fleet import (
@@ -1140,9 +1142,11 @@ class _Publication:
         """
         for certificate in self._sealed_certificates():
             forgotten_lists.add_certificate(certificate)
+        last = self._last_releases()
         changes = without_agreed_changes(
-            self.keystore, later_changes(self.keystore, self._last_releases(), self._now)
+            self.keystore, later_changes(self.keystore, last, self._now)
         )
+        perhaps_revoked = perhaps_revoked_enclaves(self.keystore, last, [*self._sealed_releases()])
         unknown = forgotten_lists.unknown_certificates(self.keystore).values()
         unknowing = KnownKeys(self.keystore).made_unknowing(self.keystore.names, unknown)
         others = {*unknowing.values()} - {e.enclave for e in changes if e.change == "key"}
@@ -1155,6 +1159,7 @@ class _Publication:
             forgotten_lists,
             shown_by=PUBLISHING,
             enclaves_with_named_rights=() if lost else rights,
+            perhaps_revoked=perhaps_revoked,
             now=self._now,
             keyring=keyring,
             dry_run=self._dry_run,
@@ -1181,6 +1186,12 @@ class _Publication:
             and not (
                 change.change in ("key", "other_key") and change.enclave in revocation.replaced
             )
+        ]
+        named = {change.enclave for change in changes if change.change in ("key", "other_key")}
+        changes += [
+            LaterChange("revoked", name, "")
+            for name in with_earlier_keys(self.keystore, perhaps_revoked - self._revoked)
+            if name not in named
         ]
         refuse_lost_changes(self.keystore, self._folder, changes)
         self.notes += other_changes_notes(self.keystore, changes)

@@ -13,7 +13,7 @@ import logging
 import re
 import textwrap
 from collections import defaultdict
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
@@ -36,12 +36,20 @@ from sros_tool.keystore.layout import (
     GOVERNANCE_FILE,
     IDENTITY,
     IDENTITY_CA_FILE,
+    LIST_FILES,
     PERMISSIONS,
     PERMISSIONS_CA_FILE,
     PERMISSIONS_FILE,
     key_on_robot,
 )
-from sros_tool.keystore.ledger import LATER_RELEASE, PUBLISHING, RENEWED_BY_NAME, RESTORED
+from sros_tool.keystore.ledger import (
+    LATER_RELEASE,
+    PERHAPS_REVOKED,
+    PUBLISHING,
+    RENEWED_BY_NAME,
+    RESTORED,
+    Entry,
+)
 from sros_tool.keystore.lifecycle.replaced import EarlierPermissions, replaced_rights
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.pki import smime
@@ -53,6 +61,7 @@ from sros_tool.pki.certificates import (
     subject_text,
     validity_of,
 )
+from sros_tool.pki.crl import SUPERSEDED, load_crls
 from sros_tool.validity import iso
 from sros_tool.values import Words
 from sros_tool.wording import counted, first_few
@@ -61,6 +70,7 @@ _LOG = logging.getLogger(__name__)
 _SHOWN = 5
 _NAMED, _LONGEST = 3, 100
 """Maximum number of names in a refusal, and of characters about the rights of an enclave."""
+_ENDS_OF_LIST_PATHS = tuple(f"/{file}" for file in LIST_FILES)
 _WAITING = frozenset({LATER_RELEASE, PUBLISHING})
 """The reasons of restores after which the keystore publishes only with ``--restored``."""
 
@@ -75,6 +85,7 @@ class LaterChange(NamedTuple):
                 "certificate",
                 "key",
                 "other_key",
+                "revoked",
                 "rights_taken",
                 "governance",
                 "rights_given",
@@ -85,10 +96,11 @@ class LaterChange(NamedTuple):
     ]
     """``certificate``: the certificate was replaced and revoked; ``key``: the enclave got another
     key; ``other_key``: the restored keystore made another key for the enclave than its robot has;
-    ``rights_taken``: the enclave lost rights or ROS domains; ``governance``: the governance was
-    changed; ``rights_given``: the enclave got rights or ROS domains; ``missing``: the keystore
-    lacks the enclave; ``added``: the robot's last release lacks the enclave.  The first five keep
-    ``--restored`` from publishing.
+    ``revoked``: the enclave was revoked or removed, or may have been; ``rights_taken``: the enclave
+    lost rights or ROS domains; ``governance``: the governance was changed; ``rights_given``: the
+    enclave got rights or ROS domains; ``missing``: the keystore lacks the enclave; ``added``: the
+    robot's last release lacks the enclave, which has a new key.  The first six keep ``--restored``
+    from publishing.
     """
     enclave: str
     """Name of the enclave; empty for the governance."""
@@ -267,6 +279,124 @@ def later_changes(
     return [change for change in changes if change.enclave not in revoked]
 
 
+def perhaps_revoked_enclaves(
+    keystore: OpenedKeystore, last: Mapping[str, Release | None], earlier: Sequence[Release]
+) -> set[str]:
+    """Return the keystore's enclaves that were revoked or removed after the backup, or may be.
+
+    ``last`` is as in `later_changes`; ``earlier`` are other sealed releases.  The seals prove what
+    is in a release, so this also finds what an identity CA revoked that the keystore has lost:
+
+    - A release that the keystore does not know lacks the enclave, or its robot has no release.
+    - A revocation list in a release has a certificate for the enclave's key, and no last release
+      has a valid certificate for this key.
+    - The last release of the robot lacks revocations of the latest release, or cannot be read, and
+      neither the ledger nor a release shows the certificates that were revoked.
+    """
+    entries = keystore.ledger_with("what", "release").entries
+    known = {entry.number for entry in entries if entry.what == "release"}
+    readable = [release for release in last.values() if release]
+    latest = max(readable, key=lambda release: release.number, default=None)
+    if latest is None or latest.number in known:
+        return set()
+    revoked = _revoked_serials_in([*readable, *earlier])
+    shown = {
+        certificate.serial_number: (name, _key_of(certificate))
+        for release in (*readable, *earlier)
+        for name, certificate in _certificates_in(release)
+    }
+    recorded = keystore.ledger_file.with_values("serial", [f"{each:x}" for each in revoked]).entries
+    explained = {entry.serial for entry in recorded}
+    unexplained = {
+        serial
+        for serial, reason in _revoked_serials_in([latest]).items()
+        if reason != SUPERSEDED and serial not in shown and f"{serial:x}" not in explained
+    }
+    found, fleet = set[str](), recorded_fleet(keystore)
+    for robot, member in fleet.robots.items():
+        own, release = enclaves_of_robot(keystore, fleet, member), last.get(robot)
+        listed = _revoked_serials_in([release]) if release else {}
+        if robot not in last or unexplained - listed.keys():
+            found |= {*own}
+        elif release and release.number not in known:
+            found |= {*own} - release.enclaves().keys()
+    valid_keys = {
+        _key_of(certificate)
+        for release in readable
+        for _, certificate in _certificates_in(release)
+        if certificate.serial_number not in revoked
+    }
+    for name, key in (shown[serial] for serial in revoked if serial in shown):
+        with suppress(SrosError):  # without a certificate, nothing is published
+            if key not in valid_keys and _key_of(keystore.certificate_of(name)) == key:
+                found.add(name)
+    return found
+
+
+def _revoked_serials_in(releases: Iterable[Release]) -> dict[int, str]:
+    """Map the serial numbers on all revocation lists in releases to the reasons for revocation.
+
+    A serial number is mapped to `SUPERSEDED` only if all lists have this reason.
+    """
+    documents = {
+        data
+        for release in releases
+        for path, data in release.files.items()
+        if path.endswith(_ENDS_OF_LIST_PATHS)
+    }
+    reasons: dict[int, str] = {}
+    for document in documents:
+        with suppress(SrosError):  # a file of CAs without a list
+            for crl in load_crls(document, "in a release"):
+                for entry in crl.revoked:
+                    if reasons.get(entry.serial, SUPERSEDED) == SUPERSEDED:
+                        reasons[entry.serial] = entry.reason
+    return reasons
+
+
+def _certificates_in(release: Release) -> Iterator[tuple[str, x509.Certificate]]:
+    """Yield the enclaves in a release with their certificates."""
+    for name, files in release.enclaves().items():
+        with suppress(SrosError):
+            yield name, load_certificates(files.get(CERTIFICATE_FILE, b""), name)[0]
+
+
+def _key_of(certificate: x509.Certificate) -> str:
+    return key_digest(certificate.public_key())  # type: ignore[arg-type]
+
+
+def with_earlier_keys(keystore: OpenedKeystore, perhaps_revoked: Iterable[str]) -> list[str]:
+    """Return the perhaps revoked enclaves that still have a key from before the restore.
+
+    The enclaves are those given, and those that earlier runs or messages of robots showed after the
+    last release (`PERHAPS_REVOKED` in the ledger).
+    """
+    releases = keystore.ledger_with("what", "release").entries
+    last = max((entry.number for entry in releases if entry.what == "release"), default=0)
+
+    def is_mark(entry: Entry) -> bool:
+        is_later = entry.what == RESTORED and entry.number > last
+        return is_later and entry.reason == PERHAPS_REVOKED
+
+    restores = keystore.ledger_with("what", RESTORED).entries
+    names = {*perhaps_revoked, *(entry.enclave for entry in restores if is_mark(entry))}
+    marked = set[str]()
+    earlier, later = defaultdict[str, set[str]](set), defaultdict[str, set[str]](set)
+    for entry in keystore.ledger_file.with_values("enclave", names).entries if names else ():
+        if is_mark(entry):
+            marked.add(entry.enclave)
+        elif entry.what == "certificate":
+            keys = later if entry.enclave in marked else earlier
+            keys[entry.enclave].add(entry.key)
+    kept = []
+    for name in sorted(names):
+        with suppress(SrosError):  # it was revoked, or has no certificate to publish
+            key = _key_of(keystore.certificate_of(name))
+            if key not in later[name] - earlier[name]:
+                kept.append(name)
+    return kept
+
+
 def _issued_digests(keystore: OpenedKeystore, releases: Sequence[Release]) -> frozenset[str]:
     """Return the SHA-256 of the signed documents in ``releases`` that the keystore issued."""
     files = (PERMISSIONS_FILE, GOVERNANCE_FILE)
@@ -393,7 +523,7 @@ def without_agreed_changes(
     named, agreed = set[str](), set[str]()
     names = {change.enclave for change in changes if change.change == "rights_taken"}
     for entry in keystore.ledger_file.with_values("enclave", names).entries if names else ():
-        if entry.what == RESTORED and entry.number > last:
+        if entry.what == RESTORED and entry.reason == PUBLISHING and entry.number > last:
             named.add(entry.enclave)
         elif entry.reason == RENEWED_BY_NAME and entry.enclave in named:
             agreed.add(entry.enclave)
@@ -456,6 +586,9 @@ def refuse_lost_changes(
     if others := names["other_key"]:
         what.append(f"robots got other keys for {shown(others)} than the keystore has")
         steps.append(other_keys_remedy(keystore.root, others))
+    if revoked := names["revoked"]:
+        what.append(f"{shown(revoked)} may have been revoked or removed")
+        steps.append(_revoked_step(keystore, revoked))
     if missing := names["missing"]:
         steps.append(_missing_step(root, missing))
     if rights := names["rights_taken"]:
@@ -466,7 +599,7 @@ def refuse_lost_changes(
         perhaps = ", or may have been" * any(": not known, because" in text for _, text in taken)
         what.append(f"rights of {shown(rights)} were taken away{perhaps} ({why})")
         steps.append("Sign the present policy again, with `sros generate_artifacts`.")
-        if not (certificates or keys or others or names["governance"]):
+        if not (certificates or keys or others or revoked or names["governance"]):
             steps.append(f"If the enclaves are to have these rights, run {renew(rights)}.")
     for change in changes:
         if change.change == "governance":
@@ -494,6 +627,22 @@ def _few_changes(keystore: OpenedKeystore, lines: Sequence[tuple[str, str]], lab
         _LOG.info("%s: %s", label, text)
     short = [textwrap.shorten(text, _LONGEST, placeholder=" ...") for text in texts[:_NAMED]]
     return "; ".join(short) + ("; -v shows more" if short != texts else "")
+
+
+def _revoked_step(keystore: OpenedKeystore, names: Sequence[str]) -> str:
+    """Return what to do about enclaves that may have been revoked after the backup."""
+    root, enclaves = quote(str(keystore.root)), " ".join(map(quote, names))
+    steps = f"Revoke those that should not run any more: `sros revoke {root} {enclaves}`."
+    if here := [name for name in names if not key_on_robot(keystore.folder(name))]:
+        renew = f"sros renew {root} {' '.join(map(quote, here))} --new-key --revoke-old"
+        steps += f" Give new keys to the others: `{renew}`."
+    if len(here) < len(names):
+        on_robots = [name for name in names if name not in here]
+        steps += (
+            f" {first_few(on_robots, _NAMED)}, whose keys were made on robots: to keep an enclave, "
+            "make a new key on its robot (docs/howto/rotate.md, A key in wrong hands)."
+        )
+    return steps
 
 
 def _missing_step(root: str, missing: Sequence[str]) -> str:

@@ -28,7 +28,7 @@ from sros_tool.keystore.layout import (
     has_key,
     key_on_robot,
 )
-from sros_tool.keystore.ledger import RESTORED, Entry, certificate_entry
+from sros_tool.keystore.ledger import PERHAPS_REVOKED, RESTORED, Entry, certificate_entry
 from sros_tool.keystore.lifecycle.change import Changed, ChangeOptions, KeystoreChange
 from sros_tool.keystore.lifecycle.revocation_list import LostRecords
 from sros_tool.keystore.reader import OpenedKeystore
@@ -176,6 +176,7 @@ def restore_revocations(
     *,
     shown_by: str = "",
     enclaves_with_named_rights: Collection[str] = (),
+    perhaps_revoked: Collection[str] = (),
     **options: Unpack[ChangeOptions],
 ) -> RestoredRevocations:
     """Revoke again all certificates on revocation lists that the keystore signed and lost.
@@ -195,7 +196,7 @@ def restore_revocations(
     Its ``reason`` is ``shown_by``.  Further entries have ``enclaves_with_named_rights``: the caller
     names the rights that these enclaves lost after the backup, so that a later renewal counts as
     consent to these rights.  These further entries are left out while there are certificates to
-    replace first.
+    replace first.  Each of the enclaves ``perhaps_revoked`` that stays has an entry, too.
 
     Raises:
         KeystoreError: as `revoke`.
@@ -272,7 +273,14 @@ def restore_revocations(
             or reasons
             or unknown.keys() - forgotten_lists.explained
         )
-        marks = [mark, *(mark._replace(enclave=name) for name in named)]
+        marks = [
+            mark,
+            *(mark._replace(enclave=name) for name in named),
+            *(
+                mark._replace(enclave=name, reason=PERHAPS_REVOKED)
+                for name in sorted({*perhaps_revoked} - gone)
+            ),
+        ]
         change.entries = [*(marks if shows_restore else ()), *unknown.values()]
         if revocations or forgotten_lists.lists:
             change.restart = tuple(name for name in change.names if name not in gone)
