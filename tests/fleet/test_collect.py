@@ -1311,6 +1311,43 @@ def test_only_the_seal_of_a_later_release_keeps_a_keystore_from_publishing(
     assert OpenedKeystore(home.root).ledger.next_number() > number, "robots refuse a lower number"
 
 
+def test_a_seal_shows_an_enclave_that_was_revoked_by_a_lost_ca(home: Home) -> None:
+    """The published folder is lost, and the keystore cannot verify the list of the lost CA."""
+    now = datetime.now(UTC)
+    home.run("fleet", "publish", "ks", "pub")
+    backup = copy_of(home.root, home.folder / "backup")
+    rotate = ("rotate_ca", "ks", "--identity", "--finish", "--allow-unconfirmed")
+    home.run(*rotate)
+    home.run("fleet", "publish", "ks", "pub")
+    number = read_published(OpenedKeystore(home.root)).robots["r1"].release.number
+    last = [release for release in releases_in(home.folder / "pub", 3) if release.number == number]
+    releases = {release.robot: release.files for release in last}
+    keystore = OpenedKeystore(home.root)
+    authority = load_authority(keystore, PERMISSIONS, keystore.template, IN_KEYSTORE, NOW)
+    files = {path.replace("base", "other"): data for path, data in releases["r3"].items()}
+    sealed = [("r1", number, releases["r1"]), ("r3", number, files)]
+    seals = dict(zip(("r1", "r3"), seal_releases(sealed, authority), strict=True))
+    for path in (home.root, home.folder / "pub"):
+        shutil.rmtree(path)
+    backup.rename(home.root)
+    # A message of another robot already shows the restore; then, the number shows nothing new.
+    for robot, signed in seals.items():
+        home.send(robot, now, seal=signed.decode())
+        notes = [note.text for note in home.collect(now).notes]
+        assert any("/r3/base may have been revoked" in note for note in notes) is (robot == "r3")
+    lines = (home.root / "ledger.jsonl").read_bytes()
+    home.send("r3", now + timedelta(minutes=1), seal=seals["r3"].decode())
+    home.collect(now)
+    assert (home.root / "ledger.jsonl").read_bytes() == lines, "it is recorded once"
+    home.run(*rotate)
+    publish = ("fleet", "publish", "ks", "pub", "--restored", "--new-folder")
+    refused = sros(*publish, cwd=home.folder)
+    assert refused.status == 2 and "/r3/base may have been revoked or removed" in refused.err
+    assert "/r1" not in refused.err and "/r2" not in refused.err
+    home.run("renew", "ks", "/r3/base", "--new-key", "--revoke-old")
+    home.run(*publish)
+
+
 def test_a_late_message_from_before_a_published_restore_shows_no_other_restore(home: Home) -> None:
     """Status would call the keystore older than its robots, though nothing is to publish."""
     home.run("fleet", "publish", "ks", "pub")

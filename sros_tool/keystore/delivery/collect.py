@@ -45,7 +45,11 @@ from sros_tool.keystore.confirmation import (
     store_refusals,
 )
 from sros_tool.keystore.delivery.published import read_published
-from sros_tool.keystore.delivery.restored import LaterSeals, has_unpublished_restore
+from sros_tool.keystore.delivery.restored import (
+    LaterSeals,
+    has_unpublished_restore,
+    perhaps_revoked_step,
+)
 from sros_tool.keystore.delivery.signing import certify_requests
 from sros_tool.keystore.expiry import read_credentials
 from sros_tool.keystore.fleet import checked_fleet, enclaves_of_robot, recorded_fleet
@@ -251,6 +255,7 @@ def collect(
             if number := seals.later_number(message.seal):
                 robots_with_seals.append(message.robot.name)
                 forgotten.later_number = max(number, forgotten.later_number)
+            forgotten.perhaps_revoked |= seals.missing_enclaves(message.seal)
             if message.signer_certificate:
                 forgotten.add_certificate(
                     message.signer_certificate,
@@ -971,7 +976,8 @@ def _revoke_again(
     """
     is_later = bool(forgotten_lists.later_number)
     unknown = forgotten_lists.unknown_certificates(OpenedKeystore(root))
-    if not (forgotten_lists.lists or unknown or is_later):
+    perhaps_revoked = forgotten_lists.perhaps_revoked
+    if not (forgotten_lists.lists or unknown or is_later or perhaps_revoked):
         return "", [], []
     forgotten_serials = {entry.serial for crl in forgotten_lists.lists for entry in crl.revoked}
     requests = [request for message in messages for request in message.requests if request.request]
@@ -989,7 +995,7 @@ def _revoke_again(
             f"it with `sros crl {quote(str(root))} --refresh --crl FILE`"
         )
         notes = [Note("fleet.later-list", text)] if robots_with_lists else []
-        if not is_later:
+        if not (is_later or perhaps_revoked):
             return "", notes, []
         forgotten_lists, robots_with_lists = LostRecords(OpenedKeystore(root), now), ()
     try:
@@ -997,6 +1003,7 @@ def _revoke_again(
             root,
             forgotten_lists,
             shown_by=LATER_RELEASE if is_later else "",
+            perhaps_revoked=perhaps_revoked,
             now=now,
             keyring=keyring,
             dry_run=dry_run,
@@ -1014,6 +1021,13 @@ def _revoke_again(
                 request.set_outcome("not_signed", why)
         return why, [], []
     notes += [restored_list_note(restored, have)] if robots_with_lists else []
+    if stay := sorted(perhaps_revoked.difference(restored.names("revoked"))):
+        step = perhaps_revoked_step(OpenedKeystore(root), stay)
+        text = (
+            f"{first_few(stay, _SHOWN)} may have been revoked or removed after the backup: the "
+            f"last release of the robot lacks it. {step}"
+        )
+        notes.append(Note("fleet.perhaps-revoked", text))
     return "", [*notes, *restored.notes], [*changes_below(root, restored.changes)]
 
 

@@ -40,6 +40,7 @@ from sros_tool.keystore.layout import (
     PERMISSIONS,
     PERMISSIONS_CA_FILE,
     PERMISSIONS_FILE,
+    enclave_folder,
     key_on_robot,
 )
 from sros_tool.keystore.ledger import (
@@ -190,6 +191,14 @@ class LaterSeals:
     def __init__(self, keystore: OpenedKeystore) -> None:
         entries = keystore.ledger_file.with_values("what", (RESTORED, "release")).entries
         self._known = {entry.number for entry in entries if entry.what == "release"}
+        self._last = max(self._known, default=0)
+        self._marked = {
+            entry.enclave
+            for entry in entries
+            if entry.what == RESTORED
+            and entry.reason == PERHAPS_REVOKED
+            and entry.number > self._last
+        }
         # A restore that the keystore waits for, or published, explains all lower numbers; a restore
         # that only a revocation list showed keeps the keystore from nothing.
         marks = [e for e in entries if e.what == RESTORED and e.reason in _WAITING]
@@ -208,6 +217,26 @@ class LaterSeals:
                 if is_unknown and not signed.problem_for(self._authorities):
                     return 0 if self._has_issued(signed.text) else number
         return 0
+
+    def missing_enclaves(self, seal: str | None) -> set[str]:
+        """Return the keystore's enclaves that a later release of their robot, by its seal, lacks.
+
+        They were revoked or removed after the backup.  Enclaves that the ledger has as perhaps
+        revoked since the last release are left out.
+        """
+        with suppress(SrosError):
+            if seal and sealed_robot(seal.encode()).number > self._last:
+                signed, fleet = smime.parse(seal.encode()), recorded_fleet(self._keystore)
+                member = fleet.robots.get(sealed_robot(seal.encode()).robot)
+                is_sealed = not signed.problem_for(self._authorities)
+                if member and is_sealed and not self._has_issued(signed.text):
+                    listed = {path for _, path in _LISTED_FILE.findall(signed.text.decode())}
+                    return {
+                        name
+                        for name in enclaves_of_robot(self._keystore, fleet, member)
+                        if f"{enclave_folder(name)}/{CERTIFICATE_FILE}" not in listed
+                    } - self._marked
+        return set()
 
     def explains(self, seal: str | None, certificate: x509.Certificate) -> bool:
         """Return whether a known restore explains that the ledger lacks a robot's certificate.
@@ -588,7 +617,7 @@ def refuse_lost_changes(
         steps.append(other_keys_remedy(keystore.root, others))
     if revoked := names["revoked"]:
         what.append(f"{shown(revoked)} may have been revoked or removed")
-        steps.append(_revoked_step(keystore, revoked))
+        steps.append(perhaps_revoked_step(keystore, revoked))
     if missing := names["missing"]:
         steps.append(_missing_step(root, missing))
     if rights := names["rights_taken"]:
@@ -629,7 +658,7 @@ def _few_changes(keystore: OpenedKeystore, lines: Sequence[tuple[str, str]], lab
     return "; ".join(short) + ("; -v shows more" if short != texts else "")
 
 
-def _revoked_step(keystore: OpenedKeystore, names: Sequence[str]) -> str:
+def perhaps_revoked_step(keystore: OpenedKeystore, names: Sequence[str]) -> str:
     """Return what to do about enclaves that may have been revoked after the backup."""
     root, enclaves = quote(str(keystore.root)), " ".join(map(quote, names))
     steps = f"Revoke those that should not run any more: `sros revoke {root} {enclaves}`."

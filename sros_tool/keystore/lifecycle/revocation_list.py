@@ -91,6 +91,8 @@ class LostRecords:
         self.certificates: dict[str, Entry] = {}
         self.later_number = 0
         """Highest number of a robot's release that the keystore sealed and does not know, or 0."""
+        self.perhaps_revoked: set[str] = set()
+        """Enclaves of the keystore that such a release of their robot lacks."""
         self.explained: set[str] = set()
         """Serial numbers of certificates from before a restore that is known already."""
         self._now = now

@@ -271,6 +271,7 @@ def restore_revocations(
             shown_by
             or forgotten_lists.lists
             or reasons
+            or perhaps_revoked
             or unknown.keys() - forgotten_lists.explained
         )
         marks = [
