@@ -896,8 +896,8 @@ def test_an_inbox_that_is_none(home: Home) -> None:
 def test_when_a_message_arrived(home: Home) -> None:
     """It may lie there for long, and its time may be set; but it came after the one before."""
 
-    def arrived(written: datetime, now: datetime) -> datetime:
-        file = home.send("r1", now)
+    def arrived(made: datetime, written: datetime, now: datetime) -> datetime:
+        file = home.send("r1", made)
         os.utime(file, (written.timestamp(),) * 2)
         home.collect(now)
         last = last_confirmation(OpenedKeystore(home.root), "r1")
@@ -905,9 +905,12 @@ def test_when_a_message_arrived(home: Home) -> None:
         return last.time
 
     day = timedelta(days=1)
-    assert arrived(NOW, NOW + day) == NOW
-    assert arrived(NOW - day, NOW + day) == NOW
-    assert arrived(NOW + 5 * day, NOW + 2 * day) == NOW + 2 * day
+    assert arrived(NOW, NOW, NOW + day) == NOW
+    assert arrived(NOW - day, NOW - day, NOW + day) == NOW
+    # The clock of the server is behind; it is ahead; the clock of the robot is ahead.
+    assert arrived(NOW + day, NOW - day, NOW + day) == NOW + day
+    assert arrived(NOW + day, NOW + 5 * day, NOW + 2 * day) == NOW + 2 * day
+    assert arrived(NOW + 5 * day, NOW + 3 * day, NOW + 4 * day) == NOW + 3 * day
 
 
 @pytest.mark.parametrize("seconds", [2**40, -(2**40)])

@@ -577,7 +577,7 @@ class _Verifier:
                 "of the last message: this is an old message, or the disk of the robot was "
                 f"restored (then add --restored {robot.name})"
             )
-        arrived = self._arrival(file, last)
+        arrived = self._arrival(file, verified.confirmation, last)
         message = LastMessage(sequence, sha256, verified.enclave)
         installed = verified.confirmation.release
         before_it = (last.confirmation.release if last else None) or 0
@@ -657,13 +657,19 @@ class _Verifier:
         entries = self._keystore.ledger_with("what", "release").entries
         return any(entry.what == "release" and entry.number == release for entry in entries)
 
-    def _arrival(self, file: _File, last: ReceivedConfirmation | None) -> datetime:
-        """Return when the file of a message was written, but no earlier than the last message.
+    def _arrival(
+        self, file: _File, confirmation: Confirmation, last: ReceivedConfirmation | None
+    ) -> datetime:
+        """Return when a message was received, but no earlier than the last message.
 
-        Messages may have been in the inbox for a long time before they are collected.
+        Messages may have been in the inbox for a long time before they are collected, so this is
+        the time at which the file was written, by the clock of the server.  If the message shows a
+        later time that has passed on this machine, the clock of the server is behind: the time in
+        the message, which the robot signed, counts.
         """
+        made = confirmation.time if confirmation.time <= self._now else file.written
         earliest = last.time if last else file.written
-        return min(max(file.written, earliest), self._now).replace(microsecond=0)
+        return min(max(file.written, made, earliest), self._now).replace(microsecond=0)
 
     def _verify(self, robot: Robot, data: bytes) -> _VerifiedMessage:
         try:
