@@ -668,6 +668,18 @@ def other_keys_remedy(root: Path, names: Sequence[str]) -> str:
     )
 
 
+def keys_on_robots_remedy(root: Path, names: Sequence[str]) -> str:
+    """Return what to do about enclaves whose revoked keys were made on robots."""
+    where, enclaves = quote(str(root)), " ".join(map(quote, names))
+    return (
+        "For keys that were made on the robot, first let the robot's agent run once, if there is a "
+        "release that it can fetch. Then take the request.pem of each of these enclaves from the "
+        f"robot, sign it with `sros sign_request {where} REQUEST --no-answer --renew`, and run "
+        f"`sros renew {where} {enclaves} --revoke-old`. If the key of a request was revoked, first "
+        "make a new key on the robot (docs/howto/rotate.md, A key in wrong hands)."
+    )
+
+
 def _key_and_description(certificate: x509.Certificate) -> tuple[str, str]:
     """Return the digest of a certificate's key, and a description of the certificate."""
     subject = subject_text(certificate.subject)

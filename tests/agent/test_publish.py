@@ -1696,7 +1696,8 @@ def test_a_revoked_key_that_a_robot_made_is_replaced_on_the_robot(publisher: Hom
     done = restore_revocations(root, lost, now=publisher.now)
     (note,) = (each.text for each in done.notes if each.id == "fleet.replaced-after-backup")
     renewal = f"run `sros renew {root} /r1/base --new-key --revoke-old`"
-    assert f"new certificates: {renewal}; for {name}, make new keys on the robots (" in note
+    assert f"new certificates: {renewal}. For keys that were made on the robot, first" in note
+    assert f"`sros renew {root} {name} --revoke-old`" in note, "the same as when publishing"
     _, *revoked = sros("crl", root, cwd=publisher.folder).out.splitlines()
     assert {line.split()[-1] for line in revoked} == {name, "/r1/base"}
     with pytest.raises(KeystoreError, match="was revoked"):

@@ -775,7 +775,7 @@ def test_a_key_that_a_revoked_key_vouched_for(home: Home, revoked: int, is_repla
     crl = sign_crl(authority, key, [entry], number=99, this_update=DUE, next_update=LATE)
     home.send("r2", later, crl=crl.decode())
     texts = {note.id: note.text for note in home.collect(later).notes}
-    step = "new certificates: for /r1/base, make new keys on the robots"
+    step = "/r1/base --revoke-old`. If the key of a request was revoked, first make a new key"
     assert (step in texts.get("fleet.replaced-after-backup", "")) == is_replaced
     keystore = OpenedKeystore(home.root)
     assert keystore.revocation_list

@@ -30,7 +30,7 @@ from sros_tool.keystore.delivery.published import read_published
 from sros_tool.keystore.delivery.release import Release, sealed_robot
 from sros_tool.keystore.delivery.rollback import retired_authorities
 from sros_tool.keystore.fleet import enclaves_of_robot, recorded_fleet
-from sros_tool.keystore.known_keys import KnownKeys, other_keys_remedy
+from sros_tool.keystore.known_keys import KnownKeys, keys_on_robots_remedy, other_keys_remedy
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     GOVERNANCE_FILE,
@@ -604,14 +604,7 @@ def refuse_lost_changes(
         if here := [name for name in keys if name not in on_robots]:
             steps.append(f"Give new keys: {renew(here, ' --new-key --revoke-old')}.")
         if on_robots:
-            steps.append(
-                "For keys that were made on the robot, first let the robot's agent run once, so "
-                "that it fetches its newest certificate. Then take the request.pem of each of "
-                f"these enclaves from the robot, sign it with `sros sign_request {root} REQUEST "
-                f"--no-answer --renew`, and run {renew(on_robots, ' --revoke-old')}. If the key of "
-                "a request was revoked, first make a new key on the robot (docs/howto/rotate.md, "
-                "A key in wrong hands)."
-            )
+            steps.append(keys_on_robots_remedy(keystore.root, on_robots))
     if others := names["other_key"]:
         what.append(f"robots got other keys for {shown(others)} than the keystore has")
         steps.append(other_keys_remedy(keystore.root, others))

@@ -14,7 +14,7 @@ from typing import Unpack
 
 from sros_tool.errors import KeystoreError, Note, SrosError, UsageError
 from sros_tool.keystore.issuing.keyring import IN_KEYSTORE
-from sros_tool.keystore.known_keys import other_keys_remedy, revoked_serials
+from sros_tool.keystore.known_keys import keys_on_robots_remedy, other_keys_remedy, revoked_serials
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     IDENTITY,
@@ -387,19 +387,15 @@ def _replaced_notes(change: KeystoreChange, replaced: Mapping[str, bool]) -> Ite
         for is_key_revoked, options in ((False, ""), (True, " --new-key --revoke-old"))
         if (names := [n for n in replaced if replaced[n] is is_key_revoked and n not in on_robots])
     ]
-    steps = [f"run {' and '.join(commands)}"] if commands else []
+    steps = [f"Give the others new certificates: run {' and '.join(commands)}."] if commands else []
     if on_robots:
-        steps.append(
-            f"for {first_few(sorted(on_robots), _MOST_SHOWN)}, make new keys on the robots "
-            "(docs/howto/rotate.md, A key in wrong hands), because the revoked keys were made there"
-        )
+        steps.append(keys_on_robots_remedy(change.root, sorted(on_robots)))
     if steps:
         yield Note(
             REPLACED_AFTER_BACKUP,
             f"after the backup, the certificates of {first_few(tuple(replaced), _MOST_SHOWN)} were "
             "replaced and revoked, and the keystore has only the revoked certificates. Revoke "
-            f"robots that were stolen (`sros revoke {root} --robot NAME`). Give the other enclaves "
-            f"new certificates: {'; '.join(steps)}.",
+            f"robots that were stolen (`sros revoke {root} --robot NAME`). {' '.join(steps)}",
         )
 
 
