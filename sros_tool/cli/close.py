@@ -171,6 +171,7 @@ def close(
     from sros_tool.close.preparation import prepare
     from sros_tool.close.proof import prove as prove_closed
     from sros_tool.close.robot import LocalRobot, Shell
+    from sros_tool.close.start_files import check_may_restart
 
     if sum((apply, prove, undo)) > 1:
         raise UsageError("--apply, --proof and --undo exclude each other", "", "Choose one.")
@@ -211,6 +212,10 @@ def close(
             )
         name = shlex.quote(str(folder))
         raise UsageError(f"'{folder}' has no watched robot", "", f"Run `sros close {name}` first.")
+    if not undo:
+        robot.check_keystore("--apply" if apply else "--proof" if prove else "")
+    if apply and not dry_run:
+        check_may_restart(robot, robot.processes.units, "--apply")
     accepted = set(Acceptance) if partial else {Acceptance(word) for word in accept}
     with nullcontext() if dry_run or prove else robot.locked():
         if undo:
@@ -385,6 +390,7 @@ def _show_end(
     ``holds`` says whether the robot is proved closed; ``apply`` is the option, and
     ``accepted`` are the claims that need not have been tested.
     """
+    from sros_tool.close.start_files import only_root_clause
     from sros_tool.close.state import starting_units
 
     folder, observed = shlex.quote(str(robot.folder)), closed.observed
@@ -444,10 +450,12 @@ def _show_end(
                 steps = f"stop and {steps}"
         if not closed.pending:
             following = ask
-        elif any(
+        elif units := {
             process.unit for process in observed.processes if process.enclave in closed.pending
-        ):
+        } - {""}:
             following = f"sros close {folder} --apply"
+            if why := only_root_clause(units):
+                following = f"{robot.as_root('--apply')}, because {why}"
         else:
             following = f"{steps}, and then {ask}"
             details = _idle_lines(closed, ask)

@@ -17,7 +17,12 @@ from sros_tool.close.nodes import ObservedNodes
 from sros_tool.close.processes import ClosedProcess, ObservedProcesses, process_text
 from sros_tool.close.proof import proofs_of
 from sros_tool.close.robot import LocalRobot
-from sros_tool.close.start_files import DROP_IN, SYSTEMD_FOLDER, drop_in_heading
+from sros_tool.close.start_files import (
+    DROP_IN,
+    SYSTEMD_FOLDER,
+    check_may_restart,
+    drop_in_heading,
+)
 from sros_tool.close.state import (
     CloseState,
     RunningRobot,
@@ -136,11 +141,13 @@ def undo(robot: LocalRobot, *, dry_run: bool) -> CloseState:
     running = RunningRobot(robot)
     observed = running.with_later_processes(robot.processes)
     drop_ins = _drop_ins_of(robot, observed)
+    units = {path.parent.name.removesuffix(".d") for path in drop_ins}
+    if not dry_run:
+        check_may_restart(robot, units, "--undo")
     for path in drop_ins:
         if not dry_run:
             remove_file(path)
         robot.shell.say(f"{'would remove' if dry_run else 'removed'} {path}")
-    units = {path.parent.name.removesuffix(".d") for path in drop_ins}
     # A unit without a drop-in still runs closed if an earlier --undo was killed before the restart.
     units |= {process.unit for process in observed.processes if not running.is_open(process)} - {""}
     policy = _readable_policy(robot)

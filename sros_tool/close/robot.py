@@ -24,11 +24,13 @@ from sros_tool.keystore.layout import (
     CLOSED_OBSERVER,
     CLOSED_POLICY,
     CLOSED_PROCESSES,
+    ENCLAVES,
+    PRIVATE,
     enclave_path,
     list_enclaves,
 )
 from sros_tool.keystore.reader import OpenedKeystore
-from sros_tool.owners import other_writers_clause, replaceable_on_the_way
+from sros_tool.owners import other_writers_clause, replaceable_on_the_way, user_name
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import Policy
 from sros_tool.runtime.environment import RMW_ZENOH
@@ -246,6 +248,36 @@ class LocalRobot:
         self.observed = observed
         content = f"{json.dumps(as_plain(observed), indent=2)}\n"
         replace_file(self.processes_file, content.encode())
+
+    def as_root(self, option: str) -> str:
+        """Return how root runs `sros close` with ``option``, from the beginning if need be.
+
+        Root goes on in this folder only if the folder belongs to root.
+        """
+        shell = "in a root shell (`sudo -s`) in which ROS 2 and sros are set up"
+        if self.folder.exists() and self.folder.stat().st_uid == 0:
+            return f"`{self.close_command}{option and f' {option}'}` {shell}"
+        other = "or another folder of root that the users of the nodes can enter"
+        return f"`sros close /opt/robot` ({other}) {shell}"
+
+    def check_keystore(self, option: str) -> None:
+        """Raise `UnavailableError`, with the command to run, if this user cannot read the keystore.
+
+        ``option`` is the option of `sros close`, or "".
+        """
+        folders = (self.keystore, self.keystore / PRIVATE, self.keystore / ENCLAVES)
+        if not any(path.exists() and not os.access(path, os.R_OK | os.X_OK) for path in folders):
+            return
+        if owner := self.keystore.stat().st_uid:
+            how = f"`{self.close_command}{option and f' {option}'}` as {user_name(owner)}"
+        else:
+            how = self.as_root(option)
+        raise UnavailableError(
+            f"this user cannot read the keystore '{self.keystore}'",
+            f"It belongs to {user_name(owner)}, and has the CA keys: do not give it to the user of "
+            "the nodes.",
+            f"Run {how}.",
+        )
 
     def check_machines(self) -> None:
         """Raise `UsageError` if --elsewhere or --here names an enclave that is not to be moved.

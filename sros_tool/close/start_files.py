@@ -11,6 +11,7 @@ from pathlib import Path
 from sros_tool.close.processes import COMPOSE_FILE, ClosedProcess, ObservedProcesses, launch_words
 from sros_tool.close.robot import LocalRobot
 from sros_tool.close.state import CloseState
+from sros_tool.errors import UnavailableError
 from sros_tool.files import remove_file
 from sros_tool.runtime.environment import (
     COMPOSE,
@@ -25,10 +26,24 @@ from sros_tool.runtime.units import unit_changes, unit_instance, unit_words, wri
 from sros_tool.runtime.variables import KEYSTORE
 from sros_tool.terminal import visible
 from sros_tool.values import FileChange
+from sros_tool.wording import enumerated
 from sros_tool.xml import read_bytes
 
 DROP_IN = "sros-close.conf"
 SYSTEMD_FOLDER = Path("/etc/systemd/system")
+
+
+def only_root_clause(units: Collection[str]) -> str:
+    """Return a clause on units that this user cannot restart with other files; "" without any."""
+    if not units or os.access(SYSTEMD_FOLDER, os.W_OK):
+        return ""
+    return f"only root can restart {enumerated(sorted(units))}"
+
+
+def check_may_restart(robot: LocalRobot, units: Collection[str], option: str) -> None:
+    """Raise `UnavailableError` if ``option`` needs root because of the units."""
+    if why := only_root_clause(units):
+        raise UnavailableError(why, "Nothing was changed.", f"Run {robot.as_root(option)}.")
 
 
 def write_start_files(robot: LocalRobot, state: CloseState) -> list[FileChange]:

@@ -1659,6 +1659,40 @@ def test_processes_of_another_user_need_the_files(
     assert robot.restarts == []
 
 
+def test_what_only_root_can_do_names_the_command_of_root(
+    robot: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The folder of an ordinary user cannot become that of root, nor the keystore the user's."""
+    robot.units, folder = UNITS, robot.folder / "robot"
+    monkeypatch.setattr(start_files, "SYSTEMD_FOLDER", robot.folder / "of root")
+    shell = " in a root shell (`sudo -s`) in which ROS 2 and sros are set up"
+    begin = "`sros close /opt/robot` (or another folder of root that the users of the nodes can "
+    only = "only root can restart listener.service and talker.service"
+    is_root = os.geteuid() == 0
+    apply_here = f"`sros close robot --apply`{shell}" if is_root else f"{begin}enter){shell}"
+    assert robot.close().err.endswith(f"yet; next: {apply_here}, because {only}\n")
+    if is_root:
+        os.chown(folder, 1234, -1)
+    before = snapshot(folder)
+    said = robot.close("--apply", status=2, SUDO_UID="1234").err
+    assert said.endswith(f": {only}. Nothing was changed. Run {begin}enter){shell}.\n")
+    assert not robot.restarts and snapshot(folder) == before and "+ " not in said
+    if is_root:
+        os.chown(folder, 0, -1)
+    monkeypatch.setattr(start_files, "SYSTEMD_FOLDER", robot.folder / "systemd")
+    robot.close("--apply")
+    monkeypatch.setattr(start_files, "SYSTEMD_FOLDER", robot.folder / "of root")
+    assert f"{only}. Nothing was changed. " in robot.close("--undo", status=2).err
+    allowed = os.access
+    unreadable = folder.relative_to(robot.folder) / "keystore/private"
+    monkeypatch.setattr(os, "access", lambda path, mode: path != unreadable and allowed(path, mode))
+    for words in (("--proof",), ()):
+        said = robot.close(*words, status=2).err
+        assert "cannot read the keystore 'robot/keystore'. It belongs to user " in said
+        assert "has the CA keys: do not give it to the user of the nodes. Run `sros close " in said
+        assert f"{' '.join(('robot', *words))}`{shell if is_root else ' as user '}" in said
+
+
 def test_root_reads_any_export(tmp_path: Path) -> None:
     export = tmp_path / "export"
     export.mkdir()
