@@ -432,6 +432,8 @@ def test_new_keys_end_the_alarm_of_two_computers(
     shutil.copytree(home.root / "enclaves/r1", home.folder / "r1/enclaves/r1", dirs_exist_ok=True)
     later += timedelta(hours=1)
     is_explained = new_key and revoke_old
+    if is_explained and not restored:
+        home.sequence = 0  # the clock of the old computer was ahead
     for boot, is_seen in ((boots[1], not is_explained), (boots[0], not is_explained or restored)):
         home.send("r1", later, boot=boot)
         remarks = "".join(home.of("r1", later).remarks)
