@@ -1752,6 +1752,11 @@ def test_a_right_that_was_taken_away_after_the_backup_does_not_come_back_in_sile
     else:
         sign("x")
     assert publisher.publish(restored=True).names("published") == ["r1", "r2", "r5"]
+    publisher.now += LATER
+    publisher.run("renew", "ks", "--all")
+    history = publisher.run("inspect", "ks", "--history").out.splitlines()
+    last = [line for line in history if line.startswith(iso(publisher.now))]
+    assert last and not any("renewed by name" in line for line in last)
 
 
 def test_what_a_restored_keystore_cannot_know_is_not_published_in_silence(

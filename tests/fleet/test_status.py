@@ -746,7 +746,7 @@ def test_a_robot_that_fetches_is_offline_after_a_day(field: Field) -> None:
     lines = field.run("fleet", "status", "ks", status=1).out.splitlines()
     assert lines[0] == "3 robots: 2 current, 1 offline"
     (line,) = (line for line in lines if line.startswith("r1 "))
-    assert line.split(maxsplit=2)[1] == "offline" and line.endswith("the disk is full")
+    assert line.split(maxsplit=2)[1] == "offline" and "it reports: the disk is full" in line
     said = field.run("fleet", "status", "ks", "--max-age", "7d", status=1).out
     assert "3 robots: 3 current" in said and "look into it" in said
     page = field.run("fleet", "status", "ks", "--html", status=1).out
@@ -1326,6 +1326,9 @@ def test_what_is_to_be_done_for_robots_that_do_not_fetch_what_is_published(field
         field.age(robot, timedelta(minutes=31))
     silent = said()["r2"]
     assert silent[0] == "check whether it is on" and silent[1].startswith("it reports: Make room")
+    field.age("r2", timedelta(days=1))
+    assert said()["r2"] == ("find out why", silent[1]), "offline"
+    field.age("r2", timedelta(days=-1))
     value = json.loads(kept.read_text())
     value["confirmation"]["problems"] = []
     kept.write_text(json.dumps(value))

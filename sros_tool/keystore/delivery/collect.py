@@ -567,7 +567,7 @@ class _Verifier:
             return _ReceivedMessage(robot, "unchanged", verified=verified, remarks=remarks)
         is_restored = robot.name in self._restored
         if before and last and sequence <= before.sequence and not restored_at(self._keystore):
-            # A new computer counts anew: nobody could sign an old message with its keys.
+            # A new computer begins again: nobody could sign an old message with its keys.
             is_new = self._came_after(verified.certificate, last)
             is_restored |= is_new and self._has_new_keys(robot, last)
         is_older = before is not None and sequence < before.sequence and not is_restored

@@ -165,13 +165,16 @@ def renew(
 def _with_consent_marks(
     change: KeystoreChange, entries: Iterable[Entry], names: Sequence[str]
 ) -> Iterator[Entry]:
-    """Yield ``entries``; in a restored keystore, mark the permissions of the enclaves ``names``.
+    """Yield ``entries``; until a restore is published, mark the permissions of ``names``.
 
     The mark says that the user named the enclave.  `sros fleet publish --restored` takes this as
     consent to rights that were taken away.
     """
+    releases = change.keystore.ledger_with("what", "release").entries
+    last = max((entry.number for entry in releases if entry.what == "release"), default=0)
     restored = change.keystore.ledger_with("what", RESTORED).entries
-    named = {*names} if any(entry.what == RESTORED for entry in restored) else set[str]()
+    is_waiting = any(entry.what == RESTORED and entry.number > last for entry in restored)
+    named = {*names} if is_waiting else set[str]()
     for entry in entries:
         is_named = entry.what == "permissions" and entry.enclave in named
         yield entry._replace(reason=RENEWED_BY_NAME) if is_named else entry
