@@ -631,11 +631,13 @@ def refuse_lost_changes(
                 f"Restore the governance that was published last, with {again}; make other "
                 "changes only after publishing."
             )
+    is_list = len(steps) > 1
+    numbered = (f"({at}) {step}" if is_list else step for at, step in enumerate(steps, 1))
     if what:
         raise KeystoreError(
             f"nothing can be published in '{folder}' yet: after the backup, {'; '.join(what)}",
             "Publishing would undo this.",
-            f"{' '.join(steps)} Then repeat this command, with --restored.",
+            f"{' '.join(numbered)} Then repeat this command, with --restored.",
         )
 
 
