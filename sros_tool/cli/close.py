@@ -330,6 +330,7 @@ def _process_line(process: ClosedProcess, closed: CloseState, policy: Policy) ->
         state = process.pids_text
     elif process.enclave in closed.absent:
         state = "not running"
+        restart += ", unless the unit was stopped"
     elif process.pid:
         # A process first seen in its enclave, but now elsewhere, was recognized by its command.
         signs = {"elimination": "because no other process is left", "enclave": "by its command"}

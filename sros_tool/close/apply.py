@@ -7,7 +7,7 @@ import shlex
 import subprocess
 import time
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence, Set
 from datetime import timedelta
 from itertools import chain
 from pathlib import Path
@@ -25,6 +25,7 @@ from sros_tool.close.start_files import (
 )
 from sros_tool.close.state import (
     CloseState,
+    Proof,
     RunningRobot,
     current_state,
     keystore_text,
@@ -68,19 +69,29 @@ def apply(robot: LocalRobot, prepared: CloseState, *, dry_run: bool) -> CloseSta
     unsecured = [process for process in observed.processes if not secured.get(process.enclave)]
     open_units = observed._replace(processes=unsecured).units
     idle = {process.unit for process in observed.processes if process.is_idle}
+    states = _states_of_stopped_units(sorted(open_units - idle))
+    stopped = {unit for unit in states if states[unit] == "inactive" or _is_disabled(unit)}
+    _say_not_started(robot, sorted(stopped), "--apply", "closed")
     # A Zenoh router comes first: nodes wait for it.
     routers = {process.unit for process in observed.processes if process.is_router}
     last = {process.unit for process in observed.processes if prepared.may_restart_last(process)}
     restarts = [
         ["try-restart" if unit in idle else "restart", unit]
-        for unit in sorted(open_units, key=lambda unit: (unit not in routers, unit in last, unit))
+        for unit in sorted(
+            open_units - stopped, key=lambda unit: (unit not in routers, unit in last, unit)
+        )
     ]
     _restart_units(robot, restarts, changed=bool(changes), dry_run=dry_run)
     state = prepared._replace(changes=[*prepared.changes, *changes])
-    by_hand = dry_run or prepared.pending_by_hand
-    proofs = () if by_hand else proofs_of(robot, prepared, _RESTART_SECONDS)
-    if not proofs:
+    if dry_run:
         return state
+    by_hand, proofs = prepared.pending_by_hand, list[Proof]()
+    if by_hand:
+        restarted = open_units - stopped - idle
+        expected = {known.enclave for known in observed.processes if known.unit in restarted}
+        _say_open_processes(robot, by_hand.values(), expected)
+    else:
+        proofs = proofs_of(robot, prepared, _RESTART_SECONDS)
     running = current_state(robot, robot.read_policy())
     return state._replace(
         proofs=proofs,
@@ -91,6 +102,24 @@ def apply(robot: LocalRobot, prepared: CloseState, *, dry_run: bool) -> CloseSta
         new=running.new,
         absent=running.absent,
     )
+
+
+def _say_open_processes(
+    robot: LocalRobot, by_hand: Iterable[Sequence[ClosedProcess]], expected: Set[str]
+) -> None:
+    """Show the open processes that no command starts again closed.
+
+    First waits until processes run in the ``expected`` enclaves: their units were restarted.
+    """
+    running = wait_until(robot, lambda seen: seen.current_enclaves >= expected, _RESTART_SECONDS)
+    named = {pid for known in chain(*by_hand) for pid in (known.pid, *known.alike)}
+    others = {
+        process.label: None
+        for process in running.open_processes
+        if not process.is_daemon and process.program[0] not in named
+    }
+    if others:
+        robot.shell.say(f"also open: {enumerated([*others])}; stop these processes, too")
 
 
 def _write_drop_ins(
@@ -123,13 +152,18 @@ def _write_drop_ins(
 
 
 def _remember_new_units(robot: LocalRobot, observed: ObservedProcesses) -> None:
-    """Write processes of units that started after the watch into the folder.
+    """Write units that started processes only after the watch into the folder.
 
     Without a drop-in, nothing else shows --undo that such a unit belongs to the robot.
     """
-    known = {process.enclave for process in robot.processes.processes}
-    if new := [each for each in observed.processes if each.unit and each.enclave not in known]:
-        processes = [*robot.processes.processes, *new]
+    units = {process.enclave: process.unit for process in observed.processes if process.unit}
+    before = robot.processes.processes
+    known = {process.enclave for process in before}
+    processes = [
+        *(each._replace(unit=units.get(each.enclave, each.unit)) for each in before),
+        *(each for each in observed.processes if each.unit and each.enclave not in known),
+    ]
+    if processes != [*before]:
         robot.write_processes(robot.processes._replace(processes=processes))
 
 
@@ -157,12 +191,8 @@ def undo(robot: LocalRobot, *, dry_run: bool) -> CloseState:
     changed = bool(drop_ins or not_running)  # an earlier --undo may have been killed
     given_up = observed.units - expected.units
     not_running = {unit: not_running[unit] for unit in sorted(not_running.keys() - given_up)}
-    if inactive := [unit for unit, state in not_running.items() if state == "inactive"]:
-        start = shlex.join(["systemctl", "start", *inactive])
-        robot.shell.say(
-            f"{enumerated(inactive)} did not run, and --undo starts no stopped unit; to start "
-            f"{'it' if len(inactive) == 1 else 'them'} open: {start}"
-        )
+    inactive = [unit for unit, state in not_running.items() if state == "inactive"]
+    _say_not_started(robot, inactive, "--undo", "open")
     # Open processes of Fast DDS find each other also if they start together.
     restarts = [["restart", *sorted(units)]] if units else []
     _restart_units(robot, restarts, changed=changed, dry_run=dry_run)
@@ -392,6 +422,21 @@ def _states_of_stopped_units(units: Iterable[str]) -> dict[str, str]:
         if state in ("inactive", "failed"):
             stopped[unit] = state
     return stopped
+
+
+def _is_disabled(unit: str) -> bool:
+    """Return whether systemd does not start a unit at boot: somebody stopped it for good."""
+    return unit_properties(unit, "UnitFileState").get("UnitFileState") in ("disabled", "masked")
+
+
+def _say_not_started(robot: LocalRobot, units: Sequence[str], option: str, how: str) -> None:
+    """Show that the option starts none of these units, which would start "open" or "closed"."""
+    if units:
+        start = shlex.join(["systemctl", "start", *units])
+        robot.shell.say(
+            f"{enumerated([*units])} did not run, and {option} starts no stopped unit; to start "
+            f"{'it' if len(units) == 1 else 'them'} {how}: {start}"
+        )
 
 
 def _restart_units(

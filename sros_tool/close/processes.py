@@ -164,7 +164,7 @@ class ClosedProcess(NamedTuple):
     def with_current_pid(
         self, running: RunningProcesses, domain: int, export: Path
     ) -> ClosedProcess:
-        """Return a copy with the id that the process has now, in its ROS domain and network.
+        """Return a copy with the id and unit that the process has now, in its domain and network.
 
         A process that runs in its enclave of the ``export`` is preferred to open ones.  The id
         stays if the process may run but could not be examined.
@@ -186,18 +186,35 @@ class ClosedProcess(NamedTuple):
         may_run = self._may_run_unseen(running)
         if is_same or (may_run and not pids and not in_enclave):
             return self._replace(alike=(), absent=False)
+        origins = {pid: process_origin(pid) for pid in pids}
+        of_unit = [pid for pid in pids if self.unit and origins[pid].unit == self.unit]
         if in_enclave:
-            pids = pids[:1]  # all of them run in the enclave
+            pids = (of_unit or pids)[:1]  # all of them run in the enclave
         elif len(pids) > 1:
-            origins = {pid: process_origin(pid) for pid in pids}
-            of_unit = [pid for pid in pids if self.unit and origins[pid].unit == self.unit]
             pids = of_unit or [pid for pid in pids if origins[pid].folder == self.folder] or pids
         runs = may_run or any(map(self.fits, running.processes))
         now = self._replace(pid=0, alike=(), absent=not (self.is_idle or runs) and bool(self.unit))
         if len(pids) > 1:
-            return now._replace(alike=pids)
+            return now._replace(alike=pids, unit=self.unit if of_unit else "")
         known_by = "command" if pids and self.known_by != "enclave" else self.known_by
-        return now._replace(pid=next(iter(pids), 0), known_by=known_by)
+        now = now._replace(pid=next(iter(pids), 0), known_by=known_by)
+        return now._with_unit_of(in_domain, origins[now.pid]) if now.pid else now
+
+    def _with_unit_of(self, in_domain: Iterable[Process], origin: ProcessOrigin) -> ClosedProcess:
+        """Return a copy with the unit in which the process runs now, as its ``origin`` shows.
+
+        Its earlier unit may have been stopped for good. Another unit counts only if it starts
+        nothing else ``in_domain``, for the same user, and if its command need not name the enclave.
+        """
+        if origin.unit == self.unit or not self.unit or origin == ProcessOrigin():
+            return self
+        is_alone = all(
+            (process.program[0], process.user) == (self.pid, self.user)
+            for process in in_domain
+            if process_origin(process.program[0]).unit == origin.unit
+        )
+        unit = origin.unit if is_alone and not self.lacks_enclave_argument else ""
+        return self._replace(unit=unit, folder=origin.folder or self.folder)
 
     @property
     def is_idle(self) -> bool:

@@ -193,7 +193,7 @@ class Robot:
 def find_origins(
     monkeypatch: pytest.MonkeyPatch, process_origin: Callable[[int], ProcessOrigin]
 ) -> None:
-    for module in (assignment, overrides, state, watch):
+    for module in (assignment, overrides, processes, state, watch):
         monkeypatch.setattr(module, "process_origin", process_origin)
 
 
@@ -1308,6 +1308,38 @@ def test_a_unit_that_does_not_run_is_not_called_open(
 
     monkeypatch.setattr(apply, "proofs_of", proofs_of)
     assert json.loads(robot.close("--apply", "--json").out)["absent"] == []
+
+
+@sometimes("a_unit_that_was_replaced_is_not_started_again", 1 / 2)
+def test_a_unit_that_was_replaced_is_not_started_again(
+    robot: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Otherwise, two drivers would run: the closed one of the stopped unit, and the open one."""
+    robot.units = UNITS
+    robot.close()
+    robot.close("--apply")
+    count, stray = len(robot.restarts), replace(robot.process("/talker", is_secured=False), pid=9)
+    for unit in UNITS.values():
+        (robot.folder / unit).write_text("ActiveState=inactive\n")
+    robot.units = dict.fromkeys(PID, "both.service")  # its script starts both
+    monkeypatch.setattr(processes, "start_of", lambda pid: f"{boot_id()} {pid} later")
+    robot.more = (replace(stray, command=("/opt/run", "other")),)
+    said = robot.close(status=1).out
+    assert said.count("known by its command: by hand") == 2
+    ended = robot.close("--apply", "--accept", "nodes", status=1)
+    assert robot.restarts[count:] == []
+    assert ended.out.count("both.service starts it: ") == 2
+    assert "also open: process 9 (run); stop these processes, too" in ended.err
+    robot.more, robot.units = (), {**UNITS, "/talker": "new.service"}
+    assert ": --apply restarts new.service" in robot.close().out
+    robot.close("--apply")
+    assert robot.restarts[count:] == ["daemon-reload", "restart new.service"]
+    robot.absent, count = {"/talker"}, len(robot.restarts)
+    for shown in ("ActiveState=inactive", "ActiveState=failed\nUnitFileState=disabled"):
+        (robot.folder / "new.service").write_text(f"{shown}\n")
+        said = robot.close("--apply", status=1).err
+        assert "new.service did not run, and --apply starts no stopped unit; to start it" in said
+    assert robot.restarts[count:] == []
 
 
 @sometimes("units_that_do_not_restart_are_named", 1 / 2)

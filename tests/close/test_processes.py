@@ -90,7 +90,7 @@ def test_a_process_of_a_unit_is_looked_up_among_those_of_the_unit(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The id of the watch says nothing after a restart; a unit without a process is not idle."""
-    units = {8: "other.service", 9: "talker.service"}
+    units = {8: "other.service", 9: "talker.service", 11: "other.service"}
     monkeypatch.setattr(
         "sros_tool.close.processes.process_origin",
         lambda pid: ProcessOrigin(units.get(pid, ""), "/opt"),
@@ -98,16 +98,20 @@ def test_a_process_of_a_unit_is_looked_up_among_those_of_the_unit(
     unit = "talker.service"
     talker = ClosedProcess("/talker", 7, ("talk",), "/opt", 0, unit, "process id", started="x 70")
     twins = process(8, "talk"), process(9, "talk")
-    for running, pid, alike, absent in (
-        ((), 0, (), True),
-        (twins[:1], 8, (), False),
-        (twins, 9, (), False),
-        ((twins[0], process(10, "talk")), 0, (8, 10), False),
-        ((replace(twins[1], environment={"ROS_DOMAIN_ID": "64"}),), 0, (), False),
+    for running, pid, alike, absent, now_of in (
+        ((), 0, (), True, unit),
+        (twins[:1], 8, (), False, "other.service"),
+        ((twins[0], process(11, "hear")), 8, (), False, ""),  # the unit starts several processes
+        ((replace(twins[0], user=4321),), 8, (), False, ""),
+        ((process(10, "talk"),), 10, (), False, ""),
+        (twins, 9, (), False, unit),
+        ((twins[0], process(10, "talk")), 0, (8, 10), False, ""),
+        ((replace(twins[1], environment={"ROS_DOMAIN_ID": "64"}),), 0, (), False, unit),
     ):
         for known in (talker, talker.with_current_pid(RunningProcesses(), 0, Path("/export"))):
             now = known.with_current_pid(RunningProcesses(running), 0, Path("/export"))
             assert (now.pid, (*now.alike,), now.absent) == (pid, alike, absent)
+            assert now.unit == now_of, "not the unit that ran it before"
     idle = talker._replace(pid=0).with_current_pid(RunningProcesses(), 0, Path("/export"))
     assert idle.is_idle and not idle.absent
 
