@@ -26,6 +26,7 @@ from sros_tool.close.processes import (
     process_text,
     run_words,
 )
+from sros_tool.close.rights import names_without_requirement
 from sros_tool.close.robot import MOST_NAMES, TEMPLATE, LocalRobot
 from sros_tool.close.start_files import write_start_files
 from sros_tool.close.state import (
@@ -354,6 +355,8 @@ def _run_step(
             remedy += f"; if you want the change, edit {needed}, or remove this file to get "
             remedy += "new requirements"
         return "findings", [f"findings of `{step.command}`{remedy}"]
+    if step.guards:
+        _say_names_without_requirement(robot)
     if step.into:
         replace_file(step.into, output.encode())
     return "done", []
@@ -382,6 +385,20 @@ def _lost_protection(robot: LocalRobot) -> Iterator[str]:
                 "renamed a name, also rename it in the requirement. If nobody needs a name any "
                 "more, remove it there (or accept this with --accept requirements)"
             )
+
+
+def _say_names_without_requirement(robot: LocalRobot) -> None:
+    """Show the names that are not signed yet, and that deserve a requirement but have none."""
+    if not robot.keystore.exists():
+        return
+    signed = {right.name for right in load_rights(OpenedKeystore(robot.keystore)).rights}
+    if names := names_without_requirement(robot.folder, signed, robot.shell.now()):
+        policy = shlex.quote(str(robot.policy))
+        robot.shell.say(
+            f"no requirement protects {first_few(names, MOST_NAMES)}, new in the policy: `sros "
+            f"check {policy} --suggest` proposes requirements; copy those that you want into "
+            f"'{robot.requirements}'"
+        )
 
 
 def _enclaves_without_origin(robot: LocalRobot, *, revoked: bool) -> list[str]:

@@ -2009,6 +2009,18 @@ def test_a_requirement_that_lost_its_right_is_told_before_a_review_fails(tmp_pat
         assert state_of_step == ("findings" if lost else "done"), groups
         said_now = "toml:1 protects /x, which the policy does not"
         assert [said_now in problem for problem in problems] == [True] * lost
+    # A later name gets no requirement by itself, unlike those of the first policy.
+    later = {"/a": publish("x", "z"), "/r": reader, "/s": subscribe("z")}
+    lost_policy = robot.policy.read_text()
+    robot.policy.write_text(policy_text(later))
+    for names, is_told in (("/x", True), ("/z", False), ("/*", False)):
+        robot.requirements.write_text(needed.replace("/gone", names))
+        said.clear()
+        assert preparation._run_step(robot, guard, accepted=set()) == ("done", [])
+        hints = [line for line in said if line.startswith("no requirement protects /z, new in")]
+        assert len(hints) == is_told, said
+    robot.policy.write_text(lost_policy)
+    robot.requirements.write_text(needed.replace("gone", "x"))
     assert preparation._run_step(robot, guard, accepted={Acceptance.REQUIREMENTS}) == ("done", [])
 
 
