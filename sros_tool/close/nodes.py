@@ -88,25 +88,34 @@ class ObservedNodes:
         """The names of the enclaves in the policy."""
         return {enclave.path for enclave in self.policy.enclaves}
 
-    def in_their_enclaves(self) -> Iterator[ObservedNode]:
-        """Yield the nodes with their old names, in the enclaves that the policy gives them now.
+    @cached_property
+    def in_their_enclaves(self) -> Sequence[ObservedNode]:
+        """The nodes with their old names, in the enclaves that the policy gives them now.
 
-        A node whose profile was moved is in the enclave of its profile; a node without a profile
-        keeps its old enclave.
+        A node whose profile was moved is in the enclave of its profile.  A node without a profile
+        follows the other nodes of its old enclave if they all moved into one enclave.
         """
         names = self.policy_enclaves
-        enclave_of = {
+        enclave_of: dict[tuple[str, str], tuple[str, ...]] = {
             (profile.ns, profile.node): (enclave.path,)
             for enclave in self.policy.enclaves
             for profile in enclave.all_profiles()
         }
-        for node in self.as_observed:
-            moved = (
-                None
-                if names.issuperset(node.enclaves)
-                else enclave_of.get((node.ns, stable_name(node.name)))
-            )
-            yield replace(node, enclaves=moved) if moved else node
+        moved = {
+            node: enclave_of.get((node.ns, stable_name(node.name)))
+            for node in self.as_observed
+            if not names.issuperset(node.enclaves)
+        }
+        followed: dict[tuple[str, ...], set[tuple[str, ...]]] = {}
+        for node, enclaves in moved.items():
+            followed.setdefault(node.enclaves, set()).update({enclaves} if enclaves else ())
+        for node, enclaves in moved.items():
+            if not enclaves and len(others := followed[node.enclaves]) == 1:
+                (moved[node],) = others
+        return [
+            replace(node, enclaves=enclaves) if (enclaves := moved.get(node)) else node
+            for node in self.as_observed
+        ]
 
     def expected_nodes(self, current: Observation | None = None) -> Observation:
         """Return the nodes whose enclaves the policy has, with the names that they should have now.
@@ -115,7 +124,7 @@ class ObservedNodes:
         name that the node uses in the ``current`` graph.
         """
         names, nodes = self.policy_enclaves, []
-        for node in self.in_their_enclaves():
+        for node in self.in_their_enclaves:
             if node_name(node) in self.renamed_nodes or names.issuperset(node.enclaves):
                 nodes.append(self._with_current_name(node, current, node.endpoints))
         return make_observation(nodes)
@@ -148,7 +157,7 @@ class ObservedNodes:
         A node counts as renamed if it is the only node of its enclave without a profile, and the
         enclave has only one profile of a node that was not observed.
         """
-        _, without_profile = self.divide_by_profile(self.as_observed)
+        _, without_profile = self.divide_by_profile(self.in_their_enclaves)
         known = {node_name(node) for node in self.as_observed}
         renamed = {}
         for enclave in self.policy.enclaves:
@@ -175,7 +184,7 @@ class ObservedNodes:
             node: {
                 endpoint: _possible_endpoints(endpoint, node, *new) for endpoint in node.endpoints
             }
-            for node in self.as_observed
+            for node in self.in_their_enclaves
             if (new := self.renamed_nodes.get(node_name(node)))
         }
         tried = []
@@ -224,7 +233,7 @@ class ObservedNodes:
             for seen in self._read_observation(intermittent_from_json)
         }
         partly, always = [], []
-        for node in self.as_observed:
+        for node in self.in_their_enclaves:
             part = frozenset(
                 endpoint
                 for endpoint in node.endpoints
@@ -276,7 +285,9 @@ class ObservedNodes:
         The names are those of observed nodes and of nodes in the policy.
         """
         with suppress(SrosError):  # opening the robot must not fail because of a broken file
-            observed = {node_name(node) for node in self.as_observed if enclave in node.enclaves}
+            observed = {
+                node_name(node) for node in self.in_their_enclaves if enclave in node.enclaves
+            }
             in_policy = self.policy.enclave(enclave)
             profiles = in_policy.all_profiles() if in_policy else ()
             names = {expand("~", profile.ns, profile.node) for profile in profiles}

@@ -824,9 +824,7 @@ class _TalkComparison:
             and node.enclaves[0] not in restarted
         ]
         moved, enclaves = nodes.moved_endpoints(self.current), nodes.policy_enclaves
-        observed = [
-            node for node in nodes.in_their_enclaves() if enclaves.issuperset(node.enclaves)
-        ]
+        observed = [node for node in nodes.in_their_enclaves if enclaves.issuperset(node.enclaves)]
         return {
             "denied": [
                 f"{right['enclave']} {right['right']} {right['name']}: {right['reason']}"

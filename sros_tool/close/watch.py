@@ -109,7 +109,7 @@ def watch(robot: LocalRobot, words: Sequence[str]) -> list[str]:
     learned = json.loads(document)
     all_nodes = observation_from_json(learned).nodes
     observed_nodes = ObservedNodes(robot, all_nodes)
-    nodes = [node for node in observed_nodes.in_their_enclaves() if not is_tool(node)]
+    nodes = [node for node in observed_nodes.in_their_enclaves if not is_tool(node)]
     observed = _observed_processes(running, nodes, learned["ended"], started)
     _write_observation(robot, document, observed)
     _show_variables(running, observed)

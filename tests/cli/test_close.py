@@ -2300,15 +2300,31 @@ def test_an_enclave_that_gets_another_name_keeps_its_process(robot: Robot) -> No
         f"If nothing needs it any more: {revoke} process reads revocations only when it starts)"
         in said.out
     )
+    # The node that gave the enclave its first name may get another name later.
+    sros("revoke", "robot/keystore", "/logger", cwd=robot.folder).ok()
+    policy.write_text(policy.read_text().replace('node="logger"', 'node="lamps"'))
+    robot.close()
+    shell = Shell(close._run, print, {}, lambda: datetime.now(UTC), UTC)
+    seen = nodes.ObservedNodes(LocalRobot(robot.folder / "robot", 0, shell))
+    expected = {node.fqn: node.enclaves for node in seen.nodes_to_compare(()).nodes}
+    mission = ("/mission",)
+    assert expected == {"/lamps": mission, "/listener": ("/listener",), "/talker": mission}
+    assert not seen.denied_rights(seen.expected_nodes())
+    assert {pair.new.topic for pair in seen.moved_endpoints()} >= {"rr/lamps/get_parametersReply"}
 
 
 def test_only_a_process_alone_follows_its_nodes_into_a_new_enclave(tmp_path: Path) -> None:
     """Otherwise, processes of one enclave would count as several with the same node name."""
-    nodes = [{"enclaves": [f"/{name}"], "namespace": "/", "name": name} for name in "abc"]
+    places = dict(zip("abcdefghi", "abcdddggg", strict=True))
     ends: dict[str, Any] = {"publish": [], "subscribe": []}
-    observed_nodes = [{**node, "participant": node["name"], **ends} for node in nodes]
-    profiles = [f'<profile ns="/" node="{name}"/>' for name in "abc"]
-    enclaves = {"both": profiles[:2], "new": profiles[2:]}
+    observed_nodes = [
+        {"enclaves": [f"/{of}"], "namespace": "/", "name": name, "participant": of, **ends}
+        for name, of in places.items()
+    ]
+    enclaves = {
+        name: [f'<profile ns="/" node="{node}"/>' for node in of]
+        for name, of in {"both": "ab", "new": "c", "x": "d", "y": "eF", "one": "ghI"}.items()
+    }
     stated = (
         f'<enclave path="/{name}"><profiles>{"".join(of)}</profiles></enclave>'
         for name, of in enclaves.items()
@@ -2321,6 +2337,8 @@ def test_only_a_process_alone_follows_its_nodes_into_a_new_enclave(tmp_path: Pat
     observed = ObservedProcesses(0, [start._replace(enclave=f"/{name}") for name in "abc"])
     renamed = preparation._with_renamed_enclaves(robot, observed)
     assert [process.enclave for process in renamed.processes] == ["/a", "/b", "/new"]
+    # The nodes of /d moved into two enclaves, so f, which has no profile, may be in either.
+    assert nodes.ObservedNodes(robot).renamed_nodes == {"/i": ("/", "I")}
 
 
 def test_the_nodes_of_a_process_that_has_several(tmp_path: Path) -> None:
