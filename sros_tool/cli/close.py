@@ -317,8 +317,12 @@ def _remapping_text(closed: CloseState, enclave: str) -> str:
 
 def _process_line(process: ClosedProcess, closed: CloseState, policy: Policy) -> str:
     """Return the enclave of a process, how sros knows the process, and how it is restarted."""
+    from sros_tool.close.state import starting_units
+
     restart = "by hand, with its launch file" if process.launch else "by hand"
     restart = "by hand, with Docker Compose" if process.container else restart
+    if units := starting_units([process]):
+        restart += f", in {enumerated(units)}"
     does = "adds a drop-in to" if process.is_idle else "restarts"
     restart = f"--apply {does} {process.unit}" if process.unit else restart
     runs = process.enclave in closed.secured
@@ -392,7 +396,7 @@ def _show_end(
     ``accepted`` are the claims that need not have been tested.
     """
     from sros_tool.close.start_files import only_root_clause
-    from sros_tool.close.state import starting_units
+    from sros_tool.close.state import unit_advice
 
     folder, observed = shlex.quote(str(robot.folder)), closed.observed
     ask, details = f"sros close {folder} --proof", list[str]()
@@ -435,8 +439,8 @@ def _show_end(
             for process in processes:
                 if process.enclave in closed.denied_remappings:
                     echo(f"  {_remapping_text(closed, process.enclave)}")
-            for unit in starting_units(processes):
-                echo(f"  {unit} starts it: also put this command into the script of the unit")
+            for advice in unit_advice(processes):
+                echo(f"  {advice}")
         answer = f"next: run these commands, and then {ask}"
         details = _idle_lines(closed, ask)
         if not_starting := _advice_without_security(robot, closed):

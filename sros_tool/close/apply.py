@@ -38,7 +38,7 @@ from sros_tool.names import expand
 from sros_tool.policy.model import Policy
 from sros_tool.runtime.environment import node_argument
 from sros_tool.runtime.logind import users_without_linger
-from sros_tool.runtime.processes import Process, program_of, user_text
+from sros_tool.runtime.processes import Process, process_origin, program_of, user_text
 from sros_tool.runtime.unit_properties import unit_properties
 from sros_tool.runtime.units import unit_changes, write_units
 from sros_tool.values import FileChange
@@ -191,7 +191,14 @@ def undo(robot: LocalRobot, *, dry_run: bool) -> CloseState:
     changed = bool(drop_ins or not_running)  # an earlier --undo may have been killed
     given_up = observed.units - expected.units
     not_running = {unit: not_running[unit] for unit in sorted(not_running.keys() - given_up)}
-    inactive = [unit for unit, state in not_running.items() if state == "inactive"]
+    replaced = {
+        process.unit
+        for process in observed.processes
+        for other in running.open_processes
+        if process.fits(other) and process.user == other.user
+    }
+    inactive = [unit for unit in not_running if not_running[unit] == "inactive"]
+    inactive = [unit for unit in inactive if unit not in replaced]
     _say_not_started(robot, inactive, "--undo", "open")
     # Open processes of Fast DDS find each other also if they start together.
     restarts = [["restart", *sorted(units)]] if units else []
@@ -288,6 +295,8 @@ class _RemainingProcesses:
                 process = secured_process(secured, process.enclave)
                 name = f"process {secured.pid}"
             command = process.open_command(self._robot.domain)
+            if unit := process_origin(secured.program[0]).unit_text:
+                command += f" ({unit} starts it: remove `sros run` there, and restart the unit)"
             started_by.setdefault(command, {})[name] = None
         for command, names in started_by.items():
             yield f"restart {enumerated([*names])} open: {command}"

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from sros_tool.close.processes import COMPOSE_FILE, ClosedProcess, ObservedProcesses, launch_words
 from sros_tool.close.robot import LocalRobot
-from sros_tool.close.state import CloseState
+from sros_tool.close.state import CloseState, unit_advice
 from sros_tool.errors import UnavailableError
 from sros_tool.files import remove_file
 from sros_tool.runtime.environment import (
@@ -179,6 +179,7 @@ def _command_lines(
         advice = processes[0].launch_advice(folder)
         yield from ("", f"# {', '.join(process.enclave for process in processes)}")
         yield from (f"# {advice}",) if advice else ()
+        yield from (f"# {text}" for text in unit_advice(processes))
         for process in processes:
             for rule in denied_remappings.get(process.enclave, ()):
                 rule_text = visible(rule)

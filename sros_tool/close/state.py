@@ -380,9 +380,18 @@ def secured_process(process: Process, enclave: str) -> ClosedProcess:
 
 
 def starting_units(processes: Iterable[ClosedProcess]) -> Sequence[str]:
-    """Return the units whose scripts started processes that run now."""
-    pids = {process.pid for process in processes} - {0}
-    return sorted({process_origin(pid).unit for pid in pids} - {""})
+    """Return the units that started processes that run now, as text; sros restarts none of them."""
+    pids = {process.pid for process in processes if not process.unit} - {0}
+    return sorted({process_origin(pid).unit_text for pid in pids} - {""})
+
+
+def unit_advice(processes: Iterable[ClosedProcess]) -> Iterator[str]:
+    """Yield what to do with the units that start these processes by themselves."""
+    for unit in starting_units(processes):
+        yield (
+            f"{unit} starts it: put this command into the unit or its script, and restart the unit "
+            "instead"
+        )
 
 
 def _enclaves_of(

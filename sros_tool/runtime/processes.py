@@ -790,22 +790,30 @@ class ProcessOrigin(NamedTuple):
     ``unit`` is the systemd system service, ``folder`` the working directory, ``launch`` the command
     of the launch that started the process (or that is the process): ``ros2 launch``, or a Python
     program that runs a launch description.  ``container`` is the id of the Docker or Podman
-    container in which the process runs.
+    container in which the process runs.  ``user_unit`` is the service of a user's own systemd:
+    this user chose its name.
     """
 
     unit: str = ""
     folder: str = ""
     launch: tuple[str, ...] = ()
     container: str = ""
+    user_unit: str = ""
+
+    @property
+    def unit_text(self) -> str:
+        """The systemd unit, or the unit of a user's own systemd, as text; "" if there is none."""
+        return self.unit or (self.user_unit and f"{self.user_unit} (systemctl --user)")
 
 
 def process_origin(pid: int, proc: Path = Path("/proc")) -> ProcessOrigin:
     """Return the unit, folder, launch and container in which a process was started."""
-    unit = folder = container = ""
+    unit = folder = container = user_unit = ""
     with suppress(OSError):
         text = (proc / str(pid) / "cgroup").read_text(errors="surrogateescape")
         unit = service[1] if (service := _SERVICE.search(text)) else ""
         unit = "" if _SERVICE_OF_OTHERS.fullmatch(unit) else unit
+        user_unit = service[1] if (service := _SERVICE_OF_USER.search(text)) else ""
         container = named[1][:12] if (named := _CONTAINER.search(text)) else ""
         folder = str((proc / str(pid) / "cwd").readlink())
     child: tuple[str, ...] = ()
@@ -818,9 +826,9 @@ def process_origin(pid: int, proc: Path = Path("/proc")) -> ProcessOrigin:
             finally:
                 os.close(handle)
             if is_launch:
-                return ProcessOrigin(unit, folder, command, container)
+                return ProcessOrigin(unit, folder, command, container, user_unit)
             child, pid = command, parent
-    return ProcessOrigin(unit, folder, (), container)
+    return ProcessOrigin(unit, folder, (), container, user_unit)
 
 
 def _runs_launch(folder: int, pid: int, command: Sequence[str], child: Sequence[str]) -> bool:
@@ -880,6 +888,13 @@ _SERVICE = re.compile(
 
 Only slices may be above the service: below a service or a container, others choose the names.
 """
+_SERVICE_OF_USER = re.compile(
+    r"^(?:0:|\d+:name=systemd):/user\.slice/user-\d+\.slice/user@\d+\.service/(?:[^/\n]+\.slice/)*("
+    + SERVICE_NAME
+    + r")$",
+    re.M | re.A,
+)
+"""A line of /proc/PID/cgroup for a service of a user's own systemd (systemctl --user)."""
 _CONTAINER = re.compile(r"/(?:docker|libpod)[-/]([0-9a-f]{64})(?:\.scope)?(?:/|$)", re.M | re.A)
 """A line of /proc/PID/cgroup for a Docker or Podman container, by either cgroup driver."""
 

@@ -193,7 +193,7 @@ class Robot:
 def find_origins(
     monkeypatch: pytest.MonkeyPatch, process_origin: Callable[[int], ProcessOrigin]
 ) -> None:
-    for module in (assignment, overrides, processes, state, watch):
+    for module in (apply, assignment, overrides, processes, state, watch):
         monkeypatch.setattr(module, "process_origin", process_origin)
 
 
@@ -608,10 +608,12 @@ def test_what_systemd_does_not_start_is_done_by_hand(
     robot: Robot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     robot.units = dict.fromkeys(PID, "both.service")  # its script starts both
-    robot.close()
+    assert "/talker: process 4711, known by its process id: by hand, in both.s" in robot.close().out
     ended = robot.close("--apply", status=1)
     assert robot.restarts == []
-    assert ended.out.count("  both.service starts it: also put this command into the script") == 2
+    advice = "both.service starts it: put this command into the unit or its script, and restart"
+    assert ended.out.count(f"  {advice} the unit instead\n") == 2
+    assert (robot.folder / "robot/start/commands.txt").read_text().count(f"# {advice}") == 2
     robot.units = {}
     assert "stop process 4711, and start again with:\n  cd /opt && sros run " in ended.out
     assert ended.err.endswith("next: run these commands, and then sros close robot --proof\n")
@@ -681,8 +683,12 @@ def test_what_systemd_does_not_start_is_done_by_hand(
     robot.by_hand, robot.absent = {"/talker"}, {"/listener"}
     (robot.folder / "link").symlink_to("robot")
     robot.spelled = "link/export"
+    robot.units = dict.fromkeys(PID, "both.service")
     undone = robot.close("--undo", status=1)
-    assert undone.out == "restart process 4711 open: cd /opt && /opt/run talker\n"
+    assert undone.out == (
+        "restart process 4711 open: cd /opt && /opt/run talker (both.service starts it: remove "
+        "`sros run` there, and restart the unit)\n"
+    )
     assert "/listener does not run; start it open: cd /opt && /opt/run listener\n" in undone.err
     foreign = replace(robot.process("/talker", is_secured=True), pid=13, command=("/opt/idle",))
     second = replace(
@@ -1330,6 +1336,7 @@ def test_a_unit_that_was_replaced_is_not_started_again(
     assert robot.restarts[count:] == []
     assert ended.out.count("both.service starts it: ") == 2
     assert "also open: process 9 (run); stop these processes, too" in ended.err
+    assert "starts no stopped unit" not in robot.close("--undo", "--dry-run").err
     robot.more, robot.units = (), {**UNITS, "/talker": "new.service"}
     assert ": --apply restarts new.service" in robot.close().out
     robot.close("--apply")

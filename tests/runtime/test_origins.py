@@ -9,13 +9,16 @@ import pytest
 
 from sros_tool.runtime.processes import ProcessOrigin, _forked_by, process_origin, program_of
 
+OF_USER = "/user.slice/user-1000.slice/user@1000.service"
+
 
 @pytest.mark.parametrize(
     ("text", "unit"),
     [
         ("0::/system.slice/robot@3.service\n", "robot@3.service"),
         ("1:name=systemd:/system.slice/system-r.slice/r@3.service\n0::/\n", "r@3.service"),
-        ("0::/user.slice/user-1000.slice/user@1000.service/app.slice/x.service\n", ""),
+        (f"0::{OF_USER}/app.slice/x.service\n", "x.service (systemctl --user)"),
+        (f"0::{OF_USER}/app.slice/vte-spawn-1.scope\n", ""),  # a terminal
         ("0::/system.slice/../x y.service\n", ""),
         ("0::/system.slice/cron.service\n", ""),  # a line with @reboot
         ("0::/system.slice/system-dropbear.slice/dropbear@1-a:22-b:9.service\n", ""),  # a login
@@ -26,7 +29,9 @@ from sros_tool.runtime.processes import ProcessOrigin, _forked_by, process_origi
 )
 def test_the_unit_of_a_process(tmp_path: Path, text: str, unit: str) -> None:
     made_up(tmp_path, 7, "/opt/talker", parent=1, cgroup=text)
-    assert process_origin(7, tmp_path) == ProcessOrigin(unit, "/opt")
+    origin = process_origin(7, tmp_path)
+    assert (origin.unit_text, origin.folder) == (unit, "/opt")
+    assert origin.unit == unit * (OF_USER not in text), "--apply restarts no unit of a user"
     assert process_origin(8, tmp_path) == ProcessOrigin()
 
 
