@@ -215,8 +215,8 @@ def undo(robot: LocalRobot, *, dry_run: bool) -> CloseState:
     problems = [
         # It may have failed because it could not start secured, or because somebody stopped it.
         *(
-            f"{unit} has failed: start it open with `systemctl start {unit}`, or let it stay "
-            f"stopped: `systemctl reset-failed {unit}`"
+            f"{unit} has failed: start it open with `systemctl start {shlex.quote(unit)}`, or let "
+            f"it stay stopped: `systemctl reset-failed {shlex.quote(unit)}`"
             for unit, state in not_running.items()
             if state == "failed"
         ),
@@ -241,7 +241,7 @@ def _processes_not_open(running: RunningRobot, started: Sequence[ClosedProcess])
         if process.enclave not in secured and not running.runs_open(process, since):
             yield (
                 f"{process.enclave} does not run open, though {process.unit} was restarted: "
-                f"systemctl status {process.unit}"
+                f"systemctl status {shlex.quote(process.unit)}"
             )
 
 

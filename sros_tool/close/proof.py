@@ -608,7 +608,8 @@ def _open_elsewhere(running: RunningRobot) -> Iterator[str]:
 def _log_command(robot: LocalRobot, unit: str = "") -> str:
     """Return the command that explains the log of a unit, or of a process without a unit."""
     explain = f"sros explain {shlex.quote(str(robot.export))} --log"
-    return f"`journalctl -n 100 -u {unit} | {explain} -`" if unit else f"`{explain} ITS_LOG`"
+    log = f"journalctl -n 100 -u {shlex.quote(unit)}"
+    return f"`{log} | {explain} -`" if unit else f"`{explain} ITS_LOG`"
 
 
 def _why_missing(running: RunningRobot, missing: Sequence[str], observed: ObservedProcesses) -> str:
@@ -618,7 +619,8 @@ def _why_missing(running: RunningRobot, missing: Sequence[str], observed: Observ
     overridden = overrides(running, observed)
     apply = f"`{robot.close_command} --apply`"
     causes = {
-        process.enclave: f"{process.unit} does not run it: systemctl status {process.unit}"
+        process.enclave: f"{process.unit} does not run it: "
+        f"systemctl status {shlex.quote(process.unit)}"
         if process.absent
         else f"{process.pids_text} is open: "
         + (f"{apply} restarts {process.unit}" if process.unit else "stop it")

@@ -183,6 +183,17 @@ def test_a_keystore_of_another_user_is_one_finding(bench: Bench) -> None:
     assert ids(bench) == {"keystore.foreign-owner", "keystore.others-write"}
 
 
+@as_root
+def test_an_export_may_belong_to_the_user_of_the_nodes(bench: Bench, tmp_path: Path) -> None:
+    """`sros close` asks root to give the export to this user."""
+    sros("distribute_key", bench.root, "--all", tmp_path / "export").ok()
+    for keystore, is_export in ((bench.root, False), (tmp_path / "export", True)):
+        give_away(keystore)
+        found = keystore_findings(OpenedKeystore(keystore), Circumstances(bench.now))
+        (remedy,) = (each.remedy for each in found if each.id == "keystore.foreign-owner")
+        assert (f"If this is user {STRANGER}, change nothing" in remedy) is is_export
+
+
 def test_a_link_to_the_keystore_that_others_own(bench: Bench) -> None:
     bench.checked = bench.root.with_name("link")
     bench.checked.symlink_to(bench.root)

@@ -1295,14 +1295,16 @@ def test_a_unit_that_does_not_run_is_not_called_open(
     robot: Robot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its process failed, as after a start with a missing file; its earlier id means nothing."""
-    robot.units = UNITS
+    robot.units = UNITS | {"/listener": r"my\x2dlistener.service"}
     robot.close()
     robot.close("--apply")
     robot.absent = {"/listener"}
     unit = robot.units["/listener"]
     said = robot.close("--proof", status=1).out
-    assert f"in /listener ({unit} does not run it: systemctl status {unit}). If a p" in said
-    assert f"ended, its log says why: `journalctl -n 100 -u {unit} | sros explain robot/exp" in said
+    assert f"in /listener ({unit} does not run it: systemctl status '{unit}'). If a p" in said
+    assert (
+        f"ended, its log says why: `journalctl -n 100 -u '{unit}' | sros explain robot/exp" in said
+    )
     assert "--without" not in said
     ended = robot.close()
     assert "  /listener: not running: --apply restarts" in ended.out

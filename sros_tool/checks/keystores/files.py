@@ -265,7 +265,14 @@ def check_files(keystore: CheckedKeystore, names: Sequence[str] | None = None) -
     root = os.fspath(keystore.root)
     state = keystore.root.stat()
     if state.st_uid not in (0, os.geteuid()):
-        yield FOREIGN_OWNER.found(root, f"it belongs to {user_name(state.st_uid)}", root)
+        owner, remedy = user_name(state.st_uid), ""
+        if not keystore.is_original:
+            remedy = (
+                f"An export has to belong to the user that runs the nodes. If this is {owner}, "
+                "change nothing: run the check as this user to have no warning. Otherwise run "
+                f"`chown -R USER {quote(root)}`."
+            )
+        yield FOREIGN_OWNER.found(root, f"it belongs to {owner}", root, remedy=remedy)
     trusted = frozenset({0, os.geteuid(), state.st_uid})
     kept: list[str] = []
     replaceable = dict(replaceable_on_the_way(keystore.root, trusted))
