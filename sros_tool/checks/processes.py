@@ -962,7 +962,11 @@ def _is_open(environment: Mapping[str, str]) -> bool:
 def _unsecured_node_findings(
     environment: Mapping[str, str], nodes: Sequence[Process], *, finding_per_node: bool
 ) -> Iterator[Finding]:
-    """Yield findings about running open nodes; only one if the environment requests no security."""
+    """Yield findings about running open nodes.
+
+    If the environment requests no security, one finding is about the environment, and names the
+    nodes; with ``finding_per_node``, there is one for each node instead.
+    """
     is_set = environment.get(ENABLE) not in (None, "", "false")
     asks = is_set or variables_without_enable(environment)
     if asks or not _is_open(environment):

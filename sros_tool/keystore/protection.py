@@ -97,7 +97,7 @@ def governance_with_stated_protections(
 
 
 def governance_for_all(protection: DomainProtection) -> Governance:
-    """Return the governance for ``protection`` in any domain."""
+    """Return the governance for ``protection`` in domain 0; the rules of all domains are equal."""
     return governance_for(protection, DomainSet.of((0, 0)))
 
 

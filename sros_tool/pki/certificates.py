@@ -207,7 +207,7 @@ class TrustSettingsUse(Enum):
     """How a program uses the trust settings of a ``TRUSTED CERTIFICATE`` (OpenSSL, X509_AUX)."""
 
     IGNORED = "nothing"
-    READ = "settings, which have no effect"
+    READ = "settings, but ignores what they say"
     OF_ANY_USE = "settings that must not restrict the certificate"
     OF_DOCUMENTS = "settings that must trust the certificate for S/MIME"
 

@@ -262,7 +262,10 @@ class Crossing:
         self._passing: dict[tuple[str, str], NameSet] = {}
 
     def topics_between(self, writer: str, reader: str) -> NameSet | None:
-        """Return the topics that can get from a writer to a reader; None for all (one router)."""
+        """Return the topics that can get from a writer to a reader.
+
+        None stands for all topics: both use one router, or the router of one of them is unknown.
+        """
         sending, receiving = self.router_of.get(writer), self.router_of.get(reader)
         if sending is None or receiving is None or sending == receiving:
             return None

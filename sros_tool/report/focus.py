@@ -651,7 +651,11 @@ class _Draft:
                     yield Link(*ends, 0, 0, ("influence",), ALLOW, WireLevel.UNKNOWN, False, _BOTH)
 
     def _hops_to_focus(self, is_before_focus: bool, hop: int) -> int:
-        """Return the hops to show: an enclave in the focus is itself the first hop before it."""
+        """Return the number of hops to show for ``hop``.
+
+        Before the focus, enclaves that are themselves in the focus have hop 1, so the number is
+        less by one.
+        """
         return hop - 1 if is_before_focus and self._flow.own else hop
 
     def _hops_on_side(self, is_before_focus: bool) -> Mapping[str, int]:

@@ -471,8 +471,9 @@ class Container:
 def object_name(enclave: str) -> str:
     """Return a name of at most 58 characters (RFC 1123) that only this enclave has.
 
-    Names of enclaves may have capitals, "_" and "/". A name that loses such a character ends with
-    "--" and the first 64 bits of the enclave's SHA-256, so that the name is unique.
+    Each "/" becomes "-".  If the enclave has other characters that the name cannot keep, such as
+    capitals or "_", or is long, the name ends with "--" and the first 64 bits of the enclave's
+    SHA-256, so that it is unique.
     """
     words = "-".join(re.findall(r"[a-z0-9]+", enclave.lower()))
     if _PLAIN_ENCLAVE.match(enclave) and len(words) <= _LONGEST_PLAIN:

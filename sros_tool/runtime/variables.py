@@ -30,7 +30,7 @@ def domain_from(environment: Mapping[str, str]) -> int | None:
     """Return ROS_DOMAIN_ID as a number, or None if the variable is unset or empty.
 
     Raises:
-        UsageError: The value is not a domain id; rcl would not start either.
+        UsageError: the value is not a domain id, or begins with a zero.
     """
     text = environment.get(DOMAIN, "")
     if not text:

@@ -273,7 +273,7 @@ def _scope_notes(policy: Policy, result: MinimizedPolicy, observed: Set[Right]) 
         text = (
             f"these enclaves were observed, but the policy lacks them: {', '.join(unknown)}. If "
             "the policy has their nodes in another enclave, write that enclave into path= of the "
-            "observed file. If it has them in several enclaves, write one of these nodes there."
+            "observed file. If it has them in several enclaves, write the name of one node there."
         )
         yield Note("minimize.enclave-not-in-policy", text)
     rules, stated = Rules(observed), Rules(policy_rights(policy))

@@ -410,7 +410,7 @@ class _ReissuedEnclave:
 class _KeptWideRights:
     """An enclave that keeps the right to everything, although the new default rights are narrower.
 
-    ``reissued`` has its new files, or None.
+    ``reissued`` says what was replaced in the enclave; it is None if nothing was.
     """
 
     name: str
