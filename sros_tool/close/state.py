@@ -511,7 +511,7 @@ class CloseState(NamedTuple):
     """
     outdated_pids: Mapping[str, Sequence[int]]
     """The enclaves of `outdated`, each with the ids of the processes to restart; restart the
-    enclaves in this order.
+    enclaves in this order. With `--apply`, the processes that are left after its restarts.
     """
     not_observed: Sequence[str]
     """Processes that run in enclaves of the robot but were not observed there, and further

@@ -462,6 +462,7 @@ def renew_without_systemd(robot: Robot) -> None:
     assert (ran.returncode, ran.stderr) == (0, "")
     assert ran.stdout.splitlines() == [
         "sros renew /opt/robot/keystore --all-expiring 30d",
+        "sros close /opt/robot --apply",
         *(f"kill {pid}" for pid in (PID["/listener"], PID["/talker"], 13)),
         "sros close /opt/robot --proof",
     ]
@@ -1316,6 +1317,25 @@ def test_a_unit_that_does_not_run_is_not_called_open(
 
     monkeypatch.setattr(apply, "proofs_of", proofs_of)
     assert json.loads(robot.close("--apply", "--json").out)["absent"] == []
+
+
+@sometimes("what_the_restarts_left_is_printed", 1 / 2)
+def test_what_the_restarts_left_is_printed(robot: Robot) -> None:
+    """A script that ended a process of a restarted unit might hit another one with its id."""
+
+    class UntilRestarted(set[str]):
+        def __contains__(self, enclave: object) -> bool:
+            return enclave == "/listener" or len(robot.restarts) == 2
+
+    robot.units = {"/talker": "talker.service"}
+    robot.close()
+    robot.by_hand = {"/listener"}
+    robot.close("--apply")
+    robot.outdated = UntilRestarted()
+    assert json.loads(robot.close("--json").out)["outdated_pids"].keys() == PID.keys()
+    left = json.loads(robot.close("--apply", "--json", status=1).out)
+    assert left["outdated_pids"] == {"/listener": [PID["/listener"]]}
+    assert (left["outdated"].keys(), left["proofs"]) == ({"/listener"}, [])
 
 
 @sometimes("a_unit_that_was_replaced_is_not_started_again", 1 / 2)
