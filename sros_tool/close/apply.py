@@ -190,15 +190,15 @@ def undo(robot: LocalRobot, *, dry_run: bool) -> CloseState:
     units -= not_running.keys()
     changed = bool(drop_ins or not_running)  # an earlier --undo may have been killed
     given_up = observed.units - expected.units
-    not_running = {unit: not_running[unit] for unit in sorted(not_running.keys() - given_up)}
     replaced = {
         process.unit
         for process in observed.processes
-        for other in running.open_processes
+        for other in running.in_domain
         if process.fits(other) and process.user == other.user
     }
+    left = sorted(not_running.keys() - given_up - replaced)
+    not_running = {unit: not_running[unit] for unit in left}
     inactive = [unit for unit in not_running if not_running[unit] == "inactive"]
-    inactive = [unit for unit in inactive if unit not in replaced]
     _say_not_started(robot, inactive, "--undo", "open")
     # Open processes of Fast DDS find each other also if they start together.
     restarts = [["restart", *sorted(units)]] if units else []

@@ -70,7 +70,7 @@ def write_start_files(robot: LocalRobot, state: CloseState) -> list[FileChange]:
 
 
 def _remove_earlier_files(robot: LocalRobot, kept: Collection[str]) -> list[FileChange]:
-    """Remove environments and drop-ins written here for enclaves without a known process."""
+    """Remove environments and drop-ins written here that no known process needs any more."""
     keystore = f"{KEYSTORE}={robot.export.absolute()}\n".encode()
     unneeded = [
         path
@@ -90,7 +90,7 @@ def _remove_earlier_files(robot: LocalRobot, kept: Collection[str]) -> list[File
         if path.name == DROP_IN and os.path.lexists(used):
             unit = path.parent.name.removesuffix(".d")
             stays = f"; {used} stays, so {unit} cannot start open (--undo removes the drop-in)"
-        robot.shell.say(f"removed {path}: it was for an enclave without a known process{stays}")
+        robot.shell.say(f"removed {path}: no known process needs it{stays}")
     return [FileChange("remove", str(path)) for path in unneeded]
 
 

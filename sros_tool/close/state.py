@@ -389,8 +389,8 @@ def unit_advice(processes: Iterable[ClosedProcess]) -> Iterator[str]:
     """Yield what to do with the units that start these processes by themselves."""
     for unit in starting_units(processes):
         yield (
-            f"{unit} starts it: put this command into the unit or its script, and restart the unit "
-            "instead"
+            f"{unit} starts it: put this command into the unit or its script, if it is not there "
+            "yet, and restart the unit instead"
         )
 
 

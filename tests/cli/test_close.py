@@ -612,8 +612,8 @@ def test_what_systemd_does_not_start_is_done_by_hand(
     assert "/talker: process 4711, known by its process id: by hand, in both.s" in robot.close().out
     ended = robot.close("--apply", status=1)
     assert robot.restarts == []
-    advice = "both.service starts it: put this command into the unit or its script, and restart"
-    assert ended.out.count(f"  {advice} the unit instead\n") == 2
+    advice = "both.service starts it: put this command into the unit or its script, if it is not"
+    assert ended.out.count(f"  {advice} there yet, and restart the unit instead\n") == 2
     assert (robot.folder / "robot/start/commands.txt").read_text().count(f"# {advice}") == 2
     robot.units = {}
     assert "stop process 4711, and start again with:\n  cd /opt && sros run " in ended.out
@@ -1359,6 +1359,9 @@ def test_a_unit_that_was_replaced_is_not_started_again(
     assert ended.out.count("both.service starts it: ") == 2
     assert "also open: process 9 (run); stop these processes, too" in ended.err
     assert "starts no stopped unit" not in robot.close("--undo", "--dry-run").err
+    robot.by_hand = {*PID}
+    assert "starts no stopped unit" not in robot.close("--undo", "--dry-run").err
+    robot.by_hand = set()
     robot.more, robot.units = (), {**UNITS, "/talker": "new.service"}
     assert ": --apply restarts new.service" in robot.close().out
     robot.close("--apply")
@@ -2303,7 +2306,7 @@ def test_units_restart_in_order_and_keep_the_drop_ins_of_removed_processes(
     said = robot.close("--elsewhere", "/listener", status=1).err
     unit = "listener.service"
     stays = f"{robot.folder}/systemd/{unit}.d/sros-close.conf stays, so {unit} cannot start open"
-    assert f": it was for an enclave without a known process; {stays} (--undo removes" in said
+    assert f": no known process needs it; {stays} (--undo removes" in said
 
 
 def test_an_enclave_that_gets_another_name_keeps_its_process(robot: Robot) -> None:
