@@ -87,7 +87,7 @@ def _run(words: Sequence[str], shows_messages: bool) -> tuple[int, str, str]:
     "accept a requirements.toml that is missing or cannot be checked, and requirements on names "
     "that the policy no longer has. connections: accept processes of which sros cannot see whether "
     "they hear the others, because they do not share the memory of Fast DDS. domains: accept "
-    "processes that are also in another domain.  Can be repeated.",
+    "processes that are also in another domain, or open in another network.  Can be repeated.",
 )
 @click.option("--partial", is_flag=True, help="Accept everything that --accept can accept.")
 @click.option(

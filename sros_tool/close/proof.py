@@ -84,7 +84,7 @@ from sros_tool.policy.rights import (
 )
 from sros_tool.proof.requirements import Must, read_requirements
 from sros_tool.runtime.environment import ROS_ARGS, named_enclave
-from sros_tool.runtime.rmw import RMW
+from sros_tool.runtime.processes import Process
 from sros_tool.runtime.unit_properties import unit_properties
 from sros_tool.runtime.variables import ENCLAVE
 from sros_tool.validity import iso
@@ -426,23 +426,19 @@ def _proof_of_silence(robot: LocalRobot, before: Observation, *, hears: bool) ->
     Before the robot was closed, the listener saw the nodes ``before``. Seeing none now proves
     something only if the observer ``hears`` the robot in its enclave.
     """
-    words = ("generate_policy", str(robot.folder / "open.xml"), "--domain", str(robot.domain))
+    unwritten, domain = str(robot.folder / "open.xml"), str(robot.domain)
+    words = ("generate_policy", unwritten, "--domain", domain, "--dry-run", "--json")
     try:
-        _, value = robot.shell.read_json((*words, "--dry-run", "--json"))
+        values = [robot.shell.read_json(words)[1]]
+        # On Cyclone DDS, a listener without these variables does not see nodes that have them.
+        if narrow := _narrow_discovery(robot.shell.environment):
+            values.append(robot.shell.read_json(words, without=narrow)[1])
     except UnavailableError as error:
         return Proof(SILENCE, None, f"{error}")
-    nodes = {f"{node['namespace'].rstrip('/')}/{node['name']}" for node in value["nodes"]}
-    found = [first_few(sorted(nodes), MOST_NAMES)] if nodes else []
-    # Nodes without endpoints, and programs without ROS, are only in notes.
-    found += [
-        f"{_OTHERS_SEEN[note['id']]} {note['text'].partition(': ')[2]}"
-        for note in value["notes"]
-        if note["id"] in _OTHERS_SEEN
-    ]
-    if found:
+    if found := [*dict.fromkeys(chain(*map(_found_by_listener, values)))]:
         text = f"it sees {enumerated(found)}; stop what runs open, or start it in its enclave"
         return Proof(SILENCE, False, text)
-    if not value["settled"]:
+    if not all(value["settled"] for value in values):
         why = "the ROS graph kept changing, or could not be read in time, so the listener may have "
         why += "missed nodes; run the proof again"
         return Proof(SILENCE, None, why)
@@ -450,35 +446,32 @@ def _proof_of_silence(robot: LocalRobot, before: Observation, *, hears: bool) ->
         why = "this proves nothing, because the observer in its enclave does not see the robot now"
         return Proof(SILENCE, None, why)
     reason = f"the listener saw {nodes_text(before.nodes)} before, and sees none now"
-    environment = robot.shell.environment
-    if not (narrow := _narrow_discovery(environment)):
-        return Proof(SILENCE, True, reason)
-    settings = enumerated([f"{name}={value}" for name, value in narrow.items()])
-    only_here = f"with {settings} in this shell, the listener sees only this machine: unset "
-    only_here += enumerated([*narrow])
-    if environment.get(RMW, "").startswith("rmw_cyclonedds"):
-        # The observer would no longer see the nodes that run with these variables.
-        listen = shlex.join(("sros", *words, "--dry-run"))
-        return Proof(SILENCE, True, reason, details=[f"{only_here}, and listen again: `{listen}`"])
-    return Proof(SILENCE, None, f"{only_here}, and run the proof again")
+    return Proof(SILENCE, True, reason)
 
 
-def _narrow_discovery(environment: Mapping[str, str]) -> Mapping[str, str]:
+def _found_by_listener(value: Mapping[str, Any]) -> Iterator[str]:
+    """Yield what the JSON of `generate_policy` shows: nodes, and what belongs to no ROS node."""
+    nodes = {f"{node['namespace'].rstrip('/')}/{node['name']}" for node in value["nodes"]}
+    if nodes:
+        yield first_few(sorted(nodes), MOST_NAMES)
+    # Nodes without endpoints, and programs without ROS, are only in notes.
+    for note in value["notes"]:
+        if note["id"] in _OTHERS_SEEN:
+            yield f"{_OTHERS_SEEN[note['id']]} {note['text'].partition(': ')[2]}"
+
+
+def _narrow_discovery(environment: Mapping[str, str]) -> Collection[str]:
     """Return the variables that keep the listener from seeing other machines.
 
     rmw_zenoh ignores these variables. Source: rcl/src/rcl/discovery_options.c and localhost.c.
     """
     if is_zenoh(environment):
-        return {}
+        return []
     wide_values = {
         "ROS_AUTOMATIC_DISCOVERY_RANGE": ("", "SUBNET", "SYSTEM_DEFAULT"),
         "ROS_LOCALHOST_ONLY": ("", "0"),
     }
-    return {
-        name: value
-        for name, wide in wide_values.items()
-        if (value := environment.get(name, "")) not in wide
-    }
+    return [name for name, wide in wide_values.items() if environment.get(name, "") not in wide]
 
 
 def _proof_of_processes(
@@ -526,7 +519,7 @@ def _proof_of_processes(
         done = "" if wrong else f"true for {number}; "
         text = f"{done}{first_few(texts, MOST_NAMES, '; ')}"
     else:
-        text += "".join(f"; {guest}" for guest in _texts_of_all(_open_elsewhere, looks))
+        text += "".join(f"; {guest}" for guest in _texts_of_all(_open_in_other_domains, looks))
     return Proof(STARTED, False if wrong else None if findings else True, text)
 
 
@@ -552,7 +545,10 @@ def _proof_of_observed_processes(looks: Sequence[RunningRobot]) -> Iterator[Proo
 
 
 def _proof_of_domains(looks: Sequence[RunningRobot]) -> Iterator[Proof]:
-    """Yield an undecided proof if a process of the domain is also in other domains."""
+    """Yield an undecided proof for processes that are also in other domains, and one for networks.
+
+    The latter is for open processes of the domain in another network namespace.
+    """
     found = {
         process.label: process
         for running in looks
@@ -570,6 +566,15 @@ def _proof_of_domains(looks: Sequence[RunningRobot]) -> Iterator[Proof]:
             f"{first_few(texts, MOST_NAMES, '; ')}; a program can leave out security there: accept "
             f"this if {look} finds no node of it",
         )
+    domain = looks[-1].robot.domain
+    if others := _texts_of_all(_open_in_other_networks, looks):
+        yield Proof(
+            ALONE,
+            None,
+            f"{first_few(others, MOST_NAMES)} in domain {domain} of another network "
+            "namespace, where the listener does not look: accept this if no other machine reaches "
+            "this domain there, or stop what runs open",
+        )
 
 
 def _process_findings(running: RunningRobot) -> list[Finding]:
@@ -586,23 +591,26 @@ def _process_findings(running: RunningRobot) -> list[Finding]:
     ]
 
 
-def _open_elsewhere(running: RunningRobot) -> Iterator[str]:
-    """Yield texts on the open processes in other domains, or in another network namespace.
-
-    Of other network namespaces, only processes of the robot's domain are named. Most of them are in
-    containers that no other machine reaches.
-    """
-    in_domain, domain = running.in_domain, running.robot.domain
-    for process in running.processes.processes:
-        if process.enclave or process.is_daemon or process in in_domain:
-            continue
+def _open_in_other_domains(running: RunningRobot) -> Iterator[str]:
+    """Yield texts on the open processes in other domains of the robot's network namespace."""
+    for process in _open_beside(running):
         if not process.network:
             yield f"{process.label} runs open in domain {process.domain}"
-        elif is_in_domain(replace(process, network=""), domain):
-            yield (
-                f"{process.label} runs open in domain {process.domain} of another network "
-                "namespace, where this proof does not look: find out who reaches it"
-            )
+
+
+def _open_in_other_networks(running: RunningRobot) -> Iterator[str]:
+    """Yield texts on the open processes in the robot's domain of another network namespace."""
+    for process in _open_beside(running):
+        if process.network and is_in_domain(replace(process, network=""), running.robot.domain):
+            yield f"{process.label} runs open"
+
+
+def _open_beside(running: RunningRobot) -> Iterator[Process]:
+    """Yield the open processes that are not in the robot's domain."""
+    in_domain = running.in_domain
+    for process in running.processes.processes:
+        if not (process.enclave or process.is_daemon or process in in_domain):
+            yield process
 
 
 def _log_command(robot: LocalRobot, unit: str = "") -> str:

@@ -6,7 +6,14 @@ import fcntl
 import json
 import os
 import shlex
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import (
+    Callable,
+    Collection,
+    Iterable,
+    Iterator,
+    MutableMapping,
+    Sequence,
+)
 from contextlib import contextmanager
 from datetime import datetime, tzinfo
 from pathlib import Path
@@ -55,7 +62,7 @@ class Shell(NamedTuple):
 
     run: Callable[[Sequence[str], bool], tuple[int, str, str]]
     say: Callable[[str], None]
-    environment: Mapping[str, str]
+    environment: MutableMapping[str, str]
     now: Callable[[], datetime]
     zone: tzinfo
 
@@ -64,10 +71,15 @@ class Shell(NamedTuple):
         for line in text.splitlines():
             self.say(line)
 
-    def read_json(self, words: Sequence[str]) -> tuple[int, Any]:
-        """Show and run a verb; return its status and the JSON that it prints."""
-        self.say(f"+ sros {shlex.join(words)}")
-        status, output, _ = self.run(words, False)
+    def read_json(self, words: Sequence[str], without: Collection[str] = ()) -> tuple[int, Any]:
+        """Show and run a verb ``without`` variables; return its status and the JSON it prints."""
+        unset = "".join(f"-u {name} " for name in without)
+        self.say(f"+ {f'env {unset}' if unset else ''}sros {shlex.join(words)}")
+        removed = {name: self.environment.pop(name) for name in without}
+        try:
+            status, output, _ = self.run(words, False)
+        finally:
+            self.environment.update(removed)
         return status, json.loads(output)
 
     def check(self, *words: str) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -23,6 +24,7 @@ from sros_tool.close.proof import (
     _unseen_text,
     _without_counterpart,
 )
+from sros_tool.close.robot import Shell
 from sros_tool.explain.audit import DeniedRight
 from sros_tool.graph.observation import Endpoint, Observation, make_observation
 from sros_tool.keystore.expiry import Lifetime
@@ -286,35 +288,52 @@ def test_an_observer_that_did_not_see_everything_proves_no_silence(is_settled: b
     assert proof.holds is (True if is_settled else None)
 
 
-def robot_beside_graph(value: dict[str, Any], **environment: str) -> Any:
-    shell = SimpleNamespace(read_json=lambda _: (1, value), environment=environment)
+def robot_beside_graph(*values: dict[str, Any], **environment: str) -> Any:
+    """Return a robot whose shell reads these JSON values, one for each listener."""
+    left = iter(values)
+    shell = SimpleNamespace(read_json=lambda _, without=(): (1, next(left)))
+    shell.environment = environment
     return SimpleNamespace(folder=Path("robot"), domain=0, shell=shell)
 
 
 @pytest.mark.parametrize(
-    ("variables", "holds", "narrow"),
+    ("variables", "is_narrow"),
     [
-        ({}, True, ""),
-        ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "SYSTEM_DEFAULT", "ROS_LOCALHOST_ONLY": "0"}, True, ""),
-        ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "subnet"}, None, "ROS_AUTOMATIC_DISCOVERY_RANGE=subnet"),
-        ({"ROS_LOCALHOST_ONLY": "1"}, None, "ROS_LOCALHOST_ONLY=1"),
-        (
-            {"ROS_LOCALHOST_ONLY": "1", "RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp"},
-            True,
-            "ROS_LOCALHOST_ONLY=1",
-        ),
-        ({"ROS_LOCALHOST_ONLY": "1", "RMW_IMPLEMENTATION": "rmw_zenoh_cpp"}, True, ""),
+        ({}, False),
+        ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "SYSTEM_DEFAULT", "ROS_LOCALHOST_ONLY": "0"}, False),
+        ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "subnet"}, True),
+        ({"ROS_LOCALHOST_ONLY": "1"}, True),
+        ({"ROS_LOCALHOST_ONLY": "1", "RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp"}, True),
+        ({"ROS_LOCALHOST_ONLY": "1", "RMW_IMPLEMENTATION": "rmw_zenoh_cpp"}, False),
     ],
 )
-def test_a_listener_that_sees_only_this_machine_proves_no_silence(
-    variables: dict[str, str], holds: bool | None, narrow: str
+def test_a_listener_that_sees_only_this_machine_is_not_the_only_one(
+    variables: dict[str, str], is_narrow: bool
 ) -> None:
-    """On Cyclone DDS, an observer without the variables does not see nodes that have them."""
-    robot = robot_beside_graph({"nodes": [], "notes": [], "settled": True}, **variables)
-    said = _proof_of_silence(robot, Observation(), hears=True)
-    assert said.holds is holds
-    text = "".join(said.details) if holds else said.reason
-    assert text.partition(" in this shell")[0] == (f"with {narrow}" if narrow else "")
+    """The second one sees other machines, but, on Cyclone DDS, not the nodes on this one."""
+    nothing: dict[str, Any] = {"nodes": [], "notes": [], "settled": True}
+    open_node = nothing | {"nodes": [{"namespace": "/far", "name": "open"}]}
+    for seen, holds in (
+        ([nothing, nothing], True),
+        ([nothing, open_node], not is_narrow),
+        ([open_node, nothing], False),
+        ([nothing, nothing | {"settled": False}], None if is_narrow else True),
+    ):
+        proof = _proof_of_silence(robot_beside_graph(*seen, **variables), Observation(), hears=True)
+        assert proof.holds is holds, seen
+
+
+def test_a_verb_without_variables_leaves_them_as_they_were() -> None:
+    variables, said = {"ROS_LOCALHOST_ONLY": "1", "HOME": "/home"}, list[str]()
+
+    def run(words: Sequence[str], _: bool) -> tuple[int, str, str]:
+        assert [*variables] == ["HOME"]
+        return 0, f'{{"seen": "{words[0]}"}}', ""
+
+    shell = Shell(run, said.append, variables, lambda: datetime.now(UTC), UTC)
+    assert shell.read_json(["audit"], ["ROS_LOCALHOST_ONLY"]) == (0, {"seen": "audit"})
+    assert said == ["+ env -u ROS_LOCALHOST_ONLY sros audit"]
+    assert variables == {"ROS_LOCALHOST_ONLY": "1", "HOME": "/home"}
 
 
 @pytest.mark.parametrize(
