@@ -36,7 +36,7 @@ from sros_tool.names import (
     right_to_use,
 )
 from sros_tool.policy.model import OFFERING_RIGHT, PEER_RIGHT, RIGHTS, below_namespace
-from sros_tool.policy.patterns import covers
+from sros_tool.policy.patterns import OTHER_NAMESPACE, covers
 from sros_tool.policy.rights import KIND_OF, is_of_every_node
 from sros_tool.proof.requirements import (
     EXCEPT,
@@ -303,18 +303,16 @@ def _matching_enclaves(
 ) -> set[str]:
     """Return the enclaves that match a pattern of the list, and no exception in the list.
 
-    Enclaves, and patterns that begin with ``/``, are in a namespace, but are written without it.
+    The enclaves are in a namespace, but are written without it; `OTHER_NAMESPACE` in a pattern
+    stands for this namespace.
     """
     matching: set[str] = set()
     excepted: set[str] = set()
+    below = {below_namespace(path, namespace): path for path in enclaves}
     for pattern in patterns:
         to = excepted if pattern[0] == EXCEPT else matching
-        name = pattern.removeprefix(EXCEPT)
-        if name[0] == "/" or namespace == "/":
-            to.update(fnmatch.filter(enclaves, name))
-        else:
-            below = {below_namespace(path, namespace): path for path in enclaves}
-            to.update(below[path] for path in fnmatch.filter(below, name))
+        name = pattern.removeprefix(EXCEPT).replace(OTHER_NAMESPACE, namespace)
+        to.update(below[path] for path in fnmatch.filter(below, name))
     return matching - excepted
 
 
@@ -325,7 +323,7 @@ def restricted_enclaves(
 
     The requirement and the enclaves are in ``namespace``, but are written without it.
     """
-    match requirement:
+    match requirement.elsewhere if requirement.elsewhere and namespace != "/" else requirement:
         case Only(enclaves=listed):
             return (set(enclaves) - _matching_enclaves(listed, enclaves, namespace),)
         case Widest(enclaves=listed) | NothingBut(enclaves=listed):

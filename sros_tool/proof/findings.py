@@ -590,12 +590,9 @@ def _edit_text(violation: Violation) -> str:
     space = requirement.namespace.rstrip("/")
     outside = sorted(name for name in enclaves if not name.startswith(f"{space}/"))
     if outside:
-        effect += (
-            f"; *{outside[0]} also allows /stranger{outside[0]}, so if a package ships the file, "
-            "write it only into a copy"
-        )
+        effect += "; if a package ships the file, write this only into a copy"
     written = {
-        name.removeprefix(space) if name.startswith(f"{space}/") else f"*{name}"
+        name.removeprefix(space) if name.startswith(f"{space}/") else f"/{name}"
         for name in enclaves
     }
     place, quoted = requirement.source, [f'"{name}"' for name in sorted(written)]

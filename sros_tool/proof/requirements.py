@@ -10,6 +10,7 @@ A requirement is a table of the file, such as::
 Names are ROS names, with the wildcards of policies; enclaves are names or patterns, as for
 ``--match``, and ``!`` before a name excepts an enclave from a list.  A file can be read for a
 namespace: then all enclaves, and the names without ``/`` or ``*`` at their beginning, are below it.
+An enclave with ``//`` at its beginning stays: ``//tool/*`` is ``/tool/*`` in every namespace.
 A file can also be read with remappings of names, such as the remappings of a node's command line.
 The docstrings of the classes state the demands of the kinds.
 
@@ -62,6 +63,8 @@ _MOST_FILLED = 20_000  # after filling in the robots of a fleet
 _LONGEST_TEXT = 500  # characters of a name or a reason
 EXCEPT = "!"
 """Prefix of an enclave that is excepted from a list of enclaves."""
+_UNMOVED = "//"
+"""Beginning of an enclave that does not move with the namespace."""
 _WORD_KEYS = ("name", "why")
 """Keys with words, which are in every table."""
 _KEYS_WITHOUT_NAMES = (*_WORD_KEYS, "enclave", "enclaves", "from", "to", "through", "level")
@@ -603,10 +606,7 @@ class _Table:
         enclaves = self.texts(key)
         for enclave in enclaves:
             name = enclave.removeprefix(EXCEPT)
-            problem = "" if name == "/" else expression_problem(name)
-            if not problem and name[0] not in "/*?[":
-                problem = "An enclave begins with '/'."
-            if problem:
+            if problem := _enclave_problem(name, "/*?["):
                 raise self.error(key, f"{shortened(enclave)} is not an enclave", problem)
         if all(enclave.startswith(EXCEPT) for enclave in enclaves):
             raise self.error(
@@ -617,9 +617,11 @@ class _Table:
         return tuple(map(self.enclave_below, enclaves))
 
     def enclave_below(self, enclave: str) -> str:
-        """Return an enclave or pattern below the namespace; a pattern for all enclaves stays."""
+        """Return an enclave or pattern below the namespace; only ``/`` alone makes it move."""
         begin = EXCEPT if enclave.startswith(EXCEPT) else ""
         name = enclave.removeprefix(begin)
+        if name.startswith(_UNMOVED):
+            return begin + name[1:]
         return begin + below_namespace(name, self.namespace) if name.startswith("/") else enclave
 
     def rights(self, *, least: int = 1) -> RightNames:
@@ -662,6 +664,15 @@ class _Table:
             problem = f"{key} is missing in [[{self.kind}]]"
         place = Source(self.source.file, self.lines.get(key, self.source.line))
         return DocumentError(f"{place}: {problem}", why, remedy)
+
+
+def _enclave_problem(name: str, beginnings: str = "/") -> str:
+    """Return why an enclave in a requirement is not valid, as a sentence, or ""."""
+    plain = name[1:] if name.startswith(_UNMOVED) else name
+    problem = "" if name == "/" else expression_problem(plain)
+    if not problem and name[0] not in beginnings:
+        problem = "An enclave begins with '/'."
+    return problem
 
 
 # ── placeholders ───────────────────────────────────────────────────────────────────────────
@@ -834,15 +845,11 @@ def _nobody_from(table: _Table) -> Nobody:
 def _must_from(table: _Table) -> Must:
     common = table.common_arguments(*KIND_OF, "enclave")
     enclave = table.text("enclave")
-    problem = expression_problem(enclave)
+    problem = _enclave_problem(enclave)
     if is_expression(enclave):
         problem = "It has a wildcard: write a table for every enclave that must have the rights."
-    if enclave != "/" and (problem or not enclave.startswith("/")):
-        raise table.error(
-            "enclave",
-            f"{shortened(enclave)} is not an enclave",
-            problem or "An enclave begins with '/'.",
-        )
+    if problem:
+        raise table.error("enclave", f"{shortened(enclave)} is not an enclave", problem)
     return Must(**common, rights=table.rights(), enclave=table.enclave_below(enclave))
 
 

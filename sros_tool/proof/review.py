@@ -1679,9 +1679,11 @@ def _namespaces_of_patterns(requirement: Requirement) -> list[str]:
     Raises:
         DocumentError: there are more namespaces than a review tries.
     """
-    fixed = (name for name in patterns_of_enclaves(requirement) if not name.startswith("/"))
-    is_moving = requirement.is_relative and requirement.elsewhere
-    namespaces = dict.fromkeys(["/", *(_namespaces_in(fixed) if is_moving else ())])
+    namespaces = dict.fromkeys(["/"])
+    if requirement.is_relative and requirement.elsewhere:
+        moved = patterns_of_enclaves(requirement.elsewhere)
+        fixed = (name for name in patterns_of_enclaves(requirement) if name in moved)
+        namespaces |= dict.fromkeys(_namespaces_in(fixed))
     if len(namespaces) > _MOST_NAMESPACES + 1:
         raise DocumentError(
             f"the enclaves of a requirement name more than {_MOST_NAMESPACES} namespaces: "

@@ -199,7 +199,7 @@ def test_after_the_edit_that_a_finding_names_the_requirement_holds(
 WEB_AND_MOTOR = {"/n/web": may("publish", "/cmd"), "/n/motor": may("subscribe", "/cmd")}
 
 
-@pytest.mark.parametrize(("namespace", "edit"), [("/n", '"/web"'), ("/m", '"*/n/web"')])
+@pytest.mark.parametrize(("namespace", "edit"), [("/n", '"/web"'), ("/m", '"//n/web"')])
 def test_an_edit_in_a_namespace(namespace: str, edit: str) -> None:
     required = '[[only]]\npublish = ["/cmd"]\nenclaves = ["/motor"ADDED]\n'
     for added, edits in (("", [edit]), (f", {edit}", [])):
@@ -300,7 +300,7 @@ PACKAGE = {**ROBOT, "/r/c": may("publish", "/z") + SERVED}
 @pytest.mark.parametrize(
     "required",
     [
-        '[[only]]\npublish = ["x"]\nenclaves = ["/r/*", "*/operator/*"]',
+        '[[only]]\npublish = ["x"]\nenclaves = ["/r/*", "//operator/*"]',
         '[[at_most]]\npublish = ["x"]\nenclaves = 3',
         # Nobody has the right yet, but an enclave has the other side of the name.
         '[[only]]\nsubscribe = ["z"]\nenclaves = ["/r/b", "*/operator/*"]',

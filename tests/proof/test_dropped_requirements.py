@@ -122,6 +122,15 @@ def test_an_exception_of_some_namespaces_is_weakened() -> None:
     assert dropped_requirements(after, after) == ()
 
 
+def test_an_enclave_that_begins_to_move_with_the_namespace_or_stops_is_weakened() -> None:
+    """Twin: ``//x`` in place of ``*/x`` is stricter."""
+    moving, unmoved, anywhere = (read(ONLY.replace('"/y"', f'"{at}y"')) for at in ("/", "//", "*/"))
+    for before, after in ((moving, unmoved), (unmoved, moving), (unmoved, anywhere)):
+        (found,) = dropped_requirements(before, after)
+        assert found.only_elsewhere is (after is not anywhere)
+    assert dropped_requirements(anywhere, unmoved) == ()
+
+
 def test_another_kind_that_stays_is_weakened() -> None:
     before, after = read(ONLY.replace('"/a"', '"a"')), read('[[nobody]]\npublish = ["/a", "/b*"]\n')
     (found,) = dropped_requirements(before, after)

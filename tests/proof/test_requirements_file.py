@@ -154,6 +154,7 @@ WRONG = {
     '[[only]]\npublish = ["/x"]\nenclaves = ["robot"]': "r.toml:3: 'robot' is not an enclave",
     '[[must]]\npublish = ["/x"]\nenclave = "/a*"': "r.toml:3: '/a*' is not an enclave",
     '[[must]]\npublish = ["/x"]\nenclave = "a"': "r.toml:3: 'a' is not an enclave",
+    '[[only]]\npublish = ["/x"]\nenclaves = ["///a"]': "r.toml:3: '///a' is not an enclave",
     '[[must]]\npublish = ["/x"]': "r.toml:1: enclave is missing in [[must]]",
     '[[at_most]]\npublish = ["/x"]\nenclaves = 0': "r.toml:3: enclaves has 0",
     '[[at_most]]\npublish = ["/x"]\nenclaves = true': "r.toml:3: enclaves has True",
@@ -225,8 +226,8 @@ enclave = "/"
 first = { publish = ["cmd"] }
 second = { call = ["/dock"] }
 [[apart]]
-from = ["*"]
-to = ["/base"]
+from = ["*", "!//arm/*"]
+to = ["/base", "//web"]
 """
     plain, *_ = parse_requirements(text, "r.toml")
     assert demand(plain) == ("only /mux, /arm/* (but not /arm/tool) may publish /cmd, /tf, */stop")
@@ -238,5 +239,5 @@ to = ["/base"]
         "only /left/mux, /left/arm/* (but not /left/arm/tool) may publish /left/cmd, /tf, */stop",
         "/left has to be able to request /left/open",
         "nobody may both publish /left/cmd and call action /dock",
-        "* must not influence /left/base",
+        "* (but not /arm/*) must not influence /left/base, /web",
     ]

@@ -1210,7 +1210,7 @@ def _moved(node: str, path: str, enclaves: dict[str, str] = _NODES) -> dict[str,
             ),
             (
                 _NODES,
-                '[[only]]\npublish = ["cmd"]\nenclaves = ["/drive", "*/arm/operator/*"]\n',
+                '[[only]]\npublish = ["cmd"]\nenclaves = ["/drive", "//arm/operator/*"]\n',
                 _moved("eye", "/operator/eye"),
                 "node /eye moves to enclave /operator/eye, where the requirement does not apply "
                 "for users in namespace /arm",

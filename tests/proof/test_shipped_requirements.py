@@ -163,19 +163,25 @@ def test_each_kind_has_a_change_that_breaks_it(requirements: tuple[Requirement, 
 
 
 def test_operators_break_no_requirement_of_the_page_for_packages(tmp_path: Path) -> None:
-    """Twin: without the exception, operators break each of its requirements."""
+    """Twins: the operators of another package, or requirements without the exception."""
     page = (policies_dir().parent / "docs/howto/package.md").read_text()
     (text,) = re.findall(r"requirements.toml -->\n```toml\n(.*?)```", page, re.DOTALL)
-    (operators := tmp_path / "operators.xml").write_bytes(
-        merge_policies(
-            policies_dir() / "operator_configure.xml",
-            [read_policy(policies_dir() / "operator_drive.xml")],
-            may_include=False,
-        ).document
-    )
+    operators, empty = tmp_path / "operators.xml", tmp_path / "empty.xml"
+    empty.write_text('<policy version="0.2.0"><enclaves/></policy>')
     for name in ("common", "operator"):
         shutil.copytree(policies_dir() / name, tmp_path / name)
-    for written, broken in ((text, 0), (text.replace("*/operator/*", "*/arm"), 2)):
+    for written, namespace, broken in (
+        (text, None, 0),
+        (text, "/vendor", 2),
+        (text, "/left", 2),
+        (text.replace("//operator/*", "/arm"), None, 2),
+    ):
+        added = [
+            read_policy(policies_dir() / f"operator_{role}.xml") for role in ("configure", "drive")
+        ]
+        operators.write_bytes(
+            merge_policies(empty, added, may_include=False, namespace=namespace).document
+        )
         (required := tmp_path / "r.toml").write_text(written)
         found = check_requirements(operators, required, namespaces=["/left"])
         lines = {each.line for each in found if each.id == "requirement.violated"}
