@@ -44,6 +44,17 @@ MISSPELLED_ENCLAVE = FindingKind(
     "Correct the name in the requirement. If both enclaves are meant, and only other robots have "
     "the missing one, leave this finding out: `--exclude requirement.misspelled-enclave`.",
 )
+ALLOWED_BY_NAME = FindingKind(
+    "requirement.allowed-by-name",
+    NOTE,
+    "access that a requirement allows to every enclave with such a name",
+    "The pattern of enclaves begins with a wildcard, so enclaves of any package can match it.",
+    "The requirements file.",
+    "If these enclaves are meant, ignore this finding. Otherwise, name the enclaves that are meant "
+    "in the requirement: `//operator/*` is only the robot's own /operator/*, whatever the "
+    "namespace.",
+    prominent=True,
+)
 UNNAMED = FindingKind(
     "requirement.unnamed",
     NOTE,

@@ -62,7 +62,7 @@ from sros_tool.proof.worlds import (
     valid_topics,
 )
 from sros_tool.reach import OF_EVERY_NODE, QUESTIONS
-from sros_tool.wording import counted
+from sros_tool.wording import counted, first_few
 
 MOST_STEPS = 8_000_000
 """Maximum number of search steps for names that several wildcards match: about twenty seconds."""
@@ -115,7 +115,8 @@ class Verdict:
     demanded use whose messages do not pass between Zenoh routers, or None. ``unnamed`` are names in
     the requirement that no right states, and that only wildcards match. ``unserved`` are clauses on
     services and actions that an enclave may use, and that nobody serves; ``unheard`` are clauses on
-    topics of which enclaves have only the right in the requirement.
+    topics of which enclaves have only the right in the requirement. ``by_name`` are uses that an
+    `Only` allows only by patterns that begin with a wildcard.
     """
 
     requirement: Requirement
@@ -127,6 +128,7 @@ class Verdict:
     blocked: BlockedUse | None = None
     unnamed: tuple[str, ...] = ()
     absent: tuple[str, ...] = ()
+    by_name: tuple[Use, ...] = ()
     unserved: tuple[str, ...] = ()
     unheard: tuple[str, ...] = ()
 
@@ -213,6 +215,7 @@ def decide(requirement: Requirement, world: World, limit: SearchLimit | None = N
     blocked = None
     if isinstance(requirement, Must) and not witness and world.crossing:
         blocked = _use_blocked_by_routers(requirement, world, limit)
+    by_name = _uses_by_name(requirement, world, limit) if isinstance(requirement, Only) else ()
     return Verdict(
         requirement,
         witness,
@@ -223,6 +226,7 @@ def decide(requirement: Requirement, world: World, limit: SearchLimit | None = N
         blocked,
         tuple(unused_names.unnamed),
         absent=tuple(name for name in exceptions if name.removeprefix(EXCEPT) not in world.away),
+        by_name=tuple(by_name),
         unserved=tuple(unused_names.unserved),
         unheard=tuple(unused_names.unheard),
     )
@@ -368,6 +372,27 @@ def _uses_of_rights(
             if topic := world.example_of_use(met, topics, limit):
                 uses[met.enclave].append(_use(met.enclave, right, part, topics, topic))
     return uses
+
+
+def _uses_by_name(requirement: Only, world: World, limit: SearchLimit) -> Iterator[Use]:
+    """Yield a use of each enclave that only a pattern such as ``*/operator/*`` allows."""
+    clear = [name for name in requirement.enclaves if not _is_of_any_package(name)]
+    if len(clear) == len(requirement.enclaves):
+        return
+    allowed = _matching_enclaves(requirement.enclaves, world.enclaves)
+    uses = _uses_of_rights(requirement.rights, world, limit, clear)
+    for enclave in sorted(allowed & uses.keys()):
+        yield min(uses[enclave], key=_use_order)
+
+
+def _is_of_any_package(pattern: str) -> bool:
+    """Return whether enclaves of any package can match a pattern that does not match them all."""
+    return pattern[0] not in ("/", EXCEPT) and not covers(pattern, "/*")
+
+
+def patterns_of_any_package(requirement: Only) -> str:
+    """Return the patterns of a requirement that enclaves of any package can match, as a list."""
+    return first_few([*filter(_is_of_any_package, requirement.enclaves)], 3)
 
 
 def _shortest_use_as_witness(uses: Mapping[str, Sequence[Use]]) -> Witness | None:

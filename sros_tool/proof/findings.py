@@ -10,6 +10,7 @@ from shlex import quote
 from sros_tool.automata import SearchLimit
 from sros_tool.checks.kind import Finding, FindingKind, RelatedPlace
 from sros_tool.checks.requirements import (
+    ALLOWED_BY_NAME,
     ASSUMED,
     HOLDS_ALONE,
     MISSPELLED_ENCLAVE,
@@ -44,6 +45,7 @@ from sros_tool.proof.decide import (
     Verdict,
     Witness,
     Worlds,
+    patterns_of_any_package,
     similar_enclave_clause,
 )
 from sros_tool.proof.requirements import (
@@ -184,7 +186,8 @@ class Decisions:
     exist, with clauses on these exceptions. ``misspelled`` are the same, if an enclave with a
     similar name exists. ``unanswered`` are requirements about names of which enclaves have only one
     side, with clauses on these names; ``unanswered_alone`` are the same, if perhaps only users of a
-    package have the other side.
+    package have the other side. ``by_name`` are requirements with uses that they allow only by a
+    pattern that enclaves of any package can match.
     """
 
     violations: tuple[Violation, ...]
@@ -198,6 +201,7 @@ class Decisions:
     misspelled: tuple[tuple[Requirement, tuple[str, ...]], ...] = ()
     unanswered: tuple[tuple[Requirement, tuple[str, ...]], ...] = ()
     unanswered_alone: tuple[tuple[Requirement, tuple[str, ...]], ...] = ()
+    by_name: tuple[tuple[Only, tuple[Step, ...]], ...] = ()
 
 
 def decide_all(requirements: Sequence[Requirement], system: System) -> Decisions:
@@ -207,6 +211,7 @@ def decide_all(requirements: Sequence[Requirement], system: System) -> Decisions
         DocumentError: there are too many wildcards to decide a requirement.
     """
     violations, assumed, blocked, unnamed = [], [], [], []
+    by_name: list[tuple[Only, tuple[Step, ...]]] = []
     vacuous: list[tuple[Requirement, tuple[str, ...]]] = []
     holding_alone: list[tuple[Requirement, tuple[str, ...]]] = []
     absent: list[tuple[Requirement, tuple[str, ...]]] = []
@@ -266,6 +271,13 @@ def decide_all(requirements: Sequence[Requirement], system: System) -> Decisions
             assumed_names := [verdict.assumed for _, verdict in verdicts if verdict.assumed]
         ):
             assumed.append((requirement, assumed_names[0]))
+        steps_by_name = {
+            use.enclave: _step(requirement, use, world, system)
+            for world, verdict in verdicts
+            for use in verdict.by_name
+        }
+        if isinstance(requirement, Only) and steps_by_name:
+            by_name.append((requirement, tuple(steps_by_name.values())))
         blocked += [(requirement, verdict.blocked) for _, verdict in verdicts if verdict.blocked][
             :1
         ]
@@ -281,6 +293,7 @@ def decide_all(requirements: Sequence[Requirement], system: System) -> Decisions
         misspelled=tuple(misspelled),
         unanswered=tuple(unanswered),
         unanswered_alone=tuple(unanswered_alone),
+        by_name=tuple(by_name),
     )
 
 
@@ -494,6 +507,7 @@ def decided_findings(
             _unnamed_finding(*unnamed, allowed)
             for unnamed in _without_namespace_repeats(decided.unnamed)
         ]
+    findings += [_by_name_finding(*allowed) for allowed in decided.by_name]
     findings += [_assumption_finding(*assumption) for assumption in decided.assumed]
     findings += [_not_crossing_finding(*blocked_use) for blocked_use in decided.blocked]
     if system.is_export:
@@ -706,6 +720,22 @@ def _part_finding(
     place = requirement.source
     text = f"{'; '.join(why)}; required: {demand(requirement)}"
     return kind.found(place.file, text, place.file, place.line, remedy)
+
+
+def _by_name_finding(requirement: Only, steps: Sequence[Step]) -> Finding:
+    """Return a finding on enclaves that a requirement allows only by a pattern for any package."""
+    allowed = _listed_names([step.use.enclave for step in steps])
+    text = f"{patterns_of_any_package(requirement)} allows this to {allowed}"
+    related = [
+        RelatedPlace(step.text(), step.source.file, step.source.line or None)
+        for step in steps[:_MOST_SHOWN]
+        if step.source
+    ]
+    place = requirement.source
+    text += f"; required: {demand(requirement)}"
+    return ALLOWED_BY_NAME.found(
+        place.file, text, place.file, place.line, related=tuple(dict.fromkeys(related))
+    )
 
 
 def _alone_remedy(

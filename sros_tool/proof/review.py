@@ -28,9 +28,16 @@ from sros_tool.checks.keystores.issued import (
     STALE,
 )
 from sros_tool.checks.keystores.opened import Circumstances
-from sros_tool.checks.kind import WARNING, ChosenFindings, Finding, FindingFilter
+from sros_tool.checks.kind import (
+    WARNING,
+    ChosenFindings,
+    Finding,
+    FindingFilter,
+    FindingKind,
+)
 from sros_tool.checks.policies import is_mended_by
 from sros_tool.checks.requirements import (
+    ALLOWED_BY_NAME,
     DROPPED,
     HOLDS_ALONE,
     MISSPELLED_ENCLAVE,
@@ -99,7 +106,11 @@ from sros_tool.proof.commit_files import (
     may_include_files,
     may_match,
 )
-from sros_tool.proof.decide import restricted_enclaves, rights_that_need_a_peer
+from sros_tool.proof.decide import (
+    patterns_of_any_package,
+    restricted_enclaves,
+    rights_that_need_a_peer,
+)
 from sros_tool.proof.findings import (
     GONE_REMEDY,
     common_namespaces,
@@ -1176,14 +1187,14 @@ class _Review:
         system: System,
         before: Iterable[Right],
         elsewhere: Callable[[], Iterable[Finding]],
-        known_notes: Callable[[], Collection[str]],
+        known_notes: Callable[[], Collection[tuple[FindingKind, str]]],
     ) -> tuple[int, ChosenFindings]:
         """Return the exit status and the findings on requirements, also in other namespaces."""
         asked = self.request
         decided = requirement_findings(requirements, system, before)
-        if any(finding.kind is HOLDS_ALONE for finding in decided):
+        if any(finding.kind in _LASTING_NOTES for finding in decided):
             known = known_notes()
-            decided = [of for of in decided if of.kind is not HOLDS_ALONE or of.text not in known]
+            decided = [of for of in decided if (of.kind, of.text) not in known]
         findings = [
             *decided,
             *left_out_robot_findings(system, asked.namespaces),
@@ -1199,10 +1210,10 @@ class _Review:
         earlier: Sequence[Requirement],
         system: System,
         sources: Callable[[], tuple[AccessSource, AccessSource]] | None,
-    ) -> Collection[str]:
-        """Return the texts of BASE's notes on requirements that only further enclaves could break.
+    ) -> Collection[tuple[FindingKind, str]]:
+        """Return kinds and texts of BASE's notes that each review would repeat.
 
-        Each review of a package would repeat them, and its change has not caused them.
+        The change has not caused them.
         """
         if system.is_keystore or self.request.fleet or not sources:
             return ()
@@ -1210,7 +1221,7 @@ class _Review:
             policy = Policy(tuple(sources()[0].enclaves.values()))
             before = policy_system(policy, self._circumstances(), self._template())
             findings = requirement_findings(earlier, replace(before, file=system.file))
-            return {finding.text for finding in findings if finding.kind is HOLDS_ALONE}
+            return {(of.kind, of.text) for of in findings if of.kind in _LASTING_NOTES}
         return ()
 
     def _failing_elsewhere(
@@ -1321,6 +1332,7 @@ class _Review:
         left = [*unanswered()]
         if sources:
             left += _findings_on_lost_restrictions(earlier, wanted_requirements, *sources, moves)
+            left += _findings_on_access_by_name(earlier, wanted_requirements, *sources, system)
         if not (dropped or left):
             return None
         assert self.base
@@ -1463,9 +1475,11 @@ def _namespaces_to_try(before: AccessSource, after: AccessSource) -> list[str]:
 
 
 _NOT_OF_DROPPED = tuple(
-    kind.id for kind in (VACUOUS, HOLDS_ALONE, MISSPELLED_ENCLAVE, UNKNOWN_ENCLAVE)
+    kind.id for kind in (VACUOUS, HOLDS_ALONE, MISSPELLED_ENCLAVE, UNKNOWN_ENCLAVE, ALLOWED_BY_NAME)
 )
 """Findings that a dropped requirement does not need."""
+_LASTING_NOTES = (HOLDS_ALONE, ALLOWED_BY_NAME)
+"""Notes that each review of a policy would repeat."""
 
 
 class _Failure(NamedTuple):
@@ -1606,6 +1620,43 @@ def _findings_on_lost_restrictions(
                 text = f"node {name} moves to {where} {to}, where the requirement does not apply"
                 text += f" for users in namespace {ns}" if ns != "/" else ""
                 remedy = "Let the requirement apply to the enclave, or approve this in the review."
+                yield DROPPED.found(str(requirement), text, place.file, place.line, remedy)
+
+
+def _findings_on_access_by_name(
+    earlier: Sequence[Requirement],
+    requirements: Sequence[Requirement],
+    before: AccessSource,
+    after: AccessSource,
+    system: System,
+) -> Iterator[Finding]:
+    """Yield a finding for each enclave that gains access by a pattern such as ``*/operator/*``.
+
+    Enclaves of any package can match such a pattern, so the owner of the requirement has to see
+    them.
+    """
+    similar_requirements = similarity_to(earlier)
+    kept = [of for of in requirements if isinstance(of, Only) and similar_requirements(of)]
+    old, new = split_actions(before.rights), split_actions(after.rights)
+    # A lost DENY gives access, too.
+    gained = {right for right in old ^ new if (right.qualifier is ALLOW) == (right in new)}
+    for requirement, steps in decide_all(kept, system).by_name if gained else ():
+        wanted = split_actions(
+            Right("", ALLOW, right, name) for right, names in requirement.rights for name in names
+        )
+        for step in steps:
+            if any(
+                own.enclave == step.use.enclave
+                and own.right == right.right
+                and overlap(own.name, right.name)
+                for own in gained
+                for right in wanted
+            ):
+                text = f"{step.text()}: new access, which the requirement allows only by "
+                text += f"{patterns_of_any_package(requirement)}, as to any enclave of such a name"
+                place = step.source or requirement.source
+                remedy = "Name the enclaves that are meant in the requirement, or approve this in "
+                remedy += "the review."
                 yield DROPPED.found(str(requirement), text, place.file, place.line, remedy)
 
 

@@ -292,7 +292,8 @@ def test_what_cannot_fail_is_said(required: str) -> None:
     assert [each for _, reasons in found.vacuous for each in reasons] == ([why] if why else [])
 
 
-FOUND = frozenset({"requirement.holds-alone"})
+ALONE, BY_NAME = "requirement.holds-alone", "requirement.allowed-by-name"
+FOUND = frozenset({ALONE, BY_NAME})
 SERVED = may("reply", "/reset") + may("execute", "/dock", "/turn_left")
 PACKAGE = {**ROBOT, "/r/c": may("publish", "/z") + SERVED}
 
@@ -315,7 +316,7 @@ def test_a_requirement_of_a_package_may_be_about_the_enclaves_of_users(required:
     found = decided(PACKAGE, required)
     assert len(found.holding_alone) == 1 and not (found.violations or found.vacuous)
     (finding,) = decided_findings(found, robot(PACKAGE))
-    assert {finding.id} == FOUND and "enclave" in finding.text
+    assert finding.id == ALONE and "enclave" in finding.text
     assert "this is the policy of a package" in finding.remedy
     (finding,) = decided_findings(found, replace(robot(PACKAGE), is_keystore=True))
     assert finding.remedy.startswith("No enclave of this keystore can break the requirement")
@@ -324,6 +325,25 @@ def test_a_requirement_of_a_package_may_be_about_the_enclaves_of_users(required:
     assert finding.remedy.startswith("No enclave of this robot can break the requirement")
     of_robot = decided(PACKAGE, re.sub(r'"([a-z])', r'"/\1', required))
     assert len(of_robot.vacuous) == 1 and not of_robot.holding_alone
+
+
+@pytest.mark.parametrize(
+    ("listed", "allowed"),
+    [
+        ('"/a", "*/op/*"', ["*/op/* allows this to /op/b and /v/op/c"]),
+        ('"/a", "*/op/*", "//op/*", "!/x"', ["*/op/* allows this to /v/op/c"]),
+        ('"/a", "/op/*", "//v/*"', []),
+        ('"*", "!/x"', []),
+        ('"/*"', []),
+    ],
+)
+def test_whom_a_pattern_for_any_package_allows_is_said(listed: str, allowed: list[str]) -> None:
+    rights = {"/a": may("publish", "/x"), "/op/idle": may("subscribe", "/x")}
+    rights |= {"/op/b": may("publish", "/*"), "/v/op/c": may("publish", "/x")}
+    required = f'[[only]]\npublish = ["/x"]\nenclaves = [{listed}]'
+    findings = requirement_findings(parse_requirements(required.encode(), "r.toml"), robot(rights))
+    by_name = [each for each in findings if each.id == BY_NAME]
+    assert [each.text.partition("; ")[0] for each in by_name] == allowed
 
 
 def test_a_note_on_an_absolute_name_is_printed_once_for_several_namespaces() -> None:
@@ -365,7 +385,7 @@ VACUOUS, VIOLATED = "requirement.vacuous", "requirement.violated"
         ('[[only]]\npublish = ["/x"]\nenclaves = ["/r/a", "*/ops/*"]', {ABSENT}),
         ('[[only]]\npublish = ["x"]\nenclaves = ["/r/a", "*/ops/*"]', NO_OTHERS),
         ('[[only]]\npublish = ["/x"]\nenclaves = ["/ops"]', {ABSENT, VIOLATED}),
-        ('[[only]]\nrequest = ["reset"]\nenclaves = ["/ops"]', {ABSENT, *FOUND}),
+        ('[[only]]\nrequest = ["reset"]\nenclaves = ["/ops"]', {ABSENT, ALONE}),
         # What is broken is not also called a requirement that no enclave can break.
         (
             '[[only]]\npublish = ["x"]\nrequest = ["reset"]\nenclaves = ["/o", "/p"]',
@@ -506,7 +526,7 @@ def test_a_requirement_about_a_name_without_another_side(
 
     expected = [VACUOUS] if said and not (is_topic and allowed == "/n/*") else []
     # Users of a package may have the other side. In a keystore or a robot, they lack no server.
-    alone = [*FOUND] * len(expected)
+    alone = [ALONE] * len(expected)
     assert found("/n/open", robot(rights)) == (alone if is_topic else expected)
     assert found("/n/open", replace(robot(rights), is_keystore=True)) == expected
     assert found("n/open", robot(rights)) == alone

@@ -1160,6 +1160,8 @@ _NODES = {
     "/drive": publish("/cmd"),
     "/eyes/ear": publish("/x") + subscribe("/cmd", "/x"),
 }
+_HANDS = _NODES | {"/operator/hand": publish("/x")}
+_NO_CMD = '<topics publish="DENY"><topic>/cmd</topic></topics>'
 _EYE = f'</profile><profile ns="/" node="eye">{NODE}{publish("/image")}'
 
 
@@ -1224,10 +1226,42 @@ def _moved(node: str, path: str, enclaves: dict[str, str] = _NODES) -> dict[str,
                 "node /ear moves to enclave /helper/ear, where the requirement does not apply "
                 "for users in namespace /leg",
             ),
-            # Both enclaves are bound, or both are exempt; or the node is new.
+            # A new enclave, a new right or a lost DENY uses an exception for any package.
+            (
+                _NODES,
+                _ONLY_OPERATORS,
+                _NODES | {"/x/operator/hand": publish("/cmd")},
+                "/x/operator/hand may publish /cmd: new access, which the requirement allows only "
+                "by */operator/*",
+            ),
+            (
+                _HANDS,
+                _ONLY_OPERATORS,
+                _HANDS | {"/operator/hand": publish("/x", "/cmd")},
+                "/operator/hand may publish /cmd: new access",
+            ),
+            (
+                _HANDS | {"/operator/hand": publish("/cmd") + _NO_CMD},
+                _ONLY_OPERATORS,
+                _HANDS | {"/operator/hand": publish("/cmd")},
+                "/operator/hand may publish /cmd: new access",
+            ),
+            # The exception is for the robot's own operators, or the enclave gains other access.
+            (
+                _NODES,
+                _ONLY_OPERATORS.replace("*/", "//"),
+                _NODES | {"/operator/hand": publish("/cmd")},
+                "",
+            ),
+            (
+                _HANDS | {"/operator/hand": publish("/cmd")},
+                _ONLY_OPERATORS,
+                _HANDS | {"/operator/hand": publish("/cmd", "/y")},
+                "",
+            ),
+            # Both enclaves are bound, or both are exempt.
             (_NODES, _ONLY_OPERATORS, _moved("eye", "/lens/eye"), ""),
-            (_NODES, _ONLY_OPERATORS, _moved("drive", "/operator/drive"), ""),
-            (_NODES, _ONLY_OPERATORS, _NODES | {"/operator/hand": publish("/cmd")}, ""),
+            (_NODES, _ONLY_OPERATORS.replace("*/", "//"), _moved("drive", "/operator/drive"), ""),
             # The enclave keeps the right that it must have.
             (
                 _NODES | {"/drive": publish("/cmd") + _EYE.replace("eye", "mux")},
@@ -1246,7 +1280,7 @@ def _moved(node: str, path: str, enclaves: dict[str, str] = _NODES) -> dict[str,
         3,
     ),
 )
-def test_a_node_moves_out_of_no_requirement(
+def test_a_change_escapes_no_requirement(
     change: Change, before: dict[str, str], required: str, after: dict[str, str], said: str
 ) -> None:
     earlier = required.partition(_ADDED)[0]
@@ -1255,7 +1289,8 @@ def test_a_node_moves_out_of_no_requirement(
     change.commit({"robot.xml": policy_text(after), "robot.toml": required})
     ended = change.review(*words)
     assert said in ended.out, ended
-    assert ("where the requirement does not apply" in ended.out) == bool(said), ended
+    found = ("where the requirement does not apply", "which the requirement allows only by")
+    assert any(text in ended.out for text in found) == bool(said), ended
     assert ended.status == bool(said), ended
     assert change.review(*words, "--dropped-requirements", "allow").status == 0
 
