@@ -970,7 +970,8 @@ def _remedies(status: FleetStatus, to_dos: Collection[str]) -> Mapping[str, str]
         f"as that robot until you run `sros renew {where} --robot OTHER --new-key --revoke-old`; "
         "then deliver to both robots",
         "check its clock": "set the clock of the robot; its agent then continues at the next "
-        "round. If the clock is right, somebody held the robot's message back",
+        "round. If it is right, the clock of the server is wrong, or somebody held the robot's "
+        "message back",
         "deliver": by_hand,
         "publish": publish_command(root),
         "renew": f"`{renewal_command(root)}`, then {_delivery_advice(root, to_renew)}",
@@ -1065,7 +1066,7 @@ class _Group(NamedTuple):
 
         A robot that never confirmed counts as confirmed at ``moment``.
         """
-        return min(self.robots, key=lambda robot: robot.received or moment)
+        return min(self.robots, key=lambda robot: robot.confirmed or moment)
 
 
 def _groups(
@@ -1152,7 +1153,7 @@ def _page_rows(compared_fleet: ComparedFleet, robots: Sequence[str]) -> Iterator
     for group in _groups(compared_fleet, problems, apart=bool(robots)):
         status, most = compared_fleet.status, len(group.robots)
         names = _robot_names(group.names, status.names, status.groups, most)
-        received = group.oldest_confirmation(compared_fleet.at).received
+        confirmed = group.oldest_confirmation(compared_fleet.at).confirmed
         expiry = [moment for robot in group.robots for moment in robot.expiry.values()]
         outdated = [name for name in group.names if name in compared_fleet.outdated_dds]
         to_do = [group.to_do] if group.to_do else []
@@ -1162,7 +1163,7 @@ def _page_rows(compared_fleet: ComparedFleet, robots: Sequence[str]) -> Iterator
         yield (
             group.state,
             names,
-            iso(received) if received else "",
+            iso(confirmed) if confirmed else "",
             iso(min(expiry)) if expiry else "",
             "; ".join(to_do),
             group.what,
@@ -1425,7 +1426,7 @@ def _file_details(robot: RobotStatus) -> Iterator[str]:
 def _age_text(robot: RobotStatus, moment: datetime) -> str:
     from sros_tool.validity import elapsed
 
-    return f"{elapsed(moment - robot.received)} ago" if robot.received else "-"
+    return f"{elapsed(moment - robot.confirmed)} ago" if robot.confirmed else "-"
 
 
 def _state_text(state: str) -> str:

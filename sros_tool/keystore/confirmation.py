@@ -451,6 +451,10 @@ class LastMessage(NamedTuple):
     """When a message last came from an earlier start of the computer than the message before, or
     with an earlier release.
     """
+    collected: datetime | None = None
+    """When the message was first seen in an inbox, by the clock of the keystore's machine; None if
+    an earlier release of sros took it.
+    """
 
     def next_boots(
         self, boot: str | None, now: datetime
@@ -479,6 +483,12 @@ class ReceivedConfirmation:
     confirmation: Confirmation
     time: datetime
     message: LastMessage | None = None
+
+    @property
+    def latest(self) -> datetime:
+        """The latest time at which the robot can have made the confirmation or its last message."""
+        collected = self.message.collected if self.message else None
+        return max(self.time, collected) if collected else self.time
 
     @property
     def is_alternation_shown(self) -> bool:
@@ -735,17 +745,20 @@ def _json_value(data: bytes) -> Any:
 
 def _message_from(value: Any) -> LastMessage:
     """Return the last message of a robot's agent from its JSON value."""
-    later = {"boots", "alternated"}  # fields added after release 0.3.0 of sros
+    later = {"boots", "alternated", "collected"}  # fields added after release 0.3.0 of sros
     if not isinstance(value, dict) or value.keys() | later != set(LastMessage._fields):
         raise _FormError('the keys of its message are not "sequence", "sha256" and "enclave"')
     sha256 = _digest_from(value["sha256"], "the digest of its message")
     sequence = _sequence_from(value["sequence"])
-    boots, alternated = value.get("boots", []), value.get("alternated")
+    boots = value.get("boots", [])
     if not isinstance(boots, list) or not all(map(_is_digest, boots)):
         raise _FormError('"boots" of its message are not SHA-256 digests')
     enclave = _enclave_from(value["enclave"])
-    moment = None if alternated is None else _moment_from(alternated)
-    return LastMessage(sequence, sha256, enclave, tuple(boots), moment)
+    alternated, collected = (
+        None if value.get(key) is None else _moment_from(value[key])
+        for key in ("alternated", "collected")
+    )
+    return LastMessage(sequence, sha256, enclave, tuple(boots), alternated, collected)
 
 
 def _confirmation_from(value: Any) -> Confirmation:

@@ -210,9 +210,9 @@ class ConfirmedFile:
 
 
 @shows(
-    *("robot", "state", "to_do", "enclaves", "revoked", "unrecorded", "sharing_name", "received"),
-    *("clock", "fetches", "release", "published", "stage", "files", "pending", "restart"),
-    *("running", "crl_in_force"),
+    *("robot", "state", "to_do", "enclaves", "revoked", "unrecorded", "sharing_name", "confirmed"),
+    *("received", "clock", "fetches", "release", "published", "stage", "files", "pending"),
+    *("restart", "running", "crl_in_force"),
     *("expiry", "dds", "problems", "notes"),
     null_if_empty=("stage",),
 )
@@ -261,8 +261,8 @@ class RobotStatus:
     """
     others: UnrecordedEnclaves
     received: datetime | None
-    """When the last confirmation was received, in UTC, by the clock of the keystore's machine; or
-    null.
+    """When the last confirmation was received, in UTC, by the clock of the keystore's machine; of a
+    message in an inbox, when its file was written; or null.
     """
     clock: datetime | None
     """The time of the robot's clock in the last confirmation, in UTC, or null."""
@@ -384,8 +384,11 @@ class RobotStatus:
         return [clause for *_, clause in sorted(clauses, key=lambda clause: clause[:2])]
 
     @property
-    def last_heard(self) -> datetime | None:
-        """The time of the robot's last known message; None if it has sent no confirmation."""
+    def confirmed(self) -> datetime | None:
+        """The time from which the age of the last confirmation counts, in UTC; null if the robot
+        sent no confirmation.  Of a message, this is the earlier one of ``received`` and ``clock``:
+        a message that somebody held back does not look new.
+        """
         if self.fetches and self.received and self.clock:
             return min(self.received, self.clock)
         return self.received
@@ -413,18 +416,36 @@ class RobotStatus:
         crl_in_force = None if self.crl_in_force is None else False
         return replace(self, crl_in_force=crl_in_force, has_list=False)
 
-    def with_to_do(self, now: datetime, *, is_accepted: bool) -> RobotStatus:
+    def with_to_do(self, now: datetime, limit: timedelta, *, is_accepted: bool) -> RobotStatus:
         """Return a copy whose ``to_do`` says what to do for the robot at ``now``.
 
-        ``is_accepted`` says whether robots accept the published metadata.
+        ``limit`` is the age from which a confirmation is overdue.  ``is_accepted`` says whether
+        robots accept the published metadata.
         """
-        return replace(self, to_do=self._to_do(now, is_accepted))
+        return replace(self, to_do=self._to_do(now, limit, is_accepted))
 
-    def _shows_wrong_clock(self, now: datetime) -> bool:
-        """Return whether a robot that was heard within a day has to set its clock first."""
-        if self.state is State.OFFLINE and self.received and self.clock:
-            return self.received - self.clock > _OFFLINE_AFTER >= now - self.received
-        others = (State.OFFLINE, State.BROKEN, State.REFUSED, *_SUSPICIOUS_STATES)
+    def is_overdue(self, now: datetime, limit: timedelta) -> bool:
+        """Return whether the last confirmation is older than ``limit``.
+
+        A message that shows a time that much later than its receipt proves nothing about its age.
+        """
+        if self.confirmed is None:
+            return False
+        is_ahead = (
+            self.fetches and self.clock and self.received and (self.clock - self.received > limit)
+        )
+        return now - self.confirmed > limit or bool(is_ahead)
+
+    def _is_overdue_by_clock(self, now: datetime, limit: timedelta) -> bool:
+        """Return whether only the robot's clock says that its last message is not new."""
+        came_in_time = self.received is not None and now - self.received <= limit
+        return came_in_time and self.is_overdue(now, limit)
+
+    def _shows_wrong_clock(self, now: datetime, limit: timedelta) -> bool:
+        """Return whether somebody has to set the robot's clock first."""
+        if self.state is State.OFFLINE:
+            return self._is_overdue_by_clock(now, limit)
+        others = (State.BROKEN, State.REFUSED, *_SUSPICIOUS_STATES)
         is_ahead = (
             any(EXPIRED_METADATA in problem for problem in self.problems or ())
             and self.received is not None
@@ -433,10 +454,10 @@ class RobotStatus:
         )
         return (self.is_behind or is_ahead) and self.state not in others
 
-    def _to_do(self, now: datetime, is_accepted: bool) -> str:
+    def _to_do(self, now: datetime, limit: timedelta, is_accepted: bool) -> str:
         if self.state is State.REVOKED and not self.enclaves:
             return "take it out of the fleet file"
-        if self._shows_wrong_clock(now):
+        if self._shows_wrong_clock(now, limit):
             return "check its clock"
         if self.state in (State.CURRENT, State.NONE):
             look = "check its server" if self.got_earlier_release else "look into it"
@@ -464,9 +485,11 @@ class RobotStatus:
             return "check its server"
         if (self.published or 0) == (self.release or 0):
             return "find out why" if self.is_published else "publish"
-        is_silent = self.received is None or now - self.received > _FETCH_EXPECTED_WITHIN
+        is_silent = self.confirmed is None or now - self.confirmed > _FETCH_EXPECTED_WITHIN
         if self.is_locked_out(now):
             return "deliver" if is_silent else "wait, else deliver"
+        if self._is_overdue_by_clock(now, _FETCH_EXPECTED_WITHIN):
+            return "check its clock"
         if is_silent:
             return "check whether it is on"
         passes = (
@@ -561,8 +584,9 @@ class FleetStatus:
     ``--robot``.
     """
     overdue: frozenset[str] = frozenset()
-    """The robots whose last confirmation is older than ``--max-age``, sorted by name; without that
-    option, the robots that fetch and have sent nothing for more than a day.
+    """The robots whose last confirmation is older than ``--max-age``, or shows a time that is later
+    than its receipt by more than that, sorted by name; without that option, the robots that fetch,
+    with one day.
     """
     older: str = ""
     """Why the keystore lacks what its robots have, as a clause: the keystore was restored from a
@@ -676,33 +700,24 @@ class FleetStatus:
         """Return a copy in which silent robots are offline, with the remedy for each robot.
 
         A robot is offline if its last confirmation is older than ``max_age``.  Without ``max_age``,
-        only a robot that fetches can be offline: if it has sent nothing for more than a day.  For
-        robots that fetch, the time in the message itself counts, too, because whoever has the inbox
-        could hold messages back.
+        only a robot that fetches can be offline: if it has sent nothing for more than a day.
         """
         limit = max_age or _OFFLINE_AFTER
         overdue = frozenset(
             robot.robot
             for robot in self.robots
-            if robot.enclaves
-            and (last_heard := robot.last_heard)
-            and (max_age or robot.fetches)
-            and now - last_heard > limit
+            if robot.enclaves and (max_age or robot.fetches) and robot.is_overdue(now, limit)
         )
 
         def status(robot: RobotStatus) -> RobotStatus:
             if robot.robot not in overdue:
                 return robot.with_expired_state(now)
-            if robot.is_behind and robot.received and now - robot.received <= limit:
-                return robot.without_list().with_expired_state(
-                    now
-                )  # it says itself that its clock is wrong
             return robot.as_offline()
 
         robots = map(status, self.robots)
         publication = self.publication and self.publication.as_seen_at(now)
         is_accepted = publication is None or publication.is_in_order
-        to_do = tuple(robot.with_to_do(now, is_accepted=is_accepted) for robot in robots)
+        to_do = tuple(robot.with_to_do(now, limit, is_accepted=is_accepted) for robot in robots)
         received = max((robot.received for robot in self.robots if robot.received), default=None)
         clock = clock_behind_clause(now, self.recorded, "the last entry of the ledger")
         clock = clock or clock_behind_clause(now, received, "the last confirmation")
@@ -1236,7 +1251,7 @@ class _KeystoreRecords:
         return max(ends, default=None)
 
     def got_earlier_release(
-        self, compared_robot: _ComparedRobot, last_heard: datetime | None
+        self, compared_robot: _ComparedRobot, confirmed_at: datetime | None
     ) -> bool:
         """Return whether a robot fetched long after the publication, but got an earlier release.
 
@@ -1246,13 +1261,13 @@ class _KeystoreRecords:
         if confirmed and any(map(shows_old_copy, confirmed.problems or ())):
             return True
         published = self.published.get(compared_robot.robot.name)
-        if not (confirmed and last_heard and published and compared_robot.different):
+        if not (confirmed and confirmed_at and published and compared_robot.different):
             return False
         if not all(EXPIRED_METADATA in problem for problem in confirmed.problems or ()):
             return False
         released_at = self._releases.get(published)
         return (confirmed.release or 0) < published and bool(
-            released_at and last_heard - released_at > _FETCH_EXPECTED_WITHIN
+            released_at and confirmed_at - released_at > _FETCH_EXPECTED_WITHIN
         )
 
     @property
@@ -1522,7 +1537,7 @@ def _robot_status(
         is_behind=bool(confirmed and confirmed.clock is RobotClock.BEHIND),
         locked_out_from=records.locked_out_from(compared_robot) if fetches else None,
     )
-    if not (status.fetches and records.got_earlier_release(compared_robot, status.last_heard)):
+    if not (status.fetches and records.got_earlier_release(compared_robot, status.confirmed)):
         return status
     if status.problems:
         return replace(status, got_earlier_release=True)
@@ -1673,8 +1688,9 @@ def fleet_metrics(
         ),
         Metric(
             "sros_fleet_confirmed_timestamp_seconds",
-            "When the last confirmation of a robot was received, in seconds since 1970.",
-            per_robot(lambda robot: int(robot.received.timestamp()) if robot.received else None),
+            "The time from which the age of the last confirmation of a robot counts, in seconds "
+            "since 1970.",
+            per_robot(lambda robot: int(robot.confirmed.timestamp()) if robot.confirmed else None),
         ),
         Metric(
             "sros_fleet_expiry_timestamp_seconds",

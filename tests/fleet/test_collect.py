@@ -446,6 +446,23 @@ def test_new_keys_end_the_alarm_of_two_computers(
         assert any(end in text for text in r1.problems or ()) == restored
 
 
+def test_no_file_with_an_early_time_brings_an_old_message_back(home: Home) -> None:
+    """Not even if the clock of the robot is behind, and the robot got new keys."""
+    home.send("r1")
+    home.collect()
+    later = NOW + timedelta(hours=1)
+    names = [name for name in OpenedKeystore(home.root).names if name.startswith("/r1/")]
+    renew(home.root, names, new_key=True, revoke_old=True, now=later)
+    shutil.copytree(home.root / "enclaves/r1", home.folder / "r1/enclaves/r1", dirs_exist_ok=True)
+    old, new = (home.message("r1", NOW - timedelta(hours=1)) for _ in range(2))
+    later += timedelta(hours=1)
+    outcomes = []
+    for message in (new, old):
+        home.put("r1", message, NOW)
+        outcomes.append(home.of("r1", later).outcome)
+    assert outcomes == ["kept", "refused"]
+
+
 def test_requests_of_strangers_neither_speak_for_sros_nor_fill_the_terminal(home: Home) -> None:
     names = ("Run it", "/r1/base\x1b[2J", *(f"/r1/x{number}" for number in range(200)))
     home.send(
@@ -895,24 +912,43 @@ def test_an_inbox_that_is_none(home: Home) -> None:
     assert ended.status == 2 and "'inbox' cannot be opened" in ended.err
 
 
-def test_when_a_message_arrived(home: Home) -> None:
-    """It may lie there for long, and its time may be set; but it came after the one before."""
+_CHECK, _SILENT = "check its clock", "find out why"
+_DAYS = 5 * 24 * 60
+_AGES = (
+    # In minutes: how far the clocks of the robot and the server are ahead, how long the message was
+    # held back, how long it then waited in the inbox, and the age that counts; then what to do if
+    # it may be 15 minutes old.
+    *((0, server, 0, 0, 0, "") for server in (-60, 0, 60)),
+    *((0, server, 40, 0, 40, _SILENT if server < 0 else _CHECK) for server in (-60, 0, 60)),
+    *((0, server, 0, 40, 40, _CHECK if server > 0 else _SILENT) for server in (-60, 0, 60)),
+    *((-30, server, 0, 0, 30, _CHECK) for server in (-60, 0, 60)),
+    *((-_DAYS, server, 0, 0, _DAYS, _CHECK) for server in (-60, 0, 60)),
+    *((-30, server, 40, 0, 70, _SILENT if server < 0 else _CHECK) for server in (-60, 0, 60)),
+    *((30, server, 0, 0, 0, _CHECK) for server in (-60, 0, 60)),
+    (30, 0, 0, 40, 40, _SILENT),
+    # With two wrong clocks, a message can look newer, but not by more than the robot's is ahead.
+    *((30, server, 0, 40, 10, "") for server in (-60, 60)),
+    *((30, server, 40, 0, 10, "") for server in (-60, 0, 60)),
+)
 
-    def arrived(made: datetime, written: datetime, now: datetime) -> datetime:
-        file = home.send("r1", made)
-        os.utime(file, (written.timestamp(),) * 2)
-        home.collect(now)
-        last = last_confirmation(OpenedKeystore(home.root), "r1")
-        assert last
-        return last.time
 
-    day = timedelta(days=1)
-    assert arrived(NOW, NOW, NOW + day) == NOW
-    assert arrived(NOW - day, NOW - day, NOW + day) == NOW
-    # The clock of the server is behind; it is ahead; the clock of the robot is ahead.
-    assert arrived(NOW + day, NOW - day, NOW + day) == NOW + day
-    assert arrived(NOW + day, NOW + 5 * day, NOW + 2 * day) == NOW + 2 * day
-    assert arrived(NOW + 5 * day, NOW + 3 * day, NOW + 4 * day) == NOW + 3 * day
+def test_the_age_of_a_message_by_three_clocks(home: Home) -> None:
+    """Only a robot whose clock is ahead can look newer, if its messages were also held back."""
+    minute = timedelta(minutes=1)
+    found = []
+    for number, (robot, server, held, waited, _, _) in enumerate(_AGES):
+        start = NOW + number * timedelta(hours=3)
+        for sent, came, seen in ((0, 0, 0), (5, 5 + held, 5 + held + waited)):
+            file = home.send("r1", start + (sent + robot) * minute)
+            os.utime(file, ((start + (came + server) * minute).timestamp(),) * 2)
+            now = start + seen * minute
+            assert home.of("r1", now).outcome == "kept"
+        status = fleet_status(OpenedKeystore(home.root), ["r1"], now)
+        (r1,) = status.with_overdue(now, 15 * minute).robots
+        assert r1.confirmed and (r1.state == "offline") == bool(r1.to_do)
+        age = (now - r1.confirmed) // minute
+        found.append((robot, server, held, waited, age, r1.to_do))
+    assert found == list(_AGES)
 
 
 @pytest.mark.parametrize("seconds", [2**40, -(2**40)])

@@ -774,14 +774,17 @@ def test_messages_that_were_held_back_are_as_old_as_they_say(field: Field) -> No
     found = field.status()
     assert (found["overdue"], found["complete"]) == (["r1"], False)
     robot = found["robots"]["r1"]
-    assert (robot["state"], robot["to_do"]) == ("current", "check its clock")
+    assert (robot["state"], robot["to_do"]) == ("offline", "check its clock")
+    shown = field.run("fleet", "status", "ks", status=1).out
+    assert "offline  1 d 1 h ago  check its clock  it reports: it is behind" in shown
+    assert robot["confirmed"] == robot["clock"] < robot["received"]
     field.age("r1", 26 * hours)
     robot = field.status()["robots"]["r1"]
     assert (robot["state"], robot["to_do"]) == ("offline", "find out why")
     (field.root / "confirmed/r2.json").unlink()
     field.confirm("r2", time=iso(now - 25 * hours))
     field.send("r1", time=now + 25 * hours)
-    assert field.states() == dict.fromkeys(ROBOTS, "current")
+    assert field.states() == {**dict.fromkeys(ROBOTS, "current"), "r1": "offline"}
     for ahead, to_do in ((hours / 2, "look into it"), (25 * hours, "check its clock")):
         field.send("r1", time=now + ahead, problems=("The metadata in x has expired.",))
         assert field.status()["robots"]["r1"]["to_do"] == to_do

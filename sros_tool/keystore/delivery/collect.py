@@ -582,7 +582,9 @@ class _Verifier:
                 f"restored (then add --restored {robot.name})"
             )
         arrived = self._arrival(file, verified.confirmation, last)
-        message = LastMessage(sequence, sha256, verified.enclave)
+        message = LastMessage(
+            sequence, sha256, verified.enclave, collected=self._now.replace(microsecond=0)
+        )
         installed = verified.confirmation.release
         before_it = (last.confirmation.release if last else None) or 0
         went_back = installed is not None and installed < before_it and not is_restored
@@ -643,7 +645,7 @@ class _Verifier:
             for entry in self._keystore.ledger_file.with_values("enclave", names).entries
             if entry.what == "certificate" and entry.enclave in names
         ]
-        earlier = [entry for entry in entries if entry.time <= iso(last.time)]
+        earlier = [entry for entry in entries if entry.time <= iso(last.latest)]
         later_keys = {entry.key for entry in entries if entry not in earlier}
         return bool(earlier) and all(
             entry.key not in {"", *later_keys}
@@ -654,7 +656,7 @@ class _Verifier:
     def _came_after(self, certificate: x509.Certificate, last: ReceivedConfirmation) -> bool:
         """Return whether a certificate was issued after a message, according to the ledger."""
         issued = self._issue_entry(digest(certificate))
-        return issued is not None and issued.time > iso(last.time)
+        return issued is not None and issued.time > iso(last.latest)
 
     def _is_published(self, release: int) -> bool:
         """Return whether the ledger has a release with this number."""
@@ -664,16 +666,18 @@ class _Verifier:
     def _arrival(
         self, file: _File, confirmation: Confirmation, last: ReceivedConfirmation | None
     ) -> datetime:
-        """Return when a message was received, but no earlier than the last message.
+        """Return when a message came into the inbox.
 
-        Messages may have been in the inbox for a long time before they are collected, so this is
-        the time at which the file was written, by the clock of the server.  If the message shows a
-        later time that has passed on this machine, the clock of the server is behind: the time in
-        the message, which the robot signed, counts.
+        Messages may be there for a long time before they are collected, so this is the time at
+        which the file was written, by the clock of the server.  If it was written before the last
+        message was collected, then the clock of the server is behind: the time that the message
+        shows counts, within the time since then.
         """
-        made = confirmation.time if confirmation.time <= self._now else file.written
-        earliest = last.time if last else file.written
-        return min(max(file.written, made, earliest), self._now).replace(microsecond=0)
+        came = file.written
+        collected = last.message.collected if last and last.message else None
+        if collected and came < collected:
+            came = max(confirmation.time, collected)
+        return min(came, self._now).replace(microsecond=0)
 
     def _verify(self, robot: Robot, data: bytes) -> _VerifiedMessage:
         try:
