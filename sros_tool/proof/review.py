@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import os
 import re
-from collections import defaultdict
 from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -28,17 +27,10 @@ from sros_tool.checks.keystores.issued import (
     STALE,
 )
 from sros_tool.checks.keystores.opened import Circumstances
-from sros_tool.checks.kind import (
-    WARNING,
-    ChosenFindings,
-    Finding,
-    FindingFilter,
-    FindingKind,
-)
+from sros_tool.checks.kind import WARNING, ChosenFindings, Finding, FindingFilter, FindingKind
 from sros_tool.checks.policies import is_mended_by
 from sros_tool.checks.requirements import (
     ALLOWED_BY_NAME,
-    DROPPED,
     HOLDS_ALONE,
     MISSPELLED_ENCLAVE,
     UNKNOWN_ENCLAVE,
@@ -77,22 +69,10 @@ from sros_tool.keystore.rights import (
     without_enclaves_of_sros,
 )
 from sros_tool.keystore.template import Template, load_template, read_template, template_names
-from sros_tool.names import expand, is_expression
 from sros_tool.policy.document import read_policy
-from sros_tool.policy.model import ALLOW, PEER_RIGHT, Enclave, Policy, policy_in_namespace
-from sros_tool.policy.patterns import common_name, overlap
+from sros_tool.policy.model import Policy, policy_in_namespace
 from sros_tool.policy.remapping import Remapping
-from sros_tool.policy.rights import (
-    NodeName,
-    Right,
-    RightsDifference,
-    goal_right,
-    nodes_of,
-    placed_rights,
-    policy_rights,
-    rights_without_counterpart,
-    split_actions,
-)
+from sros_tool.policy.rights import Right, placed_rights, policy_rights
 from sros_tool.proof.commit_files import (
     ATTRIBUTES_FILE,
     EXPORT_IGNORE,
@@ -106,13 +86,7 @@ from sros_tool.proof.commit_files import (
     may_include_files,
     may_match,
 )
-from sros_tool.proof.decide import (
-    patterns_of_any_package,
-    restricted_enclaves,
-    rights_that_need_a_peer,
-)
 from sros_tool.proof.findings import (
-    GONE_REMEDY,
     common_namespaces,
     decide_all,
     decided_findings,
@@ -121,27 +95,24 @@ from sros_tool.proof.findings import (
     unused_remapping_findings,
 )
 from sros_tool.proof.growth import Growth, compare_access
+from sros_tool.proof.lost_protection import (
+    MOST_NAMESPACES,
+    RobotMoves,
+    access_by_name_findings,
+    lost_restriction_findings,
+    namespaces_in,
+    unanswered_requirement_findings,
+)
 from sros_tool.proof.repository import FILES, LINK, SUBMODULE, Repository, TreeEntry, walk
 from sros_tool.proof.requirements import (
     KINDS,
-    AtMost,
     FleetSource,
-    Must,
-    Nobody,
-    NotBoth,
-    NothingBut,
-    Only,
     Requirement,
-    Widest,
     dropped_findings,
     dropped_requirements,
-    enclaves_of,
-    names_of,
-    patterns_of_enclaves,
     read_all_requirements,
     read_requirements,
     renamed_names,
-    similarity_to,
 )
 from sros_tool.proof.sources import AccessSource, load_policies, load_side
 from sros_tool.proof.system import System, load_system, policy_system
@@ -168,7 +139,6 @@ _ARCHIVE_SIGNATURES = (
     b"7z\xbc\xaf",
 )
 """First bytes of files of gzip, ZIP, xz, bzip2, Zstandard and 7z."""
-_MOST_NAMESPACES = 20
 _LONGEST_TARGET_SHOWN = 200  # characters that are shown of a link's target
 _NOT_USED_TEXT = (
     "changes and is not reviewed: no reviewed policy uses it. Name it with --policy, leave it out "
@@ -945,7 +915,7 @@ class _Review:
             others = f": there, sros only decided {self.decided_elsewhere}"
         if self.is_relative and not asked.namespaces:
             options = [f"--namespace {quote(name)}" for name in sorted(self.namespaces_to_add)]
-            add = f" (add {' '.join(options[:_MOST_NAMESPACES])})" if options else ""
+            add = f" (add {' '.join(options[:MOST_NAMESPACES])})" if options else ""
             names = "whether requirements with relative names hold"
             yield f"{names} in namespaces other than /{add}{others}"
         if not self.base:
@@ -1144,9 +1114,9 @@ class _Review:
                 complete=len(read) == len(paths)
                 and (subject in keystores or self.has_all_policies),
             )
-            moves = _Moves()
+            moves = RobotMoves()
             with suppress(SrosError, OSError):  # the step on requirements reports the error
-                moves = _moves(before, system.fleet())
+                moves = RobotMoves.between(before, system.fleet())
             if moves.namespaces and earlier:
                 moved = read_all_requirements(
                     [base_files[path] for path in earlier],
@@ -1160,7 +1130,7 @@ class _Review:
                     yield _undecided_step("requirements-before", subject, error)
                     continue
             unanswered = partial(
-                _unanswered_requirement_findings, required_before, wanted, rights, later_rights
+                unanswered_requirement_findings, required_before, wanted, rights, later_rights
             )
             decide = partial(
                 self._dropped_step, required_before, wanted, system, sources, unanswered, moves
@@ -1247,9 +1217,9 @@ class _Review:
             return
         base, head = sources()
         namespaces = _namespaces_to_try(base, head)
-        if len(namespaces) > _MOST_NAMESPACES and self.decided_elsewhere:
+        if len(namespaces) > MOST_NAMESPACES and self.decided_elsewhere:
             self.decided_elsewhere = (
-                f"whether the change breaks them in {_MOST_NAMESPACES} of {len(namespaces)} "
+                f"whether the change breaks them in {MOST_NAMESPACES} of {len(namespaces)} "
                 "namespaces (those of changed names first)"
             )
         left = {
@@ -1263,7 +1233,7 @@ class _Review:
             system = policy_system(policy, self._circumstances(), self._template())
             return replace(system, is_package=True)
 
-        for ns in namespaces[:_MOST_NAMESPACES]:
+        for ns in namespaces[:MOST_NAMESPACES]:
             moved, earlier = (
                 read_all_requirements(paths, namespaces=(ns,), remaps=asked.remaps)
                 for paths in (files, base_files)
@@ -1320,7 +1290,7 @@ class _Review:
         system: System,
         compared_sides: Callable[[], tuple[AccessSource, AccessSource]] | None,
         unanswered: Callable[[], Iterable[Finding]],
-        moves: _Moves,
+        moves: RobotMoves,
     ) -> tuple[int, Content] | None:
         dropped = [
             requirement.requirement
@@ -1331,8 +1301,8 @@ class _Review:
             sources = compared_sides() if compared_sides else None
         left = [*unanswered()]
         if sources:
-            left += _findings_on_lost_restrictions(earlier, wanted_requirements, *sources, moves)
-            left += _findings_on_access_by_name(earlier, wanted_requirements, *sources, system)
+            left += lost_restriction_findings(earlier, wanted_requirements, *sources, moves)
+            left += access_by_name_findings(earlier, wanted_requirements, *sources, system)
         if not (dropped or left):
             return None
         assert self.base
@@ -1471,7 +1441,7 @@ def _namespaces_to_try(before: AccessSource, after: AccessSource) -> list[str]:
     ordinary = "/any_namespace"
     while any(ordinary in right.name for right in (*before.rights, *after.rights)):
         ordinary += "_"
-    return [*dict.fromkeys([ordinary, *_namespaces_in(names)])]
+    return [*dict.fromkeys([ordinary, *namespaces_in(names)])]
 
 
 _NOT_OF_DROPPED = tuple(
@@ -1567,202 +1537,6 @@ def _status_of_findings(chosen_findings: ChosenFindings) -> int:
     return _FOUND if chosen_findings.fails(WARNING) else _OK
 
 
-def _findings_on_lost_restrictions(
-    earlier: Sequence[Requirement],
-    requirements: Sequence[Requirement],
-    before: AccessSource,
-    after: AccessSource,
-    robot_moves: _Moves,
-) -> Iterator[Finding]:
-    """Yield a finding for each node that moves to an enclave that a requirement does not restrict.
-
-    Before the move, the requirement and a similar one of ``earlier`` restricted its enclave.  A
-    node in the old namespace of a robot may follow the robot, or keep its name: both count.
-    """
-    new_enclaves = _enclaves_by_node(after.enclaves.values())
-    moves = [
-        (node, old - new_enclaves[node], new_enclaves[node] - old)
-        for follow in (robot_moves.new_name, str)
-        for node, old in _enclaves_by_node(before.enclaves.values(), follow).items()
-        if new_enclaves.get(node, old) - old
-    ]
-    new_paths = {path: robot_moves.new_name(path) for path in before.enclaves}
-    similar_requirements = similarity_to(earlier)
-    for requirement in requirements if moves else ():
-        reported: dict[NodeName, set[str]] = defaultdict(set)
-        # The namespaces of a fleet are known, and its policies name the enclaves in them.
-        for ns in ("/",) if after.fleet else _namespaces_of_patterns(requirement):
-            now_restricted = restricted_enclaves(requirement, after.enclaves, ns)
-            was_restricted = [
-                {path for path, new in new_paths.items() if not restricted.isdisjoint((path, new))}
-                for restricted in restricted_enclaves(
-                    requirement, {*new_paths, *new_paths.values()}, ns
-                )
-            ]
-            left = [
-                (node, old & was, at, new - now)
-                for at, (was, now) in enumerate(zip(was_restricted, now_restricted, strict=True))
-                for node, old, new in moves
-                if old & was and new - now
-            ]
-            required = [
-                restricted_enclaves(robot_moves.before(similar), before.enclaves, ns)
-                for similar in (similar_requirements(requirement) if left else ())
-            ]
-            left = [move for move in left if any(move[1] & was[move[2]] for was in required)]
-            for node, _, _, outside in left:
-                if outside <= reported[node]:
-                    continue
-                reported[node] |= outside
-                place = requirement.source
-                name, to = expand("~", *node), first_few(sorted(outside), 3)
-                where = "enclave" if len(outside) == 1 else "enclaves"
-                text = f"node {name} moves to {where} {to}, where the requirement does not apply"
-                text += f" for users in namespace {ns}" if ns != "/" else ""
-                remedy = "Let the requirement apply to the enclave, or approve this in the review."
-                yield DROPPED.found(str(requirement), text, place.file, place.line, remedy)
-
-
-def _findings_on_access_by_name(
-    earlier: Sequence[Requirement],
-    requirements: Sequence[Requirement],
-    before: AccessSource,
-    after: AccessSource,
-    system: System,
-) -> Iterator[Finding]:
-    """Yield a finding for each enclave that gains access by a pattern such as ``*/operator/*``.
-
-    Enclaves of any package can match such a pattern, so the owner of the requirement has to see
-    them.
-    """
-    similar_requirements = similarity_to(earlier)
-    kept = [of for of in requirements if isinstance(of, Only) and similar_requirements(of)]
-    old, new = split_actions(before.rights), split_actions(after.rights)
-    # A lost DENY gives access, too.
-    gained = {right for right in old ^ new if (right.qualifier is ALLOW) == (right in new)}
-    for requirement, steps in decide_all(kept, system).by_name if gained else ():
-        wanted = split_actions(
-            Right("", ALLOW, right, name) for right, names in requirement.rights for name in names
-        )
-        for step in steps:
-            if any(
-                own.enclave == step.use.enclave
-                and own.right == right.right
-                and overlap(own.name, right.name)
-                for own in gained
-                for right in wanted
-            ):
-                text = f"{step.text()}: new access, which the requirement allows only by "
-                text += f"{patterns_of_any_package(requirement)}, as to any enclave of such a name"
-                place = step.source or requirement.source
-                remedy = "Name the enclaves that are meant in the requirement, or approve this in "
-                remedy += "the review."
-                yield DROPPED.found(str(requirement), text, place.file, place.line, remedy)
-
-
-def _unanswered_requirement_findings(
-    earlier: Sequence[Requirement],
-    requirements: Sequence[Requirement],
-    before: Collection[Right],
-    after: Collection[Right],
-) -> Iterator[Finding]:
-    """Yield a finding for each kept requirement about a name whose other side HEAD removes.
-
-    For example, HEAD renames a service at its server, and the requirement has the old name.
-    Wildcards that match the name are no other side, such as the wildcard of a recorder, unless
-    HEAD writes a wildcard in place of a removed right.
-    """
-    first, second = split_actions(before), split_actions(after)
-    removed, added = first - second, second - first
-    changed_enclaves = {(right.enclave, right.right) for right in removed}
-    changed_names = {(right.right, right.name) for right in removed}
-    replacing = {
-        right
-        for right in added
-        if (right.enclave, right.right) in changed_enclaves
-        or (right.right, right.name) in changed_names
-    }
-
-    def without_wildcards(rights: Iterable[Right], counting: Collection[Right]) -> set[Right]:
-        return {
-            right
-            for right in rights
-            if right.qualifier is not ALLOW or not is_expression(right.name) or right in counting
-        }
-
-    similar_requirements = similarity_to(earlier)
-    asked = {
-        requirement: {
-            goal_right(Right("", ALLOW, right, name)): Right("", ALLOW, PEER_RIGHT[right], name)
-            for right, name in rights_that_need_a_peer(requirement)
-        }
-        for requirement in (requirements if removed or added else ())
-        if similar_requirements(requirement)
-    }
-    difference = RightsDifference(tuple(removed), tuple(added), {})
-    candidates = {right for peers in asked.values() for right in peers}
-    unanswered = {
-        *rights_without_counterpart(
-            without_wildcards(first, removed),
-            without_wildcards(second, replacing),
-            difference,
-            candidates,
-        )
-    }
-    for requirement, peers in asked.items():
-        lost = [
-            f"{peer.right} {peer.kind.removesuffix('s')} {peer.name}"
-            for right, peer in peers.items()
-            if right in unanswered
-        ]
-        if lost:
-            place = requirement.source
-            text = f"HEAD removes the last stated right to {first_few(lost, 3)}, without which "
-            text += "the requirement protects nothing"
-            yield DROPPED.found(str(requirement), text, place.file, place.line, GONE_REMEDY)
-
-
-def _namespaces_of_patterns(requirement: Requirement) -> list[str]:
-    """Return namespaces in which a requirement may apply to other enclaves than in ``/``.
-
-    They are in the patterns of enclaves that do not move with the namespace, and follow ``/``.
-
-    Raises:
-        DocumentError: there are more namespaces than a review tries.
-    """
-    namespaces = dict.fromkeys(["/"])
-    if requirement.is_relative and requirement.elsewhere:
-        moved = patterns_of_enclaves(requirement.elsewhere)
-        fixed = (name for name in patterns_of_enclaves(requirement) if name in moved)
-        namespaces |= dict.fromkeys(_namespaces_in(fixed))
-    if len(namespaces) > _MOST_NAMESPACES + 1:
-        raise DocumentError(
-            f"the enclaves of a requirement name more than {_MOST_NAMESPACES} namespaces: "
-            f"{requirement}",
-            "So it is not known whether a node escapes the requirement in one of them.",
-            "Name fewer namespaces there, or name the namespaces of the robots with --namespace.",
-        )
-    return [*namespaces]
-
-
-def _namespaces_in(names: Iterable[str]) -> Iterator[str]:
-    """Yield the namespaces of names, and of a name that matches each expression."""
-    for expression in names:
-        parts = (common_name([expression, "/*/*"]) or "").split("/")[:-1]
-        yield from ("/".join(parts[:end]) for end in range(2, len(parts) + 1))
-
-
-def _enclaves_by_node(
-    enclaves: Iterable[Enclave], new_name: Callable[[str], str] = str
-) -> dict[NodeName, set[str]]:
-    nodes: dict[NodeName, set[str]] = {}
-    for enclave in enclaves:
-        for node in nodes_of(enclave):
-            node = node._replace(ns=new_name(node.ns))
-            nodes.setdefault(node, set()).add(enclave.path)
-    return nodes
-
-
 def _without_removed_robots(before: Fleet | None, after: FleetSource) -> Fleet | None:
     """Return the fleet ``before`` without the robots that ``after`` lacks.
 
@@ -1780,100 +1554,6 @@ def _without_removed_robots(before: Fleet | None, after: FleetSource) -> Fleet |
     return Fleet.of(
         (robot for robot in before.robots.values() if robot.name not in gone), before.groups
     )
-
-
-@dataclass(frozen=True, slots=True)
-class _Moves:
-    """The robots whose namespaces HEAD changes.
-
-    ``namespaces`` maps their old to their new namespaces; ``fleet`` is the fleet of BASE with the
-    new namespaces.  ``clauses`` say why a requirement does not follow its robot; ``followed`` maps
-    requirements that do to what they were.
-    """
-
-    namespaces: Mapping[str, str] = field(default_factory=dict)
-    fleet: Fleet | None = None
-    clauses: dict[Requirement, str] = field(default_factory=dict)
-    followed: dict[Requirement, Requirement] = field(default_factory=dict)
-
-    def new_name(self, name: str) -> str:
-        """Return a name or namespace of BASE as it is after the move of its robot."""
-        old = name
-        while old:
-            if old in self.namespaces:
-                return self.namespaces[old].rstrip("/") + name.removeprefix(old) or "/"
-            old = old.rpartition("/")[0]
-        return self.namespaces.get("/", "") + name
-
-    def before(self, requirement: Requirement) -> Requirement:
-        """Return a requirement as BASE has it."""
-        return self.followed.get(requirement, requirement)
-
-    def follow(
-        self,
-        earlier: Sequence[Requirement],
-        moved: Sequence[Requirement],
-        requirements: Iterable[Requirement],
-        system: System,
-    ) -> list[Requirement]:
-        """Return ``earlier``, with the requirements that follow their robots as in ``moved``.
-
-        A requirement of BASE that HEAD does not demand follows its robot, unless HEAD still has
-        rights to the names, or the enclaves, of the robot's old namespace.
-        """
-        if len(earlier) != len(moved):
-            return [*earlier]
-        dropped = {each.requirement for each in dropped_requirements(earlier, requirements)}
-        result: list[Requirement] = []
-        for old, new in zip(earlier, moved, strict=True):
-            clause = _old_names_clause(old, new, system) if old in dropped and old != new else ""
-            if clause:
-                self.clauses[old] = (
-                    f"; its robot has another namespace now, but {clause}. Remove this from the "
-                    "policy, or demand the same for the old name"
-                )
-            follows = old in dropped and not clause
-            if follows:
-                self.followed[new] = old
-            result.append(new if follows else old)
-        return result
-
-
-def _moves(before: Fleet | None, after: Fleet | None) -> _Moves:
-    if before is None or after is None:
-        return _Moves()
-    robots = [
-        robot._replace(namespace=after.robots.get(robot.name, robot).namespace)
-        for robot in before.robots.values()
-    ]
-    pairs = [(before.robots[robot.name].namespace, robot.namespace) for robot in robots]
-    moved = {old: new for old, new in pairs if old != new}
-    is_clear = all(moved.get(old, old) == new for old, new in pairs)
-    return _Moves(moved, Fleet.of(robots, before.groups)) if is_clear else _Moves()
-
-
-def _old_names_clause(old: Requirement, new: Requirement, system: System) -> str:
-    """Return a clause if something in HEAD has a name that only ``old`` has, or ""."""
-    enclaves = {*enclaves_of(old)}.difference(enclaves_of(new))
-    for enclave in sorted({right.enclave for right in system.rights}) if enclaves else ():
-        if any(overlap(enclave, name) for name in enclaves):
-            return f"the enclave {enclave} still exists"
-    if isinstance(old, Must | NothingBut | Widest):  # these do not restrict who may use a name
-        return ""
-    names = {*names_of(old)}.difference(names_of(new))
-    stated = (
-        right
-        for right in system.rights
-        if right.qualifier is ALLOW and not is_expression(right.name)
-        if any(overlap(right.name, name) for name in names)
-    )
-    if right := min(stated, default=None):
-        return f"{right.enclave} may still {right.right} {right.name}"
-    if isinstance(old, Only | Nobody | AtMost | NotBoth):
-        for finding in requirement_findings([old], system):
-            if finding.kind is VIOLATED:
-                return f"{finding.subject} {finding.text}"
-    return ""
 
 
 def _undecided_step(kind: str, subject: str, error: SrosError | OSError) -> ReviewStep:

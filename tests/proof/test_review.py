@@ -24,7 +24,7 @@ from sros_tool.errors import DocumentError, SrosError, UsageError
 from sros_tool.files import templates_dir
 from sros_tool.policy.model import ALLOW
 from sros_tool.policy.rights import Right, renamed_enclaves
-from sros_tool.proof import review
+from sros_tool.proof import lost_protection, review
 from sros_tool.proof.commit_files import CommitFiles
 from sros_tool.proof.repository import Repository
 from tests.support.code_host import NODE, PROJECT
@@ -1129,7 +1129,7 @@ def test_names_that_are_too_many_to_compare_leave_the_other_steps(
     change.commit({"robot.xml": after})
     with monkeypatch.context() as patched:
         error = DocumentError("there are too many similar names")
-        patched.setattr(review, "rights_without_counterpart", Mock(side_effect=error))
+        patched.setattr(lost_protection, "rights_without_counterpart", Mock(side_effect=error))
         ended = change.review("--policy", "robot.xml", "--requirements", "robot.toml")
     assert ended.status == 2 and "requirements-before robot.xml: there are too" in ended.out, ended
     assert "+ /b subscribe topic /y" in ended.out, ended
@@ -1589,7 +1589,7 @@ def test_requirements_of_a_package_are_decided_in_a_namespace(
         in ended.out
     )
     with monkeypatch.context() as patched:
-        patched.setattr(review, "_MOST_NAMESPACES", 1)
+        patched.setattr(review, "MOST_NAMESPACES", 1)
         some = "the change breaks them in 1 of 2 namespaces (those of changed names first)"
         assert some in change.review(*asked).ok().out
     assert (

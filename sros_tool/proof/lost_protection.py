@@ -1,0 +1,346 @@
+"""What a change takes away from the requirements before it.
+
+Nodes leave the enclaves that a requirement restricts, enclaves gain access by an exception for any
+package, a name loses its other side, or a robot moves to another namespace.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+
+from sros_tool.checks.kind import Finding
+from sros_tool.checks.requirements import DROPPED, VIOLATED
+from sros_tool.errors import DocumentError
+from sros_tool.fleet.robots import Fleet
+from sros_tool.names import expand, is_expression
+from sros_tool.policy.model import ALLOW, PEER_RIGHT, Enclave
+from sros_tool.policy.patterns import common_name, overlap
+from sros_tool.policy.rights import (
+    NodeName,
+    Right,
+    RightsDifference,
+    goal_right,
+    nodes_of,
+    rights_without_counterpart,
+    split_actions,
+)
+from sros_tool.proof.decide import (
+    patterns_of_any_package,
+    restricted_enclaves,
+    rights_that_need_a_peer,
+)
+from sros_tool.proof.findings import GONE_REMEDY, decide_all, requirement_findings
+from sros_tool.proof.requirements import (
+    AtMost,
+    Must,
+    Nobody,
+    NotBoth,
+    NothingBut,
+    Only,
+    Requirement,
+    Widest,
+    dropped_requirements,
+    enclaves_of,
+    names_of,
+    patterns_of_enclaves,
+    similarity_to,
+)
+from sros_tool.proof.sources import AccessSource
+from sros_tool.proof.system import System
+from sros_tool.wording import first_few
+
+MOST_NAMESPACES = 20
+"""Number of namespaces in which a review tries requirements."""
+
+
+@dataclass(frozen=True, slots=True)
+class RobotMoves:
+    """The robots whose namespaces HEAD changes.
+
+    ``namespaces`` maps their old to their new namespaces; ``fleet`` is the fleet of BASE with the
+    new namespaces.  ``clauses`` say why a requirement does not follow its robot; ``followed`` maps
+    requirements that do to what they were.
+    """
+
+    namespaces: Mapping[str, str] = field(default_factory=dict)
+    fleet: Fleet | None = None
+    clauses: dict[Requirement, str] = field(default_factory=dict)
+    followed: dict[Requirement, Requirement] = field(default_factory=dict)
+
+    @classmethod
+    def between(cls, before: Fleet | None, after: Fleet | None) -> RobotMoves:
+        """Return the moves from one fleet to another; none if they contradict each other."""
+        if before is None or after is None:
+            return cls()
+        robots = [
+            robot._replace(namespace=after.robots.get(robot.name, robot).namespace)
+            for robot in before.robots.values()
+        ]
+        pairs = [(before.robots[robot.name].namespace, robot.namespace) for robot in robots]
+        moved = {old: new for old, new in pairs if old != new}
+        is_clear = all(moved.get(old, old) == new for old, new in pairs)
+        return cls(moved, Fleet.of(robots, before.groups)) if is_clear else cls()
+
+    def new_name(self, name: str) -> str:
+        """Return a name or namespace of BASE as it is after the move of its robot."""
+        old = name
+        while old:
+            if old in self.namespaces:
+                return self.namespaces[old].rstrip("/") + name.removeprefix(old) or "/"
+            old = old.rpartition("/")[0]
+        return self.namespaces.get("/", "") + name
+
+    def before(self, requirement: Requirement) -> Requirement:
+        """Return a requirement as BASE has it."""
+        return self.followed.get(requirement, requirement)
+
+    def follow(
+        self,
+        earlier: Sequence[Requirement],
+        moved: Sequence[Requirement],
+        requirements: Iterable[Requirement],
+        system: System,
+    ) -> list[Requirement]:
+        """Return ``earlier``, with the requirements that follow their robots as in ``moved``.
+
+        A requirement of BASE that HEAD does not demand follows its robot, unless HEAD still has
+        rights to the names, or the enclaves, of the robot's old namespace.
+        """
+        if len(earlier) != len(moved):
+            return [*earlier]
+        dropped = {gone.requirement for gone in dropped_requirements(earlier, requirements)}
+        result: list[Requirement] = []
+        for old, new in zip(earlier, moved, strict=True):
+            clause = _old_names_clause(old, new, system) if old in dropped and old != new else ""
+            if clause:
+                self.clauses[old] = (
+                    f"; its robot has another namespace now, but {clause}. Remove this from the "
+                    "policy, or demand the same for the old name"
+                )
+            follows = old in dropped and not clause
+            if follows:
+                self.followed[new] = old
+            result.append(new if follows else old)
+        return result
+
+
+def _old_names_clause(old: Requirement, new: Requirement, system: System) -> str:
+    """Return a clause if something in HEAD has a name that only ``old`` has, or ""."""
+    enclaves = {*enclaves_of(old)}.difference(enclaves_of(new))
+    for enclave in sorted({right.enclave for right in system.rights}) if enclaves else ():
+        if any(overlap(enclave, name) for name in enclaves):
+            return f"the enclave {enclave} still exists"
+    if isinstance(old, Must | NothingBut | Widest):  # these do not restrict who may use a name
+        return ""
+    names = {*names_of(old)}.difference(names_of(new))
+    stated = (
+        right
+        for right in system.rights
+        if right.qualifier is ALLOW and not is_expression(right.name)
+        if any(overlap(right.name, name) for name in names)
+    )
+    if right := min(stated, default=None):
+        return f"{right.enclave} may still {right.right} {right.name}"
+    if isinstance(old, Only | Nobody | AtMost | NotBoth):
+        for finding in requirement_findings([old], system):
+            if finding.kind is VIOLATED:
+                return f"{finding.subject} {finding.text}"
+    return ""
+
+
+def lost_restriction_findings(
+    earlier: Sequence[Requirement],
+    requirements: Sequence[Requirement],
+    before: AccessSource,
+    after: AccessSource,
+    robot_moves: RobotMoves,
+) -> Iterator[Finding]:
+    """Yield a finding for each node that moves to an enclave that a requirement does not restrict.
+
+    Before the move, the requirement and a similar one of ``earlier`` restricted its enclave.  A
+    node in the old namespace of a robot may follow the robot, or keep its name: both count.
+    """
+    new_enclaves = _enclaves_by_node(after.enclaves.values())
+    moves = [
+        (node, old - new_enclaves[node], new_enclaves[node] - old)
+        for follow in (robot_moves.new_name, str)
+        for node, old in _enclaves_by_node(before.enclaves.values(), follow).items()
+        if new_enclaves.get(node, old) - old
+    ]
+    new_paths = {path: robot_moves.new_name(path) for path in before.enclaves}
+    similar_requirements = similarity_to(earlier)
+    for requirement in requirements if moves else ():
+        reported: dict[NodeName, set[str]] = defaultdict(set)
+        # The namespaces of a fleet are known, and its policies name the enclaves in them.
+        for ns in ("/",) if after.fleet else _namespaces_of_patterns(requirement):
+            now_restricted = restricted_enclaves(requirement, after.enclaves, ns)
+            was_restricted = [
+                {path for path, new in new_paths.items() if not restricted.isdisjoint((path, new))}
+                for restricted in restricted_enclaves(
+                    requirement, {*new_paths, *new_paths.values()}, ns
+                )
+            ]
+            left = [
+                (node, old & was, at, new - now)
+                for at, (was, now) in enumerate(zip(was_restricted, now_restricted, strict=True))
+                for node, old, new in moves
+                if old & was and new - now
+            ]
+            required = [
+                restricted_enclaves(robot_moves.before(similar), before.enclaves, ns)
+                for similar in (similar_requirements(requirement) if left else ())
+            ]
+            left = [move for move in left if any(move[1] & was[move[2]] for was in required)]
+            for node, _, _, outside in left:
+                if outside <= reported[node]:
+                    continue
+                reported[node] |= outside
+                place = requirement.source
+                name, to = expand("~", *node), first_few(sorted(outside), 3)
+                where = "enclave" if len(outside) == 1 else "enclaves"
+                text = f"node {name} moves to {where} {to}, where the requirement does not apply"
+                text += f" for users in namespace {ns}" if ns != "/" else ""
+                remedy = "Let the requirement apply to the enclave, or approve this in the review."
+                yield DROPPED.found(str(requirement), text, place.file, place.line, remedy)
+
+
+def access_by_name_findings(
+    earlier: Sequence[Requirement],
+    requirements: Sequence[Requirement],
+    before: AccessSource,
+    after: AccessSource,
+    system: System,
+) -> Iterator[Finding]:
+    """Yield a finding for each enclave that gains access by a pattern such as ``*/operator/*``.
+
+    Enclaves of any package can match such a pattern, so the owner of the requirement has to see
+    them.
+    """
+    similar_requirements = similarity_to(earlier)
+    kept = [of for of in requirements if isinstance(of, Only) and similar_requirements(of)]
+    old, new = split_actions(before.rights), split_actions(after.rights)
+    # A lost DENY gives access, too.
+    gained = {right for right in old ^ new if (right.qualifier is ALLOW) == (right in new)}
+    for requirement, steps in decide_all(kept, system).by_name if gained else ():
+        wanted = split_actions(
+            Right("", ALLOW, right, name) for right, names in requirement.rights for name in names
+        )
+        for step in steps:
+            if any(
+                own.enclave == step.use.enclave
+                and own.right == right.right
+                and overlap(own.name, right.name)
+                for own in gained
+                for right in wanted
+            ):
+                text = f"{step.text()}: new access, which the requirement allows only by "
+                text += f"{patterns_of_any_package(requirement)}, as to any enclave of such a name"
+                place = step.source or requirement.source
+                remedy = "Name the enclaves that are meant in the requirement, or approve this in "
+                remedy += "the review."
+                yield DROPPED.found(str(requirement), text, place.file, place.line, remedy)
+
+
+def unanswered_requirement_findings(
+    earlier: Sequence[Requirement],
+    requirements: Sequence[Requirement],
+    before: Collection[Right],
+    after: Collection[Right],
+) -> Iterator[Finding]:
+    """Yield a finding for each kept requirement about a name whose other side HEAD removes.
+
+    For example, HEAD renames a service at its server, and the requirement has the old name.
+    Wildcards that match the name are no other side, such as the wildcard of a recorder, unless
+    HEAD writes a wildcard in place of a removed right.
+    """
+    first, second = split_actions(before), split_actions(after)
+    removed, added = first - second, second - first
+    changed_enclaves = {(right.enclave, right.right) for right in removed}
+    changed_names = {(right.right, right.name) for right in removed}
+    replacing = {
+        right
+        for right in added
+        if (right.enclave, right.right) in changed_enclaves
+        or (right.right, right.name) in changed_names
+    }
+
+    def without_wildcards(rights: Iterable[Right], counting: Collection[Right]) -> set[Right]:
+        return {
+            right
+            for right in rights
+            if right.qualifier is not ALLOW or not is_expression(right.name) or right in counting
+        }
+
+    similar_requirements = similarity_to(earlier)
+    asked = {
+        requirement: {
+            goal_right(Right("", ALLOW, right, name)): Right("", ALLOW, PEER_RIGHT[right], name)
+            for right, name in rights_that_need_a_peer(requirement)
+        }
+        for requirement in (requirements if removed or added else ())
+        if similar_requirements(requirement)
+    }
+    difference = RightsDifference(tuple(removed), tuple(added), {})
+    candidates = {right for peers in asked.values() for right in peers}
+    unanswered = {
+        *rights_without_counterpart(
+            without_wildcards(first, removed),
+            without_wildcards(second, replacing),
+            difference,
+            candidates,
+        )
+    }
+    for requirement, peers in asked.items():
+        lost = [
+            f"{peer.right} {peer.kind.removesuffix('s')} {peer.name}"
+            for right, peer in peers.items()
+            if right in unanswered
+        ]
+        if lost:
+            place = requirement.source
+            text = f"HEAD removes the last stated right to {first_few(lost, 3)}, without which "
+            text += "the requirement protects nothing"
+            yield DROPPED.found(str(requirement), text, place.file, place.line, GONE_REMEDY)
+
+
+def _namespaces_of_patterns(requirement: Requirement) -> list[str]:
+    """Return namespaces in which a requirement may apply to other enclaves than in ``/``.
+
+    They are in the patterns of enclaves that do not move with the namespace, and follow ``/``.
+
+    Raises:
+        DocumentError: there are more namespaces than a review tries.
+    """
+    namespaces = dict.fromkeys(["/"])
+    if requirement.is_relative and requirement.elsewhere:
+        moved = patterns_of_enclaves(requirement.elsewhere)
+        fixed = (name for name in patterns_of_enclaves(requirement) if name in moved)
+        namespaces |= dict.fromkeys(namespaces_in(fixed))
+    if len(namespaces) > MOST_NAMESPACES + 1:
+        raise DocumentError(
+            f"the enclaves of a requirement name more than {MOST_NAMESPACES} namespaces: "
+            f"{requirement}",
+            "So it is not known whether a node escapes the requirement in one of them.",
+            "Name fewer namespaces there, or name the namespaces of the robots with --namespace.",
+        )
+    return [*namespaces]
+
+
+def namespaces_in(names: Iterable[str]) -> Iterator[str]:
+    """Yield the namespaces of names, and of a name that matches each expression."""
+    for expression in names:
+        parts = (common_name([expression, "/*/*"]) or "").split("/")[:-1]
+        yield from ("/".join(parts[:end]) for end in range(2, len(parts) + 1))
+
+
+def _enclaves_by_node(
+    enclaves: Iterable[Enclave], new_name: Callable[[str], str] = str
+) -> dict[NodeName, set[str]]:
+    nodes: dict[NodeName, set[str]] = {}
+    for enclave in enclaves:
+        for node in nodes_of(enclave):
+            node = node._replace(ns=new_name(node.ns))
+            nodes.setdefault(node, set()).add(enclave.path)
+    return nodes
