@@ -760,9 +760,9 @@ _UNANSWERED_REMEDY = (
 )
 
 _UNANSWERED_ALONE_REMEDY = (
-    "If only nodes of the package's users have the other side of the name, ignore this finding. If "
-    "the name was changed, change it in the requirement, too; after `merge_policy --remap`, check "
-    "with the same --remap."
+    "Ignore this finding if nodes of the package's users have the other side. Otherwise, the name "
+    "was changed: write the new name into the requirement, or check with the --remap of "
+    "`merge_policy`."
 )
 
 _ENCLAVES_REMEDY = (
