@@ -78,9 +78,14 @@ if TYPE_CHECKING:
     "--unjudged",
     is_flag=True,
     help=(
-        "Accept that sros could not judge a part of the graph, or that the graph kept changing "
+        "Accept that sros did not judge a part of the graph, such as a tool that writes "
         "(otherwise, exit with 1)."
     ),
+)
+@click.option(
+    "--unsettled",
+    is_flag=True,
+    help="Accept that the graph kept changing (otherwise, exit with 1).",
 )
 @fleet_option("The robots that the placeholders of POLICY stand for.")
 @force_option
@@ -98,6 +103,7 @@ def audit(
     patch: Path | None,
     partial: bool,
     unjudged: bool,
+    unsettled: bool,
     fleet_file: Path | None,
     force: bool,
     dry_run: bool,
@@ -127,9 +133,9 @@ def audit(
       $ sros audit keystore --distro lyrical
 
     Exit status: 0 if nothing would be denied and every node of POLICY or KEYSTORE was seen; 1 if
-    something would be denied; also 1 if a node was not seen (unless --partial is given), and if
-    something was not judged or the graph kept changing (unless --unjudged is given); 2 if the audit
-    could not be done.
+    something would be denied; also 1 if a node was not seen (unless --partial is given), if
+    something was not judged (unless --unjudged is given), and if the graph kept changing (unless
+    --unsettled is given); 2 if the audit could not be done.
     """
     from sros_tool.explain import audit as audits
     from sros_tool.fleet.fleet_file import read_fleet
@@ -198,7 +204,8 @@ def audit(
         text
         for is_left_out, text in (
             (audited.unseen and not partial, _UNSEEN),
-            ((audited.unjudged or snapshot.unsettled) and not unjudged, _UNJUDGED),
+            (audited.unjudged and not unjudged, _UNJUDGED),
+            (snapshot.unsettled and not unsettled, _UNSETTLED),
         )
         if is_left_out
     ]
@@ -208,7 +215,7 @@ def audit(
             "there is nothing to audit: no node was observed",
             why_no_node_was_observed(environment, snapshot.seconds, rmw, enclave),
         )
-    ended = audits.notes_on_ended_nodes(snapshot.gone)
+    ended = audits.notes_on_ended_nodes(snapshot.gone, snapshot.everything)
     by_vendor = (audits.BY_VENDOR_ON_ZENOH,) if on_zenoh and not (enclaves.zenoh or unknown) else ()
     audited = replace(audited, notes=(*audited.notes, *ended, *by_vendor))
     existed = patch is not None and patch.exists()
@@ -229,10 +236,12 @@ def audit(
                 refused=[RefusedEnclave(name, reason) for name, reason in refused],
                 unseen=audited.unseen,
                 unjudged=audited.unjudged,
+                tools=audited.tools,
                 observation=audited.observation,
                 settled=not snapshot.unsettled,
                 partial=partial,
                 unjudged_accepted=unjudged,
+                unsettled_accepted=unsettled,
                 patch=patch if written else None,
                 dry_run=dry_run,
                 changes=file_change(patch, existed=existed) if patch and written else (),
@@ -262,9 +271,8 @@ def audit(
 
 
 _UNSEEN = "nodes were not seen (--watch finds nodes that start later, --partial accepts this)"
-_UNJUDGED = (
-    "a part of the graph was not judged, or the graph kept changing (--unjudged accepts this)"
-)
+_UNJUDGED = "a part of the graph was not judged (--unjudged accepts this)"
+_UNSETTLED = "the graph kept changing (--watch finds later endpoints, --unsettled accepts this)"
 _NO_ZENOH_FILES = "what the keystore's files for Zenoh allow"
 _ALLOW_ADVICE = (
     "to allow the denied access, add --patch missing.xml: sros then writes the missing rights as a "

@@ -455,8 +455,8 @@ def generate_policy(
         common_parts,
         draft,
         first_subjects,
-        is_tool_name,
         learn,
+        tool_nodes,
         write,
     )
     from sros_tool.graph.learn import enclave_per_node as name_enclaves
@@ -505,7 +505,8 @@ def generate_policy(
         )
     else:
         _show(plan, learned, written=not dry_run)
-    gone = sorted(node for node in snapshot.gone if not is_tool_name(node.rpartition("/")[2]))
+    tools = {node.fqn for node in tool_nodes(snapshot.everything.nodes)}
+    gone = sorted({*snapshot.gone} - tools)
     if gone and watch is None:
         nodes = first_subjects(gone)
         text = f"left out, because these nodes ended while the graph was observed: {nodes}"

@@ -56,7 +56,7 @@ from sros_tool.close.state import (
 )
 from sros_tool.errors import SrosError, UnavailableError
 from sros_tool.explain.audit import DeniedRight
-from sros_tool.graph.learn import is_tool
+from sros_tool.graph.learn import robot_nodes, tool_nodes
 from sros_tool.graph.observation import (
     PUBLISH,
     SUBSCRIBE,
@@ -942,7 +942,7 @@ class _TalkComparison:
         new = sorted(
             f"{node_name(node)} in {' or '.join(node.enclaves) or 'no enclave'}"
             for node in without_profile
-            if node_name(node) not in known and not is_tool(node)
+            if node_name(node) not in known
         )
         if new:
             yield f"new, without a profile: {first_few(new, MOST_NAMES)}"
@@ -998,9 +998,8 @@ def _name_clauses(
             )
         yield text
     _, without_profile = nodes.divide_by_profile(nodes.as_observed)
-    not_compared = {
-        node_name(node) for node in without_profile if not is_tool(node)
-    } - renamed.keys()
+    of_robot = {*without_profile} - tool_nodes(nodes.as_observed)
+    not_compared = {*map(node_name, of_robot)} - renamed.keys()
     if not_compared and not fails:
         yield (
             "not compared, because the policy has no profile for them any more: "
@@ -1062,9 +1061,8 @@ def _abandoned_names(
     uses the old name.  ``denied`` endpoints are left out.
     """
     refused = _denied_endpoints(denied)
-    robot_nodes = [node for node in expected.nodes if not is_tool(node)]
-    kept = {endpoint for _, endpoint in {*endpoints_of(robot_nodes)} - refused}
-    uses = {*endpoints_of(node for node in before.nodes if not is_tool(node))} - refused
+    kept = {endpoint for _, endpoint in {*endpoints_of(robot_nodes(expected.nodes))} - refused}
+    uses = {*endpoints_of(robot_nodes(before.nodes))} - refused
     new_names = {
         _opposite(pair.old): ros_use(pair.new)[1] for pair in moved if pair.old not in kept
     }
@@ -1090,9 +1088,7 @@ def _endpoints_without_peer(
     out.
     """
     refused = _denied_endpoints(denied)
-    talked, talks = (
-        {*endpoints_of(node for node in seen.nodes if not is_tool(node))} for seen in (before, now)
-    )
+    talked, talks = ({*endpoints_of(robot_nodes(seen.nodes))} for seen in (before, now))
     lonely = {
         (pair.new_node, *ros_use(pair.new))
         for pair in moved

@@ -23,7 +23,7 @@ from sros_tool.close.state import RunningRobot
 from sros_tool.errors import UnavailableError, UsageError
 from sros_tool.explain.explanation import likely_meaning
 from sros_tool.files import policies_dir, remove_file, replace_file
-from sros_tool.graph.learn import common_parts, is_tool
+from sros_tool.graph.learn import common_parts, robot_nodes
 from sros_tool.graph.observation import ObservedNode, make_observation, observation_from_json
 from sros_tool.names import expand, is_expression
 from sros_tool.policy.document import read_policy
@@ -109,7 +109,7 @@ def watch(robot: LocalRobot, words: Sequence[str]) -> list[str]:
     learned = json.loads(document)
     all_nodes = observation_from_json(learned).nodes
     observed_nodes = ObservedNodes(robot, all_nodes)
-    nodes = [node for node in observed_nodes.in_their_enclaves if not is_tool(node)]
+    nodes = robot_nodes(observed_nodes.in_their_enclaves)
     observed = _observed_processes(running, nodes, learned["ended"], started)
     _write_observation(robot, document, observed)
     _show_variables(running, observed)
@@ -125,7 +125,7 @@ def watch(robot: LocalRobot, words: Sequence[str]) -> list[str]:
         robot.shell.say(others)
     if os.path.lexists(robot.observed_policy):  # a file of an earlier watch
         remove_file(robot.observed_policy)
-    without_enclave = [node.fqn for node in all_nodes if not node.enclaves and not is_tool(node)]
+    without_enclave = [node.fqn for node in robot_nodes(all_nodes) if not node.enclaves]
     problems = [_text_on_nodes_without_enclave(robot, without_enclave)] if without_enclave else []
     lacking = ""
     if learned["dry_run"]:
@@ -256,7 +256,7 @@ def _lacking_text(
     from sros_tool.graph.learn import draft, learn, write  # only after another watch
 
     common, policy = common_parts(robot.folder, policies_dir()), read_policy(robot.policy)
-    learned = learn(make_observation(nodes), common)
+    learned = learn(make_observation(nodes), common, of_tools=True)
     lacking = plan_merge(policy, learned.policy()).added
     if not lacking:
         return ""

@@ -37,10 +37,11 @@ from sros_tool.graph.learn import (
     RightsOrigin,
     enclave_per_node,
     first_subjects,
-    is_tool,
     is_tool_name,
     learn,
     rights_of_endpoints,
+    tool_nodes,
+    writing_rights,
 )
 from sros_tool.graph.observation import (
     PUBLISH,
@@ -316,8 +317,8 @@ class AuditResult(NamedTuple):
     domain: int
     """The ROS domain."""
     allowed: bool
-    """Whether the exit status is 0: nothing would be denied, and ``--partial`` and ``--unjudged``
-    accept everything that was left out.
+    """Whether the exit status is 0: nothing would be denied, and ``--partial``, ``--unjudged`` and
+    ``--unsettled`` accept everything that was left out.
     """
     denied: Sequence[DeniedRight]
     """The rights that would be denied."""
@@ -331,6 +332,8 @@ class AuditResult(NamedTuple):
     """Parts of the observed graph that were not judged, as texts with a number and some names;
     ``notes`` has more.
     """
+    tools: Sequence[ObservedNode]
+    """The nodes of tools, such as `ros2 topic echo`, which were not judged."""
     observation: Observation
     settled: bool
     """Whether the whole ROS graph was seen: it stopped changing, or was watched without a gap and
@@ -339,7 +342,9 @@ class AuditResult(NamedTuple):
     partial: bool
     """Whether ``--partial`` accepted nodes that were not seen."""
     unjudged_accepted: bool
-    """Whether ``--unjudged`` accepted parts that were not judged, or a graph that kept changing."""
+    """Whether ``--unjudged`` accepted parts that were not judged."""
+    unsettled_accepted: bool
+    """Whether ``--unsettled`` accepted a graph that kept changing."""
     patch: Path | None
     """Path of the policy that ``--patch`` wrote, with the missing rights; or null."""
     dry_run: DryRun
@@ -354,7 +359,7 @@ class Audit:
     ``refused`` maps enclaves to the reason why no process could start there, or find peers.
     ``observation`` has the judged nodes, with the enclaves in which they were judged. ``unseen``
     are the ``expected`` nodes of the policy or keystore that did not appear.  ``unjudged`` are
-    clauses on what was observed but not judged.
+    clauses on what was observed but not judged.  ``tools`` are the nodes of tools.
     """
 
     denied: tuple[DeniedRight, ...]
@@ -364,6 +369,7 @@ class Audit:
     expected: frozenset[EnclaveNode]
     unseen: tuple[EnclaveNode, ...]
     unjudged: tuple[str, ...]
+    tools: tuple[ObservedNode, ...]
 
     @property
     def allowed(self) -> bool:
@@ -398,7 +404,7 @@ class Audit:
     @cached_property
     def missing(self) -> Learned:
         """The rights to add to the policy."""
-        learned = learn(_nodes_using_denied(self.denied, self.observation))
+        learned = learn(_nodes_using_denied(self.denied, self.observation), of_tools=True)
         return replace(learned, source=RightsOrigin.AUDIT)
 
 
@@ -414,11 +420,12 @@ def audit(observation: Observation, enclaves: AuditedEnclaves, observer: str = "
     ``observer`` is the enclave of the process that observed, or ""; this enclave counts as seen if
     it names no nodes.
     """
-    unjudged = _unjudged_notes(observation)
+    tools = tool_nodes(observation.nodes)
+    unjudged = _unjudged_notes(observation, tools)
     notes = [note for note, _ in unjudged]
     processes: dict[str, list[ObservedNode]] = {}
     for node in observation.nodes:
-        if not is_tool(node):
+        if node not in tools:
             processes.setdefault(node.participant, []).append(node)
     expected = frozenset(
         node
@@ -460,7 +467,8 @@ def audit(observation: Observation, enclaves: AuditedEnclaves, observer: str = "
                 refused[name] = answers[name].refused
         judged += (replace(node, enclaves=tuple(chosen)) for node in nodes)
     if without_enclave:
-        for node in enclave_per_node(make_observation(without_enclave)).observation.nodes:
+        named = enclave_per_node(make_observation(without_enclave), of_tools=True)
+        for node in named.observation.nodes:
             judged.append(node)
             denied += _rights_without_enclave(node, enclaves.what)
     if note := _note_on_subjects("undecided", _UNDECIDED_TEXT, undecided):
@@ -490,6 +498,7 @@ def audit(observation: Observation, enclaves: AuditedEnclaves, observer: str = "
         expected,
         tuple(sorted(expected - observed_nodes)),
         tuple(words for _, words in unjudged if words),
+        tuple(sorted(tools)),
     )
 
 
@@ -503,8 +512,13 @@ _UNCLEAR_TEXT = (
     "distinguish them"
 )
 _TOOLS_TEXT = (
-    "left out, because these nodes are tools that observe the robot; on the secured robot they "
-    "need an enclave such as the one in operator_look.xml (`sros policies --copy`)"
+    "left out, because these nodes are tools that only observe the robot; on the secured robot "
+    "they need an enclave such as the one in operator_look.xml (`sros policies --copy`)"
+)
+_WRITING_TOOLS_TEXT = (
+    "not judged, because these nodes have names of the command `ros2`, although they write; on the "
+    "secured robot, they need an enclave such as the one in operator_drive.xml (`sros policies "
+    "--copy`)"
 )
 _ENDED_TEXT = (
     "judged as well, although these nodes ended while the graph was observed; on a robot without "
@@ -518,22 +532,29 @@ _UNDECIDED_TEXT = (
 _STRAYS_TEXT = "not judged, because the writers or readers of these topics belong to no ROS node"
 
 
-def _unjudged_notes(observation: Observation) -> list[tuple[Note, str]]:
+def _unjudged_notes(
+    observation: Observation, tools: frozenset[ObservedNode]
+) -> list[tuple[Note, str]]:
     """Return notes on what was not judged, each with a text that has the number and the names.
 
     The text is "" for tools that only observe.
     """
-    tools = {node.fqn for node in observation.nodes if is_tool(node)}
-    active = {node.fqn for node in observation.nodes if is_tool(node) and not _only_observes(node)}
     silent = {(expand("~", ns, name), is_tool_name(name)) for _, ns, name in observation.silent}
-    tools |= {name for name, tool in silent if tool}
+    observing = {node.fqn for node in tools if not writing_rights(node)}
+    observing |= {name for name, tool in silent if tool}
     silent_nodes = {name for name, tool in silent if not tool}
     strays = {endpoint.topic for _, endpoint in observation.strays}
+    writing = {
+        f"{node.fqn} {first_few(rights, _MOST_NAMES)}"
+        for node in tools
+        if (rights := writing_rights(node))
+    }
     notes = [
+        (_note_on_subjects("tool", _TOOLS_TEXT, observing), "", observing),
         (
-            _note_on_subjects("tool", _TOOLS_TEXT, tools),
-            f"{counted(len(active), 'node')} with a tool's name",
-            active,
+            _note_on_subjects("tool-writes", _WRITING_TOOLS_TEXT, writing),
+            f"{counted(len(writing), 'node')} with a tool's name",
+            writing,
         ),
         (
             _note_on_subjects("silent", _SILENT_TEXT, silent_nodes),
@@ -547,17 +568,19 @@ def _unjudged_notes(observation: Observation) -> list[tuple[Note, str]]:
         ),
     ]
     return [
-        (note, f"{words} ({first_few(sorted(names), _MOST_NAMES)})" if names else "")
+        (note, f"{words} ({first_few(sorted(names), _MOST_NAMES)})" if words else "")
         for note, words, names in notes
         if note
     ]
 
 
-def notes_on_ended_nodes(nodes: Iterable[str]) -> tuple[Note, ...]:
-    """Return a note on nodes, by full name, that ended while the graph was observed."""
-    note = _note_on_subjects(
-        "ended", _ENDED_TEXT, (n for n in nodes if not is_tool_name(_base_name(n)))
-    )
+def notes_on_ended_nodes(nodes: Iterable[str], everything: Observation) -> tuple[Note, ...]:
+    """Return a note on nodes, by full name, that ended while the graph was observed.
+
+    ``everything`` has all observed nodes.
+    """
+    tools = {node.fqn for node in tool_nodes(everything.nodes)}
+    note = _note_on_subjects("ended", _ENDED_TEXT, {*nodes} - tools)
     return (note,) if note else ()
 
 
@@ -567,16 +590,6 @@ def _note_on_subjects(kind: str, text: str, subjects: Iterable[str]) -> Note | N
 
 
 _MOST_NAMES = 3
-_OF_EVERY_NODE = ("/rosout", "/parameter_events")
-
-
-def _only_observes(node: ObservedNode) -> bool:
-    """Return whether a node has only the services and the log that every node has."""
-    own_prefix = expand("~/", node.ns, node.name)
-    folded = rights_of_endpoints(node.endpoints)
-    return not (folded.halves or folded.foreign) and all(
-        right.name in _OF_EVERY_NODE or right.name.startswith(own_prefix) for right in folded.rights
-    )
 
 
 def _enclaves_of(

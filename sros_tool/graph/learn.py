@@ -39,6 +39,7 @@ from sros_tool.graph.observation import (
 from sros_tool.names import (
     ACTION_SEPARATOR,
     GLOBAL_TOPICS,
+    NODE_SERVICES,
     check_enclave_name,
     check_namespace,
     check_plain_namespace,
@@ -163,18 +164,25 @@ class Learned:
 _Place = tuple[str, str, str]
 
 
-def learn(observation: Observation, common: CommonParts | None = None) -> Learned:
+def learn(
+    observation: Observation, common: CommonParts | None = None, *, of_tools: bool = False
+) -> Learned:
     """Return the rights that the observed nodes use; profiles may include the parts in ``common``.
 
     If the enclave of a node is ambiguous, every possible enclave gets the node's rights, with a
-    note.
+    note.  ``observation`` has the whole graph, and tools in it get no rights; with ``of_tools``,
+    every node gets its rights, for a caller that chose the nodes.
     """
     notes = _Notes()
+    tools = frozenset[ObservedNode]() if of_tools else tool_nodes(observation.nodes)
     seen: dict[_Place, set[NodeRight]] = {}
     processes: dict[tuple[str, str], set[str]] = {}
     for node in observation.nodes:
-        if is_tool(node):
-            notes.add("tool", node.fqn)
+        if node in tools:
+            if written := writing_rights(node):
+                notes.add("tool-writes", f"{node.fqn} ({', '.join(written)})")
+            else:
+                notes.add("tool", node.fqn)
             continue
         if len(node.enclaves) == 1:
             processes.setdefault((node.fqn, *node.enclaves), set()).add(node.process)
@@ -348,15 +356,60 @@ A node with an observer's name and other endpoints is no observer.
 """
 
 
-def is_tool(node: ObservedNode) -> bool:
-    """Return whether a node belongs to a tool that observes the robot."""
+def tool_nodes(nodes: Iterable[ObservedNode]) -> frozenset[ObservedNode]:
+    """Return the nodes of tools, such as ``ros2 topic echo``, among all ``nodes`` of a graph.
+
+    Any program can give its nodes the name of a tool.  So a node counts as a tool only if all nodes
+    of its process have names of tools: no node of the robot can hide a part of its own process.
+    """
+    nodes = tuple(nodes)
+    others = {node.process for node in nodes if not _is_named_like_tool(node)}
+    return frozenset(node for node in nodes if node.process not in others)
+
+
+def robot_nodes(nodes: Iterable[ObservedNode]) -> list[ObservedNode]:
+    """Return the nodes of a graph without the nodes of tools."""
+    nodes = tuple(nodes)
+    tools = tool_nodes(nodes)
+    return [node for node in nodes if node not in tools]
+
+
+def _is_named_like_tool(node: ObservedNode) -> bool:
     tool = _TOOLS.match(node.name)
     return tool is not None and (not tool["observer"] or node.endpoints <= _OBSERVER_ENDPOINTS)
 
 
 def is_tool_name(name: str) -> bool:
-    """Return whether a node has the name of a tool that observes the robot."""
+    """Return whether a node has a name that a tool gives its nodes; it may be no tool."""
     return _TOOLS.match(name) is not None
+
+
+def writing_rights(tool: ObservedNode) -> tuple[str, ...]:
+    """Return the rights of a tool, as text, by which it does more than observe.
+
+    Reading, and writing what every node writes, is left out.
+    """
+    own_services = {expand(f"~/{service}", tool.ns, tool.name) for service in NODE_SERVICES}
+    folded = rights_of_endpoints(tool.endpoints)
+    rights = [
+        right
+        for right in folded.rights
+        if right.right != SUBSCRIBE
+        and not (right.right == PUBLISH and right.name in _WRITTEN_BY_EVERY_NODE)
+        and not (right.right == "reply" and right.name in own_services)
+    ]
+    without_right = [
+        endpoint for endpoint in folded.halves | folded.foreign if endpoint.direction == PUBLISH
+    ]
+    return tuple(
+        sorted(
+            [f"{right.right} {right.name}" for right in rights]
+            + [f"{endpoint.direction} {endpoint.topic}" for endpoint in without_right]
+        )
+    )
+
+
+_WRITTEN_BY_EVERY_NODE = ("/rosout", "/parameter_events")
 
 
 def stable_name(name: str) -> str:
@@ -556,7 +609,10 @@ _NOTE_TEXTS = {
     "run: {}. ROS_SECURITY_ENCLAVE_OVERRIDE names their enclaves, and the observer's keystore has "
     "no certificates of these enclaves. Observe with the keystore that has them (--keystore), or "
     "start the nodes with `--ros-args --enclave /its/name`",
-    "tool": "left out, because these nodes are tools that observe the robot: {}",
+    "tool": "left out, because these nodes have names of tools that observe the robot, and write "
+    "nothing: {}",
+    "tool-writes": "left out, although these nodes write, because they have names of the command "
+    "`ros2`: {}. If one of them is a part of the robot, give it another name",
 }
 
 
@@ -626,17 +682,18 @@ class NamedEnclaves(NamedTuple):
     notes: tuple[Note, ...]
 
 
-def enclave_per_node(observation: Observation) -> NamedEnclaves:
+def enclave_per_node(observation: Observation, *, of_tools: bool = False) -> NamedEnclaves:
     """Return the observation, with a new enclave for each process that has no enclave in the graph.
 
     The enclave has the namespace and name of the process's node.  If a process has several nodes,
     its enclave is named after the component container, or else after the node with the shortest
     name.  Notes name processes with several nodes, enclaves of several processes, and names that
-    Cyclone DDS mistakes for each other.
+    Cyclone DDS mistakes for each other.  ``of_tools`` is as for `learn`.
     """
+    tools = frozenset[ObservedNode]() if of_tools else tool_nodes(observation.nodes)
     processes: dict[str, list[ObservedNode]] = {}
     for node in observation.nodes:
-        if node.enclaves == UNSHOWN and not is_tool(node):
+        if node.enclaves == UNSHOWN and node not in tools:
             processes.setdefault(node.process, []).append(node)
     names = {process: _enclave_name(nodes) for process, nodes in processes.items()}
     nodes = [

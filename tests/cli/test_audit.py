@@ -66,7 +66,7 @@ def test_an_audit_says_by_whose_rules_it_decides_and_which_nodes_ended(
 def test_a_graph_that_still_grew_when_the_watch_ended_is_no_pass(
     program: Program, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for grew, accepted, status in ((False, (), 0), (True, (), 1), (True, ("--unjudged",), 0)):
+    for grew, accepted, status in ((False, (), 0), (True, (), 1), (True, ("--unsettled",), 0)):
 
         def growing(*asked: Any, grew: bool = grew, **more: Any) -> tuple[Snapshot, str]:
             snapshot, rmw = observe(*asked, **more)
@@ -220,6 +220,33 @@ def test_the_vendor_of_the_robot_decides(program: Program) -> None:
     assert "on Cyclone DDS" in ended.err
 
 
+EVIL = ("/", "/", "_ros2cli_12", "02", ["publish rt/cmd_evil", "subscribe rt/chatter"])
+
+
+@pytest.mark.parametrize(
+    ("node", "status", "said"),
+    [
+        # `ros2 topic echo` and the daemon only read.
+        ((*EVIL[:4], EVIL[4][1:]), 0, "note [audit.tool]: left out, because these nodes are tools"),
+        # `ros2 topic pub` is named with its topic.
+        (EVIL, 1, "not judged: 1 node with a tool's name (/_ros2cli_12 publish /cmd_evil)\n"),
+        # In the process of a robot's node, the name changes nothing.
+        ((*EVIL[:3], "01", EVIL[4]), 1, "2 rights would be denied to 2 nodes with 3 endpoints"),
+    ],
+)
+def test_no_node_hides_behind_the_name_of_a_tool(
+    node: Any, status: int, said: str, program: Program
+) -> None:
+    seen = graph(FINE, node)
+    ended = program(seen, "robot.xml", *SHORT)
+    assert (ended.status, said in ended.err) == (status, True), ended.err
+    found = json.loads(program(seen, "robot.xml", *SHORT, "--unjudged", "--json").out)
+    assert found["allowed"] is (node[3] == "02")
+    shown = found["tools"] if found["allowed"] else found["nodes"]
+    assert next(each for each in shown if each["name"] == "_ros2cli_12")["subscribe"]
+    assert status == 0 or "cmd_evil" in json.dumps(found)
+
+
 def test_json_has_a_stable_shape(program: Program) -> None:
     ended = program(graph(LOUD), "robot.xml", *SHORT, "--json", ROS_DOMAIN_ID="7")
     assert ended.status == 1
@@ -252,6 +279,8 @@ def test_json_has_a_stable_shape(program: Program) -> None:
         "settled": True,
         "partial": False,
         "unjudged_accepted": False,
+        "unsettled_accepted": False,
+        "tools": [],
         "nodes": [
             {
                 "enclaves": ["/t"],

@@ -226,18 +226,32 @@ def test_tools_and_strays_are_said(tmp_path: Path) -> None:
     )
     found = audited(tmp_path, TALKER, seen)
     assert found.allowed
-    assert ids(found) == ["audit.tool", "audit.stray"]
+    assert ids(found) == ["audit.tool-writes", "audit.stray"]
     assert found.unjudged == (
-        "1 node with a tool's name (/_ros2cli_12)",
+        "1 node with a tool's name (/_ros2cli_12 publish /x)",
         "1 topic without a node (Square)",
     )
     assert [each.fqn for each in found.observation.nodes] == ["/talker"]
 
 
 def test_a_tool_that_only_observes_leaves_nothing_open(tmp_path: Path) -> None:
-    seen = graph(talks(), node("/_ros2cli_daemon", like="c++", enclave="/", participant="p2"))
-    found = audited(tmp_path, TALKER, seen)
-    assert (ids(found), found.unjudged) == (["audit.tool"], ())
+    daemon = node("/_ros2cli_daemon", "subscribe /x", like="c++", enclave="/", participant="p2")
+    found = audited(tmp_path, TALKER, graph(talks(), daemon))
+    assert (ids(found), found.unjudged, found.tools) == (["audit.tool"], (), (daemon,))
+
+
+@pytest.mark.parametrize(("context", "enclave"), [("01", "/t"), ("02", "/_ros2cli_12")])
+def test_a_node_of_the_robot_with_the_name_of_a_tool_is_judged(
+    context: str, enclave: str, tmp_path: Path
+) -> None:
+    """Each context of a process has a participant of its own."""
+    process = "010f00000000000a000000"
+    hidden = node("/_ros2cli_12", "publish /evil", enclave="/", participant=process + context)
+    found = audited(tmp_path, TALKER, graph(talks(pid=f"{process}01"), hidden))
+    assert [(right.right.enclave, right.right.name) for right in found.denied] == [
+        (enclave, "/evil")
+    ]
+    assert [each.node for each in found.missing.profiles] == ["_ros2cli_12"]
 
 
 def test_a_node_without_an_endpoint_is_not_judged(tmp_path: Path) -> None:

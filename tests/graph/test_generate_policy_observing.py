@@ -174,7 +174,7 @@ def test_tools_alone_are_an_empty_graph(program: Program) -> None:
     ended = program(graph(("/", "/", "_ros2cli_12", "01", ["publish rt/x"])), *SHORT)
     assert ended.status == 1
     assert ended.err.splitlines()[0] == NO_NODES
-    assert "note [graph.tool]" in ended.err
+    assert "note [graph.tool-writes]" in ended.err and "/_ros2cli_12 (publish /x)" in ended.err
 
 
 @pytest.mark.parametrize(

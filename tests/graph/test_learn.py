@@ -138,9 +138,18 @@ def test_a_node_whose_enclave_is_open_gets_its_rights_in_each_and_a_note() -> No
 
 
 def test_tools_are_left_out_and_said() -> None:
-    learned = learn(graph(node("/_ros2cli_daemon_0_a", "publish x")))
+    daemon = node("/_ros2cli_daemon_0_a", "publish /rosout", "subscribe x")
+    learned = learn(graph(daemon, node("/_ros2cli_1", "publish x", participant="p2")))
     assert learned.profiles == ()
     assert "/_ros2cli_daemon_0_a" in text(learned, "tool")
+    assert "/_ros2cli_1 (publish /x)" in text(learned, "tool-writes")
+
+
+def test_a_node_of_the_robot_with_the_name_of_a_tool_gets_its_rights() -> None:
+    learned = learn(graph(node("/driver"), node("/_ros2cli_1", "publish /cmd_evil")))
+    assert [(each.node, *each.rights) for each in learned.profiles] == [
+        ("_ros2cli_1", ("publish", "/cmd_evil"))
+    ]
 
 
 def test_a_node_that_changes_its_name_has_one_profile() -> None:

@@ -2,11 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
-from sros_tool.graph.learn import is_tool, is_tool_name, name_as_written, stable_name
+from sros_tool.graph.learn import (
+    is_tool_name,
+    name_as_written,
+    stable_name,
+    tool_nodes,
+    writing_rights,
+)
+from sros_tool.graph.observation import Endpoint, ObservedNode
 from sros_tool.names import expand
 from tests.graph.graphs import node
+from tests.graph.test_enclaves import FIRST, SECOND
 
 
 @pytest.mark.parametrize(
@@ -56,8 +66,41 @@ def test_tools() -> None:
     assert not is_tool_name("ros2cli")
 
 
-def test_no_node_hides_behind_the_name_of_the_observer() -> None:
-    for name in ("_sros_observer", "_sros_observer_12ab"):
-        assert is_tool(node(f"/{name}", "publish /parameter_events"))
-        assert not is_tool(node(f"/{name}", "publish /parameter_events", "publish /cmd_vel"))
-    assert is_tool(node("/_ros2cli_12", "subscribe /chatter"))
+COMMAND = ("publish /rosout", "publish /parameter_events", "reply ~/get_type_description")
+
+
+@pytest.mark.parametrize(
+    ("nodes", "tools"),
+    [
+        ([node("/_ros2cli_12", *COMMAND, "subscribe /chatter")], ["/_ros2cli_12"]),
+        ([node("/_ros2cli_1"), node("/_ros2cli_X")], ["/_ros2cli_1", "/_ros2cli_X"]),
+        ([node("/_ros2cli_12"), node("/driver", participant="p2")], ["/_ros2cli_12"]),
+        # The name alone makes no tool of a node in a process of the robot.
+        ([node("/_ros2cli_12", "publish /cmd_evil"), node("/driver")], []),
+        ([node("/_ros2cli_12", participant=FIRST), node("/driver", participant=SECOND)], []),
+        ([node("/_sros_observer", *COMMAND[1:2]), node("/driver")], []),
+        ([node("/_sros_observer", *COMMAND[1:2])], ["/_sros_observer"]),
+        ([node("/_sros_observer_1", *COMMAND[1:2], "publish /cmd_evil")], []),
+    ],
+)
+def test_no_node_hides_behind_the_name_of_a_tool(
+    nodes: list[ObservedNode], tools: list[str]
+) -> None:
+    assert sorted(tool.fqn for tool in tool_nodes(nodes)) == tools
+
+
+@pytest.mark.parametrize(
+    ("rights", "writing"),
+    [
+        ((*COMMAND, "subscribe /chatter", "reply ~/get_parameters"), ()),
+        (("publish /x",), ("publish /x",)),
+        (("request /amcl/change_state",), ("request /amcl/change_state",)),
+        (("call /fib", "reply ~/open"), ("call /fib", "reply /_ros2cli_12/open")),
+        (("reply /amcl/get_parameters",), ("reply /amcl/get_parameters",)),
+    ],
+)
+def test_what_a_tool_writes(rights: tuple[str, ...], writing: tuple[str, ...]) -> None:
+    assert writing_rights(node("/_ros2cli_12", *rights)) == writing
+    half = Endpoint("rq/xRequest", "publish")
+    tool = replace(node("/_ros2cli_12"), endpoints=frozenset({half, half._replace(topic="y")}))
+    assert writing_rights(tool) == ("publish rq/xRequest", "publish y")
