@@ -386,12 +386,10 @@ class RobotStatus:
     @property
     def confirmed(self) -> datetime | None:
         """The time from which the age of the last confirmation counts, in UTC; null if the robot
-        sent no confirmation.  Of a message, this is the earlier one of ``received`` and ``clock``:
-        a message that somebody held back does not look new.
+        sent no confirmation.  This is the earlier one of ``received`` and ``clock``: a message that
+        somebody held back does not look new.
         """
-        if self.fetches and self.received and self.clock:
-            return min(self.received, self.clock)
-        return self.received
+        return min(self.received, self.clock) if self.received and self.clock else None
 
     def is_locked_out(self, now: datetime) -> bool:
         """Return whether a web server with the current CA and list refuses the robot at ``now``."""
@@ -427,17 +425,14 @@ class RobotStatus:
     def is_overdue(self, now: datetime, limit: timedelta) -> bool:
         """Return whether the last confirmation is older than ``limit``.
 
-        A message that shows a time that much later than its receipt proves nothing about its age.
+        If it shows a time that much later than its receipt, it proves nothing about its age.
         """
-        if self.confirmed is None:
+        if self.received is None or self.clock is None:
             return False
-        is_ahead = (
-            self.fetches and self.clock and self.received and (self.clock - self.received > limit)
-        )
-        return now - self.confirmed > limit or bool(is_ahead)
+        return now - min(self.received, self.clock) > limit or self.clock - self.received > limit
 
     def _is_overdue_by_clock(self, now: datetime, limit: timedelta) -> bool:
-        """Return whether only the robot's clock says that its last message is not new."""
+        """Return whether only the robot's clock says that its last confirmation is not new."""
         came_in_time = self.received is not None and now - self.received <= limit
         return came_in_time and self.is_overdue(now, limit)
 

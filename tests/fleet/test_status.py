@@ -1209,6 +1209,9 @@ def test_a_clock_that_is_wrong(field: Field, hours: int, text: str) -> None:
     received: datetime = parse_iso(found["received"])
     assert abs(received - moment) < timedelta(hours=1)
     assert "\nr1     current" in field.run("fleet", "status", "ks").out
+    limited = field.run("fleet", "status", "ks", "--max-age", "1h", status=1).out
+    age = r"\d s" if hours > 0 else "2 d 1 h"
+    assert re.search(rf"\nr1 +offline +{age} ago +check its clock +its clock is 2 ", limited)
 
 
 def test_a_hostile_confirmation_is_refused_and_changes_nothing(field: Field) -> None:
