@@ -225,8 +225,9 @@ NOT_OFFERED = FindingKind(
     "policy.not-offered",
     NOTE,
     "a called service or action that the node in its name may not offer",
-    "The node is in the policy, but may not offer this service or action, so no call succeeds. "
-    "Perhaps a new version of the node renamed it.",
+    "The node is in the policy, but may not offer this service or action; or the node is not in "
+    "the policy, and another node of the namespace offers one with the same last name, which "
+    "nobody calls. So no call succeeds. Perhaps the node, or what it offers, was renamed.",
     "sros: compares the rights of all enclaves in the policies that are checked together.",
     "Write the new name at the node that calls, or allow the other node to offer the old name. "
     "Ignore this finding if another policy of the robot has the server.",
@@ -387,7 +388,10 @@ def _check_counterparts(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
             if similar := spelled(other).similar_names(statement.name):
                 hint = f"; perhaps you mean {' or '.join(similar[:_NAMES_SHOWN])} ({other})"
             name = statement.name
-            is_of_node = statement.right.kind != "topics" and name.rpartition("/")[0] in nodes
+            node = name.rpartition("/")[0]
+            is_of_node = statement.right.kind != "topics" and (
+                node in nodes or any(_is_of_sibling(candidate, node) for candidate in same_end)
+            )
             kind = NO_COUNTERPART
             if is_of_node and not _is_service_of_every_node(name):
                 kind = NOT_OFFERED
@@ -410,6 +414,12 @@ def _differ_only_by_namespace(statement_a: _Statement, statement_b: _Statement) 
     """
     shorter, longer = sorted((statement_a, statement_b), key=lambda statement: len(statement.name))
     return longer.name.endswith(shorter.name) and "~" not in longer.written
+
+
+def _is_of_sibling(statement: _Statement, node: str) -> bool:
+    """Return whether a right is to a name of another node in the namespace of ``node``."""
+    other = statement.name.rpartition("/")[0]
+    return statement.is_private and other.rpartition("/")[0] == node.rpartition("/")[0]
 
 
 def _candidates_text(candidates: Sequence[_Statement]) -> str:

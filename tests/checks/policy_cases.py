@@ -107,6 +107,9 @@ CASES = [
          services("request", "gripper/set") + OTHER + services("reply", "gripper/set")),
     Case("policy.not-offered", EVENTS + OTHER + services("request", "n/release"),
          services("reply", "~/release") + OTHER + services("request", "n/release")),
+    Case("policy.not-offered", services("request", "old/release") + OTHER
+         + services("reply", "~/release"),
+         services("request", "/x/old/release") + OTHER + services("reply", "~/release")),
     Case("policy.side-mistaken", services("request", "~/home"), services("reply", "~/home")),
     Case("policy.several-profiles",
          '</profile></profiles><profiles><profile ns="/" node="m">' + BASICS,
