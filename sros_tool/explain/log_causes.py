@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -35,6 +35,8 @@ from sros_tool.keystore.loading import starts_without_security
 from sros_tool.keystore.participant import JoinContext, LoadedEnclave
 from sros_tool.keystore.selection import likely_names as likely_enclaves
 from sros_tool.names import (
+    GLOBAL_TOPICS,
+    NODE_SERVICES,
     PARAMETER_SERVICES,
     action_part,
     expand,
@@ -528,9 +530,8 @@ class Examiner:
         rule = Remapping("", name, meant)
         add, renamed, only = f", add `--ros-args -r {quote(str(rule))}`.", "", list[str]()
         new_name = (
-            f" If `-r OLD:={quote(name)}` or a parameter makes the node use this name, remove it "
-            "from the node's command, or give the name to the policy: `sros merge_policy POLICY "
-            f"OTHER --remap OLD:={quote(name)}`."
+            " If a remapping or a parameter is missing or wrong, correct it, or give "
+            f"the name to the policy: `sros merge_policy POLICY OTHER --remap OLD:={quote(name)}`."
         )
         if question.type == "action" and (not is_used or len(own) == 1):
             add = f": {renamed_action_text(rule)}"
@@ -554,10 +555,20 @@ class Examiner:
                 f"If only the policy lacks this remapping, merge the policy with `--remap "
                 f"{quote(meant)}:={quote(name)}`. {_otherwise(remedy)}"
             )
+        is_unknown = is_used is False or not self._keystore
+        likely = self._unused_name(denial, question, own) if is_unknown else ""
+        facts, start = list[str](), ""
+        if likely:
+            facts = [
+                f"{enclave.name} may {question.word} {likely}; perhaps a remapping or a parameter "
+                "is missing"
+            ]
+            start = f"If the node should use {likely}, start it with the remapping or the parameter"
+            start += " for this name."
         if is_used is False and self._keystore:
             place = self._keystore.kind
-            facts = [f"no enclave of the {place} may {PEER_RIGHT[denied.right]} {name}"]
-            if len(own) == 1:
+            facts.append(f"no enclave of the {place} may {PEER_RIGHT[denied.right]} {name}")
+            if len(own) == 1 and not likely:
                 facts.append(f"by exact name, the enclave may {question.word} only {own[0]}")
             if place == "export":
                 remedy = (
@@ -567,18 +578,54 @@ class Examiner:
                 )
             compare = "compare the node's command with"
             if self._closed_commands():
-                return facts, (
+                start = (
                     f"Probably the node lacks a remapping, or has a wrong one: {compare} "
-                    f"start/commands.txt of the robot's folder.{renamed or new_name} "
-                    f"{_otherwise(remedy)}"
+                    "start/commands.txt of the robot's folder."
                 )
-            return facts, (
-                f"{remedy} If the node lacks a remapping, or has a wrong one: {compare} the "
-                f"robot's launch files.{renamed or new_name}"
-            )
+            elif not start:
+                start = (
+                    f"If a remapping or a parameter is missing or wrong: {compare} the robot's "
+                    "launch files."
+                )
+            return facts, f"{start}{renamed} {_otherwise(remedy)}"
+        if likely:
+            return facts, f"{start} {_otherwise(remedy)}"
         if renamed and is_used:  # its peers may mean the new name, or the old one
             return only, f"{remedy}{renamed}{new_name}"
         return only, f"{remedy}{renamed or new_name}"
+
+    def _unused_name(self, denial: Denial, question: Question, own: Sequence[str]) -> str:
+        """Return the allowed name that is probably meant in place of a denied name, or "".
+
+        ``own`` are the names of the enclave for the denied right. Of those that the log of the
+        process does not show, the result is the only one, or the only one whose last part shares a
+        word with that of the denied name.
+        """
+        name = question.name
+        is_of_every_node = name in GLOBAL_TOPICS or _last_part(name) in NODE_SERVICES
+        if is_of_every_node or question.type == "action":
+            return ""
+        if self._policy and self._policy.possible_namespace(name, denial.enclave):
+            return ""
+        unused = [
+            other
+            for other in own
+            if other not in GLOBAL_TOPICS
+            and _last_part(other) not in NODE_SERVICES
+            and other not in self._logged_names[denial.process]
+        ]
+        words = {*_last_part(name).split("_")}
+        alike = [other for other in unused if words.intersection(_last_part(other).split("_"))]
+        likely = alike or unused
+        return likely[0] if len(likely) == 1 else ""
+
+    @cached_property
+    def _logged_names(self) -> Mapping[str, Set[str]]:
+        """Map each process to the names that its lines have."""
+        names = defaultdict[str, set[str]](set)
+        for process, message in map(labeled_line, self._lines):
+            names[process].update(_NAME.findall(message))
+        return names
 
     def _missing_rules(self, enclave: str, name: str, nodes: Iterable[str]) -> list[str]:
         """Return the remapping rules for a denied name in the command of a closed robot's process.
@@ -779,6 +826,7 @@ def _with_name(text: str, word: str, name: str) -> str:
     return plain.join(re.split(rf"\b{word}\b", text))
 
 
+_NAME = re.compile(r"/[\w/]+")
 _COMMAND = re.compile(r"(`sros\b[^`]*`)")
 _MOST_LINES = 20
 _MAX_PEERS = 5

@@ -1390,6 +1390,8 @@ def test_a_forgotten_remapping_is_shown(keystore: Path, tmp_path: Path) -> None:
             f"[SECURITY Error] rt/{topic} topic not found in allow rule. check_create_datawriter\n"
         )
         found = sros("explain", keystore, ENCLAVE, "--log", log).out
+        perhaps = "may publish /chatter; perhaps a remapping or a parameter is missing\n"
+        assert (perhaps in found) is (topic == "odom")
         assert (f"the enclave may publish /chatter{why}\n" in found) is bool(why)
         assert (f"`--ros-args -r /{topic}:=/chatter`" in found) is bool(why)
         assert (typo in found) is (topic == "chater")
@@ -1398,6 +1400,35 @@ def test_a_forgotten_remapping_is_shown(keystore: Path, tmp_path: Path) -> None:
         ) is bool(why)
         assert (f"`--remap /chatter:=/{topic}`" in found) is bool(why)
         assert f"`sros explain {keystore} {ENCLAVE} publish /{topic}`" in found
+
+
+@pytest.mark.parametrize(
+    ("names", "line", "meant"),
+    [
+        (("gimbal/cmd", "state"), "", "/right/gimbal/cmd"),  # it shares a word
+        (("state", "speed"), "", ""),
+        (("state", "speed"), "[driver]: publishes /right/speed", "/right/state"),
+        (("gimbal/cmd", "old_cmd"), "", ""),
+    ],
+)
+def test_a_missing_parameter_is_said_before_a_new_right(
+    names: tuple[str, ...], line: str, meant: str, tmp_path: Path
+) -> None:
+    policy, log = tmp_path / "p.xml", tmp_path / "robot.log"
+    allowed = publish("/rosout", "/parameter_events", *(f"/right/{name}" for name in names))
+    policy.write_text(policy_text({"/right/driver": allowed}))
+    denied = "rt/right/motor_cmd topic not found in allow rule. -> check_create_datawriter"
+    log.write_text(f"{line}\n{denied}\n")
+    said = sros("explain", policy, "/right/driver", "--log", log).out
+    found = f"found     /right/driver may publish {meant}; perhaps a remapping or a parameter is "
+    remedy = (
+        f"  remedy    If the node should use {meant}, start it with the remapping or the parameter "
+        "for this name. Or, if the policy is for another version of the node, use the policy of "
+        "the node's version. Otherwise, `sros explain "
+    )
+    assert (found in said, remedy in said) == (bool(meant), bool(meant)), said
+    assert ("missing or wrong, correct it" in said) is (not meant)
+    assert len(said.partition("  remedy ")[2].split()) <= 60
 
 
 def test_the_other_side_of_a_name_tells_whether_a_remapping_may_be_forgotten(
@@ -1422,7 +1453,10 @@ def test_the_other_side_of_a_name_tells_whether_a_remapping_may_be_forgotten(
             "/rear/image",
             (rear, "sets the name by `-r OLD:=/rear/image` or a parameter, write "),
         ),
-        ("/map_a", ("If `-r OLD:=/map_a` or a parameter makes the node use this name, remove it",)),
+        (
+            "/map_a",
+            ("If a remapping or a parameter is missing or wrong, correct it, or ",),
+        ),
         (
             "/frnt/image",
             (
@@ -1435,10 +1469,10 @@ def test_the_other_side_of_a_name_tells_whether_a_remapping_may_be_forgotten(
         (
             "/odometry",
             (
+                "/weed may subscribe /front/image; perhaps a remapping or a parameter is missing\n",
                 "no enclave of the keystore may publish /odometry\n",
-                "  remedy    If the policy is for another version of the node, use the policy of",
-                "If the node lacks a remapping, or has a wrong one: compare the node's command "
-                "with the robot's launch files. If `-r OLD:=/odometry`",
+                "  remedy    If the node should use /front/image, start it with the remapping or "
+                "the parameter for this name. Or, if the policy is for another version of the",
             ),
         ),
     ):
@@ -1467,7 +1501,7 @@ def test_the_other_side_of_a_name_tells_whether_a_remapping_may_be_forgotten(
     found = sros("explain", export, "--log", log, "/weed").out
     assert "no enclave of the export may publish /odometry\n" in found
     assert "ask the whole keystore: `sros explain KEYSTORE --log LOG`. Or, if the policy" in found
-    assert "If the node lacks a remapping, or has" in found and "therwise, If" not in found
+    assert "remedy    If the node should use /fr" in found and "therwise, If" not in found
     command = ["weed", "--ros-args", "-r", "odometry:=front/image"]
     listed = {"processes": [{"enclave": "/weed", "command": command}], "not_here": []}
     (tmp_path / "processes.json").write_text(json.dumps(listed))
