@@ -665,6 +665,11 @@ def test_overlays_can_be_filtered_and_listed(browser: Browser, tmp_path: Path) -
         page.set_viewport_size({"width": 280, "height": 600})
         right = "tabs => Math.max(...tabs.map(tab => tab.getBoundingClientRect().right))"
         assert page.eval_on_selector_all("[role=tab]", right) <= 280
+    sros("view", tmp_path / "robot.xml", tmp_path / "robot.xml", "-o", path, "--force").ok()
+    with opened(browser, path, "phone") as page:
+        # Where nothing differs, it begins with what may be used.
+        assert page.inner_text("#headlines") == "There is no difference."
+        assert page.locator("#panel-names").is_visible()
 
 
 @pytest.mark.parametrize("size", SIZES)

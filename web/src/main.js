@@ -434,7 +434,7 @@ function start() {
   // A small screen has no room for the columns of the whole map; the table and the differences fit.
   if (isSmall()) for (const fold of document.querySelectorAll(".fold")) fold.open = false;
   fillLists();
-  showTab(!isSmall() || model.scenes[0].id === "focus" ? "map" : model.overlay ? "differences" : "names");
+  showTab(!isSmall() || model.scenes[0].id === "focus" ? "map" : model.differences.length ? "differences" : "names");
   showMap();
   if (startsWithoutEnclaves()) showTab("names");
   document.body.dataset.ready = "true";
