@@ -52,6 +52,7 @@ html_theme_options = {"navigation_with_keys": True}
 
 
 _HEAD = re.compile(r"<th\b[^>]*>(.*?)</th>", re.DOTALL)
+_LONG = 30  # letters; a longer name would make its column wide at the cost of the others
 
 
 def _mark_lines(code: re.Match[str]) -> str:
@@ -65,8 +66,15 @@ def _mark_lines(code: re.Match[str]) -> str:
     return f"{code[1]}{''.join(marked)}</pre>"
 
 
+def _part_long_name(code: re.Match[str]) -> str:
+    """Let lines end between the words of a long name, so that its column leaves room for others."""
+    if len(re.sub(r"<[^>]+>", "", code[0])) <= _LONG:
+        return code[0]
+    return re.sub(r"(?:(?<=[\w)][_/|])|(?<=::))(?=[\w(])", "<wbr>", code[0])
+
+
 def _label_cells(table: re.Match[str]) -> str:
-    """Give each cell after the first of its row the words above its column, which a phone shows."""
+    """Give each cell after the first the words above its column, for phones; part long names."""
     heads = [re.sub(r"<[^>]+>", "", head).strip() for head in _HEAD.findall(table[0])]
     labels = heads if len(heads) > 2 else []
 
@@ -74,7 +82,8 @@ def _label_cells(table: re.Match[str]) -> str:
         above = iter(["", *labels[1:]])
         return re.sub("<td", lambda _: f'<td data-label="{next(above, "")}"', row[0])
 
-    return re.sub(r"<tr.*?</tr>", labelled, table[0], flags=re.DOTALL)
+    rows = re.sub(r"<tr.*?</tr>", labelled, table[0], flags=re.DOTALL)
+    return re.sub(r"<code .*?</code>", _part_long_name, rows, flags=re.DOTALL)
 
 
 def _mark_code(

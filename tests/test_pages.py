@@ -7,16 +7,23 @@ import re
 import shutil
 import subprocess
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 
 from sros_tool.keystore.template import load_template, parse_template, settings_values, with_values
+from tests.report.pictures import new_page
 from tests.support.children import python
 from tests.support.long_form import some, sometimes
 from tests.support.pages import PROJECT, PageError, alike, blocks, fits, outcome_of
 from tools import man_page
 from tools.reference_pages import FOLDER, pages
 from tools.template_keys import KEYS, template_text
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser
+
+pytest_plugins = ["tests.report.browsing"]
 
 PAGES = sorted(
     path.relative_to(PROJECT)
@@ -37,27 +44,54 @@ def test_the_commands_of_a_page_do_what_it_shows(page: Path, tmp_path: Path) -> 
     assert not wrong, wrong
 
 
-@sometimes("the site")
-def test_the_site_builds_without_a_warning_and_loads_nothing_from_elsewhere(tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The site, which builds without a warning."""
     pytest.importorskip("furo")
-    python("-m", "sphinx", "-q", "-W", "--keep-going", "-d", tmp_path / "trees", "-c", "docs", ".",
-           tmp_path / "site", cwd=PROJECT)  # fmt: skip
-    page = (tmp_path / "site" / "docs" / "zenoh.html").read_text("utf-8")
+    folder = tmp_path_factory.mktemp("site")
+    python("-m", "sphinx", "-q", "-W", "--keep-going", "-d", folder / "trees", "-c", "docs", ".",
+           folder / "site", cwd=PROJECT)  # fmt: skip
+    return folder / "site"
+
+
+@sometimes("the site")
+def test_the_site_builds_without_a_warning_and_loads_nothing_from_elsewhere(site: Path) -> None:
+    page = (site / "docs" / "zenoh.html").read_text("utf-8")
     assert "sros zenoh" in page
-    options = (tmp_path / "site" / "docs" / "reference" / "options.html").read_text("utf-8")
+    options = (site / "docs" / "reference" / "options.html").read_text("utf-8")
     assert "--all-vendors" in options and not set("\u2013\u2014\u201c\u201d") & set(options)
     assert '<span class="line" style="--rest: 4ch">  ' in page  # long lines are indented further
     assert '<td data-label="what to do">' in page  # a phone has no columns
-    assert (tmp_path / "site" / "index.html").exists()
-    data = (tmp_path / "site/_static/language_data.js").read_text("utf-8")
+    assert (site / "index.html").exists()
+    data = (site / "_static/language_data.js").read_text("utf-8")
     assert (PROJECT / "docs/scorer.js").read_text("utf-8") in data  # recipes before references
     loaded = subprocess.run(
-        ["grep", "-rlE", r"(src|href)=\"https?://[^\"]+\.(js|css|woff2?)", tmp_path / "site"],
+        ["grep", "-rlE", r"(src|href)=\"https?://[^\"]+\.(js|css|woff2?)", site],
         capture_output=True,
         text=True,
         check=False,
     )
     assert loaded.stdout == ""
+
+
+@sometimes("the site")
+@pytest.mark.browser
+def test_the_site_fits_its_screen_and_shows_where_the_keyboard_is(
+    browser: Browser, site: Path
+) -> None:
+    wide = "tables => tables.filter(table => table.scrollWidth > table.clientWidth + 1).length"
+    page = new_page(browser)
+    page.set_viewport_size({"width": 1280, "height": 900})
+    for name in ("security", "zenoh", "json"):
+        page.goto((site / f"docs/{name}.html").as_uri())
+        assert page.eval_on_selector_all("article table", wide) == 0, name
+    for _ in range(5):
+        page.keyboard.press("Tab")
+        outline = "getComputedStyle(document.activeElement).outlineStyle"
+        assert page.evaluate(outline) != "none", page.evaluate("document.activeElement.className")
+    page.set_viewport_size({"width": 390, "height": 844})
+    assert page.evaluate("document.documentElement.scrollWidth") <= 390
+    page.close()
 
 
 def test_the_search_of_the_site_ranks_titles_and_recipes_first() -> None:
