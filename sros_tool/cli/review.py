@@ -464,7 +464,7 @@ def _sentence(result: Review, step: ReviewStep) -> str:
             ]
             return ", ".join(clauses)
         case DroppedRequirements(count=count, chosen=chosen):
-            kind = f"{counted(count, 'requirement')} dropped or changed"
+            kind = f"{counted(count, 'requirement')} dropped, changed or escaped"
             return f"{kind}, checked as they were before the change: {chosen.summary()}{place}"
         case ExpiryCheck(due=due, unreadable=unreadable, lasting=count) as expiry:
             unread = f", {len(unreadable)} cannot be read" if unreadable else ""

@@ -51,6 +51,7 @@ from sros_tool.proof.requirements import (
     Requirement,
     RightNames,
     Widest,
+    patterns_of_enclaves,
 )
 from sros_tool.proof.worlds import (
     ANYBODY,
@@ -62,7 +63,7 @@ from sros_tool.proof.worlds import (
     valid_topics,
 )
 from sros_tool.reach import OF_EVERY_NODE, QUESTIONS
-from sros_tool.wording import counted, first_few
+from sros_tool.wording import counted
 
 MOST_STEPS = 8_000_000
 """Maximum number of search steps for names that several wildcards match: about twenty seconds."""
@@ -116,7 +117,7 @@ class Verdict:
     the requirement that no right states, and that only wildcards match. ``unserved`` are clauses on
     services and actions that an enclave may use, and that nobody serves; ``unheard`` are clauses on
     topics of which enclaves have only the right in the requirement. ``by_name`` are uses that an
-    `Only` allows only by patterns that begin with a wildcard.
+    `Only` allows only by `patterns_of_any_package`.
     """
 
     requirement: Requirement
@@ -375,24 +376,31 @@ def _uses_of_rights(
 
 
 def _uses_by_name(requirement: Only, world: World, limit: SearchLimit) -> Iterator[Use]:
-    """Yield a use of each enclave that only a pattern such as ``*/operator/*`` allows."""
-    clear = [name for name in requirement.enclaves if not _is_of_any_package(name)]
-    if len(clear) == len(requirement.enclaves):
+    """Yield a use of each enclave that only `patterns_of_any_package` allow."""
+    open_patterns = patterns_of_any_package(requirement)
+    if not open_patterns:
         return
+    clear = [name for name in requirement.enclaves if name not in open_patterns]
     allowed = _matching_enclaves(requirement.enclaves, world.enclaves)
     uses = _uses_of_rights(requirement.rights, world, limit, clear)
     for enclave in sorted(allowed & uses.keys()):
         yield min(uses[enclave], key=_use_order)
 
 
-def _is_of_any_package(pattern: str) -> bool:
-    """Return whether enclaves of any package can match a pattern that does not match them all."""
-    return pattern[0] not in ("/", EXCEPT) and not covers(pattern, "/*")
+def patterns_of_any_package(requirement: Only) -> list[str]:
+    """Return the patterns that enclaves of any package can match, but that do not match them all.
 
-
-def patterns_of_any_package(requirement: Only) -> str:
-    """Return the patterns of a requirement that enclaves of any package can match, as a list."""
-    return first_few([*filter(_is_of_any_package, requirement.enclaves)], 3)
+    If the requirement is a package's, enclaves that do not move with the namespace count, too: an
+    enclave of the package has such a name for users without a namespace.
+    """
+    unmoved: tuple[str, ...] = ()
+    if requirement.is_relative and requirement.elsewhere:
+        unmoved = patterns_of_enclaves(requirement.elsewhere)
+    return [
+        name
+        for name in requirement.enclaves
+        if name[0] != EXCEPT and (name[0] != "/" or name in unmoved) and not covers(name, "/*")
+    ]
 
 
 def _shortest_use_as_witness(uses: Mapping[str, Sequence[Use]]) -> Witness | None:

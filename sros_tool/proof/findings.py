@@ -507,7 +507,8 @@ def decided_findings(
             _unnamed_finding(*unnamed, allowed)
             for unnamed in _without_namespace_repeats(decided.unnamed)
         ]
-    findings += [_by_name_finding(*allowed) for allowed in decided.by_name]
+    for only, steps in decided.by_name:
+        findings += _by_name_findings(only, steps)
     findings += [_assumption_finding(*assumption) for assumption in decided.assumed]
     findings += [_not_crossing_finding(*blocked_use) for blocked_use in decided.blocked]
     if system.is_export:
@@ -722,10 +723,17 @@ def _part_finding(
     return kind.found(place.file, text, place.file, place.line, remedy)
 
 
-def _by_name_finding(requirement: Only, steps: Sequence[Step]) -> Finding:
-    """Return a finding on enclaves that a requirement allows only by a pattern for any package."""
+def _by_name_findings(requirement: Only, steps: Iterable[Step]) -> Iterator[Finding]:
+    """Yield a finding on enclaves that a requirement allows only by a pattern for any package."""
+    patterns = patterns_of_any_package(requirement)
+    # Without a namespace, the robot's own operators have a name that does not move.
+    unmoved = [name for name in patterns if name.startswith("/")]
+    steps = [step for step in steps if not any(covers(name, step.use.enclave) for name in unmoved)]
+    if not steps:
+        return
     allowed = _listed_names([step.use.enclave for step in steps])
-    text = f"{patterns_of_any_package(requirement)} allows this to {allowed}"
+    shown = first_few([name for name in patterns if name not in unmoved], 3)
+    text = f"{shown} allows this to {allowed}"
     related = [
         RelatedPlace(step.text(), step.source.file, step.source.line or None)
         for step in steps[:_MOST_SHOWN]
@@ -733,7 +741,7 @@ def _by_name_finding(requirement: Only, steps: Sequence[Step]) -> Finding:
     ]
     place = requirement.source
     text += f"; required: {demand(requirement)}"
-    return ALLOWED_BY_NAME.found(
+    yield ALLOWED_BY_NAME.found(
         place.file, text, place.file, place.line, related=tuple(dict.fromkeys(related))
     )
 

@@ -213,10 +213,9 @@ def access_by_name_findings(
     after: AccessSource,
     system: System,
 ) -> Iterator[Finding]:
-    """Yield a finding for each enclave that gains access by a pattern such as ``*/operator/*``.
+    """Yield a finding for each enclave that gains access only by `patterns_of_any_package`.
 
-    Enclaves of any package can match such a pattern, so the owner of the requirement has to see
-    them.
+    The owner of the requirement has to see such an enclave.
     """
     similar_requirements = similarity_to(earlier)
     kept = [of for of in requirements if isinstance(of, Only) and similar_requirements(of)]
@@ -236,7 +235,8 @@ def access_by_name_findings(
                 for right in wanted
             ):
                 text = f"{step.text()}: new access, which the requirement allows only by "
-                text += f"{patterns_of_any_package(requirement)}, as to any enclave of such a name"
+                patterns = first_few(patterns_of_any_package(requirement), 3)
+                text += f"{patterns}, as to any enclave of such a name"
                 place = step.source or requirement.source
                 remedy = "Name the enclaves that are meant in the requirement, or approve this in "
                 remedy += "the review."

@@ -333,6 +333,7 @@ def test_a_requirement_of_a_package_may_be_about_the_enclaves_of_users(required:
         ('"/a", "*/op/*"', ["*/op/* allows this to /op/b and /v/op/c"]),
         ('"/a", "*/op/*", "//op/*", "!/x"', ["*/op/* allows this to /v/op/c"]),
         ('"/a", "/op/*", "//v/*"', []),
+        ('"/a", "//op/*", "*/c"', ["*/c allows this to /v/op/c"]),
         ('"*", "!/x"', []),
         ('"/*"', []),
     ],
@@ -340,10 +341,11 @@ def test_a_requirement_of_a_package_may_be_about_the_enclaves_of_users(required:
 def test_whom_a_pattern_for_any_package_allows_is_said(listed: str, allowed: list[str]) -> None:
     rights = {"/a": may("publish", "/x"), "/op/idle": may("subscribe", "/x")}
     rights |= {"/op/b": may("publish", "/*"), "/v/op/c": may("publish", "/x")}
-    required = f'[[only]]\npublish = ["/x"]\nenclaves = [{listed}]'
-    findings = requirement_findings(parse_requirements(required.encode(), "r.toml"), robot(rights))
-    by_name = [each for each in findings if each.id == BY_NAME]
-    assert [each.text.partition("; ")[0] for each in by_name] == allowed
+    for name in ("x", "/x"):
+        required = f'[[only]]\npublish = ["{name}"]\nenclaves = [{listed}]'.encode()
+        findings = requirement_findings(parse_requirements(required, "r.toml"), robot(rights))
+        by_name = [each.text.partition("; ")[0] for each in findings if each.id == BY_NAME]
+        assert by_name == allowed
 
 
 def test_a_note_on_an_absolute_name_is_printed_once_for_several_namespaces() -> None:

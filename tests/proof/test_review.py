@@ -1246,6 +1246,12 @@ def _moved(node: str, path: str, enclaves: dict[str, str] = _NODES) -> dict[str,
                 _HANDS | {"/operator/hand": publish("/cmd")},
                 "/operator/hand may publish /cmd: new access",
             ),
+            (  # For users without a namespace, it is an operator of the robot.
+                _NODES,
+                _ONLY_OPERATORS.replace("*/", "//").replace('"/cmd', '"cmd'),
+                _NODES | {"/operator/hand": publish("/cmd")},
+                "/operator/hand may publish /cmd: new access",
+            ),
             # The exception is for the robot's own operators, or the enclave gains other access.
             (
                 _NODES,
