@@ -311,14 +311,11 @@ def explain(
     _refuse_ignored(mode)
     check_one_decider()
     root, rest = _split_keystore(arguments, keystore, operation_index=0 if who else 1)
-    if logs and root and policy:
-        raise UsageError(
-            "--log takes either a keystore or a policy",
-            "A process decides by the signed permissions of its keystore.",
-            f"Leave --policy out; or name only the policy: `sros explain {quote(str(policy))} "
-            f"--log {quote(logs[0])}`.",
-        )
     names_policy = root is not None and is_policy(root)
+    if logs and names_policy and policy:
+        raise UsageError(
+            f"two policies are named, '{root}' and '{policy}'", "", "Leave one of them out."
+        )
     if names_policy and not (policy or reach):
         policy, root = root, None
     policy = relative_path(policy) if policy else None  # for the names in printed commands

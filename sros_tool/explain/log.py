@@ -70,9 +70,9 @@ def explain_log_file(
     """Return the explained messages of a log; examines the enclaves that the log names.
 
     ``name`` is the enclave, or its folder, whose processes wrote the log; "" if the log names the
-    enclave, or if ``keystore`` is the folder of a single enclave.  With ``policy_file``, there is
-    no keystore, and only denials are examined: by the rights in the policy. ``rmw`` is the RMW of
-    the environment, or "".
+    enclave, or if ``keystore`` is the folder of a single enclave.  With ``policy_file`` and no
+    keystore, only denials are examined: by the rights in the policy.  With both, the keystore
+    decides, and findings have lines of the policy. ``rmw`` is the RMW of the environment, or "".
 
     Raises:
         UsageError: ``name`` is an enclave, and there is no keystore.
@@ -80,11 +80,26 @@ def explain_log_file(
     """
     named: LoadedEnclave | None = None
     policy: AskedPolicy | None = None
+    by_policy = policy_file is not None and keystore is None
+    original = stated = None
+    if policy_file:
+        original, stated = policy_to_ask(policy_file, fleet_of(asking.fleet_file, keystore))
     folder = keystore.root if keystore and not name else None
     if folder and is_enclave(folder) and not is_keystore(folder):
         keystore, name = None, str(folder)
-    if policy_file:
-        _, stated = policy_to_ask(policy_file, fleet_of(asking.fleet_file, None))
+
+    def with_policy(enclave: LoadedEnclave) -> LoadedEnclave:
+        of_policy = stated.enclave(enclave.name) if stated else None
+        if of_policy is None:
+            return enclave
+        return enclave._replace(
+            keystore=keystore,
+            policy=of_policy,
+            policy_file=policy_file,
+            has_placeholders=stated != original,
+        )
+
+    if by_policy and stated and policy_file:
         policy = AskedPolicy(str(policy_file), stated, name)
         if name and not policy.namespace_and_path(name)[1]:
             raise not_in_policy_error(stated, name, policy_file)
@@ -101,6 +116,11 @@ def explain_log_file(
                 "Write the keystore before the enclave.",
             )
 
+    if named and stated and policy_file:
+        if stated.enclave(named.name) is None:
+            raise not_in_policy_error(stated, named.name, policy_file)
+        named = with_policy(named)
+
     # Cached, because a log may name any number of enclaves, any number of times.
     @cache
     def find(enclave: str) -> LoadedEnclave | None:
@@ -116,7 +136,8 @@ def explain_log_file(
                 of_robot = policy.enclave(check_enclave_name(enclave or name))
                 return planned_enclave(of_robot, None, asking) if of_robot else None
             check_enclave_name(enclave)
-            return signed_enclave(keystore, enclave, asking.at, planned=True)
+            signed = signed_enclave(keystore, enclave, asking.at, planned=True)
+            return with_policy(signed) if signed else None
         except SrosError:  # the log names an enclave of another keystore, or a path
             return None
 

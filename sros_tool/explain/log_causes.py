@@ -19,7 +19,13 @@ from sros_tool.errors import SrosError
 from sros_tool.explain.answer import Answer, Evaluator, Part, Question, ask, with_article
 from sros_tool.explain.asking import signed_enclave
 from sros_tool.explain.denials import PARAMETER_CLIENT_TEXT, Denial, node_denied_own_service
-from sros_tool.explain.explanation import likely_names, meaning_of_other_kind, named_rights, remedy
+from sros_tool.explain.explanation import (
+    explain,
+    likely_names,
+    meaning_of_other_kind,
+    named_rights,
+    remedy,
+)
 from sros_tool.explain.log_lines import LogHit
 from sros_tool.explain.log_sources import AskedPolicy, FindEnclave, SearchedKeystore
 from sros_tool.faults import NEEDS_CA_KEYS, ORIGINAL_KEYSTORE, Fault, remedy_in_original_keystore
@@ -425,9 +431,28 @@ class Examiner:
                 )
             elif not other:
                 better = self._remedy_in_a_namespace(denial, name, better or finding.remedy)
-            facts = [answer.decision.text, *other]
-            remedy = better or finding.remedy
+            lines, sign = self._policy_facts(enclave, denial)
+            facts = [answer.decision.text, *lines, *other * (not sign)]
+            remedy = sign or better or finding.remedy
         return replace(finding, found=tuple(facts), checked=True, remedy=remedy)
+
+    def _policy_facts(self, enclave: LoadedEnclave, denial: Denial) -> tuple[list[str], str]:
+        """Return what the policy next to a keystore states about a denied topic, and a remedy.
+
+        The remedy is "" unless the policy allows the topic, so that it has to be signed.
+        """
+        if self._policy or enclave.policy is None:
+            return [], ""
+        evaluator = Evaluator(denial.vendor, enclave, self._context(enclave))
+        answer = explain(evaluator, _question(denial))
+        facts = [f"{line.source}: {line.stated}" for line in answer.lines]
+        if not answer.sign:
+            return facts, ""
+        facts.append(
+            f"'{enclave.policy_file}' allows it: the permissions are older, or from another policy"
+        )
+        commands = ", then ".join(f"`{command}`" for command in answer.commands)
+        return facts, f"Sign the policy ({commands}), and restart the process."
 
     def _remedy_in_a_namespace(self, denial: Denial, name: str, remedy: str) -> str:
         """Return ``remedy``; for a package's policy, after a remedy for a missing namespace."""
@@ -669,9 +694,11 @@ class Examiner:
             if private:
                 advice = f" as {private}: it is a private name of the node"
         enclave = "PEER" if denial.remote else enclave
+        known = None if denial.remote or self._policy else self._find(denial.enclave)
+        lines = f" --policy {quote(str(known.policy_file))}" if known and known.policy_file else ""
         commands = [
             f"`sros explain {quote(asked)} {quote(enclave)} {question.word} {quote(name)}"
-            f"{' --type action' * (question.type == 'action')}`"
+            f"{' --type action' * (question.type == 'action')}{lines}`"
             for question in _questions_to_ask(denial)
         ]
         if commands:

@@ -1403,6 +1403,44 @@ def test_a_forgotten_remapping_is_shown(keystore: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("rights", "why", "found", "remedy"),
+    [
+        # The permissions decide, not the policy next to them.
+        (
+            publish("/y"),
+            "not found in allow",
+            "' allows it: the perm",
+            "{ks} /a {file}`), and rest",
+        ),
+        (
+            publish("/x"),
+            "not found in allow",
+            "no rule allows",
+            "{ks} /a publish /y --policy {file}`",
+        ),
+        (publish("/y").replace("ALLOW", "DENY"), "denied by deny", "p.xml:1: DENY publish /y", ""),
+    ],
+)
+def test_the_policy_next_to_a_keystore_gives_lines(
+    rights: str, why: str, found: str, remedy: str, tmp_path: Path
+) -> None:
+    policy, log, keystore = tmp_path / "p.xml", tmp_path / "robot.log", tmp_path / "ks"
+    sros("create_keystore", keystore, "--template", "production").ok()
+    policy.write_text(policy_text({"/a": publish("/x")}))
+    sros("generate_artifacts", "-k", keystore, "-p", policy).ok()
+    policy.write_text(policy_text({"/a": rights}))
+    if "deny" in why:
+        sros("generate_artifacts", "-k", keystore, "-p", policy).ok()
+    log.write_text(f"rt/y topic {why} rule. -> check_create_datawriter\n")
+    for root, enclave in ((keystore, ["/a"]), (keystore / "enclaves/a", [])):
+        said = sros("explain", root, *enclave, "--log", log, "--policy", policy)
+        assert said.status == 1 and found in said.out, said
+        assert remedy.format(ks=root if enclave else "KEYSTORE", file=policy) in said.out, said
+    missing = sros("explain", keystore, "/b", "--log", log, "--policy", policy)
+    assert missing.status == 2 and "/b" in missing.err
+
+
+@pytest.mark.parametrize(
     ("names", "line", "meant"),
     [
         (("gimbal/cmd", "state"), "", "/right/gimbal/cmd"),  # it shares a word
