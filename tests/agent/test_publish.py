@@ -234,18 +234,23 @@ def test_an_earlier_revocation_list_is_not_published(publisher: Home) -> None:
     assert (result.names("published"), result.names("refused")) == ([], ["r1", "r2"])
 
 
-@pytest.mark.parametrize("missing", [False, True])
+@pytest.mark.parametrize("damage", ["changed", "missing", "link"])
 @pytest.mark.parametrize("is_renewed", [False, True])
 def test_a_damaged_archive_is_published_again(
-    publisher: Home, missing: bool, is_renewed: bool
+    publisher: Home, damage: str, is_renewed: bool
 ) -> None:
+    """Robots and programs that copy folders do not follow a link to the right content."""
     assert not publisher.publish().notes
     (archive,) = (publisher.pub / "targets/robots").glob("*.r2.tar.gz")
     data = archive.read_bytes()
-    archive.write_bytes(data[:-9] + bytes([data[-9] ^ 1]) + data[-8:])
-    if missing:
-        archive.unlink()
-    publisher.robot("r2").refuses(FetchProblem.UNREACHABLE if missing else FetchProblem.NOT_SIGNED)
+    if damage == "changed":
+        archive.write_bytes(data[:-9] + bytes([data[-9] ^ 1]) + data[-8:])
+    else:
+        archive.rename(publisher.folder / "elsewhere")
+    if damage == "link":
+        archive.symlink_to(publisher.folder / "elsewhere")
+    problem = FetchProblem.NOT_SIGNED if damage == "changed" else FetchProblem.UNREACHABLE
+    publisher.robot("r2").refuses(problem)
     publisher.run("renew", "ks", "/r2/base" if is_renewed else "/r1/base")
     result = publisher.publish()
     assert "r2" in result.names("published")

@@ -1381,14 +1381,14 @@ class _Publication:
         return bool(data)
 
     def _read(self, robot: str, release: PublishedRelease, folder: Path | None = None) -> bytes:
-        """Return the archive of a release in ``folder``; empty if missing or damaged.
+        """Return the archive of a release in ``folder``; empty if missing, damaged or a link.
 
         The default for ``folder`` is the publishing folder.
         """
-        path = (folder or self._folder) / release.path(robot)
         try:
-            data = read_bytes(path, "archive", max_bytes=release.length)
-        except SrosError:
+            with Folder(folder or self._folder) as opened:
+                data = opened.read(release.path(robot), max_bytes=release.length)
+        except (SrosError, OSError):
             return b""
         return data if hashlib.sha256(data).hexdigest() == release.sha256 else b""
 
