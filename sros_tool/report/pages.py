@@ -303,11 +303,13 @@ def _sentence(text: str) -> str:
 def _with_marks(text: str) -> str:
     """Return ``text`` in HTML, with text between backticks as code.
 
-    Options and CVE numbers are marked, so that the browser does not break them at a line end.
+    Options, dates and CVE numbers are marked, so that the browser does not break them at a line end.
     """
     marked = re.sub(r"`([^`]+)`", r"<code>\1</code>", escape(text))
     return re.sub(
-        r"\bCVE-\d+-\d+|(?<![\w-])--[a-z][a-z-]*", r'<span class="id">\g<0></span>', marked
+        r"\bCVE-\d+-\d+|\b\d{4}-\d\d-\d\d|(?<![\w-])--[a-z][a-z-]*",
+        r'<span class="id">\g<0></span>',
+        marked,
     )
 
 

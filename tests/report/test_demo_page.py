@@ -99,7 +99,7 @@ def test_every_row_is_told_with_what_came_of_it() -> None:
         ),
         "made by sros 1.2.3 on 2027-01-01",
     )
-    assert "Made by sros 1.2.3 on 2027-01-01." in page
+    assert "Made by sros 1.2.3 on 2027-01-01." in html.fromstring(page).text_content()
     rows = html.fromstring(page).xpath("//table[@class='rows']//tr[td]")
     texts = [" ".join(" ".join(row.itertext()).split()) for row in rows]
     assert len(texts) == 5
@@ -204,7 +204,7 @@ def fleet_page(
         [name],
         rows,
         {"deliver": deliver},
-        f"on 1 of 2{name}",
+        f"on 1 of 2{name} until 2036-11-27",
     )
 
 
@@ -216,7 +216,9 @@ def test_a_fleet_begins_with_how_many_are_current_and_says_it_once() -> None:
     chips = [chip.text_content() for chip in page.cssselect("tbody .chip")]
     assert chips == ["revoked", "an earlier one", "current"]
     (wrong,) = page.cssselect("p.wrong")
-    assert wrong.text_content().startswith(f"On 1 of 2{HOSTILE[0]}. Until the current revocation")
+    assert wrong.text_content().startswith(
+        f"On 1 of 2{HOSTILE[0]} until 2036-11-27. Until the current revocation"
+    )
     (library,) = page.cssselect("section > details")
     assert library.cssselect("summary")[0].text_content() == f"{HOSTILE[0]}: 1 known; on r1"
     assert "In '/opt/library" in library.text_content() and "CVE-1-2." in library.text_content()
@@ -227,6 +229,7 @@ def test_a_fleet_begins_with_how_many_are_current_and_says_it_once() -> None:
     assert said == [f"{HOSTILE[0]}: 1 known; on r1; in '/opt/{build}'" for build in "ab"]
     # A line of a phone does not end within an option: "--" and "force" are no words.
     assert [option.text for option in page.cssselect("dd code .id")] == ["--force"]
+    assert [date.text for date in page.cssselect(".wrong .id")] == ["2036-11-27"]
 
 
 @pytest.mark.browser
