@@ -91,6 +91,11 @@ def test_the_site_fits_its_screen_and_shows_where_the_keyboard_is(
         assert page.evaluate(outline) != "none", page.evaluate("document.activeElement.className")
     page.set_viewport_size({"width": 390, "height": 844})
     assert page.evaluate("document.documentElement.scrollWidth") <= 390
+    # On a phone, the words above the first column stay, and a cell without content is no line.
+    page.goto((site / "docs/fetching.html").as_uri())
+    heads = page.locator("article th:visible").all_inner_texts()
+    assert "stolen" in heads and "what to do" not in heads
+    assert page.locator("article td:has(p:empty):visible").count() == 0
     page.close()
 
 
