@@ -970,8 +970,8 @@ def _remedies(status: FleetStatus, to_dos: Collection[str]) -> Mapping[str, str]
         f"as that robot until you run `sros renew {where} --robot OTHER --new-key --revoke-old`; "
         "then deliver to both robots",
         "check its clock": "set the clock of the robot; its agent then continues at the next "
-        "round. If it is right, the clock of the server is wrong, or somebody held the robot's "
-        "message back",
+        "round. If this clock is right, the clock of the server or of this machine is wrong, or "
+        "somebody held the robot's confirmation back",
         "deliver": by_hand,
         "publish": publish_command(root),
         "renew": f"`{renewal_command(root)}`, then {_delivery_advice(root, to_renew)}",
