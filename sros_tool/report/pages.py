@@ -303,7 +303,7 @@ def _sentence(text: str) -> str:
 def _with_marks(text: str) -> str:
     """Return ``text`` in HTML, with text between backticks as code.
 
-    Options, dates and CVE numbers are marked, so that the browser does not break them at a line end.
+    Options, dates and CVE numbers are marked, so that no line ends within them.
     """
     marked = re.sub(r"`([^`]+)`", r"<code>\1</code>", escape(text))
     return re.sub(
