@@ -520,7 +520,12 @@ def _proof_of_processes(
         text = f"{done}{first_few(texts, MOST_NAMES, '; ')}"
     else:
         text += "".join(f"; {guest}" for guest in _texts_of_all(_open_in_other_domains, looks))
-    return Proof(STARTED, False if wrong else None if findings else True, text)
+    tools = _texts_of_all(RunningRobot.tools, looks)
+    named = (
+        f"taken for tools by their names: {first_few(tools, MOST_NAMES)}; stop what is not yours"
+    )
+    holds = False if wrong else None if findings else True
+    return Proof(STARTED, holds, text, details=[named] if tools else [])
 
 
 def _texts_of_all(

@@ -240,6 +240,13 @@ class RunningRobot:
             for process, enclave in further
         ]
 
+    def tools(self) -> Iterator[str]:
+        """Yield the processes in enclaves that count as tools by their program's name, as text."""
+        for process in self.in_domain:
+            enclave = process.enclave
+            if enclave and enclave.name != OBSERVER and _is_tool(process):
+                yield f"{process.label} in {enclave.name}"
+
     def with_other_files(self) -> Iterator[str]:
         """Yield the processes of the domain in enclaves of other folders, as text.
 

@@ -1041,7 +1041,8 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     inner = "not checked (--accept domains accepts this): no process is in a domain that was not "
     inner += "examined: process 5 (inner) runs open in domain 0 of another network namespace"
     said = robot.close("--proof", status=1).out
-    assert f"{guest}not checked (--accept unobserved accepts this): {more}" in said
+    tool = "taken for tools by their names: process 8 (ros2) in /talker; stop what is not yours\n"
+    assert f"{guest}  {tool}not checked (--accept unobserved accepts this): {more}" in said
     assert inner in said
     (copy := robot.folder / "copy/enclaves/office").mkdir(parents=True)
     environment = secured_environment(copy.parents[1], "/office", 0)
@@ -1053,6 +1054,7 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     said = robot.close("--proof", status=1).out
     assert "no: not every process was started in its enclave: process 5 (guest)" in said
     assert "belongs there" not in said, "only programs of ros2 are left"
+    assert tool in said
     robot.more = (replace(talker, pid=8, command=("ros2", "topic"), domains=frozenset({0, 92})),)
     further = "not checked (--accept domains accepts this): no process is in a domain that was not "
     further += "examined: process 8 (ros2): its ports show that it is also in domain 92; "
