@@ -1594,7 +1594,7 @@ class _Publication:
         self._changes = file_change(path, existed=True)
         if not self._dry_run:
             document = self.list.document(self._now)
-            with staged_file(path, document, for_owner=True) as put_in_place:
+            with staged_file(path, document, mode=0o644, for_owner=True) as put_in_place:
                 put_in_place()
 
     def keep_changes(self, change: KeystoreChange) -> None:
