@@ -224,6 +224,17 @@ class LocalRobot:
         """The keystore, or the policy if the keystore was brought to another machine."""
         return self.keystore if self.keystore.exists() else self.policy
 
+    @property
+    def revoking_advice(self) -> str:
+        """A clause on enclaves of the keystore that the policy does not have."""
+        return f"`{self.close_command}` says how to revoke or keep such an enclave"
+
+    def log_command(self, unit: str = "") -> str:
+        """Return the command that explains the log of a unit, or of a process without a unit."""
+        explain = f"sros explain {shlex.quote(str(self.export))} --log"
+        log = f"journalctl -n 100 -u {shlex.quote(unit)}"
+        return f"`{log} | {explain} -`" if unit else f"`{explain} ITS_LOG`"
+
     def read_policy(self) -> Policy | None:
         """Return the policy; None if there is none yet."""
         return read_policy(self.policy) if self.policy.exists() else None

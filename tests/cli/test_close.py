@@ -32,6 +32,7 @@ from sros_tool.close import (
     proof,
     start_files,
     state,
+    talk,
     watch,
 )
 from sros_tool.close import robot as of_robot
@@ -222,7 +223,7 @@ def robot(beside_graph: Beside, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(apply, "_SECONDS_BETWEEN", 0)
     monkeypatch.setattr(proof, "_START_SECONDS", 0.1)
     monkeypatch.setattr(state, "_LOOK_SECONDS", 0.01)
-    monkeypatch.setattr(proof, "_MOST_TRIES", 1)
+    monkeypatch.setattr(talk, "_MOST_TRIES", 1)
     for name in ("ROS_DOMAIN_ID", "RMW_IMPLEMENTATION", "ROS_SECURITY_ENABLE"):
         monkeypatch.delenv(name, raising=False)
     (tmp_path / "systemd").mkdir()

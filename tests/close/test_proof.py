@@ -15,16 +15,18 @@ from sros_tool.close import proof
 from sros_tool.close.acceptance import Acceptance
 from sros_tool.close.nodes import MovedEndpoint
 from sros_tool.close.proof import (
-    _abandoned_names,
-    _endpoint_texts,
-    _endpoints_without_peer,
     _proof_of_connections,
     _proof_of_requirements,
     _proof_of_silence,
+)
+from sros_tool.close.robot import Shell
+from sros_tool.close.talk import (
+    _abandoned_names,
+    _endpoint_texts,
+    _endpoints_without_peer,
     _unseen_text,
     _without_counterpart,
 )
-from sros_tool.close.robot import Shell
 from sros_tool.explain.audit import DeniedRight
 from sros_tool.graph.observation import Endpoint, Observation, make_observation
 from sros_tool.keystore.expiry import Lifetime
