@@ -220,13 +220,9 @@ class RunningRobot:
         """Return the processes in enclaves that sros did not observe, as text.
 
         A further process with an observed command counts, too. An enclave without an observed
-        process may have one process. Programs of `ros2` and sros do not count.
+        process may have one process.
         """
-        secured = [
-            secured
-            for secured in self.secured
-            if secured.enclave.name != OBSERVER and not _is_tool(secured.process)
-        ]
+        secured = [secured for secured in self.secured if secured.enclave.name != OBSERVER]
         observed = self.robot.processes
         known = {process.enclave for process in observed.processes}
         count = Counter(
@@ -240,22 +236,12 @@ class RunningRobot:
             for process, enclave in further
         ]
 
-    def tools(self) -> Iterator[str]:
-        """Yield the processes in enclaves that count as tools by their program's name, as text."""
-        for process in self.in_domain:
-            enclave = process.enclave
-            if enclave and enclave.name != OBSERVER and _is_tool(process):
-                yield f"{process.label} in {enclave.name}"
-
     def with_other_files(self) -> Iterator[str]:
-        """Yield the processes of the domain in enclaves of other folders, as text.
-
-        Programs of `ros2` and sros do not count.
-        """
+        """Yield the processes of the domain in enclaves of other folders, as text."""
         pids = {process.pid for process, _ in self.secured}
         for process in self.in_domain:
             enclave = process.enclave
-            if enclave and not (process.pid in pids or process.is_daemon or _is_tool(process)):
+            if enclave and process.pid not in pids:
                 files = keystore_text(enclave)
                 yield f"{process.label} in {enclave.name} (with the files of '{files}')"
 

@@ -290,6 +290,15 @@ def test_an_observer_that_did_not_see_everything_proves_no_silence(is_settled: b
     assert proof.holds is (True if is_settled else None)
 
 
+def test_a_listener_finds_what_writes_openly_under_the_name_of_a_tool() -> None:
+    """Any program can have a node `_ros2cli_...`."""
+    text = "left out, although these nodes write, ...: /_ros2cli_7 (publish topic /cmd_vel)"
+    note = {"id": "graph.tool-writes", "text": text}
+    value = {"nodes": [], "notes": [note], "settled": True}
+    proof = _proof_of_silence(robot_beside_graph(value), Observation(), hears=True)
+    assert proof.fails and "`ros2`: /_ros2cli_7 (publish topic /cmd_vel)" in proof.reason
+
+
 def robot_beside_graph(*values: dict[str, Any], **environment: str) -> Any:
     """Return a robot whose shell reads these JSON values, one for each listener."""
     left = iter(values)
