@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 from sros_tool.checks.kind import ERROR, WARNING, Finding, FindingKind
 from sros_tool.dds.decision.vendors import FAST_DDS
-from sros_tool.runtime.logind import login_users
+from sros_tool.runtime.logind import users_without_linger
 from sros_tool.runtime.processes import MemoryPort, Process, plain
 from sros_tool.wording import counted, enumerated, first_few
 
@@ -60,9 +60,9 @@ _MOST_NAMES = 4
 class Connections(NamedTuple):
     """The connections between processes of one machine.
 
-    ``deaf`` are the processes that lost their shared memory, and ``missing`` the pairs of other
-    processes that do not hear each other. ``compared`` are the processes that sros can compare with
-    each other; ``unknown`` are processes whose connections sros cannot see.
+    ``deaf`` are the processes that are stopped or lost their shared memory, and ``missing`` the
+    pairs of other processes that do not hear each other. ``compared`` are the processes that sros
+    can compare with each other; ``unknown`` are processes whose connections sros cannot see.
     """
 
     deaf: Sequence[Process]
@@ -86,7 +86,7 @@ class _Place(NamedTuple):
 
 def connections_between(processes: Iterable[Process]) -> Connections:
     """Return the connections between processes that run the nodes of one robot."""
-    deaf, processes = _divided_by_memory(processes)
+    deaf, processes = _divided_by_hearing(processes)
     ports = {process.pid: _ports_by_place(process) for process in processes}
     number = Counter(place for by_place in ports.values() for place in by_place)
     main = max(number, key=lambda place: number[place], default=None)
@@ -107,13 +107,12 @@ def connections_between(processes: Iterable[Process]) -> Connections:
     )
 
 
-def _divided_by_memory(processes: Iterable[Process]) -> tuple[list[Process], list[Process]]:
-    """Return the processes that lost their shared memory, and the others."""
-    processes = [*processes]
-    return (
-        [process for process in processes if process.lost_memory],
-        [process for process in processes if not process.lost_memory],
-    )
+def _divided_by_hearing(processes: Iterable[Process]) -> tuple[list[Process], list[Process]]:
+    """Return the processes that are stopped or lost their shared memory, and the others."""
+    divided: tuple[list[Process], list[Process]] = [], []
+    for process in processes:
+        divided[not (process.is_stopped or process.lost_memory)].append(process)
+    return divided
 
 
 def _ports_by_place(process: Process) -> Mapping[_Place, set[MemoryPort]]:
@@ -149,25 +148,30 @@ def with_time_to_connect(processes: Iterable[Process], now: datetime) -> Iterato
 def connection_findings(missing: Sequence[tuple[Process, Process]]) -> Iterator[Finding]:
     """Yield findings about secured processes that trust the same CA, and are not connected."""
     for process, peers in restarts(missing):
-        names = first_few([_process_name(peer) for peer in peers], _MOST_NAMES)
+        names = first_few([process_name(peer) for peer in peers], _MOST_NAMES)
         text = f"it has not connected to {names}: they do not hear each other"
         yield PROCESS_NOT_CONNECTED.found(
-            _process_name(process), text, remedy=_remedy(process, peers)
+            process_name(process), text, remedy=_remedy(process, peers)
         )
 
 
 def lost_memory_findings(processes: Iterable[Process]) -> Iterator[Finding]:
     """Yield a finding for each process that lost its shared memory."""
-    text = "files of its shared memory (/dev/shm) were removed while it runs: it hears nothing"
     for process in processes:
         if process.lost_memory:
-            remedy = f"{_linger_advice([process])}{PROCESS_LOST_MEMORY.remedy}"
-            yield PROCESS_LOST_MEMORY.found(_process_name(process), text, remedy=remedy)
+            if process.is_stopped:  # it opens the files again when it continues
+                text = "it is stopped (SIGSTOP), and files of its shared memory were removed"
+                remedy = f"{_continuing([process])}."
+            else:
+                text = "files of its shared memory (/dev/shm) were removed while it runs: it hears "
+                text += "nothing"
+                remedy = f"{_linger_advice([process])}{PROCESS_LOST_MEMORY.remedy}"
+            yield PROCESS_LOST_MEMORY.found(process_name(process), text, remedy=remedy)
 
 
 def _linger_advice(deaf: Iterable[Process]) -> str:
-    """Return a sentence on keeping the shared memory of users who log in; "" for system users."""
-    names = login_users(process.user for process in deaf)
+    """Return a sentence on keeping the shared memory of users who log in; "" if it is kept."""
+    names = users_without_linger(process.user for process in deaf)
     if not names:
         return ""
     linger = enumerated([f"`loginctl enable-linger {name}`" for name in names])
@@ -180,11 +184,16 @@ def _linger_advice(deaf: Iterable[Process]) -> str:
 def not_connected_text(connections: Connections) -> str:
     """Return text on processes that do not hear each other, with the remedy.
 
-    Processes that lost their shared memory come first; "" if all have connected.
+    Stopped processes come first, then those that lost their shared memory; "" if all have
+    connected.
     """
     missing = connections.missing
+    if stopped := [process for process in connections.deaf if process.is_stopped]:
+        names = first_few([*map(process_name, stopped)], _MOST_NAMES)
+        are, hear = ("is", "hears") if len(stopped) == 1 else ("are", "hear")
+        return f"{names} {are} stopped (SIGSTOP), and {hear} nothing. {_continuing(stopped)}"
     if deaf := connections.deaf:
-        names = first_few([*map(_process_name, deaf)], _MOST_NAMES)
+        names = first_few([*map(process_name, deaf)], _MOST_NAMES)
         is_one = len(deaf) == 1
         lost, hear = ("has lost its", "hears") if is_one else ("have lost their", "hear")
         restart = "Stop it, and start it again"
@@ -196,16 +205,21 @@ def not_connected_text(connections: Connections) -> str:
         )
     if not missing:
         return ""
-    first, second = map(_process_name, missing[0])
+    first, second = map(process_name, missing[0])
     more = f" and {counted(len(missing) - 1, 'other pair')}" if missing[1:] else ""
     to_restart = [*restarts(missing)]
     remedy = next(filter(None, (_remedy(process, peers) for process, peers in to_restart)), "")
     if not remedy:
-        names = enumerated([_process_name(process) for process, _ in to_restart])
+        names = enumerated([process_name(process) for process, _ in to_restart])
         remedy = (
             f"restart {names}{', one after the other' * (len(to_restart) > 1)}, and check again"
         )
     return f"{first} and {second}{more} do not hear each other; {remedy[0].lower()}{remedy[1:]}"
+
+
+def _continuing(stopped: Iterable[Process]) -> str:
+    pids = " ".join(str(process.pid) for process in stopped)
+    return f"Continue with `kill -CONT {pids}`, and check again"
 
 
 def _remedy(process: Process, peers: Iterable[Process]) -> str:
@@ -213,5 +227,6 @@ def _remedy(process: Process, peers: Iterable[Process]) -> str:
     return _REMEDY_FOR_USERS if {peer.user for peer in peers} != {process.user} else ""
 
 
-def _process_name(process: Process) -> str:
+def process_name(process: Process) -> str:
+    """Return the name of a process in messages, with its enclave."""
     return f"{process.label}{f' in {plain(process.enclave.name)}' if process.enclave else ''}"

@@ -780,7 +780,7 @@ def process_findings(
     starts_nodes = is_secured_here and bool(environment.get(ENCLAVE))
     yield from _mixed_vendor_findings(secured, environment if starts_nodes else None)
     yield from _other_keystore_findings(secured, environment if is_secured_here else None)
-    for _, processes in _group_by_authorities(secured):
+    for _, processes in group_by_authorities(secured):
         connections = connections_between(with_time_to_connect(processes, now))
         yield from connection_findings(connections.missing)
     if is_secured_here and environment.get(KEYSTORE):
@@ -1032,7 +1032,7 @@ def _other_keystore_findings(
     own_domain = ("", domain_text(environment.get(DOMAIN, ""))) if environment is not None else None
     own_keys = _authority_keys_here(environment) if environment is not None else frozenset()
     for place, processes in _group_by_network_and_domain(secured).items():
-        groups = _group_by_authorities(process for process in processes if not process.is_zenoh)
+        groups = group_by_authorities(process for process in processes if not process.is_zenoh)
         if own_keys and place == own_domain:
             main = f"this environment has '{plain((environment or {})[KEYSTORE], _LONGEST_PATH)}'"
             other_groups = [group for keys, group in groups if not keys & own_keys]
@@ -1087,7 +1087,7 @@ _PublicKeys = frozenset[bytes]
 """Public keys of identity CAs, as bytes in DER."""
 
 
-def _group_by_authorities(processes: Iterable[Process]) -> list[tuple[_PublicKeys, list[Process]]]:
+def group_by_authorities(processes: Iterable[Process]) -> list[tuple[_PublicKeys, list[Process]]]:
     """Group processes by a common identity CA; leave out processes whose CA is not known."""
     groups: list[tuple[_PublicKeys, list[Process]]] = []
     for process in processes:

@@ -16,14 +16,19 @@ from sros_tool.checks.connections import (
     CONNECTING_TIME,
     PROCESS_LOST_MEMORY,
     PROCESS_NOT_CONNECTED,
-    Connections,
     connections_between,
     not_connected_text,
+    process_name,
 )
 from sros_tool.checks.environment import is_zenoh
 from sros_tool.checks.keystores.issued import STALE
 from sros_tool.checks.kind import NOTE, Finding
-from sros_tool.checks.processes import PROCESS_NOT_SEEN, further_domains_text, process_findings
+from sros_tool.checks.processes import (
+    PROCESS_NOT_SEEN,
+    further_domains_text,
+    group_by_authorities,
+    process_findings,
+)
 from sros_tool.checks.requirements import MISSPELLED_ENCLAVE, VACUOUS
 from sros_tool.close.nodes import (
     ObservedNodes,
@@ -345,19 +350,27 @@ def _proof_of_connections(robot: LocalRobot) -> Iterator[Proof]:
     """Yield a proof whether all processes have connected to each other (None: not known).
 
     Yields nothing if at most one process has shared memory ports of Fast DDS that sros sees.
-    Waits until all processes have connected, or had enough time.
+    Waits until all processes have connected, or had enough time. Processes that may not belong to
+    the robot leave the claim untested if they have not connected.
     """
-    started = [process.started for process, _ in RunningRobot(robot).secured]
+    own, others = _connecting_processes(RunningRobot(robot))
+    started = [process.started for process in (*own, *others)]
     now = robot.shell.now()
     patience = min(max(started, default=now) + CONNECTING_TIME - now, CONNECTING_TIME)
     running = wait_until(
-        robot, lambda seen: _connections(seen).are_settled, patience.total_seconds()
+        robot,
+        lambda seen: connections_between(chain(*_connecting_processes(seen))).are_settled,
+        patience.total_seconds(),
     )
-    connections = _connections(running)
-    if text := not_connected_text(connections):
+    own, others = _connecting_processes(running)
+    connections = connections_between([*own, *others])
+    if text := not_connected_text(connections_between(own)):
         yield Proof(CONNECTED, False, text)
+    elif text := not_connected_text(connections):
+        names = first_few([process.label for process in others], MOST_NAMES)
+        yield Proof(CONNECTED, None, f"with {names}, which may also belong to the robot: {text}")
     elif connections.compared and (unknown := connections.unknown):
-        names = first_few([process.label for process in unknown], MOST_NAMES)
+        names = first_few([*map(process_name, unknown)], MOST_NAMES)
         one = len(unknown) == 1
         hear, they, share = ("hears", "it", "shares") if one else ("hear", "they", "share")
         yield Proof(
@@ -374,16 +387,28 @@ def _proof_of_connections(robot: LocalRobot) -> Iterator[Proof]:
         yield Proof(CONNECTED, True, reason)
 
 
-def _connections(running: RunningRobot) -> Connections:
-    """Return the connections between processes in enclaves.
+def _connecting_processes(running: RunningRobot) -> tuple[list[Process], list[Process]]:
+    """Return the robot's processes, and further processes of its domain that trust the same CA.
 
-    The observer is left out, and so are processes that only claim to run in an enclave.
+    The latter have other files, or only claim to run in an enclave. The observer is left out.
     """
-    return connections_between(
+    own = [
         process
         for process, enclave in running.secured
         if enclave.name != OBSERVER and running.may_use_files(process)
-    )
+    ]
+    pids = {process.pid for process in own}
+    others = [
+        process
+        for _, group in group_by_authorities(
+            process
+            for process in running.in_domain
+            if process.enclave and process.enclave.name != OBSERVER and not process.is_daemon
+        )
+        for process in group
+        if process.pid not in pids and any(member.pid in pids for member in group)
+    ]
+    return own, others
 
 
 def _proof_of_silence(robot: LocalRobot, before: Observation, *, hears: bool) -> Proof:

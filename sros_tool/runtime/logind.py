@@ -23,15 +23,11 @@ _LINGER_FOLDER = Path("/var/lib/systemd/linger")
 _LOGIND = ("org.freedesktop.login1", "/org/freedesktop/login1", "org.freedesktop.login1.Manager")
 
 
-def login_users(users: Iterable[int]) -> list[str]:
-    """Return the names (or ids) of those of ``users`` that are no system users."""
-    chosen = sorted({user for user in users if _FIRST_LOGIN_USER <= user < SEVERAL_USERS})
-    return [user_name(user).removeprefix("user ") for user in chosen]
-
-
 def users_without_linger(users: Iterable[int]) -> list[str]:
-    """Return the names of those of ``users`` whose shared memory logind removes at logout."""
-    names = [name for name in login_users(users) if not (_LINGER_FOLDER / name).exists()]
+    """Return the names (or ids) of those of ``users`` whose memory logind removes at logout."""
+    chosen = sorted({user for user in users if _FIRST_LOGIN_USER <= user < SEVERAL_USERS})
+    names = [user_name(user).removeprefix("user ") for user in chosen]
+    names = [name for name in names if not (_LINGER_FOLDER / name).exists()]
     return names if names and _removes_memory() else []
 
 

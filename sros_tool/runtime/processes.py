@@ -158,7 +158,8 @@ class Process:
     process; for a set-user-ID program, of the user who started it; `SEVERAL_USERS` if several users
     can control the process. ``own_ports`` are the ports of Fast DDS that only this process reads,
     and ``mapped_ports`` also those to which it has sent. ``lost_memory`` says that files of its own
-    shared memory were deleted, so that no other process of Fast DDS can open them. ``domains`` are
+    shared memory were deleted, so that no other process of Fast DDS can open them. ``is_stopped``
+    says that it was stopped, as by SIGSTOP, and does nothing until it continues. ``domains`` are
     the ROS domains that its ports show, which may be more than the domain that it names: a program
     can join others, and need not secure itself there.
     """
@@ -179,6 +180,7 @@ class Process:
     own_ports: frozenset[MemoryPort] = frozenset()
     mapped_ports: frozenset[MemoryPort] = frozenset()
     lost_memory: bool = False
+    is_stopped: bool = False
     domains: frozenset[int] = frozenset()
 
     @property
@@ -415,7 +417,8 @@ class _Stat(NamedTuple):
     ``parent`` is the id of the parent process, ``ticks`` the start of the process in clock ticks
     after the start of the machine, and ``size`` the size of the virtual memory in bytes.
     ``identity`` changes when the process runs another program.  ``is_idle`` is true for a process
-    that has ended and for a part of the kernel.
+    that has ended and for a part of the kernel, and ``is_stopped`` for a process that a signal
+    stopped.
     """
 
     parent: int
@@ -423,6 +426,7 @@ class _Stat(NamedTuple):
     identity: tuple[str, ...]
     size: str
     is_idle: bool
+    is_stopped: bool
 
 
 class _ProcessData(NamedTuple):
@@ -523,7 +527,9 @@ class ProcessTable:
                     # Kept from the last look, because the clock may have been set since.
                     started, advanced = before.process.started, before.process.clock_advance
                 process = _examine(pid, folder, command, started)
-                process = process and replace(process, clock_advance=advanced)
+                process = process and replace(
+                    process, clock_advance=advanced, is_stopped=stat.is_stopped
+                )
                 unseen = None
             except (PermissionError, _TooLongError) as error:
                 why = error.strerror or "the operating system refuses it"
@@ -971,7 +977,8 @@ def _stat(folder: int) -> _Stat:
         raise ProcessLookupError
     is_idle = numbers[0] in "ZX" or bool(int(numbers[6]) & _KERNEL_THREAD)
     identity = (name, numbers[19], numbers[23])
-    return _Stat(int(numbers[1]), int(numbers[19]), identity, numbers[20], is_idle)
+    is_stopped = numbers[0] == "T"
+    return _Stat(int(numbers[1]), int(numbers[19]), identity, numbers[20], is_idle, is_stopped)
 
 
 _USERS = re.compile(rb"^Uid:\s+(\d+)\s+(\d+)\s+(\d+)\s+(\d+)", re.MULTILINE)

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from sros_tool.checks import connections as connections_module
 from sros_tool.checks.connections import (
     connection_findings,
     connections_between,
@@ -116,8 +117,16 @@ def test_a_summary_names_a_pair_and_all_restarts() -> None:
     assert "; run these processes as one user" in not_connected_text(connections)
 
 
-def test_processes_that_lost_their_shared_memory_are_deaf_to_all() -> None:
+def test_processes_that_lost_their_shared_memory_are_deaf_to_all(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """They still map what was deleted, and their peers may map their ports of before."""
+    users_named = {4711: "4711", 4712: "4712"}
+    monkeypatch.setattr(
+        connections_module,
+        "users_without_linger",
+        lambda users: [users_named[user] for user in users if user in users_named],
+    )
     heard, *lost = robot(1, 2, 3)
     system, login = (replace(process, lost_memory=True) for process in lost)
     connections = connections_between([heard, system])
@@ -135,3 +144,19 @@ def test_processes_that_lost_their_shared_memory_are_deaf_to_all() -> None:
     ) in several
     (finding,) = lost_memory_findings([heard, users[0]])
     assert finding.remedy.startswith("If 4711 also logs in, first run `loginctl enable-linger 4711")
+    users_named.pop(4711)
+    assert "linger" not in not_connected_text(connections_between([heard, users[0]])), "it is on"
+
+
+@pytest.mark.parametrize("lost", [False, True])
+def test_a_stopped_process_is_continued_whatever_became_of_its_memory(lost: bool) -> None:
+    """It opens its port again by itself, so neither a restart nor linger is needed."""
+    first, *others = robot(1, 2, 3)
+    stopped = [replace(process, is_stopped=True, lost_memory=lost) for process in others]
+    assert not_connected_text(connections_between([first, *stopped])) == (
+        "process 2 (node2), process 3 (node3) are stopped (SIGSTOP), and hear nothing. Continue "
+        "with `kill -CONT 2 3`, and check again"
+    )
+    found = [*lost_memory_findings([first, *stopped])]
+    remedies = [f"Continue with `kill -CONT {pid}`, and check again." for pid in (2, 3)]
+    assert [finding.remedy for finding in found] == remedies * lost

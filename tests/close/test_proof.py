@@ -151,7 +151,10 @@ def test_a_demand_for_an_enclave_that_the_export_lacks_is_judged_by_the_keystore
     assert _proof_of_requirements(robot, str).holds is False
 
 
-STRANGER = replace(robot(9)[0], user=4711)
+OF_OTHERS = 9
+"""The id of a process that trusts the robot's CA, but may not belong to the robot."""
+FOREIGN = 10
+"""The id of a process that trusts another CA."""
 
 
 @pytest.mark.parametrize(
@@ -164,21 +167,35 @@ STRANGER = replace(robot(9)[0], user=4711)
             [*robot(1, 2), replace(robot(3)[0], own_ports=frozenset())],
             (),
             None,
-            "sros cannot see whether process 3 (node3) hears the others, because it shares no",
+            "sros cannot see whether process 3 (node3) in /node hears the others, because",
         ),
         (
             [*robot(1, 2), replace(robot(3)[0], lost_memory=True)],
             (),
             False,
-            "process 3 (node3) has lost its shared memory",
+            "process 3 (node3) in /node has lost its shared memory",
         ),
         (
             [replace(process, lost_memory=True) for process in robot(1, 2)],
             (),
             False,
-            "process 1 (node1), process 2 (node2) have lost their shared memory",
+            "process 1 (node1) in /node, process 2 (node2) in /node have lost their shared memory",
         ),
-        ([*robot(1, 2), STRANGER], (), True, "2 processes"),
+        (robot(1, 2, OF_OTHERS), (), True, "3 processes of Fast DDS, each with all others"),
+        (
+            robot(1, 2, OF_OTHERS, deaf=[(1, OF_OTHERS)]),
+            (),
+            None,
+            "with process 9 (node9), which may also belong to the robot: process 1 (node1) in "
+            "/node and process 9 (node9) in /node do not hear each other",
+        ),
+        (
+            [*robot(1, 2), replace(robot(OF_OTHERS)[0], own_ports=frozenset())],
+            (),
+            None,
+            "sros cannot see whether process 9 (node9) in /node hears the others",
+        ),
+        (robot(1, 2, FOREIGN, deaf=[(1, FOREIGN)]), (), True, "2 processes of Fast DDS"),
         ([replace(process, own_ports=frozenset()) for process in robot(1, 2)], (), None, None),
         (robot(1), (), None, None),
     ],
@@ -192,11 +209,21 @@ def test_processes_that_have_not_connected_fail_the_proof(
 ) -> None:
     """Where sros sees no connections, it proves nothing, and `close` says so.
 
-    A process of a user who cannot read the files only claims to run in an enclave.
+    A process of a user who cannot read the files only claims to run in an enclave, so it makes the
+    proof neither hold nor fail.
     """
+    in_domain = [
+        replace(process, enclave=ProcessEnclave("/export", "/node")) for process in processes
+    ]
     running: Any = SimpleNamespace(
-        secured=[(process, ProcessEnclave("/export", "/node")) for process in processes],
-        may_use_files=lambda process: process is not STRANGER,
+        in_domain=in_domain,
+        secured=[(process, process.enclave) for process in in_domain if process.pid != FOREIGN],
+        may_use_files=lambda process: process.pid not in (OF_OTHERS, FOREIGN),
+    )
+    monkeypatch.setattr(
+        proof,
+        "group_by_authorities",
+        lambda processes: [("ca", [each for each in processes if each.pid != FOREIGN])],
     )
     monkeypatch.setattr(proof, "RunningRobot", lambda *_: running)
     monkeypatch.setattr(proof, "wait_until", lambda *_: running)

@@ -47,12 +47,22 @@ class Proc:
         maps: str = "",
         parent: int = 1,
         flags: int = 0,
+        state: str = "S",
         start: str = "100",
     ) -> Path:
         folder = self.path / str(pid)
         for name in ("ns", "fd", "net"):
             (folder / name).mkdir(parents=True, exist_ok=True)
-        numbers = ["S", str(parent), *"0000", str(flags), *"000000000000", start, "4096", *"00000"]
+        numbers = [
+            state,
+            str(parent),
+            *"0000",
+            str(flags),
+            *"000000000000",
+            start,
+            "4096",
+            *"00000",
+        ]
         (folder / "stat").write_text(f"{pid} (a) b) {' '.join(numbers)}\n")
         (folder / "cmdline").write_bytes("\0".join((*command, "")).encode())
         (folder / "environ").write_bytes(environment)
@@ -312,7 +322,7 @@ def test_a_process_that_always_starts_another_program_is_named(
 ) -> None:
     proc.add(7, *ROS)
     (proc.path / "1").rmdir()
-    programs = (_Stat(1, 1, (str(number),), "1", is_idle=False) for number in range(9))
+    programs = (_Stat(1, 1, (str(number),), "1", False, False) for number in range(9))
     monkeypatch.setattr(processes, "_stat", lambda _: next(programs))
     (unseen,) = proc.look().unseen
     assert unseen.why == "it keeps starting other programs"
@@ -357,6 +367,10 @@ def test_only_what_changed_is_read_again_and_another_process_is_another(proc: Pr
     folder = proc.add(7, *ROS)
     first = proc.look(table)
     assert table.look(NOW + timedelta(seconds=9)) == first
+    proc.add(7, *ROS, state="T")
+    assert proc.look(table).processes[0].is_stopped
+    proc.add(7, *ROS)
+    assert proc.look(table) == first, "it continues"
     (folder / "environ").write_bytes(b"ROS_DOMAIN_ID=5")
     assert proc.look(table) == first
     proc.add(7, *ROS, start="900", environment=b"ROS_DOMAIN_ID=5")
