@@ -388,15 +388,15 @@ def _lost_protection(robot: LocalRobot) -> Iterator[str]:
 
 
 def _say_names_without_requirement(robot: LocalRobot) -> None:
-    """Show the names that are not signed yet, and that deserve a requirement but have none."""
+    """Show the names that deserve a requirement since this change, but have none."""
     if not robot.keystore.exists():
         return
-    signed = {right.name for right in load_rights(OpenedKeystore(robot.keystore)).rights}
+    signed = load_rights(OpenedKeystore(robot.keystore)).rights
     if names := names_without_requirement(robot.folder, signed, robot.shell.now()):
         policy = shlex.quote(str(robot.policy))
         robot.shell.say(
-            f"no requirement protects {first_few(names, MOST_NAMES)}, new in the policy: `sros "
-            f"check {policy} --suggest` proposes requirements; copy those that you want into "
+            f"no requirement protects {first_few(names, MOST_NAMES)}: `sros check {policy} "
+            "--suggest` now proposes requirements; copy those that you want into "
             f"'{robot.requirements}'"
         )
 

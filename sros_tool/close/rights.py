@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import NamedTuple
@@ -23,7 +23,7 @@ from sros_tool.policy.patterns import overlap
 from sros_tool.policy.rights import Right, Rules, policy_rights
 from sros_tool.proof.findings import decide_all
 from sros_tool.proof.requirements import Requirement, RightsRequirement, read_requirements
-from sros_tool.proof.suggestions import suggest
+from sros_tool.proof.suggestions import names_to_protect, suggest
 from sros_tool.proof.system import policy_system
 from sros_tool.wording import counted, first_few
 
@@ -193,26 +193,27 @@ def requirements_broken_by(folder: Path, addition: str, moment: datetime) -> lis
     return []
 
 
-def names_without_requirement(folder: Path, known: Collection[str], moment: datetime) -> list[str]:
-    """Return the names in the policy of a closed robot that a new requirement could protect.
+def names_without_requirement(folder: Path, signed: Iterable[Right], moment: datetime) -> list[str]:
+    """Return the names in the policy of a closed robot that a requirement can protect only now.
 
-    A requirement would be proposed for such a name, no requirement in the ``folder`` names it, and
-    it is not ``known``.  Empty if that cannot be decided.
+    A requirement is proposed for such a name, but not by the ``signed`` rights, such as for a topic
+    whose second end is new; and no requirement in the ``folder`` names it.  Empty if that cannot be
+    decided.
     """
     policy = read_policy(folder / CLOSED_POLICY)
-    if {right.name for right in policy_rights(policy)}.issubset(known):
+    stated = _names_in(read_requirements(folder / REQUIREMENTS))
+    names = {
+        name
+        for name in names_to_protect(policy_rights(policy)) - names_to_protect(signed)
+        if not any(overlap(name, other) for other in stated)
+    }
+    if not names:
         return []
     try:
         system = policy_system(policy, Circumstances(moment), load_template(TEMPLATE))
-        proposed = suggest(system.rights, system.worlds).requirements
+        return sorted(names & _names_in(suggest(system.rights, system.worlds).requirements))
     except SrosError:  # too many wildcards
         return []
-    stated = _names_in(read_requirements(folder / REQUIREMENTS))
-    return sorted(
-        name
-        for name in _names_in(proposed) - {*known}
-        if not is_expression(name) and not any(overlap(name, other) for other in stated)
-    )
 
 
 def _names_in(requirements: Iterable[Requirement]) -> set[str]:

@@ -87,6 +87,18 @@ def suggest(
     return Suggestions(requirements, [_comment_on_unmet(each) for each in missing])
 
 
+def names_to_protect(rights: Iterable[Right]) -> set[str]:
+    """Return the names that get requirements of their own if these hold for the ``rights``."""
+    stated = _StatedRights(rights)
+    return {
+        name
+        for right in _SENDING_RIGHTS
+        for requirement in _requirements_on_few_holders(stated, right)
+        for _, names in requirement.rights
+        for name in names
+    }
+
+
 def _unreserved_moves(stated: _StatedRights, proposed: Iterable[Requirement]) -> Iterator[Only]:
     """Yield a requirement for each name that moves a robot, and that ``proposed`` does not reserve.
 

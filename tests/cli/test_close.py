@@ -2047,15 +2047,25 @@ def test_a_requirement_that_lost_its_right_is_told_before_a_review_fails(tmp_pat
         said_now = "toml:1 protects /x, which the policy does not"
         assert [said_now in problem for problem in problems] == [True] * lost
     # A later name gets no requirement by itself, unlike those of the first policy.
-    later = {"/a": publish("x", "z"), "/r": reader, "/s": subscribe("z")}
     lost_policy = robot.policy.read_text()
-    robot.policy.write_text(policy_text(later))
-    for names, is_told in (("/x", True), ("/z", False), ("/*", False)):
+    one_end = {"/a": publish("x", "z"), "/r": reader}
+    both_ends = one_end | {"/s": subscribe("z")}
+    for stated, names, is_told, is_signed in (
+        (both_ends, "/x", True, False),
+        (both_ends, "/z", False, False),
+        (both_ends, "/*", False, False),
+        (one_end, "/x", False, True),
+        (both_ends, "/x", True, True),  # the other end came later
+        (both_ends, "/x", False, False),  # it was named before it was signed
+    ):
+        robot.policy.write_text(policy_text(stated))
         robot.requirements.write_text(needed.replace("/gone", names))
         said.clear()
         assert preparation._run_step(robot, guard, accepted=set()) == ("done", [])
-        hints = [line for line in said if line.startswith("no requirement protects /z, new in")]
+        hints = [line for line in said if line.startswith("no requirement protects /z: `sros")]
         assert len(hints) == is_told, said
+        if is_signed:
+            sros("generate_artifacts", "-k", robot.keystore, "-p", robot.policy).ok()
     robot.policy.write_text(lost_policy)
     robot.requirements.write_text(needed.replace("gone", "x"))
     assert preparation._run_step(robot, guard, accepted={Acceptance.REQUIREMENTS}) == ("done", [])
