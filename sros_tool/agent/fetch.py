@@ -330,7 +330,8 @@ def _fetch_error(error: Exception, source: str, now: datetime) -> FetchError:
             f"{source} has an old copy of the files, or somebody withholds the new files.",
             f"On the keystore machine, run `sros fleet publish{needs}`; {_SET_CLOCK}.",
         )
-    if isinstance(error, exceptions.BadVersionNumberError):
+    # Roots of other versions are not older files, but damaged or foreign ones.
+    if isinstance(error, exceptions.BadVersionNumberError) and "root version" not in str(error):
         return FetchError(
             FetchProblem.ROLLED_BACK,
             f"the files in {source} {OLDER_THAN_SEEN}",

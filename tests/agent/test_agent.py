@@ -652,7 +652,7 @@ def test_a_key_that_others_could_read_is_named_until_it_is_revoked(home: Home, r
         problems = r1.round().problems
         assert key.stat().st_mode & 0o777 == 0o600
         assert "others could read 1 private key: enclaves/r1/a/key.pem" in problems[0]
-        assert "If the key was made on this robot, revoke the enclave" in problems[0]
+        assert "If the key was made on its robot, revoke the enclave" in problems[0]
     (problem,) = r1.round(moment() + timedelta(days=30)).problems
     assert "others could read" in problem and not is_mended(problem)
     present = key.read_bytes()

@@ -145,6 +145,9 @@ def test_mixing_versions(publisher: Home) -> None:
         (metadata / new).write_bytes((metadata / old).read_bytes())
         publisher.robot().refuses(problem)
         (metadata / new).write_bytes(kept)
+    (foreign := metadata / "2.root.json").write_bytes((metadata / "1.root.json").read_bytes())
+    assert "puts altered files right" in publisher.robot().refuses(FetchProblem.NOT_SIGNED).remedy
+    foreign.unlink()
     publisher.robot().gets()
 
 
