@@ -217,8 +217,9 @@ def access_by_name_findings(
 
     The owner of the requirement has to see such an enclave.
     """
-    similar_requirements = similarity_to(earlier)
-    kept = [of for of in requirements if isinstance(of, Only) and similar_requirements(of)]
+    similar_requirements = similarity_to(requirements)
+    # As they were before: the change may also name its own enclaves in them.
+    kept = [of for of in earlier if isinstance(of, Only) and similar_requirements(of)]
     old, new = split_actions(before.rights), split_actions(after.rights)
     # A lost DENY gives access, too.
     gained = {right for right in old ^ new if (right.qualifier is ALLOW) == (right in new)}
@@ -237,9 +238,9 @@ def access_by_name_findings(
                 text = f"{step.text()}: new access, which the requirement allows only by "
                 patterns = first_few(patterns_of_any_package(requirement), 3)
                 text += f"{patterns}, as to any enclave of such a name"
-                place = step.source or requirement.source
-                remedy = "Name the enclaves that are meant in the requirement, or approve this in "
-                remedy += "the review."
+                place = step.source or similar_requirements(requirement)[0].source
+                remedy = "Approve this in the review. If an earlier change names the enclaves that "
+                remedy += "are meant in the requirement, they need no approval."
                 yield DROPPED.found(str(requirement), text, place.file, place.line, remedy)
 
 

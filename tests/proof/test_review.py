@@ -1155,6 +1155,7 @@ _NOTHING_BUT = (
 )
 _ONLY_OPERATORS = '[[only]]\npublish = ["/cmd"]\nenclaves = ["/drive", "*/operator/*"]\n'
 _ADDED = "# added\n"
+_REPLACED = "# replaced by\n"
 _NODES = {
     "/eyes/eye": publish("/image"),
     "/drive": publish("/cmd"),
@@ -1246,6 +1247,14 @@ def _moved(node: str, path: str, enclaves: dict[str, str] = _NODES) -> dict[str,
                 _HANDS | {"/operator/hand": publish("/cmd")},
                 "/operator/hand may publish /cmd: new access",
             ),
+            (  # The change itself names the enclave in the requirement.
+                _NODES,
+                _ONLY_OPERATORS
+                + _REPLACED
+                + _ONLY_OPERATORS.replace("*/operator/*", "/x/operator/hand"),
+                _NODES | {"/x/operator/hand": publish("/cmd")},
+                "/x/operator/hand may publish /cmd: new access",
+            ),
             (  # For users without a namespace, it is an operator of the robot.
                 _NODES,
                 _ONLY_OPERATORS.replace("*/", "//").replace('"/cmd', '"cmd'),
@@ -1289,7 +1298,8 @@ def _moved(node: str, path: str, enclaves: dict[str, str] = _NODES) -> dict[str,
 def test_a_change_escapes_no_requirement(
     change: Change, before: dict[str, str], required: str, after: dict[str, str], said: str
 ) -> None:
-    earlier = required.partition(_ADDED)[0]
+    earlier, _, later = required.partition(_REPLACED)
+    earlier, required = earlier.partition(_ADDED)[0], later or required
     change.base = change.commit({"robot.xml": policy_text(before), "robot.toml": earlier})
     words = ("--policy", "robot.xml", "--requirements", "robot.toml", "--new-access", "allow")
     change.commit({"robot.xml": policy_text(after), "robot.toml": required})
