@@ -174,7 +174,7 @@ def lost_restriction_findings(
     for requirement in requirements if moves else ():
         reported: dict[NodeName, set[str]] = defaultdict(set)
         # The namespaces of a fleet are known, and its policies name the enclaves in them.
-        for ns in ("/",) if after.fleet else _namespaces_of_patterns(requirement):
+        for ns in ("/",) if after.fleet else namespaces_of_patterns(requirement):
             now_restricted = restricted_enclaves(requirement, after.enclaves, ns)
             was_restricted = [
                 {path for path, new in new_paths.items() if not restricted.isdisjoint((path, new))}
@@ -306,7 +306,7 @@ def unanswered_requirement_findings(
             yield DROPPED.found(str(requirement), text, place.file, place.line, GONE_REMEDY)
 
 
-def _namespaces_of_patterns(requirement: Requirement) -> list[str]:
+def namespaces_of_patterns(requirement: Requirement) -> list[str]:
     """Return namespaces in which a requirement may apply to other enclaves than in ``/``.
 
     They are in the patterns of enclaves that do not move with the namespace, and follow ``/``.
@@ -323,7 +323,7 @@ def _namespaces_of_patterns(requirement: Requirement) -> list[str]:
         raise DocumentError(
             f"the enclaves of a requirement name more than {MOST_NAMESPACES} namespaces: "
             f"{requirement}",
-            "So it is not known whether a node escapes the requirement in one of them.",
+            "So it is not known whether the requirement holds in each of them.",
             "Name fewer namespaces there, or name the namespaces of the robots with --namespace.",
         )
     return [*namespaces]

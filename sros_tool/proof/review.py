@@ -101,6 +101,7 @@ from sros_tool.proof.lost_protection import (
     access_by_name_findings,
     lost_restriction_findings,
     namespaces_in,
+    namespaces_of_patterns,
     unanswered_requirement_findings,
 )
 from sros_tool.proof.repository import FILES, LINK, SUBMODULE, Repository, TreeEntry, walk
@@ -1222,8 +1223,9 @@ class _Review:
                 f"whether the change breaks them in {MOST_NAMESPACES} of {len(namespaces)} "
                 "namespaces (those of changed names first)"
             )
+        # In the namespaces of its own patterns, a requirement is for other enclaves than in /.
         left = {
-            at
+            at: [*namespaces[:MOST_NAMESPACES], *namespaces_of_patterns(here)[1:]]
             for at, here in enumerate(requirements)
             if here.is_relative and not _failures(here, system)
         }
@@ -1233,14 +1235,14 @@ class _Review:
             system = policy_system(policy, self._circumstances(), self._template())
             return replace(system, is_package=True)
 
-        for ns in namespaces[:MOST_NAMESPACES]:
+        for ns in dict.fromkeys([*namespaces[:MOST_NAMESPACES], *chain(*left.values())]):
             moved, earlier = (
                 read_all_requirements(paths, namespaces=(ns,), remaps=asked.remaps)
                 for paths in (files, base_files)
             )
             before, after = cache(partial(system_in, ns, base)), system_in(ns, head)
             dropped = cache(partial(_dropped_failures, earlier, moved, before))
-            for at in sorted(left):
+            for at in [at for at in left if ns in left[at]]:
                 broken = _failures(moved[at], after, before)
                 if not broken:
                     continue
@@ -1248,7 +1250,7 @@ class _Review:
                 place = f"in namespace {ns}, which the review tries"
                 for failure, finding in broken.items():
                     if failure not in known:
-                        left.discard(at)
+                        left.pop(at, None)
                         yield finding._replace(text=f"{place}: {finding.text}")
 
     def place(self) -> str:

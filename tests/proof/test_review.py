@@ -1768,6 +1768,26 @@ def test_requirements_may_swap_their_names(change: Change) -> None:
         assert ended.status == status, ended
 
 
+@pytest.mark.parametrize(
+    ("requirement", "right"),
+    [
+        ('[[only]]\npublish = ["x"]\nenclaves = ["/a", "/op", "!//arm*/op*"]\n', "x"),
+        ('[[widest]]\npublish = ["x"]\nenclaves = ["//arm*/op*"]\n', "y/*"),
+    ],
+)
+def test_a_requirement_for_other_enclaves_in_the_namespaces_of_its_patterns(
+    change: Change, requirement: str, right: str
+) -> None:
+    """No name of the policy has these namespaces."""
+    enclaves = {"/a": publish("x"), "/arm1/open": publish("y"), "/op": publish("y")}
+    change.base = change.commit({"robot.xml": policy_text(enclaves), "robot.toml": requirement})
+    change.commit({"robot.xml": policy_text({**enclaves, "/op": publish("y", right)})})
+    asked = ("--policy", "robot.xml", "--requirements", "robot.toml", "--new-access", "allow")
+    ended = change.review(*asked)
+    assert ended.status == 1, ended
+    assert "/arm/op: in namespace /arm, which the review tries" in ended.out, ended
+
+
 _DENIED = publish("/left/*") + publish("x").replace("ALLOW", "DENY")
 
 
