@@ -400,6 +400,9 @@ def _show_end(
 
     folder, observed = shlex.quote(str(robot.folder)), closed.observed
     ask, details = f"sros close {folder} --proof", list[str]()
+    then = f"and then {ask}"
+    if not closed.denied_remappings.keys().isdisjoint(closed.pending):
+        then = f"then {robot.close_command} (it remembers the changed commands), {then}"
     for proof in closed.proofs:
         word = proof.acceptance
         accept = f" (--accept {word} accepts this)" if word else ""
@@ -426,6 +429,11 @@ def _show_end(
             details.append(f"bring {folder}/keystore, which has the CA keys, to another machine")
     elif closed.proofs:
         accept = _ACCEPT_ADVICE if closed.is_proved(set(Acceptance)) else ""
+        if _has_changed_command(robot, closed):
+            accept = (
+                f"if you changed the command of a process, {robot.close_command} (it remembers the "
+                f"command), and then {ask}; otherwise, {accept}"
+            )
         next_command = f"correct the problems above, and then run sros close {folder} --proof, "
         next_command += "or go back with --undo"
         answer = f"the robot is not proved closed; next: {accept}{next_command}"
@@ -441,7 +449,7 @@ def _show_end(
                     echo(f"  {_remapping_text(closed, process.enclave)}")
             for advice in unit_advice(processes):
                 echo(f"  {advice}")
-        answer = f"next: run these commands, and then {ask}"
+        answer = f"next: run these commands, {then}"
         details = _idle_lines(closed, ask)
         if not_starting := _advice_without_security(robot, closed):
             answer = f"no node would start by these commands yet; next: {not_starting}"
@@ -462,7 +470,7 @@ def _show_end(
             if why := only_root_clause(units):
                 following = f"{robot.as_root('--apply')}, because {why}"
         else:
-            following = f"{steps}, and then {ask}"
+            following = f"{steps}, {then}"
             details = _idle_lines(closed, ask)
         if not_starting := _advice_without_security(robot, closed):
             following, details = not_starting, []
@@ -471,6 +479,16 @@ def _show_end(
     echo(answer, err=True)
     for detail in (*details, *_other_machines_lines(robot, closed)):
         echo(f"  {detail}", err=True)
+
+
+def _has_changed_command(robot: LocalRobot, closed: CloseState) -> bool:
+    """Return whether a process has a command that the next `sros close` remembers."""
+    known = {(process.enclave, *process.command) for process in robot.processes.processes}
+    enclaves = {enclave for enclave, *_ in known}
+    return any(
+        process.enclave in enclaves and (process.enclave, *process.command) not in known
+        for process in closed.observed.processes
+    )
 
 
 def _idle_lines(state: CloseState, ask: str) -> list[str]:

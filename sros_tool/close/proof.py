@@ -530,8 +530,7 @@ def _proof_of_observed_processes(looks: Sequence[RunningRobot]) -> Iterator[Proo
             KNOWN,
             None,
             f"sros did not see {first_few(more, MOST_NAMES)} when it watched, and each process has "
-            "all rights of its enclave: stop what is not yours; if only the command of a process "
-            f"is new, `{looks[-1].robot.close_command}` remembers it",
+            "all rights of its enclave: stop what is not yours",
         )
 
 

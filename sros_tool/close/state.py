@@ -410,16 +410,19 @@ def _enclaves_of(
 def _with_running_command(observed: ClosedProcess, running: Sequence[Process]) -> ClosedProcess:
     """Return an observed process with the command of the only program that runs in its enclave.
 
-    Programs of `ros2` and sros do not count. If a unit, a launch, a container or another process
-    starts the observed process, its command does not change.
+    Programs of `ros2` and sros do not count. If a launch, a container or another process starts the
+    observed process, its command does not change; nor does it if the process left its unit, or if
+    the drop-in of its unit has the command.
     """
-    started_by = observed.unit or observed.launch or observed.container or observed.shares
+    started_by = observed.launch or observed.container or observed.shares
     programs = {process.program: process for process in running}
     if started_by or len(programs) != 1 or any(map(observed.fits, running)):
         return observed
     (process,) = programs.values()
     now = secured_process(process, observed.enclave)
-    if now.unit or now.launch or now.container or _is_tool(process):
+    if now.launch or now.container or _is_tool(process):
+        return observed
+    if observed.unit and (now.unit != observed.unit or now.lacks_enclave_argument):
         return observed
     return observed._replace(command=now.command, folder=now.folder, rmw=now.rmw, user=now.user)
 

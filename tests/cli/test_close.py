@@ -321,8 +321,11 @@ def test_a_policy_that_was_changed_stays_and_is_followed(robot: Robot) -> None:
         "First change the remapping words:=chatter: the policy denies the new name.\ncd /opt && "
     )
     assert f"\n# /listener\n# {change}" in commands and commands.count("First change") == 1
-    assert (
-        f" words:=chatter\n  the {denied}: change the remap" in robot.close("--apply", status=1).out
+    by_hand = robot.close("--apply", status=1)
+    assert f" words:=chatter\n  the {denied}: change the remap" in by_hand.out
+    assert by_hand.err.endswith(
+        "next: run these commands, then sros close robot (it remembers the changed commands), and "
+        "then sros close robot --proof\n"
     )
     robot.units = UNITS
     assert "/listener: the rights that it lost still work until 20" in ended.err
@@ -660,7 +663,9 @@ def test_what_systemd_does_not_start_is_done_by_hand(
     assert "start again with" in (said := robot.close("--apply", status=1).out)
     assert "process 4712" in said and "process 4711" not in said
     robot.by_hand, robot.named = {"/talker", "/listener"}, True
+    robot.units = dict.fromkeys(PID, "both.service")
     ended = robot.close()
+    robot.units = {}
     assert "  /talker: process 4711: closed\n" in ended.out
     now = "/opt/run talker --ros-args -r __node:=talker -r words:=chatter"
     remembered = "/talker was started by another command than before; sros remembers the new "
@@ -1035,7 +1040,21 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     robot.absent, others = {"/talker"}, robot.more
     robot.more = (replace(talker, command=("/opt/b",)),)
     by_other = "see process 4711 (b) in /talker (by another command than the observed process) when"
-    assert f"there: sros did not {by_other}" in robot.close("--proof", status=1).out
+    ended = robot.close("--proof", status=1)
+    assert f"there: sros did not {by_other}" in ended.out
+    advised = (
+        "not proved closed; next: if you changed the command of a process, sros close robot (i"
+    )
+    assert advised in ended.err
+    file = robot.folder / "robot/processes.json"
+    known = file.read_text()
+    remembered = "/talker was started by another command than before; sros remembers the new one: "
+    assert f"{remembered}cd /opt && /opt/b; before: " in robot.close().err, "in the same unit"
+    robot.close("--proof")
+    file.write_text(known)
+    robot.more = (replace(robot.more[0], pid=12),)
+    assert remembered not in robot.close().err, "not in its unit"
+    assert advised not in robot.close("--proof", status=1).err
     robot.absent, robot.more = set(), others
     more = "every process in an enclave belongs there: sros did not see process 6 (thief) in "
     more += "/talker, process 7 (run) in /talker, process 8 (ros2) in /talker when it watched"

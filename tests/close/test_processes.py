@@ -132,7 +132,7 @@ def test_sros_does_not_choose_among_processes_that_fit_equally() -> None:
 def test_the_command_of_a_secured_process_takes_the_place_of_the_observed_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Not that of a tool, of another user, or one of several; nor where something else starts it.
+    """Not that of a tool, of another user, or one of several; nor of a launch, or out of its unit.
 
     A command that starts a node later would otherwise be one that the robot does not use any more.
     """
@@ -164,19 +164,26 @@ def test_the_command_of_a_secured_process_takes_the_place_of_the_observed_one(
     assert command_after([tried], camera) == ("pilot --camera", "/new")
     cyclone = replace(camera, environment={RMW: "rmw_cyclonedds_cpp"})
     assert command_after([before], cyclone) == ("pilot --camera", "/new rmw_cyclonedds_cpp")
+    in_unit, of_unit = replace(camera, pid=99), before._replace(unit="pilot.service")
+    for known_before in (before, of_unit):
+        assert command_after([known_before], in_unit) == ("pilot --camera", "/new")
+    # On Zenoh, the drop-in of the unit has the command.
+    on_zenoh = replace(in_unit, environment={RMW: "rmw_zenoh_cpp"})
+    of_unit_on_zenoh = of_unit._replace(rmw="rmw_zenoh_cpp")
+    assert command_after([of_unit_on_zenoh], on_zenoh) == ("pilot", "/opt rmw_zenoh_cpp")
     ros2 = replace(camera, command=("/usr/bin/python3", "/opt/ros/bin/ros2", "topic", "echo"))
     for known, running in (
         ([before], (camera, other)),
         ([before], (camera, replace(camera, pid=9, command=("pilot",)))),
         ([before], (replace(camera, user=4321),)),
-        *(([before], (replace(camera, pid=pid),)) for pid in origins),
+        *(([before], (replace(camera, pid=pid),)) for pid in (98, 97)),
         ([before], (ros2,)),
         ([before], (replace(camera, command=demo_node("talker", "/image")),)),
         ([before], (replace(camera, command=demo_node("talker", "/image")[:-4]),)),
         ([before], (replace(camera, command=("/opt/venv/bin/python3", "/opt/venv/bin/sros")),)),
         ([before], (replace(camera, enclave=replace(enclave, folders=((1, 1),))),)),
         ([before, before._replace(pid=6)], (camera,)),
-        ([before._replace(unit="pilot.service")], (camera,)),
+        ([of_unit], (camera,)),
         ([before._replace(launch=("ros2", "launch", "a"))], (camera,)),
         ([before._replace(container="c0ffee")], (camera,)),
         ([before._replace(shares=("/x",))], (camera,)),
