@@ -1238,13 +1238,21 @@ def _enclaves_within(narrow: Sequence[str], wide: Sequence[str]) -> bool:
     )
     narrow_names = [name for name in narrow if not name.startswith(EXCEPT)]
     wide_names = [name for name in wide if not name.startswith(EXCEPT)]
-    names = [name.replace(OTHER_NAMESPACE, "/*", 1) for name in narrow_names]
     still_excepted = (
-        enclave for enclave in wide_excepted if any(overlap(enclave, name) for name in names)
+        enclave
+        for enclave in wide_excepted
+        if any(_overlap_in_a_namespace(enclave, name) for name in narrow_names)
     )
     return _patterns_within(narrow_names, wide_names) and _patterns_within(
         still_excepted, narrow_excepted
     )
+
+
+def _overlap_in_a_namespace(first: str, second: str) -> bool:
+    """Return whether any name matches both patterns, in any namespace for `OTHER_NAMESPACE`."""
+    if OTHER_NAMESPACE not in second:  # else, the namespace of both is the same
+        first = first.replace(OTHER_NAMESPACE, "/*", 1)
+    return overlap(first, second.replace(OTHER_NAMESPACE, "/*", 1))
 
 
 def _is_about_same(new: Requirement, old: Requirement) -> bool:

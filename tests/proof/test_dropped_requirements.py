@@ -122,6 +122,18 @@ def test_an_exception_of_some_namespaces_is_weakened() -> None:
     assert dropped_requirements(after, after) == ()
 
 
+def test_an_exception_that_moves_into_what_does_not_is_weakened() -> None:
+    """In /arm, ``!/z`` is an exception from ``//arm/*``; twin: never from ``/arm/*``."""
+    for listed, is_weakened in (("//arm/*", True), ("/arm/*", False)):
+        only, nothing_but = (text.replace("/y", listed) for text in (ONLY, NOTHING_BUT))
+        excepting, sparing = (
+            text.replace(listed, f'{listed}", "!/z') for text in (only, nothing_but)
+        )
+        for before, after in ((excepting, only), (nothing_but, sparing)):
+            found = dropped_requirements(read(before), read(after))
+            assert [each.only_elsewhere for each in found] == [True] * is_weakened
+
+
 def test_an_enclave_that_begins_to_move_with_the_namespace_or_stops_is_weakened() -> None:
     """Twin: ``//x`` in place of ``*/x`` is stricter."""
     moving, unmoved, anywhere = (read(ONLY.replace('"/y"', f'"{at}y"')) for at in ("/", "//", "*/"))
