@@ -301,9 +301,6 @@ def _show(robot: LocalRobot, closed: CloseState) -> None:
         )
     for name in closed.denied_remappings:
         echo(_remapping_text(closed, name))
-    if stays := len(closed.denied) - len(closed.newly_denied):
-        rights = counted(stays, "right")
-        echo(f"the policy still denies {rights} that the robot used when sros watched (see --json)")
 
 
 def _remapping_text(closed: CloseState, enclave: str) -> str:
