@@ -98,7 +98,7 @@ HOLDS_ALONE = FindingKind(
     "The requirements file.",
     "If this is the policy of a package, also check a policy that has other enclaves: `sros check "
     "ROBOT_POLICY --requirements FILE --namespace NS`. If it is the policy of a whole robot, "
-    "ignore this finding.",
+    "check it with `--namespace /`: sros then warns if the name was probably changed.",
     prominent=True,
 )
 NOT_CROSSING = FindingKind(

@@ -110,8 +110,9 @@ class Verdict:
     ``witness`` is None if the requirement holds.  ``empty`` are clauses on enclaves under the
     requirement that do not exist, and on names that no enclave may use.  ``absent`` are the
     exceptions (enclaves or patterns) that fit no enclave.  ``waiting`` are clauses on
-    names that no enclave may use yet, but whose other side an enclave has. ``always`` is a clause
-    that says why the requirement cannot fail whatever rights enclaves get, or "".  ``assumed`` is a
+    names that no enclave may use yet, but whose other side an enclave has; ``gone`` are the same,
+    if on a robot the name was probably changed. ``always`` is a clause that says why the
+    requirement cannot fail whatever rights enclaves get, or "".  ``assumed`` is a
     name whose protection is assumed because the policy does not state it, or "".  ``blocked`` is a
     demanded use whose messages do not pass between Zenoh routers, or None. ``unnamed`` are names in
     the requirement that no right states, and that only wildcards match. ``unserved`` are clauses on
@@ -124,6 +125,7 @@ class Verdict:
     witness: Witness | None
     empty: tuple[str, ...] = ()
     waiting: tuple[str, ...] = ()
+    gone: tuple[str, ...] = ()
     always: str = ""
     assumed: str = ""
     blocked: BlockedUse | None = None
@@ -221,11 +223,12 @@ def decide(requirement: Requirement, world: World, limit: SearchLimit | None = N
         requirement,
         witness,
         empty,
-        tuple(unused_names.waiting),
-        always,
-        assumed,
-        blocked,
-        tuple(unused_names.unnamed),
+        waiting=tuple(unused_names.waiting),
+        gone=tuple(unused_names.gone),
+        always=always,
+        assumed=assumed,
+        blocked=blocked,
+        unnamed=tuple(unused_names.unnamed),
         absent=tuple(name for name in exceptions if name.removeprefix(EXCEPT) not in world.away),
         by_name=tuple(by_name),
         unserved=tuple(unused_names.unserved),
@@ -838,6 +841,7 @@ class _UnusedNames(NamedTuple):
 
     unused: list[str]
     waiting: list[str]
+    gone: list[str]
     unnamed: list[str]
     unserved: list[str]
     unheard: list[str]
@@ -846,14 +850,19 @@ class _UnusedNames(NamedTuple):
 def _unused_names(requirement: Requirement, world: World, limit: SearchLimit) -> _UnusedNames:
     """Return the names of a requirement that nobody uses, or of which one side is missing.
 
-    A name waits for users if an enclave has its other side, such as the server of a service.
+    A name waits for users if an enclave has its other side, such as the server of a service.  The
+    name is gone instead if it lacks its server, or if an enclave that an `Only` lists by its exact
+    name exists: this enclave probably had the right under the earlier name.
 
     A name that no right states can still be used by a wildcard, and `Nobody` demands that nobody
     uses it.  So such a name counts as unused only if a right states another name that differs by
     one typing error, as in ``/cmd_vle``, or if the name is in use as another kind (service or
     action).
     """
-    result = _UnusedNames([], [], [], [], [])
+    result = _UnusedNames([], [], [], [], [], [])
+    is_listed = isinstance(requirement, Only) and any(
+        name in world.enclaves for name in requirement.enclaves
+    )
     for right, name, parts in _restricted_names(requirement):
         if isinstance(requirement, Protected) and name == "/*":  # also of a kind without names yet
             continue
@@ -874,7 +883,9 @@ def _unused_names(requirement: Requirement, world: World, limit: SearchLimit) ->
             elif not _is_used_by_anybody(world, _sufficient_parts(peer), name, limit):
                 result.unused.append(f"no enclave may {verb} or {peer} {named}")
             elif known:
-                result.waiting.append(f"no enclave may {verb} {named}")
+                is_gone = is_listed or verb in ("reply", "execute")
+                clauses = result.gone if is_gone else result.waiting
+                clauses.append(f"no enclave may {verb} {named}")
             else:
                 result.unused.append(f"no enclave may {verb} {named}")
         elif meant:

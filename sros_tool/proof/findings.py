@@ -249,7 +249,9 @@ def decide_all(requirements: Sequence[Requirement], system: System) -> Decisions
             )
         empty, reasons = _why_never_fails([verdict for _, verdict in verdicts])
         if empty or reasons:
-            if empty or not _users_may_break(requirement):
+            is_complete = not lacks_enclaves and _has_all_enclaves(requirement, system)
+            is_gone = is_complete and _texts_in_all(verdict.gone for _, verdict in verdicts)
+            if empty or is_gone or not _users_may_break(requirement):
                 vacuous.append((requirement, (*empty, *reasons)))
             elif not broken:
                 holding_alone.append((requirement, tuple(reasons)))
@@ -312,7 +314,7 @@ def _unanswered_clauses(
             _texts_in_all(verdict.unheard for verdict in verdicts),
         )
     )
-    is_complete = system.is_keystore or _is_for_robot(requirement, system)
+    is_complete = _has_all_enclaves(requirement, system)
     if is_complete and not requirement.is_relative:
         return (*unserved, *unheard), ()
     if is_complete or not requirement.is_relative:
@@ -320,9 +322,12 @@ def _unanswered_clauses(
     return (), (*unserved, *unheard)
 
 
-def _is_for_robot(requirement: Requirement, system: System) -> bool:
-    """Return whether a requirement is checked in a namespace, as users of a package check it."""
-    return requirement.elsewhere is None and not system.is_package
+def _has_all_enclaves(requirement: Requirement, system: System) -> bool:
+    """Return whether a system is a robot's: a keystore, or a policy that is checked in a namespace.
+
+    A package's policy lacks the enclaves of users, also where a review tries it in a namespace.
+    """
+    return system.is_keystore or (requirement.elsewhere is None and not system.is_package)
 
 
 def _users_may_break(requirement: Requirement) -> bool:
@@ -364,7 +369,7 @@ def _why_never_fails(verdicts: Sequence[Verdict]) -> tuple[list[str], list[str]]
     """
     empty = _texts_in_all(verdict.empty for verdict in verdicts)
     reasons = [verdicts[0].always] if all(verdict.always for verdict in verdicts) else []
-    if waiting := _texts_in_all(verdict.waiting for verdict in verdicts):
+    if waiting := _texts_in_all((*verdict.gone, *verdict.waiting) for verdict in verdicts):
         reasons = [_listed_clauses(waiting)]
     return [_listed_clauses(empty)] if empty else [], reasons
 
@@ -749,11 +754,13 @@ def _by_name_findings(requirement: Only, steps: Iterable[Step]) -> Iterator[Find
 def _alone_remedy(
     holding_alone: Iterable[tuple[Requirement, tuple[str, ...]]], system: System
 ) -> str:
-    for_robot = any(_is_for_robot(requirement, system) for requirement, _ in holding_alone)
-    if not (system.is_keystore or for_robot):
+    if not any(_has_all_enclaves(requirement, system) for requirement, _ in holding_alone):
         return ""
     what = "keystore" if system.is_keystore else "robot"
-    return f"No enclave of this {what} can break the requirement now: ignore this finding."
+    return (
+        f"No enclave of this {what} can break the requirement now. Ignore this finding, unless a "
+        "name in it was changed: then change the name in the requirement, too."
+    )
 
 
 _NOBODY_REMEDY = (

@@ -15,6 +15,7 @@ from sros_tool.dds.decision.vendors import TESTED
 from sros_tool.files import templates_dir
 from sros_tool.keystore.template import load_template
 from sros_tool.policy.document import read_policy
+from sros_tool.policy.model import PEER_RIGHT
 from sros_tool.proof import decide as decisions
 from sros_tool.proof.findings import (
     Decisions,
@@ -23,7 +24,14 @@ from sros_tool.proof.findings import (
     requirement_findings,
     short_text,
 )
-from sros_tool.proof.requirements import Nobody, Only, Protected, Widest, parse_requirements
+from sros_tool.proof.requirements import (
+    Nobody,
+    Only,
+    Protected,
+    Requirement,
+    Widest,
+    parse_requirements,
+)
 from sros_tool.proof.suggestions import render_requirements, suggest
 from sros_tool.proof.system import System, load_system, policy_system
 from tests.support.harness import may, policy_text, sros
@@ -544,6 +552,40 @@ def test_a_requirement_about_a_name_without_another_side(
     assert not found("/n/open", replace(robot(rights), is_export=True))
     for served in ("/n/open", "/n/o*"):
         assert not found("/n/open", robot(rights | {"/n": may(peer, served)}))
+
+
+@pytest.mark.parametrize("right", ["publish", "subscribe", "request", "reply", "call", "execute"])
+@pytest.mark.parametrize(
+    ("listed", "is_gone"),
+    [("/a", True), ("//panel", True), ('/op", "/*', False)],
+)
+def test_a_right_that_nobody_has_any_more_on_a_robot(
+    right: str, listed: str, is_gone: bool
+) -> None:
+    """After a rename, only the leftover peer has the earlier name. Twin: users may lack the right.
+
+    On a robot, a name without its server is always gone.
+    """
+    peer = PEER_RIGHT[right]
+    kept = {"/n/b": may(peer, "/n/old"), "/panel": may("publish", "/odom")}
+    system = robot({**kept, "/n/a": may(right, "/n/new")})
+    toml = '[[only]]\n{} = ["{}"]\nenclaves = ["{}"]'
+    of_n = toml.format(right, "old", listed).encode()
+    at_n = parse_requirements(of_n, "r.toml", namespaces=["/n"])
+    of_package = toml.format(right, "n/old", "/n/a" if listed == "/a" else listed).encode()
+    package = parse_requirements(of_package, "r.toml")
+
+    def found(required: Sequence[Requirement], system: System) -> list[str]:
+        findings = requirement_findings(required, system)
+        return [each.id for each in findings if each.text.startswith(f"no enclave may {right} ")]
+
+    on_robot = [VACUOUS] if is_gone or right in ("reply", "execute") else [ALONE]
+    assert found(at_n, system) == on_robot
+    assert found(package, replace(system, is_keystore=True)) == on_robot
+    assert found(package, system) == [ALONE]
+    assert found(at_n, replace(system, is_package=True)) == [ALONE]
+    assert found(at_n, replace(system, is_export=True)) == [ALONE]
+    assert not found(at_n, robot({**kept, "/n/a": may(right, "/n/old")}))
 
 
 @pytest.mark.parametrize(

@@ -1703,6 +1703,22 @@ def test_a_requirement_that_protects_nothing_any_more_in_a_namespace(
     assert (said in ended.out) == (after == "/x"), ended
 
 
+@pytest.mark.parametrize("after", ["/n/z", "/n/x"])
+def test_a_right_that_the_change_renames_on_a_robot(change: Change, after: str) -> None:
+    """The subscriber is left with the earlier name; twin: the publisher keeps it, too."""
+    only = '[[only]]\npublish = ["x"]\nenclaves = ["/a"]\n'
+    reads = '<topics subscribe="ALLOW"><topic>/n/x</topic></topics>'
+    before, renamed = (
+        policy_text({"/n/a": publish(*names), "/b": reads}) for names in (["/n/x"], [after, "/n/y"])
+    )
+    change.base = change.commit({"robot.xml": before, "robot.toml": only})
+    change.commit({"robot.xml": renamed})
+    asked = ("--policy", "robot.xml", "--requirements", "robot.toml", "--new-access", "allow")
+    ended = change.review(*asked, "--namespace", "/n")
+    assert ended.status == (after == "/n/z"), ended
+    assert ("no enclave may publish topic /n/x; " in ended.out) == (after == "/n/z"), ended
+
+
 @pytest.mark.parametrize(
     ("name", "namespace"),
     [("/*/x", "/any_namespace"), ("/[!a]*/x", "/b"), ("/left/x", "/left"), ("/*_arm/x", "/_arm")],
