@@ -358,7 +358,7 @@ def check(
         if len(systems) > 1:
             raise _not_one_system_error("--suggest")
         with progress("deciding"):
-            text = _suggested_requirements(_load_system(systems[0], at, template))
+            text = _suggested_requirements(systems[0], _load_system(systems[0], at, template))
         echo_document(text)
         return 0
     if template and not requirements:
@@ -517,11 +517,11 @@ def _load_system(
     return load_system(paths, circumstances, load_template(template) if template else None)
 
 
-def _suggested_requirements(system: System) -> str:
+def _suggested_requirements(paths: Iterable[Path], system: System) -> str:
     from sros_tool.proof.suggestions import render_requirements, suggest
 
     proposed = suggest(system.rights, system.worlds, system.fleet())
-    return render_requirements(proposed.requirements, system.file, proposed.comments)
+    return render_requirements(proposed.requirements, map(str, paths), proposed.comments)
 
 
 def _split_family(targets: tuple[Path, ...]) -> tuple[str, tuple[Path, ...]]:

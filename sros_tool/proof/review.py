@@ -913,12 +913,12 @@ class _Review:
             yield "requirements: none are named"
         others = ""
         if self.decided_elsewhere:
-            others = f": there, sros only decided {self.decided_elsewhere}"
+            others = f": sros only decided {self.decided_elsewhere}"
         if self.is_relative and not asked.namespaces:
             options = [f"--namespace {quote(name)}" for name in sorted(self.namespaces_to_add)]
             add = f" (add {' '.join(options[:MOST_NAMESPACES])})" if options else ""
-            names = "whether requirements with relative names hold"
-            yield f"{names} in namespaces other than /{add}{others}"
+            relative = "requirements with relative names in namespaces other than /"
+            yield f"{relative}{add}{others}"
         if not self.base:
             yield "nothing is compared with an earlier commit, as the options say"
         if asked.allow_new_access:

@@ -35,7 +35,7 @@ from sros_tool.proof.requirements import (
     demand,
 )
 from sros_tool.proof.worlds import World
-from sros_tool.wording import counted
+from sros_tool.wording import counted, enumerated
 
 _NOWHERE = Source("", 0)
 _OF_EVERY_NODE = frozenset({"/rosout", "/parameter_events"})
@@ -409,21 +409,21 @@ def _with_lists(requirement: Requirement, change: Callable[[Names, str], Names])
 # ── writing ────────────────────────────────────────────────────────────────────────────────
 
 _HEADING = """\
-# Requirements that hold for {of} today, for all names that could ever be used.
+# Requirements that hold for {sources} today, for all names that could ever be used.
 # Keep the requirements that have to hold tomorrow, say why, and delete the others.
 # In a package, leave out the first "/" of names that its users put into a namespace.
 """
 
 
 def render_requirements(
-    requirements: Iterable[Requirement], source_name: str, comments: Iterable[str] = ()
+    requirements: Iterable[Requirement], source_names: Iterable[str], comments: Iterable[str] = ()
 ) -> str:
     """Return requirements as TOML, with their demands as comments, and ``comments`` at the end.
 
-    ``source_name`` is written at the top.  `sros_tool.proof.requirements.parse_requirements`
+    ``source_names`` are written at the top.  `sros_tool.proof.requirements.parse_requirements`
     returns equal requirements, with other places.
     """
-    lines = [_HEADING.format(of=json.dumps(source_name))]
+    lines = [_HEADING.format(sources=enumerated([*map(json.dumps, source_names)]))]
     for requirement in requirements:
         lines += [f"# {demand(requirement)}", f"[[{requirement.KIND}]]"]
         lines += [f"{key} = {_toml_value(value)}" for key, value in _values(requirement)]

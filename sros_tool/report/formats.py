@@ -465,7 +465,7 @@ def _render_markdown(picture: Picture, *, everything: bool = False) -> str:
         for end, lack, controlled, sends in zip(ends, sides, controls, (True, False), strict=True):
             first = [stated.protection.everybody] if not controlled else []
             is_denied_alone = controlled and (kind, name) not in allowed
-            first += ["nobody"] if stated.lacks is lack or is_denied_alone else []
+            first += ["no enclave here"] if stated.lacks is lack or is_denied_alone else []
             who = ", ".join(dict.fromkeys((*first, *end)))
             cells.append(who or _remark_on_single_names(picture, stated, sends=sends))
         lines.append(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |")

@@ -680,7 +680,7 @@ def test_what_is_proposed_for_a_package_blames_no_other_part_of_the_robot() -> N
     served = robot({"/gripper": gripper, "/user": may("subscribe", "width")})
     assert any(isinstance(each, Nobody) for each in suggest(served.rights, served.worlds)[0])
     only_wildcards = [each for each in proposed if isinstance(each, Widest)]
-    text = render_requirements(only_wildcards, "gripper.xml").encode()
+    text = render_requirements(only_wildcards, ["gripper.xml"]).encode()
     widest = parse_requirements(text, "r.toml", namespaces=["/left"])
     wild = may("publish", "/left/*")
     others = operator | {"/operator/drive": wild, "/planner": wild}

@@ -168,7 +168,7 @@ def test_proposals_for_a_fleet_demand_what_those_for_its_robots_demand(folder: P
         folder / "robot.xml", Circumstances(datetime(2027, 1, 1, tzinfo=UTC), fleet=fleet)
     )
     each, folded = (suggest(system.rights, system.worlds, of) for of in (None, fleet))
-    text = render_requirements(folded.requirements, "robot.xml")
+    text = render_requirements(folded.requirements, ["robot.xml"])
     assert "# only /{robot}/mux may publish {namespace}/cmd_vel\n" in text
     assert "# only /{robot:carriers}/lift may publish {namespace:carriers}/lift\n" in text
     filled = read(text, fleet)

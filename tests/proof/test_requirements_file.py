@@ -207,7 +207,7 @@ def test_proposals_have_no_name_that_the_file_could_not_have() -> None:
         "/f": TopicAccess(NameSet(), names_of(Style.FNMATCH, ("rt/ok", "rt/fine*"))),
     }
     world = World("a world", sides, confirm=lambda *_: True, stated_access=sides)
-    text = render_requirements(suggest(rights, [world]).requirements, 'a "file"\n')
+    text = render_requirements(suggest(rights, [world]).requirements, ['a "file"\n'])
     found = parse_requirements(text.encode(), "r.toml")
     assert [demand(each) for each in found][:1] == ["only /e may publish /ok"]
     assert "/* (but not /operator/*) may use wildcards only to publish /fine*" in map(demand, found)

@@ -130,8 +130,8 @@ def test_no_cell_of_the_table_is_empty_where_a_denial_alone_names_something(tmp_
     rights = '<topics subscribe="DENY"><topic>/q</topic><topic>/arm/*</topic></topics>'
     (tmp_path / "p.xml").write_text(policy_text({"/z": rights}))
     table = sros("view", tmp_path / "p.xml", "--format", "markdown").ok().out
-    assert "| topic `/q` | nobody | nobody, `/z` is denied |" in table
-    assert "| topic `/arm/*` | nobody | nobody, `/z` is denied |" in table
+    assert "| topic `/q` | no enclave here | no enclave here, `/z` is denied |" in table
+    assert "| topic `/arm/*` | no enclave here | no enclave here, `/z` is denied |" in table
 
 
 def test_a_table_says_which_names_move_with_the_namespace(tmp_path: Path) -> None:
@@ -166,10 +166,9 @@ def test_a_table_has_every_right_that_not_every_node_needs(tmp_path: Path) -> No
     assert "`/mobile_robot/recorder` is denied by `/front_camera/*`" in table
     for name, sides in cells.items():
         lacks = {drawn_name.lacks for drawn_name in picture.names if drawn_name.name == name}
-        nobody = {Lack.SENDER: sides[0].strip(), Lack.RECEIVER: sides[1].strip()}
-        assert {side for side, text in nobody.items() if text[:6] == "nobody"} == lacks - {
-            Lack.NOTHING
-        }
+        texts = zip((Lack.SENDER, Lack.RECEIVER), sides, strict=True)
+        lacking = {side for side, text in texts if text.strip().startswith("no enclave here")}
+        assert lacking == lacks - {Lack.NOTHING}
     every = sros("view", MOBILE_ROBOT, "--format", "markdown", "--all").ok().out
     assert "`/parameter_events`" in every and "`/parameter_events`" not in table
     (tmp_path / "hostile.xml").write_text(hostile_permissions())
