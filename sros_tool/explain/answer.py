@@ -12,6 +12,7 @@ import hashlib
 from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime
 from enum import StrEnum
+from shlex import quote
 from typing import Annotated, NamedTuple
 
 from sros_tool.dds.decision.access import (
@@ -584,8 +585,10 @@ class Answer(NamedTuple):
             return []
         keystore = self.enclave.root
         robot = folder_of_closed_robot(keystore) if keystore else None
-        file = str(self.enclave.policy_file or (robot / CLOSED_POLICY if robot else "POLICY"))
-        root = str(keystore if keystore and not self.is_of_export else "KEYSTORE")
+        file = quote(
+            str(self.enclave.policy_file or (robot / CLOSED_POLICY if robot else "POLICY"))
+        )
+        root = quote(str(keystore if keystore and not self.is_of_export else "KEYSTORE"))
         if self.enclave.has_placeholders:
             recorded = keystore and (keystore / FLEET).exists()
             robots = f"{root}/{FLEET}" if recorded else "FLEET_FILE"
@@ -595,7 +598,7 @@ class Answer(NamedTuple):
         if self.change and self.change.document:
             commands.append(f"sros merge_policy {file} {ADDITION} --in-place")
         if robot:
-            return [*commands, f"sros close {robot}"]
+            return [*commands, f"sros close {quote(str(robot))}"]
         sign = f"sros create_permission {root} {self.enclave.name} {file}"
         return [*commands, sign, *self._export_commands(root)]
 

@@ -1418,13 +1418,18 @@ def test_a_forgotten_remapping_is_shown(keystore: Path, tmp_path: Path) -> None:
             "no rule allows",
             "{ks} /a publish /y --policy {file}`",
         ),
-        (publish("/y").replace("ALLOW", "DENY"), "denied by deny", "p.xml:1: DENY publish /y", ""),
+        (
+            publish("/y").replace("ALLOW", "DENY"),
+            "denied by deny",
+            "(p).xml:1: DENY publish /y",
+            "",
+        ),
     ],
 )
 def test_the_policy_next_to_a_keystore_gives_lines(
     rights: str, why: str, found: str, remedy: str, tmp_path: Path
 ) -> None:
-    policy, log, keystore = tmp_path / "p.xml", tmp_path / "robot.log", tmp_path / "ks"
+    policy, log, keystore = tmp_path / "$(p).xml", tmp_path / "robot.log", tmp_path / "ks"
     sros("create_keystore", keystore, "--template", "production").ok()
     policy.write_text(policy_text({"/a": publish("/x")}))
     sros("generate_artifacts", "-k", keystore, "-p", policy).ok()
@@ -1435,7 +1440,8 @@ def test_the_policy_next_to_a_keystore_gives_lines(
     for root, enclave in ((keystore, ["/a"]), (keystore / "enclaves/a", [])):
         said = sros("explain", root, *enclave, "--log", log, "--policy", policy)
         assert said.status == 1 and found in said.out, said
-        assert remedy.format(ks=root if enclave else "KEYSTORE", file=policy) in said.out, said
+        asked = remedy.format(ks=root if enclave else "KEYSTORE", file=shlex.quote(str(policy)))
+        assert asked in said.out, said
     missing = sros("explain", keystore, "/b", "--log", log, "--policy", policy)
     assert missing.status == 2 and "/b" in missing.err
 
