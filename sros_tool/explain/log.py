@@ -117,7 +117,7 @@ def explain_log_file(
             )
 
     if named and stated and policy_file:
-        if stated.enclave(named.name) is None:
+        if named.name and stated.enclave(named.name) is None:
             raise not_in_policy_error(stated, named.name, policy_file)
         named = with_policy(named)
 
@@ -128,7 +128,7 @@ def explain_log_file(
             return named
         # Without its certificate, an enclave's folder does not tell the name of the enclave.
         if named and not named.name and str(Path(name).absolute()).endswith(f"/enclaves{enclave}"):
-            return named._replace(name=enclave)
+            return with_policy(named._replace(name=enclave))
         if policy is None and (keystore is None or not enclave):
             return None
         try:

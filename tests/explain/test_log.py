@@ -1442,6 +1442,8 @@ def test_the_policy_next_to_a_keystore_gives_lines(
         assert said.status == 1 and found in said.out, said
         asked = remedy.format(ks=root if enclave else "KEYSTORE", file=shlex.quote(str(policy)))
         assert asked in said.out, said
+    (keystore / "enclaves/a/cert.pem").unlink()  # so the folder does not name its enclave
+    assert sros("explain", root, "--log", log, "--policy", policy).status == 1
     missing = sros("explain", keystore, "/b", "--log", log, "--policy", policy)
     assert missing.status == 2 and "/b" in missing.err
 
