@@ -454,9 +454,8 @@ def generate_policy(
         ReportedRights,
         common_parts,
         draft,
-        first_subjects,
         learn,
-        tool_nodes,
+        notes_on_ended_nodes,
         write,
     )
     from sros_tool.graph.learn import enclave_per_node as name_enclaves
@@ -484,6 +483,8 @@ def generate_policy(
     stayed = {node.participant for node in snapshot.observation.nodes}
     ended = sorted({node.participant for node in seen.observation.nodes} - stayed)
     learned = learn(seen.observation, None if flat else common).with_notes(seen.notes)
+    if watch is None:
+        learned = learned.with_notes(notes_on_ended_nodes(snapshot.gone, snapshot.everything))
     if not learned.profiles:
         if as_json:
             value = _learned_json(None, file, learned, seen.observation, dry_run)
@@ -505,12 +506,6 @@ def generate_policy(
         )
     else:
         _show(plan, learned, written=not dry_run)
-    tools = {node.fqn for node in tool_nodes(snapshot.everything.nodes)}
-    gone = sorted({*snapshot.gone} - tools)
-    if gone and watch is None:
-        nodes = first_subjects(gone)
-        text = f"left out, because these nodes ended while the graph was observed: {nodes}"
-        echo(f"{text}; --watch keeps them.", err=True)
     if why := snapshot.unsettled:
         advice = "--watch collects nodes that come and go"
         advice = "watch again for longer" if snapshot.grew else advice

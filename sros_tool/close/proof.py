@@ -76,11 +76,12 @@ _START_SECONDS = 3.0
 """How long processes that were restarted by hand may take until they run in their enclaves."""
 
 _OTHERS_SEEN = {
+    "graph.ended": "nodes that ended while it listened:",
     "graph.silent": "nodes without endpoints:",
     "graph.stray": "topics with writers or readers that belong to no ROS node:",
     "graph.tool-writes": "nodes that write, with names of the command `ros2`:",
 }
-"""The notes of `generate_policy` on what it sees besides nodes with endpoints, as words."""
+"""The notes of `generate_policy` on what it sees besides the nodes of its result, as words."""
 
 _KINDS_OF_CONNECTIONS = (PROCESS_LOST_MEMORY, PROCESS_NOT_CONNECTED)
 """The findings on processes that only concern the proof of connections."""
@@ -445,7 +446,7 @@ def _found_by_listener(value: Mapping[str, Any]) -> Iterator[str]:
     nodes = {f"{node['namespace'].rstrip('/')}/{node['name']}" for node in value["nodes"]}
     if nodes:
         yield first_few(sorted(nodes), MOST_NAMES)
-    # Nodes without endpoints, and programs without ROS, are only in notes.
+    # Nodes that ended, nodes without endpoints, and programs without ROS are only in notes.
     for note in value["notes"]:
         if note["id"] in _OTHERS_SEEN:
             yield f"{_OTHERS_SEEN[note['id']]} {note['text'].partition(': ')[2]}"

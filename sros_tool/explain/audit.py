@@ -574,13 +574,15 @@ def _unjudged_notes(
     ]
 
 
-def notes_on_ended_nodes(nodes: Iterable[str], everything: Observation) -> tuple[Note, ...]:
-    """Return a note on nodes, by full name, that ended while the graph was observed.
+def notes_on_ended_nodes(
+    nodes: Iterable[ObservedNode], everything: Observation
+) -> tuple[Note, ...]:
+    """Return a note on nodes that ended while the graph was observed, without tools.
 
     ``everything`` has all observed nodes.
     """
-    tools = {node.fqn for node in tool_nodes(everything.nodes)}
-    note = _note_on_subjects("ended", _ENDED_TEXT, {*nodes} - tools)
+    ended = {node.fqn for node in {*nodes} - tool_nodes(everything.nodes)}
+    note = _note_on_subjects("ended", _ENDED_TEXT, ended)
     return (note,) if note else ()
 
 

@@ -164,6 +164,20 @@ class Learned:
 _Place = tuple[str, str, str]
 
 
+def notes_on_ended_nodes(
+    nodes: Iterable[ObservedNode], everything: Observation
+) -> tuple[Note, ...]:
+    """Return a note on nodes that ended while the graph was observed, without tools that only read.
+
+    ``everything`` has all observed nodes.
+    """
+    notes, tools = _Notes(), tool_nodes(everything.nodes)
+    for node in nodes:
+        if node not in tools or writing_rights(node):
+            notes.add("ended", node.fqn)
+    return notes.notes()
+
+
 def learn(
     observation: Observation, common: CommonParts | None = None, *, of_tools: bool = False
 ) -> Learned:
@@ -582,6 +596,8 @@ _NOTE_TEXTS = {
     "show which node runs in which enclave, so each of these enclaves gets the rights of all these "
     "nodes. To tell them apart, start one node at a time while this command runs with --watch",
     "changing-name": "nodes whose name changes with every start have a profile with a wildcard: {}",
+    "ended": "left out, because these nodes ended while the graph was observed (--watch keeps "
+    "them): {}",
     "half-service": "left out, because only the request or the reply of these services was "
     "observed: {}. Observe again with a longer --spin-time",
     "no-ros-name": "left out, because a policy cannot name topics that have no ROS name: {}",

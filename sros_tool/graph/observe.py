@@ -298,11 +298,11 @@ class Snapshot:
         return f"the ROS graph kept changing for {self.seconds:.0f} s, or could not be read in time"
 
     @property
-    def gone(self) -> frozenset[str]:
-        """Full names of the nodes that left while the graph was observed."""
+    def gone(self) -> frozenset[ObservedNode]:
+        """The nodes that left while the graph was observed."""
         stayed = {(node.participant, node.fqn) for node in self.observation.nodes}
         return frozenset(
-            node.fqn for node in self.everything.nodes if (node.participant, node.fqn) not in stayed
+            node for node in self.everything.nodes if (node.participant, node.fqn) not in stayed
         )
 
 

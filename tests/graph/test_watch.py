@@ -73,7 +73,7 @@ def test_the_snapshot_is_the_graph_as_it_is_now() -> None:
     assert snapshot.observation == ONE
     # What went is known all the same.
     assert snapshot.everything == ONE.union(TWO)
-    assert snapshot.gone == {each.fqn for each in TWO.nodes} - {each.fqn for each in ONE.nodes}
+    assert snapshot.gone == {*TWO.nodes} - {*ONE.nodes}
     assert snapshot.gone
 
 
