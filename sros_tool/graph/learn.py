@@ -206,9 +206,7 @@ def learn(
         if len(using) > 1:
             notes.add("same-node", f"{fqn} in {enclave} ({len(using)} processes)")
     for enclave, ns, name in observation.silent:
-        if is_tool_name(name):
-            notes.add("tool", f"{ns.rstrip('/')}/{name}")
-        elif (enclave, ns, stable_name(name)) not in seen:
+        if (enclave, ns, stable_name(name)) not in seen:
             notes.add("silent", f"{ns.rstrip('/')}/{name}")
     for _, endpoint in observation.strays:
         notes.add("stray", endpoint.topic)

@@ -14,6 +14,7 @@ from sros_tool.close.proof import _found_by_listener
 from sros_tool.graph.observation import (
     IntermittentEndpoint,
     intermittent_from_json,
+    make_observation,
 )
 from sros_tool.graph.observe import Snapshot
 from tests.cli.test_json import Seen
@@ -86,21 +87,24 @@ def test_json_has_a_stable_shape(program: Program) -> None:
     }
 
 
-def test_what_was_seen_only_for_a_while_is_named(
+def test_what_was_seen_only_for_a_while_or_without_endpoints_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Also under the name of a tool; twin: a tool that only reads."""
     talker, tool = node("/talker", "publish x"), node("/_ros2cli_7", "publish x", participant="p2")
     everything = known_graph(talker, tool, node("/_ros2cli_8", "subscribe x", participant="p3"))
-    snapshot = Snapshot(known_graph(), everything, 9.0, True)
+    left = make_observation([], silent=[("/", "/", "_ros2cli_9")])
+    snapshot = Snapshot(left, everything, 9.0, True)
     monkeypatch.setattr(observing, "observe", lambda *_, **__: (snapshot, "rmw_fake"))
     ended = sros("generate_policy", "robot.xml", "--json", cwd=tmp_path)
     notes = {note["id"]: note["text"] for note in json.loads(ended.out)["notes"]}
     assert {of: text.rpartition(": ")[2] for of, text in notes.items()} == {
         "graph.ended": "/_ros2cli_7, /talker",
+        "graph.silent": "/_ros2cli_9",
     }
     assert [*_found_by_listener({"nodes": [], "notes": json.loads(ended.out)["notes"]})] == [
         "nodes that ended while it listened: /_ros2cli_7, /talker",
+        "nodes without endpoints: /_ros2cli_9",
     ]
 
 
