@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -1198,6 +1199,10 @@ _ONLY_TESTS = (
 )
 
 
+_ALTERNATIVE = re.compile(r"(?<=[.)]) (?=(?:If|Or, if|Otherwise,) )")
+"""The space between two sentences of a remedy of which a reader follows one."""
+
+
 def _finding_lines(finding: LogFinding) -> Iterator[str]:
     from sros_tool.runtime.log_texts import UNKNOWN
     from sros_tool.runtime.vendor_log import plain_refusal
@@ -1211,4 +1216,6 @@ def _finding_lines(finding: LogFinding) -> Iterator[str]:
     source = _ZENOH_TITLE if finding.zenoh else source
     yield f"  means     {source}{of}: {finding.cause}"
     yield from (f"  found     {cause}" for cause in finding.found)
-    yield f"  remedy    {finding.remedy}"
+    first, *others = _ALTERNATIVE.split(finding.remedy)
+    yield f"  remedy    {first}"
+    yield from (f"            {other}" for other in others)

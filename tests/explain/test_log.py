@@ -36,6 +36,8 @@ LOGS = Path(__file__).with_name("logs")
 CYCLONE_LINE = "1795242829.914522 [0]     recvUC: "
 _HANDSHAKE = f"{CYCLONE_LINE}Process handshake failed: Certificate not valid: error: "
 FAST_LINE = "2026-01-01 12:00:00.000 [SECURITY Error] "
+NEXT = f"\n{' ' * 12}"
+"""Between two alternatives of a remedy, each of which begins a line."""
 FILE_LINE = "[1795309573.65] [EMERGENCY] 01.0f.78|0.0.1.c1 0 "
 FAST, FAST_14, CYCLONE = "fastdds_2.9.1", "fastdds_2.14.5", "cyclone_0.10.2"
 FAST_3 = "fastdds_3.6.2"
@@ -1179,7 +1181,9 @@ def test_a_node_of_another_version_than_its_policy(tmp_path: Path) -> None:
     log.write_text(f"{denied}. -> check_create_datareader\n")
     said = sros("explain", policy, "/a", "--log", log).out
     assert "remedy    If the policy is for another version of the node, use the policy" in said
-    assert "missing in the policy: add it. If the policy means this action by /grasp: start" in said
+    assert (
+        f"missing in the policy: add it.{NEXT}If the policy means this action by /grasp: " in said
+    )
     assert "by exact name, the enclave may execute only action /grasp\n" in said
 
 
@@ -1469,8 +1473,8 @@ def test_a_missing_parameter_is_said_before_a_new_right(
     found = f"found     /right/driver may publish {meant}; perhaps a remapping or a parameter is "
     remedy = (
         f"  remedy    If the node should use {meant}, start it with the remapping or the parameter "
-        "for this name. Or, if the policy is for another version of the node, use the policy of "
-        "the node's version. Otherwise, `sros explain "
+        f"for this name.{NEXT}Or, if the policy is for another version of the node, use the policy "
+        f"of the node's version.{NEXT}Otherwise, `sros explain "
     )
     assert (found in said, remedy in said) == (bool(meant), bool(meant)), said
     assert ("missing or wrong, correct it" in said) is (not meant)
@@ -1518,7 +1522,7 @@ def test_the_other_side_of_a_name_tells_whether_a_remapping_may_be_forgotten(
                 "/weed may subscribe /front/image; perhaps a remapping or a parameter is missing\n",
                 "no enclave of the keystore may publish /odometry\n",
                 "  remedy    If the node should use /front/image, start it with the remapping or "
-                "the parameter for this name. Or, if the policy is for another version of the",
+                f"the parameter for this name.{NEXT}Or, if the policy is for another version of ",
             ),
         ),
     ):
@@ -1546,7 +1550,8 @@ def test_the_other_side_of_a_name_tells_whether_a_remapping_may_be_forgotten(
     sros("distribute_key", keystore, "/weed", export).ok()
     found = sros("explain", export, "--log", log, "/weed").out
     assert "no enclave of the export may publish /odometry\n" in found
-    assert "ask the whole keystore: `sros explain KEYSTORE --log LOG`. Or, if the policy" in found
+    asked = "ask the whole keystore: `sros explain KEYSTORE --log LOG`."
+    assert f"{asked}{NEXT}Or, if the policy" in found
     assert "remedy    If the node should use /fr" in found and "therwise, If" not in found
     command = ["weed", "--ros-args", "-r", "odometry:=front/image"]
     listed = {"processes": [{"enclave": "/weed", "command": command}], "not_here": []}
