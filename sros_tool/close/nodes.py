@@ -277,7 +277,7 @@ class ObservedNodes:
         context = JoinContext(self.robot.domain, shell.now(), shell.zone)
         vendor = chosen_vendor(None, None, shell.environment)[0]
         enclaves = audited_enclaves([self.robot.rights_source], vendor, context)
-        return audit(observation, enclaves, OBSERVER).denied
+        return audit(observation, replace(enclaves, changed_since=True), OBSERVER).denied
 
     def names_in(self, enclave: str) -> tuple[set[str], str]:
         """Return the full names of an enclave's nodes, and the old name of a renamed node or "".

@@ -136,7 +136,7 @@ class AuditedEnclaves:
 
     ``what`` is "policy" or "keystore".
     With ``zenoh``, a right has to be in the Zenoh files of ``keystore``, and in the permissions if
-    these load.
+    these load.  ``changed_since`` says that the policy changed after the nodes were observed.
     """
 
     what: str
@@ -146,6 +146,7 @@ class AuditedEnclaves:
     context: JoinContext
     keystore: OpenedKeystore | None = None
     zenoh: ZenohEvaluator | None = None
+    changed_since: bool = False
     _evaluators: dict[str, Evaluator] = field(default_factory=dict)
 
     def on_zenoh(self) -> AuditedEnclaves:
@@ -638,7 +639,7 @@ def _judge(process: Sequence[ObservedNode], enclave: str, enclaves: AuditedEncla
         right
         for node in process
         if join.allowed
-        for right in _denied_rights(node, process, enclave, evaluator)
+        for right in _denied_rights(node, process, enclave, enclaves)
     ]
     if zenoh:
         by_permissions = {denied_right.right for denied_right in denied}
@@ -650,12 +651,12 @@ def _judge(process: Sequence[ObservedNode], enclave: str, enclaves: AuditedEncla
 
 
 def _denied_rights(
-    node: ObservedNode, process: Sequence[ObservedNode], enclave: str, evaluator: Evaluator
+    node: ObservedNode, process: Sequence[ObservedNode], enclave: str, enclaves: AuditedEnclaves
 ) -> Iterator[DeniedRight]:
     parts = tuple(Part(AccessVerb(e.direction), e.topic) for e in sorted(node.endpoints))
     if not parts:
         return
-    answer = evaluator.answer(Question(_USE_WORD, only=parts))
+    answer = enclaves.evaluator(enclave).answer(Question(_USE_WORD, only=parts))
     decisions = {
         Endpoint(part.topic, part.verb.value): decision
         for part, decision in answer.parts
@@ -672,7 +673,9 @@ def _denied_rights(
                 endpoint for endpoint in endpoints if decisions[endpoint].reason == _DENY_RULE
             ]
             reason = decisions[(by_rule or endpoints)[0]].clause
-            if not by_rule and (meant := likely_meaning(right, used, named)):
+            is_renamed = enclaves.changed_since
+            meant = likely_meaning(right, used, named, is_renamed=is_renamed)
+            if meant and not by_rule:
                 reason = f"{reason}; {meant}"
             yield DeniedRight(right, (node.fqn,), reason, bool(by_rule), False, endpoints)
 

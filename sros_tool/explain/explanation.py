@@ -400,11 +400,13 @@ def likely_actions(answer: Answer) -> tuple[str, ...]:
     return _similar_names(answer.question.name, names, is_service=False)
 
 
-def likely_meaning(right: Right, used: Collection[Right], named: Iterable[Right]) -> str:
+def likely_meaning(
+    right: Right, used: Collection[Right], named: Iterable[Right], *, is_renamed: bool = False
+) -> str:
     """Return a clause on the name that a policy may mean instead of a denied right, or "".
 
     ``used`` are rights that the node uses, and that are therefore no mistakes; ``named`` are the
-    `named_rights` of the node's enclave.
+    `named_rights` of the node's enclave. If the policy ``is_renamed``, the node lacks no remapping.
     """
     if right.kind == "dds":
         return ""
@@ -414,7 +416,7 @@ def likely_meaning(right: Right, used: Collection[Right], named: Iterable[Right]
     names = {other.name for other in unused if other.right == right.right}
     similar = _similar_names(right.name, names, right.kind == "services")
     meaning = f"perhaps the policy means {' or '.join(similar)}" if similar else ""
-    if len(similar) == 1 and right.kind != "actions":
+    if len(similar) == 1 and right.kind != "actions" and not is_renamed:
         meaning += f" ({remapping_clause(right.name, similar[0])})"
     return meaning
 
