@@ -585,12 +585,15 @@ def _process_findings(running: RunningRobot) -> list[Finding]:
 def _open_in_other_domains(running: RunningRobot) -> Iterator[str]:
     """Yield texts on the open processes in other domains of the robot's network namespace."""
     for process in _open_beside(running):
-        if not process.network:
+        if not (process.network or process.is_daemon):
             yield f"{process.label} runs open in domain {process.domain}"
 
 
 def _open_in_other_networks(running: RunningRobot) -> Iterator[str]:
-    """Yield texts on the open processes in the robot's domain of another network namespace."""
+    """Yield texts on the open processes in the robot's domain of another network namespace.
+
+    The daemon of ros2 counts, as in the robot's network: any program can have its name.
+    """
     for process in _open_beside(running):
         if process.network and is_in_domain(replace(process, network=""), running.robot.domain):
             yield f"{process.label} runs open"
@@ -600,7 +603,7 @@ def _open_beside(running: RunningRobot) -> Iterator[Process]:
     """Yield the open processes that are not in the robot's domain."""
     in_domain = running.in_domain
     for process in running.processes.processes:
-        if not (process.enclave or process.is_daemon or process in in_domain):
+        if not (process.enclave or process in in_domain):
             yield process
 
 

@@ -1038,7 +1038,7 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
         for pid, command in ((6, ("/tmp/thief",)), (7, talker.command), (8, ("ros2", "topic")))
     )
     daemon = replace(seven, pid=9, environment={}, command=("/bin/python", "/bin/_ros2_daemon"))
-    robot.absent, others = {"/talker"}, robot.more
+    robot.absent, others = {"/talker"}, (*robot.more, replace(daemon, network="net:[1]"))
     robot.more = (replace(talker, command=("/opt/b",)),)
     by_other = "see process 4711 (b) in /talker (by another command than the observed process) when"
     ended = robot.close("--proof", status=1)
@@ -1061,7 +1061,8 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     more += "/talker, process 7 (run) in /talker, process 8 (ros2) in /talker when it watched"
     guest = "in domain 0; process 5 (guest) runs open in domain 7\n"
     inner = "not checked (--accept domains accepts this): no process is in a domain that was not "
-    inner += "examined: process 5 (inner) runs open in domain 0 of another network namespace"
+    inner += "examined: process 5 (inner) runs open, process 9 (_ros2_daemon) runs open in "
+    inner += "domain 0 of another network namespace"
     said = robot.close("--proof", status=1).out
     assert f"{guest}not checked (--accept unobserved accepts this): {more}" in said
     assert inner in said
