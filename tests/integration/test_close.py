@@ -110,7 +110,7 @@ def test_a_robot_is_closed(tmp_path: Path) -> None:
     assert said["not yet"].status == 1
     (first,) = proofs(said["not yet"]).values()
     assert first["reason"].startswith(
-        "no secured process of this robot runs in /listener (stop process "
+        "no secured process of this robot runs in /listener (process "
     )
 
     assert said["closed"].status == 1, said["closed"]
