@@ -430,9 +430,9 @@ def security_clauses(environment: Mapping[str, str], folder: Path) -> Iterator[s
         yield from _configuration_security_clauses(
             _CYCLONE_SECURITY, "CYCLONEDDS_URI", part.encode() if inline else path
         )
-    for name in (*_PROFILE_VARIABLES, "FASTDDS_ENVIRONMENT_FILE"):
+    for name in (*PROFILE_VARIABLES, "FASTDDS_ENVIRONMENT_FILE"):
         if text := environment.get(name, ""):
-            sought = _PROFILE_SECURITY if name in _PROFILE_VARIABLES else _NAMES_PROFILES
+            sought = _PROFILE_SECURITY if name in PROFILE_VARIABLES else _NAMES_PROFILES
             yield from _configuration_security_clauses(sought, name, folder / text)
     for path in map(folder.joinpath, _DEFAULT_PROFILES):
         if path.exists():
@@ -486,7 +486,7 @@ _PROFILE_SECURITY = rb"dds\.sec\.|&#"
 """The properties that secure a participant of Fast DDS, or an escape that may hide them."""
 _NAMES_PROFILES = rb"_PROFILES_FILE|\\u"
 """Variables that name profiles, as text in a file of variables, or an escape that may hide them."""
-_PROFILE_VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
+PROFILE_VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
 _DEFAULT_PROFILES = ("DEFAULT_FASTRTPS_PROFILES.xml", "DEFAULT_FASTDDS_PROFILES.xml")
 """The files that Fast DDS reads from its working directory (Fast DDS 2.14, ``XMLProfileManager``).
 Security properties in a default profile apply to every participant of rmw_fastrtps.

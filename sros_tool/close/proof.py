@@ -20,7 +20,7 @@ from sros_tool.checks.connections import (
     not_connected_text,
     process_name,
 )
-from sros_tool.checks.environment import is_zenoh
+from sros_tool.checks.environment import PROFILE_VARIABLES, is_zenoh
 from sros_tool.checks.keystores.issued import STALE
 from sros_tool.checks.kind import NOTE, Finding
 from sros_tool.checks.processes import (
@@ -422,7 +422,7 @@ def _proof_of_silence(robot: LocalRobot, before: Observation, *, hears: bool) ->
     words = ("generate_policy", unwritten, "--domain", domain, "--dry-run", "--json")
     try:
         values = [robot.shell.read_json(words)[1]]
-        # On Cyclone DDS, a listener without these variables does not see nodes that have them.
+        # A listener without these variables may not see the nodes that have them.
         if narrow := _narrow_discovery(robot.shell.environment):
             values.append(robot.shell.read_json(words, without=narrow)[1])
     except UnavailableError as error:
@@ -453,15 +453,18 @@ def _found_by_listener(value: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _narrow_discovery(environment: Mapping[str, str]) -> Collection[str]:
-    """Return the variables that keep the listener from seeing other machines.
+    """Return the variables that may keep the listener from seeing other machines.
 
-    rmw_zenoh ignores these variables. Source: rcl/src/rcl/discovery_options.c and localhost.c.
+    rmw_zenoh ignores these variables. Sources: rcl/src/rcl/discovery_options.c and localhost.c; the
+    manuals of Cyclone DDS and Fast DDS.
     """
     if is_zenoh(environment):
         return []
     wide_values = {
         "ROS_AUTOMATIC_DISCOVERY_RANGE": ("", "SUBNET", "SYSTEM_DEFAULT"),
         "ROS_LOCALHOST_ONLY": ("", "0"),
+        "ROS_DISCOVERY_SERVER": ("",),
+        **dict.fromkeys(("CYCLONEDDS_URI", *PROFILE_VARIABLES), ("",)),
     }
     return [name for name, wide in wide_values.items() if environment.get(name, "") not in wide]
 
