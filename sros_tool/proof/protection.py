@@ -31,7 +31,8 @@ from sros_tool.keystore.comparison import (
 from sros_tool.keystore.fleet import with_routers_of_robots
 from sros_tool.keystore.protection import contradictions
 from sros_tool.keystore.template import load_template
-from sros_tool.policy.model import DomainProtection, Level, StatedProtection
+from sros_tool.policy.model import ALLOW, DomainProtection, Level, StatedProtection
+from sros_tool.policy.rights import KIND_OF, Right, parts
 from sros_tool.proof.sources import AT, KEYSTORE_ITSELF, AccessSource, Trust
 from sros_tool.proof.worlds import ROS_TOPICS, names_of_expression, valid_topics
 from sros_tool.proof.zenoh_settings import looser_settings
@@ -151,7 +152,7 @@ def less_protection(
     if new.zenoh_files:
         yield from looser_settings(old.zenoh_files, new.zenoh_files)
     if old.protections and new.protections is not None:
-        yield from _dropped_statements(old.protections, new.protections, limit)
+        yield from _dropped_statements(old, new, limit)
     yield from _weaker_for_later_enclaves(old, new, limit)
 
 
@@ -284,33 +285,65 @@ def _topics_by_protection(rule: DomainRule, style: Style) -> list[tuple[TopicRul
 
 
 def _dropped_statements(
-    old: Iterable[StatedProtection], new: Iterable[StatedProtection], limit: SearchLimit
+    old: AccessSource, new: AccessSource, limit: SearchLimit
 ) -> Iterator[SettingChange]:
-    """Yield a change for each name for which ``new`` demands less protection than ``old``."""
-    later = tuple(new)
-    for protection in old:
+    """Yield a change for each name for which ``new`` demands less protection than ``old``.
+
+    An enclave that no longer demands a protection counts, even if other enclaves still demand it:
+    users may merge the enclave without the others.
+    """
+    later = dict.fromkeys(new.protections or ())
+    changed = [protection for protection in old.protections or () if protection not in later]
+    allowed = defaultdict[str, list[Right]](list)
+    for right in new.rights if changed else ():
+        if right.qualifier is ALLOW:
+            allowed[right.enclave].append(right)
+    for protection in changed:
         enough = [
-            later_statement.name
-            for later_statement in later
-            if later_statement.kind == protection.kind
-            and (later_statement.level, protection.level) != (Level.SIGN, Level.ENCRYPT)
+            statement
+            for statement in later
+            if (statement.level, protection.level) != (Level.SIGN, Level.ENCRYPT)
         ]
-        names = _set_of_names((protection.name,)) - _set_of_names(enough)
+        names = _set_of_names((protection.name,)) - _set_of_names(
+            _names_of_kind(enough, protection.kind)
+        )
         example = names.example(limit)
         if example is not None:
             valid = names & _ABSOLUTE_NAMES
             name = example if example in _ABSOLUTE_NAMES else valid.example(limit) or example
-            less = (
-                "sign"
-                if name in _set_of_names(_names_of_kind(later, protection.kind))
-                else "nothing"
+            signed = name in _set_of_names(_names_of_kind(later, protection.kind))
+            key, what = f"protect {protection}", f"{protection.kind.removesuffix('s')} {name}"
+            meaning = f"the policy no longer demands this for {what}"
+        else:
+            lost = _topics_lost_at_enclave(protection, enough, allowed[protection.enclave])
+            topic = lost.example(limit)
+            if topic is None:
+                continue
+            own = (statement for statement in later if statement.enclave == protection.enclave)
+            signed = topic in _topics((stated.kind, stated.name) for stated in own)
+            key = f"protect {protection} of {protection.enclave}"
+            meaning = (
+                "the enclave no longer demands this; other enclaves do, but users who merge this "
+                "enclave without them lose the protection"
             )
-            yield _looser_change(
-                f"protect {protection}",
-                protection.word,
-                less,
-                f"the policy no longer demands this for {protection.kind.removesuffix('s')} {name}",
-            )
+        yield _looser_change(key, protection.word, "sign" if signed else "nothing", meaning)
+
+
+def _topics_lost_at_enclave(
+    protection: StatedProtection, enough: Iterable[StatedProtection], rights: Iterable[Right]
+) -> NameSet:
+    """Return the DDS topics that an enclave may still use without a protection that it demanded.
+
+    ``rights`` are allowed to the enclave.
+    """
+    allowed = ((KIND_OF[part.right], part.name) for right in rights for part in parts(right))
+    own = ((each.kind, each.name) for each in enough if each.enclave == protection.enclave)
+    return (_topics([(protection.kind, protection.name)]) & _topics(allowed)) - _topics(own)
+
+
+def _topics(names: Iterable[tuple[str, str]]) -> NameSet:
+    """Return the DDS topics of names with their kinds, such as "actions"."""
+    return _set_of_names({topic for kind, name in names for topic in protected_topics(kind, name)})
 
 
 def _names_of_kind(stated_protections: Iterable[StatedProtection], kind: str) -> list[str]:

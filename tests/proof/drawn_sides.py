@@ -673,10 +673,32 @@ def _less_than_stated(base: Drawn, head: Governance, styles: Collection[Style]) 
 
 
 def _states_less(base: Drawn, head: Drawn) -> bool:
+    """Return whether all enclaves, or one that still has the right, demand less for a topic."""
     order = (None, Level.SIGN, Level.ENCRYPT)
+    pairs = [(base, head)]
+    for enclave in head.policy.enclaves:
+        own = [each for each in base.policy.enclaves if each.path == enclave.path]
+        pairs += [(_with_enclaves(base, own), _with_enclaves(head, [enclave]))]
     return any(
-        order.index(_demanded(head, topic)) < order.index(_demanded(base, topic))
+        order.index(_demanded(after, topic)) < order.index(_demanded(before, topic))
+        for before, after in pairs
         for topic in TOPICS
+        if before is base or _is_stated(after, topic)
+    )
+
+
+def _with_enclaves(drawn: Drawn, enclaves: Sequence[Enclave]) -> Drawn:
+    return replace(drawn, policy=replace(drawn.policy, enclaves=tuple(enclaves)))
+
+
+def _is_stated(drawn: Drawn, topic: str) -> bool:
+    """Return whether an enclave is allowed to use a topic; a DENY of it does not count."""
+    return any(
+        matches(Style.FNMATCH, each, topic)
+        for right in policy_rights(drawn.policy)
+        if right.qualifier is ALLOW
+        for names in (dds_names(right.right, right.name),)
+        for each in (*names.publish, *names.subscribe)
     )
 
 

@@ -398,6 +398,31 @@ def test_less_protection_is_found(tmp_path: Path) -> None:
     assert "less protection" not in back.out
 
 
+def test_less_protection_at_one_of_two_enclaves_is_found(tmp_path: Path) -> None:
+    """Users may merge one of the enclaves without the other."""
+    tag = "<actions execute='ALLOW'><action>/go{}</action></actions>"
+    level, gone = '<?sros protect="{}"?>', "protect action /go of /arm encrypt -> "
+    parts = "".join(
+        f"<services reply='ALLOW'><service>/go/_action/{name}</service></services>"
+        for name in ("send_goal", "cancel_goal", "get_result")
+    )
+    encrypts = level.format("encrypt")
+    other = tag.replace("execute", "call").format(encrypts)
+    base = policy_text({"/arm": tag.format(encrypts), "/ui": other})
+    (tmp_path / "base.xml").write_text(base)
+    for arm, told in (
+        (tag.format(""), f"{gone}nothing"),
+        (parts, f"{gone}nothing"),
+        ("", ""),
+        (tag.format(encrypts), ""),
+    ):
+        (tmp_path / "head.xml").write_text(policy_text({"/arm": arm, "/ui": other}))
+        ended = sros("diff_policy", "--no-new-access", "base.xml", "head.xml", cwd=tmp_path)
+        assert ended.status == bool(told), ended
+        assert told in ended.out and ("less protection" in ended.out) == bool(told), ended.out
+        assert ("nothing is protected less" in ended.err) == (not told), ended.err
+
+
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("made")
