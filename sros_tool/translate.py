@@ -5,7 +5,7 @@ Names are mapped as in ros2/sros2, so that both tools give the same rights for a
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Set
+from collections.abc import Collection, Iterable, Iterator, Sequence, Set
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from sros_tool.dds.decision.expressions import ExpressionIndex
@@ -21,6 +21,7 @@ from sros_tool.dds.permissions import (
     Rule,
     grant,
 )
+from sros_tool.errors import PolicyError
 from sros_tool.names import (
     GOAL,
     ROS_DISCOVERY_TOPIC,
@@ -30,13 +31,13 @@ from sros_tool.names import (
     is_expression,
     service_of,
 )
-from sros_tool.policy.model import ALLOW, DENY, RIGHTS, Enclave, Qualifier
-from sros_tool.policy.patterns import covers
+from sros_tool.policy.model import ALLOW, DENY, RIGHTS, Enclave, Level, Qualifier
+from sros_tool.policy.patterns import ComparisonLimit, Names, covers
 from sros_tool.policy.rights import Right
 from sros_tool.validity import Window
 
 if TYPE_CHECKING:
-    from sros_tool.policy.model import DomainProtection, TopicProtection
+    from sros_tool.policy.model import DomainProtection, StatedProtection, TopicProtection
 
 # ── ROS → DDS ──────────────────────────────────────────────────────────────────────────────
 
@@ -170,6 +171,48 @@ def protected_topics(kind: str, name: str) -> list[str]:
     return list(expressions)
 
 
+def contradictions(
+    stated_protections: Sequence[StatedProtection],
+) -> Iterator[tuple[StatedProtection, StatedProtection]]:
+    """Yield the pairs of statements that state different levels for a common name, in order."""
+    limit = ComparisonLimit()
+    signed: dict[str, list[StatedProtection]] = {}
+    for protection in stated_protections:
+        if protection.level is Level.SIGN:
+            for topic in protected_topics(protection.kind, protection.name):
+                signed.setdefault(topic, []).append(protection)
+    names = Names(signed, limit)
+    place = {protection: number for number, protection in enumerate(stated_protections)}
+    for protection in stated_protections:
+        if protection.level is Level.SIGN:
+            continue
+        met = {
+            statement: None
+            for topic in protected_topics(protection.kind, protection.name)
+            for meeting in names.overlapping(topic)
+            for statement in signed[meeting]
+        }
+        for statement in met:
+            first, second = sorted((protection, statement), key=place.__getitem__)
+            yield first, second
+
+
+def refuse_contradictions(
+    stated_protections: Sequence[StatedProtection], known: Collection[StatedProtection] = ()
+) -> None:
+    """Raise `PolicyError` if statements contradict each other, unless both are ``known``."""
+    for stated_protection, other in contradictions(stated_protections):
+        if stated_protection in known and other in known:
+            continue
+        raise PolicyError(
+            f'{other.source}: {other} has protect="{other.word}", and {stated_protection} has '
+            f'protect="{stated_protection.word}" at {stated_protection.source}',
+            "A keystore has one governance for all enclaves, so each name has one protection; a "
+            "wildcard protects all names that it matches.",
+            "State the same protection in both places, or only one protection.",
+        )
+
+
 def _topic_rule(expression: str, protection: TopicProtection) -> TopicRule:
     return TopicRule(topic_expression=expression, **_rule_attributes(protection, TopicRule))
 
@@ -255,7 +298,6 @@ def protection_for(governance: Governance) -> DomainProtection | None:
 
 def _protection_fields(rule: DomainRule | TopicRule) -> dict[str, Any]:
     """Map the fields of a protection to the values of a rule: the reverse of `_rule_attributes`."""
-    from sros_tool.policy.model import Level
 
     chosen = {attribute: getattr(rule, attribute.name) for attribute in attributes(type(rule))}
     return {

@@ -42,7 +42,6 @@ from sros_tool.files import policies_dir
 from sros_tool.fleet.expansion import FleetPolicy
 from sros_tool.fleet.robots import Fleet, Robot, group_of
 from sros_tool.keystore.issuing.size import SizeEstimator, right_bytes
-from sros_tool.keystore.protection import contradictions
 from sros_tool.keystore.template import Template
 from sros_tool.names import (
     ACTION_PARTS,
@@ -77,7 +76,7 @@ from sros_tool.policy.patterns import ComparisonLimit, Names, covers, literal_pr
 from sros_tool.policy.placeholders import parts_of
 from sros_tool.policy.rights import Right, Rules, parts, placed_rights, policy_rights
 from sros_tool.spelling import NearNames, is_typing_error
-from sros_tool.translate import permissions_for
+from sros_tool.translate import contradictions, permissions_for
 from sros_tool.validity import Window
 from sros_tool.wording import counted, first_few
 from sros_tool.xml import parse, read_bytes

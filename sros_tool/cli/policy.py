@@ -105,7 +105,8 @@ def merge_policy(
     (`<enclaves/>`). A right is added only if the enclave does not have it yet; rights from includes
     and wildcards count. Where a profile of OTHER includes common parts, the new profile in POLICY
     includes the same parts from POLICY's folder. Publish and subscribe are separate rights. A DENY
-    always stays and always wins over an ALLOW; contradictions between the policies are reported.
+    always stays and always wins over an ALLOW, and a note names the ALLOW. If the policies state
+    different protect= values for a name, nothing is written.
 
     Example:
       $ sros merge_policy robot.xml learned.xml --in-place

@@ -72,10 +72,11 @@ from sros_tool.policy.model import (
     policy_in_enclave,
     policy_in_namespace,
     policy_of_nodes,
+    stated_protections,
 )
 from sros_tool.policy.remapping import remapped_policies
 from sros_tool.policy.rights import Right, Rules, order, policy_rights, profile_rights
-from sros_tool.translate import ros_rights
+from sros_tool.translate import refuse_contradictions, ros_rights
 from sros_tool.values import DryRun, FileChanges, Notes, Words, shows
 from sros_tool.wording import first_few
 from sros_tool.xml import read_bytes, tag_of
@@ -1058,7 +1059,7 @@ def merge_policies(
 
     Raises:
         SrosError: as `merge_all` and `remapped_policies`; or a name is not valid, or a node is in
-            no policy.
+            no policy; or the result would state two levels of protection for a name.
     """
     additions = list(others)
     if namespace is not None:
@@ -1084,6 +1085,9 @@ def merge_policies(
         check_enclave_name(enclave)
         additions = [policy_in_enclave(addition, enclave) for addition in additions]
     merged = merge_all(path, additions)
+    protections = stated_protections(present.enclaves)
+    added = (stated for addition in additions for stated in stated_protections(addition.enclaves))
+    refuse_contradictions((*protections, *added), known=protections)
     notes += (*merged.notes, *counterpart_notes(present, stated, merged.rights))
     document = merged.document
     if merged.added and may_include:

@@ -20,36 +20,9 @@ from sros_tool.policy.model import (
     StatedProtection,
     TopicProtection,
 )
-from sros_tool.policy.patterns import ComparisonLimit, Names, covers
+from sros_tool.policy.patterns import Names, covers
 from sros_tool.policy.rights import KIND_OF
-from sros_tool.translate import governance_for, protected_topics
-
-
-def contradictions(
-    stated_protections: Sequence[StatedProtection],
-) -> Iterator[tuple[StatedProtection, StatedProtection]]:
-    """Yield the pairs of statements that state different levels for a common name, in order."""
-    limit = ComparisonLimit()
-    signed: dict[str, list[StatedProtection]] = {}
-    for protection in stated_protections:
-        if protection.level is Level.SIGN:
-            for topic in protected_topics(protection.kind, protection.name):
-                signed.setdefault(topic, []).append(protection)
-    names = Names(signed, limit)
-    place = {protection: number for number, protection in enumerate(stated_protections)}
-    for protection in stated_protections:
-        if protection.level is Level.SIGN:
-            continue
-        met = {
-            statement: None
-            for topic in protected_topics(protection.kind, protection.name)
-            for meeting in names.overlapping(topic)
-            for statement in signed[meeting]
-        }
-        for statement in met:
-            first, second = sorted((protection, statement), key=place.__getitem__)
-            yield first, second
-
+from sros_tool.translate import governance_for, protected_topics, refuse_contradictions
 
 # ── from statements to the protection of a keystore ────────────────────────────────────────
 
@@ -63,14 +36,7 @@ def with_stated_protections(
         PolicyError: statements contradict each other; or a wildcard in the settings matches only
             some of the names of a statement, so that it is unclear which of the two decides.
     """
-    for stated_protection, other in contradictions(stated_protections):
-        raise PolicyError(
-            f'{other.source}: {other} has protect="{other.word}", and {stated_protection} has '
-            f'protect="{stated_protection.word}" at {stated_protection.source}',
-            "A keystore has one governance for all enclaves, so each name has one protection; a "
-            "wildcard protects all names that it matches.",
-            "State the same protection in both places, or only one protection.",
-        )
+    refuse_contradictions(stated_protections)
     raised = _RaisedProtection(protection)
     for stated_protection in {
         (stated_protection.kind, stated_protection.name, stated_protection.level): stated_protection

@@ -29,14 +29,13 @@ from sros_tool.keystore.comparison import (
     compare_settings,
 )
 from sros_tool.keystore.fleet import with_routers_of_robots
-from sros_tool.keystore.protection import contradictions
 from sros_tool.keystore.template import load_template
 from sros_tool.policy.model import ALLOW, DomainProtection, Level, StatedProtection
 from sros_tool.policy.rights import KIND_OF, Right, parts
 from sros_tool.proof.sources import AT, KEYSTORE_ITSELF, AccessSource, Trust
 from sros_tool.proof.worlds import ROS_TOPICS, names_of_expression, valid_topics
 from sros_tool.proof.zenoh_settings import looser_settings
-from sros_tool.translate import governance_for, protected_topics
+from sros_tool.translate import contradictions, governance_for, protected_topics
 from sros_tool.wording import counted
 from sros_tool.zenoh.configuration import ZenohNetwork
 

@@ -10,7 +10,6 @@ import pytest
 from sros_tool.dds.governance import TopicRule
 from sros_tool.errors import PolicyError
 from sros_tool.keystore.protection import (
-    contradictions,
     governance_for_all,
     unfulfilled_protections,
     with_stated_protections,
@@ -24,7 +23,7 @@ from sros_tool.policy.model import (
     TopicProtection,
 )
 from sros_tool.policy.patterns import matches
-from sros_tool.translate import protected_topics
+from sros_tool.translate import contradictions, protected_topics
 
 KINDS = ("topics", "services", "actions")
 NAMES = ["/" + "/".join(part) for n in (1, 2) for part in product("abc", repeat=n)]

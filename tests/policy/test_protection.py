@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,7 @@ from lxml import etree
 from sros_tool.errors import PolicyError
 from sros_tool.fleet.expansion import FleetPolicy
 from sros_tool.fleet.robots import Fleet, Robot
+from sros_tool.graph.learn import merge_policies
 from sros_tool.policy.document import policy_xml, read_policy
 from sros_tool.policy.merge import merge_into
 from sros_tool.policy.minimize import minimize
@@ -161,6 +163,25 @@ def test_a_merge_keeps_it_and_adds_it_with_new_names(tmp_path: Path) -> None:
     (protecting := tmp_path / "new.xml").write_text(policy(enclave("/a", f"/free{SIGN}")))
     merged = read(merge_into(protecting, read(WRITTEN)).document.decode())
     assert {*said(merged)} == {"/a topic /free sign", *SAID}, said(merged)
+
+
+def test_a_merge_is_refused_if_another_enclave_states_another_level(tmp_path: Path) -> None:
+    """`check` and `generate_artifacts` would refuse the result; what POLICY has already, stays."""
+    file = tmp_path / "own.xml"
+    own = enclave("/recorder", f"/scan{SIGN}", right="subscribe")
+    for others, added, refused in (
+        ((), enclave("/a", f"/scan{ENCRYPT}"), True),
+        ((), enclave("/a", f"/sc*{ENCRYPT}"), True),
+        ((), enclave("/a", f"/scan{SIGN}"), False),
+        ((enclave("/b", f"/sc*{ENCRYPT}"),), enclave("/b", "/new"), False),
+    ):
+        file.write_text(policy(own, *others))
+        with (
+            pytest.raises(PolicyError, match=r"/scan has protect=.sign")
+            if refused
+            else nullcontext()
+        ):
+            merge_policies(file, [read(policy(added))])
 
 
 def test_a_narrowed_policy_demands_the_same_of_the_names_that_are_left() -> None:
