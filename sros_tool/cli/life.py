@@ -584,10 +584,10 @@ def rotate_ca(
             old_keys_elsewhere=step.kept_elsewhere,
             remarks=() if dry_run else rotation_status(OpenedKeystore(root), now=now()).remarks,
         )
-    cannot = "could not" if dry_run else "cannot"
     cut_off = (
-        "these robots are cut off until they have the files of this stage: "
-        f"{', '.join(step.cut_off)}. Robots with these files {cannot} talk to robots without them"
+        f"these robots have not confirmed the stage before: {', '.join(step.cut_off)}. They "
+        f"{'would be' if dry_run else 'are'} cut off from robots that have the files of this "
+        "stage, until they have these files, too"
     )
     is_published = bool(publish_command(root))
     if is_published and step.stage == "retire" and step.replaces_identity:
