@@ -293,6 +293,7 @@ def diff_policy(
       + /talker publish topic /arm_*  (robot.xml:7): such as /arm_c
       1 right is new
     """
+    from sros_tool.fleet.changes import renewal_notes
     from sros_tool.keystore.rights import (
         compare_sources,
         load_rights,
@@ -309,6 +310,8 @@ def diff_policy(
         fleets = fleets_of(fleet_files)
         first, second = load_rights(a, fleets[0]), load_rights(b, fleets[-1])
     first, second = without_enclaves_of_sros(first, second), without_enclaves_of_sros(second, first)
+    notes = (*second.notes, *renewal_notes(first.fleet, second.fleet))
+    second = replace(second, notes=notes)
     compared = compare_sources(first, second, governance=True)
     difference, protections = compared.rights, compared.protections
     if form == "json":
@@ -776,11 +779,13 @@ def _show_new_access(
     Raises:
         SrosError: sros cannot decide whether HEAD adds access.
     """
+    from sros_tool.fleet.changes import renewal_notes
     from sros_tool.proof.growth import ComparedSide, NewAccess, compare_access
     from sros_tool.proof.sources import load_side
 
     with progress("reading"):
         before, after = load_side(base, fleets[0]), load_side(head, fleets[-1])
+    after = replace(after, notes=(*after.notes, *renewal_notes(before.fleet, after.fleet)))
     with progress("comparing"):
         growth = compare_access(before, after)
     if form == "json":

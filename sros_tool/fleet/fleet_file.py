@@ -309,7 +309,8 @@ _VARIABLES = {
     "renewal_grace": "sros_renewal_grace",
 }
 """Robot setting → the Ansible host variable that has it."""
-_ROBOT_VARIABLE = "sros_robot"
+ROBOT_VARIABLE = "sros_robot"
+"""The Ansible host variable with the robot's name."""
 _SHOWN_KEYS = {"robots": "hosts", **_VARIABLES}
 """Word in a fleet file → word in an inventory, for messages."""
 
@@ -339,12 +340,12 @@ def _table_from_inventory(data: bytes, label: str, *, is_json: bool) -> dict[str
 def _connection_settings(data: bytes, label: str, *, is_json: bool) -> dict[str, str]:
     """Return the settings of an inventory that decide how Ansible connects and delivers, by key.
 
-    The settings of the fleet itself are left out (`_table_from_inventory`).  If a group has
-    variables, the members of the group are added, too.  If a value is a template, all values are
-    returned.  Parameters and errors are the same as for `_table_from_inventory`.
+    The settings of robots are left out (`_VARIABLES`).  If a group has variables, the members of
+    the group are added, too.  If a value is a template, all values are returned.  Parameters
+    and errors are the same as for `_table_from_inventory`.
     """
     values = dict(_inventory_leaves(_load_inventory(data, label, is_json=is_json)))
-    known = {*_VARIABLES.values(), _ROBOT_VARIABLE}
+    known = _VARIABLES.values()  # without sros_robot, which decides whose keys a host gets
     kept = {
         path: text
         for path, text in values.items()
@@ -524,9 +525,7 @@ class _Inventory:
     def _used_variables(self, value: Any, key_path: object) -> dict[str, Any]:
         """Return the variables that a fleet uses; other variables are left out."""
         values = self._checked_mapping(value, key_path)
-        return {
-            key: values[key] for key in (*_VARIABLES.values(), _ROBOT_VARIABLE) if key in values
-        }
+        return {key: values[key] for key in (*_VARIABLES.values(), ROBOT_VARIABLE) if key in values}
 
     def _variables_of(self, host: str) -> dict[str, Any]:
         own = self._own[host]
@@ -547,19 +546,19 @@ class _Inventory:
         named: dict[str, str] = {}
         for host in self._own:
             values = self._variables_of(host)
-            name = values.get(_ROBOT_VARIABLE, host)
+            name = values.get(ROBOT_VARIABLE, host)
             if not isinstance(name, str) or (problem := name_problem(name)):
                 text = problem if isinstance(name, str) else "It is not a text."
                 raise self._error(
                     f"the host {host!r} cannot be a robot by the name {name!r}",
                     text,
-                    f"Give it the variable {_ROBOT_VARIABLE}, such as {_ROBOT_VARIABLE}: r7.",
+                    f"Give it the variable {ROBOT_VARIABLE}, such as {ROBOT_VARIABLE}: r7.",
                 )
             if name in named:
                 raise self._error(
                     f"the hosts {named[name]!r} and {host!r} have the same robot name {name}",
                     "",
-                    f"Give them different values of {_ROBOT_VARIABLE}.",
+                    f"Give them different values of {ROBOT_VARIABLE}.",
                 )
             named[name] = host
             robot = {key: values[word] for key, word in _VARIABLES.items() if word in values}
@@ -612,7 +611,7 @@ def _ansible_variables(robot: Robot) -> dict[str, Any]:
         for key, variable in _VARIABLES.items()
         if settings[key] not in (None, "", [])
     }
-    return {_ROBOT_VARIABLE: robot.name, **shown}
+    return {ROBOT_VARIABLE: robot.name, **shown}
 
 
 def _is_json(data: bytes) -> bool:

@@ -41,9 +41,10 @@ from sros_tool.checks.targets import path_findings, policy_findings
 from sros_tool.errors import DocumentError, SrosError
 from sros_tool.faults import Fault
 from sros_tool.files import policies_dir
+from sros_tool.fleet.changes import FleetChange, delivery_place, fleet_changes
 from sros_tool.fleet.expansion import FleetPolicy, fleet_with_enclaves, read_policy_for
-from sros_tool.fleet.fleet_file import read_connection_settings, read_fleet
-from sros_tool.fleet.robots import Fleet, Robot
+from sros_tool.fleet.fleet_file import ROBOT_VARIABLE, read_connection_settings, read_fleet
+from sros_tool.fleet.robots import Fleet, Robot, robot_of
 from sros_tool.folders import Folder
 from sros_tool.keystore.expiry import ExpiryCheck, Threshold, due_enclaves
 from sros_tool.keystore.fleet import load_fleet
@@ -154,9 +155,9 @@ _UNSIGNED_POLICY_IDS = tuple(
 """Ids of findings which say that a keystore is not signed for the policies."""
 _TEMPLATE_TABLES = ("authorities", "certificates", "permissions", "protection")
 _SETTINGS_TABLE = re.compile(
-    rf"^[ \t]*\[+(?:{'|'.join((*_TEMPLATE_TABLES, *KINDS))})\b".encode(), re.MULTILINE
+    rf"^[ \t]*\[+(?:{'|'.join((*_TEMPLATE_TABLES, *KINDS, 'robots'))})\b".encode(), re.MULTILINE
 )
-"""A table of a keystore template or of requirements."""
+"""A table of a keystore template, of requirements or of a fleet file."""
 _LARGEST_SETTINGS = 1024 * 1024
 _PRIVATE_KEY_FOUND = (
     "has a private key, which everybody who can read the repository has now: replace it, because "
@@ -495,7 +496,7 @@ class _Review:
                 "files", "", partial(self._unreviewed_step, of_head, head_fleet)
             )
             if head_fleet:
-                where = partial(self._delivery_step, (of_base, base_fleet), (of_head, head_fleet))
+                where = partial(self._fleet_step, (of_base, base_fleet), (of_head, head_fleet))
                 yield from self._step_result("new-access", asked.fleet, where)
         for error in self.head.refused + (self.base.refused if self.base else []):
             yield ReviewStep("files", "", _UNDECIDED, error)
@@ -622,27 +623,17 @@ class _Review:
         before = other.repository.tree(other.commit) if other else ""
         return walk(side.repository, tree, maximum=_MOST_ENTRIES, other=before)
 
-    def _delivery_step(
+    def _fleet_step(
         self, base: tuple[list[Path], Fleet | None], head: tuple[list[Path], Fleet]
     ) -> tuple[int, Content] | None:
-        """Return status and findings on changes of the robots that get keys; None without any.
+        """Return status and findings on changes of the fleet file; None without any.
 
-        Such a change delivers keys to another address, to another robot, or in another way.
+        The rights do not show such changes: `fleet_changes`, keys that another robot gets, and
+        other settings for the connections of Ansible.
         """
-        lines: list[tuple[str, str]] = []
-        robots = base[1].robots if base[1] else {}
-        for name, new in head[1].robots.items():
-            if name in robots and _delivery_place(robots[name]) != _delivery_place(new):
-                lines.append((f"gets its keys at another address: {_delivery_place(new)}", name))
-        earlier = _robots_by_enclave(*base)
-        for enclave, robot in _robots_by_enclave(*head).items():
-            old = earlier.get(enclave, robot)
-            if robot and (
-                not old
-                or (old.name != robot.name and _delivery_place(old) != _delivery_place(robot))
-            ):
-                had = old.name if old else "no robot"
-                lines.append((f"gets the keys of {enclave}, which {had} had before", robot.name))
+        known_paths = fleet_with_enclaves(base[1], base[0]).enclaves if base[1] else ()
+        changes = [*fleet_changes(base[1], head[1], known_paths)]
+        changes += _moved_keys(_robots_by_enclave(*base), _robots_by_enclave(*head), head[1])
         if base[1] and self.base:
             file = self.request.fleet
             before, after = (
@@ -650,10 +641,13 @@ class _Review:
             )
             for where in sorted({*before, *after}, key=_variables_before_hosts):
                 if before.get(where) != (value := after.get(where)):
+                    is_robot = where.endswith(f".{ROBOT_VARIABLE}")
+                    if is_robot and value is None and before[where] not in head[1].robots:
+                        continue  # the robot is gone
                     text = "is gone" if value is None else f"is {value}"
                     effect = "this can change which keys Ansible delivers, and how"
-                    lines.append((f"{text}: {effect}", where))
-        return (_FOUND, StepFindings(tuple(lines))) if lines else None
+                    changes.append(FleetChange(where, f"{text}: {effect}"))
+        return _fleet_findings(changes)
 
     def _converted_step(self) -> tuple[int, Content] | None:
         """Return status and findings on reviewed files that git may change on checkout, or None."""
@@ -966,7 +960,7 @@ class _Review:
         return sorted(folder or "." for folder in folders if folder is not None)
 
     def _changed_settings(self) -> list[str]:
-        """Return changed TOML files that look like templates or requirements, and are not read."""
+        """Return changed TOML files that are not read and have a `_SETTINGS_TABLE`."""
         with suppress(SrosError):  # the step on changed files reports the error
             changed = self._changed_files(self.head, self.base) if self.base else ()
             files = {
@@ -1366,8 +1360,28 @@ class _Review:
 
         yield from self._step_result("keystore", path, findings)
         yield from self._step_result("signed", path, signed, is_wanted=bool(stated))
+
+        def of_robots() -> tuple[int, Content] | None:
+            after = self.robots.get(path)
+            if not before or not after:
+                return None
+            earlier = self._keystore_fleet(path)
+            if earlier == after:
+                return None
+            changes = [*fleet_changes(earlier, after)]
+            had, have = (
+                {name: robot_of(fleet, name) if fleet else None for name in keystore.names}
+                for keystore, fleet in (
+                    (OpenedKeystore(before), earlier),
+                    (OpenedKeystore(folder), after),
+                )
+            )
+            changes += _moved_keys(had, have, after)
+            return _fleet_findings(changes)
+
         if self.base:
             yield from self._step_result("new-access", path, access)
+            yield from self._step_result("new-access", f"{path}/{FLEET}", of_robots)
         yield from self._step_result(
             "expiry", path, lambda: self._expiring_enclaves(before or folder, folder)
         )
@@ -1385,20 +1399,38 @@ def _variables_before_hosts(where: str) -> tuple[bool, str]:
     return not any(part in where for part in ("ansible_", "sros_")), where
 
 
-def _delivery_place(robot: Robot) -> str:
-    """Return the place to which a robot's keys are delivered, as text.
+def _fleet_findings(changes: Iterable[FleetChange]) -> tuple[int, Content] | None:
+    lines: dict[bool, list[tuple[str, str]]] = {True: [], False: []}
+    for change in changes:
+        lines[change.is_access].append((change.text, change.name))
+    facts = StepFindings(tuple(lines[True]), tuple(lines[False]))
+    return (_FOUND if facts.failing else _OK, facts) if facts.lines else None
 
-    This is ``user@address``, only the address, or "its name" if the robot has no address.
-    """
-    return f"{robot.user}@{robot.address}" if robot.user else robot.address or "its name"
+
+def _moved_keys(
+    before: Mapping[str, Robot | None], after: Mapping[str, Robot | None], fleet: Fleet
+) -> Iterator[FleetChange]:
+    """Yield enclaves whose keys another robot of ``fleet`` gets, unless it was only renamed."""
+    for enclave, robot in after.items():
+        old = before.get(enclave, robot)
+        if not robot or (old and old.name == robot.name):
+            continue
+        if old and old.name not in fleet.robots and delivery_place(old) == delivery_place(robot):
+            continue
+        had = old.name if old else "no robot"
+        yield FleetChange(robot.name, f"gets the keys of {enclave}, which {had} had before")
 
 
 def _robots_by_enclave(files: Iterable[Path], fleet: Fleet | None) -> dict[str, Robot | None]:
     """Map enclaves to the robot that gets their keys, or to None if they belong to no robot."""
     if fleet is None:
         return {enclave.path: None for file in files for enclave in read_policy(file).enclaves}
-    policies = (FleetPolicy(read_policy(file, placeholders=True), fleet) for file in files)
-    return {path: policy.stated_enclave(path)[1] for policy in policies for path in policy}
+    policies = [FleetPolicy(read_policy(file, placeholders=True), fleet) for file in files]
+    return {
+        path: policy.stated_enclave(path)[1] or robot_of(fleet, path)
+        for policy in policies
+        for path in policy
+    }
 
 
 _FILES_OF_ENCLAVES = (*REQUIRED_FILES, *OPTIONAL_FILES, *ZENOH_FILES)

@@ -137,7 +137,9 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     wide = policy_text({"/{robot}/base": publish("{namespace}/odom"), "/d": publish("{robots}/go")})
     (folder / "p.xml").write_text(wide)
     (folder / "f.toml").write_text("[robots]\nr1 = {}\nr2 = {}\nr3 = {}\n")
-    (folder / "g.toml").write_text('[robots]\nr1 = {}\nr2 = {namespace = "/b"}\n')
+    (folder / "g.toml").write_text(
+        '[robots]\nr1 = {}\nr2 = {namespace = "/b", renewal = "allowed"}\n'
+    )
     sros("generate_artifacts", "-k", "ks", "-p", "p.xml", "--fleet", "f.toml", cwd=folder).ok()
     return folder
 
@@ -154,6 +156,10 @@ def test_two_fleets_are_compared(made: Path) -> None:
         "- /{robot}/base ALLOW publish topic {namespace}/odom  (2 robots: r2, r3)",
         "+ /r2/base ALLOW publish topic /b/odom",
     ]
+    renewal = "[fleet.renewal]: r2 may now request renewal (renewal: refused -> allowed)"
+    assert renewal in ended.err
+    words = ("diff_policy", "--no-new-access", "p.xml", "p.xml", "--fleet", "f.toml")
+    assert renewal in sros(*words, "--fleet", "g.toml", cwd=made).err
 
 
 def test_what_a_change_takes_away_is_folded(made: Path) -> None:

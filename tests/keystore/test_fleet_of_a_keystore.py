@@ -373,6 +373,8 @@ def test_names_that_differ_only_in_case_are_noted(tmp_path: Path) -> None:
     note = "note [fleet.similar-names]: robots whose names differ only in upper and lower case: "
     assert f"{note}R7 and r7. DNS" in sros("generate_artifacts", "-k", root, *words).ok().err
     assert note in sros("fleet", "publish", root, pub, "--dry-run").ok().err
-    (tmp_path / "fleet.toml").write_text("[robots.r7]\n[robots.r8]\n")
+    (tmp_path / "fleet.toml").write_text('[robots.r7]\n[robots.r8]\nrenewal_grace = "9d"\n')
+    planned = sros("generate_artifacts", "-k", root, *words, "--dry-run").ok().err
+    assert "[fleet.renewal]: r8 can request renewal for a longer time" in planned
     assert note not in sros("generate_artifacts", "-k", root, *words).ok().err
     assert note not in sros("fleet", "publish", root, pub, "--dry-run").ok().err

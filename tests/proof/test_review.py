@@ -11,8 +11,10 @@ import shutil
 import subprocess
 import tarfile
 from collections.abc import Callable, Mapping
+from dataclasses import fields
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple
 from unittest.mock import Mock
 
 import pytest
@@ -22,6 +24,8 @@ from sros_tool.checks.kind import all_kinds
 from sros_tool.cli.review import review as review_verb
 from sros_tool.errors import DocumentError, SrosError, UsageError
 from sros_tool.files import templates_dir
+from sros_tool.fleet.fleet_file import inventory, render_fleet
+from sros_tool.fleet.robots import Fleet, Robot
 from sros_tool.policy.model import ALLOW
 from sros_tool.policy.rights import Right, renamed_enclaves
 from sros_tool.proof import lost_protection, review
@@ -950,6 +954,10 @@ namespace = "/n2"
 _HOSTS = """{"_meta": {"hostvars": {"r1": {"ansible_host": "10.0.0.1"}}},
  "all": {"children": ["far"], "vars": {"color": "red"}}, "far": {"hosts": ["r1"]}}
 """
+_TWO_PORTS = """{"all": {"hosts": {
+ "h1": {"sros_robot": "r1", "ansible_host": "10.0.0.1", "ansible_port": 22},
+ "h2": {"sros_robot": "r2", "ansible_host": "10.0.0.1", "ansible_port": 2222}}}}
+"""
 
 
 @pytest.mark.parametrize(
@@ -968,6 +976,16 @@ _HOSTS = """{"_meta": {"hostvars": {"r1": {"ansible_host": "10.0.0.1"}}},
                 f'{_TWO}[robots.hq]\naddress = "10.6.6.6"\nnamespace = "/hq"\n',
                 "'hq' gets the keys of /hq/a, which no robot had before",
             ),
+            (
+                "fleet.toml",
+                _TWO.replace("0.2", "0.1"),
+                _TWO.replace("0.2", "0.1")
+                .replace("/n2", "/n")
+                .replace("/n1", "/n2")
+                .replace('"/n"', '"/n1"'),
+                "'r1' gets the keys of /n2/a, which r2 had before, and 1 more",
+            ),
+            ("fleet.toml", _TWO, _TWO.replace("r2", "r3"), ""),
             ("hosts.json", _HOSTS, _HOSTS.replace("red", "blue"), ""),
             (
                 "hosts.json",
@@ -981,8 +999,33 @@ _HOSTS = """{"_meta": {"hostvars": {"r1": {"ansible_host": "10.0.0.1"}}},
                 _HOSTS.replace('10.0.0.1"', '10.0.0.1", "sros_patterns": ["/*"]'),
                 "'_meta.hostvars.r1.sros_patterns' is ['/*']: this can change which",
             ),
+            (
+                "hosts.json",
+                _TWO_PORTS,
+                _TWO_PORTS.replace("r1", "r").replace("r2", "r1").replace('"r"', '"r2"'),
+                "'all.hosts.h1.sros_robot' is r2: this can change which",
+            ),
+            (
+                "hosts.json",
+                '{"all": {"hosts": {"h1": {"sros_robot": "r1"}, "h2": {"sros_robot": "r2"}}}}',
+                '{"all": {"hosts": {"h1": {"sros_robot": "r1"}}}}',
+                "",
+            ),
+            (
+                "fleet.toml",
+                _TWO,
+                f'enclaves = ["/desk/{{robot}}"]\n{_TWO}',
+                "'enclaves' has the new path /desk/{robot}, and robots get the keys of enclaves "
+                "with such a path, and 1 more",
+            ),
+            (
+                "fleet.toml",
+                f'{_TWO}router = "h:7447"\n',
+                f'routers = "/{{robot}}/a"\n{_TWO}router = "h:7447"\n',
+                "'routers' makes other enclaves the routers of robots: /{robot}/a",
+            ),
         ],
-        2,
+        3,
     ),
 )
 def test_keys_go_to_no_other_robot_unseen(
@@ -991,12 +1034,95 @@ def test_keys_go_to_no_other_robot_unseen(
     """The access of every enclave stays what it is."""
     rights = publish("/x")
     alone = {"/hq/a": rights} if "/hq" in after else {}
-    policy = {"{namespace}/a": rights}
+    policy = {"{namespace}/a": rights} | ({"/desk/r1": rights} if "/desk" in after else {})
     change.base = change.commit({path: before, "robots.xml": policy_text({**policy, **alone})})
     change.commit({path: after, "robots.xml": policy_text(policy)})
     ended = change.review("--policy", "robots.xml", "--fleet", path)
     assert (f"new-access {path}: {said}" in ended.out) == bool(said), ended
     assert ended.status == bool(said), ended
+
+
+class _Key(NamedTuple):
+    """A key of the fleet file: two values of a robot with its name, and what changing each says.
+
+    ``gained`` is said if the second value replaces the first, ``lost`` the other way round.
+    """
+
+    first: Any
+    second: Any
+    gained: str
+    lost: str
+
+
+_GRACE = "request renewal for a {} time after its certificate expired (renewal_grace: "
+_FLEET_KEYS = {
+    "namespace": _Key(
+        "/n1",
+        "/n2",
+        "+ /namespace/a publish topic /n2/x",
+        "+ /namespace/a publish topic /n1/x",
+    ),
+    "domain": _Key(5, 6, "/domain/x  (robots.xml:3); in domain 6", "(robots.xml:3); in domain 5"),
+    "address": _Key("h1", "h2", "gets its keys at another address: h2", "another address: h1"),
+    "user": _Key("u1", "u2", "another address: u2@user", "another address: u1@user"),
+    "groups": _Key((), ("g",), "+ /groups/lift publish topic /lift", ""),
+    "router": _Key(
+        "h:1",
+        "h:2",
+        "'router' has its router at another address: h:2 (/router/router)",
+        "'router' has its router at another address: h:1 (/router/router)",
+    ),
+    "crossing": _Key(("/f",), ("/f", "/g"), "/g may pass between this router and others", ""),
+    "distribution": _Key("jazzy", "humble", "", ""),
+    "renewal": _Key(
+        "",
+        "allowed",
+        "'renewal' may now request renewal (renewal: refused -> allowed)",
+        "'renewal' may no longer request renewal (renewal: allowed -> refused)",
+    ),
+    "renewal_grace": _Key(
+        "2w",
+        "3650d",
+        f"'renewal_grace' can {_GRACE.format('longer')}2w -> 3650d)",
+        f"'renewal_grace' can {_GRACE.format('shorter')}3650d -> 2w)",
+    ),
+}
+"""Every setting of a robot; "" means that the change says nothing, as it is no access."""
+
+
+@pytest.mark.parametrize(("path", "back"), [("fleet.toml", False), ("fleet.toml", True),
+                                            ("hosts.json", False)])  # fmt: skip
+def test_what_counts_is_decided_for_every_key_of_a_robot(
+    change: Change, path: str, back: bool
+) -> None:
+    """A new key has to be decided, too; `test_keys_go_to_no_other_robot_unseen` has other keys."""
+    assert _FLEET_KEYS.keys() == set(Robot._fields) - {"name"}
+    keys = {field.name for field in fields(Fleet) if field.compare}
+    assert keys == {"robots", "groups", "enclaves", "routers"}
+    policy = policy_text({"/{robot}/a": publish("x"), "/{robot:g}/lift": publish("/lift")})
+    policy = policy.replace('ns="/" node="a"', 'ns="{namespace}" node="a"')
+
+    def text(value: Callable[[_Key], Any]) -> str:
+        robots = []
+        for key, row in _FLEET_KEYS.items():
+            usual = Robot(key, f"/{key}", address=key)
+            if key == "crossing":
+                usual = usual._replace(router="h:7447")
+            robots.append(usual._replace(**{key: value(row)}))
+        fleet = Fleet.of(robots, ["g"])
+        return render_fleet(fleet) if path.endswith("toml") else json.dumps(inventory(fleet))
+
+    sides = [text(lambda row: row.first), text(lambda row: row.second)]
+    before, after = sides[::-1] if back else sides
+    change.base = change.commit({"robots.xml": policy, path: before})
+    change.commit({path: after})
+    ended = change.review("--policy", "robots.xml", "--fleet", path, "--json")
+    steps = [step for step in json.loads(ended.out)["steps"] if step["step"] == "new-access"]
+    for key, row in _FLEET_KEYS.items():
+        said = row.lost if back else row.gained
+        lines = [text for step in steps for text in step["lines"]]
+        about = [text for text in lines if f"/{key}/" in text or text.startswith(f"'{key}'")]
+        assert any(said in text for text in about) if said else not about, (key, about)
 
 
 @pytest.mark.parametrize("case", some(["rights", "ca", "governance", "default"], 1))
@@ -1005,7 +1131,8 @@ def test_the_access_of_a_keystore_is_compared(
 ) -> None:
     public = change.folder / "ks"
     copy_of(made_keystores / "before", public)
-    change.base = change.commit({})
+    robots = 'enclaves = ["/{robot}"]\n[robots.r1]\n'
+    change.base = change.commit({"ks/fleet.toml": robots})
     words = ("--policy", "robot.xml", "--keystore", "ks", "--requirements", "robot.toml")
     change.commit({"README": "x"})
     same = change.review(*words)
@@ -1013,10 +1140,11 @@ def test_the_access_of_a_keystore_is_compared(
     assert "new-access ks: nobody gets more access" in same.out, same
     shutil.rmtree(public)
     copy_of(made_keystores / case, public)
-    change.commit({})
+    change.commit({"ks/fleet.toml": f'{robots}renewal = "allowed"\n'})
     ended = change.review(*words)
     assert ended.status > 0
-    (line,) = (each for each in ended.out.splitlines() if "] new-access ks" in each)
+    assert "[FAILED] new-access ks/fleet.toml: 'r1' may now request renewal" in ended.out
+    (line,) = (each for each in ended.out.splitlines() if "] new-access ks:" in each)
     assert "nobody gets more" not in line
     assert ("requirements ks: 1 error" in ended.out) == (case == "rights")
     assert ("error: " in ended.out and "  + /" in ended.out) or case != "rights", ended
@@ -1403,11 +1531,13 @@ def test_private_keys_in_a_commit_are_named(change: Change, made_keystores: Path
         {
             "mention.py": f'KEY = "{begin}\\n"\n',
             "own.toml": '[protection]\nrtps = "NONE"\n',
+            "robots.toml": "[robots.r1]\n",
             "pyproject.toml": "[project]\n",
         }
     )
     passed = change.review(*words).ok().out.splitlines()[-2]
     assert "private keys of keystores are not reviewed; 'own.toml' changes and" in passed
+    assert "'robots.toml' changes and is not reviewed" in passed
     assert "pyproject" not in passed
     keys = ("ks/enclaves/a/key.pem", "ks/private/permissions_ca.key.pem", "old/ca.key")
     texts = (f"{begin}\nMHcCAQEE\n", f"{begin}\r\nMHcCAQEE\r\n", rf'{{"key": "{begin}\nMHcC"}}')

@@ -25,6 +25,7 @@ from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import Governance
 from sros_tool.errors import KeystoreError, Note, SrosError
+from sros_tool.fleet.changes import renewal_notes
 from sros_tool.fleet.robots import Fleet, enclaves_of, similar_names_notes
 from sros_tool.keystore.fleet import (
     checked_fleet,
@@ -298,6 +299,7 @@ class KeystoreChange:
         self.fleet = fleet
         self.entries += entries
         self.notes += (*_short_lived_notes(fleet, self.template), *similar_names_notes(fleet))
+        self.notes += renewal_notes(before, fleet)
         if self.template.zenoh:
             self.set_network(self.with_routers_of_robots(self.template.zenoh, before))
         elif any(robot.router for robot in fleet.robots.values()):
