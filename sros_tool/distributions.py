@@ -74,6 +74,12 @@ class Distribution(NamedTuple):
         return self.given_name.capitalize()
 
     @property
+    def title_with_assumption(self) -> str:
+        """The title, with the distribution that decides in place of an unsupported one."""
+        like = self.stands_for and f", which is assumed to be like {self.name.capitalize()}"
+        return self.title + like
+
+    @property
     def shipped(self) -> tuple[Shipped, ...]:
         """The DDS products that the distribution ships, the default first."""
         products = (("Fast DDS", self.fast), ("Cyclone DDS", self.cyclone))
@@ -105,9 +111,7 @@ class Distribution(NamedTuple):
 
     def reason_for(self, vendor: Vendor) -> str:
         """Return why a vendor decides, such as ``as in ROS 2 Jazzy``, with the assumptions."""
-        parts = [f"as in ROS 2 {self.title}"]
-        if self.stands_for:
-            parts.append(f"which is assumed to be like {self.name.capitalize()}")
+        parts = [f"as in ROS 2 {self.title_with_assumption}"]
         parts += (
             f"whose {shipped.release} was not tested"
             for shipped in self.shipped

@@ -137,6 +137,11 @@ def audit(
     something was not judged (unless --unjudged is given), and if the graph kept changing (unless
     --unsettled is given); 2 if the audit could not be done.
     """
+    from sros_tool.distributions import (
+        ROS_DISTRO,
+        sourced_distribution,
+        unknown_distribution_notes,
+    )
     from sros_tool.explain import audit as audits
     from sros_tool.fleet.fleet_file import read_fleet
     from sros_tool.keystore.participant import JoinContext
@@ -158,8 +163,6 @@ def audit(
     if patch is not None:
         check_output(patch, force=force)
     if not (vendor or distro):
-        from sros_tool.distributions import unknown_distribution_notes
-
         print_notes(unknown_distribution_notes(os.environ))
     variables = {**os.environ, **environment}
     enclaves = audits.audited_enclaves(
@@ -217,7 +220,10 @@ def audit(
         )
     ended = audits.notes_on_ended_nodes(snapshot.gone, snapshot.everything)
     by_vendor = (audits.BY_VENDOR_ON_ZENOH,) if on_zenoh and not (enclaves.zenoh or unknown) else ()
-    audited = replace(audited, notes=(*audited.notes, *ended, *by_vendor))
+    decides = distro or (None if vendor else sourced_distribution(variables.get(ROS_DISTRO)))
+    assumption = decides.assumption if decides and not enclaves.zenoh else ""
+    assumed = (Note("audit.assumed-distribution", assumption),) if assumption else ()
+    audited = replace(audited, notes=(*audited.notes, *ended, *by_vendor, *assumed))
     existed = patch is not None and patch.exists()
     written = _write_patch(audited, patch, dry_run=dry_run)
     if as_json:

@@ -382,9 +382,10 @@ def check(
         assumed = load_template(template)
         findings = [finding for finding in findings if not is_mended_by(assumed, finding)]
     chosen = selection.choose(map(_with_relative_paths, findings))
+    scope = _scope(vendors if vendor else (), distro, all_distros=all_distros)
+    if scope and (form == "text" or (distro and distro.assumption)):
+        echo(f"checked for {scope}", err=True)
     if form == "text":
-        if scope := _scope(vendors if vendor else (), distro, all_distros=all_distros):
-            echo(f"checked for {scope}", err=True)
         _print_text(chosen, _fleet_of(at, paths))
     elif form == "markdown":
         _print_markdown(chosen, _fleet_of(at, paths))
@@ -630,7 +631,7 @@ def _scope(vendors: Iterable[str], distro: Distribution | None, *, all_distros: 
     distributions = SUPPORTED if all_distros else (distro,) if distro else ()
     titles = ["Zenoh" if vendor == ZENOH else Vendor(vendor).title for vendor in vendors]
     if distributions:
-        titles.append(f"ROS 2 {enumerated([each.title for each in distributions])}")
+        titles.append(f"ROS 2 {enumerated([each.title_with_assumption for each in distributions])}")
     return ", ".join(titles)
 
 

@@ -161,6 +161,10 @@ def test_parts_of_one_action_are_one_finding(tmp_path: Path) -> None:
         (("--all-distros",), "checked for ROS 2 Humble, Jazzy, Kilted and Lyrical\n"),
         (("--distro", "humble"), "checked for ROS 2 Humble\n"),
         (
+            ("--distro", "iron"),
+            "checked for ROS 2 Iron, which is assumed to be like Jazzy\n",
+        ),
+        (
             ("--distro", "humble", "--vendor", "fastdds"),
             "checked for Fast DDS 2.6, ROS 2 Humble\n",
         ),

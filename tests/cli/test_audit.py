@@ -220,6 +220,23 @@ def test_the_vendor_of_the_robot_decides(program: Program) -> None:
     assert "on Cyclone DDS" in ended.err
 
 
+@pytest.mark.parametrize(
+    ("words", "sourced", "assumed"),
+    [
+        (("--distro", "iron"), "", True),
+        ((), "rolling", True),
+        (("--vendor", "fastdds"), "rolling", False),
+        (("--distro", "jazzy"), "rolling", False),
+    ],
+)
+def test_an_audit_says_that_the_rules_of_a_distribution_are_assumed(
+    words: tuple[str, ...], sourced: str, assumed: bool, program: Program
+) -> None:
+    ended = program(graph(FINE), "robot.xml", *SHORT, *words, ROS_DISTRO=sourced)
+    note = "note [audit.assumed-distribution]: ROS 2"
+    assert (f"\n{note}" in ended.err and "decided as in" in ended.err) is assumed, ended.err
+
+
 EVIL = ("/", "/", "_ros2cli_12", "02", ["publish rt/cmd_evil", "subscribe rt/chatter"])
 
 
