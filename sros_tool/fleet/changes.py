@@ -71,8 +71,8 @@ def _renewal_changes(before: Fleet | None, after: Fleet) -> Iterator[FleetChange
             yield FleetChange(name, text, is_allowed)
         if _grace(old) != _grace(new):
             longer = _grace(new) > _grace(old)
-            text = f"can request renewal for a {'longer' if longer else 'shorter'} time after its "
-            text += f"certificate expired (renewal_grace: {old.renewal_grace or 'none'} -> "
+            text = f"can request renewal for a {'longer' if longer else 'shorter'} time after "
+            text += f"the expiry of a certificate (renewal_grace: {old.renewal_grace or 'none'} -> "
             yield FleetChange(name, f"{text}{new.renewal_grace or 'none'})", longer)
 
 

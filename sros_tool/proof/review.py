@@ -159,6 +159,8 @@ _SETTINGS_TABLE = re.compile(
 )
 """A table of a keystore template, of requirements or of a fleet file."""
 _LARGEST_SETTINGS = 1024 * 1024
+_VARIABLE_FOLDERS = frozenset({"group_vars", "host_vars"})
+"""Folders next to an inventory from which only Ansible reads variables."""
 _PRIVATE_KEY_FOUND = (
     "has a private key, which everybody who can read the repository has now: replace it, because "
     "the history of the repository keeps it"
@@ -960,9 +962,18 @@ class _Review:
         return sorted(folder or "." for folder in folders if folder is not None)
 
     def _changed_settings(self) -> list[str]:
-        """Return changed TOML files that are not read and have a `_SETTINGS_TABLE`."""
+        """Return changed files with settings that are not read.
+
+        These are variables of an inventory, and TOML files that have a `_SETTINGS_TABLE`.
+        """
         with suppress(SrosError):  # the step on changed files reports the error
-            changed = self._changed_files(self.head, self.base) if self.base else ()
+            changed = [*self._changed_files(self.head, self.base)] if self.base else []
+            earlier = [*self._changed_files(self.base, self.head)] if self.base else []
+            variables = {
+                path
+                for path, _ in (*changed, *earlier)
+                if self.request.fleet and not _VARIABLE_FOLDERS.isdisjoint(Path(path).parts)
+            }
             files = {
                 path: entry.id
                 for path, entry in changed
@@ -970,7 +981,7 @@ class _Review:
             }
             contents = self._contents(files.values(), _LARGEST_SETTINGS)
             settings = {digits for digits, content in contents if _SETTINGS_TABLE.search(content)}
-            return sorted(path for path, digits in files.items() if digits in settings)
+            return sorted(variables | {path for path in files if files[path] in settings})
         return []
 
     # ── policies ───────────────────────────────────────────────────────────────────────────

@@ -839,12 +839,15 @@ def test_a_fleet_counts_as_each_commit_has_it(change: Change) -> None:
     fleet = 'enclaves = ["/{robot}"]\n[robots.r1]\n'
     policy = policy_text({"/{robot}": publish("/{robot}/x")})
     change.base = change.commit({"fleet.xml": policy, "fleet.toml": fleet})
-    change.commit({"README": "x"})
+    change.commit({"group_vars/all.yml": "x: 1"})
     words = ("--policy", "fleet.xml", "--fleet", "fleet.toml")
-    assert change.review(*words).status == 0
-    change.commit({"fleet.toml": f"{fleet}[robots.r2]\n"})
+    passed = change.review(*words).ok().out
+    assert "'group_vars/all.yml' changes and is not reviewed" in passed
+    change.base = change.git("rev-parse", "HEAD")
+    change.commit({"fleet.toml": f"{fleet}[robots.r2]\n", "group_vars/all.yml": None})
     ended = change.review(*words)
     assert ended.status == 1, ended
+    assert "'group_vars/all.yml' changes and is not reviewed" in ended.out
     assert "new-access fleet.xml: " in ended.out
     change.base = change.commit({"fleet.toml": f'{fleet}address = "10.0.0.1"\n'})
     change.commit({"fleet.toml": f'{fleet}address = "10.6.6.6"\n'})
@@ -1054,7 +1057,7 @@ class _Key(NamedTuple):
     lost: str
 
 
-_GRACE = "request renewal for a {} time after its certificate expired (renewal_grace: "
+_GRACE = "request renewal for a {} time after the expiry of a certificate (renewal_grace: "
 _FLEET_KEYS = {
     "namespace": _Key(
         "/n1",
