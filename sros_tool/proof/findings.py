@@ -35,7 +35,7 @@ from sros_tool.names import (
     service_of,
 )
 from sros_tool.policy.model import ALLOW, DENY, Level, Source
-from sros_tool.policy.patterns import covers
+from sros_tool.policy.patterns import covers, matches
 from sros_tool.policy.remapping import Remapping, has_new_name, remapped_name
 from sros_tool.policy.rights import KIND_OF, Right
 from sros_tool.proof.decide import (
@@ -608,6 +608,15 @@ def _edit_text(violation: Violation) -> str:
     if requirement.robot or any(name.startswith(EXCEPT) for name in listed):
         return ""
     space = requirement.namespace.rstrip("/")
+    moved = [name for name in enclaves if space and name.startswith(f"{space}/")]
+    for own in (name.removeprefix(space) for name in moved):
+        if any(matches(name, own) for name in listed):
+            return (
+                f"Change the policy at the named lines. To keep {own} out of {space}, as the "
+                f"requirement says, merge its policy with `--enclave {own}`."
+            )
+    if moved:
+        effect += f"; there, a name with one / at its beginning is below {space}"
     outside = sorted(name for name in enclaves if not name.startswith(f"{space}/"))
     if outside:
         effect += "; if a package ships the file, write this only into a copy"

@@ -398,6 +398,9 @@ def review(request: ReviewRequest, folder: Path) -> Review:
     )
 
 
+_ONLY_THE_CHANGE = "whether the change breaks them"
+
+
 @dataclass(slots=True)
 class _Review:
     request: ReviewRequest
@@ -411,7 +414,7 @@ class _Review:
     """Whether a requirement has a name that moves with the namespace."""
     namespaces_to_add: set[str] = field(default_factory=set)
     """Namespaces in which the policies or keystores have names of the requirements."""
-    decided_elsewhere: str = "whether the change breaks them"
+    decided_elsewhere: str = _ONLY_THE_CHANGE
     """What the review decided about requirements in other namespaces; "" for nothing."""
 
     def _allows(self, kind: str) -> bool:
@@ -907,14 +910,8 @@ class _Review:
             yield "policies: none is named"
         if not asked.requirements:
             yield "requirements: none are named"
-        others = ""
-        if self.decided_elsewhere:
-            others = f": sros only decided {self.decided_elsewhere}"
         if self.is_relative and not asked.namespaces:
-            options = [f"--namespace {quote(name)}" for name in sorted(self.namespaces_to_add)]
-            add = f" (add {' '.join(options[:MOST_NAMESPACES])})" if options else ""
-            relative = "requirements with relative names in namespaces other than /"
-            yield f"{relative}{add}{others}"
+            yield from self._undecided_in_namespaces()
         if not self.base:
             yield "nothing is compared with an earlier commit, as the options say"
         if asked.allow_new_access:
@@ -932,7 +929,8 @@ class _Review:
                 yield f"'{path}' is a keystore and is not reviewed"
         except SrosError as error:
             yield f"keystores that did not change were not looked for: {error.what}"
-        if self._is_template_changed():
+        own_template = asked.template and asked.template not in template_names()
+        if own_template and self.base and self._is_changed(asked.template):
             yield f"'{asked.template}' changes, and the access that it gives is not compared"
         for path in self._changed_settings():
             yield f"'{path}' changes and is not reviewed"
@@ -954,6 +952,19 @@ class _Review:
         elif differing := self.head.differing_files(top):
             files = first_few([f"'{path}'" for path in differing], 3)
             yield f"the checkout differs from the reviewed commit: {files}"
+
+    def _undecided_in_namespaces(self) -> Iterator[str]:
+        """Yield a clause if requirements may fail in a namespace, though no change breaks them."""
+        options = [f"--namespace {quote(name)}" for name in sorted(self.namespaces_to_add)]
+        if (
+            not options
+            and self.decided_elsewhere == _ONLY_THE_CHANGE
+            and not any(map(self._is_changed, self.request.requirements))
+        ):
+            return
+        add = f" (add {' '.join(options[:MOST_NAMESPACES])})" if options else ""
+        decided = self.decided_elsewhere and f": sros only decided {self.decided_elsewhere}"
+        yield f"requirements with relative names in namespaces other than /{add}{decided}"
 
     def _unreviewed_keystores(self, entries: Iterable[tuple[str, TreeEntry]]) -> list[str]:
         """Return keystores and exports with ``entries`` that are neither reviewed nor left out."""
@@ -1276,12 +1287,10 @@ class _Review:
             return read_template(file)
         raise self._missing_file_error(choice)
 
-    def _is_template_changed(self) -> bool:
-        choice = self.request.template
-        if not (choice and self.base) or choice in template_names():
-            return False
+    def _is_changed(self, path: str) -> bool:
+        """Return whether a file of HEAD differs from BASE, or may differ."""
         try:
-            return self.base.entry(choice) != self.head.entry(choice)
+            return not self.base or self.base.entry(path) != self.head.entry(path)
         except DocumentError:  # a link is on the path, perhaps only in BASE
             return True
 

@@ -522,6 +522,18 @@ def test_requirements_of_a_package_in_two_namespaces(tmp_path: Path) -> None:
         'add "//mission" to `enclaves` of the requirement at r.toml:1; if a package ships the '
         "file, write this only into a copy." in ended.out
     )
+    (tmp_path / "p.xml").write_text(policy_text(rights | {"/left/ui": publish("/left/cmd")}))
+    ended = sros(*asked, "--namespace", "/left", cwd=tmp_path)
+    assert (
+        'add "/ui" to `enclaves` of the requirement at r.toml:1; there, a name with one / at its '
+        "beginning is below /left." in ended.out
+    )
+    (tmp_path / "ui.toml").write_text('[[only]]\npublish = ["cmd"]\nenclaves = ["/mux", "//ui*"]\n')
+    ended = sros(*asked[:-1], "ui.toml", "--namespace", "/left", cwd=tmp_path)
+    said = (
+        "To keep /ui out of /left, as the requirement says, merge its policy with `--enclave /ui`."
+    )
+    assert said in ended.out and "to allow this" not in ended.out
     (tmp_path / "less.toml").write_text('[[must]]\npublish = ["cmd"]\nenclave = "/mux"\n')
     less = ("check", "p.xml", *ONLY[2:], "--requirements", "less.toml")
     both = ("--requirements-before", "r.toml", "--namespace", "/left", "--namespace", "/right")

@@ -1761,10 +1761,12 @@ def test_requirements_of_a_package_are_decided_in_a_namespace(
     change.commit({"other": "3"})
     hint = "(add --namespace /l --namespace /r)"
     assert hint in change.review(*asked).out
-    change.commit({"robot.toml": only})
     # No namespace fits the policy of a package, so that there is no option to add.
-    change.base = change.commit({"robot.xml": policy_text({"/a": publish("x", "/m/y")})})
+    package = {"robot.xml": policy_text({"/a": publish("x", "/m/y")}), "robot.toml": only}
+    change.base = change.commit(package)
     change.commit({"other": "2"})
+    assert "in namespaces" not in change.review(*asked).ok().out
+    change.commit({"robot.toml": f"# Why.\n{only}"})
     ended = change.review(*asked).ok()
     assert "namespaces other than /: sros only decided" in ended.out, ended
     moved = sros(
