@@ -318,10 +318,11 @@ def _process_line(process: ClosedProcess, closed: CloseState, policy: Policy) ->
 
     restart = "by hand, with its launch file" if process.launch else "by hand"
     restart = "by hand, with Docker Compose" if process.container else restart
-    if units := starting_units([process]):
+    if units := [process.unit] if process.unit else starting_units([process]):
         restart += f", in {enumerated(units)}"
-    does = "adds a drop-in to" if process.is_idle else "restarts"
-    restart = f"--apply {does} {process.unit}" if process.unit else restart
+    if not process.is_by_hand:
+        is_changed = process.is_idle and not process.secured_by_unit
+        restart = f"--apply {'adds a drop-in to' if is_changed else 'restarts'} {process.unit}"
     runs = process.enclave in closed.secured
     if closed.secured.get(process.enclave):
         restart = "closed"
@@ -436,8 +437,9 @@ def _show_end(
         answer = f"the robot is not proved closed; next: {accept}{next_command}"
     elif apply:
         for command, processes in closed.pending_by_hand.items():
-            stop = _shared_start_text(processes)
-            echo(f"stop {stop}, and start again with:" if stop else "start again with:")
+            start = "restart the unit" if processes[0].unit else "start again"
+            stop = "" if processes[0].unit else _shared_start_text(processes)
+            echo(f"stop {stop}, and {start} with:" if stop else f"{start} with:")
             echo(f"  {command}")
             if advice := processes[0].launch_advice(robot.folder.absolute()):
                 echo(f"  {advice}")
@@ -461,8 +463,10 @@ def _show_end(
         if not closed.pending:
             following = ask
         elif units := {
-            process.unit for process in observed.processes if process.enclave in closed.pending
-        } - {""}:
+            process.unit
+            for process in observed.processes
+            if process.enclave in closed.pending and not process.is_by_hand
+        }:
             following = f"sros close {folder} --apply"
             if why := only_root_clause(units):
                 following = f"{robot.as_root('--apply')}, because {why}"

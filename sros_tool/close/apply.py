@@ -14,15 +14,16 @@ from pathlib import Path
 
 from sros_tool.checks.processes import ROOT_IS_NOT_ENOUGH
 from sros_tool.close.nodes import ObservedNodes
-from sros_tool.close.processes import ClosedProcess, ObservedProcesses, process_text
-from sros_tool.close.proof import proofs_of
-from sros_tool.close.robot import LocalRobot
-from sros_tool.close.start_files import (
+from sros_tool.close.processes import (
     DROP_IN,
     SYSTEMD_FOLDER,
-    check_may_restart,
-    drop_in_heading,
+    ClosedProcess,
+    ObservedProcesses,
+    process_text,
 )
+from sros_tool.close.proof import proofs_of
+from sros_tool.close.robot import LocalRobot
+from sros_tool.close.start_files import check_may_restart, drop_in_heading
 from sros_tool.close.state import (
     CloseState,
     Proof,
@@ -40,7 +41,7 @@ from sros_tool.runtime.environment import node_argument
 from sros_tool.runtime.logind import users_without_linger
 from sros_tool.runtime.processes import Process, process_origin, program_of, user_text
 from sros_tool.runtime.unit_properties import unit_properties
-from sros_tool.runtime.units import unit_changes, write_units
+from sros_tool.runtime.units import TEMPLATE, unit_changes, write_units
 from sros_tool.values import FileChange
 from sros_tool.wording import enumerated
 from sros_tool.xml import read_bytes
@@ -57,7 +58,7 @@ _STABLE_FOR = timedelta(seconds=2)
 
 
 def apply(robot: LocalRobot, prepared: CloseState, *, dry_run: bool) -> CloseState:
-    """Restart, with drop-ins, the units that do not run in their enclaves; return the new state.
+    """Restart the units that do not run closed, and add drop-ins; return the new state.
 
     Proves that the robot is closed, if nothing is left to do by hand.
     """
@@ -130,7 +131,7 @@ def _write_drop_ins(
     Raises:
         SrosError: a unit has the drop-in of another folder, or a file cannot be used.
     """
-    paths = [f"{unit}.d/{DROP_IN}" for unit in sorted(observed.units)]
+    paths = [f"{unit}.d/{DROP_IN}" for unit in sorted(observed.units_with_drop_in)]
     files = {path: read_bytes(robot.start / "units" / path, "unit").decode() for path in paths}
     _drop_ins_of(robot, observed)
     if names := users_without_linger(
@@ -156,11 +157,15 @@ def _remember_new_units(robot: LocalRobot, observed: ObservedProcesses) -> None:
 
     Without a drop-in, nothing else shows --undo that such a unit belongs to the robot.
     """
-    units = {process.enclave: process.unit for process in observed.processes if process.unit}
+    now = {process.enclave: process for process in observed.processes if process.unit}
     before = robot.processes.processes
     known = {process.enclave for process in before}
     processes = [
-        *(each._replace(unit=units.get(each.enclave, each.unit)) for each in before),
+        *(
+            each._replace(unit=found.unit, secured_by_unit=found.secured_by_unit)
+            for each in before
+            for found in [now.get(each.enclave, each)]
+        ),
         *(each for each in observed.processes if each.unit and each.enclave not in known),
     ]
     if processes != [*before]:
@@ -183,13 +188,17 @@ def undo(robot: LocalRobot, *, dry_run: bool) -> CloseState:
             remove_file(path)
         robot.shell.say(f"{'would remove' if dry_run else 'removed'} {path}")
     # A unit without a drop-in still runs closed if an earlier --undo was killed before the restart.
-    units |= {process.unit for process in observed.processes if not running.is_open(process)} - {""}
+    units |= {
+        process.unit
+        for process in observed.processes
+        if process.unit and not (process.secured_by_unit or running.is_open(process))
+    }
     policy = _readable_policy(robot)
     expected = observed.limited_to(policy) if policy else observed
     not_running = _states_of_stopped_units(units)
     units -= not_running.keys()
     changed = bool(drop_ins or not_running)  # an earlier --undo may have been killed
-    given_up = observed.units - expected.units
+    given_up = observed.units_with_drop_in - expected.units_with_drop_in
     replaced = {
         process.unit
         for process in observed.processes
@@ -280,23 +289,40 @@ class _RemainingProcesses:
             for process, enclave in by_user
             if (enclave.name, process.program[0]) not in further
         }
-        by_hand = observed.commands_by_hand(self._robot.folder)
+        processes = [
+            process._replace(unit="") if process.secured_by_unit else process
+            for process in observed.processes
+        ]
+        by_hand = observed._replace(processes=processes).commands_by_hand(self._robot.folder)
         self._started_by_hand = [*chain.from_iterable(by_hand.values())]
+        units = {process.enclave: process.unit for process in observed.processes}
+        candidates = {
+            process.enclave: units[process.enclave]
+            for process in self._started_by_hand
+            if process.secured_by_unit
+            and process.enclave not in self._secured
+            and not running.runs_open(process)
+        }
+        stopped = _states_of_stopped_units(candidates.values())
+        # systemd starts their processes again in a moment, in their enclaves.
+        self._waiting = {name: unit for name, unit in candidates.items() if unit not in stopped}
 
     def commands_to_open(self) -> Iterator[str]:
-        """Yield commands that restart secured processes open; none for processes of units."""
-        closed = [process for process in self._started_by_hand if process.enclave in self._secured]
+        """Yield commands that restart secured processes open; none for units with a drop-in."""
+        may_be_closed = {*self._secured, *self._waiting}
+        closed = [process for process in self._started_by_hand if process.enclave in may_be_closed]
         counts = Counter(process.enclave for process in closed)
         started_by: dict[str, dict[str, None]] = {}
         for process in closed:
-            secured, name = self._secured[process.enclave], process.enclave
+            name, secured = process.enclave, self._secured.get(process.enclave)
+            unit = process_origin(secured.program[0]).unit_text if secured else self._waiting[name]
             is_alone = counts[process.enclave] == 1 and not process.launch
-            if is_alone and not process.container and self._running.may_use_files(secured):
+            is_alone = is_alone and not process.container
+            if secured and is_alone and self._running.may_use_files(secured):
                 process = secured_process(secured, process.enclave)
                 name = f"process {secured.pid}"
             command = process.open_command(self._robot.domain)
-            if unit := process_origin(secured.program[0]).unit_text:
-                command += f" ({unit} starts it: remove `sros run` there, and restart the unit)"
+            command = _with_unit_to_change(command, unit) if unit else command
             started_by.setdefault(command, {})[name] = None
         for command, names in started_by.items():
             yield f"restart {enumerated([*names])} open: {command}"
@@ -304,7 +330,8 @@ class _RemainingProcesses:
     def secured_processes_of_units(self) -> Iterator[str]:
         """Yield a text for each process that still runs secured after a restart of its unit."""
         for process in self._observed.processes:
-            if process.unit and process.enclave in self._secured:
+            by_drop_in = process.unit and not process.secured_by_unit
+            if by_drop_in and process.enclave in self._secured:
                 yield (
                     f"{self._secured[process.enclave].label} still runs in {process.enclave}: stop "
                     f"it if {process.unit} did not start it; otherwise remove `sros run`, or the "
@@ -321,7 +348,8 @@ class _RemainingProcesses:
             if not any(other.fits(process) for other in known.processes)
         ]
         for process in self._started_by_hand:
-            if process.enclave in self._secured or running.runs_open(process):
+            is_known = process.enclave in {*self._secured, *self._waiting}
+            if is_known or running.runs_open(process):
                 continue
             names, old_name = nodes.names_in(process.enclave)
             named = node_argument(process.command)
@@ -391,6 +419,20 @@ class _RemainingProcesses:
             self._robot.shell.say(f"{why}{remedy}")
 
 
+def _with_unit_to_change(command: str, unit: str) -> str:
+    """Return the open command of a process, and what to do with its unit, which starts it closed.
+
+    In a unit of `sros units`, there is no part that can be removed.
+    """
+    if unit.startswith(TEMPLATE.removesuffix(".service")):
+        disable = f"systemctl disable --now {shlex.quote(unit)}"
+        return f"first `{disable}`, because this unit starts it closed; then {command}"
+    return (
+        f"{command} ({unit} starts it: instead, remove `sros run`, or the variables of the "
+        "enclave, from the unit or its script, and restart the unit)"
+    )
+
+
 def _may_be_process(process: Process, observed: ClosedProcess, nodes: Collection[str]) -> bool:
     """Return whether a process may be the ``observed`` process, started by another command.
 
@@ -408,7 +450,7 @@ def _drop_ins_of(robot: LocalRobot, observed: ObservedProcesses) -> list[Path]:
         for path in sorted(SYSTEMD_FOLDER.glob(f"*.d/{DROP_IN}"))
         if read_bytes(path, "unit").startswith(drop_in_heading(robot).encode())
     ]
-    for unit in sorted(observed.units):
+    for unit in sorted(observed.units_with_drop_in):
         path = SYSTEMD_FOLDER / f"{unit}.d/{DROP_IN}"
         if path not in drop_ins and os.path.lexists(path):
             raise SrosError(

@@ -8,9 +8,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
-from sros_tool.close.processes import ObservedProcesses
+from sros_tool.close.processes import DROP_IN, ObservedProcesses
 from sros_tool.close.robot import LocalRobot
-from sros_tool.close.start_files import DROP_IN
 from sros_tool.close.state import RunningRobot
 from sros_tool.errors import SrosError
 from sros_tool.runtime.processes import Process, process_origin

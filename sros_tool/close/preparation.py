@@ -191,10 +191,11 @@ def _write_later_processes(robot: LocalRobot) -> None:
     before = _with_renamed_enclaves(robot, robot.observed._replace(not_here=not_here))
     now = RunningRobot(robot).with_later_processes(before)
     for old, new in zip(before.processes, now.processes, strict=False):
-        if new != old:
+        now_by, before_by = new.open_command(robot.domain), old.open_command(robot.domain)
+        if now_by != before_by:
             robot.shell.say(
                 f"{new.enclave} was started by another command than before; sros remembers the new "
-                f"one: {new.open_command(robot.domain)}; before: {old.open_command(robot.domain)}"
+                f"one: {now_by}; before: {before_by}"
             )
     if now != robot.observed:
         robot.write_processes(now)

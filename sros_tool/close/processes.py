@@ -43,6 +43,8 @@ from sros_tool.xml import read_bytes
 ROUTER = "/router"
 """The enclave of a Zenoh router."""
 COMPOSE_FILE = "compose.yaml"
+DROP_IN = "sros-close.conf"
+SYSTEMD_FOLDER = Path("/etc/systemd/system")
 
 
 class ClosedProcess(NamedTuple):
@@ -100,6 +102,10 @@ class ClosedProcess(NamedTuple):
     """Whether the process does not run now, although its systemd unit started it when sros
     watched.
     """
+    secured_by_unit: bool = False
+    """Whether the unit itself starts the process in its enclave, as the units of `sros units` do.
+    Such a unit gets no drop-in.
+    """
 
     @classmethod
     def from_process(
@@ -122,6 +128,16 @@ class ClosedProcess(NamedTuple):
     def is_demo(self) -> bool:
         """Whether `sros demo` starts the process; its nodes name their enclaves themselves."""
         return tuple(self.command[:2]) == ("sros", "demo")
+
+    @property
+    def is_by_hand(self) -> bool:
+        """Whether the user restarts the process, not --apply.
+
+        A unit that needs no drop-in can be restarted without sros. So somebody who is not root need
+        not close the robot as root because of it.
+        """
+        may_restart = not self.secured_by_unit or os.access(SYSTEMD_FOLDER, os.W_OK)
+        return not (self.unit and may_restart)
 
     @property
     def is_launch(self) -> bool:
@@ -184,6 +200,8 @@ class ClosedProcess(NamedTuple):
         ]
         is_same = self.pid in pids and self.still_runs
         may_run = self._may_run_unseen(running)
+        if self.secured_by_unit and pids and not in_enclave:
+            return self._replace(secured_by_unit=False).with_current_pid(running, domain, export)
         if is_same or (may_run and not pids and not in_enclave):
             return self._replace(alike=(), absent=False)
         origins = {pid: process_origin(pid) for pid in pids}
@@ -360,8 +378,13 @@ class ObservedProcesses(NamedTuple):
 
     @property
     def units(self) -> set[str]:
-        """The systemd units that each start a single process."""
-        return {process.unit for process in self.processes} - {""}
+        """The systemd units that each start a single process, and that --apply restarts."""
+        return {process.unit for process in self.processes if not process.is_by_hand}
+
+    @property
+    def units_with_drop_in(self) -> set[str]:
+        """The units that start their processes in the enclaves by a drop-in of sros."""
+        return {process.unit for process in self.processes if not process.secured_by_unit} - {""}
 
     def with_current_pids(self, running: RunningProcesses, export: Path) -> ObservedProcesses:
         """Return a copy with the current ids and the current unknown processes."""
@@ -450,7 +473,7 @@ class ObservedProcesses(NamedTuple):
         )[1]
 
     def commands_by_hand(self, folder: Path) -> Mapping[str, Sequence[ClosedProcess]]:
-        """Map shell commands to the processes that they start, without those with their own unit.
+        """Map shell commands to the processes that they start, without those of `units`.
 
         A Zenoh router comes first: nodes wait for it.
         """
@@ -461,7 +484,10 @@ class ObservedProcesses(NamedTuple):
         }
         commands: dict[str, list[ClosedProcess]] = {}
         for process in sorted(self.processes, key=lambda process: process.enclave != ROUTER):
-            if not process.unit:
+            if process.is_by_hand and process.unit:
+                command = f"sudo systemctl restart {shlex.quote(process.unit)}"
+                commands[command] = [process]
+            elif process.is_by_hand:
                 started = process._replace(enclave=self.start_enclave(process))
                 command = started.secured_command(folder, launches.get(tuple(process.launch), ""))
                 commands.setdefault(command, []).append(process)

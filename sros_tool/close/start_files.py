@@ -8,7 +8,14 @@ import shutil
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
-from sros_tool.close.processes import COMPOSE_FILE, ClosedProcess, ObservedProcesses, launch_words
+from sros_tool.close.processes import (
+    COMPOSE_FILE,
+    DROP_IN,
+    SYSTEMD_FOLDER,
+    ClosedProcess,
+    ObservedProcesses,
+    launch_words,
+)
 from sros_tool.close.robot import LocalRobot
 from sros_tool.close.state import CloseState, unit_advice
 from sros_tool.errors import UnavailableError
@@ -28,9 +35,6 @@ from sros_tool.terminal import visible
 from sros_tool.values import FileChange
 from sros_tool.wording import enumerated
 from sros_tool.xml import read_bytes
-
-DROP_IN = "sros-close.conf"
-SYSTEMD_FOLDER = Path("/etc/systemd/system")
 
 
 def only_root_clause(units: Collection[str]) -> str:
@@ -58,7 +62,7 @@ def write_start_files(robot: LocalRobot, state: CloseState) -> list[FileChange]:
         for enclave, variables in environments.items()
     }
     for process in observed.processes:
-        if process.unit:
+        if process.unit and not process.secured_by_unit:
             variables = environments[observed.start_enclave(process)]
             files[f"units/{process.unit}.d/{DROP_IN}"] = _drop_in_text(robot, process, variables)
     files[robot.commands_file.name] = _commands_text(robot, state)

@@ -19,7 +19,9 @@ from sros_tool.checks.processes import (
 from sros_tool.close.acceptance import Acceptance, Acceptances
 from sros_tool.close.assignment import with_command_of_unit
 from sros_tool.close.processes import (
+    DROP_IN,
     ROUTER,
+    SYSTEMD_FOLDER,
     ClosedProcess,
     ObservedProcesses,
     command_without_enclave,
@@ -283,7 +285,7 @@ class RunningRobot:
         ]
 
     def with_later_processes(self, observed: ObservedProcesses) -> ObservedProcesses:
-        """Return the observed processes with their present commands, and processes of new enclaves.
+        """Return the observed processes with their present commands and units, and new processes.
 
         Only processes of users who can read the enclaves count, because sros proposes to run their
         commands.
@@ -294,19 +296,46 @@ class RunningRobot:
             if self.may_use_files(process):
                 running.setdefault(enclave.name, []).append(process)
         as_started = [
-            _with_running_command(process, running.get(process.enclave, ()))
+            self._with_own_unit(_with_running_command(process, processes), processes)
             if known[process.enclave] == 1
             else process
             for process in observed.processes
+            for processes in [running.get(process.enclave, ())]
         ]
         later = [
-            secured_process(process, name)
+            self._with_own_unit(secured_process(process, name)._replace(unit=""), [process])
             for name, processes in running.items()
             if name not in {OBSERVER, *observed.not_here, *known}
             for process in processes
             if not _is_tool(process)
         ]
         return observed._replace(processes=[*as_started, *later])
+
+    def _with_own_unit(self, known: ClosedProcess, running: Sequence[Process]) -> ClosedProcess:
+        """Return a process with the unit that starts only it, and in its enclave.
+
+        ``running`` are the processes in its enclave.
+        """
+        programs = {each.program[0]: each for each in running if known.fits(each)}
+        if known.launch or known.container or known.shares or len(programs) != 1:
+            return known
+        ((pid, process),) = programs.items()
+        unit, folder, launch, container, _ = process_origin(pid)
+        is_alone = self._programs_of_units[unit] == 1 and not (launch or container)
+        needs_drop_in = (SYSTEMD_FOLDER / f"{unit}.d" / DROP_IN).exists()
+        if unit == known.unit:
+            return known._replace(secured_by_unit=known.secured_by_unit and not needs_drop_in)
+        # With another strategy, a restart would not help.
+        if unit and is_alone and process.environment.get(STRATEGY) == "Enforce":
+            known = known._replace(user=process.user, folder=folder or known.folder)
+            return known._replace(unit=unit, secured_by_unit=not needs_drop_in)
+        return known._replace(unit="", secured_by_unit=False) if known.secured_by_unit else known
+
+    @cached_property
+    def _programs_of_units(self) -> Mapping[str, int]:
+        """The number of programs in the robot's domain that each unit started."""
+        programs = {process.program[0] for process in self.in_domain}
+        return Counter(process_origin(pid).unit for pid in programs)
 
     def with_new_units(
         self, observed: ObservedProcesses, new: Mapping[str, Collection[str]]
@@ -317,8 +346,6 @@ class RunningRobot:
         can read the enclaves count, and only units that start a single process. Only a name shows
         the enclave: the last process left may be any program, and may not get rights.
         """
-        programs = {process.program[0] for process in self.in_domain}
-        started = Counter(process_origin(pid).unit for pid in programs)
         claims: dict[str, list[tuple[Process, str]]] = {}
         for process in filter(self.may_use_files, self.open_processes):
             enclaves, known_by = _enclaves_of(process, new)
@@ -329,7 +356,7 @@ class RunningRobot:
             for enclave, ((process, known_by), *others) in claims.items()
             if not others
             and (known := with_command_of_unit(secured_process(process, enclave))).unit
-            and started[known.unit] == 1
+            and self._programs_of_units[known.unit] == 1
         }
         return observed._replace(
             processes=[*observed.processes, *found.values()],

@@ -216,7 +216,7 @@ def robot(beside_graph: Beside, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     # The RMWs of this machine may lack security.
     lacking = tmp_path / "lacking"
     monkeypatch.setattr(of_robot, "built_without_security", lambda *_: lacking.exists())
-    for module in (apply, start_files):
+    for module in (apply, processes, start_files, state):
         monkeypatch.setattr(module, "SYSTEMD_FOLDER", tmp_path / "systemd")
     monkeypatch.setattr(apply, "_RESTART_SECONDS", 0.1)
     monkeypatch.setattr(apply, "_STABLE_FOR", timedelta())
@@ -596,7 +596,8 @@ def test_a_robot_is_closed_proved_and_opened_again(
     processes = robot.folder / "robot/processes.json"
     processes.rename(robot.folder / "processes.json")  # as if it was broken, and removed
     assert "the robot runs closed" in robot.close("--for", "1s", status=2).err
-    assert still in robot.close("--undo", status=1).out
+    of_unit = "(talker.service starts it: instead, remove `sros run`, or the variables of the enc"
+    assert of_unit in robot.close("--undo", status=1).out
     robot.by_hand = set()
     assert "\nthe robot is open: " in f"\n{robot.close('--undo').err}", "who knows what it had?"
     (robot.folder / "processes.json").rename(processes)
@@ -694,8 +695,9 @@ def test_what_systemd_does_not_start_is_done_by_hand(
     robot.units = dict.fromkeys(PID, "both.service")
     undone = robot.close("--undo", status=1)
     assert undone.out == (
-        "restart process 4711 open: cd /opt && /opt/run talker (both.service starts it: remove "
-        "`sros run` there, and restart the unit)\n"
+        "restart process 4711 open: cd /opt && /opt/run talker (both.service starts it: instead, "
+        "remove `sros run`, or the variables of the enclave, from the unit or its script, and "
+        "restart the unit)\n"
     )
     assert "/listener does not run; start it open: cd /opt && /opt/run listener\n" in undone.err
     foreign = replace(robot.process("/talker", is_secured=True), pid=13, command=("/opt/idle",))
@@ -1362,6 +1364,50 @@ def test_what_the_restarts_left_is_printed(robot: Robot) -> None:
     left = json.loads(robot.close("--apply", "--json", status=1).out)
     assert left["outdated_pids"] == {"/listener": [PID["/listener"]]}
     assert (left["outdated"].keys(), left["proofs"]) == ({"/listener"}, [])
+
+
+@sometimes("a_unit_that_secures_its_process_itself_is_restarted_without_a_drop_in", 1 / 2)
+def test_a_unit_that_secures_its_process_itself_is_restarted_without_a_drop_in(
+    robot: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As those of `sros units`: a timer renews their files, and has to restart them."""
+    robot.close()
+    unit, robot.by_hand = "sros@talker.service", {*PID}
+    robot.units = dict.fromkeys(PID, unit)
+    robot.outdated = {"/talker"}
+    assert f"settings: by hand, in {unit}\n" in robot.close().out
+    robot.units = {"/talker": unit}
+    assert f": --apply restarts {unit}\n" in (ended := robot.close()).out
+    assert ended.err.count("next: sros close robot --apply\n") == 1
+    monkeypatch.setattr(processes, "SYSTEMD_FOLDER", robot.folder / "of root")
+    assert f"settings: by hand, in {unit}\n" in robot.close().out
+    by_hand = f"restart the unit with:\n  sudo systemctl restart {unit}\n"
+    assert by_hand in robot.close("--apply", status=1).out
+    monkeypatch.setattr(processes, "SYSTEMD_FOLDER", robot.folder / "systemd")
+
+    class UntilRestarted(set[str]):
+        def __contains__(self, enclave: object) -> bool:
+            return not robot.restarts
+
+    robot.outdated = UntilRestarted()
+    robot.absent = {"/listener"}  # nobody else hears the talker
+    assert "\nthe robot is closed" in robot.close("--apply", "--without", "/listener").err
+    assert robot.restarts == ["daemon-reload", f"restart {unit}"]
+    assert not [*robot.folder.glob("**/*.d/sros-close.conf")]
+    open_again = f"first `systemctl disable --now {unit}`, because this unit starts it closed; then"
+    start = f"open: {open_again} cd /opt && /opt/run talker\n"
+    assert robot.close("--undo", status=1).out == f"restart process 4711 {start}"
+    robot.absent = {*PID}
+    (robot.folder / unit).write_text("ActiveState=activating\n")  # it waits for its restart
+    assert robot.close("--undo", status=1).out == f"restart /talker {start}"
+    assert "start again with" not in robot.close("--apply", "--without", "/listener", status=1).out
+    assert robot.restarts[2:] == ["daemon-reload", f"restart {unit}"]
+    (robot.folder / unit).write_text("ActiveState=inactive\n")
+    robot.absent, robot.units, robot.by_hand = {"/listener"}, {}, set()
+    assert "\nthe robot is open: " in f"\n{robot.close('--undo').err}"
+    robot.units = {"/talker": unit}  # somebody took the variables out of the unit
+    robot.close("--apply", status=1)
+    assert (robot.folder / f"systemd/{unit}.d/sros-close.conf").exists()
 
 
 @sometimes("a_unit_that_was_replaced_is_not_started_again", 1 / 2)
