@@ -8,6 +8,7 @@ import shlex
 import sys
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext, redirect_stderr, redirect_stdout
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -269,6 +270,8 @@ def _show(robot: LocalRobot, closed: CloseState) -> None:
     for why in dict.fromkeys(closed.outdated.values()):
         names = [name for name, other in closed.outdated.items() if other == why]
         echo(f"  {why} the processes of {enumerated(names)}: restart them")
+    for name, pids in closed.also_open.items():
+        echo(f"  a process of {name} also runs open: {_pids_text(pids)}; stop it")
     for process_text in closed.not_observed:
         echo(f"  not observed before: {process_text}; if it does not belong to the robot, stop it")
     for name in closed.new:
@@ -461,7 +464,8 @@ def _show_end(
             if not closed.stopped.issuperset(closed.pending):
                 steps = f"stop and {steps}"
         if not closed.pending:
-            following = ask
+            pids = sorted({*chain.from_iterable(closed.also_open.values())})
+            following = f"stop {_pids_text(pids)}, and then {ask}" if pids else ask
         elif units := {
             process.unit
             for process in observed.processes
@@ -635,8 +639,12 @@ def _shared_start_text(processes: Sequence[ClosedProcess]) -> str:
         return f"{'the containers' if first.container else 'the launch'} of {names}"
     if first.alike:
         return first.pids_text
-    pids = [*dict.fromkeys(str(process.pid) for process in processes if process.pid)]
-    return f"process{'es' * (len(pids) > 1)} {enumerated(pids)}" if pids else ""
+    return _pids_text([*dict.fromkeys(process.pid for process in processes if process.pid)])
+
+
+def _pids_text(pids: Sequence[int]) -> str:
+    """Return the ids of processes as text; "" without any."""
+    return f"process{'es' * (len(pids) > 1)} {enumerated([*map(str, pids)])}" if pids else ""
 
 
 _MOST_DENIED = 4

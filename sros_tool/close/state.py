@@ -238,6 +238,20 @@ class RunningRobot:
             for process, enclave in further
         ]
 
+    def also_open(
+        self, observed: ObservedProcesses, secured: Collection[str]
+    ) -> Mapping[str, Sequence[int]]:
+        """Map enclaves in ``secured`` to the open processes that have the command of an enclave."""
+        processes = observed.processes
+        known = {pid for process in processes for pid in (process.pid, *process.alike)}
+        others = [each for each in self.open_processes if each.program[0] not in known]
+        pids = {
+            process.enclave: [other.program[0] for other in others if process.fits(other)]
+            for process in processes
+            if process.enclave in secured
+        }
+        return {name: [*dict.fromkeys(found)] for name, found in pids.items() if found}
+
     def with_other_files(self) -> Iterator[str]:
         """Yield the processes of the domain in enclaves of other folders, as text."""
         pids = {process.pid for process, _ in self.secured}
@@ -320,14 +334,15 @@ class RunningRobot:
         if known.launch or known.container or known.shares or len(programs) != 1:
             return known
         ((pid, process),) = programs.items()
-        unit, folder, launch, container, _ = process_origin(pid)
-        is_alone = self._programs_of_units[unit] == 1 and not (launch or container)
+        origin = process_origin(pid)
+        unit = origin.unit
+        is_alone = self._programs_of_units[unit] == 1 and not (origin.launch or origin.container)
         needs_drop_in = (SYSTEMD_FOLDER / f"{unit}.d" / DROP_IN).exists()
         if unit == known.unit:
             return known._replace(secured_by_unit=known.secured_by_unit and not needs_drop_in)
         # With another strategy, a restart would not help.
         if unit and is_alone and process.environment.get(STRATEGY) == "Enforce":
-            known = known._replace(user=process.user, folder=folder or known.folder)
+            known = known._replace(user=process.user)
             return known._replace(unit=unit, secured_by_unit=not needs_drop_in)
         return known._replace(unit="", secured_by_unit=False) if known.secured_by_unit else known
 
@@ -536,6 +551,10 @@ class CloseState(NamedTuple):
     """The enclaves of `outdated`, each with the ids of the processes to restart; restart the
     enclaves in this order. With `--apply`, the processes that are left after its restarts.
     """
+    also_open: Mapping[str, Sequence[int]]
+    """The enclaves whose process runs closed, each with the ids of further processes that have the
+    same command and run open, such as a new version of a node.
+    """
     not_observed: Sequence[str]
     """Processes that run in enclaves of the robot but were not observed there, and further
     processes with an observed command, as "process 123 (talker) in /talker". The text of a
@@ -679,6 +698,7 @@ def current_state(robot: LocalRobot, policy: Policy | None) -> CloseState:
             name: [*dict.fromkeys(process.program[0] for process, _ in processes)]
             for name, processes in outdated.items()
         },
+        also_open=running.also_open(observed, secured),
         not_observed=running.not_observed(),
         new=sorted(new),
         absent=sorted(absent - secured.keys()),

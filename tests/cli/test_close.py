@@ -676,6 +676,12 @@ def test_what_systemd_does_not_start_is_done_by_hand(
     assert f" /talker -- {now}\n" in commands and " /opt/run talker\n" not in commands
     in_enclaves = "\nthe processes run in their enclaves; next: sros close robot --proof\n  the fi"
     assert f"{in_enclaves}les are valid until 20" in ended.err
+    robot.more = (replace(robot.process("/talker", is_secured=False), pid=12),)
+    ended, robot.more = robot.close(), ()
+    assert "\n  a process of /talker also runs open: process 12; stop it\n" in ended.out
+    assert (
+        "in their enclaves; next: stop process 12, and then sros close robot --proof\n" in ended.err
+    )
     robot.named = False
     robot.more = (replace(robot.process("/talker", is_secured=True), pid=13, command=("/opt/b",)),)
     robot.absent = {"/talker"}
