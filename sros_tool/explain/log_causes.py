@@ -32,6 +32,7 @@ from sros_tool.faults import NEEDS_CA_KEYS, ORIGINAL_KEYSTORE, Fault, remedy_in_
 from sros_tool.graph.observation import PUBLISH, SUBSCRIBE
 from sros_tool.keystore.layout import (
     KEY_FILE,
+    RobotEnclaves,
     enclaves_of_closed_robot,
     is_keystore,
     is_original_keystore,
@@ -537,7 +538,9 @@ class Examiner:
             return [f"{other}, but {name} is {with_article(question.type)}"], ""
         if rules := self._missing_rules(enclave.name, name, _served_names(asked)):
             return [f"the process had {enumerated(rules)} in its command when sros watched it"], (
-                "Start the process by its command in start/commands.txt of the robot's folder."
+                f"Add this to its command in {unit}, and restart the unit."
+                if (unit := self._closed_robot().units.get(enclave.name))
+                else f"Start the process by its command in {_COMMANDS}."
             )
         is_used = self._keystore.has_other_side(denied) if self._keystore else None
         names = likely_names(asked)
@@ -601,16 +604,14 @@ class Examiner:
                     "machine), ask the whole keystore: `sros explain KEYSTORE --log LOG`. "
                     f"{_otherwise(remedy)}"
                 )
-            compare = "compare the node's command with"
-            if self._closed_commands():
-                start = (
-                    f"Probably the node lacks a remapping, or has a wrong one: {compare} "
-                    "start/commands.txt of the robot's folder."
-                )
+            if self._closed_robot().commands:
+                start = "Probably the node lacks a remapping, or has a wrong one: look at "
+                unit = self._closed_robot().units.get(enclave.name)
+                start += f"its command in {unit or _COMMANDS}."
             elif not start:
                 start = (
-                    f"If a remapping or a parameter is missing or wrong: {compare} the robot's "
-                    "launch files."
+                    "If a remapping or a parameter is missing or wrong: compare the node's command "
+                    "with the robot's launch files."
                 )
             return facts, f"{start}{renamed} {_otherwise(remedy)}"
         if likely:
@@ -657,7 +658,7 @@ class Examiner:
 
         ``nodes`` are the full names of the nodes of the enclave.
         """
-        commands = self._closed_commands()
+        commands = self._closed_robot().commands
         places = [node.rpartition("/") for node in nodes or ("/",)]
         return [
             f"`-r {of_node}{':' * bool(of_node)}{old}:={new}`"
@@ -665,9 +666,9 @@ class Examiner:
             if any(name in (old, expand(old, ns or "/", node)) for ns, _, node in places)
         ]
 
-    def _closed_commands(self) -> Mapping[str, Sequence[str]]:
-        """Map enclaves to the commands that `sros close` remembers, if the folder is of it."""
-        return enclaves_of_closed_robot(Path(self._root)).commands if self._root else {}
+    def _closed_robot(self) -> RobotEnclaves:
+        """Return the enclaves that `sros close` remembers, if the folder is of it."""
+        return enclaves_of_closed_robot(Path(self._root)) if self._root else RobotEnclaves()
 
     def _misspelled_in_policy(self, denied: Right, named: Iterable[Right]) -> str:
         """Return an allowed name that is similar to the denied name, and no peer may use; or ""."""
@@ -855,6 +856,7 @@ def _with_name(text: str, word: str, name: str) -> str:
 
 _NAME = re.compile(r"/[\w/]+")
 _COMMAND = re.compile(r"(`sros\b[^`]*`)")
+_COMMANDS = "start/commands.txt of the robot's folder"
 _MOST_LINES = 20
 _MAX_PEERS = 5
 """Maximum number of peers that are examined for one message."""

@@ -307,6 +307,8 @@ class RobotEnclaves(NamedTuple):
     """The enclaves of other machines, such as laptops."""
     commands: Mapping[str, Sequence[str]] = {}
     """The commands of the processes on this machine, by enclave."""
+    units: Mapping[str, str] = {}
+    """The systemd units that start the processes; "" if you start the process by hand."""
 
 
 def enclaves_of_closed_robot(root: Path) -> RobotEnclaves:
@@ -324,11 +326,15 @@ def enclaves_of_closed_robot(root: Path) -> RobotEnclaves:
             str(process["enclave"]): [*map(str, process.get("command", ()))]
             for process in listed["processes"]
         }
+        units = {
+            str(process["enclave"]): str(process.get("unit", "")) for process in listed["processes"]
+        }
         here = commands.keys() | {*map(str, listed.get("ended", ()))}
         elsewhere = frozenset(map(str, listed["not_here"]))
     except (SrosError, ValueError, TypeError, KeyError, AttributeError):
         return RobotEnclaves()
-    return RobotEnclaves(frozenset({CLOSED_OBSERVER, *here}) - elsewhere, elsewhere, commands)
+    own = frozenset({CLOSED_OBSERVER, *here}) - elsewhere
+    return RobotEnclaves(own, elsewhere, commands, units)
 
 
 def how_to_learn_one_process(robot: Path, domain: int = 0) -> str:

@@ -1562,8 +1562,16 @@ def test_the_other_side_of_a_name_tells_whether_a_remapping_may_be_forgotten(
     listed["processes"] = [{"enclave": "/weed", "command": ["weed"]}]
     (tmp_path / "processes.json").write_text(json.dumps(listed))
     found = sros("explain", export, "--log", log, "/weed").out
-    assert "Probably the node lacks a remapping, or has a wrong one: compare the node's" in found
-    assert "with start/commands.txt of the robot's folder." in found
+    wrong = "Probably the node lacks a remapping, or has a wrong one: look at its command in"
+    assert f"{wrong} start/commands.txt of the robot's folder." in found
+    listed["processes"] = [{"enclave": "/weed", "command": ["weed"], "unit": "weed.service"}]
+    (tmp_path / "processes.json").write_text(json.dumps(listed))
+    found = sros("explain", export, "--log", log, "/weed").out
+    assert f"{wrong} weed.service." in found
+    listed["processes"] = [{"enclave": "/weed", "command": command, "unit": "weed.service"}]
+    (tmp_path / "processes.json").write_text(json.dumps(listed))
+    found = sros("explain", export, "--log", log, "/weed").out
+    assert "Add this to its command in weed.service, and restart the unit." in found
     (tmp_path / "processes.json").unlink()
     (keystore / "enclaves/camera/permissions.p7s").write_text("damaged")
     found = sros("explain", keystore, "/weed", "--log", log).out
