@@ -224,9 +224,9 @@ NOT_OFFERED = FindingKind(
     "policy.not-offered",
     NOTE,
     "a called service or action that the node in its name may not offer",
-    "The node is in the policy, but may not offer this service or action; or the node is not in "
-    "the policy, and another node of the namespace offers one with the same last name, which "
-    "nobody calls. So no call succeeds. Perhaps the node, or what it offers, was renamed.",
+    "No call succeeds, because the policy does not let this node offer the service or action. "
+    "Perhaps it was renamed. Or the node was: then it is not in the policy, but another node of "
+    "the namespace offers a service or action with the same last part, which nobody calls.",
     "sros: compares the rights of all enclaves in the policies that are checked together.",
     "Write the new name at the node that calls, or allow the other node to offer the old name. "
     "Ignore this finding if another policy of the robot has the server.",

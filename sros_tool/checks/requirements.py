@@ -50,9 +50,9 @@ ALLOWED_BY_NAME = FindingKind(
     "access that a requirement allows to every enclave with such a name",
     "The pattern of enclaves begins with a wildcard, so enclaves of any package can match it.",
     "The requirements file.",
-    "If these enclaves are meant, ignore this finding. Otherwise, name the enclaves that are meant "
-    "in the requirement: `//operator/*` is only the robot's own /operator/*, whatever the "
-    "namespace.",
+    "If these enclaves are meant, ignore this finding. Otherwise, replace the pattern in the "
+    "requirement by the enclaves that are meant: `//operator/*` is only the robot's own "
+    "/operator/*, whatever the namespace.",
     prominent=True,
 )
 UNNAMED = FindingKind(

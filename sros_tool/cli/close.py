@@ -432,8 +432,8 @@ def _show_end(
         accept = _ACCEPT_ADVICE if closed.is_proved(set(Acceptance)) else ""
         if _has_changed_command(robot, closed):
             accept = (
-                f"if you changed the command of a process, {robot.close_command} (it remembers the "
-                f"command), and then {ask}; otherwise, {accept}"
+                f"if you changed the command of a process, run {robot.close_command} (it remembers "
+                f"the command), and then {ask}; otherwise, {accept}"
             )
         next_command = f"correct the problems above, and then run sros close {folder} --proof, "
         next_command += "or go back with --undo"

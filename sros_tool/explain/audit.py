@@ -517,8 +517,8 @@ _TOOLS_TEXT = (
     "they need an enclave such as the one in operator_look.xml (`sros policies --copy`)"
 )
 _WRITING_TOOLS_TEXT = (
-    "not judged, because these nodes have names of the command `ros2`, although they write; on the "
-    "secured robot, they need an enclave such as the one in operator_drive.xml (`sros policies "
+    "not judged, because these nodes have names of the command `ros2`; since they write, on the "
+    "secured robot they need an enclave such as the one in operator_drive.xml (`sros policies "
     "--copy`)"
 )
 _ENDED_TEXT = (

@@ -438,7 +438,7 @@ class Examiner:
         return replace(finding, found=tuple(facts), checked=True, remedy=remedy)
 
     def _policy_facts(self, enclave: LoadedEnclave, denial: Denial) -> tuple[list[str], str]:
-        """Return what the policy next to a keystore states about a denied topic, and a remedy.
+        """Return what the policy given with a keystore states about a denied topic, and a remedy.
 
         The remedy is "" unless the policy allows the topic, so that it has to be signed.
         """
@@ -610,8 +610,8 @@ class Examiner:
                 start += f"its command in {unit or _COMMANDS}."
             elif not start:
                 start = (
-                    "If a remapping or a parameter is missing or wrong: compare the node's command "
-                    "with the robot's launch files."
+                    "Perhaps a remapping or a parameter is missing or wrong: compare the node's "
+                    "command with the robot's launch files."
                 )
             return facts, f"{start}{renamed} {_otherwise(remedy)}"
         if likely:
@@ -623,9 +623,9 @@ class Examiner:
     def _unused_name(self, denial: Denial, question: Question, own: Sequence[str]) -> str:
         """Return the allowed name that is probably meant in place of a denied name, or "".
 
-        ``own`` are the names of the enclave for the denied right. Of those that the log of the
-        process does not show, the result is the only one, or the only one whose last part shares a
-        word with that of the denied name.
+        ``own`` are the names of the enclave for the denied right. Names that the log of the process
+        shows do not count. The result is the only name whose last part shares a word with the last
+        part of the denied name; if there is no such name, the only name.
         """
         name = question.name
         is_of_every_node = name in GLOBAL_TOPICS or _last_part(name) in NODE_SERVICES

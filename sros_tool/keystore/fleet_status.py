@@ -386,7 +386,7 @@ class RobotStatus:
     @property
     def confirmed(self) -> datetime | None:
         """The time from which the age of the last confirmation counts, in UTC; null if the robot
-        sent no confirmation.  This is the earlier one of ``received`` and ``clock``: a message that
+        sent no confirmation.  This is the earlier of ``received`` and ``clock``: a message that
         somebody held back does not look new.
         """
         return min(self.received, self.clock) if self.received and self.clock else None
@@ -425,7 +425,8 @@ class RobotStatus:
     def is_overdue(self, now: datetime, limit: timedelta) -> bool:
         """Return whether the last confirmation is older than ``limit``.
 
-        If it shows a time that much later than its receipt, it proves nothing about its age.
+        Also true if it shows a time that is later than its receipt by more than ``limit``: then it
+        proves nothing about its age.
         """
         if self.received is None or self.clock is None:
             return False
@@ -580,8 +581,8 @@ class FleetStatus:
     """
     overdue: frozenset[str] = frozenset()
     """The robots whose last confirmation is older than ``--max-age``, or shows a time that is later
-    than its receipt by more than that, sorted by name; without that option, the robots that fetch,
-    with one day.
+    than its receipt by more than that, sorted by name. Without that option, the limit is a day,
+    and only robots that fetch are listed.
     """
     older: str = ""
     """Why the keystore lacks what its robots have, as a clause: the keystore was restored from a

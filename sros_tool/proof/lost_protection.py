@@ -1,4 +1,4 @@
-"""What a change takes away from the requirements before it.
+"""What escapes the earlier requirements by a change.
 
 Nodes leave the enclaves that a requirement restricts, enclaves gain access by an exception for any
 package, a name loses its other side, or a robot moves to another namespace.
@@ -239,8 +239,8 @@ def access_by_name_findings(
                 patterns = first_few(patterns_of_any_package(requirement), 3)
                 text += f"{patterns}, as to any enclave of such a name"
                 place = step.source or similar_requirements(requirement)[0].source
-                remedy = "Approve this in the review. If an earlier change names the enclaves that "
-                remedy += "are meant in the requirement, they need no approval."
+                remedy = "Approve this in the review. No approval is needed if an earlier change "
+                remedy += "already listed the enclave in the requirement by its own name."
                 yield DROPPED.found(str(requirement), text, place.file, place.line, remedy)
 
 

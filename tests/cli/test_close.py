@@ -1052,7 +1052,7 @@ def test_a_proof_fails_for_each_reason(robot: Robot, monkeypatch: pytest.MonkeyP
     ended = robot.close("--proof", status=1)
     assert f"there: sros did not {by_other}" in ended.out
     advised = (
-        "not proved closed; next: if you changed the command of a process, sros close robot (i"
+        "not proved closed; next: if you changed the command of a process, run sros close robot (i"
     )
     assert advised in ended.err
     file = robot.folder / "robot/processes.json"
