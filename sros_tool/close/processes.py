@@ -133,8 +133,8 @@ class ClosedProcess(NamedTuple):
     def is_by_hand(self) -> bool:
         """Whether the user restarts the process, not --apply.
 
-        A unit that needs no drop-in can be restarted without sros. So somebody who is not root need
-        not close the robot as root because of it.
+        A unit that needs no drop-in can be restarted without sros, so it alone does not require
+        that root closes the robot.
         """
         may_restart = not self.secured_by_unit or os.access(SYSTEMD_FOLDER, os.W_OK)
         return not (self.unit and may_restart)

@@ -196,9 +196,9 @@ def requirements_broken_by(folder: Path, addition: str, moment: datetime) -> lis
 def names_without_requirement(folder: Path, signed: Iterable[Right], moment: datetime) -> list[str]:
     """Return the names in the policy of a closed robot that a requirement can protect only now.
 
-    A requirement is proposed for such a name, but not by the ``signed`` rights, such as for a topic
-    whose second end is new; and no requirement in the ``folder`` names it.  Empty if that cannot be
-    decided.
+    sros would propose a requirement for such a name now, but not for the ``signed`` rights: for
+    example, a topic had a publisher, and now also has a subscriber.  No requirement in the
+    ``folder`` names it.  Empty if that cannot be decided.
     """
     policy = read_policy(folder / CLOSED_POLICY)
     stated = _names_in(read_requirements(folder / REQUIREMENTS))

@@ -326,7 +326,7 @@ class RunningRobot:
         return observed._replace(processes=[*as_started, *later])
 
     def _with_own_unit(self, known: ClosedProcess, running: Sequence[Process]) -> ClosedProcess:
-        """Return a process with the unit that starts only it, and in its enclave.
+        """Return a process with its unit, if the unit starts only this process, in its enclave.
 
         ``running`` are the processes in its enclave.
         """
@@ -454,7 +454,7 @@ def _with_running_command(observed: ClosedProcess, running: Sequence[Process]) -
 
     Programs of `ros2` and sros do not count. If a launch, a container or another process starts the
     observed process, its command does not change; nor does it if the process left its unit, or if
-    the drop-in of its unit has the command.
+    the program runs without the argument for its enclave.
     """
     started_by = observed.launch or observed.container or observed.shares
     programs = {process.program: process for process in running}

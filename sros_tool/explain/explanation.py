@@ -406,7 +406,8 @@ def likely_meaning(
     """Return a clause on the name that a policy may mean instead of a denied right, or "".
 
     ``used`` are rights that the node uses, and that are therefore no mistakes; ``named`` are the
-    `named_rights` of the node's enclave. If the policy ``is_renamed``, the node lacks no remapping.
+    `named_rights` of the node's enclave. With ``is_renamed``, the policy has new names on purpose,
+    so the clause proposes no remapping.
     """
     if right.kind == "dds":
         return ""

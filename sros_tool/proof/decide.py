@@ -393,8 +393,8 @@ def _uses_by_name(requirement: Only, world: World, limit: SearchLimit) -> Iterat
 def patterns_of_any_package(requirement: Only) -> list[str]:
     """Return the patterns that enclaves of any package can match, but that do not match them all.
 
-    If the requirement is a package's, enclaves that do not move with the namespace count, too: an
-    enclave of the package has such a name for users without a namespace.
+    In a requirement of a package, patterns that do not move with the namespace count, too: for
+    users without a namespace, an enclave of the package can match them.
     """
     unmoved: tuple[str, ...] = ()
     if requirement.is_relative and requirement.elsewhere:

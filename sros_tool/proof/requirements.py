@@ -617,7 +617,7 @@ class _Table:
         return tuple(map(self.enclave_below, enclaves))
 
     def enclave_below(self, enclave: str) -> str:
-        """Return an enclave or pattern below the namespace; only ``/`` alone makes it move."""
+        """Return an enclave or pattern in the namespace; ``//`` or a wildcard keeps it out."""
         begin = EXCEPT if enclave.startswith(EXCEPT) else ""
         name = enclave.removeprefix(begin)
         if name.startswith(_UNMOVED):

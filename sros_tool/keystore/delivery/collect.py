@@ -671,7 +671,7 @@ class _Verifier:
         Messages may be there for a long time before they are collected, so this is the time at
         which the file was written, by the clock of the server.  If it was written before the last
         message was collected, then the clock of the server is behind: the time that the message
-        shows counts, within the time since then.
+        shows counts, but no time before that collection or after now.
         """
         came = file.written
         collected = last.message.collected if last and last.message else None
