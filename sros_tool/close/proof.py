@@ -369,7 +369,7 @@ def _proof_of_connections(robot: LocalRobot) -> Iterator[Proof]:
         yield Proof(CONNECTED, False, text)
     elif text := not_connected_text(connections):
         names = first_few([process.label for process in others], MOST_NAMES)
-        yield Proof(CONNECTED, None, f"with {names}, which may also belong to the robot: {text}")
+        yield Proof(CONNECTED, None, f"{names} may also belong to the robot: {text}")
     elif connections.compared and (unknown := connections.unknown):
         names = first_few([*map(process_name, unknown)], MOST_NAMES)
         one = len(unknown) == 1

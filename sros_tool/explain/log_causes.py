@@ -667,7 +667,7 @@ class Examiner:
         ]
 
     def _closed_robot(self) -> RobotEnclaves:
-        """Return the enclaves that `sros close` remembers, if the folder is of it."""
+        """Return the enclaves that `sros close` remembers, if it made the folder."""
         return enclaves_of_closed_robot(Path(self._root)) if self._root else RobotEnclaves()
 
     def _misspelled_in_policy(self, denied: Right, named: Iterable[Right]) -> str:

@@ -110,9 +110,9 @@ class Verdict:
     ``witness`` is None if the requirement holds.  ``empty`` are clauses on enclaves under the
     requirement that do not exist, and on names that no enclave may use.  ``absent`` are the
     exceptions (enclaves or patterns) that fit no enclave.  ``waiting`` are clauses on
-    names that no enclave may use yet, but whose other side an enclave has; ``gone`` are the same,
-    if on a robot the name was probably changed. ``always`` is a clause that says why the
-    requirement cannot fail whatever rights enclaves get, or "".  ``assumed`` is a
+    names that no enclave may use yet, but whose other side an enclave has; ``gone`` are the same on
+    a robot, if the name was probably changed. ``always`` is a clause that says why the requirement
+    cannot fail whatever rights enclaves get, or "".  ``assumed`` is a
     name whose protection is assumed because the policy does not state it, or "".  ``blocked`` is a
     demanded use whose messages do not pass between Zenoh routers, or None. ``unnamed`` are names in
     the requirement that no right states, and that only wildcards match. ``unserved`` are clauses on

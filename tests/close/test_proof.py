@@ -186,7 +186,7 @@ FOREIGN = 10
             robot(1, 2, OF_OTHERS, deaf=[(1, OF_OTHERS)]),
             (),
             None,
-            "with process 9 (node9), which may also belong to the robot: process 1 (node1) in "
+            "process 9 (node9) may also belong to the robot: process 1 (node1) in "
             "/node and process 9 (node9) in /node do not hear each other",
         ),
         (
