@@ -310,8 +310,8 @@ def _remapping_text(closed: CloseState, enclave: str) -> str:
     """Return what to change in a start command that gives a node a denied name."""
     return (
         f"the start command of {enclave} remaps to a name that the policy denies "
-        f"({enumerated(closed.denied_remappings[enclave])}): change the remapping before you start "
-        "the process"
+        f"({enumerated(closed.denied_remappings[enclave])}): change the remapping, and then "
+        "restart the process"
     )
 
 
@@ -365,20 +365,24 @@ def _node_names(policy: Policy, enclave: str) -> Sequence[str]:
 def _renaming_advice(closed: CloseState, policy: Policy) -> str:
     """Return how to rename an enclave that sros named after one of its nodes.
 
-    Returns "" when processes already run closed: another name would then need a restart.
+    Returns "" after the run that made the keystore: another name might then need a restart.
     """
     several = [
         process.enclave
         for process in closed.observed.processes
         if process.enclave in (nodes := _node_names(policy, process.enclave)) and len(nodes) > 1
     ]
-    if closed.secured or not several:
+    is_first = any(
+        step.state == "done" and step.command.startswith("sros create_keystore ")
+        for step in closed.steps
+    )
+    if not (several and is_first):
         return ""
     folder = closed.folder
     return (
-        f"sros named {enumerated(several)} after one of several nodes; to choose another name, "
-        f"change `path=` of the enclave (not `node=`) in {folder / 'policy.xml'}, and the name in "
-        f"{folder / 'requirements.toml'}, before the first process runs closed; then revoke the "
+        f"sros named {enumerated(several)} after one of several nodes. To choose another name, do "
+        "it before --apply: change `path=` of the enclave (not `node=`) in "
+        f"{folder / 'policy.xml'}, and the name in {folder / 'requirements.toml'}. Then revoke the "
         f"earlier name: sros revoke {shlex.quote(str(folder / 'keystore'))} ENCLAVE"
     )
 
@@ -404,6 +408,10 @@ def _show_end(
     then = f"and then {ask}"
     if not closed.denied_remappings.keys().isdisjoint(closed.pending):
         then = f"then {robot.close_command} (it remembers the changed commands), {then}"
+    if apply:
+        for process in observed.processes:
+            if not process.is_by_hand and process.enclave in closed.denied_remappings:
+                echo(_remapping_text(closed, process.enclave))
     for proof in closed.proofs:
         word = proof.acceptance
         accept = f" (--accept {word} accepts this)" if word else ""

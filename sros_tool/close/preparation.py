@@ -548,9 +548,11 @@ def _unknown_process_problems(running: RunningRobot, state: CloseState) -> Itera
             if len(observed.unknown) > len({*state.new}.difference(observed.ended)):
                 learn = how_to_learn_one_process(robot.folder, robot.domain)
                 advice += f"; to give another process its own enclave, {learn}"
+        unknown = "the enclave of" if state.secured else "a node of"
+        number = counted(len(observed.unknown), "open process", "open processes")
         yield (
-            f"sros knows no node of {counted(len(observed.unknown), 'process', 'processes')}: "
-            f"{processes}; {advice}; otherwise {silent.format(them)}"
+            f"sros does not know {unknown} {number}: {processes}; {advice}; otherwise "
+            f"{silent.format(them)}"
         )
     routers = [process for process in running.open_processes if process.is_router]
     if routers and not any(process.is_router for process in observed.processes):

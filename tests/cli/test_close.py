@@ -315,7 +315,7 @@ def test_a_policy_that_was_changed_stays_and_is_followed(robot: Robot) -> None:
     changed = policy.read_text()
     ended = robot.close()
     denied = "start command of /listener remaps to a name that the policy denies (words:=chatter)"
-    assert f"{denied}: change the remapping before you start the process\n" in ended.out
+    assert f"{denied}: change the remapping, and then restart the process\n" in ended.out
     commands = (robot.folder / "robot/start/commands.txt").read_text()
     change = (
         "First change the remapping words:=chatter: the policy denies the new name.\ncd /opt && "
@@ -327,7 +327,9 @@ def test_a_policy_that_was_changed_stays_and_is_followed(robot: Robot) -> None:
         "next: run these commands, then sros close robot (it remembers the changed commands), and "
         "then sros close robot --proof\n"
     )
-    robot.units = UNITS
+    robot.units, robot.by_hand = UNITS, {*PID}
+    assert denied in robot.close("--apply", status=1).out
+    robot.by_hand = set()
     assert "/listener: the rights that it lost still work until 20" in ended.err
     assert sros("diff_policy", "robot/keystore", "robot/policy.xml", cwd=robot.folder).ok()
     assert policy.read_text() == changed
@@ -818,7 +820,7 @@ def a_unit_that_started_after_the_watch(robot: Robot, late: Process) -> None:
     ):
         robot.units["8"], robot.more = "late.service", more
         said = robot.close(status=1).out
-        assert "sros knows no node of" in said and not drop_in.exists()
+        assert "sros does not know the enclave of" in said and not drop_in.exists()
         by_unit = "or, if late.service starts it, add the name of its node to the command in the"
         assert (by_unit in said) is (more != (by_another_user,))
     del robot.units["7"], robot.units["8"]
@@ -831,7 +833,8 @@ def test_processes_that_started_after_the_watch(robot: Robot) -> None:
     late = Process(7, ("/opt/late", "--ros-args"), {}, datetime.now(UTC))
     robot.more = (late,)
     said = robot.close(status=1).out
-    assert "knows no node of 1 process: process 7 (late): /opt/late --ros-args; watch again" in said
+    unknown = "does not know a node of 1 open process: process 7 (late): /opt/late --ros-args;"
+    assert f"{unknown} watch again" in said
     robot.close("--accept", "nodes")
     robot.more = ()
     robot.close()
@@ -1501,7 +1504,8 @@ def test_nothing_is_closed_of_what_is_not_understood(robot: Robot) -> None:
     robot.units = UNITS
     robot.more = (Process(5, ("other", "--ros-args"), {}, datetime.now(UTC)),)
     assert (
-        "first:\n  sros knows no node of 1 process: process 5 (other)" in robot.close(status=1).out
+        "first:\n  sros does not know a node of 1 open process: process 5 (o"
+        in robot.close(status=1).out
     )
     assert (
         "nobody would hear it any more (--accept nodes accepts this)"
@@ -2404,10 +2408,11 @@ def test_an_enclave_that_gets_another_name_keeps_its_process(robot: Robot) -> No
     robot.remaining = robot.nodes
     said = robot.close()
     policy = robot.folder / "robot/policy.xml"
-    named = "\nsros named /logger after one of several nodes; to choose another name, change `path="
-    files = "` of the enclave (not `node=`) in robot/policy.xml, and the name in robot/requirements"
-    price = "then revoke the earlier name: sros revoke robot/keystore ENCLAVE\n"
-    assert f"{named}{files}.toml, before the first process runs closed; {price}" in said.out
+    named = "\nsros named /logger after one of several nodes. To choose another name, do it before "
+    files = "--apply: change `path=` of the enclave (not `node=`) in robot/policy.xml, and the name"
+    price = "in robot/requirements.toml. Then revoke the earlier name: sros revoke robot/keystore E"
+    assert f"{named}{files} {price}NCLAVE\n" in said.out
+    assert "after one of several nodes" not in robot.close().out
     for file in (policy, robot.folder / "robot/requirements.toml"):
         file.write_text(file.read_text().replace('"/logger"', '"/mission"'))
     said = robot.close(status=1)

@@ -334,14 +334,14 @@ def lasting_text(root: Path, replaced_rights: Sequence[ReplacedRights]) -> str:
     names = [rights.enclave for rights in lasting]
     if len(names) == 1:
         lost, kept = f"{names[0]}: the rights that it lost", "its earlier permissions and its key"
-        processes, owner = "its processes", "this enclave"
+        owner = "this enclave"
     else:
         lost = f"{first_few(names, _ENCLAVES_SHOWN)}: the rights that they lost"
-        kept, processes, owner = "earlier permissions and keys", "their processes", "these enclaves"
+        kept, owner = "earlier permissions and keys", "these enclaves"
     which = " ".join(map(quote, names)) if len(names) <= _ENCLAVES_SHOWN else "ENCLAVE..."
     others = "" if len(names) <= _ENCLAVES_SHOWN else " (or with --robot NAME, or --all)"
     return (
-        f"{lost} {work} for whoever kept {kept}, and in {processes} until they are restarted. To "
-        f"end these rights, run `sros renew {quote(str(root))} {which} --revoke-old`{others}, and "
-        f"restart all processes, first those of {owner}."
+        f"{lost} {work}: for whoever kept {kept}, and in running processes until their restart. "
+        f"To end these rights, run `sros renew {quote(str(root))} {which} --revoke-old`{others}, "
+        f"and restart all processes, first those of {owner}."
     )
