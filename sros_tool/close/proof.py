@@ -638,7 +638,7 @@ def _why_missing(running: RunningRobot, missing: Sequence[str], observed: Observ
     enclaves = ", ".join(f"{name} ({causes[name]})" if name in causes else name for name in absent)
     reasons = [f"no secured process of this robot runs in {enclaves}"] * bool(absent)
     advice = ""
-    units = {process.enclave: process.unit for process in observed.processes if process.unit}
+    units = {process.enclave for process in observed.processes if not process.is_by_hand}
     if any(name not in units for name in absent):
         advice = f". Start each process as {robot.commands_file} says"
     stopped = [
@@ -667,7 +667,7 @@ def _why_missing(running: RunningRobot, missing: Sequence[str], observed: Observ
         )
         texts = [overridden[name].text for name in names if name in overridden]
         if to_restart := [name for name in names if name not in overridden]:
-            of_units = units.keys() >= {*to_restart}
+            of_units = units >= {*to_restart}
             texts.insert(0, f"{apply} restarts them" if of_units else "restart them")
         reasons.append(f"{why} the processes of {enclaves}; {'; '.join(texts)}")
     named = {
