@@ -578,9 +578,8 @@ def _other_machines_lines(robot: LocalRobot, closed: CloseState) -> list[str]:
     if needed := closed.needed_elsewhere:
         lines.append(
             f"other machines need the current files of {_times_text(needed)}"
-            f"; bring the output of `sros distribute_key {keystore} ENCLAVE FOLDER --force` to the "
-            "machine, restart the process there, and then run "
-            f"`{robot.close_command} --brought ENCLAVE`"
+            f"; bring the output of `sros distribute_key {keystore} ENCLAVE FOLDER --force` "
+            f"there, restart the process, and run `{robot.close_command} --brought ENCLAVE`"
         )
     if brought := closed.brought:
         lines.append(
