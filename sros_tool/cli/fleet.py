@@ -923,6 +923,8 @@ def _revocation_list_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
         in_force, robots = numbers
         number = f"{in_force} of " if in_force < robots else "all " if in_force > 1 else ""
         text = f"the revocation list is in force on {number}{counted(robots, 'robot')}"
+        missing = [robot.robot for robot in status.robots if robot.crl_in_force is False]
+        text += f" (not on {first_few(missing, 3)})" if in_force and missing else ""
         if waiting := sum(
             robot.has_list and robot.crl_in_force is False for robot in status.robots
         ):

@@ -964,6 +964,8 @@ def test_a_revocation_list_is_in_force_after_the_restart(field: Field) -> None:
     assert found["running"] == {"/r2/base": "earlier"}
     field.send("r2", running={"/r2/base": RunningFiles.NOT_SEEN})
     assert in_force() == [True, True, False]
+    said = field.run("fleet", "status", "ks", status=1).out
+    assert "\nthe revocation list is in force on 2 of 3 robots (not on r3); no robot" in said
     field.age("r2", timedelta(days=2))
     assert in_force() == [True, False, False]
     text = field.run("fleet", "status", "ks", "--prometheus", status=1).out
