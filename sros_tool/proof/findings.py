@@ -62,6 +62,7 @@ from sros_tool.proof.requirements import (
     RightsRequirement,
     Widest,
     demand,
+    names_demanded_by,
     names_of,
     read_all_requirements,
     unused_remappings,
@@ -395,16 +396,20 @@ _MOST_SHOWN = 5
 
 
 def requirement_findings(
-    requirements: Sequence[Requirement], system: System, before: Iterable[Right] = ()
+    requirements: Sequence[Requirement],
+    system: System,
+    before: Iterable[Right] = (),
+    earlier: Sequence[Requirement] = (),
 ) -> list[Finding]:
     """Return a finding for each requirement that does not hold, or that cannot fail.
 
-    ``before`` are the rights before a change, which may have renamed names in requirements.
+    ``before`` are the rights before a change, which may have renamed names in requirements, and
+    ``earlier`` are the requirements before it.
 
     Raises:
         DocumentError: there are too many wildcards to decide a requirement.
     """
-    return decided_findings(decide_all(requirements, system), system, before)
+    return decided_findings(decide_all(requirements, system), system, before, earlier)
 
 
 def left_out_robot_findings(system: System, namespaces: Sequence[str]) -> list[Finding]:
@@ -487,7 +492,10 @@ def _with_parent_namespaces(namespace: str) -> Iterator[str]:
 
 
 def decided_findings(
-    decided: Decisions, system: System, before: Iterable[Right] = ()
+    decided: Decisions,
+    system: System,
+    before: Iterable[Right] = (),
+    earlier: Sequence[Requirement] = (),
 ) -> list[Finding]:
     """Return the findings of decisions: broken requirements first, in order."""
     findings = [_violation_finding(violation) for violation in decided.violations]
@@ -509,7 +517,7 @@ def decided_findings(
     if decided.unnamed:
         allowed = [right for right in before if right.qualifier is ALLOW]
         findings += [
-            _unnamed_finding(*unnamed, allowed)
+            _unnamed_finding(*unnamed, allowed, earlier)
             for unnamed in _without_namespace_repeats(decided.unnamed)
         ]
     for only, steps in decided.by_name:
@@ -868,17 +876,22 @@ GONE_REMEDY = (
 
 
 def _unnamed_finding(
-    requirement: Requirement, names: Sequence[str], allowed_before: Iterable[Right]
+    requirement: Requirement,
+    names: Sequence[str],
+    allowed_before: Iterable[Right],
+    earlier: Sequence[Requirement],
 ) -> Finding:
-    # That a forbidden right is gone shows no renaming.
-    forbidden = (
-        {right for right, _ in requirement.rights} if isinstance(requirement, Nobody) else ()
-    )
-    known_before = {
-        f"{right.kind.removesuffix('s')} {right.name}"
-        for right in allowed_before
-        if right.right not in forbidden
-    }
+    if isinstance(requirement, Nobody):
+        # Neither a forbidden right that is gone, nor a name that only the change forbids, shows a
+        # renaming.
+        forbidden = {right for right, _ in requirement.rights}
+        forbidden_before = names_demanded_by(earlier, requirement)
+        allowed_before = [
+            right
+            for right in allowed_before
+            if right.right not in forbidden and right.name in forbidden_before
+        ]
+    known_before = {f"{right.kind.removesuffix('s')} {right.name}" for right in allowed_before}
     if gone := [name for name in names if name in known_before]:
         why = f"no right is stated for {_listed_names(gone)} any more"
         return _part_finding(VACUOUS, requirement, [why], GONE_REMEDY)

@@ -1063,6 +1063,12 @@ def renamed_names(old: Requirement, new: Requirement) -> dict[tuple[str, str], s
     }
 
 
+def names_demanded_by(requirements: Iterable[Requirement], requirement: Requirement) -> set[str]:
+    """Return the names about which ``requirements`` fully demand what ``requirement`` demands."""
+    is_demanded = _demanded_by(requirements)
+    return {name for part in _parts(requirement) if is_demanded(part) for name in names_of(part)}
+
+
 def _demanded_by(requirements: Iterable[Requirement]) -> Callable[[Requirement], bool]:
     """Return a function that returns whether ``requirements`` fully demand a requirement."""
     parts = [part for requirement in requirements for part in _parts(requirement)]

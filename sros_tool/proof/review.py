@@ -1124,6 +1124,7 @@ class _Review:
                     wanted,
                     system,
                     rights,
+                    required_before,
                     elsewhere,
                     known,
                 ),
@@ -1173,12 +1174,13 @@ class _Review:
         requirements: Sequence[Requirement],
         system: System,
         before: Iterable[Right],
+        earlier: Sequence[Requirement],
         elsewhere: Callable[[], Iterable[Finding]],
         known_notes: Callable[[], Collection[tuple[FindingKind, str]]],
     ) -> tuple[int, ChosenFindings]:
         """Return the exit status and the findings on requirements, also in other namespaces."""
         asked = self.request
-        decided = requirement_findings(requirements, system, before)
+        decided = requirement_findings(requirements, system, before, earlier)
         if any(finding.kind in _LASTING_NOTES for finding in decided):
             known = known_notes()
             decided = [of for of in decided if (of.kind, of.text) not in known]
@@ -1259,7 +1261,7 @@ class _Review:
             before, after = cache(partial(system_in, ns, base)), system_in(ns, head)
             dropped = cache(partial(_dropped_failures, earlier, moved, before))
             for at in [at for at in left if ns in left[at]]:
-                broken = _failures(moved[at], after, before)
+                broken = _failures(moved[at], after, before, earlier)
                 if not broken:
                     continue
                 known = {*_failures(moved[at], before()), *_with_new_names(moved[at], dropped())}
@@ -1543,15 +1545,19 @@ _ABSOLUTE_NAME = re.compile(r"(?<!\S)(?<!enclave )/[^\s,;:()]*")
 
 
 def _failures(
-    requirement: Requirement, system: System, before: Callable[[], System] | None = None
+    requirement: Requirement,
+    system: System,
+    before: Callable[[], System] | None = None,
+    earlier: Sequence[Requirement] = (),
 ) -> dict[_Failure, Finding]:
     """Return the findings which say that a requirement does not hold, or protects nothing.
 
-    A name that no right states counts only if a right of ``before`` states it.
+    A name that no right states counts only if a right of ``before`` states it; for `Nobody`, only
+    if the ``earlier`` requirements forbid it already.
     """
     decided = decide_all([requirement], system)
     rights = before().rights if before and decided.unnamed else ()
-    findings = decided_findings(decided, system, rights)
+    findings = decided_findings(decided, system, rights, earlier)
     failures = {
         _Failure(text=finding.text): finding for finding in findings if finding.kind is VACUOUS
     }

@@ -1280,6 +1280,25 @@ def test_a_name_that_nobody_may_use_may_lose_its_denial_and_its_right(change: Ch
     change.review(*words).ok()
 
 
+@pytest.mark.parametrize("name", ["/q", "q"])
+@pytest.mark.parametrize("forbidden_before", [False, True])
+def test_a_change_may_forbid_the_name_that_it_removes(
+    change: Change, name: str, forbidden_before: bool
+) -> None:
+    """Twin: if BASE forbids the name, too, the subscriber perhaps got another name, unprotected."""
+    nobody = f'[[nobody]]\npublish = ["{name}"]\n'
+    only = nobody.replace("nobody", "only") + 'enclaves = ["/a"]\n'
+    before = policy_text({"/a": publish("/x", "/q"), "/b": subscribe("/x", name)})
+    robot = policy_text({"/a": publish("/x"), "/b": subscribe("/x")})
+    if forbidden_before:
+        only, before = nobody, before.replace("/q</topic>", "/x</topic>", 1)
+    change.base = change.commit({"robot.xml": before, "robot.toml": only})
+    change.commit({"robot.xml": robot, "robot.toml": f"# shorter\n{nobody}"})
+    ended = change.review("--policy", "robot.xml", "--requirements", "robot.toml")
+    assert ("for topic /q any more; required: nobody" in ended.out) == forbidden_before, ended
+    assert ended.status == forbidden_before, ended
+
+
 _NOTHING_BUT = (
     '[[nothing_but]]\nenclaves = ["/third/*"]\npublish = ["/scan", "/image"]\n'
     'subscribe = ["/clock"]\nreply = ["*"]\n'
