@@ -64,7 +64,7 @@ from sros_tool.policy.patterns import matches
 from sros_tool.policy.rights import Right, order
 from sros_tool.translate import governance_for
 from sros_tool.values import DryRun, FileChanges, Notes, Words, shows
-from sros_tool.wording import counted, first_few
+from sros_tool.wording import counted, enumerated, first_few
 
 if TYPE_CHECKING:
     from sros_tool.explain.zenoh import ZenohEvaluator
@@ -389,13 +389,20 @@ class Audit:
         for right in self.denied:
             if right.new_enclave:
                 rights_without_enclave.setdefault(right.nodes, []).append(right)
-        names = Counter(_base_name(node) for nodes in rights_without_enclave for node in nodes)
+        nodes_without_enclave = {node for nodes in rights_without_enclave for node in nodes}
+        names = Counter(map(_base_name, nodes_without_enclave))
+        unseen_names = Counter(_base_name(unseen.node) for unseen in self.unseen)
+        unseen_by_name = {
+            name: str(unseen)
+            for unseen in self.unseen
+            if names[name := _base_name(unseen.node)] == unseen_names[name] == 1
+        }
         for nodes, rights in rights_without_enclave.items():
-            name = _base_name(nodes[0])
-            meant = [unseen for unseen in self.unseen if _base_name(unseen.node) == name]
+            meant = [unseen_by_name.get(_base_name(node), "") for node in nodes]
             hint = ""
-            if len(nodes) == len(meant) == names[name] == 1:
-                hint = f"; perhaps it is {meant[0]}, which was not seen"
+            if all(meant):
+                they, were = ("it is", "was") if len(nodes) == 1 else ("they are", "were")
+                hint = f"; perhaps {they} {enumerated(meant)}, which {were} not seen"
             shown = ", ".join(nodes)
             used = first_few([right.right.describe() for right in rights], 3)
             text = f"{shown}: {rights[0].reason}: {counted(len(rights), 'right')} ({used}){hint}"

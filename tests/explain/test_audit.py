@@ -455,6 +455,18 @@ def test_one_line_for_a_node_without_an_enclave(
     assert list(audited(tmp_path, enclaves, graph(*nodes)).lines().values()) == lines
 
 
+def test_the_nodes_of_a_process_in_the_wrong_namespace(tmp_path: Path) -> None:
+    enclaves: Enclaves = {"/rig": {"/left/cell": [], "/left/talker": []}}
+    nodes = (talks("publish /x"), talks("publish /y", fqn="/cell"))
+    lines = audited(tmp_path, enclaves, graph(*nodes)).lines().values()
+    cell, talker = (f"node /left/{name} of enclave /rig" for name in ("cell", "talker"))
+    assert [line.partition("; ")[2] for line in lines] == [
+        f"perhaps they are {cell} and {talker}, which were not seen",
+        f"perhaps it is {talker}, which was not seen",
+        f"perhaps it is {cell}, which was not seen",
+    ]
+
+
 def test_each_right_of_a_known_enclave_has_a_line(tmp_path: Path) -> None:
     seen = graph(talks("publish /x", "publish /y"), talks(fqn="/new", pid="p2"))
     denied = audited(tmp_path, TALKER, seen)
