@@ -599,7 +599,7 @@ def minimize_policy(
           publish topic /status
         wider than used
           request service /*  becomes  request service /add_two_ints
-        never observed, but kept because every node needs it: 11
+        never observed, but kept because every node needs them: 11 rights
         observed, and not allowed
           publish topic /cmd_vel
         permissions.p7s: 4044 bytes, then 4028, of at most 61439
@@ -659,8 +659,8 @@ def _use_lines(enclave: MinimizedEnclave) -> Iterator[str]:
             yield f"    {wide.rule.describe()}  covered {used}"
             yield f"      {f'becomes {granted}' if granted else 'not needed: other rules give it'}"
     if use.kept_for_every_node:
-        number = len(use.kept_for_every_node)
-        yield f"  never observed, but kept because every node needs it: {number}"
+        number = counted(len(use.kept_for_every_node), "right")
+        yield f"  never observed, but kept because every node needs them: {number}"
     if use.in_part:
         yield "  used or allowed only in part, and kept"
         yield from (f"    {right.describe()}" for right in use.in_part)

@@ -478,8 +478,8 @@ def _keystore_problems(robot: LocalRobot) -> Iterator[str]:
             + (
                 f"If its machine still needs it: {merge}"
                 if name in robot.not_here
-                else f"If it belongs to this machine: {merge}. If it belongs to another machine, "
-                f"such as a laptop: also {robot.close_command} --elsewhere {name}"
+                else f"Otherwise, merge its policy: {merge}. If it belongs to another machine, "
+                f"such as a laptop, then also run {robot.close_command} --elsewhere {name}"
             )
         )
 

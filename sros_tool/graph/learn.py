@@ -393,7 +393,7 @@ def _is_named_like_tool(node: ObservedNode) -> bool:
 
 
 def is_tool_name(name: str) -> bool:
-    """Return whether a node has a name that a tool gives its nodes; it may be no tool."""
+    """Return whether a name is as tools give it to their nodes; other nodes can have it, too."""
     return _TOOLS.match(name) is not None
 
 

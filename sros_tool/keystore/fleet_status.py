@@ -292,8 +292,8 @@ class RobotStatus:
     confirmation; null if the confirmation does not tell."""
     crl_in_force: bool | None
     """Whether the current revocation list, or an earlier list that revokes the same certificates,
-    is in force on the robot: the robot has the list, the list has not expired, the robot says that
-    no process may run with another list or with earlier CAs, and the robot is not ``offline``.
+    is in force on the robot: the robot has the list, the list has not expired, the robot reports
+    that surely no process runs with another list or with earlier CAs, and it is not ``offline``.
     False if this is not known, or if the keystore was restored from a backup and lacks what its
     robots have; null if the keystore has no list, or the robot has no enclave. A restart that is
     due only for new permissions, a new governance or a new certificate of the process itself does

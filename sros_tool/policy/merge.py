@@ -221,7 +221,7 @@ def _entry_order(entry: AddedName) -> tuple[int, GroupRights, str]:
 
 
 def merge_notes(contradictions: Sequence[Contradiction]) -> tuple[Note, ...]:
-    """Return a note for each denial that keeps a requested right from being added."""
+    """Return a note for each denial that overrides a right: one that is added, or that stays."""
     by_denial: dict[tuple[Right, bool], list[Right]] = {}
     for contradiction in contradictions:
         by_denial.setdefault((contradiction.denied, contradiction.new), []).append(

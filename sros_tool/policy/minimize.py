@@ -360,7 +360,7 @@ class _Narrowing:
         return self._rules.cover(part) and not self._rules.cover(part._replace(qualifier=DENY))
 
     def _is_usable(self, part: Right) -> bool:
-        """Return whether the enclave allows a right at all, or a part of it by a wildcard."""
+        """Return whether the enclave allows a right or, if it has a wildcard, a part of it."""
         if self._is_allowed(part):
             return True
         return is_expression(part.name) and self._rules.overlaps(part)

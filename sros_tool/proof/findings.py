@@ -500,7 +500,7 @@ def decided_findings(
     """Return the findings of decisions: broken requirements first, in order."""
     findings = [_violation_finding(violation) for violation in decided.violations]
     findings += [
-        _part_finding(VACUOUS, requirement, why, _vacuous_remedy(requirement, system.rights))
+        _part_finding(VACUOUS, requirement, why, _remedy_for_vacuous(requirement, system.rights))
         for requirement, why in _without_namespace_repeats(decided.vacuous)
     ]
     for kind, decisions, remedy in (
@@ -803,7 +803,7 @@ _ENCLAVES_REMEDY = (
 )
 
 
-def _vacuous_remedy(requirement: Requirement, rights: Iterable[Right]) -> str:
+def _remedy_for_vacuous(requirement: Requirement, rights: Iterable[Right]) -> str:
     """Return a remedy that fits better than the remedy of `VACUOUS`; "" if there is none."""
     if other_namespace := _namespace_remedy(requirement, rights):
         return other_namespace

@@ -494,7 +494,7 @@ class _Review:
             yield from self._keystore_steps(path, keystore, earlier_keystore, of_head, head_fleet)
         # Not allowed by --new-access: its user has read the commit, not a checkout, which may
         # differ.
-        yield from self._step_result("files", "", self._converted_step, can_be_allowed=False)
+        yield from self._step_result("files", "", self._git_attributes_step, can_be_allowed=False)
         yield from self._step_result("keystore", " ".join(asked.keystores), self._keys_step)
         if self.base:
             yield from self._step_result(
@@ -654,7 +654,7 @@ class _Review:
                     changes.append(FleetChange(where, f"{text}: {effect}"))
         return _fleet_findings(changes)
 
-    def _converted_step(self) -> tuple[int, Content] | None:
+    def _git_attributes_step(self) -> tuple[int, Content] | None:
         """Return status and findings on reviewed files that git may change on checkout, or None."""
         lines = []
         for folder in sorted({parent for path in self.head.files for parent in Path(path).parents}):

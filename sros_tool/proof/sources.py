@@ -435,7 +435,7 @@ def _trust_by_enclave(
 
     Raises:
         DocumentError: a list is damaged, is of no CA that the enclave trusts, does not cover all
-            certificates, or has entries that may revoke nothing; or there are several lists of a
+            certificates, or has entries that vendors may ignore; or there are several lists of a
             CA, so that it is uncertain which of them OpenSSL takes.
     """
 

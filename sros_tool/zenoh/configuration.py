@@ -200,12 +200,14 @@ def _access_control_text(rendered_rights: Sequence[RenderedRights]) -> str:
     every_ids = rule_ids([rights.rules for rights in rendered_rights], names)
     for rights, ids in zip(rendered_rights, every_ids, strict=True):
         rules.update(zip(ids, rights.rules, strict=True))
-        own_names = _list([rights.name])
+        own_names = _json_list([rights.name])
         lines["subjects"].append(
             f'   {{"id": {own_names[1:-1]}, "cert_common_names": {own_names}}}'
         )
-        lines["policies"].append(f'   {{"rules": {_list(ids)}, "subjects": {own_names}}}')
-    lines["rules"] = [f'   {{"id": {_list([name])[1:-1]}, {rule}' for name, rule in rules.items()]
+        lines["policies"].append(f'   {{"rules": {_json_list(ids)}, "subjects": {own_names}}}')
+    lines["rules"] = [
+        f'   {{"id": {_json_list([name])[1:-1]}, {rule}' for name, rule in rules.items()
+    ]
     lists = [
         f'  "{name}": [\n{text}\n  ]' if (text := ",\n".join(of)) else f'  "{name}": [\n  ]'
         for name, of in lines.items()
@@ -301,16 +303,18 @@ def render_rights(remote: RemoteRights) -> RenderedRights:
 def _rendered_rule(rule: AccessRule) -> str:
     return (
         f'"permission": "{_PERMISSIONS[rule.allows]}", "flows": ["{rule.flow}"], '
-        f'"messages": {_listed(rule.messages)}, "key_exprs": {_listed(rule.key_expressions)}}}'
+        f'"messages": {_kept_list(rule.messages)}, '
+        f'"key_exprs": {_kept_list(rule.key_expressions)}}}'
     )
 
 
 @lru_cache(maxsize=4096)  # several rules have the same list, and in peer mode many files have it
-def _listed(texts: tuple[str, ...]) -> str:
-    return _list(texts)
+def _kept_list(texts: tuple[str, ...]) -> str:
+    """Return `_json_list` of texts, made once."""
+    return _json_list(texts)
 
 
-def _list(texts: Iterable[str]) -> str:
+def _json_list(texts: Iterable[str]) -> str:
     """Return texts as a JSON list; for short texts, this is much faster than `json.dumps`."""
     return f"[{', '.join(map(encode_basestring_ascii, texts))}]"
 

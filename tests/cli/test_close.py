@@ -397,7 +397,7 @@ def test_what_is_taken_out_of_the_policy_stays_out(robot: Robot) -> None:
     first = robot.close("--apply", status=1)
     assert "the keystore has /listener, and the policy does not, so /listener keeps" in first.out
     assert f"{revoke} (then restart all closed processes, " in first.out
-    assert ". If it belongs to another machine, such as a laptop: also sros cl" in first.out
+    assert ". If it belongs to another machine, such as a laptop, then also run" in first.out
     assert (
         "removed robot/start/listener.env: no known process needs it" in first.err
         and mine.exists()
