@@ -278,7 +278,10 @@ def audit(
 
 _UNSEEN = "nodes were not seen (--watch finds nodes that start later, --partial accepts this)"
 _UNJUDGED = "a part of the graph was not judged (--unjudged accepts this)"
-_UNSETTLED = "the graph kept changing (--watch finds later endpoints, --unsettled accepts this)"
+_UNSETTLED = (
+    "the graph was not seen standing still (a longer --watch finds later endpoints, --unsettled "
+    "accepts this)"
+)
 _NO_ZENOH_FILES = "what the keystore's files for Zenoh allow"
 _ALLOW_ADVICE = (
     "to allow the denied access, add --patch missing.xml: sros then writes the missing rights as a "

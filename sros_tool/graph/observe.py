@@ -50,6 +50,9 @@ _READING_SECONDS = 0.1
 _START_SECONDS = 30.0
 _END_SECONDS = 3.0
 _MOST_UNREAD_SECONDS = 5.0
+_SHORT_WATCH_SECONDS = 10.0
+"""In a shorter watch, a graph that stands still may look as if it grew until the end: discovery
+takes seconds, and the graph then has to stand still for `Settling.still`."""
 
 
 class Readings(NamedTuple):
@@ -291,6 +294,11 @@ class Snapshot:
     @property
     def unsettled(self) -> str:
         """Why nodes or endpoints may be missing, as a clause; "" if the whole graph was seen."""
+        if self.grew and self.seconds < _SHORT_WATCH_SECONDS:
+            return (
+                f"the watch was shorter than {_SHORT_WATCH_SECONDS:.0f} s, too short to see "
+                "whether new nodes or endpoints still appear"
+            )
         if self.grew:
             return "new nodes or endpoints still appeared when the watch ended"
         if self.settled:

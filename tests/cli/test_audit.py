@@ -70,7 +70,7 @@ def test_a_graph_that_still_grew_when_the_watch_ended_is_no_pass(
 
         def growing(*asked: Any, grew: bool = grew, **more: Any) -> tuple[Snapshot, str]:
             snapshot, rmw = observe(*asked, **more)
-            return replace(snapshot, grew=grew), rmw
+            return replace(snapshot, grew=grew, seconds=12.0), rmw
 
         monkeypatch.setattr(audit, "observe", growing)
         ended = program(graph(FINE), "robot.xml", *SHORT, *accepted)

@@ -113,7 +113,7 @@ def test_json_names_what_a_watch_saw_for_a_part_of_its_time(
 ) -> None:
     lost = IntermittentEndpoint("/talker", "p1", "rt/chatter", "publish")
     seen = known_graph(node("/talker", "publish chatter"))
-    snapshot = Snapshot(seen, seen, 9.0, True, frozenset({lost}), grew=True)
+    snapshot = Snapshot(seen, seen, 19.0, True, frozenset({lost}), grew=True)
     monkeypatch.setattr(observing, "observe", lambda *_, **__: (snapshot, "rmw_fake"))
     ended = sros("generate_policy", "robot.xml", "--watch", "9s", "--json", cwd=tmp_path)
     Seen().check("generate_policy", ended.ok())

@@ -139,15 +139,19 @@ def test_an_endpoint_that_goes_while_its_node_stays_is_intermittent() -> None:
 
 
 def test_a_watch_says_whether_the_graph_still_grew_at_its_end() -> None:
-    for changes, grew in (
-        ([(0.1, ONE)], False),
-        ([(0.1, ONE), (7.0, TWO)], True),
-        ([(0.1, TWO), (7.0, ONE)], False),
-        ([(0.1, TWO), (4.0, ONE), (7.0, TWO)], False),
+    """A watch that is shorter than discovery and its quiet time cannot know."""
+    for seconds, changes, why in (
+        (12.0, [(0.1, ONE)], ""),
+        (12.0, [(0.1, ONE), (10.0, TWO)], "new nodes or endpoints still appeared when"),
+        (12.0, [(0.1, TWO), (10.0, ONE)], ""),
+        (12.0, [(0.1, TWO), (7.0, ONE), (10.0, TWO)], ""),
+        (6.0, [(1.9, ONE)], ""),
+        (5.0, [(1.9, ONE)], "the watch was shorter than 10 s, too short to see whether new nodes"),
     ):
         script = Script(changes)
-        snapshot = watch(script, 9.0, script.clock, stop=lambda: False, report=lambda _: None)
-        assert (snapshot.grew, snapshot.settled) == (grew, True), changes
+        snapshot = watch(script, seconds, script.clock, stop=lambda: False, report=lambda _: None)
+        assert (snapshot.grew, snapshot.settled) == (bool(why), True), changes
+        assert snapshot.unsettled.startswith(why), changes
 
 
 def test_what_is_half_discovered_is_not_told_for_a_moment() -> None:
