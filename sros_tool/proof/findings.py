@@ -868,11 +868,10 @@ def common_namespaces(requirements: Iterable[Requirement], rights: Iterable[Righ
     return common or set()
 
 
-GONE_REMEDY = (
+_GONE_REMEDY = (
     "If the name was changed, change it in the requirement, too. If nobody uses the name any more, "
-    "approve this in the review."
+    "remove the requirement, and approve its removal in the review."
 )
-"""Remedy for a requirement about a name that a change removes."""
 
 
 def _unnamed_finding(
@@ -894,7 +893,7 @@ def _unnamed_finding(
     known_before = {f"{right.kind.removesuffix('s')} {right.name}" for right in allowed_before}
     if gone := [name for name in names if name in known_before]:
         why = f"no right is stated for {_listed_names(gone)} any more"
-        return _part_finding(VACUOUS, requirement, [why], GONE_REMEDY)
+        return _part_finding(VACUOUS, requirement, [why], _GONE_REMEDY)
     return _part_finding(UNNAMED, requirement, [f"no right is stated for {_listed_names(names)}"])
 
 

@@ -31,7 +31,7 @@ from sros_tool.proof.decide import (
     restricted_enclaves,
     rights_that_need_a_peer,
 )
-from sros_tool.proof.findings import GONE_REMEDY, decide_all, requirement_findings
+from sros_tool.proof.findings import decide_all, requirement_findings
 from sros_tool.proof.requirements import (
     AtMost,
     Must,
@@ -244,6 +244,12 @@ def access_by_name_findings(
                 yield DROPPED.found(str(requirement), text, place.file, place.line, remedy)
 
 
+_GONE_REMEDY = (
+    "If the name was changed, change it in the requirement, too. If nobody uses the name any more, "
+    "approve this in the review."
+)
+
+
 def unanswered_requirement_findings(
     earlier: Sequence[Requirement],
     requirements: Sequence[Requirement],
@@ -303,7 +309,7 @@ def unanswered_requirement_findings(
             place = requirement.source
             text = f"HEAD removes the last stated right to {first_few(lost, 3)}, without which "
             text += "the requirement protects nothing"
-            yield DROPPED.found(str(requirement), text, place.file, place.line, GONE_REMEDY)
+            yield DROPPED.found(str(requirement), text, place.file, place.line, _GONE_REMEDY)
 
 
 def namespaces_of_patterns(requirement: Requirement) -> list[str]:

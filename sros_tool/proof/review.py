@@ -32,8 +32,6 @@ from sros_tool.checks.policies import is_mended_by
 from sros_tool.checks.requirements import (
     ALLOWED_BY_NAME,
     HOLDS_ALONE,
-    MISSPELLED_ENCLAVE,
-    UNKNOWN_ENCLAVE,
     VACUOUS,
     VIOLATED,
 )
@@ -1333,8 +1331,8 @@ class _Review:
             for finding in dropped_findings(earlier, wanted_requirements, "", moves.clauses)
             for place in finding.related
         ]
-        broken = requirement_findings(dropped, system)
-        chosen = FindingFilter(exclude=_NOT_OF_DROPPED).choose([*findings, *left, *broken])
+        broken = [of for of in requirement_findings(dropped, system) if of.kind is VIOLATED]
+        chosen = FindingFilter().choose([*findings, *left, *broken])
         return _FOUND, DroppedRequirements(len(dropped) + len(left), chosen)
 
     # ── keystores ──────────────────────────────────────────────────────────────────────────
@@ -1500,10 +1498,6 @@ def _namespaces_to_try(before: AccessSource, after: AccessSource) -> list[str]:
     return [*dict.fromkeys([ordinary, *namespaces_in(names)])]
 
 
-_NOT_OF_DROPPED = tuple(
-    kind.id for kind in (VACUOUS, HOLDS_ALONE, MISSPELLED_ENCLAVE, UNKNOWN_ENCLAVE, ALLOWED_BY_NAME)
-)
-"""Findings that a dropped requirement does not need."""
 _LASTING_NOTES = (HOLDS_ALONE, ALLOWED_BY_NAME)
 """Notes that each review of a policy would repeat."""
 

@@ -1294,9 +1294,13 @@ def test_a_change_may_forbid_the_name_that_it_removes(
         only, before = nobody, before.replace("/q</topic>", "/x</topic>", 1)
     change.base = change.commit({"robot.xml": before, "robot.toml": only})
     change.commit({"robot.xml": robot, "robot.toml": f"# shorter\n{nobody}"})
-    ended = change.review("--policy", "robot.xml", "--requirements", "robot.toml")
+    words = ("--policy", "robot.xml", "--requirements", "robot.toml")
+    ended = change.review(*words)
     assert ("for topic /q any more; required: nobody" in ended.out) == forbidden_before, ended
     assert ended.status == forbidden_before, ended
+    change.commit({"robot.toml": ONLY})
+    assert change.review(*words).status == 1
+    change.review(*words, "--dropped-requirements", "allow").ok()
 
 
 _NOTHING_BUT = (
