@@ -225,7 +225,7 @@ def close(
             closed = prove_closed(robot)
         else:
             closed = prepare(robot, duration, accepted=accepted, dry_run=dry_run)
-            if apply and not closed.problems:
+            if apply and not closed.blocked:
                 closed = apply_security(robot, closed, dry_run=dry_run)
     holds = closed.is_proved(accepted)
     if as_json:
@@ -401,7 +401,6 @@ def _show_end(
     ``accepted`` are the claims that need not have been tested.
     """
     from sros_tool.close.start_files import only_root_clause
-    from sros_tool.close.state import unit_advice
 
     folder, observed = shlex.quote(str(robot.folder)), closed.observed
     ask, details = f"sros close {folder} --proof", list[str]()
@@ -424,10 +423,15 @@ def _show_end(
         for detail in proof.details:
             echo(f"  {detail}")
     if closed.problems:
-        echo(f"{_state_text(closed, apply=apply)}; but fix this first:")
+        echo(f"{_state_text(closed, apply=apply)}; but fix this{' first' * closed.blocked}:")
         for problem in closed.problems:
             echo(f"  {problem}")
         answer = f"next: sros close {folder}{' --apply' if apply else ''}"
+        if not closed.blocked and apply:
+            _show_commands_by_hand(robot, closed, only_secured=True)
+        elif not closed.blocked:
+            these = enumerated(sorted(closed.closed_units_to_restart))
+            answer += f" --apply, which restarts {these} in any case"
     elif holds:
         is_asked = all(proof.holds for proof in closed.proofs)
         exceptions = "" if is_asked else ", except for the claims that were not checked"
@@ -447,18 +451,7 @@ def _show_end(
         next_command += "or go back with --undo"
         answer = f"the robot is not proved closed; next: {accept}{next_command}"
     elif apply:
-        for command, processes in closed.pending_by_hand.items():
-            start = "restart the unit" if processes[0].unit else "start again"
-            stop = "" if processes[0].unit else _shared_start_text(processes)
-            echo(f"stop {stop}, and {start} with:" if stop else f"{start} with:")
-            echo(f"  {command}")
-            if advice := processes[0].launch_advice(robot.folder.absolute()):
-                echo(f"  {advice}")
-            for process in processes:
-                if process.enclave in closed.denied_remappings:
-                    echo(f"  {_remapping_text(closed, process.enclave)}")
-            for advice in unit_advice(processes):
-                echo(f"  {advice}")
+        _show_commands_by_hand(robot, closed)
         answer = f"next: run these commands, {then}"
         details = _idle_lines(closed, ask)
         if not_starting := _advice_without_security(robot, closed):
@@ -492,6 +485,31 @@ def _show_end(
     echo(answer, err=True)
     for detail in (*details, *_other_machines_lines(robot, closed)):
         echo(f"  {detail}", err=True)
+
+
+def _show_commands_by_hand(
+    robot: LocalRobot, closed: CloseState, *, only_secured: bool = False
+) -> None:
+    """Print how to start by hand each process that should have the current files.
+
+    With ``only_secured``, processes that run open are left out.
+    """
+    from sros_tool.close.state import unit_advice
+
+    for command, processes in closed.pending_by_hand.items():
+        if only_secured and closed.secured.keys().isdisjoint(each.enclave for each in processes):
+            continue
+        start = "restart the unit" if processes[0].unit else "start again"
+        stop = "" if processes[0].unit else _shared_start_text(processes)
+        echo(f"stop {stop}, and {start} with:" if stop else f"{start} with:")
+        echo(f"  {command}")
+        if advice := processes[0].launch_advice(robot.folder.absolute()):
+            echo(f"  {advice}")
+        for process in processes:
+            if process.enclave in closed.denied_remappings:
+                echo(f"  {_remapping_text(closed, process.enclave)}")
+        for advice in unit_advice(processes):
+            echo(f"  {advice}")
 
 
 def _has_changed_command(robot: LocalRobot, closed: CloseState) -> bool:

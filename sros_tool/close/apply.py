@@ -60,10 +60,15 @@ _STABLE_FOR = timedelta(seconds=2)
 def apply(robot: LocalRobot, prepared: CloseState, *, dry_run: bool) -> CloseState:
     """Restart the units that do not run closed, and add drop-ins; return the new state.
 
-    Proves that the robot is closed, if nothing is left to do by hand.
+    If there are problems, open units stay open.  Proves that the robot is closed, if nothing is
+    left to do by hand or to close.
     """
     robot.shell.check_open()
     observed, secured = prepared.observed, prepared.secured
+    if prepared.problems:
+        closed = [process for process in observed.processes if process.enclave in secured]
+        observed = observed._replace(processes=closed)
+    is_left = len(observed.processes) < len(prepared.observed.processes)
     changes = _write_drop_ins(robot, observed, dry_run=dry_run)
     if not dry_run:
         _remember_new_units(robot, observed)
@@ -87,7 +92,7 @@ def apply(robot: LocalRobot, prepared: CloseState, *, dry_run: bool) -> CloseSta
     if dry_run:
         return state
     by_hand, proofs = prepared.pending_by_hand, list[Proof]()
-    if by_hand:
+    if by_hand or is_left:
         restarted = open_units - stopped - idle
         expected = {known.enclave for known in observed.processes if known.unit in restarted}
         _say_open_processes(robot, by_hand.values(), expected)

@@ -133,25 +133,24 @@ def prepare(
         _write_later_processes(robot)
     state = current_state(robot, robot.read_policy())._replace(steps=done, dry_run=dry_run)
     if dry_run and not is_stopped and robot.keystore.exists() and robot.export.exists():
-        problems += _problems_of(robot, state, accepted=accepted)
+        state = _with_problems(robot, state, problems, accepted=accepted)
+        return state._replace(changes=ignored)
     if dry_run or is_stopped:
-        return state._replace(problems=problems, changes=ignored)
+        return state._replace(problems=problems, blocked=bool(problems), changes=ignored)
     denied_rights = _denied_rights(robot)
     remappings = denied_remappings(denied_rights, state.observed.processes)
     state = state._replace(denied_remappings=remappings)
     changes = [*ignored, *write_start_files(robot, state), *removed]
     denied = [str(right) for right in denied_rights]
     newly_denied = [right for right in denied if right not in denied_before]
-    problems += _problems_of(robot, state, accepted=accepted)
+    state = _with_problems(robot, state, problems, accepted=accepted)
     if not state.secured:
         for rmw in robot.rmws_without_security():
             robot.shell.say(
                 f"WARNING: {no_security_text(rmw)}. Before you stop the robot, find an RMW that "
                 "enforces security: sros doctor"
             )
-    return state._replace(
-        denied=denied, newly_denied=newly_denied, problems=problems, changes=changes
-    )
+    return state._replace(denied=denied, newly_denied=newly_denied, changes=changes)
 
 
 def _check_folder(robot: LocalRobot) -> None:
@@ -432,20 +431,40 @@ def _remove_enclaves(robot: LocalRobot) -> list[FileChange]:
     return [FileChange("remove", path) for path in paths]
 
 
-def _problems_of(robot: LocalRobot, state: CloseState, *, accepted: Acceptances) -> Iterator[str]:
-    """Yield the problems that keep the robot from running closed, with their remedies."""
-    yield from _keystore_problems(robot)
-    for name in sorted(robot.not_here & state.secured.keys()):
-        yield f"{name} belongs to another machine, but a process runs in it here: stop the process"
+def _with_problems(
+    robot: LocalRobot, state: CloseState, of_steps: Sequence[str], *, accepted: Acceptances
+) -> CloseState:
+    """Return a state with the problems that keep the robot from running closed.
+
+    A problem of other processes, such as a thief's, does not block the restart of closed units:
+    only this restart makes a revocation effective.
+    """
+    of_files = [*of_steps, *_file_problems(robot, state)]
+    problems = [*of_files, *_process_problems(robot, state, accepted=accepted)]
+    blocked = bool(of_files or (problems and not state.closed_units_to_restart))
+    return state._replace(problems=problems, blocked=blocked)
+
+
+def _file_problems(robot: LocalRobot, state: CloseState) -> Iterator[str]:
+    """Yield problems of files with which processes that restart might not run closed."""
     for name in _enclaves_without_origin(robot, revoked=False):
         remove = f"rm -r {shlex.quote(str(enclave_path(robot.export, name)))}"
         yield (
             f"the export has {name}, which is not in the keystore and was not revoked there: "
             f"remove it with {remove}"
         )
+    yield from _user_problems(robot, state.observed)
+
+
+def _process_problems(
+    robot: LocalRobot, state: CloseState, *, accepted: Acceptances
+) -> Iterator[str]:
+    """Yield problems of processes that --apply does not restart, and of rights that are left."""
+    yield from _keystore_problems(robot)
+    for name in sorted(robot.not_here & state.secured.keys()):
+        yield f"{name} belongs to another machine, but a process runs in it here: stop the process"
     running = RunningRobot(robot)
     yield from _copy_problems(running)
-    yield from _user_problems(robot, state.observed)
     yield from _launch_problems(robot, state.observed)
     if Acceptance.NODES not in accepted:
         yield from _unknown_process_problems(running, state)

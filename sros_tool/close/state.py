@@ -600,6 +600,10 @@ class CloseState(NamedTuple):
     """
     problems: Sequence[str]
     """Reasons why the robot is not closed yet, or not open again, with what to do."""
+    blocked: bool
+    """Whether `problems` keep `--apply` from restarting any unit. If not, `--apply` restarts the
+    units that run closed and whose files changed, in spite of the problems.
+    """
     proofs: Sequence[Proof]
     """The claims that prove the robot closed; empty if they were not tested."""
     dry_run: DryRun
@@ -628,6 +632,15 @@ class CloseState(NamedTuple):
         processes = self.observed.processes
         stopped = {other.enclave for other in processes if not (other.pid or other.alike)}
         return {*self.new, *self.absent, *stopped} - self.secured.keys()
+
+    @property
+    def closed_units_to_restart(self) -> set[str]:
+        """The units whose process runs in its enclave, but has to be restarted."""
+        return {
+            process.unit
+            for process in self.observed.processes
+            if process.enclave in self.secured and process.enclave in self.pending
+        } & self.observed.units
 
     @property
     def pending_by_hand(self) -> Mapping[str, Sequence[ClosedProcess]]:
@@ -715,6 +728,7 @@ def current_state(robot: LocalRobot, policy: Policy | None) -> CloseState:
         newly_denied=(),
         denied_remappings={},
         problems=(),
+        blocked=False,
         proofs=(),
         dry_run=False,
         changes=(),

@@ -2070,9 +2070,8 @@ def test_what_is_exported_without_the_enclaves_of_other_machines(
     state_now = state.current_state(robot, None)
     assert state_now.needed_elsewhere == {"/b": datetime.fromtimestamp(revoked, UTC)}
     for problems in ((), ("the policy is broken",)):
-        close._show_end(
-            robot, state_now._replace(problems=problems), apply=False, holds=False, accepted=set()
-        )
+        now = state_now._replace(problems=problems, blocked=bool(problems))
+        close._show_end(robot, now, apply=False, holds=False, accepted=set())
         said = capsys.readouterr()
         assert ("fix this first" in said.out) is bool(problems)
         assert (
@@ -2247,6 +2246,48 @@ def test_a_process_with_older_files_of_an_enclave_is_no_closed_process(robot: Ro
         assert (f"{said}/robot/export': stop it; if it belongs to the robot" in ended.out) == bool(
             status
         ), ended
+
+
+def test_a_thief_does_not_keep_units_from_a_revocation(robot: Robot) -> None:
+    """Only the restart makes it effective. An error of the files blocks the restart."""
+    robot.units = {"/talker": "talker.service"}
+    robot.close()
+    robot.by_hand = {"/listener"}
+    shutil.copytree(robot.folder / "robot/export", copy := robot.folder / "copy")
+    (copy / "enclaves/talker/permissions.p7s").write_bytes(b"of the earlier key")
+    robot.close("--apply")
+    robot.spelled = "copy"
+    robot.more = (replace(robot.process("/talker", is_secured=True), pid=13),)
+    robot.spelled, count = "robot/export", len(robot.restarts)
+    thief = f"  process 13 (run): it runs in /talker from '{copy}', not from "
+    said = robot.close("--apply", status=1).out
+    assert f"the processes run in their enclaves; but fix this first:\n{thief}" in said
+    assert robot.restarts[count:] == []
+
+    class UntilRestarted(set[str]):
+        def __contains__(self, enclave: object) -> bool:
+            is_due = enclave == "/talker" and len(robot.restarts) == count
+            return is_due or enclave in by_hand
+
+    by_hand: set[str] = set()
+    robot.outdated = UntilRestarted()
+    ended = robot.close(status=1)
+    assert f"but fix this:\n{thief}" in ended.out
+    assert "next: sros close robot --apply, which restarts talker.service in any" in ended.err
+    needed = robot.folder / "robot/requirements.toml"
+    kept = needed.read_text()
+    needed.write_text('[[only]]\npublish = ["/chatter"]\nenclaves = ["/listener"]\n')
+    assert "but fix this first:" in robot.close("--apply", status=1).out
+    needed.write_text(kept)
+    assert robot.restarts[count:] == []
+    ended = robot.close("--apply", status=1)
+    assert robot.restarts[count:] == ["daemon-reload", "restart talker.service"]
+    assert f"the processes run in their enclaves; but fix this:\n{thief}" in ended.out
+    assert "every process in an enclave belongs there: sros did not see process 13" in ended.out
+    by_hand, count = {"/listener"}, len(robot.restarts)
+    said = robot.close("--apply", status=1).out
+    assert robot.restarts[count:] == ["daemon-reload", "restart talker.service"]
+    assert f"but fix this:\n{thief}" in said and "start again with:\n  cd /opt && " in said
 
 
 @sometimes("an_enclave_that_belongs_to_another_machine")
