@@ -42,6 +42,7 @@ from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import Policy
 from sros_tool.runtime.environment import RMW_ZENOH
 from sros_tool.runtime.rmw import RMW, built_without_security, default_rmw
+from sros_tool.runtime.unit_properties import log_file_of_unit
 from sros_tool.runtime.variables import domain_of
 from sros_tool.validity import time_of_file
 from sros_tool.values import as_plain
@@ -232,8 +233,9 @@ class LocalRobot:
     def log_command(self, unit: str = "") -> str:
         """Return the command that explains the log of a unit, or of a process without a unit."""
         explain = f"sros explain {shlex.quote(str(self.export))} --log"
-        log = f"journalctl -n 100 -u {shlex.quote(unit)}"
-        return f"`{log} | {explain} -`" if unit else f"`{explain} ITS_LOG`"
+        if file := log_file_of_unit(unit) if unit else "ITS_LOG":
+            return f"`{explain} {shlex.quote(file)}`"
+        return f"`journalctl -n 100 -u {shlex.quote(unit)} | {explain} -`"
 
     def read_policy(self) -> Policy | None:
         """Return the policy; None if there is none yet."""

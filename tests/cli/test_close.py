@@ -92,6 +92,7 @@ TALKER = ros_node("talker", "010f0000671200000000", "publish rt/chatter")
 LISTENER = ros_node("listener", "010f0000681200000000", "subscribe rt/chatter")
 SYSTEMCTL = """#!/bin/sh
 [ $1 = show ] && exec cat {states}/$3 2> /dev/null
+[ $1 = cat ] && exec cat {states}/$2
 echo "$@" >> {log}
 exit $(cat {status})
 """
@@ -1344,6 +1345,15 @@ def test_a_unit_that_does_not_run_is_not_called_open(
         f"ended, its log says why: `journalctl -n 100 -u '{unit}' | sros explain robot/exp" in said
     )
     assert "--without" not in said
+    for lines, file in (
+        ("StandardOutput=append:/var/a b.log\nStandardError=inherit", "'/var/a b.log'"),
+        ("StandardOutput=null\nStandardError=file:/var/b.log", "/var/b.log"),
+        ("StandardOutput=append:/var/%n.log", "ITS_LOG"),
+    ):
+        (robot.folder / unit).write_text(f"{lines}\n")
+        said = robot.close("--proof", status=1).out
+        assert f"its log says why: `sros explain robot/export --log {file}`" in said
+    (robot.folder / unit).unlink()
     ended = robot.close()
     assert "  /listener: not running: --apply restarts" in ended.out
     assert "in their enclaves, except for /listener (not running); next:" in ended.err
