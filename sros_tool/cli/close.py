@@ -586,7 +586,7 @@ def _run_state_text(closed: CloseState, enclave: str) -> str:
     if enclave in closed.other_files:
         return "secured with other files"
     if enclave in closed.stopped:  # an unknown process may be the process of the enclave
-        return "no known process" if closed.observed.unknown else "not running"
+        return "not running, or not recognized" if closed.observed.unknown else "not running"
     return "open"
 
 

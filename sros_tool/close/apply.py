@@ -158,16 +158,20 @@ def _write_drop_ins(
 
 
 def _remember_new_units(robot: LocalRobot, observed: ObservedProcesses) -> None:
-    """Write units that started processes only after the watch into the folder.
+    """Write units that started processes only after the watch, with the commands, into the folder.
 
     Without a drop-in, nothing else shows --undo that such a unit belongs to the robot.
     """
     now = {process.enclave: process for process in observed.processes if process.unit}
     before = robot.processes.processes
-    known = {process.enclave for process in before}
+    known = Counter(process.enclave for process in before)
     processes = [
         *(
-            each._replace(unit=found.unit, secured_by_unit=found.secured_by_unit)
+            each._replace(
+                command=found.command if known[each.enclave] == 1 else each.command,
+                unit=found.unit,
+                secured_by_unit=found.secured_by_unit,
+            )
             for each in before
             for found in [now.get(each.enclave, each)]
         ),

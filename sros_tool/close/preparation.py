@@ -550,28 +550,27 @@ def _unknown_process_problems(running: RunningRobot, state: CloseState) -> Itera
     """Yield texts on processes without known nodes, and on nodes without a known process."""
     robot, observed = running.robot, state.observed
     close = robot.close_command
-    silent = "nobody would hear {} any more (--accept nodes accepts this)"
+    silent = "Otherwise, nobody would hear {} any more (--accept nodes accepts this)"
     if observed.unknown:
         them, runs = ("it", "it runs") if len(observed.unknown) == 1 else ("them", "they run")
         processes = first_few(observed.unknown, MOST_NAMES)
-        advice = f"watch again while {runs}: {close} --for 1m"
+        advice = f"Watch again while {runs}: {close} --for 1m"
         if observed.elsewhere:
-            advice += "; if sros still sees no node, add the node's name to the command of "
+            advice += ". If sros still sees no node, add the node's name to the command of "
             advice += f"each process ({_REMAP})"
         if state.secured:
             advice = _start_of_unknown_process(running, state)
             advice += (
-                "stop processes that are not of the robot, such as your own `sros demo listener`"
+                "Stop processes that are not of the robot, such as your own `sros demo listener`"
             )
             # An enclave that was added while the robot is closed may already be of this process.
             if len(observed.unknown) > len({*state.new}.difference(observed.ended)):
                 learn = how_to_learn_one_process(robot.folder, robot.domain)
-                advice += f"; to give another process its own enclave, {learn}"
+                advice += f". To give another process its own enclave, {learn}"
         unknown = "the enclave of" if state.secured else "a node of"
         number = counted(len(observed.unknown), "open process", "open processes")
         yield (
-            f"sros does not know {unknown} {number}: {processes}; {advice}; otherwise "
-            f"{silent.format(them)}"
+            f"sros does not know {unknown} {number}: {processes}. {advice}. {silent.format(them)}"
         )
     routers = [process for process in running.open_processes if process.is_router]
     if routers and not any(process.is_router for process in observed.processes):
@@ -596,18 +595,18 @@ def _unknown_process_problems(running: RunningRobot, state: CloseState) -> Itera
             f"sros knows no process of this machine for nodes of {enclaves}. If they run on "
             f"another machine: {close} {options}. If you do not know one of the nodes, it may be "
             f"a stranger's: remove its enclave from '{robot.policy}', and remove "
-            f"'{robot.requirements}', which sros then proposes again. Otherwise, "
+            f"'{robot.requirements}', which sros then proposes again. "
             f"{silent.format('them')}"
         )
 
 
 def _start_of_unknown_process(running: RunningRobot, state: CloseState) -> str:
-    """Return a clause on how to start an unknown process in an enclave that has no process.
+    """Return sentences on how to start an unknown process in an enclave that has no process.
 
-    Returns "" without such an enclave. The clause has the command of the process if there is only
+    Returns "" without such an enclave. The sentence has the command of the process if there is only
     one process and one enclave, no unit starts the process, and the process is of a user who can
-    read the enclaves.  If units start unknown processes, and the policy has new enclaves, the
-    clause also says how to name the nodes in the units.
+    read the enclaves.  If units start unknown processes, another sentence says how to name the
+    nodes in the units.
     """
     observed, export = state.observed, running.robot.export.absolute()
     if not (idle := sorted(state.stopped)):
@@ -623,12 +622,12 @@ def _start_of_unknown_process(running: RunningRobot, state: CloseState) -> str:
         start = unknown[0].secured_command(export.parent)
     names = first_few(idle, MOST_NAMES)
     which = "the process" if len(observed.unknown) == 1 else "one of them"
-    advice = f"if {which} belongs in {names}, stop it, and start it in its enclave: {start}; "
-    if units and state.new:
+    advice = f"If {which} belongs in {names}, stop it, and start it in its enclave: {start}. "
+    if units:
         advice += (
-            f"or, if {first_few(units, MOST_NAMES)} starts it, add the name of its node to the "
+            f"Or, if {first_few(units, MOST_NAMES)} starts it, add the name of its node to the "
             f"command in the unit ({_REMAP}), restart the unit, and run "
-            f"`{running.robot.close_command}`; "
+            f"`{running.robot.close_command}`. "
         )
     return advice
 

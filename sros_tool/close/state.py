@@ -353,17 +353,17 @@ class RunningRobot:
         return Counter(process_origin(pid).unit for pid in programs)
 
     def with_new_units(
-        self, observed: ObservedProcesses, new: Mapping[str, Collection[str]]
+        self, observed: ObservedProcesses, idle: Mapping[str, Collection[str]]
     ) -> ObservedProcesses:
-        """Return the observed processes, and the open processes of units for new enclaves.
+        """Return the observed processes, and the open processes of units for enclaves without one.
 
-        ``new`` maps these enclaves to the full names of their nodes. Only processes of users who
+        ``idle`` maps these enclaves to the full names of their nodes. Only processes of users who
         can read the enclaves count, and only units that start a single process. Only a name shows
         the enclave: the last process left may be any program, and may not get rights.
         """
         claims: dict[str, list[tuple[Process, str]]] = {}
         for process in filter(self.may_use_files, self.open_processes):
-            enclaves, known_by = _enclaves_of(process, new)
+            enclaves, known_by = _enclaves_of(process, idle)
             if len(enclaves) == 1 and process_text(process) in observed.unknown:
                 claims.setdefault(enclaves[0], []).append((process, known_by))
         found = {
@@ -373,8 +373,10 @@ class RunningRobot:
             and (known := with_command_of_unit(secured_process(process, enclave))).unit
             and self._programs_of_units[known.unit] == 1
         }
+        moved = {known.enclave for known in found.values()}
+        stay = [process for process in observed.processes if process.enclave not in moved]
         return observed._replace(
-            processes=[*observed.processes, *found.values()],
+            processes=[*stay, *found.values()],
             unknown=[text for text in observed.unknown if text not in found],
         )
 
@@ -676,7 +678,11 @@ def current_state(robot: LocalRobot, policy: Policy | None) -> CloseState:
         observed = observed.with_current_pids(running.processes, robot.export)
     observed = observed.limited_to(policy) if policy else observed
     if secured and policy:
-        observed = running.with_new_units(observed, _new_enclaves(robot, policy, observed, secured))
+        idle = {
+            **_new_enclaves(robot, policy, observed, secured),
+            **_movable_enclaves(policy, observed, secured),
+        }
+        observed = running.with_new_units(observed, idle)
     absent = {process.enclave for process in observed.processes if process.absent}
     new = _new_enclaves(robot, policy, observed, secured) if policy else {}
     outdated = {
@@ -748,6 +754,28 @@ def _new_enclaves(
         enclave.path: {profile.full_name for profile in enclave.all_profiles()}
         for enclave in policy.enclaves
         if robot.observed and enclave.path not in known
+    }
+
+
+def _movable_enclaves(
+    policy: Policy, observed: ObservedProcesses, secured: Collection[str]
+) -> Mapping[str, Collection[str]]:
+    """Map the enclaves without a process whose node may have moved into a unit to names.
+
+    The user started the process by hand or by a script. The names are the full names of the nodes,
+    and the program of the process.
+    """
+    count = Counter(process.enclave for process in observed.processes)
+    movable = {
+        process.enclave: f"/{program_of(tuple(process.command)).removesuffix('.py')}"
+        for process in observed.processes
+        if process.is_idle and process.enclave not in secured and count[process.enclave] == 1
+        if not (process.unit or process.launch or process.container or process.shares)
+    }
+    return {
+        enclave.path: {movable[enclave.path], *(each.full_name for each in enclave.all_profiles())}
+        for enclave in policy.enclaves
+        if enclave.path in movable
     }
 
 

@@ -822,9 +822,25 @@ def a_unit_that_started_after_the_watch(robot: Robot, late: Process) -> None:
         robot.units["8"], robot.more = "late.service", more
         said = robot.close(status=1).out
         assert "sros does not know the enclave of" in said and not drop_in.exists()
-        by_unit = "or, if late.service starts it, add the name of its node to the command in the"
+        by_unit = "Or, if late.service starts it, add the name of its node to the command in the"
         assert (by_unit in said) is (more != (by_another_user,))
-    del robot.units["7"], robot.units["8"]
+    del robot.units["8"]
+    robot.units["7"], robot.absent = "moved.service", {"/talker"}
+    for command, known in (
+        (("python3", "/opt/talker.py"), "by its program"),  # the name of its node
+        (("/usr/run", "-v"), "by its program"),  # the program of the command that sros remembers
+        (("/opt/x", "--ros-args", "-r", "__node:=talker"), "by its node name"),
+    ):
+        robot.more = (replace(late, command=command),)
+        said = robot.close().out
+        assert f"  /talker: process 7, known {known}: --apply restarts moved.service" in said
+    robot.close("--apply", status=1)
+    (talker,) = (each for each in json.loads(processes.read_text())["processes"] if each["unit"])
+    assert (talker["enclave"], tuple(talker["command"])) == ("/talker", command)
+    processes.write_bytes(before)
+    (robot.folder / "systemd/moved.service.d/sros-close.conf").unlink()
+    robot.absent = set()
+    del robot.units["7"]
 
 
 @sometimes("processes_that_started_after_the_watch", 1 / 2)
@@ -834,8 +850,8 @@ def test_processes_that_started_after_the_watch(robot: Robot) -> None:
     late = Process(7, ("/opt/late", "--ros-args"), {}, datetime.now(UTC))
     robot.more = (late,)
     said = robot.close(status=1).out
-    unknown = "does not know a node of 1 open process: process 7 (late): /opt/late --ros-args;"
-    assert f"{unknown} watch again" in said
+    unknown = "does not know a node of 1 open process: process 7 (late): /opt/late --ros-args."
+    assert f"{unknown} Watch again" in said
     robot.close("--accept", "nodes")
     robot.more = ()
     robot.close()
@@ -863,20 +879,22 @@ def test_processes_that_started_after_the_watch(robot: Robot) -> None:
     assert "  if a systemd unit starts a new process, start the unit open, and run " in ended.out
     robot.more = (late,)
     said = robot.close(status=1).out
-    assert "enclaves, except for /late (no known process); but fix this first:\n" in said
+    assert (
+        "enclaves, except for /late (not running, or not recognized); but fix this first:\n" in said
+    )
     export = robot.folder / "robot/export"
     start = f"cd /opt && sros run {export} /late -- /opt/late --ros-args"
     assert (
-        f"; if the process belongs in /late, stop it, and start it in its enclave: {start}; stop"
+        f". If the process belongs in /late, stop it, and start it in its enclave: {start}. Stop"
         in said
     )
-    assert "such as your own `sros demo listener`; otherwise nobody would hear" in said
+    assert "such as your own `sros demo listener`. Otherwise, nobody would hear" in said
     a_unit_that_started_after_the_watch(robot, late)
     robot.more = (late, replace(late, pid=8, command=("/opt/more", "--ros-args")))
     said = robot.close(status=1).out
-    assert f"in its enclave: sros run {export} ENCLAVE -- COMMAND; stop processes that " in said
+    assert f"in its enclave: sros run {export} ENCLAVE -- COMMAND. Stop processes that " in said
     assert (
-        "`sros demo listener`; to give another process its own enclave, let the process run" in said
+        "`sros demo listener`. To give another process its own enclave, let the process run" in said
     )
     learn = "`sros generate_policy robot/policy.xml --enclave-per-node`; read the added rights"
     assert f"next to the closed robot, and run {learn}" in said
