@@ -553,9 +553,9 @@ def _published_lines(published: PublishedFleet, moment: datetime) -> Iterator[st
     )
     yield f"{releases} in '{published.folder}'{unchanged}"
     if removed := published.names("removed"):
-        took = "would remove" if published.dry_run else "removed"
         which = f"robots that left the fleet or were revoked: {first_few(removed, _MOST_GROUPS)}"
-        yield f"{took} the releases of {which}"
+        offers = "would no longer offer" if published.dry_run else "no longer offers"
+        yield f"{offers} releases to {which} (their files are removed after two days)"
     for robot in published.robots:
         if robot.outcome == "refused":
             keeps = "keeps its earlier release" if robot.number else "has no release"

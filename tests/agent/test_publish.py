@@ -147,6 +147,9 @@ def test_revoked_robots_lose_their_release_and_others_learn_of_it(publisher: Hom
     publisher.run("revoke", "ks", "--robot", "r1")
     result = publisher.publish()
     assert (result.names("removed"), result.names("published")) == (["r1"], ["r2", "r5"])
+    said = "\n".join(_published_lines(result, publisher.now))
+    kept = list(publisher.pub.glob("targets/robots/*.r1.tar.gz"))
+    assert kept and ": r1 (their files are removed after two days)" in said
     robot.refuses(FetchProblem.NOT_FOR_ROBOT)
     release = other.gets()
     assert release.enclaves()["/r2/base"]["crl.pem"]

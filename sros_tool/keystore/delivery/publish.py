@@ -166,9 +166,9 @@ class RobotRelease(NamedTuple):
     robot: str
     """Name of the robot."""
     outcome: Annotated[str, Words(("published", "kept", "removed", "refused"))]
-    """``published``: a new release; ``kept``: nothing has changed; ``removed``: the robot has no
-    enclaves any more, or left the fleet; ``refused``: the robot keeps its earlier release, if it
-    has one.
+    """``published``: a new release; ``kept``: nothing has changed; ``removed``: no release is
+    offered to the robot any more, because it has no enclaves or left the fleet; ``refused``: the
+    robot keeps its earlier release, if it has one.
     """
     number: int | None
     """Number of the release that is now published for the robot; null if none is."""
