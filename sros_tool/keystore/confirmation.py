@@ -496,21 +496,23 @@ class ReceivedConfirmation:
         alternated = self.message.alternated if self.message else None
         return alternated is not None and self.time - alternated <= _ALTERNATED_SHOWN
 
-    def two_computers_sentence(self, *, was_restored: bool) -> str:
+    def two_computers_sentence(self, *, was_restored: bool, makes_keys: bool) -> str:
         """Return a sentence if messages of the last day came from two computers, or "".
 
         With ``was_restored``, the keystore was restored from a backup: its ledger may lack earlier
-        keys of the robot, so new keys do not end the problem (`collect`).
+        keys of the robot, so new keys do not end the problem (`collect`).  With ``makes_keys``, the
+        robot makes its keys itself.
         """
         alternated = self.message.alternated if self.message else None
         if alternated is None or not self.is_alternation_shown:
             return ""
+        section = "Keys that are made on the robot" if makes_keys else "Same name, new hardware"
         return (
             f"{_TWO_COMPUTERS} seem to send messages in turn: a message came from an earlier start "
             "of the computer, or showed an earlier release, than the message before it; last at "
             f"{iso(alternated)}. Perhaps a disk was copied or restored. "
             "sros knows the files of only one of the two computers. Give the robot new keys, and "
-            "revoke the earlier keys (docs/howto/one_robot.md: Same name, new hardware)."
+            f"revoke the earlier keys (docs/howto/one_robot.md: {section})."
         ) + was_restored * (
             " Because the keystore was restored from a backup, this problem is shown, even if the "
             "robot has new keys, until a message comes after "

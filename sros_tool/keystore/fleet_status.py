@@ -71,6 +71,7 @@ from sros_tool.keystore.layout import (
     REQUIRED_FILES,
     enclave_folder,
     enclave_path,
+    key_on_robot,
 )
 from sros_tool.keystore.ledger import SAME_KEY, Entry, clock_behind_clause
 from sros_tool.keystore.lifecycle.rotation import RotationStage, read_rotation
@@ -1205,6 +1206,11 @@ class _KeystoreRecords:
         keys = {name: enclave_path(self.root, name) / KEY_FILE for name in enclaves_without_key}
         return tuple(sorted(name for name, key in keys.items() if os.path.lexists(key)))
 
+    def makes_keys(self, compared_robot: _ComparedRobot) -> bool:
+        """Return whether a key of a robot was made on the robot."""
+        folders = map(self._keystore.folder, compared_robot.enclaves)
+        return any(map(key_on_robot, folders))
+
     def lacks_ca(self, compared_robot: _ComparedRobot, *, is_published: bool) -> bool:
         """Return whether a robot that fetches does not trust the CA that seals releases.
 
@@ -1473,8 +1479,10 @@ def _robot_status(
         compared_robot = compared_robot._replace(notes=(lost_note, *compared_robot.notes))
     problems = confirmed.problems if confirmed else None
     if (
-        two_computers := received.two_computers_sentence(was_restored=records.was_restored)
-        if received and compared_robot.enclaves
+        two_computers := received.two_computers_sentence(
+            was_restored=records.was_restored, makes_keys=records.makes_keys(compared_robot)
+        )
+        if received and received.is_alternation_shown and compared_robot.enclaves
         else ""
     ):
         problems = (*(problems or ()), two_computers)

@@ -396,9 +396,14 @@ def test_two_computers_that_are_alike_are_seen_by_their_starts(home: Home) -> No
         assert collected.complete != is_earlier, "so that the service fails"
         status = fleet_status(OpenedKeystore(home.root), ["r1"])
         (r1,) = status.robots
-        assert any("Two computers" in text for text in r1.problems or ()) == is_seen, boot
+        problems = "".join(r1.problems or ())
+        assert ("one_robot.md: Same name, new hardware)" in problems) == is_seen, boot
         assert (status.unconfirmed == ("r1",)) == is_seen, "no stage of a rotation"
         assert not (is_seen and r1.is_settled)
+    folder = home.root / "enclaves/r1/base"
+    (folder / "key.pem").rename(folder / "request.pem")
+    (r1,) = fleet_status(OpenedKeystore(home.root), ["r1"]).robots
+    assert "one_robot.md: Keys that are made on the robot)" in "".join(r1.problems or ())
     later = NOW + timedelta(days=2)
     home.send("r1", later, boot=second)
     home.collect(later)
