@@ -923,14 +923,18 @@ def _revocation_list_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
         in_force, robots = numbers
         number = f"{in_force} of " if in_force < robots else "all " if in_force > 1 else ""
         text = f"the revocation list is in force on {number}{counted(robots, 'robot')}"
-        missing = [robot.robot for robot in status.robots if robot.crl_in_force is False]
+        lacking = [robot for robot in status.robots if robot.crl_in_force is False]
+        missing = [robot.robot for robot in lacking]
         text += f" (not on {first_few(missing, 3)})" if in_force and missing else ""
-        if waiting := sum(
-            robot.has_list and robot.crl_in_force is False for robot in status.robots
-        ):
+        if waiting := sum(robot.has_list for robot in lacking):
             have = "have" if waiting > 1 else "has"
             text += f"; {waiting} more {have} the list, but perhaps not all processes there "
             text += "have loaded it and the current CAs"
+        if shared := [robot.robot for robot in lacking if robot.has_shared_keys]:
+            text += (
+                f"; two computers seem to have the keys of {first_few(shared, 3)}, so sros does "
+            )
+            text += "not know whether the list is in force there"
         if (until := status.revoked_until) is None:
             text += (
                 "; sros does not know until when robots need the list, because the ledger lacks a "

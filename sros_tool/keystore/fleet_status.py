@@ -236,6 +236,7 @@ class RobotStatus:
     - ``lacks_ca``: it refuses releases, because it does not trust the CA that seals releases;
     - ``is_doubtful``: its files are not known, whatever it confirmed, because its last message was
       refused, its release was never published, or two computers have its keys;
+    - ``has_shared_keys``: two computers seem to have its keys;
     - ``may_trust_replaced``: one of its processes may trust an identity CA that was replaced;
     - ``is_behind``: its clock is earlier than documents that it has verified;
     - ``reported``: how many of its problems are in its own words; they come first in ``problems``.
@@ -295,11 +296,12 @@ class RobotStatus:
     """Whether the current revocation list, or an earlier list that revokes the same certificates,
     is in force on the robot: the robot has the list, the list has not expired, the robot reports
     that surely no process runs with another list or with earlier CAs, and it is not ``offline``.
-    False if this is not known, or if the keystore was restored from a backup and lacks what its
-    robots have; null if the keystore has no list, or the robot has no enclave. A restart that is
-    due only for new permissions, a new governance or a new certificate of the process itself does
-    not count if the confirmation says which restarts the list needs, as those of ``sros agent``,
-    ``sros fleet report`` and the Ansible collection do; otherwise, any restart that is due counts.
+    False if this is not known, also because two computers seem to have the keys of the robot
+    (`problems`), or if the keystore was restored from a backup and lacks what its robots have; null
+    if the keystore has no list, or the robot has no enclave. A restart that is due only for new
+    permissions, a new governance or a new certificate of the process itself does not count if the
+    confirmation says which restarts the list needs, as those of ``sros agent``, ``sros fleet
+    report`` and the Ansible collection do; otherwise, any restart that is due counts.
     """
     expiry: Mapping[Annotated[str, Words(_EXPIRING_KINDS)], datetime]
     """By kind of file, the first expiry of the files that the robot confirmed, in UTC, according
@@ -320,6 +322,7 @@ class RobotStatus:
     short_lived: tuple[str, ...] = ()
     has_list: bool = False
     is_doubtful: bool = False
+    has_shared_keys: bool = False
     may_trust_replaced: bool = True
     renew_from: datetime | None = None
     lacks_key: tuple[str, ...] = ()
@@ -1529,6 +1532,7 @@ def _robot_status(
         short_lived=records.short_lived(validity),
         has_list=has_list,
         is_doubtful=is_doubtful,
+        has_shared_keys=bool(two_computers),
         may_trust_replaced=not (has_authorities and is_restarted),
         renew_from=min(
             (file.window.expires_soon_from() for file in validity.values()), default=None

@@ -449,6 +449,9 @@ def test_new_keys_end_the_alarm_of_two_computers(
         assert home.alternated("r1") == since
         end = f"until a message comes after {iso(since + timedelta(days=1))}." if since else "?"
         assert any(end in text for text in r1.problems or ()) == restored
+        said = sros("fleet", "status", "ks", cwd=home.folder).out
+        why = "two computers seem to have the keys of r1, so sros does not know whether the list"
+        assert (why in said) == (revoke_old and r1.is_doubtful), said
 
 
 def test_no_file_with_an_early_time_brings_an_old_message_back(home: Home) -> None:
