@@ -429,6 +429,7 @@ def _show_end(
         answer = f"next: sros close {folder}{' --apply' if apply else ''}"
         if not closed.blocked and apply:
             _show_commands_by_hand(robot, closed, only_secured=True)
+            answer = f"next: do this, and then run sros close {folder} --apply"
         elif not closed.blocked:
             these = enumerated(sorted(closed.closed_units_to_restart))
             answer += f" --apply, which restarts {these} in any case"
