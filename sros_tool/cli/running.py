@@ -353,7 +353,10 @@ def run(
     if not command:
         remedy = "Write `sros run KEYSTORE ENCLAVE -- COMMAND...`."
         raise UsageError("no command is given", "", remedy)
-    name = enclave_of_node(policy, command) if policy else rest[0] if rest else ""
+    if not (policy or rest):
+        remedy = "Write `sros run KEYSTORE ENCLAVE -- COMMAND...`, or use --policy FILE."
+        raise UsageError("no enclave is given", "", remedy)
+    name = enclave_of_node(policy, command) if policy else rest[0]
     if (other := named_enclave(command)) and other != name:
         raise UsageError(
             f"the command names the enclave {other}, but sros would run the command in {name}",

@@ -354,6 +354,7 @@ def test_verify_reports_faults_and_sets_its_exit_status(keystore: Path, tmp_path
     assert ended.out.count(at_home) == 2, "both faults have one remedy"
     started = sros("run", out, "/b", "--domain", "0", "--", "true")
     assert started.status == 2 and started.err.count(at_home) == 1, started
+    assert "no enclave is given" in sros("run", out, "--", "true").err
     assert f"{out}/enclaves/a/key.pem: error: a private key that others can read" in ended.out
     assert f"chmod 600 {out}/enclaves/a/key.pem`" in ended.out
     said = json.loads(sros("verify", out, "--json", "--at", "2026-12-24", "--domain", "7").out)
