@@ -575,7 +575,8 @@ def _text(result: Review) -> list[str]:
         mark = "allowed" if step.allowed else _STATUS_MARKS[step.status]
         lines.append(f"[{mark}] {step.kind}{subject}: {sentence}")
         lines_to_read = _lines_to_read(step)
-        further = [f"and {len(lines_to_read) - _MAX_REASONS} more (--summary FILE has all)"]
+        more = counted(len(lines_to_read) - _MAX_REASONS, "more line")
+        further = [f"and {more} (--summary FILE has all)"]
         shown = lines_to_read[:_MAX_REASONS] + further * (len(lines_to_read) > _MAX_REASONS)
         lines += [f"  {result.with_shown_paths(line)}" for line in shown]
     not_covered = [f"not covered: {'; '.join(result.left_out)}"] if result.left_out else []

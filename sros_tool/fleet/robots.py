@@ -469,6 +469,7 @@ def _possible_robots(fleet: Fleet, pattern: _Pattern, enclave: str) -> Iterator[
 
 
 _MOST_SHOWN = 20  # maximum number of robots that a line names; --json has all
+_MOST_OTHERS = 3  # other robots in a line, such as those that pass a message on
 _MOST_TARGETS = 5  # if more pairs of robots share a text, they become one line
 
 
@@ -477,9 +478,10 @@ def folded_lines(fleet: Fleet | None, lines: Iterable[tuple[str, str]]) -> Itera
 
     That line has placeholders for the robot's name and namespace, and lists the robots at its end.
     The robot of a line is the robot of the enclave, or, for an enclave of no robot, the only robot
-    that the text names.  Lines that name one *other* robot, and differ only in that robot, share a
-    line with ``{other}``; lines that differ in both robots become one line if they are many, or are
-    about each robot of one set with each robot of another set.
+    that the text names.  Lines that differ only in one *other* robot share a line with ``{other}``;
+    lines that differ in both robots become one line if they are many, or are about each robot of
+    one set with each robot of another set.  Lines with more than three other robots are not folded
+    by these.
 
     Args:
         fleet: the robots; None leaves every line as it is.
@@ -488,8 +490,7 @@ def folded_lines(fleet: Fleet | None, lines: Iterable[tuple[str, str]]) -> Itera
     if fleet is None:
         yield from (text for _, text in lines)
         return
-    foldings = ((text, _foldings(fleet, enclave, text)) for enclave, text in lines)
-    read = [(text, possible[:2], possible[2:]) for text, possible in foldings]
+    read = [(text, *_foldings(fleet, enclave, text)) for enclave, text in lines]
     pairs: dict[_Folding, list[str]] = defaultdict(list)
     for _, _, wide in read:
         for folding, pair in wide:
@@ -550,28 +551,31 @@ class _Folding(NamedTuple):
     pairs: bool = False
 
 
-def _foldings(fleet: Fleet, enclave: str, text: str) -> list[tuple[_Folding, str]]:
-    """Return forms of a line with placeholders in place of robots, and the names of these robots.
+_Foldings = list[tuple[_Folding, str]]
+"""Forms of a line with placeholders in place of robots, and the names of these robots."""
 
-    One form replaces the robot of ``enclave``, one the only other robot that ``text`` names, and
-    one both.  A line without these robots has a single form, without a robot.
+
+def _foldings(fleet: Fleet, enclave: str, text: str) -> tuple[_Foldings, _Foldings]:
+    """Return the forms of a line with a placeholder for one robot, and for two.
+
+    The first form replaces the robot of ``enclave``, the others another robot that ``text`` names,
+    or both.  A line without these robots has a single form, without a robot.
     """
     own = robot_of(fleet, enclave)
     named = [robot for robot in named_robots(fleet, "", text) if robot != own]
-    other = named[0] if len(named) == 1 else None
-    if own is None and other:
-        own, other = other, None
+    others = named if len(named) <= _MOST_OTHERS else []
+    if own is None and len(named) == 1:
+        own, others = named[0], []
     if own is None:
         # Marked, so that a text which contains "{robot}" itself is not mixed up with a folded text.
-        return [(_Folding(f"\0{text}"), "")]
+        return [(_Folding(f"\0{text}"), "")], []
     any_own = _with_placeholders(text, enclave, own)
-    if other is None:
-        return [(_Folding(any_own), own.name)]
-    return [
-        (_Folding(any_own), own.name),
-        (_Folding(_with_other(text, other), own.name), other.name),
-        (_Folding(_with_other(any_own, other), pairs=True), f"{own.name} and {other.name}"),
+    by_other = [(_Folding(_with_other(text, other), own.name), other.name) for other in others]
+    by_both = [
+        (_Folding(_with_other(any_own, other), pairs=True), f"{own.name} and {other.name}")
+        for other in others
     ]
+    return [(_Folding(any_own), own.name), *by_other], by_both
 
 
 def named_robots(fleet: Fleet, enclave: str, text: str) -> tuple[Robot, ...]:

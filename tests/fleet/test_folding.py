@@ -126,6 +126,13 @@ def test_pairs_are_said_to_be_all_only_if_they_are_all() -> None:
     assert line == "/{robot}/x to /{other}/y  (42 pairs of robots, such as a0 and b1)"
     (line,) = told(every)
     assert line.endswith("a6, each with 6 robots: b1, b2, b3, b4, b5, b6)")
+    # Over robots that pass it on; a line with more other robots is about too much to be folded.
+    for via, is_folded in ("b0", True), ("b0 to /b1/z to /b2", False):
+        path = f"to /{via}/z to"
+        passed_on = [(f"/{a}/x", f"/{a}/x {path} /{b}/y") for a, b in permutations(sources, 2)]
+        folded = list(folded_lines(fleet, passed_on))
+        every_other = each_other[0].partition("  ")[2]
+        assert (folded == [f"/{{robot}}/x {path} /{{other}}/y  {every_other}"]) == is_folded
     few = [*product(sources[:2], targets[:2])]
     assert told(few) == ["/{robot}/x to /{other}/y  (2 robots: a0, a1, each with 2 robots: b0, b1)"]
     assert len(told(few[1:])) == 2

@@ -1633,7 +1633,7 @@ def test_new_access_is_never_pushed_out_of_a_comment(change: Change, tmp_path: P
         summary = Path(outside, "review.md")
         ended = change.review("--policy", "robot.xml\nmany", "--summary", str(summary))
         text = summary.read_text()
-    assert ended.status == 2
+    assert ended.status == 2 and re.search(r"\n  and \d+ more lines \(--summary FILE", ended.out)
     assert len(text) < 65_536
     assert "New access `robot.xml many`" in text.partition("###")[0]
 
