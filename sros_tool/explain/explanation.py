@@ -14,6 +14,7 @@ from collections.abc import Set as AbstractSet
 from contextlib import suppress
 from pathlib import Path
 from shlex import quote
+from typing import NamedTuple
 
 from lxml import etree
 
@@ -33,6 +34,7 @@ from sros_tool.explain.answer import (
     recorded_policy_digest,
 )
 from sros_tool.faults import FAULTS, NOT_IN_THE_FILE, REPLACE, Fault, remedy_in_original_keystore
+from sros_tool.files import policies_dir
 from sros_tool.keystore.layout import (
     GOVERNANCE_FILE,
     IDENTITY_CA_FILE,
@@ -405,12 +407,17 @@ def likely_meaning(
 ) -> str:
     """Return a clause on the name that a policy may mean instead of a denied right, or "".
 
+    For a right that a common part gives, the clause names the part instead.
+
     ``used`` are rights that the node uses, and that are therefore no mistakes; ``named`` are the
     `named_rights` of the node's enclave. With ``is_renamed``, the policy has new names on purpose,
     so the clause proposes no remapping.
     """
     if right.kind == "dds":
         return ""
+    named = tuple(named)
+    if part := lacking_part(right, named):
+        return part.advice
     unused = [other for other in named if other not in used]
     if of_other_kind := meaning_of_other_kind(right, unused):
         return of_other_kind
@@ -420,6 +427,43 @@ def likely_meaning(
     if len(similar) == 1 and right.kind != "actions" and not is_renamed:
         meaning += f" ({remapping_clause(right.name, similar[0])})"
     return meaning
+
+
+_PARTS_OF_NODES = {
+    "common/lifecycle_node.xml": "lifecycle node",
+    "common/component_container.xml": "component container",
+}
+"""Common parts of policies with more private names of a node than ``common/node.xml`` has."""
+
+
+class PartOfNode(NamedTuple):
+    """A common part of policies that the profile of a node probably lacks."""
+
+    reason: str
+    advice: str
+
+
+def lacking_part(denied: Right, named: Iterable[Right]) -> PartOfNode | None:
+    """Return the common part that gives a node the denied right; None if no part does.
+
+    ``named`` are the `named_rights` of the enclave: the nodes whose standard services they serve
+    are the nodes of the enclave.
+    """
+    from sros_tool.graph.learn import common_parts  # imported only for denied rights
+
+    parts = common_parts(policies_dir(), policies_dir())
+    for node in nodes_served((right.right, right.name) for right in named):
+        ns, _, name = node.rpartition("/")
+        for part, kind in _PARTS_OF_NODES.items():
+            rights = parts.included_rights([part], ns or "/", name)
+            rights -= parts.included_rights(["common/node.xml"], ns or "/", name)
+            if (denied.right, denied.name) in rights:
+                return PartOfNode(
+                    f"every {kind} needs this right",
+                    f"if {node} is a {kind}, include {part} in its profile, in place of "
+                    "common/node.xml",
+                )
+    return None
 
 
 def remapping_clause(name: str, meant: str) -> str:

@@ -21,6 +21,7 @@ from sros_tool.explain.asking import signed_enclave
 from sros_tool.explain.denials import PARAMETER_CLIENT_TEXT, Denial, node_denied_own_service
 from sros_tool.explain.explanation import (
     explain,
+    lacking_part,
     likely_names,
     meaning_of_other_kind,
     named_rights,
@@ -536,6 +537,9 @@ class Examiner:
         denied = question.needed_right(enclave.name)
         if other := meaning_of_other_kind(denied, named_rights(asked)):
             return [f"{other}, but {name} is {with_article(question.type)}"], ""
+        if part := lacking_part(denied, named_rights(asked)):
+            advice = f"{part.advice[0].upper()}{part.advice[1:]}"
+            return [part.reason], f"{advice}. {_otherwise(remedy)}"
         if rules := self._missing_rules(enclave.name, name, _served_names(asked)):
             return [f"the process had {enumerated(rules)} in its command when sros watched it"], (
                 f"Add this to its command in {unit}, and restart the unit."

@@ -37,8 +37,10 @@ from sros_tool.explain.asking import (
 )
 from sros_tool.explain.explanation import (
     explain,
+    lacking_part,
     likely_actions,
     likely_names,
+    named_rights,
     remapping_clause,
 )
 from sros_tool.faults import REFUSE_STRANGERS, Fault
@@ -368,10 +370,16 @@ def _not_a_topic_notes(answer: Answer, asked_enclave: AskedEnclave) -> Iterator[
 def _other_name_notes(answer: Answer, asked_enclave: AskedEnclave) -> Iterator[Note]:
     """Yield a note on names that may be meant, if no peer has a right to the denied name.
 
-    A name to which a peer has a right is no mistake.
+    For a right that a common part gives to a node, the note names the part instead. A name
+    to which a peer has a right is no mistake.
     """
     question = answer.question
     if answer.allowed or answer.problems or not question.right:
+        return
+    denied = question.needed_right(answer.enclave.name)
+    part = lacking_part(denied, named_rights(answer))
+    if part and answer.decision.reason != "deny-rule":
+        yield Note("explain.common-part", f"{part.reason}: {part.advice}.")
         return
     needed = PEER_RIGHT[question.right]
     rights = asked_enclave.other_rights(question.name)

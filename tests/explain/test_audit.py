@@ -127,6 +127,15 @@ def talks(*more: str, enclave: str = "/", fqn: str = "/talker", pid: str = "p1")
             [node("/a", "publish /y", enclave="/t"), node("/b", "publish /y", enclave="/t")],
             [f"/t publish topic /y (/a, /b): no rule allows publish rt/y{lacks('/y', '/old/y')}"],
         ),
+        (
+            {"/t": {"/talker": ["reply ~/get_parameters", "publish transition_event"]}},
+            [node("/talker", "publish ~/transition_event", enclave="/t")],
+            [
+                "/t publish topic /talker/transition_event (/talker): no rule allows publish "
+                "rt/talker/transition_event; if /talker is a lifecycle node, include "
+                "common/lifecycle_node.xml in its profile, in place of common/node.xml"
+            ],
+        ),
         # What another node of the process uses is no name that a remapping lacks.
         (
             {"/t": {"/a": ["publish old/y"], "/b": []}},

@@ -898,6 +898,41 @@ def test_a_missing_common_part_is_told(keystore: Path, tmp_path: Path) -> None:
     assert 'href="common/node.xml"' in found
 
 
+@pytest.mark.parametrize(
+    ("word", "name", "part"),
+    [
+        ("publish", "/n/transition_event", "lifecycle_node"),
+        ("serve", "/n/change_state", "lifecycle_node"),
+        ("serve", "/n/get_state", "lifecycle_node"),
+        ("serve", "/n/get_available_states", "lifecycle_node"),
+        ("serve", "/n/get_available_transitions", "lifecycle_node"),
+        ("serve", "/n/get_transition_graph", "lifecycle_node"),
+        ("serve", "/n/_container/load_node", "component_container"),
+        ("subscribe", "/n/transition_event", ""),
+        ("call", "/n/change_state", ""),
+        ("serve", "/m/change_state", ""),  # the policy has no node /m
+        ("serve", "/n/open", ""),
+    ],
+)
+def test_the_common_part_for_a_kind_of_node_is_named_and_no_remapping(
+    word: str, name: str, part: str, tmp_path: Path
+) -> None:
+    own = "".join(f"<service>~/{service}</service>" for service in ("get_parameters", "set_state"))
+    policy, log = tmp_path / "p.xml", tmp_path / "robot.log"
+    rights = f'<services reply="ALLOW">{own}</services>{publish("/rate")}'
+    policy.write_text(policy_text({"/n": rights}))
+    topic = f"rt{name}" if word in ("publish", "subscribe") else f"rq{name}Request"
+    kind = "writer" if word in ("publish", "call") else "reader"
+    log.write_text(f"{topic} topic not found in allow rule. -> check_create_data{kind}\n")
+    include = f"f /n is a {part.replace('_', ' ')}, include common/{part}.xml in its profile, in p"
+    for said in (
+        sros("explain", policy, "/n", "--log", log).out,
+        sros("explain", policy, "/n", word, name).err,
+    ):
+        assert (include in said) is bool(part), said
+        assert ("remapping" in said) is (not part), said
+
+
 # ── enclaves that a log names by a node, by a GUID, or not at all ──────────────────────────
 
 
