@@ -35,6 +35,7 @@ from sros_tool.names import (
     ACTION_TOPICS,
     PARAMETER_SERVICES,
     check_enclave_name,
+    expand,
     expression_problem,
     is_expression,
     node_of_service,
@@ -242,8 +243,8 @@ _ASSUMED_NODE_TEXT = (
     "node's name; if this is wrong, name the node with --node /NAMESPACE/NAME: {}"
 )
 _ALL_BASIC_RIGHTS_TEXT = (
-    "the profile has none of the rights that every node needs, so all of them are proposed "
-    "together, instead of one after each restart: {}"
+    "a node needs all rights of these common parts, so all of them are proposed together, instead "
+    "of one after each restart: {}"
 )
 _OTHER_ENCLAVE_TEXT = "not proposed, because the log names another enclave than --enclave: {}"
 PARAMETER_CLIENT_TEXT = (
@@ -259,6 +260,7 @@ _SEVERAL_ENCLAVES_NOTE = Note(
 
 _COMMON_NODE_FILES = ("common/node.xml", "common/node/parameters.xml")
 """Files to include, the largest first; a node without a right of a file lacks this include."""
+_LIFECYCLE_NODE = "common/lifecycle_node.xml"
 
 
 def learned_from_logs(
@@ -468,10 +470,17 @@ def _missing_common_part(
     """Return a tuple with the common part that a profile needs and does not include; or ().
 
     A profile needs a part if a right of the part was ``denied`` (None counts as any right), and
-    lacks the part if the profile has no right of the part.
+    lacks the part if the profile has no right of the part. A lifecycle node, which first asks for
+    its transition_event, also lacks its part if the profile has only the rights of every node.
     """
     if is_expression(profile[1]):
         return ()
+    if {_LIFECYCLE_NODE, _COMMON_NODE_FILES[0]} <= common.rights.keys():
+        ordinary = common.included_rights(_COMMON_NODE_FILES[:1], *profile)
+        of_lifecycle = common.included_rights([_LIFECYCLE_NODE], *profile) - ordinary
+        event = NodeRight("publish", expand("~/transition_event", *profile))
+        if event in (denied or ()) and node_rights & (ordinary | of_lifecycle) == ordinary:
+            return (_LIFECYCLE_NODE,)
     for part in _COMMON_NODE_FILES:
         if part in common.rights:
             rights = common.included_rights([part], *profile)

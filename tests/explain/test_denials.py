@@ -10,7 +10,7 @@ import pytest
 from sros_tool.errors import UsageError
 from sros_tool.explain.denials import Denial, MissingRights, as_learned, propose, read_denials
 from sros_tool.files import policies_dir
-from sros_tool.graph.learn import NodeRight, common_parts
+from sros_tool.graph.learn import NodeRight, common_parts, groups_of
 from sros_tool.names import PARAMETER_SERVICES
 from sros_tool.policy.model import ALLOW, Enclave, Group, Policy, Profile, Profiles
 from sros_tool.runtime.vendor_log import plain_text
@@ -292,6 +292,17 @@ def test_of_a_common_part_that_is_there_one_right_is_proposed() -> None:
     proposal = of("rq/talker/set_parametersRequest")
     (profile,) = as_learned(proposal, "/robot", None, robot(WHOLE), COMMON).profiles
     assert (profile.includes, len(profile.rights)) == ((), 1)
+
+
+def test_a_lifecycle_node_gets_all_its_rights_at_once() -> None:
+    """Twins: a service that other nodes may have; a profile with only some rights of every node."""
+    ordinary = COMMON.included_rights(["common/node.xml"], "/", "talker")
+    node = replace(BARE, groups=groups_of(ordinary, "/", "talker"))
+    event, state = of("rt/talker/transition_event", "publish"), of("rq/talker/get_stateRequest")
+    for denied, present, added in ((event, node, 6), (state, node, 1), (event, WHOLE, 1)):
+        (profile,) = as_learned(denied, "/robot", None, robot(present), COMMON).profiles
+        assert len(profile.rights - ordinary) == added
+        assert profile.includes == ("common/lifecycle_node.xml",) * (added == 6)
 
 
 def test_a_parameter_client_is_told_which_services_it_also_needs() -> None:
