@@ -81,11 +81,11 @@ class Note(NamedTuple):
     """One paragraph for people."""
 
 
-def check_meaning(read: object, meant: object, document: str) -> None:
-    """Raise `PkiError` unless ``read``, parsed from the new document, equals ``meant``."""
+def check_meaning(read: object, meant: object, what: str) -> None:
+    """Raise `PkiError` on ``what`` unless ``read``, parsed from a new document, is ``meant``."""
     if read != meant:
         raise PkiError(
-            f"{document} would not have the intended content",
+            f"{what} would not have the intended content",
             "Nothing was written.",
             "This is a defect of sros: please report it with the policy.",
         )

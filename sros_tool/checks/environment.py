@@ -365,8 +365,9 @@ UNREAD = FindingKind(
     "runtime.zenoh-unread",
     WARNING,
     "a Zenoh configuration that sros cannot read",
-    "Zenoh reads what sros cannot read: YAML, TOML, lists in place of objects, pipes, and files "
-    "of more than 16 MiB. So sros does not know whether the configuration enforces anything.",
+    "Zenoh reads files that sros cannot read: YAML that is not JSON, TOML, lists in place of "
+    "objects, pipes, and files of more than 16 MiB. So sros does not know whether the "
+    "configuration enforces anything.",
     _ZENOH_SOURCE,
     f"Write it as JSON5 objects into a file of at most 16 MiB. {OWN_CONFIGURATION}",
 )

@@ -369,7 +369,11 @@ def check(
         )
     for option, given in (("--namespace", namespaces), ("--remap", remaps)):
         if given and not requirements:
-            raise UsageError(f"{option} is for --requirements", "", "Leave it out.")
+            raise UsageError(
+                f"{option} has no effect without --requirements",
+                "",
+                f"Add it, or leave {option} out.",
+            )
     decide = _requirements(family, paths, requirements, earlier, namespaces, remaps)
     with progress("checking"):
         findings = [*_findings(family, paths, at), *_stated_distribution_findings(paths, at)]

@@ -317,11 +317,11 @@ def _remapping_text(closed: CloseState, enclave: str) -> str:
 
 def _process_line(process: ClosedProcess, closed: CloseState, policy: Policy) -> str:
     """Return the enclave of a process, how sros knows the process, and how it is restarted."""
-    from sros_tool.close.state import starting_units
+    from sros_tool.close.state import units_that_started
 
     restart = "by hand, with its launch file" if process.launch else "by hand"
     restart = "by hand, with Docker Compose" if process.container else restart
-    if units := [process.unit] if process.unit else starting_units([process]):
+    if units := [process.unit] if process.unit else units_that_started([process]):
         restart += f", in {enumerated(units)}"
     if not process.is_by_hand:
         is_changed = process.is_idle and not process.secured_by_unit

@@ -154,7 +154,8 @@ def _paths_option(name: str, help_text: str) -> Callable[[Decorated], Decorated]
     type=click.Choice(["fail", "allow"]),
     default="fail",
     show_default=True,
-    help="Whether new access, or a changed policy that is not reviewed, makes the review fail.",
+    help="Whether new access, or a changed policy that --policy does not cover, makes the review "
+    "fail.",
 )
 @click.option(
     "--dropped-requirements",
@@ -278,7 +279,11 @@ def review(
     )
     for option, given in (("--namespace", places), ("--remap", rules)):
         if given and not requirement_files:
-            raise UsageError(f"{option} is for --requirements", "", "Leave it out.")
+            raise UsageError(
+                f"{option} has no effect without --requirements",
+                "",
+                f"Add it, or leave {option} out.",
+            )
     repository = Repository(folder.resolve())
     threshold = parse_threshold(renew_within)
     outputs = _Outputs(repository, (*policies, *keystores)[0], summary, sarif, annotations)

@@ -416,7 +416,7 @@ def secured_process(process: Process, enclave: str) -> ClosedProcess:
     return known._replace(command=command_without_enclave(known.command, enclave))
 
 
-def starting_units(processes: Iterable[ClosedProcess]) -> Sequence[str]:
+def units_that_started(processes: Iterable[ClosedProcess]) -> Sequence[str]:
     """Return the units that started processes that run now, as text; sros restarts none of them."""
     pids = {process.pid for process in processes if not process.unit} - {0}
     return sorted({process_origin(pid).unit_text for pid in pids} - {""})
@@ -424,7 +424,7 @@ def starting_units(processes: Iterable[ClosedProcess]) -> Sequence[str]:
 
 def unit_advice(processes: Iterable[ClosedProcess]) -> Iterator[str]:
     """Yield what to do with the units that start these processes by themselves."""
-    for unit in starting_units(processes):
+    for unit in units_that_started(processes):
         yield (
             f"{unit} starts it: put this command into the unit or its script, if it is not there "
             "yet, and restart the unit instead"

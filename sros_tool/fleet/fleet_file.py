@@ -145,7 +145,10 @@ class _Reader:
         fleet = Fleet.of(read, groups, enclaves, routers)
         for robot in read:
             if robot.router and robot_of(fleet, router_enclave_of(fleet, robot)) != robot:
-                text = f"{routers} is not a path of the enclaves of {robot.name}."
+                text = (
+                    f"It does not name an enclave of the robot {robot.name}. Write a path such as "
+                )
+                text += f"{ROUTERS}."
                 raise self._invalid_value_error("routers", routers, text)
         if ambiguous := sorted(fleet.robots.keys() & fleet.groups.keys()):
             raise self._error(

@@ -89,9 +89,9 @@ class Witness:
     """The reason why a requirement does not hold: a shortest list of forbidden or missing uses.
 
     For influence, the uses are a chain: after each use that writes comes the use that reads.
-    ``others`` are uses of each further enclave that breaks the requirement: the uses of the witness
-    if this enclave has them, else different uses.  For influence, they are the chain with another
-    enclave in one place.
+    ``others`` has an entry for each further enclave that breaks the requirement: the same uses by
+    that enclave if it has them, otherwise other uses that break it.  For influence, the entry is
+    the same chain with the further enclave in the place of another one.
     """
 
     uses: tuple[Use, ...]

@@ -393,7 +393,7 @@ class RenderedReader:
             listen, connect = (tuple(document[key]["endpoints"]) for key in ("listen", "connect"))
             revoked = document.get("metadata", {}).get(_REVOKED_KEY, "")
             if _text_without_control(mode, listen, connect, revoked) != text:
-                raise ValueError("not as it is rendered")
+                raise ValueError("the text is not as sros writes it")
             self._beginnings[text] = Configuration(
                 mode, listen, connect, AccessControl(()), revoked
             )
@@ -430,7 +430,7 @@ class RenderedReader:
                 stated["permission"] == _PERMISSIONS[True],
             )
             if _rendered_rule(rule) != text:
-                raise ValueError("not as it is rendered")
+                raise ValueError("the text is not as sros writes it")
             self._rules[text] = rule
         return self._rules[text]
 

@@ -160,7 +160,7 @@ def test_a_value_that_is_not_valid(line: str, problem: str) -> None:
         ('routers = "/router"\n[robots.r]', "no placeholder"),
         ("routers = 7\n[robots.r]", "not a text"),
         ('routers = "/{robot:a}/router"\n[robots.r]\nrouter = "r:7447"',
-         "not a path of the enclaves of r"),
+         "not name an enclave of the robot r"),
         ('enclaves = ["/{robots}"]\n[robots.r]', "write {robot}"),
         ('enclaves = ["/{robot:a}/{robot:b}"]\n[robots.r]', "different groups"),
         ('enclaves = ["{robot}"]\n[robots.r]', "does not start with '/'"),
