@@ -1521,7 +1521,7 @@ def test_processes_that_show_no_id_are_to_be_named(robot: Robot) -> None:
         for index, name in enumerate(("left", "right"))
     )
     said = robot.close(status=1).out
-    assert "; watch again while they run: sros close" in said
+    assert ". Watch again while they run: sros close" in said
     assert "add the node's name to the command of each process (--ros-args" in said
     assert "for nodes of /left, /right. If they run on another machine" in said
     assert "from 'robot/policy.xml', and remove 'robot/requirements.toml', which sros then" in said
