@@ -12,9 +12,10 @@ import hashlib
 from collections.abc import Collection, Iterable, Iterator
 from collections.abc import Set as AbstractSet
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
 from shlex import quote
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from lxml import etree
 
@@ -56,6 +57,9 @@ from sros_tool.policy.model import ALLOW, DENY, Enclave, Group, Policy, Profile,
 from sros_tool.policy.rights import Right, action_right, order, profile_rights
 from sros_tool.spelling import is_spelled_alike
 from sros_tool.terminal import log_step
+
+if TYPE_CHECKING:
+    from sros_tool.graph.learn import CommonParts
 
 
 def explain(evaluator: Evaluator, question: Question) -> Answer:
@@ -443,15 +447,20 @@ class PartOfNode(NamedTuple):
     advice: str
 
 
+@cache  # an audit asks for each denied right
+def _shipped_parts() -> CommonParts:
+    from sros_tool.graph.learn import common_parts  # imported only for denied rights
+
+    return common_parts(policies_dir(), policies_dir())
+
+
 def lacking_part(denied: Right, named: Iterable[Right]) -> PartOfNode | None:
     """Return the common part that gives a node the denied right; None if no part does.
 
     ``named`` are the `named_rights` of the enclave: the nodes whose standard services they serve
     are the nodes of the enclave.
     """
-    from sros_tool.graph.learn import common_parts  # imported only for denied rights
-
-    parts = common_parts(policies_dir(), policies_dir())
+    parts = _shipped_parts()
     for node in nodes_served((right.right, right.name) for right in named):
         ns, _, name = node.rpartition("/")
         for part, kind in _PARTS_OF_NODES.items():
