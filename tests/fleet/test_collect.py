@@ -411,6 +411,23 @@ def test_two_computers_that_are_alike_are_seen_by_their_starts(home: Home) -> No
     assert not r1.problems, "only the last day counts"
 
 
+def test_no_file_with_an_early_time_ends_the_alarm_of_two_computers(home: Home) -> None:
+    """Nor if an earlier release of sros took the last message, without noting when."""
+    boots = ("1" * 64, "2" * 64)
+    for boot in boots:
+        home.send("r1", boot=boot)
+        home.collect()
+    record = home.root / "confirmed/r1.json"
+    value = json.loads(record.read_text())
+    assert value["message"].pop("collected") == iso(NOW)
+    record.write_text(json.dumps(value))
+    for written in (NOW - timedelta(days=9), NOW):
+        home.put("r1", home.message("r1", NOW, boot=boots[0]), written)
+        home.collect()
+        (r1,) = fleet_status(OpenedKeystore(home.root), ["r1"]).robots
+        assert any("Two computers" in text for text in r1.problems or ()), written
+
+
 @pytest.mark.parametrize(
     ("new_key", "revoke_old", "restored"),
     [(True, True, False), (True, False, False), (False, True, False), (True, True, True)],

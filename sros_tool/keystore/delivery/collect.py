@@ -674,7 +674,7 @@ class _Verifier:
         shows counts, but no time before that collection or after now.
         """
         came = file.written
-        collected = last.message.collected if last and last.message else None
+        collected = last.message and (last.message.collected or last.time) if last else None
         if collected and came < collected:
             came = max(confirmation.time, collected)
         return min(came, self._now).replace(microsecond=0)
