@@ -636,7 +636,9 @@ class _Review:
         """
         known_paths = fleet_with_enclaves(base[1], base[0]).enclaves if base[1] else ()
         changes = [*fleet_changes(base[1], head[1], known_paths)]
-        changes += _moved_keys(_robots_by_enclave(*base), _robots_by_enclave(*head), head[1])
+        changes += _moved_keys(
+            _robots_by_enclave(*base), _robots_by_enclave(*head), base[1], head[1]
+        )
         if base[1] and self.base:
             file = self.request.fleet
             before, after = (
@@ -1396,7 +1398,7 @@ class _Review:
                     (OpenedKeystore(folder), after),
                 )
             )
-            changes += _moved_keys(had, have, after)
+            changes += _moved_keys(had, have, earlier, after)
             return _fleet_findings(changes)
 
         if self.base:
@@ -1428,14 +1430,19 @@ def _fleet_findings(changes: Iterable[FleetChange]) -> tuple[int, Content] | Non
 
 
 def _moved_keys(
-    before: Mapping[str, Robot | None], after: Mapping[str, Robot | None], fleet: Fleet
+    before: Mapping[str, Robot | None],
+    after: Mapping[str, Robot | None],
+    earlier: Fleet | None,
+    later: Fleet,
 ) -> Iterator[FleetChange]:
-    """Yield enclaves whose keys another robot of ``fleet`` gets, unless it was only renamed."""
+    """Yield enclaves whose keys another robot of ``later`` gets, unless it was only renamed."""
+    known = earlier.robots if earlier else ()
     for enclave, robot in after.items():
         old = before.get(enclave, robot)
         if not robot or (old and old.name == robot.name):
             continue
-        if old and old.name not in fleet.robots and delivery_place(old) == delivery_place(robot):
+        is_renamed = old and old.name not in later.robots and robot.name not in known
+        if old and is_renamed and delivery_place(old) == delivery_place(robot):
             continue
         had = old.name if old else "no robot"
         yield FleetChange(robot.name, f"gets the keys of {enclave}, which {had} had before")

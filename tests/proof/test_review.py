@@ -961,6 +961,9 @@ _TWO_PORTS = """{"all": {"hosts": {
  "h1": {"sros_robot": "r1", "ansible_host": "10.0.0.1", "ansible_port": 22},
  "h2": {"sros_robot": "r2", "ansible_host": "10.0.0.1", "ansible_port": 2222}}}}
 """
+_TWO_BEHIND_ONE = """{"all": {"hosts": {"h1": {"sros_robot": "r1", "ansible_host": "gate"}, \
+"h2": {"sros_robot": "r2", "ansible_host": "gate"}}}}
+"""  # with their ports in other files
 
 
 @pytest.mark.parametrize(
@@ -989,6 +992,12 @@ _TWO_PORTS = """{"all": {"hosts": {
                 "'r1' gets the keys of /n2/a, which r2 had before, and 1 more",
             ),
             ("fleet.toml", _TWO, _TWO.replace("r2", "r3"), ""),
+            (
+                "hosts.json",
+                _TWO_BEHIND_ONE,
+                re.sub('"h1": {.*}, "h2": {', '"h2": {"sros_namespace": "/r1", ', _TWO_BEHIND_ONE),
+                "'r2' gets the keys of /r1/a, which r1 had before",
+            ),
             ("hosts.json", _HOSTS, _HOSTS.replace("red", "blue"), ""),
             (
                 "hosts.json",
