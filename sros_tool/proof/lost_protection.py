@@ -43,6 +43,7 @@ from sros_tool.proof.requirements import (
     Widest,
     dropped_requirements,
     enclaves_of,
+    names_demanded_by,
     names_of,
     patterns_of_enclaves,
     similarity_to,
@@ -221,8 +222,7 @@ def access_by_name_findings(
     # As they were before: the change may also name its own enclaves in them.
     kept = [of for of in earlier if isinstance(of, Only) and similar_requirements(of)]
     old, new = split_actions(before.rights), split_actions(after.rights)
-    # A lost DENY gives access, too.
-    gained = {right for right in old ^ new if (right.qualifier is ALLOW) == (right in new)}
+    gained = {right for right in old ^ new if _is_gained(right, new)}
     for requirement, steps in decide_all(kept, system).by_name if gained else ():
         wanted = split_actions(
             Right("", ALLOW, right, name) for right, names in requirement.rights for name in names
@@ -258,7 +258,8 @@ def unanswered_requirement_findings(
 ) -> Iterator[Finding]:
     """Yield a finding for each kept requirement about a name whose other side HEAD removes.
 
-    For example, HEAD renames a service at its server, and the requirement has the old name.
+    For example, HEAD renames a service at its server, and the requirement has the old name. A
+    `Nobody` that replaces a limit counts only if HEAD adds such an other side under another name.
     Wildcards that match the name are no other side, such as the wildcard of a recorder, unless
     HEAD writes a wildcard in place of a removed right.
     """
@@ -281,16 +282,29 @@ def unanswered_requirement_findings(
         }
 
     similar_requirements = similarity_to(earlier)
-    asked = {
-        requirement: {
+    compared = requirements if removed or added else ()
+    nobody = [of for of in compared if isinstance(of, Nobody)]
+    gained = {right.right for right in first ^ second if _is_gained(right, second)}
+
+    def peers_of(requirement: Requirement) -> dict[Right, Right]:
+        return {
             goal_right(Right("", ALLOW, right, name)): Right("", ALLOW, PEER_RIGHT[right], name)
             for right, name in rights_that_need_a_peer(requirement)
         }
-        for requirement in (requirements if removed or added else ())
-        if similar_requirements(requirement)
+
+    asked = {of: peers_of(of) for of in compared if similar_requirements(of)}
+    # HEAD may forbid a name that it removes; but its peers perhaps have another name now.
+    limits = [of for of in earlier if isinstance(of, Only | AtMost)] if nobody else []
+    renamed = {
+        limit: {
+            right: peer
+            for right, peer in peers_of(limit).items()
+            if PEER_RIGHT[right.right] in gained
+        }
+        for limit in limits
     }
     difference = RightsDifference(tuple(removed), tuple(added), {})
-    candidates = {right for peers in asked.values() for right in peers}
+    candidates = {right for peers in (*asked.values(), *renamed.values()) for right in peers}
     unanswered = {
         *rights_without_counterpart(
             without_wildcards(first, removed),
@@ -299,17 +313,29 @@ def unanswered_requirement_findings(
             candidates,
         )
     }
+    for limit, peers in renamed.items():
+        lost = {right: peer for right, peer in peers.items() if right in unanswered}
+        for forbidding in nobody if lost else ():
+            names = names_demanded_by([forbidding], limit)
+            asked.setdefault(forbidding, {}).update(
+                {right: peer for right, peer in lost.items() if peer.name in names}
+            )
     for requirement, peers in asked.items():
-        lost = [
+        lost_texts = [
             f"{peer.right} {peer.kind.removesuffix('s')} {peer.name}"
             for right, peer in peers.items()
             if right in unanswered
         ]
-        if lost:
+        if lost_texts:
             place = requirement.source
-            text = f"HEAD removes the last stated right to {first_few(lost, 3)}, without which "
-            text += "the requirement protects nothing"
+            text = f"HEAD removes the last stated right to {first_few(lost_texts, 3)}, without "
+            text += "which the requirement protects nothing"
             yield DROPPED.found(str(requirement), text, place.file, place.line, _GONE_REMEDY)
+
+
+def _is_gained(right: Right, later: Collection[Right]) -> bool:
+    """Return whether a changed right gives access: an ALLOW in ``later``, or a lost DENY."""
+    return (right.qualifier is ALLOW) == (right in later)
 
 
 def namespaces_of_patterns(requirement: Requirement) -> list[str]:
