@@ -66,8 +66,7 @@ def apply(robot: LocalRobot, prepared: CloseState, *, dry_run: bool) -> CloseSta
     robot.shell.check_open()
     observed, secured = prepared.observed, prepared.secured
     if prepared.problems:
-        closed = [process for process in observed.processes if process.enclave in secured]
-        observed = observed._replace(processes=closed)
+        observed = observed._replace(processes=[*filter(prepared.runs_closed, observed.processes)])
     is_left = len(observed.processes) < len(prepared.observed.processes)
     changes = _write_drop_ins(robot, observed, dry_run=dry_run)
     if not dry_run:

@@ -641,8 +641,16 @@ class CloseState(NamedTuple):
         return {
             process.unit
             for process in self.observed.processes
-            if process.enclave in self.secured and process.enclave in self.pending
+            if self.runs_closed(process) and process.enclave in self.pending
         } & self.observed.units
+
+    def runs_closed(self, process: ClosedProcess) -> bool:
+        """Return whether a process of the robot runs in its enclave, even with earlier files.
+
+        A process of another user can claim the enclave, while the robot's process runs open.
+        """
+        is_current = self.secured.get(process.enclave, False)
+        return is_current or process.pid in self.outdated_pids.get(process.enclave, ())
 
     @property
     def pending_by_hand(self) -> Mapping[str, Sequence[ClosedProcess]]:

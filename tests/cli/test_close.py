@@ -2326,6 +2326,19 @@ def test_a_thief_does_not_keep_units_from_a_revocation(robot: Robot) -> None:
     assert not (robot.folder / "systemd/listener.service.d").exists(), "what is open stays open"
 
 
+def test_who_only_claims_an_enclave_makes_no_unit_closed(robot: Robot) -> None:
+    """Despite a problem, --apply would close the open unit of the enclave, and no other."""
+    robot.units = UNITS
+    robot.close()
+    secured = replace(robot.process("/talker", is_secured=True), pid=13, user=os.geteuid() + 1)
+    stranger = Process(14, ("/opt/stranger",), {}, datetime.now(UTC))
+    for command in (("/opt/guest",), secured.command):
+        robot.more = (replace(secured, command=command), stranger)
+        said = robot.close("--apply", status=1).out
+        assert "; but fix this first:\n" in said and robot.restarts == []
+        assert not [*(robot.folder / "systemd").iterdir()]
+
+
 @sometimes("an_enclave_that_belongs_to_another_machine")
 def test_an_enclave_that_belongs_to_another_machine(robot: Robot) -> None:
     """Seen while sros watched, it has to be seen again; another one may be away, as a laptop."""
