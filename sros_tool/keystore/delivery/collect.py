@@ -671,7 +671,8 @@ class _Verifier:
         Messages may be there for a long time before they are collected, so this is the time at
         which the file was written, by the clock of the server.  If it was written before the last
         message was collected, then the clock of the server is behind: the time that the message
-        shows counts, but no time before that collection or after now.
+        shows counts, but no time before that collection or after now.  For a message that an
+        earlier release of sros took, the time of its receipt stands for its collection.
         """
         came = file.written
         collected = last.message and (last.message.collected or last.time) if last else None
