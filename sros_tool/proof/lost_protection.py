@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from sros_tool.checks.kind import Finding
 from sros_tool.checks.requirements import DROPPED, VIOLATED
@@ -16,13 +16,14 @@ from sros_tool.errors import DocumentError
 from sros_tool.fleet.robots import Fleet
 from sros_tool.names import expand, is_expression
 from sros_tool.policy.model import ALLOW, PEER_RIGHT, Enclave
-from sros_tool.policy.patterns import common_name, overlap
+from sros_tool.policy.patterns import Names, common_name, overlap
 from sros_tool.policy.rights import (
     NodeName,
     Right,
     RightsDifference,
     goal_right,
     nodes_of,
+    parts,
     rights_without_counterpart,
     split_actions,
 )
@@ -219,11 +220,18 @@ def access_by_name_findings(
     The owner of the requirement has to see such an enclave.
     """
     similar_requirements = similarity_to(requirements)
-    # As they were before: the change may also name its own enclaves in them.
-    kept = [of for of in earlier if isinstance(of, Only) and similar_requirements(of)]
     old, new = split_actions(before.rights), split_actions(after.rights)
     gained = {right for right in old ^ new if _is_gained(right, new)}
-    for requirement, steps in decide_all(kept, system).by_name if gained else ():
+    # As they were before: the change may also name its own enclaves in them.
+    whole = {
+        _about_rights(requirement, gained): requirement
+        for requirement in earlier
+        if isinstance(requirement, Only)
+        and patterns_of_any_package(requirement)
+        and similar_requirements(requirement)
+    }
+    narrowed = [requirement for requirement in whole if requirement.rights]
+    for requirement, steps in decide_all(narrowed, system).by_name:
         wanted = split_actions(
             Right("", ALLOW, right, name) for right, names in requirement.rights for name in names
         )
@@ -238,10 +246,29 @@ def access_by_name_findings(
                 text = f"{step.text()}: new access, which the requirement allows only by "
                 patterns = first_few(patterns_of_any_package(requirement), 3)
                 text += f"{patterns}, as to any enclave of such a name"
-                place = step.source or similar_requirements(requirement)[0].source
+                place = step.source or similar_requirements(whole[requirement])[0].source
                 remedy = "Approve this in the review. No approval is needed if an earlier change "
                 remedy += "already listed the enclave in the requirement by its own name."
-                yield DROPPED.found(str(requirement), text, place.file, place.line, remedy)
+                subject = str(whole[requirement])
+                yield DROPPED.found(subject, text, place.file, place.line, remedy)
+
+
+def _about_rights(requirement: Only, rights: Iterable[Right]) -> Only:
+    """Return a requirement without the names that ``rights`` are not about."""
+    names_by_word: dict[str, set[str]] = defaultdict(set)
+    for right in rights:
+        names_by_word[right.right].add(right.name)
+    known = {word: Names(sorted(names)) for word, names in names_by_word.items()}
+
+    def is_known(word: str, name: str) -> bool:
+        own = parts(Right("", ALLOW, word, name))
+        return any(part.right in known and known[part.right].overlaps(part.name) for part in own)
+
+    left = (
+        (word, tuple(name for name in names if is_known(word, name)))
+        for word, names in requirement.rights
+    )
+    return replace(requirement, rights=tuple((word, names) for word, names in left if names))
 
 
 _GONE_REMEDY = (

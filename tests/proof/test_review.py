@@ -1420,6 +1420,12 @@ def _moved(node: str, path: str, enclaves: dict[str, str] = _NODES) -> dict[str,
                 _HANDS | {"/operator/hand": publish("/cmd")},
                 "/operator/hand may publish /cmd: new access",
             ),
+            (  # It had access to a shorter name already.
+                _HANDS | {"/operator/hand": publish("/cmd")},
+                _ONLY_OPERATORS.replace('"/cmd"', '"/cmd", "/cmd_all"'),
+                _HANDS | {"/operator/hand": publish("/cmd", "/cmd_all")},
+                "/operator/hand may publish /cmd_all: new access",
+            ),
             (  # The change itself names the enclave in the requirement.
                 _NODES,
                 _ONLY_OPERATORS
