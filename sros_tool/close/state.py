@@ -40,7 +40,7 @@ from sros_tool.keystore.layout import (
 from sros_tool.keystore.reader import FilesReadOnce, OpenedKeystore, open_enclave
 from sros_tool.names import expand
 from sros_tool.policy.model import Policy
-from sros_tool.runtime.environment import node_argument
+from sros_tool.runtime.environment import node_argument, started_nodes
 from sros_tool.runtime.processes import (
     Process,
     ProcessEnclave,
@@ -361,9 +361,10 @@ class RunningRobot:
         can read the enclaves count, and only units that start a single process. Only a name shows
         the enclave: the last process left may be any program, and may not get rights.
         """
+        programs = _programs_of_enclaves(observed)
         claims: dict[str, list[tuple[Process, str]]] = {}
         for process in filter(self.may_use_files, self.open_processes):
-            enclaves, known_by = _enclaves_of(process, idle)
+            enclaves, known_by = _enclaves_of(process, idle, programs)
             if len(enclaves) == 1 and process_text(process) in observed.unknown:
                 claims.setdefault(enclaves[0], []).append((process, known_by))
         found = {
@@ -431,22 +432,47 @@ def unit_advice(processes: Iterable[ClosedProcess]) -> Iterator[str]:
         )
 
 
+def _programs_of_enclaves(observed: ObservedProcesses) -> Mapping[str, str]:
+    """Map the enclaves of observed processes to their program, if it shows which node it runs.
+
+    It does not if several enclaves have the program, such as `component_container`, or if the
+    command gives the node a name or a namespace.
+    """
+    programs = {
+        (process.enclave, _program_name(process.command)): any(
+            map(any, started_nodes(process.command))
+        )
+        for process in observed.processes
+    }
+    count = Counter(program for _, program in programs)
+    return {
+        enclave: program
+        for (enclave, program), is_named in programs.items()
+        if count[program] == 1 and not is_named
+    }
+
+
+def _program_name(command: Sequence[str]) -> str:
+    return program_of(tuple(command)).removesuffix(".py")
+
+
 def _enclaves_of(
-    process: Process, nodes: Mapping[str, Collection[str]]
+    process: Process, nodes: Mapping[str, Collection[str]], programs: Mapping[str, str]
 ) -> tuple[Sequence[str], str]:
     """Return the enclaves with a node of a process's name, and what shows the name.
 
-    ``nodes`` maps enclaves to the full names of their nodes. The name is the node's in the command,
-    or otherwise the name of the program.
+    ``nodes`` maps enclaves to the full names of their nodes, and ``programs`` enclaves to the
+    program that sros remembers. The name is the node's in the command, or otherwise the name of the
+    program.
     """
     if named := node_argument(process.command):
         full_name = expand("~", *named)
         return [enclave for enclave, names in nodes.items() if full_name in names], "node name"
-    program = program_of(process.command).removesuffix(".py")
+    program = _program_name(process.command)
     fitting = [
         enclave
         for enclave, names in nodes.items()
-        if program in {name.rpartition("/")[2] for name in names}
+        if program in {programs.get(enclave), *(name.rpartition("/")[2] for name in names)}
     ]
     return fitting, "program"
 
@@ -768,20 +794,19 @@ def _new_enclaves(
 def _movable_enclaves(
     policy: Policy, observed: ObservedProcesses, secured: Collection[str]
 ) -> Mapping[str, Collection[str]]:
-    """Map the enclaves without a process whose node may have moved into a unit to names.
+    """Map the enclaves without a process whose node may have moved into a unit to full names.
 
-    The user started the process by hand or by a script. The names are the full names of the nodes,
-    and the program of the process.
+    The user started the process by hand or by a script.
     """
     count = Counter(process.enclave for process in observed.processes)
     movable = {
-        process.enclave: f"/{program_of(tuple(process.command)).removesuffix('.py')}"
+        process.enclave
         for process in observed.processes
         if process.is_idle and process.enclave not in secured and count[process.enclave] == 1
         if not (process.unit or process.launch or process.container or process.shares)
     }
     return {
-        enclave.path: {movable[enclave.path], *(each.full_name for each in enclave.all_profiles())}
+        enclave.path: {profile.full_name for profile in enclave.all_profiles()}
         for enclave in policy.enclaves
         if enclave.path in movable
     }

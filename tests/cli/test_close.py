@@ -826,14 +826,24 @@ def a_unit_that_started_after_the_watch(robot: Robot, late: Process) -> None:
         assert (by_unit in said) is (more != (by_another_user,))
     del robot.units["8"]
     robot.units["7"], robot.absent = "moved.service", {"/talker"}
-    for command, known in (
-        (("python3", "/opt/talker.py"), "by its program"),  # the name of its node
-        (("/usr/run", "-v"), "by its program"),  # the program of the command that sros remembers
-        (("/opt/x", "--ros-args", "-r", "__node:=talker"), "by its node name"),
+    node = ["--ros-args", "-r", "__node:=talker"]
+    by_say, by_named_say = (
+        before.replace(b'"/opt/run",\n        "talker"', json.dumps(words)[1:-1].encode())
+        for words in (["/opt/say"], ["/opt/say", *node])
+    )
+    for remembered, command, known in (
+        (before, ("python3", "/opt/talker.py"), "by its program"),  # the name of its node
+        (by_say, ("/usr/say", "-v"), "by its program"),  # of the command that sros remembers
+        (before, ("/usr/run", "-v"), ""),  # the program of /listener, too
+        (by_named_say, ("/usr/say", "-v"), ""),  # the program may run another node
+        (by_say, ("/opt/x", *node[:2], "__node:=say"), ""),  # the program of another node
+        (before, ("/opt/x", *node), "by its node name"),
     ):
+        processes.write_bytes(remembered)
         robot.more = (replace(late, command=command),)
-        said = robot.close().out
-        assert f"  /talker: process 7, known {known}: --apply restarts moved.service" in said
+        said = robot.close(status=int(not known)).out
+        moved = f"  /talker: process 7, known {known}: --apply restarts moved.service"
+        assert (moved in said) is bool(known), command
     robot.close("--apply", status=1)
     (talker,) = (each for each in json.loads(processes.read_text())["processes"] if each["unit"])
     assert (talker["enclave"], tuple(talker["command"])) == ("/talker", command)
