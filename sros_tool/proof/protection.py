@@ -336,7 +336,7 @@ def _topics_lost_at_enclave(
     ``rights`` are allowed to the enclave.
     """
     allowed = ((KIND_OF[part.right], part.name) for right in rights for part in parts(right))
-    own = ((each.kind, each.name) for each in enough if each.enclave == protection.enclave)
+    own = ((stated.kind, stated.name) for stated in enough if stated.enclave == protection.enclave)
     return (_topics([(protection.kind, protection.name)]) & _topics(allowed)) - _topics(own)
 
 

@@ -85,6 +85,15 @@ from sros_tool.proof.commit_files import (
     may_include_files,
     may_match,
 )
+from sros_tool.proof.escapes import (
+    MOST_NAMESPACES,
+    RobotMoves,
+    access_by_name_findings,
+    lost_restriction_findings,
+    namespaces_in,
+    namespaces_of_patterns,
+    unanswered_requirement_findings,
+)
 from sros_tool.proof.findings import (
     common_namespaces,
     decide_all,
@@ -94,15 +103,6 @@ from sros_tool.proof.findings import (
     unused_remapping_findings,
 )
 from sros_tool.proof.growth import Growth, compare_access
-from sros_tool.proof.lost_protection import (
-    MOST_NAMESPACES,
-    RobotMoves,
-    access_by_name_findings,
-    lost_restriction_findings,
-    namespaces_in,
-    namespaces_of_patterns,
-    unanswered_requirement_findings,
-)
 from sros_tool.proof.repository import FILES, LINK, SUBMODULE, Repository, TreeEntry, walk
 from sros_tool.proof.requirements import (
     KINDS,

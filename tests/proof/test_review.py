@@ -28,7 +28,7 @@ from sros_tool.fleet.fleet_file import inventory, render_fleet
 from sros_tool.fleet.robots import Fleet, Robot
 from sros_tool.policy.model import ALLOW
 from sros_tool.policy.rights import Right, renamed_enclaves
-from sros_tool.proof import lost_protection, review
+from sros_tool.proof import escapes, review
 from sros_tool.proof.commit_files import CommitFiles
 from sros_tool.proof.repository import Repository
 from tests.support.code_host import NODE, PROJECT
@@ -1269,7 +1269,7 @@ def test_names_that_are_too_many_to_compare_leave_the_other_steps(
     change.commit({"robot.xml": after})
     with monkeypatch.context() as patched:
         error = DocumentError("there are too many similar names")
-        patched.setattr(lost_protection, "rights_without_counterpart", Mock(side_effect=error))
+        patched.setattr(escapes, "rights_without_counterpart", Mock(side_effect=error))
         ended = change.review("--policy", "robot.xml", "--requirements", "robot.toml")
     assert ended.status == 2 and "requirements-before robot.xml: there are too" in ended.out, ended
     assert "+ /b subscribe topic /y" in ended.out, ended
