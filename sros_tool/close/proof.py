@@ -464,6 +464,7 @@ def _narrow_discovery(environment: Mapping[str, str]) -> Collection[str]:
         "ROS_AUTOMATIC_DISCOVERY_RANGE": ("", "SUBNET", "SYSTEM_DEFAULT"),
         "ROS_LOCALHOST_ONLY": ("", "0"),
         "ROS_DISCOVERY_SERVER": ("",),
+        "FASTDDS_ENVIRONMENT_FILE": ("",),  # it may set the variables of Fast DDS
         **dict.fromkeys(("CYCLONEDDS_URI", *PROFILE_VARIABLES), ("",)),
     }
     return [name for name, wide in wide_values.items() if environment.get(name, "") not in wide]

@@ -343,6 +343,7 @@ def robot_beside_graph(*values: dict[str, Any], **environment: str) -> Any:
         ({"ROS_LOCALHOST_ONLY": "1"}, True),
         ({"CYCLONEDDS_URI": "", "ROS_DISCOVERY_SERVER": ""}, False),
         *(({name: "x"}, True) for name in ("CYCLONEDDS_URI", "FASTRTPS_DEFAULT_PROFILES_FILE")),
+        ({"FASTDDS_ENVIRONMENT_FILE": "x"}, True),
         ({"ROS_LOCALHOST_ONLY": "1", "RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp"}, True),
         ({"ROS_LOCALHOST_ONLY": "1", "RMW_IMPLEMENTATION": "rmw_zenoh_cpp"}, False),
     ],
