@@ -157,7 +157,7 @@ def _write_drop_ins(
 
 
 def _remember_new_units(robot: LocalRobot, observed: ObservedProcesses) -> None:
-    """Write units that started processes only after the watch, with the commands, into the folder.
+    """Write units that started processes only after the watch, and how, into the folder.
 
     Without a drop-in, nothing else shows --undo that such a unit belongs to the robot.
     """
@@ -167,12 +167,16 @@ def _remember_new_units(robot: LocalRobot, observed: ObservedProcesses) -> None:
     processes = [
         *(
             each._replace(
-                command=found.command if known[each.enclave] == 1 else each.command,
+                command=started.command,
+                folder=started.folder,
+                rmw=started.rmw,
+                user=started.user,
                 unit=found.unit,
                 secured_by_unit=found.secured_by_unit,
             )
             for each in before
             for found in [now.get(each.enclave, each)]
+            for started in [found if known[each.enclave] == 1 else each]
         ),
         *(each for each in observed.processes if each.unit and each.enclave not in known),
     ]

@@ -826,7 +826,10 @@ def a_unit_that_started_after_the_watch(robot: Robot, late: Process) -> None:
         assert (by_unit in said) is (more != (by_another_user,))
     del robot.units["8"]
     robot.units["7"], robot.absent = "moved.service", {"/talker"}
-    node = ["--ros-args", "-r", "__node:=talker"]
+    node, cyclone = (
+        ["--ros-args", "-r", "__node:=talker"],
+        {"RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp"},
+    )
     by_say, by_named_say = (
         before.replace(b'"/opt/run",\n        "talker"', json.dumps(words)[1:-1].encode())
         for words in (["/opt/say"], ["/opt/say", *node])
@@ -840,13 +843,14 @@ def a_unit_that_started_after_the_watch(robot: Robot, late: Process) -> None:
         (before, ("/opt/x", *node), "by its node name"),
     ):
         processes.write_bytes(remembered)
-        robot.more = (replace(late, command=command),)
+        robot.more = (replace(late, command=command, environment=cyclone),)
         said = robot.close(status=int(not known)).out
         moved = f"  /talker: process 7, known {known}: --apply restarts moved.service"
         assert (moved in said) is bool(known), command
     robot.close("--apply", status=1)
     (talker,) = (each for each in json.loads(processes.read_text())["processes"] if each["unit"])
     assert (talker["enclave"], tuple(talker["command"])) == ("/talker", command)
+    assert talker["rmw"] == "rmw_cyclonedds_cpp", "otherwise, --undo would not know it"
     processes.write_bytes(before)
     (robot.folder / "systemd/moved.service.d/sros-close.conf").unlink()
     robot.absent = set()
