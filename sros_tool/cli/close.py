@@ -498,7 +498,8 @@ def _show_commands_by_hand(
     from sros_tool.close.state import unit_advice
 
     for command, processes in closed.pending_by_hand.items():
-        if only_secured and closed.secured.keys().isdisjoint(each.enclave for each in processes):
+        enclaves = {process.enclave for process in processes}
+        if only_secured and enclaves.isdisjoint(closed.secured):
             continue
         start = "restart the unit" if processes[0].unit else "start again"
         stop = "" if processes[0].unit else _shared_start_text(processes)

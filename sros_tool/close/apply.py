@@ -161,24 +161,19 @@ def _remember_new_units(robot: LocalRobot, observed: ObservedProcesses) -> None:
 
     Without a drop-in, nothing else shows --undo that such a unit belongs to the robot.
     """
-    now = {process.enclave: process for process in observed.processes if process.unit}
+    of_units = {process.enclave: process for process in observed.processes if process.unit}
     before = robot.processes.processes
-    known = Counter(process.enclave for process in before)
-    processes = [
-        *(
-            each._replace(
-                command=started.command,
-                folder=started.folder,
-                rmw=started.rmw,
-                user=started.user,
-                unit=found.unit,
-                secured_by_unit=found.secured_by_unit,
+    count = Counter(process.enclave for process in before)
+    processes = list[ClosedProcess]()
+    for process in before:
+        now = of_units.get(process.enclave, process)
+        if count[process.enclave] == 1:
+            process = process._replace(
+                command=now.command, folder=now.folder, rmw=now.rmw, user=now.user
             )
-            for each in before
-            for found in [now.get(each.enclave, each)]
-            for started in [found if known[each.enclave] == 1 else each]
-        ),
-        *(each for each in observed.processes if each.unit and each.enclave not in known),
+        processes.append(process._replace(unit=now.unit, secured_by_unit=now.secured_by_unit))
+    processes += [
+        process for process in observed.processes if process.unit and process.enclave not in count
     ]
     if processes != [*before]:
         robot.write_processes(robot.processes._replace(processes=processes))

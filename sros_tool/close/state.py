@@ -177,7 +177,7 @@ class RunningRobot:
             by_enclave.setdefault(secured.enclave.name, []).append(secured)
         not_current: dict[str, list[tuple[Process, str]]] = {}
         for name, processes in by_enclave.items():
-            may_use = [each for each in processes if self.may_use_files(each.process)]
+            may_use = [secured for secured in processes if self.may_use_files(secured.process)]
             for process, enclave in may_use or processes:
                 if why := self._why_not_current(process, enclave):
                     not_current.setdefault(name, []).append((process, why))
@@ -244,13 +244,13 @@ class RunningRobot:
         """Map enclaves in ``secured`` to the open processes that have the command of an enclave."""
         processes = observed.processes
         known = {pid for process in processes for pid in (process.pid, *process.alike)}
-        others = [each for each in self.open_processes if each.program[0] not in known]
+        others = [process for process in self.open_processes if process.program[0] not in known]
         pids = {
             process.enclave: [other.program[0] for other in others if process.fits(other)]
             for process in processes
             if process.enclave in secured
         }
-        return {name: [*dict.fromkeys(found)] for name, found in pids.items() if found}
+        return {name: [*dict.fromkeys(fitting)] for name, fitting in pids.items() if fitting}
 
     def with_other_files(self) -> Iterator[str]:
         """Yield the processes of the domain in enclaves of other folders, as text."""
@@ -270,17 +270,19 @@ class RunningRobot:
         unless its user cannot read the files of the enclave.
         """
         programs: dict[tuple[str, int], SecuredProcess] = {}
-        for each in sorted(
-            secured, key=lambda each: (not self.may_use_files(each.process), each.process.started)
-        ):
-            programs.setdefault((each.enclave.name, each.process.program[0]), each)
+        by_user = sorted(
+            secured,
+            key=lambda entry: (not self.may_use_files(entry.process), entry.process.started),
+        )
+        for entry in by_user:
+            programs.setdefault((entry.enclave.name, entry.process.program[0]), entry)
         count = Counter[tuple[str, Sequence[int]]]()
-        for (name, _), each in programs.items():
+        for (name, _), program in programs.items():
             known = [known for known in observed.processes if known.enclave == name]
-            fitting = tuple(place for place, like in enumerate(known) if like.fits(each.process))
+            fitting = tuple(place for place, like in enumerate(known) if like.fits(program.process))
             count[name, fitting] += 1
             if count[name, fitting] > (len(fitting) if known else 1):
-                yield each
+                yield program
 
     def enclaves_with_other_files(self, observed: ObservedProcesses) -> Sequence[str]:
         """Return the enclaves whose process runs secured, but with no files of the export."""
@@ -330,7 +332,7 @@ class RunningRobot:
 
         ``running`` are the processes in its enclave.
         """
-        programs = {each.program[0]: each for each in running if known.fits(each)}
+        programs = {process.program[0]: process for process in running if known.fits(process)}
         if known.launch or known.container or known.shares or len(programs) != 1:
             return known
         ((pid, process),) = programs.items()
@@ -367,18 +369,18 @@ class RunningRobot:
             enclaves, known_by = _enclaves_of(process, idle, programs)
             if len(enclaves) == 1 and process_text(process) in observed.unknown:
                 claims.setdefault(enclaves[0], []).append((process, known_by))
-        found = {
+        recognized = {
             process_text(process): known._replace(known_by=known_by)
             for enclave, ((process, known_by), *others) in claims.items()
             if not others
             and (known := with_command_of_unit(secured_process(process, enclave))).unit
             and self._programs_of_units[known.unit] == 1
         }
-        moved = {known.enclave for known in found.values()}
+        moved = {known.enclave for known in recognized.values()}
         stay = [process for process in observed.processes if process.enclave not in moved]
         return observed._replace(
-            processes=[*stay, *found.values()],
-            unknown=[text for text in observed.unknown if text not in found],
+            processes=[*stay, *recognized.values()],
+            unknown=[text for text in observed.unknown if text not in recognized],
         )
 
     def other_domains_text(self) -> str:

@@ -64,8 +64,11 @@ class UnitRestarts:
 
     def __init__(self, robot: LocalRobot, observed: ObservedProcesses) -> None:
         self._robot = robot
-        processes = [each for each in observed.processes if each.enclave not in robot.without]
-        self._units = {each.enclave: each.unit for each in processes if each.unit}
+        self._units = {
+            process.enclave: process.unit
+            for process in observed.processes
+            if process.unit and process.enclave not in robot.without
+        }
         self._before = {unit: self._count(unit) for unit in self._units.values()}
 
     def _count(self, unit: str) -> int:
