@@ -310,7 +310,6 @@ def unanswered_requirement_findings(
 
     similar_requirements = similarity_to(earlier)
     compared = requirements if removed or added else ()
-    nobody = [of for of in compared if isinstance(of, Nobody)]
     gained = {right.right for right in first ^ second if _is_gained(right, second)}
 
     def peers_of(requirement: Requirement) -> dict[Right, Right]:
@@ -320,18 +319,9 @@ def unanswered_requirement_findings(
         }
 
     asked = {of: peers_of(of) for of in compared if similar_requirements(of)}
-    # HEAD may forbid a name that it removes; but its peers perhaps have another name now.
-    limits = [of for of in earlier if isinstance(of, Only | AtMost)] if nobody else []
-    renamed = {
-        limit: {
-            right: peer
-            for right, peer in peers_of(limit).items()
-            if PEER_RIGHT[right.right] in gained
-        }
-        for limit in limits
-    }
+    asked_before = {of: peers_of(of) for of in earlier} if compared else {}
     difference = RightsDifference(tuple(removed), tuple(added), {})
-    candidates = {right for peers in (*asked.values(), *renamed.values()) for right in peers}
+    candidates = {right for peers in (*asked.values(), *asked_before.values()) for right in peers}
     unanswered = {
         *rights_without_counterpart(
             without_wildcards(first, removed),
@@ -340,12 +330,16 @@ def unanswered_requirement_findings(
             candidates,
         )
     }
-    for limit, peers in renamed.items():
+    # HEAD may demand the same about wider names, or forbid the names.
+    for old, peers in asked_before.items():
         lost = {right: peer for right, peer in peers.items() if right in unanswered}
-        for forbidding in nobody if lost else ():
-            names = names_demanded_by([forbidding], limit)
-            asked.setdefault(forbidding, {}).update(
-                {right: peer for right, peer in lost.items() if peer.name in names}
+        for requirement in compared if lost else ():
+            names = names_demanded_by([requirement], old)
+            asked.setdefault(requirement, {}).update(
+                (right, peer)
+                for right, peer in lost.items()
+                if peer.name in names
+                if not isinstance(requirement, Nobody) or PEER_RIGHT[right.right] in gained
             )
     for requirement, peers in asked.items():
         lost_texts = [

@@ -1291,34 +1291,35 @@ def test_a_name_that_nobody_may_use_may_lose_its_denial_and_its_right(change: Ch
 
 @pytest.mark.parametrize("name", ["/q", "q"])
 @pytest.mark.parametrize(
-    ("forbidden_before", "after", "also", "fails"),
+    ("before", "after", "others", "fails"),
     [
-        (False, "", "", False),
-        (True, "", "", True),
-        (False, "/r", "", True),
-        (False, "/r", "subscribe", True),
+        ("only", '[[nobody]]\npublish = ["{}"]\n', (), False),
+        ("nobody", '[[nobody]]\npublish = ["{}"]\n', (), True),
+        ("only", '[[nobody]]\npublish = ["{}"]\n', ("/r",), True),
+        ("only", '[[nobody]]\npublish = ["{0}"]\nsubscribe = ["{0}"]\n', ("/r",), True),
+        ("only", '[[only]]\npublish = ["{}*"]\nenclaves = ["/a"]\n', ("/r", "/qx"), True),
     ],
 )
 def test_a_change_may_forbid_the_name_that_it_removes(
-    change: Change, name: str, forbidden_before: bool, after: str, also: str, fails: bool
+    change: Change, name: str, before: str, after: str, others: tuple[str, ...], fails: bool
 ) -> None:
     """Twins: the subscriber gets, or perhaps got, another name, which no requirement restricts."""
-    nobody = f'[[nobody]]\npublish = ["{name}"]\n'
-    only = nobody.replace("nobody", "only") + 'enclaves = ["/a"]\n'
-    before = policy_text({"/a": publish("/x", "/q"), "/b": subscribe("/x", name)})
-    names = ("/x", after) if after else ("/x",)
-    robot = policy_text({"/a": publish(*names), "/b": subscribe(*names)})
-    if forbidden_before:
-        only, before = nobody, before.replace("/q</topic>", "/x</topic>", 1)
-    if also:
-        nobody += f'{also} = ["{name}"]\n'
-    change.base = change.commit({"robot.xml": before, "robot.toml": only})
-    change.commit({"robot.xml": robot, "robot.toml": f"# shorter\n{nobody}"})
+    is_forbidden = before == "nobody"
+    required = f'[[{before}]]\npublish = ["{name}"]\n' + 'enclaves = ["/a"]\n' * (not is_forbidden)
+    publisher = publish("/x") if is_forbidden else publish("/x", "/q")
+    change.base = change.commit(
+        {
+            "robot.xml": policy_text({"/a": publisher, "/b": subscribe("/x", name)}),
+            "robot.toml": required,
+        }
+    )
+    robot = policy_text({"/a": publish("/x", *others), "/b": subscribe("/x", *others)})
+    change.commit({"robot.xml": robot, "robot.toml": f"# shorter\n{after.format(name)}"})
     words = ("--policy", "robot.xml", "--requirements", "robot.toml", "--new-access", "allow")
     ended = change.review(*words)
-    assert ("for topic /q any more; required: nobody" in ended.out) == forbidden_before, ended
+    assert ("for topic /q any more; required: nobody" in ended.out) == is_forbidden, ended
     lost = "HEAD removes the last stated right to subscribe topic /q,"
-    assert (lost in ended.out) == bool(after), ended
+    assert (lost in ended.out) == bool(others), ended
     assert ended.status == fails, ended
 
 
