@@ -95,6 +95,7 @@ from sros_tool.proof.escapes import (
     unanswered_requirement_findings,
 )
 from sros_tool.proof.findings import (
+    Decisions,
     common_namespaces,
     decide_all,
     decided_findings,
@@ -1110,7 +1111,6 @@ class _Review:
                 files.values(),
                 base_files.values(),
                 wanted,
-                system,
                 sources,
             )
             required_before = [*chain.from_iterable(earlier.values())]
@@ -1175,19 +1175,20 @@ class _Review:
         system: System,
         before: Iterable[Right],
         earlier: Sequence[Requirement],
-        elsewhere: Callable[[], Iterable[Finding]],
+        elsewhere: Callable[[Decisions], Iterable[Finding]],
         known_notes: Callable[[], Collection[tuple[FindingKind, str]]],
     ) -> tuple[int, ChosenFindings]:
         """Return the exit status and the findings on requirements, also in other namespaces."""
         asked = self.request
-        decided = requirement_findings(requirements, system, before, earlier)
-        if any(finding.kind in _LASTING_NOTES for finding in decided):
+        decided = decide_all(requirements, system)
+        own = decided_findings(decided, system, before, earlier)
+        if any(finding.kind in _LASTING_NOTES for finding in own):
             known = known_notes()
-            decided = [of for of in decided if (of.kind, of.text) not in known]
+            own = [of for of in own if (of.kind, of.text) not in known]
         findings = [
-            *decided,
+            *own,
             *left_out_robot_findings(system, asked.namespaces),
-            *elsewhere(),
+            *elsewhere(decided),
             *unused_remapping_findings(files, system, asked.namespaces, asked.remaps),
         ]
         # In several namespaces, a requirement with absolute names is decided several times.
@@ -1218,15 +1219,16 @@ class _Review:
         files: Iterable[Path],
         base_files: Iterable[Path],
         requirements: Sequence[Requirement],
-        system: System,
         sources: Callable[[], tuple[AccessSource, AccessSource]] | None,
+        decided: Decisions,
     ) -> Iterator[Finding]:
         """Yield findings on requirements that fail in another namespace only because of the change.
 
         A requirement fails if it is broken, or if no right is left for any name in it.  It does not
         fail because of the change if BASE has the same failure under names that the change renames.
         Users may put the nodes of a package, and its requirements, into their own namespaces.
-        ``requirements`` are the requirements in ``files`` for the namespace / of ``system``.
+        ``requirements`` are the requirements in ``files`` for the namespace /, and ``decided`` are
+        the decisions on them.
         """
         asked = self.request
         if not any(requirement.is_relative for requirement in requirements):
@@ -1241,11 +1243,13 @@ class _Review:
                 f"whether the change breaks them in {MOST_NAMESPACES} of {len(namespaces)} "
                 "namespaces (those of changed names first)"
             )
+        failing = {violation.requirement for violation in decided.violations}
+        failing |= {requirement for requirement, _ in decided.vacuous}
         # In the namespaces of its own patterns, a requirement is for other enclaves than in /.
         left = {
             at: [*namespaces[:MOST_NAMESPACES], *namespaces_of_patterns(here)[1:]]
             for at, here in enumerate(requirements)
-            if here.is_relative and not _failures(here, system)
+            if here.is_relative and here not in failing
         }
 
         def system_in(ns: str, source: AccessSource) -> System:
