@@ -300,9 +300,12 @@ def test_a_lifecycle_node_gets_all_its_rights_at_once() -> None:
     node = replace(BARE, groups=groups_of(ordinary, "/", "talker"))
     event, state = of("rt/talker/transition_event", "publish"), of("rq/talker/get_stateRequest")
     for denied, present, added in ((event, node, 6), (state, node, 1), (event, WHOLE, 1)):
-        (profile,) = as_learned(denied, "/robot", None, robot(present), COMMON).profiles
+        learned = as_learned(denied, "/robot", None, robot(present), COMMON)
+        (profile,) = learned.profiles
         assert len(profile.rights - ordinary) == added
         assert profile.includes == ("common/lifecycle_node.xml",) * (added == 6)
+        (told,) = [note.text for note in learned.notes] or [""]
+        assert told.endswith(": /talker: common/lifecycle_node.xml") is (added == 6)
 
 
 def test_a_parameter_client_is_told_which_services_it_also_needs() -> None:
