@@ -182,8 +182,8 @@ class ClosedProcess(NamedTuple):
     ) -> ClosedProcess:
         """Return a copy with the id and unit that the process has now, in its domain and network.
 
-        A process that runs in its enclave of the ``export`` is preferred to open ones.  The id
-        stays if the process may run but could not be examined.
+        A process that runs in its enclave of the ``export`` is preferred to open ones, unless its
+        user cannot read the files.  The id stays if the process may run but could not be examined.
         """
         in_domain = [other for other in running.processes if is_in_domain(other, domain)]
         in_enclave = [
@@ -192,6 +192,7 @@ class ClosedProcess(NamedTuple):
             if (enclave := other.enclave)
             and enclave.name == self.enclave
             and enclave.is_in_keystore(export)
+            and may_use_files(other, export)
         ]
         pids = [
             *dict.fromkeys(
@@ -300,6 +301,14 @@ class ClosedProcess(NamedTuple):
             f"SecuredNodes({given}) from sros_tool.launch in front of its nodes, once "
             "(docs/launch.md); without it, none of them starts."
         )
+
+
+def may_use_files(process: Process, export: Path) -> bool:
+    """Return whether a process is of a user who can read the enclaves of an export.
+
+    A process of another user can only claim to run in an enclave.
+    """
+    return process.user == 0 or (export.exists() and process.user == export.stat().st_uid)
 
 
 def _start_command(process: Process) -> tuple[str, ...]:

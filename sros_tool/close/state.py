@@ -26,6 +26,7 @@ from sros_tool.close.processes import (
     ObservedProcesses,
     command_without_enclave,
     is_in_domain,
+    may_use_files,
     process_text,
 )
 from sros_tool.close.robot import MOST_NAMES, OBSERVER, LocalRobot, check_enclaves
@@ -184,11 +185,8 @@ class RunningRobot:
         return not_current
 
     def may_use_files(self, process: Process) -> bool:
-        """Return whether a process is of a user who can read the enclaves.
-
-        A process of another user can only claim to run in an enclave.
-        """
-        return process.user in (0, self.robot.export.stat().st_uid)
+        """Return whether a process is of a user who can read the enclaves."""
+        return may_use_files(process, self.robot.export)
 
     def _why_not_current(self, process: Process, enclave: ProcessEnclave) -> str:
         """Return why a process is not closed, as text before "the processes of X"; "" for a closed

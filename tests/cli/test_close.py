@@ -2341,7 +2341,7 @@ def test_a_thief_does_not_keep_units_from_a_revocation(robot: Robot) -> None:
 
 
 def test_who_only_claims_an_enclave_makes_no_unit_closed(robot: Robot) -> None:
-    """Despite a problem, --apply would close the open unit of the enclave, and no other."""
+    """Or --apply would close only this unit despite a problem, or all others without one."""
     robot.units = UNITS
     robot.close()
     secured = replace(robot.process("/talker", is_secured=True), pid=13, user=os.geteuid() + 1)
@@ -2351,6 +2351,10 @@ def test_who_only_claims_an_enclave_makes_no_unit_closed(robot: Robot) -> None:
         said = robot.close("--apply", status=1).out
         assert "; but fix this first:\n" in said and robot.restarts == []
         assert not [*(robot.folder / "systemd").iterdir()]
+    robot.more = (secured,)
+    said = robot.close("--apply", status=1).out
+    assert robot.restarts == ["daemon-reload", *RESTARTS], "the unit of /talker, too"
+    assert "every process in an enclave belongs there: sros did not see process 13 (run)" in said
 
 
 @sometimes("an_enclave_that_belongs_to_another_machine")
