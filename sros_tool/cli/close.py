@@ -74,7 +74,8 @@ def _run(words: Sequence[str], shows_messages: bool) -> tuple[int, str, str]:
 @click.option(
     "--undo",
     is_flag=True,
-    help="Open the robot again: restart its systemd units without security.",
+    help="Open the robot again: remove the drop-ins of --apply, restart their systemd units, and "
+    "say what is left to do by hand.",
 )
 @click.option(
     "--accept",
