@@ -372,8 +372,8 @@ def _proof_of_connections(robot: LocalRobot) -> Iterator[Proof]:
         yield Proof(CONNECTED, None, f"{names} may also belong to the robot: {text}")
     elif connections.compared and (unknown := connections.unknown):
         names = first_few([*map(process_name, unknown)], MOST_NAMES)
-        one = len(unknown) == 1
-        hear, they, share = ("hears", "it", "shares") if one else ("hear", "they", "share")
+        is_one = len(unknown) == 1
+        hear, they, share = ("hears", "it", "shares") if is_one else ("hear", "they", "share")
         yield Proof(
             CONNECTED,
             None,
@@ -427,8 +427,8 @@ def _proof_of_silence(robot: LocalRobot, before: Observation, *, hears: bool) ->
             values.append(robot.shell.read_json(words, without=narrow)[1])
     except UnavailableError as error:
         return Proof(SILENCE, None, f"{error}")
-    if found := [*dict.fromkeys(chain(*map(_found_by_listener, values)))]:
-        text = f"it sees {enumerated(found)}; stop what runs open, or start it in its enclave"
+    if seen := [*dict.fromkeys(chain(*map(_seen_by_listener, values)))]:
+        text = f"it sees {enumerated(seen)}; stop what runs open, or start it in its enclave"
         return Proof(SILENCE, False, text)
     if not all(value["settled"] for value in values):
         why = "the ROS graph kept changing, or could not be read in time, so the listener may have "
@@ -441,7 +441,7 @@ def _proof_of_silence(robot: LocalRobot, before: Observation, *, hears: bool) ->
     return Proof(SILENCE, True, reason)
 
 
-def _found_by_listener(value: Mapping[str, Any]) -> Iterator[str]:
+def _seen_by_listener(value: Mapping[str, Any]) -> Iterator[str]:
     """Yield what the JSON of `generate_policy` shows: nodes, and what belongs to no ROS node."""
     nodes = {f"{node['namespace'].rstrip('/')}/{node['name']}" for node in value["nodes"]}
     if nodes:
@@ -485,12 +485,12 @@ def _proof_of_processes(
     robot.shell.say(
         f'$ eval "$(sros env {shlex.quote(str(robot.export))} {OBSERVER})"; sros check runtime'
     )
-    found = chain(*map(_process_findings, looks))
+    all_findings = chain(*map(_process_findings, looks))
     # The text about all unseen processes is kept only once, because such processes come and go.
     findings = [
         *{
-            (each.id, each.subject, each.subject != "processes" and each.text): each
-            for each in found
+            (finding.id, finding.subject, finding.subject != "processes" and finding.text): finding
+            for finding in all_findings
         }.values()
     ]
     enclave_of = {tuple(process.command): process.enclave for process in robot.processes.processes}
@@ -544,16 +544,16 @@ def _proof_of_domains(looks: Sequence[RunningRobot]) -> Iterator[Proof]:
 
     The latter is for open processes of the domain in another network namespace.
     """
-    found = {
+    in_several = {
         process.label: process
         for running in looks
         for process in running.in_domain
         if process.further_domains and not process.is_daemon
     }
-    if found:
-        processes = found.values()
-        texts = [f"{each.label}: {further_domains_text(each)}" for each in processes]
-        numbers = sorted({number for each in processes for number in each.further_domains})
+    if in_several:
+        processes = in_several.values()
+        texts = [f"{process.label}: {further_domains_text(process)}" for process in processes]
+        numbers = sorted({number for process in processes for number in process.further_domains})
         look = f"`sros generate_policy open.xml --domain {numbers[0]} --dry-run`"
         yield Proof(
             ALONE,
@@ -614,7 +614,7 @@ def _open_beside(running: RunningRobot) -> Iterator[Process]:
 def _why_missing(running: RunningRobot, missing: Sequence[str], observed: ObservedProcesses) -> str:
     """Return the enclaves without a secured process, and why their other processes do not count."""
     robot = running.robot
-    outdated = {name: found for name, found in running.not_current.items() if name in missing}
+    outdated = {name: pairs for name, pairs in running.not_current.items() if name in missing}
     overridden = overrides(running, observed)
     apply = f"`{robot.close_command} --apply`"
     causes = {

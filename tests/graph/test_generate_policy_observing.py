@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from sros_tool.cli import observing
-from sros_tool.close.proof import _found_by_listener
+from sros_tool.close.proof import _seen_by_listener
 from sros_tool.graph.observation import (
     IntermittentEndpoint,
     intermittent_from_json,
@@ -102,7 +102,7 @@ def test_what_was_seen_only_for_a_while_or_without_endpoints_is_named(
         "graph.ended": "/_ros2cli_7, /talker",
         "graph.silent": "/_ros2cli_9",
     }
-    assert [*_found_by_listener({"nodes": [], "notes": json.loads(ended.out)["notes"]})] == [
+    assert [*_seen_by_listener({"nodes": [], "notes": json.loads(ended.out)["notes"]})] == [
         "nodes that ended while it listened: /_ros2cli_7, /talker",
         "nodes without endpoints: /_ros2cli_9",
     ]
