@@ -973,8 +973,9 @@ def _remedies(status: FleetStatus, to_dos: Collection[str]) -> Mapping[str, str]
         "find out why": "check whether the robot is on, and which machine reports as this robot: "
         "that machine "
         "may have a wrong name, or a copied disk. If it has files of another robot, it can act "
-        f"as that robot until you run `sros renew {where} --robot OTHER --new-key --revoke-old`; "
-        "then deliver to both robots",
+        f"as that robot until you run `sros renew {where} --robot OTHER --new-key --revoke-old` "
+        "(if OTHER makes its keys itself: docs/howto/one_robot.md, Keys that are made on the "
+        "robot); then deliver to both robots",
         "check its clock": "set the clock of the robot; its agent then continues at the next "
         "round. If this clock is right, the clock of the server or of this machine is wrong, or "
         "somebody held the robot's confirmation back",
