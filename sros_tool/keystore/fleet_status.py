@@ -1130,7 +1130,7 @@ class _KeystoreRecords:
     def is_later(self, robot: str, release: int) -> bool:
         """Return whether a release number is higher than any that was published for a robot."""
         last = self.published.get(robot)
-        return release > (self._last_release if last is None else last)
+        return release > (self._keystore.last_release if last is None else last)
 
     def has_release(self, compared_robot: _ComparedRobot) -> bool:
         """Return whether the last release of a robot that fetches has the current files."""
@@ -1275,16 +1275,11 @@ class _KeystoreRecords:
             released_at and confirmed_at - released_at > _FETCH_EXPECTED_WITHIN
         )
 
-    @property
-    def _last_release(self) -> int:
-        """The highest number of a release in the ledger; 0 without a release."""
-        return max(self._releases, default=0)
-
     @cached_property
     def _releases(self) -> Mapping[int, datetime]:
         """Maps the numbers of all releases to the times of their publication."""
-        entries = self._keystore.ledger_with("what", "release").entries
-        return {entry.number: parse_iso(entry.time) for entry in entries if entry.what == "release"}
+        releases = self._keystore.entries_of("release")
+        return {entry.number: parse_iso(entry.time) for entry in releases}
 
     @property
     def is_any_revoked(self) -> bool:

@@ -62,8 +62,7 @@ def other_enclave(keystore: OpenedKeystore, name: str, certificate: x509.Certifi
 
 def revoked_serials(keystore: OpenedKeystore) -> frozenset[int]:
     """Return the serial numbers of all revoked certificates, including replaced certificates."""
-    entries = keystore.ledger_with("what", "revocation").entries
-    recorded = {int(entry.serial, 16) for entry in entries if entry.what == "revocation"}
+    recorded = {int(entry.serial, 16) for entry in keystore.entries_of("revocation")}
     listed = {entry.serial for crl in keystore.revocation_lists for entry in crl.revoked}
     return frozenset(recorded | listed)
 
@@ -244,8 +243,7 @@ def known_authorities(keystore: OpenedKeystore, role: str) -> frozenset[str] | N
 
 def _known_authorities(keystore: OpenedKeystore, role: str) -> frozenset[str] | None:
     chain = keystore.authority(role)
-    entries = keystore.ledger_with("what", "ca").entries
-    recorded = {entry.sha256 for entry in entries if entry.what == "ca"}
+    recorded = {entry.sha256 for entry in keystore.entries_of("ca")}
     if not recorded:
         return None
     known = {digest(ca): ca for ca in chain if digest(ca) in recorded}
@@ -359,15 +357,9 @@ class KnownKeys:
         self._keystore = keystore
 
     @cached_property
-    def _revocations(self) -> Sequence[Entry]:
-        """The revocations in the ledger."""
-        entries = self._keystore.ledger_with("what", "revocation").entries
-        return [entry for entry in entries if entry.what == "revocation"]
-
-    @cached_property
     def _revoked_keys(self) -> Mapping[str, str]:
         """Maps the digests of revoked keys to descriptions of the revoked certificates."""
-        recorded = [entry for entry in self._revocations if entry.key]
+        recorded = [entry for entry in self._keystore.entries_of("revocation") if entry.key]
         descriptions = {
             entry.key: f"certificate {entry.serial} of {entry.subject}" for entry in recorded
         }
@@ -394,7 +386,7 @@ class KnownKeys:
         """The serial numbers of certificates that were revoked together with their keys."""
         serials = {
             int(revocation.serial, 16)
-            for revocation in self._revocations
+            for revocation in self._keystore.entries_of("revocation")
             if revocation.reason != SUPERSEDED
         }
         lists = (entry for crl in self._keystore.revocation_lists for entry in crl.revoked)
@@ -405,7 +397,7 @@ class KnownKeys:
         """The serial numbers on copied or published lists that the ledger lacks."""
         from sros_tool.keystore.delivery.published import later_revoked_serials
 
-        recorded = {int(entry.serial, 16) for entry in self._revocations}
+        recorded = {int(entry.serial, 16) for entry in self._keystore.entries_of("revocation")}
         listed = {entry.serial for crl in self._keystore.revocation_lists for entry in crl.revoked}
         return (later_revoked_serials(self._keystore) | listed) - recorded
 
@@ -418,7 +410,8 @@ class KnownKeys:
         if not self._revoked_serials:
             return set()
         files = revoked_certificates(self._keystore.root)
-        enclaves, recorded = set(), {entry.serial for entry in self._revocations}
+        revocations = self._keystore.entries_of("revocation")
+        enclaves, recorded = set(), {entry.serial for entry in revocations}
         for entry in self._keystore.ledger_file.with_values("enclave", names).entries:
             recorded.add(entry.serial)
             if entry.what == "certificate":
@@ -440,8 +433,7 @@ class KnownKeys:
 
         Messages of robots or published releases showed them to the restored keystore.
         """
-        restored = self._keystore.ledger_with("what", RESTORED).entries
-        times = {entry.time for entry in restored if entry.what == RESTORED}
+        times = {entry.time for entry in self._keystore.entries_of(RESTORED)}
         return [
             entry
             for entry in self._keystore.ledger_file.with_values("enclave", names).entries
@@ -531,7 +523,8 @@ class KnownKeys:
 
     def revoked_enclaves(self) -> list[str]:
         """Return the revoked enclaves that the keystore no longer has, sorted by name."""
-        names = {entry.enclave for entry in self._revocations if entry.enclave}
+        revocations = self._keystore.entries_of("revocation")
+        names = {entry.enclave for entry in revocations if entry.enclave}
         return sorted(self.enclaves_revoked_before(names.difference(self._keystore.names)))
 
     def revoked_before_notes(self, names: Iterable[str]) -> Iterator[Note]:

@@ -57,7 +57,7 @@ from sros_tool.keystore.layout import (
     is_original_keystore,
     key_on_robot,
 )
-from sros_tool.keystore.ledger import Ledger, LedgerFile
+from sros_tool.keystore.ledger import Entry, Ledger, LedgerFile
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import (
     extension,
@@ -349,6 +349,16 @@ class OpenedKeystore:
     def ledger_with(self, name: str, value: str) -> Ledger:
         """Return the ledger with at least the entries whose field ``name`` has ``value``."""
         return self.once(("ledger", name, value), lambda: self.ledger_file.with_field(name, value))
+
+    def entries_of(self, what: str) -> Sequence[Entry]:
+        """Return the ledger entries of one kind, such as "release", oldest first."""
+        entries = self.ledger_with("what", what).entries
+        return self.once(("entries", what), lambda: [e for e in entries if e.what == what])
+
+    @property
+    def last_release(self) -> int:
+        """The highest number of a release in the ledger; 0 without a release."""
+        return max((entry.number for entry in self.entries_of("release")), default=0)
 
     # ── CAs ──
 

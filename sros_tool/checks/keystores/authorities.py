@@ -438,8 +438,7 @@ def _has_ca_service(keystore: CheckedKeystore) -> bool:
 
 def _restore_findings(keystore: CheckedKeystore, file: str) -> Iterator[Finding]:
     opened = keystore.opened
-    was_restored = any(e.what == RESTORED for e in opened.ledger_with("what", RESTORED).entries)
-    if not (opened.has(PUBLISHED) or was_restored):
+    if not (opened.entries_of(RESTORED) or opened.has(PUBLISHED)):
         return
     # Most keystores publish nothing, and do not need it.
     from sros_tool.keystore.delivery.publish import (

@@ -660,8 +660,7 @@ class _Verifier:
 
     def _is_published(self, release: int) -> bool:
         """Return whether the ledger has a release with this number."""
-        entries = self._keystore.ledger_with("what", "release").entries
-        return any(entry.what == "release" and entry.number == release for entry in entries)
+        return any(entry.number == release for entry in self._keystore.entries_of("release"))
 
     def _arrival(
         self, file: _File, confirmation: Confirmation, last: ReceivedConfirmation | None
@@ -715,12 +714,8 @@ class _Verifier:
     @cached_property
     def _revoked_names(self) -> frozenset[str]:
         """The enclaves that had a certificate revoked for another reason than its replacement."""
-        entries = self._keystore.ledger_with("what", "revocation").entries
-        return frozenset(
-            entry.enclave
-            for entry in entries
-            if entry.what == "revocation" and entry.reason != SUPERSEDED
-        )
+        revocations = self._keystore.entries_of("revocation")
+        return frozenset(entry.enclave for entry in revocations if entry.reason != SUPERSEDED)
 
     def _enclave(self, robot: Robot, signer: x509.Certificate) -> str:
         """Return the robot's enclave to which the keystore issued the certificate.

@@ -609,8 +609,7 @@ def _write_folder(
 
 def _recorded_authorities(keystore: OpenedKeystore) -> frozenset[str]:
     """Return the SHA-256 of all CAs that the keystore has or had, as the ledger records them."""
-    entries = keystore.ledger_with("what", "ca").entries
-    return frozenset(entry.sha256 for entry in entries if entry.what == "ca")
+    return frozenset(entry.sha256 for entry in keystore.entries_of("ca"))
 
 
 def _check_robot(keystore: OpenedKeystore, target: Path, files: Mapping[str, bytes]) -> None:

@@ -934,8 +934,7 @@ class _Publication:
 
     def _claim_of_later_release(self) -> RobotClaim | None:
         """Return a robot's claim to have a release that the keystore never published, or None."""
-        entries = self.keystore.ledger_with("what", "release").entries
-        last = max((entry.number for entry in entries if entry.what == "release"), default=0)
+        last = self.keystore.last_release
         fleet = recorded_fleet(self.keystore)
         for robot, member in fleet.robots.items():
             if not enclaves_of_robot(self.keystore, fleet, member):
@@ -1053,8 +1052,7 @@ class _Publication:
             return False
         # The next number of the ledger does not tell: a restored keystore may have issued files
         # since.
-        entries = self.keystore.ledger_with("what", "release").entries
-        if any(entry.what == "release" and entry.number == latest for entry in entries):
+        if any(entry.number == latest for entry in self.keystore.entries_of("release")):
             return False
         if not restored:
             known = self.list.robots
@@ -1265,8 +1263,7 @@ class _Publication:
         return False
 
     def _known_numbers(self) -> set[int]:
-        entries = self.keystore.ledger_with("what", "release").entries
-        return {entry.number for entry in entries if entry.what == "release"}
+        return {entry.number for entry in self.keystore.entries_of("release")}
 
     def _check_seals(self) -> None:
         """Refuse a folder without metadata in which an unknown CA sealed releases."""

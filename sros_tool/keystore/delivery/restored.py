@@ -322,8 +322,7 @@ def perhaps_revoked_enclaves(
     - The last release of the robot lacks revocations of the latest release, or cannot be read, and
       neither the ledger nor a release shows the certificates that were revoked.
     """
-    entries = keystore.ledger_with("what", "release").entries
-    known = {entry.number for entry in entries if entry.what == "release"}
+    known = {entry.number for entry in keystore.entries_of("release")}
     readable = [release for release in last.values() if release]
     latest = max(readable, key=lambda release: release.number, default=None)
     if latest is None or latest.number in known:
@@ -400,15 +399,14 @@ def with_earlier_keys(keystore: OpenedKeystore, perhaps_revoked: Iterable[str]) 
     The enclaves are those given, and those that earlier runs or messages of robots showed after the
     last release (`PERHAPS_REVOKED` in the ledger).
     """
-    releases = keystore.ledger_with("what", "release").entries
-    last = max((entry.number for entry in releases if entry.what == "release"), default=0)
+    last = keystore.last_release
 
     def is_mark(entry: Entry) -> bool:
         is_later = entry.what == RESTORED and entry.number > last
         return is_later and entry.reason == PERHAPS_REVOKED
 
-    restores = keystore.ledger_with("what", RESTORED).entries
-    names = {*perhaps_revoked, *(entry.enclave for entry in restores if is_mark(entry))}
+    marks = filter(is_mark, keystore.entries_of(RESTORED))
+    names = {*perhaps_revoked, *(mark.enclave for mark in marks)}
     marked = set[str]()
     earlier, later = defaultdict[str, set[str]](set), defaultdict[str, set[str]](set)
     for entry in keystore.ledger_file.with_values("enclave", names).entries if names else ():
@@ -547,8 +545,7 @@ def without_agreed_changes(
     A governance counts as agreed to if publishing was refused, the governance was then signed
     again, and it lacks no known line of the published governance.
     """
-    releases = keystore.ledger_with("what", "release").entries
-    last = max((entry.number for entry in releases if entry.what == "release"), default=0)
+    last = keystore.last_release
     named, agreed = set[str](), set[str]()
     names = {change.enclave for change in changes if change.change == "rights_taken"}
     for entry in keystore.ledger_file.with_values("enclave", names).entries if names else ():

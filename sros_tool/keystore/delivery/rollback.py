@@ -207,8 +207,7 @@ def _foreign_authorities(
     CAs is in the ledger or in ``files``.  If only one kind of CA is unknown, the keystore may be a
     backup from before that CA was replaced.
     """
-    entries = keystore.ledger_with("what", "ca").entries
-    recorded = {entry.sha256 for entry in entries if entry.what == "ca"}
+    recorded = {entry.sha256 for entry in keystore.entries_of("ca")}
     trusted: dict[str, dict[str, Sequence[x509.Certificate]]] = defaultdict(dict)
     keys: set[str] = set()
     for path, data in files.items():
@@ -239,7 +238,7 @@ def _later_authorities(
     there says which one is later.  A CA that is not in the ledger counts as later if it is at least
     as new as the newest CA in the file of the export.
     """
-    entries = [e for e in keystore.ledger_with("what", "ca").entries if e.what == "ca"]
+    entries = keystore.entries_of("ca")
     place_in_ledger = {entry.sha256: place for place, entry in enumerate(entries)}
     later: dict[str, x509.Certificate] = {}
     for path, data in files.items():

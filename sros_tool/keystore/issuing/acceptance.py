@@ -429,8 +429,7 @@ class _FilesOfChange:
         If the list comes from a robot and the keystore from a backup, some numbers are only on the
         list.
         """
-        entries = self._keystore.ledger_with("what", "revocation").entries
-        of_ledger = {int(entry.serial, 16) for entry in entries if entry.what == "revocation"}
+        of_ledger = {int(entry.serial, 16) for entry in self._keystore.entries_of("revocation")}
         has_list = self._keystore.has(CRL)
         return _listed_serials(
             self._keystore.read(CRL, "revocation list") if has_list else b""

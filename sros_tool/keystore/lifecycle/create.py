@@ -1074,8 +1074,7 @@ class _EnclaveMaker:
         working: dict[str, tuple[set[int], list[str]]] = {}
         try:
             ledger = keystore.ledger_file.with_values("enclave", {*self.names})
-            restored = keystore.ledger_with("what", RESTORED)
-            is_restored = any(entry.what == RESTORED for entry in restored.entries)
+            is_restored = keystore.entries_of(RESTORED)
             # Only the whole ledger has the order of marks and subjects.
             since = subjects_since_restore(keystore, keystore.ledger) if is_restored else None
         except SrosError:

@@ -170,10 +170,8 @@ def _with_consent_marks(
     The mark says that the user named the enclave.  `sros fleet publish --restored` takes this as
     consent to rights that were taken away.
     """
-    releases = change.keystore.ledger_with("what", "release").entries
-    last = max((entry.number for entry in releases if entry.what == "release"), default=0)
-    restored = change.keystore.ledger_with("what", RESTORED).entries
-    is_waiting = any(entry.what == RESTORED and entry.number > last for entry in restored)
+    last = change.keystore.last_release
+    is_waiting = any(entry.number > last for entry in change.keystore.entries_of(RESTORED))
     named = {*names} if is_waiting else set[str]()
     for entry in entries:
         is_named = entry.what == "permissions" and entry.enclave in named

@@ -301,8 +301,7 @@ class RevocationListSigner:
         listed = {entry.serial for entry in self.present.revoked} if self.present else set()
         # Revocations that only the list has do not count: somebody may have copied the list from a
         # robot.
-        ledger = self._keystore.ledger_with("what", "revocation").entries
-        recorded = {int(e.serial, 16) for e in ledger if e.what == "revocation"}
+        recorded = {int(entry.serial, 16) for entry in self._keystore.entries_of("revocation")}
         revocations = []
         moment = iso(self._known_time)
         present = last
@@ -497,10 +496,8 @@ class RevocationListSigner:
         if authority.service:
             # A CA service's list may also have other certificates, and drops certificates that have
             # expired.
-            moment, recorded = iso(self._now), self._keystore.ledger_with("what", "revocation")
-            own = {
-                int(entry.serial, 16) for entry in recorded.entries if entry.what == "revocation"
-            }
+            moment = iso(self._now)
+            own = {int(entry.serial, 16) for entry in self._keystore.entries_of("revocation")}
             needed = {
                 entry.serial for entry in kept if expiries.get(entry.serial, moment) >= moment
             }
@@ -508,8 +505,7 @@ class RevocationListSigner:
             return self._list_of_service(authority, needed & (own | new))
         # Without an authentic earlier list, this number is above all that were used: each signed
         # list adds an entry to the ledger, and at most 2 to the number.
-        lists = self._keystore.ledger_with("what", "crl").entries
-        used = 2 * sum(entry.what == "crl" for entry in lists)
+        used = 2 * len(self._keystore.entries_of("crl"))
         number = max(old.number + 1 if old else used + 1, least)
         return sign_list(authority, kept, number=number, template=self._template, now=self._now)
 

@@ -339,11 +339,7 @@ def _was_ca_replaced(keystore: OpenedKeystore) -> bool:
     trusted = {
         subject_text(certificate.subject) for certificates in names for certificate in certificates
     }
-    made = Counter(
-        entry.subject
-        for entry in keystore.ledger_with("what", "ca").entries
-        if entry.what == "ca" and entry.reason != SAME_KEY
-    )
+    made = Counter(entry.subject for entry in keystore.entries_of("ca") if entry.reason != SAME_KEY)
     return any(number > 1 or subject not in trusted for subject, number in made.items())
 
 
