@@ -381,12 +381,8 @@ def start_of(pid: int) -> str:
     Together with the id of the process, this identifies the process.  The result is "" if no such
     process runs, or sros cannot see it.
     """
-    with suppress(OSError):
-        handle = os.open(f"/proc/{pid}", os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-        try:
-            return f"{boot_id()} {_stat(handle).ticks}"
-        finally:
-            os.close(handle)
+    with suppress(OSError), _opened(f"/proc/{pid}") as folder:
+        return f"{boot_id()} {_stat(folder).ticks}"
     return ""
 
 
@@ -462,7 +458,7 @@ class ProcessTable:
             if pid == os.getpid():
                 continue
             try:
-                with self._opened(pid) as folder:
+                with _opened(self._proc / str(pid)) as folder:
                     looked = self._look(pid, folder, before.get(pid), begin, longest_advance)
                     if looked is None:
                         continue
@@ -484,14 +480,6 @@ class ProcessTable:
             _namespace(self._proc / "self/ns/pid") not in ("", _FIRST_PID_NAMESPACE),
             os.geteuid() == 0,
         )
-
-    @contextmanager
-    def _opened(self, pid: int) -> Iterator[int]:
-        handle = os.open(self._proc / str(pid), os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-        try:
-            yield handle
-        finally:
-            os.close(handle)
 
     def _look(
         self,
@@ -550,7 +538,7 @@ class ProcessTable:
         """
         longest = timedelta()
         for pid in filter(str.isdigit, os.listdir(self._proc)):
-            with suppress(OSError), self._opened(int(pid)) as folder:
+            with suppress(OSError), _opened(self._proc / pid) as folder:
                 started = begin + timedelta(seconds=_stat(folder).ticks / self._ticks)
                 longest = max(longest, _clock_advance(folder, started))
         return longest
@@ -559,7 +547,7 @@ class ProcessTable:
         """Return the process with the state of its files, resolved as the process sees them."""
         try:
             working_folder = os.readlink("cwd", dir_fd=folder)
-            root = os.open("root", os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC, dir_fd=folder)
+            root = _open_root(folder)
         except OSError as error:
             problem = f"its root directory cannot be examined ({error.strerror})"
             enclave = ProcessEnclave("", "", problem=problem) if process.asks_for_security else None
@@ -605,12 +593,9 @@ def with_files(process: Process, root: ProcessRoot, folder: str) -> Process:
 def dds_of(pid: int) -> tuple[MappedLibrary, ...]:
     """Return the DDS libraries that a process has mapped; empty if these cannot be seen."""
     try:
-        folder = os.open(f"/proc/{pid}", os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-        try:
+        with _opened(f"/proc/{pid}") as folder:
             libraries = _mapped_dds(_read(folder, "maps", _MOST_MAPS))
-            root = os.open("root", os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC, dir_fd=folder)
-        finally:
-            os.close(folder)
+            root = _open_root(folder)
     except OSError:
         return ()
     try:
@@ -683,15 +668,12 @@ def _examine(pid: int, folder: int, command: tuple[str, ...], started: datetime)
 
 def _open_files(folder: int) -> list[str]:
     """Return the files and sockets that a process has opened, as /proc/PID/fd names them."""
-    handle = os.open("fd", os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC, dir_fd=folder)
-    try:
-        names = []
+    names = []
+    with _opened("fd", folder) as handle:
         for name in os.listdir(handle)[:_MOST_ENTRIES]:
             with suppress(FileNotFoundError):  # closed since
                 names.append(os.readlink(name, dir_fd=handle))
-        return names
-    finally:
-        os.close(handle)
+    return names
 
 
 def _discovery_domains(folder: int, opened: Iterable[str]) -> set[int]:
@@ -726,11 +708,8 @@ def _forked_by(folder: int, command: tuple[str, ...]) -> tuple[int, tuple[str, .
     with suppress(OSError):
         parent = _stat(folder).parent
         while parent > 1:
-            handle = os.open(f"../{parent}", os.O_RDONLY | os.O_DIRECTORY, dir_fd=folder)
-            try:
+            with _opened(f"../{parent}", folder) as handle:
                 words, above = tuple(_words(handle, "cmdline")), _stat(handle).parent
-            finally:
-                os.close(handle)
             is_python = bool(words) and Path(words[0]).name.startswith("python")
             if words != command and not (
                 is_python and any(map(_MULTIPROCESSING_CHILD.match, command))
@@ -825,12 +804,9 @@ def process_origin(pid: int, proc: Path = Path("/proc")) -> ProcessOrigin:
     child: tuple[str, ...] = ()
     with suppress(OSError, IndexError, ValueError):
         while pid > 1:
-            handle = os.open(proc / str(pid), os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-            try:
+            with _opened(proc / str(pid)) as handle:
                 command, parent = tuple(_words(handle, "cmdline")), _stat(handle).parent
                 is_launch = launch_word_index(command) or _runs_launch(handle, pid, command, child)
-            finally:
-                os.close(handle)
             if is_launch:
                 return ProcessOrigin(unit, folder, command, container, user_unit)
             child, pid = command, parent
@@ -1056,9 +1032,8 @@ def _read(folder: int, name: str, max_bytes: int) -> bytes:
     Raises:
         OSError: The file cannot be read, or is longer than ``max_bytes``.
     """
-    handle = os.open(name, os.O_RDONLY | os.O_CLOEXEC, dir_fd=folder)
-    try:
-        parts, length = [], 0
+    parts, length = [], 0
+    with _opened(name, folder, is_folder=False) as handle:
         while part := os.read(handle, 1024 * 1024):
             parts.append(part)
             length += len(part)
@@ -1066,9 +1041,25 @@ def _read(folder: int, name: str, max_bytes: int) -> bytes:
                 raise _TooLongError(
                     0, f"/proc/PID/{name} is longer than {max_bytes // 1024**2} MiB"
                 )
-        return b"".join(parts)
+    return b"".join(parts)
+
+
+@contextmanager
+def _opened(
+    path: str | Path, folder: int | None = None, *, is_folder: bool = True
+) -> Iterator[int]:
+    """Open a folder, or a file, for reading in a context; a relative path is below ``folder``."""
+    kind = os.O_DIRECTORY if is_folder else 0
+    handle = os.open(path, os.O_RDONLY | os.O_CLOEXEC | kind, dir_fd=folder)
+    try:
+        yield handle
     finally:
         os.close(handle)
+
+
+def _open_root(folder: int) -> int:
+    """Open the root directory of the process whose folder of /proc is ``folder``, with O_PATH."""
+    return os.open("root", os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC, dir_fd=folder)
 
 
 def _namespace(path: Path) -> str:
@@ -1225,25 +1216,21 @@ class ProcessRoot:
         """
         above, _, name = path.rpartition("/")
         try:
-            with self._opened(above) as (folder, _way):
-                handle = os.open(f"/proc/self/fd/{folder}", os.O_RDONLY | os.O_DIRECTORY)
-                try:
-                    size = os.stat(name, dir_fd=handle, follow_symlinks=False).st_size
-                    with os.scandir(handle) as entries:
-                        names = [
-                            entry.name
-                            for entry, _ in zip(entries, range(_MOST_ENTRIES + 1), strict=False)
-                        ]
-                    if len(names) > _MOST_ENTRIES:
-                        return []
-                    return [
-                        copy
-                        for copy in names
-                        if copy.startswith(f"{name}.")
-                        and _is_of_size(os.stat(copy, dir_fd=handle, follow_symlinks=False), size)
+            with self._opened(above) as (folder, _), _opened(f"/proc/self/fd/{folder}") as handle:
+                size = os.stat(name, dir_fd=handle, follow_symlinks=False).st_size
+                with os.scandir(handle) as entries:
+                    names = [
+                        entry.name
+                        for entry, _ in zip(entries, range(_MOST_ENTRIES + 1), strict=False)
                     ]
-                finally:
-                    os.close(handle)
+                if len(names) > _MOST_ENTRIES:
+                    return []
+                return [
+                    copy
+                    for copy in names
+                    if copy.startswith(f"{name}.")
+                    and _is_of_size(os.stat(copy, dir_fd=handle, follow_symlinks=False), size)
+                ]
         except OSError:
             return []
 
