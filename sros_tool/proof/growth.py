@@ -875,13 +875,10 @@ def _has_same_access(old: AccessSource, new: AccessSource, enclave: str, world: 
 def _same_grants(permissions: Permissions | None, other: Permissions | None) -> bool:
     if permissions is None or other is None:
         return permissions is other
-    return [_without_name(grant) for grant in permissions.grants] == [
-        _without_name(grant) for grant in other.grants
-    ]
-
-
-def _without_name(grant: Grant) -> Grant:
-    return grant._replace(name="")
+    unnamed, other_unnamed = (
+        [grant._replace(name="") for grant in side.grants] for side in (permissions, other)
+    )
+    return unnamed == other_unnamed
 
 
 class _Denials:
@@ -1340,8 +1337,9 @@ def _with_default_domains_and_governance(side: AccessSource, other: AccessSource
     own_domains = DomainSet.of(*((domain, domain) for domain in domains.values()))
     if side.kind != "policy":
         own_domains = _certified_domains(side)
-    governance = _with_access_control(other.governance, own_domains)
-    if governance is None:
+    if other.governance:
+        governance = _with_access_control(other.governance, own_domains)
+    else:
         known = DomainSet((*own_domains.ranges, *_certified_domains(other).ranges)).closed()
         open_ended = {"policy"} >= {side.kind, other.kind}
         governance = governance_for(strict_protection(), ALL_DOMAINS if open_ended else known)
@@ -1402,25 +1400,12 @@ def _certified_domains(side: AccessSource) -> DomainSet:
     if side.kind == "policy":
         return DomainSet(())
     return DomainSet(
-        tuple(
-            part
-            for permissions in side.permissions.values()
-            for grant in permissions.grants
-            for rule in grant.rules
-            for part in rule.domains.ranges
-        )
+        tuple(part for domains in _domains_of_grants(side) for part in domains.ranges)
     ).closed()
 
 
-def _with_access_control(
-    governance: Governance | None, more_domains: DomainSet
-) -> Governance | None:
-    """Return ``governance`` with control of all access, also in ``more_domains``.
-
-    The result is None if ``governance`` is None.
-    """
-    if governance is None:
-        return None
+def _with_access_control(governance: Governance, more_domains: DomainSet) -> Governance:
+    """Return ``governance`` with control of all access, also in ``more_domains``."""
     strict = governance_for(strict_protection(), more_domains).domain_access_rules[0]
 
     def rule_with_control(rule: DomainRule) -> DomainRule:
