@@ -42,6 +42,7 @@ from sros_tool.pki.keys import (
     algorithm,
     check_key,
     holds_private_key,
+    is_portable,
     is_weak,
     key_problem,
 )
@@ -443,17 +444,20 @@ def likely_issued(certificate: x509.Certificate, authority: x509.Certificate) ->
     ):
         return False
     named = extension(certificate, x509.AuthorityKeyIdentifier)
-    if named is None:
-        return True
+    return named is None or identifies(named, authority)
+
+
+def identifies(identifier: x509.AuthorityKeyIdentifier, authority: x509.Certificate) -> bool:
+    """Return whether a key identifier names a CA (OpenSSL 3, X509_check_akid)."""
     key_identifier = extension(authority, x509.SubjectKeyIdentifier)
     issuers = [
         name.value
-        for name in named.authority_cert_issuer or ()
+        for name in identifier.authority_cert_issuer or ()
         if isinstance(name, x509.DirectoryName)
     ]
     return (
-        (not key_identifier or named.key_identifier in (None, key_identifier.digest))
-        and named.authority_cert_serial_number in (None, authority.serial_number)
+        (not key_identifier or identifier.key_identifier in (None, key_identifier.digest))
+        and identifier.authority_cert_serial_number in (None, authority.serial_number)
         and (not issuers or same_name(issuers[0], authority.issuer))
     )
 
@@ -868,9 +872,7 @@ def load_request(data: bytes, label: str) -> SigningRequest:
             "No DDS vendor loads such a key next to a certificate of the keystore.",
             "Create the key with `sros create_request`.",
         )
-    if not (
-        isinstance(public, ec.EllipticCurvePublicKey) and public.curve.name == "secp256r1"
-    ) and (not (isinstance(public, rsa.RSAPublicKey) and public.key_size == 2048)):
+    if not is_portable(public):
         raise PkiError(
             f"the request {label} is for a key of {algorithm(public)}",
             "Only EC prime256v1 and RSA 2048 are accepted by every DDS vendor.",

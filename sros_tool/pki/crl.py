@@ -22,6 +22,7 @@ from sros_tool.pki import der, pem, tolerant
 from sros_tool.pki.certificates import (
     authority_identifier,
     extension,
+    identifies,
     is_signed,
     load_certificates,
     subject_text,
@@ -529,28 +530,9 @@ def _issuer(
     first = 1 if len(chain) > 1 else 0
     for place, certificate in enumerate(chain[first:]):
         named = place == 0 or same_name(certificate.subject, crl.issuer)
-        if named and (identifier is None or _identifies(identifier, certificate)):
+        if named and (identifier is None or identifies(identifier, certificate)):
             return certificate
     return None
-
-
-def _identifies(identifier: x509.AuthorityKeyIdentifier, authority: x509.Certificate) -> bool:
-    """Return whether a key identifier names the CA (X509_check_akid)."""
-    own_identifier = extension(authority, x509.SubjectKeyIdentifier)
-    if (
-        identifier.key_identifier is not None
-        and own_identifier
-        and identifier.key_identifier != own_identifier.digest
-    ):
-        return False
-    if identifier.authority_cert_serial_number not in (None, authority.serial_number):
-        return False
-    names = [
-        name.value
-        for name in identifier.authority_cert_issuer or ()
-        if isinstance(name, x509.DirectoryName)
-    ]
-    return not names or same_name(names[0], authority.issuer)
 
 
 class _HashableList:

@@ -8,6 +8,7 @@ import os
 import re
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from typing import TypeGuard
 
 from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric import dsa, ec, rsa
@@ -417,6 +418,13 @@ def key_problem(key: PublicKey) -> str:
         if math.isqrt(square) ** 2 == square:
             return "its modulus can be factored: its primes are too close"
     return ""
+
+
+def is_portable(key: object) -> TypeGuard[PublicKey]:
+    """Return whether a key is public and of a kind that every DDS vendor accepts."""
+    if isinstance(key, rsa.RSAPublicKey):
+        return key.key_size == 2048
+    return isinstance(key, ec.EllipticCurvePublicKey) and key.curve.name == "secp256r1"
 
 
 def algorithm(key: object) -> str:

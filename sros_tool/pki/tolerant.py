@@ -659,8 +659,7 @@ def _basic_constraints(content: bytes) -> _LooseConstraints:
 
 def _key_usage(content: bytes) -> x509.KeyUsage:
     value = der.first_value(content)
-    if value.tag != der.BIT_STRING or not value.content or value.content[0] > 7:
-        raise ValueError("not a BIT STRING")
+    _check_bits(value)
     bits = "".join(f"{octet:08b}" for octet in value.content[1:])
     if value.content[0] and bits:  # OpenSSL clears the unused bits of the last byte
         bits = bits[: -value.content[0]]
@@ -762,10 +761,7 @@ def _crl_reason(content: bytes) -> x509.CRLReason:
 
 
 def _values_inside(content: bytes) -> list[der.Value]:
-    value = der.first_value(content)
-    if value.tag != der.SEQUENCE:
-        raise ValueError("not a SEQUENCE")
-    return der.children(value.content)
+    return _sequence(der.first_value(content))
 
 
 _CERTIFICATE_READERS: dict[ObjectIdentifier, _LooseReader] = {

@@ -11,7 +11,6 @@ from shlex import quote
 
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes
-from cryptography.hazmat.primitives.asymmetric import ec, rsa
 
 from sros_tool.checks.keystores.files import UNREADABLE, key_mode_findings
 from sros_tool.checks.keystores.opened import CheckedKeystore
@@ -47,7 +46,7 @@ from sros_tool.pki.certificates import (
 )
 from sros_tool.pki.chains import denies_issuing, purpose_faults
 from sros_tool.pki.crl import signed_by
-from sros_tool.pki.keys import algorithm, few_rounds_clause, load_key
+from sros_tool.pki.keys import algorithm, few_rounds_clause, is_portable, load_key
 from sros_tool.pki.token import is_token_uri
 from sros_tool.validity import AUTHORITY_SOON, iso
 from sros_tool.wording import counted, first_few
@@ -155,10 +154,7 @@ def key_findings(
     ``owner_clause`` begins the texts of the findings.
     """
     key = certificate.public_key()
-    fits = (isinstance(key, ec.EllipticCurvePublicKey) and key.curve.name == "secp256r1") or (
-        isinstance(key, rsa.RSAPublicKey) and key.key_size == 2048
-    )
-    if not fits:
+    if not is_portable(key):
         yield KEY_ALGORITHM.found(subject, f"{owner_clause} a key of {algorithm(key)}", file)
     digest = certificate.signature_hash_algorithm
     if not isinstance(digest, hashes.SHA256):

@@ -15,7 +15,6 @@ from shlex import quote
 
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes
-from cryptography.hazmat.primitives.asymmetric import ec, rsa
 
 from sros_tool.dds.decision.vendors import TESTED, Vendor
 from sros_tool.errors import KeystoreError, Note, PkiError, UsageError, check_meaning
@@ -52,7 +51,7 @@ from sros_tool.pki.certificates import (
     weakness,
 )
 from sros_tool.pki.chains import denies_issuing, purpose_faults
-from sros_tool.pki.keys import PrivateKey, algorithm
+from sros_tool.pki.keys import PrivateKey, algorithm, is_portable
 from sros_tool.pki.token import TokenKey
 from sros_tool.validity import iso, window
 
@@ -413,10 +412,7 @@ def _refusal_notes(
         )
     for certificate in chain:
         key, name = certificate.public_key(), subject_text(certificate.subject)
-        fits = (isinstance(key, ec.EllipticCurvePublicKey) and key.curve.name == "secp256r1") or (
-            isinstance(key, rsa.RSAPublicKey) and key.key_size == 2048
-        )
-        if role == IDENTITY and not fits:
+        if role == IDENTITY and not is_portable(key):
             yield Note(
                 "portable.key-algorithm",
                 f"{name} has a key of {algorithm(key)}; Cyclone DDS accepts only EC secp256r1 and "
