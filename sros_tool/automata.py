@@ -491,6 +491,12 @@ class NameSet:
         self._node: _Node = _Union(frozenset(exact_names), frozenset(automata))
 
     @classmethod
+    def of_automata(cls, automata: Mapping[str, Automaton | None]) -> NameSet:
+        """Return the names of automata by expression; None stands for the expression's own text."""
+        exact_names = (text for text, automaton in automata.items() if automaton is None)
+        return cls(exact_names, filter(None, automata.values()))
+
+    @classmethod
     def _of(cls, node: _Node) -> NameSet:
         name_set = cls()
         name_set._node = node

@@ -460,11 +460,7 @@ def _add_chunk_edges(
 
 def names_of(expressions: Iterable[str]) -> NameSet:
     """Return the set of keys that at least one of the expressions includes."""
-    automata = {expression: _automaton(expression) for expression in expressions}
-    return NameSet(
-        (expression for expression, automaton in automata.items() if automaton is None),
-        filter(None, automata.values()),
-    )
+    return NameSet.of_automata({text: _automaton(text) for text in expressions})
 
 
 @lru_cache(maxsize=_CACHE_SIZE)

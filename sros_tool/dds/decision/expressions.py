@@ -67,11 +67,7 @@ def _automaton(style: Style, expression: str) -> Automaton | None:
 
 def names_of(style: Style, expressions: Iterable[str]) -> NameSet:
     """Return the names that match at least one of the expressions."""
-    made = {expression: _automaton(style, expression) for expression in expressions}
-    return NameSet(
-        (expression for expression, wild in made.items() if wild is None),
-        filter(None, made.values()),
-    )
+    return NameSet.of_automata({text: _automaton(style, text) for text in expressions})
 
 
 def _pattern_of(letters: Letters) -> str:
