@@ -528,12 +528,17 @@ def _revocation_not_delivered(copy: KeystoreCopy, part: str) -> None:
     """Revoke the enclave that plays ``part``, keep its files, and remove the listener's CRL."""
     before = {name: copy.read(part, name) for name in REQUIRED_FILES}
     _revoke(copy, part)
-    stolen = enclave_path(copy.root, STOLEN)
-    stolen.mkdir(mode=0o700)
-    for name, data in before.items():
-        (stolen / name).touch(0o600)
-        (stolen / name).write_bytes(data)
+    keep_stolen(copy, before)
     (copy.folder("listener") / CRL_FILE).unlink()
+
+
+def keep_stolen(copy: KeystoreCopy, files: Mapping[str, bytes]) -> None:
+    """Store the copy that a thief made of an enclave's files, under another name."""
+    folder = enclave_path(copy.root, STOLEN)
+    folder.mkdir(mode=0o700)
+    for name, data in files.items():
+        (folder / name).touch(0o600)
+        (folder / name).write_bytes(data)
 
 
 def identity_copied_by_another_user(copy: KeystoreCopy) -> None:

@@ -11,7 +11,7 @@ from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
-from sros_tool.demo.forger import STOLEN, KeystoreCopy
+from sros_tool.demo.forger import KeystoreCopy, keep_stolen
 from sros_tool.demo.scenarios.model import zenoh_policy
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
@@ -440,7 +440,7 @@ def allow_shared_memory(copy: KeystoreCopy) -> None:
 
 def revoked_talker(copy: KeystoreCopy) -> None:
     """Revoke the talker; a thief has a copy of the talker's enclave."""
-    _keep_stolen(copy, _revoke_talker(copy))
+    keep_stolen(copy, _revoke_talker(copy))
 
 
 def revoked_talker_in_the_rules(copy: KeystoreCopy) -> None:
@@ -450,7 +450,7 @@ def revoked_talker_in_the_rules(copy: KeystoreCopy) -> None:
     for path, data in before.items():
         if path.parent.is_dir():
             path.write_bytes(data)
-    _keep_stolen(copy, stolen)
+    keep_stolen(copy, stolen)
 
 
 def revoked_name_in_use_again(copy: KeystoreCopy) -> None:
@@ -458,7 +458,7 @@ def revoked_name_in_use_again(copy: KeystoreCopy) -> None:
     stolen = _revoke_talker(copy)
     talker, policy = copy.enclave("talker"), zenoh_policy(copy.topic)
     generate_artifacts(copy.root, enclaves=[talker], policies=[policy], now=copy.now)
-    _keep_stolen(copy, stolen)
+    keep_stolen(copy, stolen)
 
 
 def rights_taken_away(copy: KeystoreCopy) -> None:
@@ -475,15 +475,6 @@ def _revoke_talker(copy: KeystoreCopy) -> dict[str, bytes]:
     stolen = {file.name: file.read_bytes() for file in copy.folder("talker").iterdir()}
     revoke(copy.root, [copy.enclave("talker")], now=copy.now, keyring=copy.keyring)
     return stolen
-
-
-def _keep_stolen(copy: KeystoreCopy, files: Mapping[str, bytes]) -> None:
-    """Store the copy that a thief made of an enclave's files, under another name."""
-    folder = enclave_path(copy.root, STOLEN)
-    folder.mkdir(mode=0o700)
-    for name, data in files.items():
-        (folder / name).touch(0o600)
-        (folder / name).write_bytes(data)
 
 
 def valid_certificate(copy: KeystoreCopy) -> None:
