@@ -119,6 +119,10 @@ class PathAtRevision:
             str(_NOWHERE), f"{PREFIX}{self.name}:"
         )
 
+    def error(self, error: SrosError) -> DocumentError:
+        """Return an error whose paths read ``git:REVISION:PATH``."""
+        return DocumentError(*map(self.with_git_paths, (error.what, error.why, error.remedy)))
+
     def source(self, source: Source) -> Source:
         """Return a source whose path reads ``git:REVISION:PATH``."""
         return Source(self.with_git_paths(source.file), source.line)
@@ -235,8 +239,7 @@ class CommitFiles:
         try:
             return [self._policy(policy.path, placeholders) for policy in folder.policies()]
         except SrosError as error:
-            texts = (folder.with_git_paths(part) for part in (error.what, error.why, error.remedy))
-            raise DocumentError(*texts) from error
+            raise folder.error(error) from error
 
     def write_tree(self, path: str) -> Path | None:
         """Write a folder with all its content, such as a keystore; return its new path, or None.
@@ -329,11 +332,7 @@ class CommitFiles:
                 if where not in self.files:  # so that the file does not count as missing
                     with Folder(self.folder) as folder:
                         _make_folders(folder, where)
-                texts = (
-                    path_at_revision.with_git_paths(part)
-                    for part in (error.what, error.why, error.remedy)
-                )
-                self.refused.append(DocumentError(*texts))
+                self.refused.append(path_at_revision.error(error))
                 raise
             entry = self.entry(where)
             assert entry

@@ -395,21 +395,13 @@ def _texts_in_all(lists: Iterable[Sequence[str]]) -> tuple[str, ...]:
 _MOST_SHOWN = 5
 
 
-def requirement_findings(
-    requirements: Sequence[Requirement],
-    system: System,
-    before: Iterable[Right] = (),
-    earlier: Sequence[Requirement] = (),
-) -> list[Finding]:
+def requirement_findings(requirements: Sequence[Requirement], system: System) -> list[Finding]:
     """Return a finding for each requirement that does not hold, or that cannot fail.
-
-    ``before`` are the rights before a change, which may have renamed names in requirements, and
-    ``earlier`` are the requirements before it.
 
     Raises:
         DocumentError: there are too many wildcards to decide a requirement.
     """
-    return decided_findings(decide_all(requirements, system), system, before, earlier)
+    return decided_findings(decide_all(requirements, system), system)
 
 
 def left_out_robot_findings(system: System, namespaces: Sequence[str]) -> list[Finding]:
@@ -497,7 +489,11 @@ def decided_findings(
     before: Iterable[Right] = (),
     earlier: Sequence[Requirement] = (),
 ) -> list[Finding]:
-    """Return the findings of decisions: broken requirements first, in order."""
+    """Return the findings of decisions: broken requirements first, in order.
+
+    ``before`` are the rights before a change, which may have renamed names in requirements, and
+    ``earlier`` are the requirements before it.
+    """
     findings = [_violation_finding(violation) for violation in decided.violations]
     findings += [
         _part_finding(VACUOUS, requirement, why, _remedy_for_vacuous(requirement, system.rights))

@@ -519,10 +519,7 @@ def _access_at_revision(path_at_revision: PathAtRevision, fleet: Fleet | None) -
         ]
         side = _access_of_policies(str(path_at_revision), policies)
     except SrosError as error:
-        texts = (
-            path_at_revision.with_git_paths(part) for part in (error.what, error.why, error.remedy)
-        )
-        raise DocumentError(*texts) from error
+        raise path_at_revision.error(error) from error
     return replace(side, path_at_revision=path_at_revision)
 
 
