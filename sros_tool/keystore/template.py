@@ -611,10 +611,7 @@ class _Table:
     def level(
         self, key: str, default: Level | None = None, allowed: tuple[Level, ...] = tuple(Level)
     ) -> Level:
-        value = self._take(key, str, default)
-        if value not in allowed:
-            raise _TemplateError(f"{self._at(key)} is {value!r}, not one of {', '.join(allowed)}")
-        return Level(value)
+        return Level(self.one_of(key, allowed, default))
 
     def span(self, key: str) -> Span:
         value = self.text(key)

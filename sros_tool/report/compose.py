@@ -219,17 +219,22 @@ def with_requirements(picture: Picture, requirements: Requirements) -> Picture:
     )
 
 
-def union(sources: Sequence[PictureSource]) -> PictureSource:
-    """Return one source with the rights and nodes of several observations."""
+def _nodes_of(sources: Iterable[PictureSource]) -> dict[str, tuple[str, ...]]:
+    """Map enclaves to their nodes in all ``sources``, sorted."""
     nodes: dict[str, set[str]] = defaultdict(set)
     for source in sources:
         for path, names in source.nodes.items():
             nodes[path].update(names)
+    return {path: tuple(sorted(names)) for path, names in nodes.items()}
+
+
+def union(sources: Sequence[PictureSource]) -> PictureSource:
+    """Return one source with the rights and nodes of several observations."""
     title = " and ".join(source.origin.title for source in sources)
     return PictureSource(
         SourceTitle(title, "observation"),
         frozenset(right for source in sources for right in source.rights),
-        {path: tuple(sorted(names)) for path, names in nodes.items()},
+        _nodes_of(sources),
         findings=tuple(finding for source in sources for finding in source.findings),
     )
 
@@ -340,16 +345,12 @@ def _enclaves(
                 right.qualifier, right.right, right.kind, right.name, reaches, stated_rights[right]
             )
         )
-    nodes: dict[str, set[str]] = defaultdict(set)
-    for source in sources:
-        for path, names in source.nodes.items():
-            nodes[path].update(names)
-    domains = _domains_of(sources)
+    nodes, domains = _nodes_of(sources), _domains_of(sources)
     return tuple(
         replace(
             described.get(path, PicturedEnclave(path, "")),
             group=group_of(path, hosts),
-            nodes=tuple(sorted(nodes.get(path, ()))),
+            nodes=nodes.get(path, ()),
             domains=domains.get(path, ""),
             statements=tuple(statements.get(path, ())),
         )
