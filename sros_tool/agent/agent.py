@@ -291,7 +291,14 @@ class _Round:
             replaced=_moments_of(due, self._state.replaced),
             list_replaced=_moments_of(list_due, self._state.list_replaced),
         )
-        asked = self._renewals(names)
+        asked = _renewals(
+            self._folder,
+            names,
+            now=now,
+            new_key=self._settings.new_key,
+            secrets=self._machine.secrets,
+        )
+        self._problems += asked.problems
         arrived = self._confirm(names, opened, processes, clock, asked)
         self._state = replace(
             self._state,
@@ -321,13 +328,16 @@ class _Round:
         """Call ``work``; return whether it succeeded, and add a problem to the round if not."""
         try:
             work()
-        except SrosError as error:
-            self._problems.append(_error_sentence(error))
-        except OSError as error:
+        except (SrosError, OSError) as error:
+            self._note_error(error)
+            return False
+        return True
+
+    def _note_error(self, error: SrosError | OSError) -> None:
+        if isinstance(error, OSError):
             self._problems.append(self._write_error_text(error))
         else:
-            return True
-        return False
+            self._problems.append(_error_sentence(error))
 
     def _write_error_text(self, error: OSError) -> str:
         where = f" '{os.fsdecode(error.filename)}'" if error.filename else ""
@@ -402,20 +412,13 @@ class _Round:
 
         try:
             release = self._ask_as_enclave(settings.source, fetch)
-        except FetchError as error:
-            self._problems.append(_error_sentence(error))
-            if error.problem is FetchProblem.EXPIRED:
+        except (SrosError, OSError) as error:
+            self._note_error(error)
+            if isinstance(error, FetchError) and error.problem is FetchProblem.EXPIRED:
                 self._problems.append(
                     f"The clock of this robot shows {iso(self._machine.now)}; if the time is "
-                    "wrong, "
-                    "set the clock."
+                    "wrong, set the clock."
                 )
-            return Installation(), False
-        except SrosError as error:
-            self._problems.append(_error_sentence(error))
-            return Installation(), False
-        except OSError as error:
-            self._problems.append(self._write_error_text(error))
             return Installation(), False
         if release is None:
             self._is_in_step = True
@@ -674,11 +677,8 @@ class _Round:
                 keep=self._newer_enclaves() if release.number == state.accepted else (),
                 before=before,
             )
-        except SrosError as error:
-            self._problems.append(_error_sentence(error))
-            return Installation()
-        except OSError as error:
-            self._problems.append(self._write_error_text(error))
+        except (SrosError, OSError) as error:
+            self._note_error(error)
             return Installation()
         for name, why in installation.kept.items():
             remedy = _BRING_KEY.format(settings.robot) if concerns_key(why) else ""
@@ -873,17 +873,6 @@ class _Round:
         """Return the current time, which is later than the start of the round."""
         passed = timedelta(seconds=_since_boot() - self._began)
         return self._machine.now + passed
-
-    def _renewals(self, names: Iterable[str]) -> Renewals:
-        asked = _renewals(
-            self._folder,
-            names,
-            now=self._machine.now,
-            new_key=self._settings.new_key,
-            secrets=self._machine.secrets,
-        )
-        self._problems += asked.problems
-        return asked
 
     # ── the message ────────────────────────────────────────────────────────────────────────
 
