@@ -418,14 +418,6 @@ class RobotStatus:
         crl_in_force = None if self.crl_in_force is None else False
         return replace(self, crl_in_force=crl_in_force, has_list=False)
 
-    def with_to_do(self, now: datetime, limit: timedelta, *, is_accepted: bool) -> RobotStatus:
-        """Return a copy whose ``to_do`` says what to do for the robot at ``now``.
-
-        ``limit`` is the age from which a confirmation is overdue.  ``is_accepted`` says whether
-        robots accept the published metadata.
-        """
-        return replace(self, to_do=self._to_do(now, limit, is_accepted))
-
     def is_overdue(self, now: datetime, limit: timedelta) -> bool:
         """Return whether the last confirmation is older than ``limit``.
 
@@ -454,7 +446,12 @@ class RobotStatus:
         )
         return (self.is_behind or is_ahead) and self.state not in others
 
-    def _to_do(self, now: datetime, limit: timedelta, is_accepted: bool) -> str:
+    def next_step(self, now: datetime, limit: timedelta, *, is_accepted: bool) -> str:
+        """Return what to do for the robot at ``now``, as ``to_do`` has it.
+
+        ``limit`` is the age from which a confirmation is overdue.  ``is_accepted`` says whether
+        robots accept the published metadata.
+        """
         if self.state is State.REVOKED and not self.enclaves:
             return "take it out of the fleet file"
         if self._shows_wrong_clock(now, limit):
@@ -709,15 +706,15 @@ class FleetStatus:
             if robot.enclaves and (max_age or robot.fetches) and robot.is_overdue(now, limit)
         )
 
-        def status(robot: RobotStatus) -> RobotStatus:
-            if robot.robot not in overdue:
-                return robot.with_expired_state(now)
-            return robot.as_offline()
-
-        robots = map(status, self.robots)
         publication = self.publication and self.publication.as_seen_at(now)
         is_accepted = publication is None or publication.is_in_order
-        to_do = tuple(robot.with_to_do(now, limit, is_accepted=is_accepted) for robot in robots)
+
+        def status(robot: RobotStatus) -> RobotStatus:
+            is_overdue = robot.robot in overdue
+            robot = robot.as_offline() if is_overdue else robot.with_expired_state(now)
+            return replace(robot, to_do=robot.next_step(now, limit, is_accepted=is_accepted))
+
+        to_do = tuple(map(status, self.robots))
         received = max((robot.received for robot in self.robots if robot.received), default=None)
         clock = clock_behind_clause(now, self.recorded, "the last entry of the ledger")
         clock = clock or clock_behind_clause(now, received, "the last confirmation")
@@ -1435,6 +1432,7 @@ def _robot_status(
     else:
         state = State.RESTART if restart else State.CURRENT
     received, confirmed = compared_robot.received, compared_robot.confirmed
+    notes = [*compared_robot.notes]
     if compared_robot.enclaves and any(map(is_unusable, (confirmed and confirmed.problems) or ())):
         state = max(state, State.UNUSABLE, key=_RANK_OF_STATE.__getitem__)
     is_later = bool(
@@ -1448,8 +1446,8 @@ def _robot_status(
     is_refused = bool(refusal and (received is None or received.time <= refusal.time))
     if refusal and is_refused:
         state = max(state, State.REFUSED, key=_RANK_OF_STATE.__getitem__)
-        refusal_note = f"its last message has been refused since {iso(refusal.time)}: {refusal.why}"
-        compared_robot = compared_robot._replace(notes=(*compared_robot.notes, refusal_note))
+        since = iso(refusal.time)
+        notes.append(f"its last message has been refused since {since}: {refusal.why}")
     is_ahead = bool(
         state is State.UNKNOWN
         and received
@@ -1457,12 +1455,11 @@ def _robot_status(
         and records.is_ahead(received.confirmation)
     )
     if is_ahead and confirmed:
-        ahead_note = (
+        notes.append(
             f"it says that it has release {confirmed.release}, from after the backup of the "
             "keystore: its files are then newer than the keystore's, and the next release replaces "
             "them"
         )
-        compared_robot = compared_robot._replace(notes=(*compared_robot.notes, ahead_note))
     is_lost = state is State.REFUSED and refusal and refusal.why.startswith(NOT_IN_LEDGER)
     if (is_lost or (state is State.UNKNOWN and not is_ahead)) and records.is_restored:
         others = sorted(records.enclaves_with_other_keys.intersection(compared_robot.enclaves))
@@ -1473,8 +1470,7 @@ def _robot_status(
             else "lacks what it issued after the backup. If the message is genuine, run `sros "
             f"distribute_key {quote(str(records.root))} --robot NAME FOLDER --force`"
         )
-        lost_note = f"the keystore was restored, and {remedy}"
-        compared_robot = compared_robot._replace(notes=(lost_note, *compared_robot.notes))
+        notes.insert(0, f"the keystore was restored, and {remedy}")
     problems = confirmed.problems if confirmed else None
     if (
         two_computers := received.two_computers_sentence(
@@ -1521,7 +1517,7 @@ def _robot_status(
         {kind: file.window.not_after for kind, file in validity.items()},
         confirmed.dds if confirmed else None,
         problems,
-        compared_robot.notes,
+        tuple(notes),
         has_release=has_release,
         lacks_ca=fetches and records.lacks_ca(compared_robot, is_published=has_release),
         short_lived=records.short_lived(validity),

@@ -356,9 +356,14 @@ class OpenedKeystore:
         return self.once(("entries", what), lambda: [e for e in entries if e.what == what])
 
     @property
+    def known_releases(self) -> set[int]:
+        """The numbers of the releases in the ledger."""
+        return {entry.number for entry in self.entries_of("release")}
+
+    @property
     def last_release(self) -> int:
         """The highest number of a release in the ledger; 0 without a release."""
-        return max((entry.number for entry in self.entries_of("release")), default=0)
+        return max(self.known_releases, default=0)
 
     # ── CAs ──
 

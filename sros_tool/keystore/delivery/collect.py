@@ -660,7 +660,7 @@ class _Verifier:
 
     def _is_published(self, release: int) -> bool:
         """Return whether the ledger has a release with this number."""
-        return any(entry.number == release for entry in self._keystore.entries_of("release"))
+        return release in self._keystore.known_releases
 
     def _arrival(
         self, file: _File, confirmation: Confirmation, last: ReceivedConfirmation | None

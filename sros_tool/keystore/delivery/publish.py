@@ -1052,7 +1052,7 @@ class _Publication:
             return False
         # The next number of the ledger does not tell: a restored keystore may have issued files
         # since.
-        if any(entry.number == latest for entry in self.keystore.entries_of("release")):
+        if latest in self.keystore.known_releases:
             return False
         if not restored:
             known = self.list.robots
@@ -1222,7 +1222,7 @@ class _Publication:
         keystore has or issued all files of the release, because then publishing was only
         interrupted before the ledger recorded its number.
         """
-        known = self._known_numbers()
+        known = self.keystore.known_releases
         is_same_folder = self._earlier_folder == self.list.folder
         last = self.list.number if is_same_folder else 0
         forgotten = LostRecords(self.keystore, self._now)
@@ -1262,12 +1262,9 @@ class _Publication:
             )
         return False
 
-    def _known_numbers(self) -> set[int]:
-        return {entry.number for entry in self.keystore.entries_of("release")}
-
     def _check_seals(self) -> None:
         """Refuse a folder without metadata in which an unknown CA sealed releases."""
-        known, authorities = self._known_numbers(), self.keystore.authority(PERMISSIONS)
+        known, authorities = self.keystore.known_releases, self.keystore.authority(PERMISSIONS)
         foreign = {
             release.robot
             for release in self._releases()

@@ -322,7 +322,7 @@ def perhaps_revoked_enclaves(
     - The last release of the robot lacks revocations of the latest release, or cannot be read, and
       neither the ledger nor a release shows the certificates that were revoked.
     """
-    known = {entry.number for entry in keystore.entries_of("release")}
+    known = keystore.known_releases
     readable = [release for release in last.values() if release]
     latest = max(readable, key=lambda release: release.number, default=None)
     if latest is None or latest.number in known:
