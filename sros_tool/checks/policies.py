@@ -508,7 +508,7 @@ def _check_node_names(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
         own = enclave.path.rpartition("/")[2]
         near = []
         for profile in enclave.all_profiles():
-            full = expand("~", profile.ns, profile.node)
+            full = profile.full_name
             if enclave.path == full or (
                 own == profile.node and not is_typing_error(enclave.path, full)
             ):
@@ -728,7 +728,7 @@ def _check_parameters_of_others(checked_policy: _CheckedPolicy) -> Iterator[Find
     enclave_by_node: dict[str, str] = {}
     for enclave in checked_policy.policy.enclaves:
         for profile in enclave.all_profiles():
-            node = expand("~", profile.ns, profile.node)
+            node = profile.full_name
             nodes[enclave.path].add(node)
             if profile.node and not is_expression(node):
                 enclave_by_node.setdefault(node, enclave.path)
@@ -886,7 +886,7 @@ def _has_named_node(enclave: Enclave) -> bool:
 def _lacking_basics(
     checked_policy: _CheckedPolicy, enclave: Enclave, profile: Profile
 ) -> Iterator[_NodeLackingRight]:
-    node = expand("~", profile.ns, profile.node)
+    node = profile.full_name
     is_listener = profile.node.startswith(_TF_LISTENER_PREFIX)
     lacks_others = False
     for kind, right, names in _NODE_BASICS:
@@ -1015,7 +1015,7 @@ def _check_root_enclave(checked_policy: _CheckedPolicy) -> Iterator[Finding]:
     root = checked_policy.policy.enclave("/")
     if root is None:
         return
-    nodes = {expand("~", profile.ns, profile.node) for profile in root.all_profiles()}
+    nodes = {profile.full_name for profile in root.all_profiles()}
     text = clause_on_enclaves_within_root(policy_rights(checked_policy.policy))
     if not text and len(nodes) > 1:
         text = f"/ has the rights of {len(nodes)} nodes"
@@ -1391,7 +1391,7 @@ def _node_in_two_enclaves_findings(enclaves: Iterable[Enclave]) -> Iterator[Find
     by_node: dict[str, dict[str, Source]] = defaultdict(dict)
     for enclave in enclaves:
         for profile in enclave.all_profiles():
-            node = expand("~", profile.ns, profile.node)
+            node = profile.full_name
             if profile.node and not is_expression(node):
                 by_node[node].setdefault(enclave.path, profile.source)
     for node, places in by_node.items():
@@ -1502,7 +1502,7 @@ def _robots_with_the_same_node(fleet: Fleet, enclaves: Iterable[Enclave]) -> fro
     for enclave in enclaves:
         if robot := robot_of(fleet, enclave.path):
             for profile in enclave.all_profiles():
-                robots_by_node[expand("~", profile.ns, profile.node)].add(robot.name)
+                robots_by_node[profile.full_name].add(robot.name)
     return frozenset(chain(*(names for names in robots_by_node.values() if len(names) > 1)))
 
 

@@ -165,7 +165,7 @@ class ObservedNodes:
             new = {
                 (profile.ns, profile.node)
                 for profile in enclave.all_profiles()
-                if expand("~", profile.ns, profile.node) not in known
+                if profile.full_name not in known
                 and not is_expression(f"{profile.ns}{profile.node}")
             }
             if len(old) == len(new) == 1:
@@ -290,7 +290,7 @@ class ObservedNodes:
             }
             in_policy = self.policy.enclave(enclave)
             profiles = in_policy.all_profiles() if in_policy else ()
-            names = {expand("~", profile.ns, profile.node) for profile in profiles}
+            names = {profile.full_name for profile in profiles}
             return observed | names, next(iter(observed & self.renamed_nodes.keys()), "")
         return set(), ""
 

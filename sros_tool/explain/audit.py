@@ -219,7 +219,7 @@ def policy_enclaves(
 ) -> AuditedEnclaves:
     """Return the enclaves of a policy, as if the policy were signed now with ``governance``."""
     nodes = {
-        enclave.path: tuple(expand("~", p.ns, p.node) for p in enclave.all_profiles())
+        enclave.path: tuple(p.full_name for p in enclave.all_profiles())
         for enclave in policy.enclaves
     }
 

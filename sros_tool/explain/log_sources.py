@@ -15,7 +15,7 @@ from sros_tool.keystore.participant import LoadedEnclave
 from sros_tool.keystore.reader import OpenedKeystore
 from sros_tool.keystore.rights import RightsSource, load_rights
 from sros_tool.keystore.selection import likely_names as likely_enclaves
-from sros_tool.names import expand, is_expression, nodes_served
+from sros_tool.names import is_expression, nodes_served
 from sros_tool.pki.certificates import IDENTITY_DIGITS
 from sros_tool.policy.model import (
     ALLOW,
@@ -189,7 +189,7 @@ class AskedPolicy:
         """
         stated = self.policy.enclave(self.namespace_and_path(enclave)[1])
         for profile in stated.all_profiles() if stated else ():
-            own = below_namespace(expand("~", profile.ns, profile.node), space)
+            own = below_namespace(profile.full_name, space)
             if name.startswith(f"{own}/"):
                 return f"~{name.removeprefix(own)}"
         return ""

@@ -214,10 +214,7 @@ def _protected_as_before(before: Policy, after: Policy) -> Policy:
     gone = {(e.kind, e.name, e.level) for e in stated_protections(before.enclaves)} - known
     if not gone:
         return after
-    left: dict[str, set[str]] = defaultdict(set)
-    for right in policy_rights(after):
-        left[right.kind].add(right.name)
-    names = {kind: Names(sorted(names_of_kind)) for kind, names_of_kind in left.items()}
+    names = Names.by_key((right.kind, right.name) for right in policy_rights(after))
     levels: dict[tuple[str, str], Level] = {}
     for kind, name, level in sorted(gone):
         met = list(names[kind].overlapping(name)) if kind in names else []

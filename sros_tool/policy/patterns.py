@@ -310,6 +310,14 @@ class Names:
         self._exact = self._every.difference(self._wild)
         self._limit = limit or ComparisonLimit()
 
+    @classmethod
+    def by_key(cls, pairs: Iterable[tuple[str, str]]) -> dict[str, Names]:
+        """Return sets for pairs of a key and a name: one sorted set for each key."""
+        names: dict[str, set[str]] = {}
+        for key, name in pairs:
+            names.setdefault(key, set()).add(name)
+        return {key: cls(sorted(names_of_key)) for key, names_of_key in names.items()}
+
     def cover(self, name: str) -> bool:
         """Return whether the set contains ``name`` or an expression that covers it."""
         return name in self._every or (bool(self._wild) and any(self.covering(name)))

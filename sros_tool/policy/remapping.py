@@ -496,7 +496,7 @@ def remapped_policy(
         of_node = [rule for rule in rules if rule.old != _NODE and rule.node in ("", node)]
         moved = [rule for rule in of_node if rule.old == _NAMESPACE]
         ns = moved[0].new if moved else profile.ns
-        own, new = expand("~", profile.ns, profile.node), expand("~", ns, node)
+        own, new = profile.full_name, expand("~", ns, node)
         used.update(UsedRule(rule, profile.node, "", own, new) for rule in renamed[:1] + moved[:1])
         of_names = [rule for rule in of_node if rule.old != _NAMESPACE]
         new_profile = replace(profile, ns=ns, node=node)

@@ -557,10 +557,7 @@ def rights_without_counterpart(
     """
     reduced = [right for right in difference.only_first if right.qualifier is not DENY]
     reduced += (right for right in difference.only_second if right.qualifier is DENY)
-    names_of: dict[str, set[str]] = defaultdict(set)
-    for right in reduced:
-        names_of[right.right].add(right.name)
-    touched = {word: Names(sorted(names)) for word, names in names_of.items()}
+    touched = Names.by_key((right.right, right.name) for right in reduced)
     asked = [
         right
         for right in (second_rights if candidates is None else candidates)

@@ -255,10 +255,7 @@ def access_by_name_findings(
 
 def _about_rights(requirement: Only, rights: Iterable[Right]) -> Only:
     """Return a requirement without the names that ``rights`` are not about."""
-    names_by_word: dict[str, set[str]] = defaultdict(set)
-    for right in rights:
-        names_by_word[right.right].add(right.name)
-    known = {word: Names(sorted(names)) for word, names in names_by_word.items()}
+    known = Names.by_key((right.right, right.name) for right in rights)
 
     def is_known(word: str, name: str) -> bool:
         own = parts(Right("", ALLOW, word, name))

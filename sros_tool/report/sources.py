@@ -321,10 +321,8 @@ def drawn_difference(
     """
     if first_source.kind != second_source.kind or not difference:
         return ""
-    changed: dict[str, set[str]] = {}
-    for right in (*difference.only_first, *difference.only_second):
-        changed.setdefault(right.kind, set()).add(right.name)
-    names = {kind: Names(sorted(members)) for kind, members in changed.items()}
+    changed = (*difference.only_first, *difference.only_second)
+    names = Names.by_key((right.kind, right.name) for right in changed)
 
     def titled_source(title: str, source: RightsSource) -> PictureSource:
         used = frozenset(
