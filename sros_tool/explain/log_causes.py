@@ -48,6 +48,7 @@ from sros_tool.names import (
     PARAMETER_SERVICES,
     action_part,
     expand,
+    is_expression,
     nodes_served,
     right_to_use,
     service_of,
@@ -500,20 +501,15 @@ class Examiner:
         """Return causes and a remedy if the permissions are for another node's name; or [], ""."""
         node, nodes = node_denied_own_service(denial), _served_names(answer)
         if node and not any(covers(own_node, node) for own_node in nodes):
-            enclaves: tuple[str, ...] = ()
-            if self._keystore:
-                enclaves = self._keystore.enclaves_for(node)
-            elif self._policy:
-                enclaves = self._policy.enclaves_for(node, denial.enclave)
             beginning = f"the permissions are for {_nodes_text(nodes)}, and " if nodes else ""
-            if enclaves:
-                return [
-                    f"{beginning}this is the node {node}, for which there is "
-                    f"{_enclaves_text(enclaves)}"
-                ], (
+            if enclaves := self._enclaves_for(node, denial.enclave):
+                cause = f"{beginning}this is the node {node}, for which there is "
+                cause += _enclaves_text(enclaves)
+                advice = (
                     "Start the node in its enclave: `sros run "
                     f"{quote(self._root or 'KEYSTORE')} {quote(enclaves[0])} -- COMMAND`."
                 )
+                return self._composed_cause(denial, node, nodes, cause, advice)
             if nodes:
                 advice = _renaming_advice(nodes, node, denial.enclave)
                 return [f"{beginning}this is the node {node}"], advice
@@ -524,6 +520,37 @@ class Examiner:
                 f"{quote(denial.enclave)} --from-log LOG`."
             )
         return [], ""
+
+    def _enclaves_for(self, node: str, enclave: str) -> tuple[str, ...]:
+        """Return the enclaves for a node; ``enclave`` is the one in which its process runs."""
+        if self._keystore:
+            return self._keystore.enclaves_for(node)
+        return self._policy.enclaves_for(node, enclave) if self._policy else ()
+
+    def _composed_cause(
+        self, denial: Denial, node: str, nodes: Sequence[str], cause: str, advice: str
+    ) -> tuple[list[str], str]:
+        """Return causes and a remedy that also say what to do if one process runs several nodes.
+
+        ``nodes`` are the nodes of the enclave; ``cause`` and ``advice`` are about ``node`` alone.
+        """
+        exact = [other for other in nodes if not is_expression(other)]
+        is_one_process = bool(denial.process) or len(self._started_folders) == 1
+        logged = [
+            other
+            for other in self._logging_nodes.get(denial.process, ())
+            if is_one_process and other in exact
+        ]
+        together = sorted({node, *(logged or exact)})
+        if len(together) == 1:
+            return [cause], advice
+        composed = _composing_advice(together)
+        if not logged:
+            return [cause], f"{advice} If one process runs {enumerated(together)}, {composed}"
+        only = "but a process runs in only one enclave"
+        fact = f"the log shows that the process also runs {enumerated(logged)}, {only}"
+        several = f"If these are several processes, {_within_sentence(advice)}"
+        return [cause, fact], f"{composed[0].upper()}{composed[1:]} {several}"
 
     def _similar_name_cause(
         self, denial: Denial, name: str, enclave: LoadedEnclave, remedy: str
@@ -941,6 +968,20 @@ def _renaming_advice(nodes: Sequence[str], wrong: str, enclave: str) -> str:
     return (
         f"{start}{renamed}. A further node needs a profile with common/node.xml: in the policy of "
         f"{enclave}, or in an enclave of its own if it is another program."
+    )
+
+
+def _composing_advice(nodes: Sequence[str]) -> str:
+    """Return the remedy for one process that runs ``nodes`` although they have several enclaves."""
+    spaces = {node.rpartition("/")[0] for node in nodes}
+    ns = spaces.pop() if len(spaces) == 1 else ""
+    options = [f"--namespace {quote(ns)}"] * bool(ns) + [f"--enclave {quote(f'{ns}/NEW')}"]
+    options += [f"--node {quote(node.rpartition('/')[2])}" for node in nodes]
+    return (
+        "give these nodes one enclave: write their profiles into one <enclave> of the policy. "
+        "Profiles from the policy of a package, merge again into a policy without these nodes: "
+        f"`sros merge_policy POLICY OTHER {' '.join(options)}`. Then start the process in the new "
+        "enclave."
     )
 
 

@@ -941,7 +941,7 @@ def test_the_enclave_of_a_node_that_runs_in_another_one_is_named(keystore: Path)
     found = sros("explain", keystore, "--log", log).out
     assert f"this is the node /listener, for which there is the enclave {OTHER}" in found
     assert f"`sros run {keystore} {OTHER} -- COMMAND`" in found
-    assert "__node:=" not in found and "profile" not in found
+    assert "__node:=" not in found and "profile of" not in found
     # Without that enclave, the name is what is wrong.
     shutil.rmtree(keystore / "enclaves" / OTHER.lstrip("/"))
     assert (
@@ -1263,9 +1263,11 @@ def test_a_new_name_in_a_log_without_the_namespace(
 
 
 @pytest.mark.parametrize("namespace", ["", "/front"])
+@pytest.mark.parametrize("logs", ["", "guard", "other"])
 def test_a_node_in_another_enclave_of_a_policy_without_a_keystore(
-    namespace: str, tmp_path: Path
+    logs: str, namespace: str, tmp_path: Path
 ) -> None:
+    """Perhaps one process runs both nodes; a line of a node of the enclave shows that it does."""
     policy, log = tmp_path / "p.xml", tmp_path / "robot.log"
     served = "".join(f"<service>~/{name}</service>" for name in PARAMETER_SERVICES)
     reply = f'<services reply="ALLOW">{served}</services>'
@@ -1273,15 +1275,30 @@ def test_a_node_in_another_enclave_of_a_policy_without_a_keystore(
     for node in ("blade", "guard"):
         text = text.replace('node="n"', f'node="{node}"', 1)
     policy.write_text(text)
+    logger = f"{namespace}/{logs}".strip("/").replace("/", ".")
     log.write_text(
         f"[INFO] [1.0] [rcl]: Found security directory: /k/enclaves{namespace}/guard\n"
         f"[SECURITY Error] rq{namespace}/blade/get_parametersRequest topic not found in allow rule."
-        " -> check_create_datareader\n"
+        f" -> check_create_datareader\n[INFO] [1.1] [{logger or 'rcl'}]: ready\n"
     )
     found = sros("explain", policy, "/guard", "--log", log).out
     where = f"{namespace}/blade"
     assert f"this is the node {where}, for which there is the enclave {where}" in found
-    assert f"Start the node in its enclave: `sros run KEYSTORE {where} -- COMMAND`" in found
+    together = logs == "guard"
+    shown = f"the log shows that the process also runs {namespace}/guard, but a process runs in"
+    assert (shown in found) is together
+    space = f"--namespace {namespace} " * bool(namespace)
+    nodes = f"--enclave {namespace}/NEW --node blade --node guard`"
+    assert f"`sros merge_policy POLICY OTHER {space}{nodes}" in found
+    run = f"`sros run KEYSTORE {where} -- COMMAND`"
+    if together:
+        assert "remedy    Give these nodes one enclave: " in found
+        assert (
+            f"{NEXT}If these are several processes, start the node in its enclave: {run}" in found
+        )
+    else:
+        assert f"remedy    Start the node in its enclave: {run}" in found
+        assert f"{NEXT}If one process runs {where} and {namespace}/guard, give these nodes" in found
 
 
 def test_a_denial_by_a_rule_is_not_said_to_miss_something(tmp_path: Path) -> None:
