@@ -386,6 +386,17 @@ def test_forked_processes_report_what_a_single_one_would(tmp_path: Path) -> None
     assert not text.endswith("\n0")
 
 
+def python_that_says(variable: str, ends: str, venv: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """In place of the Python of the checks: a program that says a variable and its arguments."""
+    python = venv / "python"
+    python.write_text(f'#!/bin/sh\necho "ran {variable}: $*"\n{ends}\n')
+    python.chmod(0o755)
+    for name, value in (("PYTHON", python), ("VENV", venv), ("CHECKOUT", venv)):
+        monkeypatch.setattr(checks, name, value)
+    monkeypatch.setattr(checks, "read_record", Record)
+    return python
+
+
 @pytest.mark.parametrize(
     ("arguments", "started"),
     [
@@ -401,13 +412,8 @@ def test_every_check_is_run_and_shown_and_the_worst_counts(
     monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
-    python = venv / "python"
     ends = 'case "$*" in *mypy*) exit 3;; *format*) exit 1;; esac'
-    python.write_text(f'#!/bin/sh\necho "ran $SROS_LONG: $*"\n{ends}\n')
-    python.chmod(0o755)
-    for name, value in (("PYTHON", python), ("VENV", venv), ("CHECKOUT", venv)):
-        monkeypatch.setattr(checks, name, value)
-    monkeypatch.setattr(checks, "read_record", Record)
+    python_that_says("$SROS_LONG", ends, venv, monkeypatch)
     assert checks.run(arguments, {"PATH": "/usr/bin:/bin"}, with_tests=True) == 3
     lines = capfd.readouterr().out.splitlines()
     ran = [line for line in lines if line.startswith("ran ")]
@@ -421,13 +427,8 @@ def test_every_check_is_run_and_shown_and_the_worst_counts(
 def test_tests_that_failed_run_again_with_the_same_seed_to_tell_their_values(
     venv: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    python = venv / "python"
     ends = 'case "$*" in *--processes*) exit 1;; esac'
-    python.write_text(f'#!/bin/sh\necho "ran $SROS_SEED: $*"\n{ends}\n')
-    python.chmod(0o755)
-    for name, value in (("PYTHON", python), ("VENV", venv), ("CHECKOUT", venv)):
-        monkeypatch.setattr(checks, name, value)
-    monkeypatch.setattr(checks, "read_record", Record)
+    python_that_says("$SROS_SEED", ends, venv, monkeypatch)
     assert checks.run([], {"PATH": "/usr/bin:/bin"}, with_tests=True) == 1
     ran = [line for line in capfd.readouterr().out.splitlines() if "pytest" in line]
     all_of_them, again = ran
@@ -440,13 +441,9 @@ def test_tests_that_failed_run_again_with_the_same_seed_to_tell_their_values(
 def test_the_oldest_packages_are_those_that_the_package_asks_for_or_newer(
     venv: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    python = venv / "python"
-    python.write_text('#!/bin/sh\necho "ran $PYTHONPATH: $*"\ncase "$*" in *==41*) exit 4;; esac\n')
-    python.chmod(0o755)
-    for name, value in (("PYTHON", python), ("VENV", venv), ("CHECKOUT", venv)):
-        monkeypatch.setattr(checks, name, value)
+    ends = 'case "$*" in *==41*) exit 4;; esac'
+    python = python_that_says("$PYTHONPATH", ends, venv, monkeypatch)
     monkeypatch.setattr(steps, "LOG", venv / "log")
-    monkeypatch.setattr(checks, "read_record", Record)
     with pytest.raises(steps.SetupError):
         checks.run(["--oldest"], {}, with_tests=True)
     python.write_text(python.read_text().replace("exit 4", "exit 0"))

@@ -57,25 +57,11 @@ NAMES = (
 )
 
 
-def groups() -> st.SearchStrategy[Group]:
-    def of(kind: str) -> st.SearchStrategy[Group]:
-        either = st.none() | st.sampled_from(Qualifier)
-        rights = st.tuples(either, either).map(
-            lambda pair: tuple(
-                (right, said) for right, said in zip(RIGHTS[kind], pair, strict=True) if said
-            )
-        )
-        names = st.lists(st.sampled_from(NAMES), min_size=1, max_size=3).map(tuple)
-        return st.builds(Group, st.just(kind), rights.filter(bool), names)
-
-    return st.sampled_from(sorted(RIGHTS)).flatmap(of)
-
-
 profiles = st.builds(
     Profile,
     st.sampled_from(("/", "/ns", "/ns/deep")),
     st.sampled_from(("n", "m", "*")),
-    st.lists(groups(), max_size=3).map(tuple),
+    st.lists(drawn_groups(st.sampled_from(NAMES)), max_size=3).map(tuple),
 )
 blocks = st.lists(profiles, min_size=1, max_size=2).map(lambda made: Profiles(tuple(made)))
 enclaves = st.builds(Enclave, st.just("/e"), st.lists(blocks, min_size=1, max_size=2).map(tuple))

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from itertools import groupby
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -29,7 +30,7 @@ from sros_tool.runtime.log_texts import LOG_TEXTS, UNKNOWN, LogText
 from sros_tool.runtime.zenoh_log import ZENOH_TEXTS
 from tests.explain.broken import BREAKAGES, ENCLAVE, OTHER, Enclave, make_keystore
 from tests.support.children import python, run
-from tests.support.harness import copy_of, policy_text, publish, sros, subscribe
+from tests.support.harness import Ended, copy_of, policy_text, publish, sros, subscribe
 from tests.support.long_form import some
 
 LOGS = Path(__file__).with_name("logs")
@@ -86,6 +87,12 @@ def nothing(_: str) -> None:
 
 def explained(text: str) -> tuple[LogFinding, ...]:
     return explain_log(text, nothing, lambda _: pytest.fail("nothing is there to be looked at"))
+
+
+def said_of(text: str, folder: Path, *asked: object, **more: Any) -> Ended:
+    """What `sros explain` says about a log with this text, asked in a folder."""
+    (log := folder / "robot.log").write_text(text)
+    return sros("explain", *asked, "--log", log, **more)
 
 
 @pytest.fixture(scope="module")
@@ -280,8 +287,7 @@ def test_cyclone_says_nothing_of_a_whole_enclave(keystore: Path, tmp_path: Path)
     program = Path(__file__).with_name("join_cyclone.py")
     done = python(program, Enclave(keystore).folder)
     assert done.stdout == "joined\n", done
-    (tmp_path / "robot.log").write_text(done.stdout + done.stderr)
-    ended = sros("explain", keystore, ENCLAVE, "--log", tmp_path / "robot.log")
+    ended = said_of(done.stdout + done.stderr, tmp_path, keystore, ENCLAVE)
     assert ended.out.startswith("no line of the log says that a node runs secured")
 
 
@@ -356,8 +362,7 @@ def test_a_file_that_only_the_user_of_the_node_cannot_read_is_the_first_suspect(
     line: str, keystore: Path, tmp_path: Path
 ) -> None:
     key = Enclave(keystore).folder / "key.pem"
-    (tmp_path / "robot.log").write_text(line % key)
-    ended = sros("explain", keystore, ENCLAVE, "--log", tmp_path / "robot.log")
+    ended = said_of(line % key, tmp_path, keystore, ENCLAVE)
     assert "  remedy    Allow the user of the node to read the file" in ended.out
     assert f"can be read. Enclave {ENCLAVE} now has no fault" in ended.out
 
@@ -401,8 +406,7 @@ def test_a_peer_without_security_is_to_be_started_in_an_enclave_of_its_own(
     keystore: Path, tmp_path: Path
 ) -> None:
     line = f"{CYCLONE_LINE}Non secure remote writer 1:2:3:4 is not allowed"
-    (tmp_path / "robot.log").write_text(line)
-    said = sros("explain", keystore, ENCLAVE, "--log", tmp_path / "robot.log").out
+    said = said_of(line, tmp_path, keystore, ENCLAVE).out
     assert f"Start the peer in its enclave: `sros run {keystore} PEER -- COMMAND`." in said
 
 
@@ -469,8 +473,7 @@ def test_what_is_not_understood_is_shown(line: str, tmp_path: Path) -> None:
     assert (found.id, found.line, found.count) == ("not-understood", 2, 2)
     both = f"{line}\n[SECURITY Error] PKCS7 data verification failed -> Function init\n"
     assert [each.id for each in explained(both)] == ["signature", "not-understood"]
-    (tmp_path / "robot.log").write_text(line)
-    said = sros("explain", "--log", tmp_path / "robot.log")
+    said = said_of(line, tmp_path)
     assert said.status == 1 and " ".join(line.split())[-20:] in said.out
 
 
@@ -567,8 +570,7 @@ def test_every_shape_has_its_cause_and_a_remedy(text: str, name: str, tmp_path: 
     (found,) = explained(f"before\n{text}\nafter")
     assert (found.id, found.line) == (name, 2)
     assert found.cause and found.remedy
-    (tmp_path / "robot.log").write_text(text)
-    assert sros("explain", "--log", tmp_path / "robot.log").status == 1
+    assert said_of(text, tmp_path).status == 1
 
 
 @pytest.mark.parametrize(
@@ -617,8 +619,7 @@ def test_a_remedy_names_the_keystore_and_the_enclave_that_the_user_named(
     unnamed = sros("explain", "--log", tmp_path / "robot.log").out
     assert "`sros explain KEYSTORE ENCLAVE join`" in unnamed
     started = "[INFO] [1.0] [rcl]: Found security directory: /robot/keystore/enclaves/a/b\n"
-    (tmp_path / "robot.log").write_text(f"{started}[SECURITY Error] Bad thing -> Function set\n")
-    of_log = sros("explain", "--log", tmp_path / "robot.log").out
+    of_log = said_of(f"{started}[SECURITY Error] Bad thing -> Function set\n", tmp_path).out
     assert "`sros explain KEYSTORE /a/b join`" in of_log
     of_folder = sros("explain", f"{keystore}/enclaves{ENCLAVE}", "--log", tmp_path / "denied.log")
     assert f"`sros explain KEYSTORE {ENCLAVE} publish /x`" in of_folder.out
@@ -666,8 +667,7 @@ def test_nothing_found_is_said_of_what_was_read(tmp_path: Path) -> None:
         ("one\ntwo\n", f"{none} 2 lines, and no line 'Found security directory'\n"),
         ("one", f"{none} 1 line, and no line 'Found security directory'\n"),
     ):
-        (tmp_path / "robot.log").write_text(text)
-        ended = sros("explain", "--log", tmp_path / "robot.log").ok()
+        ended = said_of(text, tmp_path).ok()
         assert ended.err.startswith(said)
     assert "\nnot shown: whether a node runs open (`sros check runtime` on its machi" in ended.err
     assert "denials on Zenoh, because a log has them only with RUST_LOG=zenoh=trace" in ended.err
@@ -676,8 +676,7 @@ def test_nothing_found_is_said_of_what_was_read(tmp_path: Path) -> None:
     assert "in 1 line\nnot shown: whether a node runs open (`sros check" in on_zenoh.ok().err
     for found in ("[INFO] [1.0] [rcl]: Found", "[talker]"):  # rcl, and a node of `sros demo`
         line = f"{found} security directory: /k/enclaves/talker\n"
-        (tmp_path / "robot.log").write_text(line)
-        ended = sros("explain", "--log", tmp_path / "robot.log").ok()
+        ended = said_of(line, tmp_path).ok()
         first, second = ended.err.splitlines()
         assert first == f"{none} 1 line; a node found its enclave '/k/enclaves/talker'"
         assert second.startswith("not shown: whether peers drop the node's messages (explain the")
@@ -729,8 +728,7 @@ def test_a_log_of_an_enclave_has_to_show_that_its_node_runs_secured(
         ([keystore, ENCLAVE], " \n", zenoh, False),
         ([keystore], node, {}, None),
     ):
-        log.write_text(text)
-        ended = sros("explain", *asked, "--log", log, env=variables)
+        ended = said_of(text, tmp_path, *asked, env=variables)
         whole = sros("explain", *asked, "--log", log, "--json", env=variables)
         assert json.loads(whole.out)["secured"] is secured, (asked, text)
         assert ended.status == whole.status == (secured is False), (asked, text)
@@ -741,12 +739,10 @@ def test_a_log_of_an_enclave_has_to_show_that_its_node_runs_secured(
 
 
 def test_a_log_that_names_another_folder_is_said_to_do_so(keystore: Path, tmp_path: Path) -> None:
-    (tmp_path / "robot.log").write_text(STARTED.format("/robot", ENCLAVE))
-    ended = sros("explain", keystore, ENCLAVE, "--log", tmp_path / "robot.log").ok()
+    ended = said_of(STARTED.format("/robot", ENCLAVE), tmp_path, keystore, ENCLAVE).ok()
     named = f"the log names another folder than {keystore}: /robot/enclaves{ENCLAVE}\n"
     assert ended.err.startswith(f"note [log.other-folder]: {named}")
-    (tmp_path / "robot.log").write_text(STARTED.format(keystore, ENCLAVE))
-    ended = sros("explain", keystore, ENCLAVE, "--log", tmp_path / "robot.log").ok()
+    ended = said_of(STARTED.format(keystore, ENCLAVE), tmp_path, keystore, ENCLAVE).ok()
     assert "other-folder" not in ended.err
 
 
@@ -1014,8 +1010,7 @@ def test_the_only_key_of_a_robot_is_missing(refused: bool, keystore: Path, tmp_p
     (folder := robot / "enclaves" / ENCLAVE[1:]).joinpath("key.pem").unlink()
     copy, log = copy_of(robot, tmp_path / "copy"), tmp_path / "robot.log"
     refusal = "RCLError: error creating node: couldn't find all security files!\n" * refused
-    log.write_text(STARTED.format(robot, ENCLAVE) + refusal)
-    here = sros("explain", robot, ENCLAVE, "--log", log)
+    here = said_of(STARTED.format(robot, ENCLAVE) + refusal, tmp_path, robot, ENCLAVE)
     assert here.status == 1
     assert "  found     key.pem: missing\n" in here.out
     assert ("on DDS the node RAN UNSECURED" in here.out) is not refused
@@ -1168,15 +1163,13 @@ def test_a_private_name_is_not_written_with_the_name_of_the_node(
     topic: str, advice: str, tmp_path: Path
 ) -> None:
     """The node is renamed where it runs, which only the log shows: its logger has the new name."""
-    policy, log = tmp_path / "p.xml", tmp_path / "robot.log"
+    policy = tmp_path / "p.xml"
     policy.write_text(policy_text({"/a": publish("y")}))
     denied = f"{FAST_LINE}{topic} topic not found in allow rule. -> check_create_datareader\n"
     started = STARTED.format("/k", "/left/a")
     logged = "[INFO] [1.0] [left.new]: up\n"
-    log.write_text(started + logged + denied)
-    assert f"add it as {advice}" in sros("explain", policy, "--log", log).out
-    log.write_text(logged + denied)  # without the namespace
-    said = sros("explain", policy, "/a", "--log", log).out
+    assert f"add it as {advice}" in said_of(started + logged + denied, tmp_path, policy).out
+    said = said_of(logged + denied, tmp_path, policy, "/a").out
     assert ("add it as ~/purge: it" in said) is (topic == "rq/left/new/purgeRequest")
 
 
@@ -1197,11 +1190,10 @@ def test_a_topic_of_cyclone_dds_that_one_direction_would_create(
     line: str, said: str, tmp_path: Path
 ) -> None:
     """Then the process has files of another policy. Twin: only its writer is denied."""
-    policy, log = tmp_path / "p.xml", tmp_path / "robot.log"
+    policy = tmp_path / "p.xml"
     served = '<services reply="ALLOW"><service>home</service></services>'
     policy.write_text(policy_text({"/a": served}))
-    log.write_text(line)
-    ended = sros("explain", policy, "/a", "--log", log)
+    ended = said_of(line, tmp_path, policy, "/a")
     assert said in ended.out, ended
     is_older = "The process loaded permissions of another policy" in ended.out
     assert is_older == ("failed" in line), ended
@@ -1209,12 +1201,11 @@ def test_a_topic_of_cyclone_dds_that_one_direction_would_create(
 
 def test_a_node_of_another_version_than_its_policy(tmp_path: Path) -> None:
     """A name unlike all others is seldom a renamed one, so that this is said last."""
-    policy, log = tmp_path / "p.xml", tmp_path / "robot.log"
+    policy = tmp_path / "p.xml"
     names = "<action>/grasp</action><action>/lift*</action>"
     policy.write_text(policy_text({"/a": f'<actions execute="ALLOW">{names}</actions>'}))
     denied = "[SECURITY Error] rq/calibrate/_action/send_goalRequest topic not found in allow rule"
-    log.write_text(f"{denied}. -> check_create_datareader\n")
-    said = sros("explain", policy, "/a", "--log", log).out
+    said = said_of(f"{denied}. -> check_create_datareader\n", tmp_path, policy, "/a").out
     assert "remedy    If the policy is for another version of the node, use the policy" in said
     assert (
         f"missing in the policy: add it.{NEXT}If the policy means this action by /grasp: " in said
@@ -1254,8 +1245,7 @@ def test_a_new_name_in_a_log_without_the_namespace(
     policy, log = tmp_path / "p.xml", tmp_path / "robot.log"
     policy.write_text(policy_text({"/a": publish("width", "/fixed/x")}))
     line = f"[SECURITY Error] rt/{name} topic not found in allow rule. -> {side}\n"
-    log.write_text(line)
-    found = sros("explain", policy, "/a", "--log", log).out
+    found = said_of(line, tmp_path, policy, "/a").out
     assert f"sros explain {policy} /a publish /{name}`" in found
     assert (f"remedy    {said}" in found) if said else "is the namespace of" not in found
     log.write_text(f"[rcl]: Found security directory: /k/enclaves/a\n{line}")
@@ -1356,8 +1346,7 @@ def test_a_topic_that_is_denied_in_either_direction_is_looked_up_in_both(
     keystore: Path, tmp_path: Path
 ) -> None:
     line = "cannot create topic rt/x. Not Allowed By Security"
-    (tmp_path / "robot.log").write_text(line)
-    said = sros("explain", keystore, ENCLAVE, "--log", tmp_path / "robot.log").out
+    said = said_of(line, tmp_path, keystore, ENCLAVE).out
     assert "no rule allows it" not in said.partition("found")[0]
     for direction in ("publish", "subscribe"):
         assert f"  found     Cyclone DDS 0.10: no rule names {direction} rt/x" in said
@@ -1516,12 +1505,11 @@ def test_the_policy_next_to_a_keystore_gives_lines(
 def test_a_missing_parameter_is_said_before_a_new_right(
     names: tuple[str, ...], line: str, meant: str, tmp_path: Path
 ) -> None:
-    policy, log = tmp_path / "p.xml", tmp_path / "robot.log"
+    policy = tmp_path / "p.xml"
     allowed = publish("/rosout", "/parameter_events", *(f"/right/{name}" for name in names))
     policy.write_text(policy_text({"/right/driver": allowed}))
     denied = "rt/right/motor_cmd topic not found in allow rule. -> check_create_datawriter"
-    log.write_text(f"{line}\n{denied}\n")
-    said = sros("explain", policy, "/right/driver", "--log", log).out
+    said = said_of(f"{line}\n{denied}\n", tmp_path, policy, "/right/driver").out
     found = f"found     /right/driver may publish {meant}; perhaps a remapping or a parameter is "
     remedy = (
         f"  remedy    If the node should use {meant}, start it with the remapping or the parameter "

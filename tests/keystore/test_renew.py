@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from dataclasses import replace
 from datetime import UTC, datetime, timedelta
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +19,11 @@ from sros_tool.dds.permissions import parse_permissions
 from sros_tool.errors import KeystoreError, SrosError, UsageError
 from sros_tool.keystore.expiry import Threshold, parse_threshold, survey
 from sros_tool.keystore.layout import enclave_path
-from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, generate_artifacts
+from sros_tool.keystore.lifecycle.create import create_enclaves, generate_artifacts
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revoke import revoke
 from sros_tool.keystore.lifecycle.rotate import rotate_ca
 from sros_tool.keystore.reader import OpenedKeystore, open_enclave
-from sros_tool.keystore.template import load_template
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import validity_of
 from sros_tool.policy.document import read_policy
@@ -33,7 +32,7 @@ from sros_tool.zenoh.configuration import ZenohNetwork
 from tests.support.harness import (
     certificate,
     check_whole,
-    made_once,
+    keystore_of,
     policy_text,
     publish,
     snapshot,
@@ -46,15 +45,7 @@ NOW = datetime(2026, 6, 1, tzinfo=UTC)
 LATER = NOW + timedelta(days=100)
 LEDGERS = {"ledger.jsonl", "ledger.p7s"}
 RENEWED = {"cert.pem", "permissions.p7s", "permissions.xml"}
-
-
-def made(root: Path, *names: str, template: str = "production", **more: object) -> Path:
-    def make(root: Path) -> None:
-        choices = replace(load_template(template), **more)  # type: ignore[arg-type]
-        create_keystore(root, template=choices, now=NOW)
-        create_enclaves(root, names, now=NOW)
-
-    return made_once(root, make, names, template, *more.items())
+made = partial(keystore_of, now=NOW)
 
 
 def changed(before: dict[str, tuple[int, bytes]], root: Path) -> set[str]:

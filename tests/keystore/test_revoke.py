@@ -8,6 +8,7 @@ import re
 import shutil
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -30,7 +31,7 @@ from tests.support.harness import (
     certificate,
     check_whole,
     copy_of,
-    made_once,
+    keystore_of,
     policy_text,
     publish,
     snapshot,
@@ -40,15 +41,7 @@ from tests.support.long_form import some
 
 NOW = datetime(2026, 6, 1, tzinfo=UTC)
 DAY = timedelta(days=1)
-
-
-def made(root: Path, *names: str, template: str = "production", **more: timedelta) -> Path:
-    def make(root: Path) -> None:
-        choices = replace(load_template(template), **more)  # type: ignore[arg-type]
-        create_keystore(root, template=choices, now=NOW)
-        create_enclaves(root, names, now=NOW)
-
-    return made_once(root, make, names, template, *more.items())
+made = partial(keystore_of, now=NOW)
 
 
 def serial(root: Path, name: str) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -83,19 +84,34 @@ CASES: dict[str, tuple[str, Extensions, dict[int, Extensions]]] = {
 }
 
 
+def authority() -> tuple[x509.Certificate, PrivateKey, Window]:
+    """A CA with its key, and its validity."""
+    key, window = generate_key(), Window(NOW - DAY, NOW + DAY)
+    return issue_ca(key, common_name("CA"), window), key, window
+
+
+def list_of(ca: x509.Certificate) -> x509.CertificateRevocationListBuilder:
+    return x509.CertificateRevocationListBuilder(ca.subject, NOW - DAY, NOW + DAY).add_extension(
+        authority_identifier(ca), critical=False
+    )
+
+
+def verified(
+    folder: Path, ca: bytes, crl: bytes, certificate: bytes
+) -> subprocess.CompletedProcess[str]:
+    """What openssl says of a certificate and a list."""
+    for name, data in (("ca", ca), ("crl", crl), ("certificate", certificate)):
+        (folder / name).write_bytes(data)
+    command = ["openssl", "verify", "-crl_check", "-CAfile", "ca", "-CRLfile", "crl", "certificate"]
+    return run(command, cwd=folder, status=None)
+
+
 @pytest.mark.parametrize("case", CASES)
 def test_what_is_said_of_a_list_is_what_openssl_does(case: str, tmp_path: Path) -> None:
     expected, extensions, entries = CASES[case]
-    key, window = generate_key(), Window(NOW - DAY, NOW + DAY)
-    ca = issue_ca(key, common_name("CA"), window)
+    ca, key, window = authority()
     certificate = Issuer(ca, key).issue(common_name("/a"), generate_key().public_key(), window)
-    builder = (
-        x509.CertificateRevocationListBuilder()
-        .issuer_name(ca.subject)
-        .last_update(NOW - DAY)
-        .next_update(NOW + DAY)
-        .add_extension(authority_identifier(ca), critical=False)
-    )
+    builder = list_of(ca)
     for extension, critical in extensions:
         builder = builder.add_extension(extension, critical=critical)
     for number, more in entries.items():
@@ -106,11 +122,7 @@ def test_what_is_said_of_a_list_is_what_openssl_does(case: str, tmp_path: Path) 
         builder = builder.add_revoked_certificate(entry.build())
     document = builder.sign(key, hashes.SHA256()).public_bytes(serialization.Encoding.PEM)
 
-    files = {"ca": pem(ca), "crl": document, "certificate": pem(certificate)}
-    for name, data in files.items():
-        (tmp_path / name).write_bytes(data)
-    command = ["openssl", "verify", "-crl_check", "-CAfile", "ca", "-CRLfile", "crl", "certificate"]
-    done = run(command, cwd=tmp_path, status=None)
+    done = verified(tmp_path, pem(ca), document, pem(certificate))
     revoked = "certificate revoked" in done.stderr
     observed = USABLE if not done.returncode else REVOKED if revoked else REFUSED
     assert observed == expected or (case.startswith("changes") and takes_changes_for_lists())
@@ -124,19 +136,14 @@ def test_what_is_said_of_a_list_is_what_openssl_does(case: str, tmp_path: Path) 
 @pytest.mark.filterwarnings("ignore")  # of cryptography, for the serial number
 @pytest.mark.parametrize("listed", [False, True])
 def test_a_certificate_with_a_negative_serial_number(listed: bool, tmp_path: Path) -> None:
-    key, window = generate_key(), Window(NOW - DAY, NOW + DAY)
-    ca = issue_ca(key, common_name("CA"), window)
+    ca, key, window = authority()
     issued = Issuer(ca, key).issue(common_name("/a"), generate_key().public_key(), window)
     (changed,) = Node.read(issued.public_bytes(serialization.Encoding.DER))
     changed.children[0].children[1].content = b"\xfb"  # -5
     certificate = x509.load_der_x509_certificate(signed_again(changed, key))
     entry = x509.RevokedCertificateBuilder().revocation_date(NOW - DAY).serial_number(OWN)
     built = (
-        x509.CertificateRevocationListBuilder()
-        .issuer_name(ca.subject)
-        .last_update(NOW - DAY)
-        .next_update(NOW + DAY)
-        .add_extension(authority_identifier(ca), critical=False)
+        list_of(ca)
         .add_extension(x509.CRLNumber(1), critical=False)
         .add_revoked_certificate(entry.build())
         .sign(key, hashes.SHA256())
@@ -147,19 +154,14 @@ def test_a_certificate_with_a_negative_serial_number(listed: bool, tmp_path: Pat
         entries.children[0].children[0].content = b"\xfb"
     data = raw_pki.pem("X509 CRL", signed_again(changed, key))
     crl = read_list(data, "")
-    (tmp_path / "ca").write_bytes(pem(ca))
-    (tmp_path / "crl").write_bytes(data)
-    (tmp_path / "certificate").write_bytes(pem(certificate))
-    command = ["openssl", "verify", "-crl_check", "-CAfile", "ca", "-CRLfile", "crl", "certificate"]
-    done = run(command, cwd=tmp_path, status=None)
+    done = verified(tmp_path, pem(ca), data, pem(certificate))
     assert ("certificate revoked" in done.stderr) is listed
     assert lists_as_revoked(crl, certificate.serial_number) is listed
 
 
 @pytest.mark.parametrize("serial", [-1, 0, 1 << 159, (1 << 175) + 1])
 def test_a_serial_number_that_no_list_holds_is_refused(serial: int) -> None:
-    key, window = generate_key(), Window(NOW - DAY, NOW + DAY)
-    ca = issue_ca(key, common_name("CA"), window)
+    ca, key, _ = authority()
     times = {"this_update": NOW - DAY, "next_update": NOW + DAY}
     assert load_crl(
         sign_crl(ca, key, [RevocationEntry((1 << 159) - 1, NOW)], number=1, **times), ""
@@ -169,8 +171,7 @@ def test_a_serial_number_that_no_list_holds_is_refused(serial: int) -> None:
 
 
 def test_a_list_whose_serial_numbers_are_no_numbers_is_refused(tmp_path: Path) -> None:
-    key, window = generate_key(), Window(NOW - DAY, NOW + DAY)
-    ca = issue_ca(key, common_name("CA"), window)
+    ca, key, _ = authority()
     times = {"this_update": NOW - DAY, "next_update": NOW + DAY}
     made = load_crl(sign_crl(ca, key, [RevocationEntry(5, NOW)], number=1, **times), "").list
     (changed,) = Node.read(made.public_bytes(serialization.Encoding.DER))

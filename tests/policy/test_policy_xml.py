@@ -14,27 +14,14 @@ from lxml import etree
 
 from sros_tool.errors import DocumentError, PolicyError
 from sros_tool.policy.document import policy_xml, read_policy
-from sros_tool.policy.model import RIGHTS, Enclave, Group, Policy, Profile, Profiles, Qualifier
+from sros_tool.policy.model import Enclave, Policy, Profile, Profiles
 from sros_tool.policy.patterns import matches
 from sros_tool.policy.rights import policy_rights
 from sros_tool.xml import tag_of
+from tests.support.drawn_policies import drawn_groups
 from tests.support.harness import policy_text, publish, with_includes
 
 names = st.sampled_from(("x", "/x/y", "~/z", "~", "*", "a?", "[!a-c]d", "/a/*/b"))
-
-
-def groups() -> st.SearchStrategy[Group]:
-    def of(kind: str) -> st.SearchStrategy[Group]:
-        either = st.none() | st.sampled_from(Qualifier)
-        rights = st.tuples(either, either).map(
-            lambda pair: tuple(
-                (right, said) for right, said in zip(RIGHTS[kind], pair, strict=True) if said
-            )
-        )
-        some = st.lists(names, min_size=1, max_size=3).map(tuple)
-        return st.builds(Group, st.just(kind), rights.filter(bool), some)
-
-    return st.sampled_from(sorted(RIGHTS)).flatmap(of)
 
 
 texts = st.text(alphabet=string.ascii_letters + "&<>\"' \té中😀", max_size=8)
@@ -55,7 +42,7 @@ blocks = st.builds(
             Profile,
             st.sampled_from(("/", "/ns", "/ns/*")),
             st.sampled_from(("n", "node_2", "*")),
-            st.lists(groups(), max_size=3).map(tuple),
+            st.lists(drawn_groups(names), max_size=3).map(tuple),
         ),
         min_size=1,
         max_size=3,

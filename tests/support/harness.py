@@ -13,7 +13,8 @@ import threading
 import traceback
 from collections.abc import Callable, Hashable, Mapping
 from contextlib import redirect_stderr, redirect_stdout, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from datetime import datetime
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -26,6 +27,8 @@ from sros_tool.cli import main
 from sros_tool.dds.permissions import parse_permissions
 from sros_tool.keystore.delivery.robot import NewRequest, create_requests
 from sros_tool.keystore.layout import LEDGER_INDEX, LOCK, REQUIRED_FILES
+from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
+from sros_tool.keystore.template import load_template
 from sros_tool.pki import smime
 from tests.support.children import Forked
 
@@ -45,6 +48,19 @@ def made_once(root: Path, make: Callable[[Path], object], *how: Hashable) -> Pat
     else:
         copy_of(_KEPT[key], root)
     return root
+
+
+def keystore_of(
+    root: Path, *names: str, now: datetime, template: str = "production", **more: object
+) -> Path:
+    """Make a keystore with enclaves, once for each template and changes of it."""
+
+    def make(root: Path) -> None:
+        choices = replace(load_template(template), **more)  # type: ignore[arg-type]
+        create_keystore(root, template=choices, now=now)
+        create_enclaves(root, names, now=now)
+
+    return made_once(root, make, names, now, template, *more.items())
 
 
 def copy_of(source: Path, target: Path) -> Path:
