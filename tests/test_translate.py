@@ -36,6 +36,7 @@ from sros_tool.policy.model import (
 from sros_tool.policy.patterns import covers
 from sros_tool.translate import governance_for, needed_expressions, permissions_for, ros_rights
 from sros_tool.validity import window
+from tests.support.drawn_policies import drawn_groups
 
 DOMAINS = DomainSet.parse("0,7")
 BEGIN = datetime(2026, 1, 1, tzinfo=UTC)
