@@ -890,10 +890,10 @@ def _fleet_facts(compared_fleet: ComparedFleet) -> Iterator[str]:
             "put them right; find out who else can write to the folder"
         )
     if status.stage != "complete":
-        behind, robots = len(status.unconfirmed), sum(bool(each.enclaves) for each in status.robots)
-        every = "all " if robots > 1 else ""
-        confirmed = f"not confirmed by {counted(behind, 'robot')} yet"
-        confirmed = confirmed if behind else f"confirmed by {every}{counted(robots, 'robot')}"
+        robots = sum(bool(each.enclaves) for each in status.robots)
+        confirmed = f"confirmed by {'all ' * (robots > 1)}{counted(robots, 'robot')}"
+        if behind := status.unconfirmed:
+            confirmed = f"not confirmed by {first_few(behind, 3)} yet"
         yield f"CA rotation: {status.stage}; {confirmed}"
     yield from _revocation_list_facts(compared_fleet)
     yield from _expiry_facts(compared_fleet)

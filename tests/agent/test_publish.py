@@ -622,6 +622,22 @@ def test_two_at_once(publisher: Home, monkeypatch: pytest.MonkeyPatch) -> None:
     publisher.publish()
 
 
+def test_a_run_that_waited_for_another_sees_what_that_one_published(
+    publisher: Home, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    acquire = transaction.KeystoreLock.acquire
+
+    def first_publish_otherwise(lock: transaction.KeystoreLock) -> transaction.KeystoreLock:
+        monkeypatch.setattr(transaction.KeystoreLock, "acquire", acquire)
+        assert publisher.publish(after=timedelta()).names("published") == ["r1"]
+        return acquire(lock)
+
+    publisher.run("renew", "ks", "--robot", "r1")
+    publisher.now += LATER
+    monkeypatch.setattr(transaction.KeystoreLock, "acquire", first_publish_otherwise)
+    assert publisher.publish(after=timedelta()).names("published") == []
+
+
 # ── keys and times ─────────────────────────────────────────────────────────────────────────
 
 

@@ -469,6 +469,10 @@ def test_new_keys_end_the_alarm_of_two_computers(
         said = sros("fleet", "status", "ks", cwd=home.folder).out
         why = "two computers seem to have the keys of r1, so sros does not know whether the list"
         assert (why in said) == (revoke_old and r1.is_doubtful), said
+    if restored:
+        sros("rotate_ca", "ks", "--next", cwd=home.folder).ok()
+        refused = sros("rotate_ca", "ks", "--next", cwd=home.folder).err
+        assert "Two computers seem to have the keys of r1, so their confirmations" in refused
 
 
 def test_no_file_with_an_early_time_brings_an_old_message_back(home: Home) -> None:

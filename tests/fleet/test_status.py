@@ -537,7 +537,7 @@ def test_a_rotation_goes_on_when_every_robot_has_confirmed_its_stage(field: Fiel
             field.confirm("r2", restart=["/r2/base"])
             assert ": r2. " in field.run("rotate_ca", "ks", "--next", status=2).err
             said = field.run("fleet", "status", "ks", status=1).out
-            assert "CA rotation: distribute; not confirmed by 1 robot yet" in said
+            assert "CA rotation: distribute; not confirmed by r2 yet" in said
             field.confirm("r2", restart=[])
             said = field.run("fleet", "status", "ks", status=0).out
             assert "CA rotation: distribute; confirmed by all 3 robots\n" in said

@@ -283,6 +283,8 @@ def publish(
             lock = KeystoreLock(opened, "publishing folder")
             stack.callback(lock.release)
             lock.acquire()
+        keystore.forget()  # another run may have published while this one waited
+        fleet = recorded_fleet(keystore)
         run = _Publication(keystore, folder, now, expiry or MetadataExpiry(), dry_run)
         run.notes += similar_names_notes(fleet)
         run.notes += left_enclaves_notes(keystore, fleet, left_enclaves(keystore, fleet, now))

@@ -311,9 +311,14 @@ def _cut_off_error(
             f"robot{by_hand}, and restart everything. Otherwise go stage by stage, with "
             f"`sros rotate_ca {where} --next`.",
         )
+    status = fleet_status(keystore, robots).robots
+    copied = [robot.robot for robot in status if robot.has_shared_keys]
+    doubt = f" Two computers seem to have the keys of {first_few(copied, _MOST_SHOWN)}, so their "
+    doubt += "confirmations do not count: `sros fleet status` says until when."
     return KeystoreError(
         f"not every robot has confirmed the stage {rotation.stage}: {names}",
-        "After the next stage, these robots could not communicate with the other robots.",
+        "After the next stage, these robots could not communicate with the other robots."
+        f"{doubt if copied else ''}",
         "Deliver the current files, restart processes that run with earlier files, and confirm "
         f"the files and the restart; see `sros fleet status {where}`. --allow-unconfirmed goes on "
         "without these robots.",
