@@ -18,10 +18,10 @@ from tests.support.children import run
 from tests.support.harness import (
     Ended,
     Running,
+    check_dry_run,
     copy_of,
     policy_text,
     publish,
-    remains,
     snapshot,
     sros,
     topics_of,
@@ -273,18 +273,7 @@ def test_a_dry_run_prints_what_the_command_does(line: str, keystore: Path, tmp_p
     shutil.copy(request, tmp_path / "r.pem")
     copy_of(keystore, tmp_path / "twin")
     sros("sign_request", tmp_path / "twin", request, "-o", tmp_path / "good.tgz").ok()
-    before = snapshot(tmp_path)
-    said = sros(*line.split(), "--dry-run", cwd=tmp_path).ok().out
-    assert snapshot(tmp_path) == before
-    sros(*line.split(), cwd=tmp_path).ok()
-    after = snapshot(tmp_path)
-    assert not remains(tmp_path)
-    told = {path: action for _, action, path in (w.split(" ", 2) for w in said.splitlines())}
-    assert told == {
-        path: "replace" if path in before else "create"
-        for path, (mode, content) in after.items()
-        if not stat.S_ISDIR(mode) and before.get(path, (0, None))[1] != content
-    }
+    check_dry_run(line, tmp_path)
 
 
 MISUSE: dict[str, tuple[str, str]] = {

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import stat
 import time
 from pathlib import Path
 
 import pytest
 
-from tests.support.harness import copy_of, snapshot, sros
+from tests.support.harness import check_dry_run, copy_of, sros
 
 LINES = (
     "renew ks /a --new-key",
@@ -39,21 +38,4 @@ def home(made: Path, tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize("line", LINES)
 def test_a_dry_run_tells_what_the_verb_then_does(line: str, home: Path) -> None:
-    before = snapshot(home)
-    said = sros(*line.split(), "--dry-run", cwd=home).ok().out
-    assert snapshot(home) == before
-    sros(*line.split(), cwd=home).ok()
-    after = snapshot(home)
-    files = [
-        path
-        for path in before.keys() | after.keys()
-        if not stat.S_ISDIR((after.get(path) or before[path])[0])
-    ]
-    done = {
-        path: "create" if path not in before else "replace" if path in after else "remove"
-        for path in files
-        if before.get(path) != after.get(path)
-    }
-    told = [line.split(" ", 2)[1:] for line in said.splitlines()]
-    assert {path: action for action, path in told} == done
-    assert len(told) == len(done) > 1
+    assert check_dry_run(line, home) > 1

@@ -344,6 +344,29 @@ def remains(folder: Path) -> list[str]:
     ]
 
 
+def check_dry_run(line: str, folder: Path, *more: str) -> int:
+    """Compare what a dry run says with the files that the run changes; return how many these are.
+
+    ``line`` is run in the folder; ``more`` are options of the dry run.
+    """
+    before = snapshot(folder)
+    said = sros(*line.split(), "--dry-run", *more, cwd=folder).ok().out
+    assert snapshot(folder) == before
+    sros(*line.split(), cwd=folder).ok()
+    after = snapshot(folder)
+    assert not remains(folder)
+    done = {
+        path: "create" if path not in before else "replace" if path in after else "remove"
+        for path in before.keys() | after.keys()
+        if not stat.S_ISDIR((after.get(path) or before[path])[0])
+        and before.get(path) != after.get(path)
+    }
+    told = [text.split(" ", 2)[1:] for text in said.splitlines()]
+    assert {path: action for action, path in told} == done
+    assert len(told) == len(done)
+    return len(done)
+
+
 def topics_of(enclave: Path) -> frozenset[str]:
     """Return the DDS topics of an enclave's signed permissions, as DDS would load them."""
     signed, authority = (enclave / name for name in ("permissions.p7s", "permissions_ca.cert.pem"))
