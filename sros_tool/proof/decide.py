@@ -102,6 +102,17 @@ class Witness:
         """The enclaves of the uses, in order, without duplicates."""
         return tuple(dict.fromkeys(use.enclave for use in self.uses))
 
+    def led_by_new(self, known: frozenset[str]) -> Witness:
+        """Return the same witness, first with uses of enclaves that are not all ``known``.
+
+        Enclaves that only together break a requirement keep their order.
+        """
+        if len(self.uses) > max(map(len, self.others), default=0):
+            return self
+        chains = [self.uses, *self.others]
+        chains.sort(key=lambda uses: known.issuperset(use.enclave for use in uses))
+        return Witness(chains[0], tuple(chains[1:]))
+
 
 @dataclass(frozen=True, slots=True)
 class Verdict:

@@ -205,8 +205,12 @@ class Decisions:
     by_name: tuple[tuple[Only, tuple[Step, ...]], ...] = ()
 
 
-def decide_all(requirements: Sequence[Requirement], system: System) -> Decisions:
+def decide_all(
+    requirements: Sequence[Requirement], system: System, breaking: frozenset[str] = frozenset()
+) -> Decisions:
     """Return the decisions on requirements in all worlds.
+
+    A violation of several enclaves begins with one that is not in ``breaking``.
 
     Raises:
         DocumentError: there are too many wildcards to decide a requirement.
@@ -232,6 +236,7 @@ def decide_all(requirements: Sequence[Requirement], system: System) -> Decisions
         broken = [(world, verdict.witness) for world, verdict in verdicts if verdict.witness]
         if broken:
             world, witness = min(broken, key=lambda pair: len(pair[1].uses))
+            witness = witness.led_by_new(breaking) if breaking else witness
             steps = tuple(_step(requirement, use, world, system) for use in witness.uses)
             titles = tuple(world.title for world, _ in broken)
             titles = () if len(broken) == len(system.worlds) else titles

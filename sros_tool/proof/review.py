@@ -1269,6 +1269,10 @@ class _Review:
                 if not broken:
                     continue
                 known = {*_failures(moved[at], before()), *_with_new_names(moved[at], dropped())}
+                if known.issuperset(broken):
+                    continue
+                if breaking := frozenset[str]().union(*(failure.enclaves for failure in known)):
+                    broken = _failures(moved[at], after, before, earlier, breaking)
                 place = f"in namespace {ns}, which the review tries"
                 for failure, finding in broken.items():
                     if failure not in known:
@@ -1527,6 +1531,11 @@ class _Failure(NamedTuple):
     """Whether the enclave that has to have rights cannot start."""
     text: str = ""
 
+    @property
+    def enclaves(self) -> frozenset[str]:
+        """All enclaves that break the requirement."""
+        return self.others.union(enclave for enclave, *_ in self.uses)
+
     def with_new_names(self, names: Mapping[tuple[str, str], str]) -> _Failure:
         """Return the same failure under new names, which are given by right and old name."""
 
@@ -1554,13 +1563,15 @@ def _failures(
     system: System,
     before: Callable[[], System] | None = None,
     earlier: Sequence[Requirement] = (),
+    breaking: frozenset[str] = frozenset(),
 ) -> dict[_Failure, Finding]:
     """Return the findings which say that a requirement does not hold, or protects nothing.
 
     A name that no right states counts only if a right of ``before`` states it; for `Nobody`, only
-    if the ``earlier`` requirements forbid it already.
+    if the ``earlier`` requirements forbid it already.  The place of a finding is a right of an
+    enclave that is not in ``breaking``, if such an enclave breaks the requirement.
     """
-    decided = decide_all([requirement], system)
+    decided = decide_all([requirement], system, breaking)
     rights = before().rights if before and decided.unnamed else ()
     findings = decided_findings(decided, system, rights, earlier)
     failures = {

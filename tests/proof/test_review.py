@@ -1940,13 +1940,16 @@ def test_a_renamed_requirement_may_stay_broken_in_a_namespace(
         return policy_text({"/a": publish(name), "/d": publish("w"), **enclaves})
 
     change.base = change.commit({"robot.xml": policy("x", writers), "robot.toml": only})
-    renamed = only.replace('"x"', f'"{new}"')
-    change.commit({"robot.xml": policy(new, later), "robot.toml": renamed})
+    renamed, after = only.replace('"x"', f'"{new}"'), policy(new, later)
+    change.commit({"robot.xml": after, "robot.toml": renamed})
     asked = ("--policy", "robot.xml", "--requirements", "robot.toml", "--new-access", "allow")
     assert "requirement.dropped" in change.review(*asked).out
     ended = change.review(*asked, "--dropped-requirements", "allow")
     assert ended.status == status, ended
     assert ("in namespace /left, which the review" in ended.out) == bool(status), ended
+    for added in {*later.split()}.difference(writers.split()):
+        line = after[: after.index(f'"{added}"')].count("\n") + 2
+        assert f"  robot.xml:{line}: error: /left{added}: in namespace /left" in ended.out, ended
 
 
 def test_requirements_may_swap_their_names(change: Change) -> None:
