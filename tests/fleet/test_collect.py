@@ -306,6 +306,16 @@ def test_a_robot_cannot_answer_for_another_one(home: Home) -> None:
     assert home.kept("r1") is None and home.kept("r2") is None
     home.put("r1", smime.sign(named_r1, stolen, home.key("r1", "/r1/base")))
     assert home.of("r1").outcome == "kept"
+    home.run("revoke", "ks", "/r2/base", "--reason", "key_compromise")
+    time = OpenedKeystore(home.root).entries_of("revocation")[-1].time
+    home.put("r1", of_r2)
+    for owner in ("an enclave of r2", "which belongs to no robot"):
+        assert home.of("r1").why == (
+            f"it is signed with a revoked certificate of /r2/base, {owner} (revoked at {time}, "
+            "keyCompromise): a computer that has this key sends messages in the place of r1"
+        )
+        (home.folder / "fleet.toml").write_text("[robots]\nr1 = {}\nr3 = {}\n")
+        home.run("generate_artifacts", "-k", "ks", "-p", "policy.xml", "--fleet", "fleet.toml")
 
 
 def test_a_stranger_with_a_long_name_is_refused_in_a_short_line(
@@ -528,7 +538,11 @@ def test_a_message_that_was_replayed(home: Home) -> None:
     refused = home.of("r1")
     home.put("r1", last)  # whoever has the inbox can put back what was accepted
     assert home.of("r1").outcome == "unchanged" and "r1" in refusals(OpenedKeystore(home.root))
-    assert refused.outcome == "refused" and "not higher than 2" in refused.why
+    assert (
+        refused.outcome == "refused"
+        and "not higher than 2" in refused.why
+        and "two computers have" in refused.why
+    )
     assert "--restored r1" in refused.why and home.kept("r1") == 2
     # Another message with the same number, and one after somebody confirmed without a number.
     home.send("r1", sequence=2)

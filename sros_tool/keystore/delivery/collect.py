@@ -578,8 +578,9 @@ class _Verifier:
         if before and sequence <= before.sequence and not is_restored:
             raise _RefusedError(
                 f"its sequence number {sequence} is not higher than {before.sequence}, the number "
-                "of the last message: this is an old message, or the disk of the robot was "
-                f"restored (then add --restored {robot.name})"
+                "of the last message: this is an old message, two computers have the robot's "
+                "keys, or the disk of the robot was restored (only then add --restored "
+                f"{robot.name})"
             )
         arrived = self._arrival(file, verified.confirmation, last)
         message = LastMessage(
@@ -735,32 +736,48 @@ class _Verifier:
                 why += " (perhaps the CA was replaced after the backup of the keystore: see "
                 why += "docs/howto/keystore_is_lost.md)"
             raise _RefusedError(f"{why}: {fault}")
+        issued = self._issue_entry(digest(signer))
+        owner = robot_of(self._fleet, issued.enclave) if issued else None
+        of_whom = f", an enclave of {owner.name}" if owner else ", which belongs to no robot"
         if signer.serial_number in self._revoked:
-            raise _OutdatedCertificateError(
+            why = (
                 f"its certificate, {signer.serial_number:x}, was revoked: perhaps the robot lacks "
                 "its new keys, or another computer that has earlier keys of the robot sends "
-                "messages in its place",
-                "its certificate was revoked after this message was accepted",
+                "messages in its place"
+            )
+            if issued and owner != robot:
+                why = (
+                    f"it is signed with a revoked certificate of {issued.enclave}{of_whom}"
+                    f"{self._revocation_clause(signer)}: a computer that has this key sends "
+                    f"messages in the place of {robot.name}"
+                )
+            raise _OutdatedCertificateError(
+                why, "its certificate was revoked after this message was accepted"
             )
         if is_of_replaced_ca:
             why = "its identity CA was replaced: the robot missed the rotation of this CA"
             raise _OutdatedCertificateError(why, why)
-        issued = self._issue_entry(digest(signer))
         if issued is None:
             raise _RefusedError(
                 f"{NOT_IN_LEDGER}, though the keystore's identity CA issued it: the keystore may "
                 "have been restored from a backup that is older than this certificate"
             )
-        owner = robot_of(self._fleet, issued.enclave)
         if owner != robot:
-            owner_clause = f"an enclave of {owner.name}" if owner else "which belongs to no robot"
-            raise _RefusedError(f"it is signed by {issued.enclave}, {owner_clause}")
+            raise _RefusedError(f"it is signed by {issued.enclave}{of_whom}")
         if self._now > validity.not_after and not self._has_key_of(issued.enclave, signer):
             age = elapsed(self._now - validity.not_after)
             raise _RefusedError(
                 f"its certificate expired {age} ago, and {issued.enclave} has another key now"
             )
         return issued.enclave
+
+    def _revocation_clause(self, certificate: x509.Certificate) -> str:
+        """Return when and why a certificate was revoked, in parentheses; "" if it is not known."""
+        for entry in self._keystore.entries_of("revocation"):
+            if int(entry.serial, 16) == certificate.serial_number:
+                reason = "" if entry.reason in ("", "unspecified") else f", {entry.reason}"
+                return f" (revoked at {entry.time}{reason})"
+        return ""
 
     def _was_of_replaced_ca(self, robot: Robot, signer: x509.Certificate) -> bool:
         """Return whether a replaced CA issued the certificate to an enclave of the robot.
