@@ -14,7 +14,8 @@ from shlex import quote
 from typing import TYPE_CHECKING
 
 from sros_tool.errors import KeystoreError, Note, UsageError
-from sros_tool.keystore.layout import PERMISSIONS_FILE, remedy_in_keystore
+from sros_tool.faults import KEY_MADE_ON_ROBOT
+from sros_tool.keystore.layout import PERMISSIONS_FILE, is_original_keystore, remedy_in_keystore
 from sros_tool.keystore.reader import read_consistently
 from sros_tool.owners import (
     closing_command,
@@ -212,11 +213,12 @@ def _refuse_key_readable_by_others(
     mode = stat.S_IMODE(key.stat().st_mode)
     if mode & 0o077:
         renew = f"`sros renew KEYSTORE {enclave} --new-key --revoke-old`."
+        on_robot = "" if is_original_keystore(keystore.root) else KEY_MADE_ON_ROBOT
         raise KeystoreError(
             f"others can read the private key of enclave {enclave}",
             f"The mode of '{key}' is {mode:04o}: whoever has read the key can act as the enclave.",
             f"Run `chmod 600 {quote(str(key))}`. If others had access, give the enclave another "
-            f"key. {remedy_in_keystore(keystore.root, renew)}{how_to_accept}",
+            f"key. {remedy_in_keystore(keystore.root, renew)}{on_robot}{how_to_accept}",
         )
 
 

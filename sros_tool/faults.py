@@ -40,6 +40,11 @@ _SET_OR_ADD_DOMAIN = (
 )
 ORIGINAL_KEYSTORE = "keystore that has the CA keys"
 """How the remedies for an export name the keystore that issued it."""
+KEY_MADE_ON_ROBOT = (
+    " If the key was made on its robot, revoke the enclave, and make a new key there "
+    "(docs/howto/one_robot.md: Keys that are made on the robot)."
+)
+"""Follows a remedy with `sros renew --new-key`, which replaces only the keys of the keystore."""
 REFUSE_STRANGERS = (
     "`sros update_keystore KEYSTORE --set protection.allow_unauthenticated_participants=false`"
 )

@@ -68,6 +68,7 @@ from sros_tool.checks.keystores.arrival import (
     unusable_sentences,
 )
 from sros_tool.errors import SrosError, UnavailableError
+from sros_tool.faults import KEY_MADE_ON_ROBOT
 from sros_tool.files import remove_file, replace_file, staged_file
 from sros_tool.folders import Folder
 from sros_tool.keystore.confirmation import (
@@ -144,10 +145,6 @@ _BRING_KEY = (
     "keystore machine, and bring DIR here. If the key was made on a robot, the keystore does "
     "not have it: make a new key, as for new hardware (docs/howto/one_robot.md). If another "
     "computer replaced this one, switch this computer off instead."
-)
-_KEY_MADE_ON_ROBOT = (
-    " If the key was made on its robot, revoke the enclave, and make a new key there "
-    "(docs/howto/one_robot.md: Keys that are made on the robot)."
 )
 _DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 _ServerAnswer = TypeVar("_ServerAnswer")
@@ -573,7 +570,7 @@ class _Round:
                 f"{REMOVED_ENCLAVES}the last at {iso(max(key.at for key in removed))}, because "
                 f"the installed release lacks them: {first_few(names, 3)}. If they belong to "
                 "another robot, somebody may have copied their keys: run `sros renew KEYSTORE "
-                f"ENCLAVE --new-key --revoke-old`.{_KEY_MADE_ON_ROBOT}"
+                f"ENCLAVE --new-key --revoke-old`.{KEY_MADE_ON_ROBOT}"
             )
 
     def _note_closed_keys(self, now: datetime) -> None:
@@ -587,7 +584,7 @@ class _Round:
                 f"{iso(max(closed.values()))}{READABLE_KEYS}{counted(len(closed), 'private key')}: "
                 f"{first_few(sorted(closed), 2)}. File modes are correct now, but somebody may "
                 "have copied a key: run `sros renew KEYSTORE ENCLAVE --new-key --revoke-old`, "
-                f"and bring the new key.{_KEY_MADE_ON_ROBOT}"
+                f"and bring the new key.{KEY_MADE_ON_ROBOT}"
             )
 
     def _copied_key(self, path: str) -> CopiedKey:

@@ -39,7 +39,7 @@ from sros_tool.dds.decision.grants import read_date
 from sros_tool.dds.decision.vendors import FAST_DDS, DateRule, Vendor
 from sros_tool.dds.permissions import Grant, parse_permissions
 from sros_tool.errors import SrosError
-from sros_tool.faults import ORIGINAL_KEYSTORE, Fault
+from sros_tool.faults import KEY_MADE_ON_ROBOT, ORIGINAL_KEYSTORE, Fault
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     CRL_FILE,
@@ -153,7 +153,7 @@ PROCESS_KEY_READABLE = FindingKind(
     "rcl 9, Fast DDS 2.14.5 and Cyclone DDS 0.10.2 check no modes.",
     "Run `chmod 600` on the key. If others had access, give the enclave another key in the "
     f"{ORIGINAL_KEYSTORE}: `sros renew KEYSTORE ENCLAVE --new-key --revoke-old`. Then export the "
-    "enclave again, if the process runs from an export.",
+    f"enclave again, if the process runs from an export.{KEY_MADE_ON_ROBOT}",
 )
 PROCESS_NOT_SEEN = FindingKind(
     "runtime.process-not-seen",

@@ -237,6 +237,7 @@ def test_a_key_that_others_may_have_copied_is_to_be_replaced(
     assert readable.remedy.startswith(f"Run `chmod 600 {bench.checked / key}`. If others may have")
     assert f": {replaced_by.format(root=bench.checked)}. Then export the" in readable.remedy
     assert "that has the CA keys: `" in readable.remedy or not exported
+    assert ("If the key was made on its robot, revoke" in readable.remedy) == exported
 
 
 @pytest.mark.parametrize("file", ["cert.pem", "permissions.p7s", "identity_ca.cert.pem"])

@@ -398,6 +398,7 @@ def test_files_of_a_robot_that_others_can_read_or_change(field: Field) -> None:
     assert permissions.startswith("enclaves/r1/base/permissions.p7s: a file or folder that everyb")
     shown = "enclaves/r1/base/key.pem: a private key that others can read: its mode is 0644. Run `"
     assert key.startswith(shown) and "`chmod 600`" in key and "--revoke-old`" in key
+    assert "If the key was made on its robot, revoke the enclave" in key
     assert found["to_do"] == "look into it"
 
 

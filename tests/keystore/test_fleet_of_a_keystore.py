@@ -303,6 +303,15 @@ def test_requests_for_robots_that_the_keystore_does_not_know(made: Path, tmp_pat
     said = sros("sign_request", root, requests, *words, "--no-answer").ok().err
     assert said.count("note [fleet.unrecorded-enclaves]") == 1
     assert "which robot has /new, /other: its fleet does not have the robot" in said
+    sros("revoke", root, "/new").ok()
+    refused = sros("generate_artifacts", "-k", root, *words)
+    assert "remove the folder of each enclave on the robot (its key" in refused.err
+    folder = tmp_path / "robot/enclaves/new"
+    sign = ("sign_request", root, folder / "request.pem", "--no-answer", *words)
+    assert "On the robot, remove the enclave's folder" in sros(*sign, "--enclave", "/new").err
+    shutil.rmtree(folder)
+    sros("create_request", "/new", tmp_path / "robot").ok()
+    sros(*sign, "--enclave", "/new").ok()
 
 
 def test_many_enclaves_are_counted_with_the_next_step(tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from sros_tool.checks.keystores.keystore import keystore_findings
 from sros_tool.checks.keystores.opened import CheckedKeystore, Circumstances
 from sros_tool.checks.kind import ERROR, Finding, FindingFilter, FindingKind
 from sros_tool.errors import DocumentError, SrosError
-from sros_tool.faults import Fault
+from sros_tool.faults import KEY_MADE_ON_ROBOT, Fault
 from sros_tool.keystore.confirmation import COULD_NOT_START
 from sros_tool.keystore.delivery.archive import SUFFIXES
 from sros_tool.keystore.layout import (
@@ -300,7 +300,7 @@ def _enclave(
 _MOST_NAMED = 2
 _CLOSE_KEY = (
     " Run `chmod 600` on it; if others may have copied it, also run `sros renew KEYSTORE ENCLAVE "
-    "--new-key --revoke-old`."
+    f"--new-key --revoke-old`.{KEY_MADE_ON_ROBOT}"
 )
 
 

@@ -13,7 +13,7 @@ from shlex import quote
 from sros_tool.checks.keystores.opened import CheckedKeystore
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind, names_text
 from sros_tool.errors import KeystoreError, SrosError
-from sros_tool.faults import ORIGINAL_KEYSTORE
+from sros_tool.faults import KEY_MADE_ON_ROBOT, ORIGINAL_KEYSTORE
 from sros_tool.keystore.layout import (
     AGENT,
     CONFIRMED,
@@ -450,7 +450,7 @@ def key_mode_findings(keystore: CheckedKeystore, path: str, mode: int) -> Iterat
 
 def _how_to_replace_key(keystore: CheckedKeystore, path: str) -> str:
     """Return, as a clause and a sentence, how to replace the key of an enclave or of a CA."""
-    root, where = quote(os.fspath(keystore.root)), ""
+    root, where, on_robot = quote(os.fspath(keystore.root)), "", ""
     if not keystore.looks_like_original:
         root, where = "KEYSTORE", f" in the {ORIGINAL_KEYSTORE}"
     place = Path(os.path.relpath(path, keystore.root))
@@ -464,9 +464,10 @@ def _how_to_replace_key(keystore: CheckedKeystore, path: str) -> str:
         how = f"finish the rotation{where}: `sros rotate_ca {root} --status` shows its stage"
     elif folder == ENCLAVES and name == KEY_FILE and enclave in keystore.names:
         how = f"replace it{where}: `sros renew {root} {quote(enclave)} --new-key --revoke-old`"
+        on_robot = "" if keystore.looks_like_original else KEY_MADE_ON_ROBOT
     else:
         return "replace it."
-    return f"{how}. Then export the enclaves again, and restart all processes."
+    return f"{how}. Then export the enclaves again, and restart all processes.{on_robot}"
 
 
 class _Links:

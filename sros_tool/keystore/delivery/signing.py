@@ -608,7 +608,10 @@ def _check_requested_key(
 
     An enclave that already shares its key with another enclave is renewed, with a note.
     """
-    remedy = "Create a new key on the robot, with `sros create_request` in another folder."
+    remedy = (
+        "On the robot, remove the enclave's folder, and create a new key with `sros "
+        "create_request`."
+    )
     certificate = (
         present_certificate
         if present_certificate and present_certificate.public_key() == request.public_key

@@ -438,7 +438,8 @@ def _revoked_before_notes(
         if on_robots:
             options = " ".join(f"--enclave {quote(name)}" for name in on_robots)
             steps.append(
-                f"for {first_few(on_robots, 3)}, whose keys were made on the robot, run `sros "
+                f"for {first_few(on_robots, 3)}, whose keys were made on the robot, remove the "
+                "folder of each enclave on the robot (its key is revoked), run `sros "
                 "create_request` there, and pass all these requests to `sros sign_request "
                 f"{quote(str(root))} - --no-answer -p POLICY_FILE"
                 f"{' --fleet FLEET_FILE' if fleet else ''} {options}`"
