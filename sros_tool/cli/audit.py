@@ -271,7 +271,8 @@ def audit(
         echo(_ALLOW_ADVICE, err=True)
     elif patch is not None:
         stays = f"; the earlier '{patch}' stays" if existed else ""
-        patch_remark = "no patch is needed" if audited.allowed else _NO_PATCH
+        patch_remark = _NO_PATCH_ELSEWHERE if audited.misplaced else _NO_PATCH
+        patch_remark = "no patch is needed" if audited.allowed else patch_remark
         echo(patch_remark + stays, err=True)
     return 0 if fine else 1
 
@@ -292,6 +293,8 @@ _WRITE_ZENOH_FILES = (
     "the files again with `sros zenoh KEYSTORE`, and restart the processes that it names"
 )
 _NO_PATCH = "no patch was written: no additional right would allow the denied access"
+
+_NO_PATCH_ELSEWHERE = "no patch was written: first give the nodes of each process one enclave"
 
 
 def _write_patch(audited: Audit, patch: Path | None, *, dry_run: bool) -> str:

@@ -91,12 +91,15 @@ class EnclaveNodes:
 
         Enclaves with exactly this name are preferred to enclaves with a matching wildcard.
         """
-        exact = frozenset(name for name, nodes in self.by_enclave.items() if node in nodes)
-        return exact or frozenset(
+        return self.enclaves_naming(node) or frozenset(
             name
             for name, nodes in self.by_enclave.items()
             if any(_matches_node_name(node, named_node) for named_node in nodes)
         )
+
+    def enclaves_naming(self, node: str) -> frozenset[str]:
+        """Return the enclaves that have exactly this full name of a node, without wildcards."""
+        return frozenset(name for name, nodes in self.by_enclave.items() if node in nodes)
 
     @property
     def expected(self) -> frozenset[EnclaveNode]:
@@ -371,6 +374,7 @@ class Audit:
     unseen: tuple[EnclaveNode, ...]
     unjudged: tuple[str, ...]
     tools: tuple[ObservedNode, ...]
+    misplaced: frozenset[EnclaveNode]
 
     @property
     def allowed(self) -> bool:
@@ -411,9 +415,16 @@ class Audit:
 
     @cached_property
     def missing(self) -> Learned:
-        """The rights to add to the policy."""
-        learned = learn(_nodes_using_denied(self.denied, self.observation), of_tools=True)
+        """The rights to add to the policy, without those of nodes that have another enclave."""
+        addable = [denied for right in self.denied if (denied := self._without_misplaced(right))]
+        learned = learn(_nodes_using_denied(addable, self.observation), of_tools=True)
         return replace(learned, source=RightsOrigin.AUDIT)
+
+    def _without_misplaced(self, denied: DeniedRight) -> DeniedRight | None:
+        """Return a denied right without misplaced nodes; None if no node is left."""
+        enclave = denied.right.enclave
+        nodes = [node for node in denied.nodes if EnclaveNode(enclave, node) not in self.misplaced]
+        return replace(denied, nodes=tuple(nodes)) if nodes else None
 
 
 def _base_name(node: str) -> str:
@@ -445,6 +456,8 @@ def audit(observation: Observation, enclaves: AuditedEnclaves, observer: str = "
     refused: dict[str, str] = {}
     judged: list[ObservedNode] = []
     unclear, divided, without_enclave = [], [], []
+    misplaced: set[EnclaveNode] = set()
+    moved: list[str] = []
     undecided: set[str] = set()
     for nodes in processes.values():
         names = ", ".join(sorted(node.fqn for node in nodes))
@@ -468,6 +481,19 @@ def audit(observation: Observation, enclaves: AuditedEnclaves, observer: str = "
             divided.append(f"{names} (judged in {chosen[0]})")
         elif len(chosen) > 1:
             unclear.append(f"{names} in {' or '.join(chosen)}")
+        elsewhere = {
+            EnclaveNode(name, node): homes
+            for name in chosen
+            for right in answers[name].denied
+            for node in right.nodes
+            if (homes := enclaves.nodes.enclaves_naming(node)) and name not in homes
+        }
+        misplaced |= elsewhere.keys()
+        if together:
+            moved += (
+                f"{place.node} in {place.enclave} (its enclave: {' or '.join(sorted(homes))})"
+                for place, homes in elsewhere.items()
+            )
         for name in chosen:
             denied += answers[name].denied
             undecided |= answers[name].undecided
@@ -491,6 +517,8 @@ def audit(observation: Observation, enclaves: AuditedEnclaves, observer: str = "
                 "audit.divided-process", f"{_DIVIDED_TEXT}: {first_subjects(sorted(divided), '; ')}"
             )
         )
+    if note := _note_on_subjects("other-enclave", _MISPLACED_TEXT, moved):
+        notes.append(note)
     if unclear:
         notes.append(
             Note(
@@ -507,12 +535,23 @@ def audit(observation: Observation, enclaves: AuditedEnclaves, observer: str = "
         tuple(sorted(expected - observed_nodes)),
         tuple(words for _, words in unjudged if words),
         tuple(sorted(tools)),
+        frozenset(misplaced),
     )
 
 
+_ONE_ENCLAVE = (
+    "give these nodes one enclave (`sros merge_policy POLICY OTHER --enclave ENCLAVE`, with --node "
+    "for each, and a POLICY without these nodes), and audit the new policy"
+)
 _DIVIDED_TEXT = (
     "no single enclave has all nodes of these processes, but a process runs in one enclave; sros "
-    "judged the enclave with the fewest denials"
+    "judged the enclave with the fewest denials, and leaves the nodes of other enclaves out of a "
+    f"patch; {_ONE_ENCLAVE}"
+)
+_MISPLACED_TEXT = (
+    "left out of a patch, because these nodes have another enclave, and a node belongs in only "
+    "one; start each process in its enclave, or, if one process runs nodes of several enclaves, "
+    f"{_ONE_ENCLAVE}"
 )
 _UNCLEAR_TEXT = (
     "several enclaves have these nodes, and the graph does not show in which of them they run; "

@@ -387,6 +387,21 @@ def test_a_denial_by_a_rule_is_not_patched(program: Program, tmp_path: Path) -> 
     assert not (tmp_path / "add.xml").exists()
 
 
+def test_the_rights_of_a_node_of_another_enclave_are_not_patched(
+    program: Program, tmp_path: Path
+) -> None:
+    """A process of two nodes: `sros check` would refuse a node in two enclaves."""
+    (tmp_path / "other.xml").write_text(
+        POLICY.replace('"/t"', '"/l"').replace("talker", "listener")
+    )
+    other = ("/", "/", "listener", "01", ["publish rt/chatter"])
+    ended = program(graph(LOUD, other), "robot.xml", "other.xml", *SHORT, "--patch", "add.xml")
+    assert ended.status == 1
+    assert "`sros merge_policy POLICY OTHER --enclave ENCLAVE`, with --node for each" in ended.err
+    assert "no patch was written: first give the nodes of each process one enclave\n" in ended.err
+    assert not (tmp_path / "add.xml").exists()
+
+
 def test_a_watch_tells_each_denial_when_it_is_seen(program: Program) -> None:
     ended = program(graph(LOUD), "robot.xml", "--watch", "1s")
     assert (ended.status, ended.out) == (1, DENIED)

@@ -146,7 +146,7 @@ def talks(*more: str, enclave: str = "/", fqn: str = "/talker", pid: str = "p1")
         ({"/t": {"/talker": [], "/b": ["publish /chatter"]}}, [talks()], []),
         # The enclave that the graph shows counts, whatever the names of the nodes.
         (
-            {**TALKER, "/u": {"/other": ["publish /x"]}},
+            {"/t": {"/*": ["publish chatter"]}, "/u": {"/other": ["publish /x"]}},
             [talks(enclave="/u")],
             ["/u publish topic /chatter (/talker): no rule allows publish rt/chatter"],
         ),
@@ -208,14 +208,34 @@ def test_a_process_that_fits_several_enclaves_is_judged_in_all(tmp_path: Path) -
     assert "/talker in /one or /two" in found.notes[0].text
 
 
-def test_a_process_whose_nodes_are_in_different_enclaves(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("enclave", "denied", "notes"),
+    [
+        ("/", "/b", ["audit.divided-process"]),
+        ("/b", "/b", ["audit.other-enclave"]),
+        ("/c", "/c", ["audit.other-enclave"]),
+        ("/free", "/free", []),
+    ],
+)
+def test_a_process_whose_nodes_are_in_different_enclaves(
+    enclave: str, denied: str, notes: list[str], tmp_path: Path
+) -> None:
+    """A patch would put a node into a second enclave. Twin: the enclave also has the node."""
     enclaves = {"/a": {"/a": ["publish x"]}, "/b": {"/b": ["publish y", "publish z"]}}
-    seen = graph(
-        node("/a", "publish x", enclave="/"), node("/b", "publish y", "publish z", enclave="/")
-    )
+    enclaves["/c"] = {"/c": []}
+    enclaves |= {"/free": {"/a": [], "/b": ["publish y", "publish z"]}} if not notes else {}
+    b_uses = ("publish y", "publish z", "publish new")
+    seen = graph(node("/a", "publish x", enclave=enclave), node("/b", *b_uses, enclave=enclave))
     found = audited(tmp_path, enclaves, seen)
-    assert said(found) == ["/b publish topic /x (/a): no rule allows publish rt/x"]
-    assert ids(found) == ["audit.divided-process"]
+    assert f"{denied} publish topic /x (/a): no rule allows publish rt/x" in said(found)
+    assert ids(found) == notes
+    added = [(profile.enclave, profile.node) for profile in found.missing.profiles]
+    own = [("/b", "b")] if denied == "/b" else []
+    assert added == (own if notes else [("/free", "a"), ("/free", "b")])
+    for note in found.notes:
+        assert "--enclave ENCLAVE`, with --node for each" in note.text
+        judged = f"/a, /b (judged in {denied})" if enclave == "/" else f"/a in {denied} (its enc"
+        assert judged in note.text
 
 
 def test_what_a_rule_denies_cannot_be_added(tmp_path: Path) -> None:
