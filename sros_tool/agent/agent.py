@@ -72,6 +72,7 @@ from sros_tool.faults import KEY_MADE_ON_ROBOT
 from sros_tool.files import remove_file, replace_file, staged_file
 from sros_tool.folders import Folder
 from sros_tool.keystore.confirmation import (
+    FOREIGN_ENCLAVES,
     LONGEST_LIST,
     LONGEST_SEAL,
     MESSAGE_FILE,
@@ -288,9 +289,10 @@ class _Round:
             replaced=_moments_of(due, self._state.replaced),
             list_replaced=_moments_of(list_due, self._state.list_replaced),
         )
+        own = self._own_enclaves(names)
         asked = _renewals(
             self._folder,
-            names,
+            own,
             now=now,
             new_key=self._settings.new_key,
             secrets=self._machine.secrets,
@@ -516,12 +518,24 @@ class _Round:
             released, newer = self._released_files(), self._newer_enclaves()
             here = sorted(self._enclaves())
             unreleased = [name for name in here if _certificate_path(name) not in released]
-            for name in (name for name in unreleased if name in newer):
+            unpublished = [name for name in unreleased if name in newer]
+            foreign = self._seemingly_foreign(unpublished, released)
+            for name in (name for name in unpublished if name not in foreign):
                 self._problems.append(
-                    f"{name} is newer than release {accepted}, which lacks this enclave. Publish "
-                    "the "
-                    "enclave (`sros fleet publish KEYSTORE PUB`), or remove it here: the next "
-                    "release that lacks the enclave removes its files and its key."
+                    f"{name} is newer than release {accepted}, which lacks this enclave. If it is "
+                    "an enclave of this robot, publish it (`sros fleet publish KEYSTORE PUB`). "
+                    "Otherwise remove it here: the next release that lacks the enclave removes its "
+                    "files and its key."
+                )
+            if foreign:
+                folders = first_few([enclave_folder(name) for name in foreign], 3)
+                self._problems.append(
+                    f"{FOREIGN_ENCLAVES}{first_few(foreign, 3)}. Release {accepted} lacks them, "
+                    f"and their paths do not name {self._settings.robot}. If they belong to "
+                    f"another robot, somebody may have copied their keys: remove {folders} here, "
+                    "and run `sros renew KEYSTORE ENCLAVE --new-key --revoke-old`."
+                    f"{KEY_MADE_ON_ROBOT} If they are new enclaves of this robot, publish them "
+                    "(`sros fleet publish KEYSTORE PUB`)."
                 )
             if older := [name for name in unreleased if name not in newer]:
                 self._problems.append(
@@ -531,6 +545,29 @@ class _Round:
                     "from another robot: the next round that can fetch and install removes "
                     "everything that the release lacks."
                 )
+
+    def _seemingly_foreign(self, names: Sequence[str], released: Iterable[str]) -> list[str]:
+        """Return the enclaves ``names`` whose paths seem to be those of another robot.
+
+        The agent does not know the fleet, so this is a guess: these paths do not name the robot,
+        although the paths of all enclaves of the release, with the files ``released``, do.
+        """
+        robot = self._settings.robot
+        own = {enclave_of(path) for path in released if path.endswith(f"/{CERTIFICATE_FILE}")}
+        if not all(robot in name.split("/") for name in own):
+            return []
+        return [name for name in names if robot not in name.split("/")]
+
+    def _own_enclaves(self, names: Sequence[str]) -> tuple[str, ...]:
+        """Return the enclaves ``names`` that the accepted release has.
+
+        Before the first release, and without a readable seal, all are returned.
+        """
+        if self._state.accepted:
+            with suppress(SrosError):  # the next installation writes the seal again
+                released = self._released_files()
+                return tuple(name for name in names if _certificate_path(name) in released)
+        return tuple(names)
 
     def _note_repaired_files(self, now: datetime) -> None:
         """Report for a day the files that differed from the release and were replaced."""
@@ -912,7 +949,7 @@ class _Round:
             crl=self._list_to_send(names),
             seal=self._seal_to_send(),
         )
-        signers = (renewals.signer,) if renewals.signer else names
+        signers = (renewals.signer,) if renewals.signer else self._own_enclaves(names)
         message = self._signed_message(confirmation, signers)
         if not message:
             return False
@@ -1024,7 +1061,8 @@ class _Round:
                 refused.append(f"{name}: {error}")
         why = f" ({refused[0]})" if refused else ""
         self._problems.append(
-            f"No enclave has a key and a certificate that can sign the message of this robot{why}."
+            "No enclave of this robot's release has a key and a certificate that can sign its "
+            f"message{why}."
         )
         return b""
 
@@ -1061,22 +1099,25 @@ class _Round:
             ) from error
 
     def _client_certificates(self) -> list[ClientCertificate]:
-        """Return the enclaves' certificates and keys for TLS, sorted by expiry, the latest first.
+        """Return the enclaves' certificates and keys for TLS: those of the release come first.
 
-        At most `_MOST_CERTIFICATES` are returned.  An enclave whose key does not belong to its
-        certificate, or cannot be read, is left out: `unusable_sentences` reports it.
+        They are then sorted by expiry, the latest first. At most `_MOST_CERTIFICATES` are
+        returned. An enclave whose key does not belong to its certificate, or cannot be read, is
+        left out: `unusable_sentences` reports it.
         """
-        certificates_by_expiry: list[tuple[datetime, ClientCertificate]] = []
-        for name in self._enclaves():
+        ranked: list[tuple[bool, datetime, ClientCertificate]] = []
+        names = self._enclaves()
+        own = self._own_enclaves(names)
+        for name in names:
             place = enclave_path(self._folder, name)
             with suppress(SrosError, OSError):
                 files = ClientCertificate(place / CERTIFICATE_FILE, place / KEY_FILE)
                 certificate = read_certificate(files.certificate)
                 key = load_key(read_bytes(files.key, "private key"), f"'{files.key}'")
                 if key.public_key() == certificate.public_key():
-                    certificates_by_expiry.append((validity_of(certificate).not_after, files))
-        certificates_by_expiry.sort(key=lambda pair: pair[0], reverse=True)
-        return [files for _, files in certificates_by_expiry[:_MOST_CERTIFICATES]]
+                    ranked.append((name in own, validity_of(certificate).not_after, files))
+        ranked.sort(key=lambda certificate: certificate[:2], reverse=True)
+        return [files for *_, files in ranked[:_MOST_CERTIFICATES]]
 
 
 def _is_refusal(error: FetchError | RefusedError) -> bool:

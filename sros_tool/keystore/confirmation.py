@@ -245,10 +245,11 @@ REPLACED_FILES = "changed or missing here, and replaced: "
 """An agent's words on files that it has mended, and reports for a day."""
 READABLE_KEYS = ", others could read "
 REMOVED_ENCLAVES = "The agent removed enclaves, "
+FOREIGN_ENCLAVES = "This robot perhaps has enclaves of another robot: "
 _OPEN_KEYS = ("private key that others can read", "private key others can read")
 _ALTERNATED_SHOWN = timedelta(days=1)
 _TWO_COMPUTERS = "Two computers with the keys of this robot"
-_COPIED_KEYS = (READABLE_KEYS, REMOVED_ENCLAVES, *_OPEN_KEYS, _TWO_COMPUTERS)
+_COPIED_KEYS = (READABLE_KEYS, REMOVED_ENCLAVES, FOREIGN_ENCLAVES, *_OPEN_KEYS, _TWO_COMPUTERS)
 """Words on private keys that somebody may have copied."""
 
 

@@ -40,7 +40,7 @@ from sros_tool.keystore.issuing.keyring import no_secrets
 from sros_tool.keystore.layout import CRL_FILE, KEY_FILE, REQUIRED_FILES
 from sros_tool.keystore.reader import OpenedKeystore, read_certificate
 from sros_tool.pki import smime
-from sros_tool.pki.certificates import load_certificates, load_request, validity_of
+from sros_tool.pki.certificates import load_certificates, load_request, pem, validity_of
 from sros_tool.pki.crl import load_crl, load_crls, sign_crl
 from sros_tool.pki.keys import load_key
 from sros_tool.runtime.processes import (
@@ -346,6 +346,29 @@ def test_enclaves_that_the_release_does_not_have(home: Home, r1: Robot) -> None:
     assert "lacks them: /r1/damaged, /r1/since, /r2/x. If they" in problem
     late = "\n".join(r1.round(moment() + timedelta(days=1, minutes=1)).problems)
     assert "lacks them: /r1/since, /r2/x. If they" in late, "for a day, if it had no certificate"
+
+
+def test_an_enclave_of_another_robot_that_is_newer_than_the_release(home: Home, r1: Robot) -> None:
+    """It is no enclave to publish, signs no message, and identifies the robot last."""
+    r1.settings = replace(r1.settings, source="https://home/pub")
+    r1.round()
+    taken = r1.folder / "enclaves/q2/x"
+    shutil.copytree(r1.folder / "enclaves/r1/a", taken)
+    renewed = home.renewed.files["enclaves/r1/a/cert.pem"]
+    (taken / "cert.pem").write_bytes(renewed)
+    r1.tried[:] = []
+    done = r1.round()
+    (problem,) = (each for each in done.problems if "/q2/x" in each)
+    assert "another robot: /q2/x. Release 1 lacks them, and their paths do not name r1." in problem
+    assert "remove enclaves/q2/x here" in problem and not is_mended(problem)
+    assert done.sent and r1.tried == [NAMES[0]]
+    signed = smime.parse((r1.inbox / "r1/confirmation.p7s").read_bytes())
+    signer = signed.signer()
+    assert signer and pem(signer) != renewed
+    for key in (r1.folder / "enclaves/r1").glob("*/key.pem"):
+        key.unlink()
+    done = r1.round()
+    assert not done.sent and any("No enclave of this robot's release" in x for x in done.problems)
 
 
 def test_a_removed_enclave_is_named_until_its_certificate_is_revoked_or_a_release_has_it(
