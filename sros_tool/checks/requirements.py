@@ -74,7 +74,8 @@ DROPPED = FindingKind(
     "requirement "
     "forbade, without a finding.",
     "The requirements file, and the one given as --requirements-before.",
-    "Restore the requirement, or approve its removal in the review.",
+    "Restore the requirement, or approve its removal in the review (`--dropped-requirements "
+    "allow`).",
 )
 ASSUMED = FindingKind(
     "requirement.assumed",

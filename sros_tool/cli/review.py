@@ -470,7 +470,9 @@ def _sentence(result: Review, step: ReviewStep) -> str:
             return ", ".join(clauses)
         case DroppedRequirements(count=count, chosen=chosen):
             kind = f"{counted(count, 'requirement')} dropped, changed or escaped"
-            return f"{kind}, checked as they were before the change: {chosen.summary()}{place}"
+            text = f"{kind}, checked as they were before the change: {chosen.summary()}{place}"
+            way = "; a reviewer can approve this: --dropped-requirements allow"
+            return text if step.allowed else f"{text}{way}"
         case ExpiryCheck(due=due, unreadable=unreadable, lasting=count) as expiry:
             unread = f", {len(unreadable)} cannot be read" if unreadable else ""
             left_out = expiry.short_lived_text()

@@ -269,9 +269,20 @@ def _about_rights(requirement: Only, rights: Iterable[Right]) -> Only:
 
 
 _GONE_REMEDY = (
-    "If the name was changed, change it in the requirement, too. If nobody uses the name any more, "
-    "approve this in the review."
+    "If the name was changed, change it in the requirement, too. In any case, a reviewer has to "
+    "approve this (`--dropped-requirements allow`)."
 )
+
+
+def rights_with_new_peers(before: Collection[Right], after: Collection[Right]) -> set[str]:
+    """Return the rights, such as publish, whose names a change may rename.
+
+    The change gives the other side, here subscribe, to more names.
+    """
+    first, second = split_actions(before), split_actions(after)
+    gained = {right.right for right in first ^ second if _is_gained(right, second)}
+    goals = {right: goal_right(Right("", ALLOW, right, "")).right for right in PEER_RIGHT}
+    return {right for right, goal in goals.items() if PEER_RIGHT[goal] in gained}
 
 
 def unanswered_requirement_findings(
@@ -307,7 +318,7 @@ def unanswered_requirement_findings(
 
     similar_requirements = similarity_to(earlier)
     compared = requirements if removed or added else ()
-    gained = {right.right for right in first ^ second if _is_gained(right, second)}
+    renamed = rights_with_new_peers(before, after)
 
     def peers_of(requirement: Requirement) -> dict[Right, Right]:
         return {
@@ -336,7 +347,7 @@ def unanswered_requirement_findings(
                 (right, peer)
                 for right, peer in lost.items()
                 if peer.name in names
-                if not isinstance(requirement, Nobody) or PEER_RIGHT[right.right] in gained
+                if not isinstance(requirement, Nobody) or right.right in renamed
             )
     for requirement, peers in asked.items():
         lost_texts = [
@@ -346,8 +357,11 @@ def unanswered_requirement_findings(
         ]
         if lost_texts:
             place = requirement.source
-            text = f"HEAD removes the last stated right to {first_few(lost_texts, 3)}, without "
-            text += "which the requirement protects nothing"
+            text = f"HEAD removes the last stated right to {first_few(lost_texts, 3)}, "
+            if isinstance(requirement, Nobody):
+                text += "perhaps because of a new name, which the requirement does not restrict"
+            else:
+                text += "without which the requirement protects nothing"
             yield DROPPED.found(str(requirement), text, place.file, place.line, _GONE_REMEDY)
 
 

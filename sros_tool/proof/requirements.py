@@ -27,7 +27,7 @@ namespace.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import product
@@ -978,8 +978,12 @@ class DroppedRequirement:
         """The demands of the new file about some of the same names, as clauses."""
         return tuple(demand(requirement) for requirement in self.kept)
 
-    def text(self) -> str:
-        """Return a clause on the part of the requirement that the new file still demands."""
+    def text(self, renamed: Collection[str] = ()) -> str:
+        """Return a clause on the part of the requirement that the new file still demands.
+
+        ``renamed`` are the rights, such as publish, whose names a change may rename: for these, the
+        clause does not propose `Nobody`, which would not be enough.
+        """
         if self.only_elsewhere:
             names = {*_moving_names([self.requirement])} ^ {*_moving_names(self.kept)}
             text = "the new file demands less in another namespace (`sros check --namespace`)"
@@ -992,7 +996,8 @@ class DroppedRequirement:
             text = "the new file has no such requirement"
         if isinstance(self.requirement, Only | AtMost):
             kept = {*_single_rights(right for e in self.kept for right in getattr(e, "rights", ()))}
-            if gone := [one for one in _single_rights(self.requirement.rights) if one not in kept]:
+            gone = [one for one in _single_rights(self.requirement.rights) if one not in kept]
+            if gone := [one for one in gone if one[0] not in renamed]:
                 retired = _rights_text(tuple(gone))
                 text += f" (if nobody is to {retired} any more, write so in [[nobody]])"
         return text
@@ -1088,10 +1093,11 @@ def dropped_findings(
     after: Iterable[Requirement],
     file: str,
     clauses: Mapping[Requirement, str] = MappingProxyType({}),
+    renamed: Collection[str] = (),
 ) -> list[Finding]:
     """Return a finding for each requirement that ``after`` does not fully demand.
 
-    ``clauses`` has texts to add to findings.
+    ``clauses`` has texts to add to findings; ``renamed`` as for `DroppedRequirement.text`.
 
     The requirements that one table makes for several robots share a finding.  Its place is a table
     that still demands something about the same names; without one, it is ``file``, the path of the
@@ -1105,7 +1111,7 @@ def dropped_findings(
     return [
         DROPPED.found(
             ": ".join(filter(None, (first.name, first.demand))),
-            first.text()
+            first.text(renamed)
             + clauses.get(first.requirement, "")
             + _other_robots_text([other.requirement.robot for other in others]),
             *((first.kept[0].source.file, first.kept[0].source.line) if first.kept else (file, 0)),

@@ -92,6 +92,7 @@ from sros_tool.proof.escapes import (
     lost_restriction_findings,
     namespaces_in,
     namespaces_of_patterns,
+    rights_with_new_peers,
     unanswered_requirement_findings,
 )
 from sros_tool.proof.findings import (
@@ -1147,11 +1148,14 @@ class _Review:
                 except SrosError as error:
                     yield _undecided_step("requirements-before", subject, error)
                     continue
-            unanswered = partial(
-                unanswered_requirement_findings, required_before, wanted, rights, later_rights
-            )
             decide = partial(
-                self._dropped_step, required_before, wanted, system, sources, unanswered, moves
+                self._dropped_step,
+                required_before,
+                wanted,
+                system,
+                sources,
+                (rights, later_rights),
+                moves,
             )
             yield from self._step_result(
                 "requirements-before", subject, decide, is_wanted=len(read) == len(files)
@@ -1315,7 +1319,7 @@ class _Review:
         wanted_requirements: Sequence[Requirement],
         system: System,
         compared_sides: Callable[[], tuple[AccessSource, AccessSource]] | None,
-        unanswered: Callable[[], Iterable[Finding]],
+        rights: tuple[Collection[Right], Collection[Right]],
         moves: RobotMoves,
     ) -> tuple[int, Content] | None:
         dropped = [
@@ -1325,7 +1329,7 @@ class _Review:
         sources = None
         with suppress(SrosError, OSError):  # the comparison reports the error
             sources = compared_sides() if compared_sides else None
-        left = [*unanswered()]
+        left = [*unanswered_requirement_findings(earlier, wanted_requirements, *rights)]
         if sources:
             left += lost_restriction_findings(earlier, wanted_requirements, *sources, moves)
             left += access_by_name_findings(earlier, wanted_requirements, *sources, system)
@@ -1338,7 +1342,9 @@ class _Review:
             else finding._replace(
                 file=str(self.head.folder / Path(place.file).relative_to(self.base.folder))
             )
-            for finding in dropped_findings(earlier, wanted_requirements, "", moves.clauses)
+            for finding in dropped_findings(
+                earlier, wanted_requirements, "", moves.clauses, rights_with_new_peers(*rights)
+            )
             for place in finding.related
         ]
         broken = [of for of in requirement_findings(dropped, system) if of.kind is VIOLATED]

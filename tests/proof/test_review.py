@@ -1303,7 +1303,10 @@ def test_a_name_that_nobody_may_use_may_lose_its_denial_and_its_right(change: Ch
 def test_a_change_may_forbid_the_name_that_it_removes(
     change: Change, name: str, before: str, after: str, others: tuple[str, ...], fails: bool
 ) -> None:
-    """Twins: the subscriber gets, or perhaps got, another name, which no requirement restricts."""
+    """Twins: the subscriber gets, or perhaps got, another name, which no requirement restricts.
+
+    A review of the requirements without the name proposes [[nobody]] only where it is enough.
+    """
     is_forbidden = before == "nobody"
     required = f'[[{before}]]\npublish = ["{name}"]\n' + 'enclaves = ["/a"]\n' * (not is_forbidden)
     publisher = publish("/x") if is_forbidden else publish("/x", "/q")
@@ -1314,8 +1317,15 @@ def test_a_change_may_forbid_the_name_that_it_removes(
         }
     )
     robot = policy_text({"/a": publish("/x", *others), "/b": subscribe("/x", *others)})
-    change.commit({"robot.xml": robot, "robot.toml": f"# shorter\n{after.format(name)}"})
     words = ("--policy", "robot.xml", "--requirements", "robot.toml", "--new-access", "allow")
+    if before == "only" and "nobody" in after and name == "/q":
+        change.commit({"robot.xml": robot, "robot.toml": ONLY})
+        ended = change.review(*words)
+        assert "; a reviewer can approve this: --dropped-requirements allow\n" in ended.out, ended
+        assert ("write so in [[nobody]]" in ended.out) == (not fails), ended
+        allowed = change.review(*words, "--dropped-requirements", "allow").ok()
+        assert "a reviewer can approve" not in allowed.out, allowed
+    change.commit({"robot.xml": robot, "robot.toml": f"# shorter\n{after.format(name)}"})
     ended = change.review(*words)
     assert ("for topic /q any more; required: nobody" in ended.out) == is_forbidden, ended
     lost = "HEAD removes the last stated right to subscribe topic /q,"
